@@ -1,0 +1,1 @@
+"""What a bird is: mesh, joint tree, priors, pose and kinematics."""
