@@ -1,0 +1,1 @@
+"""The objective: short pure terms and their weighted sum."""

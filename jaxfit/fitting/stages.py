@@ -1,0 +1,46 @@
+"""Stages as data, turned into what the solver takes."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxfit.camera import Camera
+from jaxfit.config import FitConfig, StageConfig
+from jaxfit.fitting.solve import Problem
+from jaxfit.model.bird import Bird
+from jaxfit.model.kinematics import Rig
+from jaxfit.model.pose import Pose
+from jaxfit.objective.scene import Priors
+
+__all__ = ["needs_mask", "stage_problem"]
+
+MASK_TERMS = ("mask", "mask_smooth_l1")
+
+
+def needs_mask(stage: StageConfig) -> bool:
+    """Whether any of a stage's terms looks at the silhouette."""
+    return any(name in MASK_TERMS for name in stage.terms)
+
+
+def stage_problem(
+    config: FitConfig, stage: StageConfig, bird: Bird, rig: Rig, priors: Priors, camera: Camera
+) -> Problem:
+    """What the solver needs for one stage; weights, settings and step sizes become traced arrays."""
+
+    def step_size(name: str):
+        scale = jnp.asarray(stage.step_scale.get(name, 1.0), jnp.float32)
+        return stage.learning_rate * scale if name in stage.free else jnp.zeros_like(scale)
+
+    settings = {
+        name: {key: jnp.float32(value) for key, value in values.items()}
+        for name, values in config.stage_settings(stage).items()
+    }
+    return Problem(
+        rig=rig,
+        priors=priors,
+        settings=settings,
+        step_size=Pose(**{name: step_size(name) for name in Pose.__dataclass_fields__}),
+        keypoints_on=jnp.array([float(name not in stage.keypoints_off) for name in bird.keypoint_names]),
+        camera=camera,
+        backend=config.backend,
+    )

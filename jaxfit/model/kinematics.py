@@ -1,0 +1,128 @@
+"""From a pose to posed joints, keypoints and vertices.
+
+Skinning is linear in the joint transforms A (J, 3, 4), so that everything the fit needs is folded once
+into a `Rig`: keypoints = (K, J, 4)·A without touching the mesh, vertices = (V, 4J)·A in one product.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxfit.model.bird import Bird
+from jaxfit.model.pose import Pose
+from jaxfit.model.rotation import axis_angle_to_matrix
+
+__all__ = ["Rig", "fold_bird", "joint_transforms", "posed_joints", "posed_keypoints", "posed_vertices"]
+
+
+class Rig(eqx.Module):
+    """A bird folded for fitting: what poses it, and nothing else.
+
+    Pass it to compiled functions as an argument: as a constant it would be folded into the program.
+    """
+
+    joints: Float[Array, "J 3"]
+    keypoint_map: Float[Array, "K J 4"]
+    """Σ_v keypoint_weights · skin_weights · (v, 1): keypoints as a linear map of the joint transforms."""
+    keypoint_shape_map: Float[Array, "S K J 3"]
+    """The same for each shape direction."""
+    vertex_map: Float[Array, "V 4J"]
+    """skin_weights · (v, 1), ordered coordinate by coordinate: [x·w | y·w | z·w | w]."""
+    skin_weights: Float[Array, "V J"]
+    shape_basis: Float[Array, "S V 3"]
+    faces: Int[Array, "F 3"]
+    parents: tuple[int, ...] = eqx.field(static=True)
+
+
+def fold_bird(bird: Bird) -> Rig:
+    """Fold keypoint weights, skin weights, rest vertices and shape directions (in float64, once)."""
+    weights = np.asarray(bird.skin_weights, np.float64)
+    to_keypoints = np.asarray(bird.keypoint_weights, np.float64)
+    basis = np.asarray(bird.shape_basis, np.float64)
+    homogeneous = np.concatenate([np.asarray(bird.vertices, np.float64), np.ones((len(weights), 1))], axis=1)
+    per_vertex = weights[:, :, None] * homogeneous[:, None]  # (V, J, 4)
+    shape_map = (
+        np.stack([np.einsum("kv,vj,vc->kjc", to_keypoints, weights, b, optimize=True) for b in basis])
+        if len(basis)
+        else np.zeros((0, len(to_keypoints), weights.shape[1], 3))
+    )
+    return Rig(
+        joints=jnp.asarray(bird.joints, jnp.float32),
+        keypoint_map=jnp.asarray(
+            np.einsum("kv,vjc->kjc", to_keypoints, per_vertex, optimize=True), jnp.float32
+        ),
+        keypoint_shape_map=jnp.asarray(shape_map, jnp.float32),
+        vertex_map=jnp.asarray(per_vertex.transpose(0, 2, 1).reshape(len(weights), -1), jnp.float32),
+        skin_weights=jnp.asarray(weights, jnp.float32),
+        shape_basis=jnp.asarray(basis, jnp.float32),
+        faces=jnp.asarray(bird.faces, jnp.int32),
+        parents=bird.parents,
+    )
+
+
+def joint_transforms(rig: Rig, pose: Pose) -> Float[Array, "J 3 4"]:
+    """Unit-scale transforms A_j: a rest point v bound to joint j alone is posed to A_j·(v, 1).
+
+    R_j = R_parent · R(θ_j),  t_j = t_parent + R_parent · (bone_j · (J_j − J_parent)),
+    A_j = [R_j | t_j − R_j · J_j]; the root turns about its own rest position. Scale and translation are
+    applied after skinning, which is the same as scaling vertices, joints and offsets before it.
+
+    Source: avian-mesh (Badger et al. 2020), section 3, "pose".
+    """
+    depth = [0] * len(rig.parents)
+    for j, parent in enumerate(rig.parents[1:], start=1):
+        depth[j] = depth[parent] + 1
+    rotations = axis_angle_to_matrix(jnp.concatenate([pose.global_orient[None], pose.body_pose]))
+    parents = np.maximum(np.asarray(rig.parents), 0)
+    offsets = (rig.joints - rig.joints[parents])[1:] * pose.bone_length[:, None]
+    # One level of the tree at a time: seven small steps instead of a chain of 25, for XLA to compile.
+    level = np.array([0])
+    R_levels, t_levels, order = [rotations[:1]], [rig.joints[:1]], [0]
+    for d in range(1, max(depth) + 1):
+        children = np.flatnonzero(np.asarray(depth) == d)
+        above = np.searchsorted(level, parents[children])
+        R_parent, t_parent = R_levels[-1][above], t_levels[-1][above]
+        R_levels.append(_matmul(R_parent, rotations[children]))
+        t_levels.append(t_parent + _matvec(R_parent, offsets[children - 1]))
+        order.extend(children.tolist())
+        level = children
+    back = np.argsort(order)
+    R, t = jnp.concatenate(R_levels)[back], jnp.concatenate(t_levels)[back]
+    return jnp.concatenate([R, (t - _matvec(R, rig.joints))[..., None]], axis=-1)
+
+
+def posed_keypoints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "K 3"]:
+    """Keypoints in the camera frame, model units, from the joint transforms."""
+    unit = jnp.einsum("kjc,jdc->kd", rig.keypoint_map, A)
+    if rig.shape_basis.shape[0]:
+        shaped = jnp.tensordot(pose.betas, rig.keypoint_shape_map, axes=1)  # (K, J, 3)
+        unit = unit + jnp.einsum("kjc,jdc->kd", shaped, A[..., :3])
+    return unit * pose.scale + pose.transl
+
+
+def posed_vertices(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "V 3"]:
+    """Vertices in the camera frame, model units, by linear blend skinning of the joint transforms."""
+    unit = rig.vertex_map @ A.transpose(2, 0, 1).reshape(-1, 3)
+    if rig.shape_basis.shape[0]:
+        displaced = jnp.tensordot(pose.betas, rig.shape_basis, axes=1)  # (V, 3)
+        blended = rig.skin_weights @ A[..., :3].reshape(-1, 9)  # (V, 9)
+        unit = unit + _matvec(blended.reshape(-1, 3, 3), displaced)
+    return unit * pose.scale + pose.transl
+
+
+def posed_joints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "J 3"]:
+    """Joints in the camera frame, model units."""
+    unit = _matvec(A[..., :3], rig.joints) + A[..., 3]
+    return unit * pose.scale + pose.transl
+
+
+def _matmul(a: Float[Array, "*B 3 3"], b: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:
+    """Small matrix products as sums: XLA fuses and vectorises these, but calls a library for a batched dot."""
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
+
+
+def _matvec(a: Float[Array, "*B 3 3"], v: Float[Array, "*B 3"]) -> Float[Array, "*B 3"]:
+    return jnp.sum(a * v[..., None, :], axis=-1)

@@ -1,0 +1,53 @@
+"""What moves a bird: the pose of every frame of a window, as one pytree."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfit.model.bird import Bird
+
+__all__ = ["Pose", "rest_pose"]
+
+
+class Pose(eqx.Module):
+    """The pose of one bird in one frame; a window holds the same fields with a leading T.
+
+    Rotations are axis-angle in radians, each joint relative to its parent; lengths are in model units,
+    camera frame. In a window, `bone_length` and `betas` stay without a frame axis: a bird keeps its
+    skeleton and its shape. `scale` has one entry per frame, or one for the window ("common size").
+    """
+
+    global_orient: Float[Array, "*T 3"]
+    """Rotation model → camera, about the root joint."""
+    body_pose: Float[Array, "*T J-1 3"]
+    """Rotation of every other joint against its parent."""
+    transl: Float[Array, "*T 3"]
+    """Position of the root joint's rest origin in the camera frame."""
+    scale: Float[Array, "*T"]
+    """Size relative to the model's rest size."""
+    bone_length: Float[Array, "J-1"]
+    """Length of each bone relative to the rest skeleton."""
+    betas: Float[Array, "S"]
+    """Shape coefficients."""
+
+
+def rest_pose(bird: Bird, frames: int | None = None, common_size: bool = False) -> Pose:
+    """The bird at its prior's mean pose and bone lengths, unrotated at the origin, scale 1.
+
+    Args:
+        bird: the model.
+        frames: length T of a window; None gives one frame without a leading axis.
+        common_size: one scale for the whole window instead of one a frame.
+    """
+    lead = () if frames is None else (frames,)
+    joints = bird.num_joints
+    return Pose(
+        global_orient=jnp.zeros((*lead, 3)),
+        body_pose=jnp.broadcast_to(bird.pose_mean.reshape(joints - 1, 3), (*lead, joints - 1, 3)),
+        transl=jnp.zeros((*lead, 3)),
+        scale=jnp.ones((1,) if common_size and frames is not None else lead),
+        bone_length=bird.bone_mean,
+        betas=jnp.zeros(bird.num_shapes),
+    )

@@ -1,0 +1,131 @@
+"""Rotations: axis-angle, matrices, quaternions, the distance between them, and grids over SO(3)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+__all__ = [
+    "axis_angle_to_matrix",
+    "geodesic_distance",
+    "matrix_to_axis_angle",
+    "unwrap_axis_angle",
+    "view_grid",
+    "viewing_axis_rotations",
+]
+
+
+def axis_angle_to_matrix(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
+    """Rotation matrices of axis-angles in radians (Rodrigues), smooth at zero.
+
+    R = I + a·[r]× + b·[r]×², a = sin θ/θ, b = (1 − cos θ)/θ²; below θ = 1e-2 by their series in θ²,
+    so that values and gradients stay exact to float32 and finite at zero rotation.
+    """
+    theta2 = jnp.sum(axis_angle**2, axis=-1)
+    small = theta2 < 1e-4
+    safe2 = jnp.where(small, 1.0, theta2)
+    theta = jnp.sqrt(safe2)
+    a = jnp.where(small, 1 - theta2 / 6 + theta2**2 / 120, jnp.sin(theta) / theta)
+    b = jnp.where(small, 0.5 - theta2 / 24 + theta2**2 / 720, (1 - jnp.cos(theta)) / safe2)
+    x, y, z = axis_angle[..., 0], axis_angle[..., 1], axis_angle[..., 2]
+    rows = [
+        [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+        [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
+        [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def matrix_to_axis_angle(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3"]:
+    """Axis-angles in radians, θ in [0, π], of rotation matrices (through unit quaternions)."""
+    quaternion = _matrix_to_quaternion(R)
+    w, xyz = quaternion[..., :1], quaternion[..., 1:]
+    sine = jnp.linalg.norm(xyz, axis=-1, keepdims=True)
+    theta = 2 * jnp.arctan2(sine, w)
+    return jnp.where(sine < 1e-6, 2 * xyz, xyz * (theta / jnp.maximum(sine, 1e-6)))
+
+
+def _matrix_to_quaternion(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 4"]:
+    """Unit quaternions (w ≥ 0), from whichever of the four components is largest: stable everywhere."""
+    m = [[R[..., i, j] for j in range(3)] for i in range(3)]
+    candidates = jnp.stack(
+        [
+            jnp.stack(
+                [1 + m[0][0] + m[1][1] + m[2][2], m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]], -1
+            ),
+            jnp.stack(
+                [m[2][1] - m[1][2], 1 + m[0][0] - m[1][1] - m[2][2], m[1][0] + m[0][1], m[0][2] + m[2][0]], -1
+            ),
+            jnp.stack(
+                [m[0][2] - m[2][0], m[1][0] + m[0][1], 1 - m[0][0] + m[1][1] - m[2][2], m[2][1] + m[1][2]], -1
+            ),
+            jnp.stack(
+                [m[1][0] - m[0][1], m[0][2] + m[2][0], m[2][1] + m[1][2], 1 - m[0][0] - m[1][1] + m[2][2]], -1
+            ),
+        ],
+        axis=-2,
+    )
+    largest = jnp.argmax(jnp.diagonal(candidates, axis1=-2, axis2=-1), axis=-1)
+    quaternion = jnp.take_along_axis(candidates, largest[..., None, None], axis=-2)[..., 0, :]
+    quaternion = quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)
+    return jnp.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def geodesic_distance(Ra: Float[Array, "*B 3 3"], Rb: Float[Array, "*B 3 3"]) -> Float[Array, "*B"]:
+    """The angle between rotations, in radians within [0, π].
+
+    By the chord ‖Ra − Rb‖ = 2√2·sin(θ/2), which keeps its precision at small angles where arccos does not.
+    """
+    chord = jnp.sqrt(jnp.sum((Ra - Rb) ** 2, axis=(-2, -1)))
+    return 2 * jnp.arcsin(jnp.clip(chord / (2 * jnp.sqrt(2.0)), 0, 1))
+
+
+def unwrap_axis_angle(axis_angle: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
+    """The same rotations, each in the representative r + 2πk·r/‖r‖ nearest to its predecessor's.
+
+    Axis-angle is many-to-one; without this, a bird that turns through θ = π jumps by 2π between frames
+    and the velocity term pulls at a motion that is not there.
+    """
+
+    def step(previous, current):
+        theta = jnp.linalg.norm(current)
+        axis = current / jnp.maximum(theta, 1e-9)
+        # nearest point of the line of representatives: (θ + 2πk)·axis closest to the predecessor
+        k = jnp.round((jnp.dot(previous, axis) - theta) / (2 * jnp.pi))
+        nearest = jnp.where(theta < 1e-6, current, current + 2 * jnp.pi * k * axis)
+        return nearest, nearest
+
+    _, unwrapped = jax.lax.scan(step, axis_angle[0], axis_angle)
+    return unwrapped
+
+
+def viewing_axis_rotations(count: int) -> Float[np.ndarray, "C 3 3"]:
+    """`count` rotations about the camera's z axis in equal steps (the paper's 30 steps of 12°)."""
+    angles = 2 * np.pi * np.arange(count) / count
+    rotations = np.zeros((count, 3, 3))
+    rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(angles)
+    rotations[:, 1, 0], rotations[:, 0, 1] = np.sin(angles), -np.sin(angles)
+    rotations[:, 2, 2] = 1
+    return rotations
+
+
+def view_grid(directions: int, turns: int) -> Float[np.ndarray, "C 3 3"]:
+    """A near-uniform grid over SO(3): a Fibonacci sphere of viewing directions × turns about the view axis.
+
+    Args:
+        directions: directions from which the bird is seen.
+        turns: equal turns about the camera's z axis for each direction.
+
+    Returns:
+        directions · turns rotation matrices, model → camera.
+    """
+    i = np.arange(directions) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * i / directions), np.pi * (1 + 5**0.5) * i
+    toward = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1)
+    helper = np.where(np.abs(toward[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    x = np.cross(helper, toward)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    facing = np.stack([x, np.cross(toward, x), toward], axis=1)  # rows: camera axes in the model's frame
+    return (viewing_axis_rotations(turns)[:, None] @ facing).reshape(-1, 3, 3)

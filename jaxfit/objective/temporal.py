@@ -1,0 +1,39 @@
+"""The terms that tie the frames of a window together. Pairs and triples with a missing frame count nothing."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxfit.objective.scene import Scene
+from jaxfit.objective.terms import safe_norm
+
+__all__ = ["acceleration", "velocity"]
+
+
+def velocity(scene: Scene, *, beta_global: float = 10.0, beta_pose: float = 1.0) -> Float[Array, ""]:
+    """E_vel = Σ_k β_k Σ_i ‖θ_k,i+1 − θ_k,i‖₂ over k = global orientation, body pose.
+
+    Source: Hägerlind et al. 2024, velocity term; norms not squared.
+    """
+    return _differences(scene, 1, beta_global, beta_pose)
+
+
+def acceleration(scene: Scene, *, beta_global: float = 10.0, beta_pose: float = 1.0) -> Float[Array, ""]:
+    """E_acc = Σ_k β_k Σ_i ‖θ′_k,i+1 − θ′_k,i‖₂ with θ′ the frame-to-frame difference.
+
+    Source: Hägerlind et al. 2024, acceleration term; norms not squared.
+    """
+    return _differences(scene, 2, beta_global, beta_pose)
+
+
+def _differences(scene: Scene, order: int, beta_global: float, beta_pose: float) -> Float[Array, ""]:
+    frames = scene.pose.global_orient.shape[0]
+    if frames <= order:
+        return jnp.zeros(())
+    complete = scene.evidence.present[: frames - order]
+    for shift in range(1, order + 1):
+        complete = complete & scene.evidence.present[shift : frames - order + shift]
+    orient = safe_norm(jnp.diff(scene.pose.global_orient, order, axis=0))
+    body = safe_norm(jnp.diff(scene.pose.body_pose.reshape(frames, -1), order, axis=0))
+    return jnp.sum(jnp.where(complete, beta_global * orient + beta_pose * body, 0.0))

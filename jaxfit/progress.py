@@ -1,0 +1,40 @@
+"""Progress on long work: one protocol, silent by default, a bar on the terminal for the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+__all__ = ["ProgressTask", "Tick", "silent", "terminal"]
+
+Tick = Callable[[float, str], None]
+"""Called with the amount of work just done and a short note."""
+ProgressTask = Callable[[str, float], "contextmanager[Tick]"]
+"""Opens a task of a given name and total amount of work."""
+
+
+@contextmanager
+def silent(_name: str, _total: float) -> Iterator[Tick]:
+    """Report nothing."""
+    yield lambda _done, _note: None
+
+
+@contextmanager
+def terminal(name: str, total: float) -> Iterator[Tick]:
+    """A bar with elapsed and remaining time on stderr; plain lines where that is not a terminal."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description:<22}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[note]}"),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(name, total=total, note="")
+        yield lambda done, note: bar.update(task, advance=done, note=note)
