@@ -1,0 +1,94 @@
+"""What the joints and keypoints of the published bird models are called.
+
+Both models share one skeleton. In rest pose the bird looks along +y with +z up, so its left side is −x.
+A joint is named by the place it turns about, in a bird's terms: the thigh lies inside the body, the joint
+that shows half-way down the leg and bends backwards is the ankle, and `foot` is where the toes begin.
+The folded wings cross over the back, which puts `left_wingtip` a little to the right of the midline.
+
+Source: the keypoints' order is Badger et al. 2020 (marcbadger/avian-mesh, `utils/constants.py`) and
+Wang et al. 2021 (the parts of CUB-200-2011, feet, shins and tail split as that work annotates them); the
+joints' names are ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+__all__ = ["AVES_KEYPOINTS", "AVIAN_MESH_KEYPOINTS", "JOINT_NAMES", "mirror_pairs"]
+
+JOINT_NAMES = (
+    "root",
+    "lower_body",
+    "tail",
+    "upper_body",
+    "chest",
+    "left_hip",
+    "left_knee",
+    "left_ankle",
+    "left_foot",
+    "left_wing_root",  # at the midline; moves no vertex of its own, but the whole wing
+    "left_shoulder",
+    "left_elbow",
+    "left_wrist",
+    "neck_root",  # likewise for neck and head
+    "neck",
+    "head",
+    "jaw",  # the lower bill
+    "right_wing_root",
+    "right_shoulder",
+    "right_elbow",
+    "right_wrist",
+    "right_hip",
+    "right_knee",
+    "right_ankle",
+    "right_foot",
+)
+
+AVIAN_MESH_KEYPOINTS = (
+    "bill_tip",
+    "left_eye",
+    "right_eye",
+    "neck",
+    "nape",
+    "left_wingtip",
+    "right_wingtip",
+    "left_foot",
+    "right_foot",
+    "tail_tip",
+    "left_wrist",
+    "right_wrist",
+)
+
+AVES_KEYPOINTS = (
+    "left_eye",
+    "right_eye",
+    "forehead",
+    "crown",
+    "nape",
+    "back",
+    "throat",
+    "breast",
+    "bill_base",
+    "bill_tip",
+    "left_foot",
+    "left_shin",
+    "right_foot",
+    "right_shin",
+    "tail_base",
+    "tail_tip",
+    "left_wingtip",
+    "right_wingtip",
+)
+
+
+def mirror_pairs(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
+    """(left, right) indices of the names that differ only in `left_` and `right_`."""
+    index = {name: i for i, name in enumerate(names)}
+    pairs = []
+    for i, name in enumerate(names):
+        if (
+            name.startswith("left_")
+            and (right := index.get("right_" + name.removeprefix("left_"))) is not None
+        ):
+            pairs.append((i, right))
+    return tuple(pairs)

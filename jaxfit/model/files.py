@@ -1,0 +1,111 @@
+"""A bird in one `.npz` file: plain arrays and names, no pickles.
+
+Beside the fields of `Bird` under their own names the file holds `format_version` (now 1); parents and pairs
+are integer arrays, names are arrays of text. A file of a newer version is refused, unknown extra arrays are
+passed over.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfit.errors import InputError
+from jaxfit.model.bird import Bird
+from jaxfit.model.checks import ARRAY_FIELDS, check_bird
+from jaxfit.storage import load_npz, write_whole
+
+__all__ = ["FORMAT_VERSION", "load_bird", "save_bird"]
+
+FORMAT_VERSION = 1
+STATIC_FIELDS = {
+    "parents": 1,
+    "joint_names": 1,
+    "keypoint_names": 1,
+    "joint_pairs": 2,
+    "keypoint_pairs": 2,
+    "name": 0,
+}
+"""Fields of `Bird` that are no arrays there, and their dimensions in the file."""
+TEXT_FIELDS = ("joint_names", "keypoint_names", "name")
+
+
+def save_bird(bird: Bird, path: Path | str) -> None:
+    """Write a bird to an `.npz` file, whole or not at all; an older file of that name is replaced.
+
+    Args:
+        bird: the model; its arrays are stored as float32 and int32.
+        path: the file, conventionally `<name>.npz`.
+
+    Raises:
+        InputError: a field of the bird is wrong, or the file cannot be written.
+    """
+    check_bird(bird, f"bird {bird.name!r}")
+    arrays: dict[str, np.ndarray] = {"format_version": np.asarray(FORMAT_VERSION, np.int32)}
+    for field in ARRAY_FIELDS:
+        arrays[field] = np.asarray(getattr(bird, field), np.int32 if field == "faces" else np.float32)
+    for field, dimensions in STATIC_FIELDS.items():
+        value = getattr(bird, field)
+        array = np.asarray(value, np.str_ if field in TEXT_FIELDS else np.int32)
+        arrays[field] = array.reshape(-1, 2) if dimensions == 2 else array
+    write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
+
+
+def load_bird(path: Path | str) -> Bird:
+    """Read a bird that `save_bird` wrote, and check it.
+
+    Args:
+        path: the `.npz` file.
+
+    Returns:
+        The bird, with jax arrays of float32 and int32.
+
+    Raises:
+        InputError: no such file, a folder, no `.npz`, truncated, Python objects inside, of a newer version,
+            a field missing, or of a wrong shape or content.
+    """
+    path = Path(path)
+    found = load_npz(path, {"format_version": 0})
+    version = found["format_version"]
+    if version.dtype.kind not in "iu" or version < 1:
+        raise InputError(path, f"format_version: {version!s:.40} is none", "write the file again")
+    if version > FORMAT_VERSION:
+        problem = f"format_version: {version}, this jaxfit reads up to {FORMAT_VERSION}"
+        raise InputError(path, problem, "needs a newer jaxfit")
+    dimensions = {field: len(axes.split()) for field, axes in ARRAY_FIELDS.items()} | STATIC_FIELDS
+    for field, ndim in dimensions.items():
+        if field not in found:
+            raise InputError(path, f"{field}: missing", "import the model again with `jaxfit model import`")
+        kinds = "U" if field in TEXT_FIELDS else "f" if field in ARRAY_FIELDS and field != "faces" else "iu"
+        array = found[field]
+        if array.ndim != ndim or array.dtype.kind not in kinds:
+            problem = f"{field}: a {array.dtype} array of shape {array.shape} does not belong here"
+            raise InputError(path, problem, "write the file again with save_bird")
+
+    def pairs(field: str) -> tuple[tuple[int, int], ...]:
+        if found[field].shape[1] != 2:
+            problem = f"{field}: shape {found[field].shape}, expected (pairs, 2)"
+            raise InputError(path, problem, "write the file again with save_bird")
+        return tuple((int(left), int(right)) for left, right in found[field])
+
+    def whole(array: np.ndarray) -> np.ndarray:
+        # an index beyond int32 is turned into one that is never valid, not wrapped round to one that may be
+        return np.where((array < 2**31) & (array >= 0), array, -1).astype(np.int32)
+
+    with np.errstate(over="ignore"):  # what does not fit float32 becomes infinite, which the check reports
+        arrays = {
+            field: jnp.asarray(whole(found[field]) if field == "faces" else found[field].astype(np.float32))
+            for field in ARRAY_FIELDS
+        }
+    bird = Bird(
+        **arrays,
+        parents=tuple(int(parent) for parent in found["parents"]),
+        joint_names=tuple(map(str, found["joint_names"])),
+        keypoint_names=tuple(map(str, found["keypoint_names"])),
+        joint_pairs=pairs("joint_pairs"),
+        keypoint_pairs=pairs("keypoint_pairs"),
+        name=str(found["name"]),
+    )
+    return check_bird(bird, path)
