@@ -1,0 +1,263 @@
+"""Files and folders written whole or not at all, and arrays read back with their layout checked."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from jaxfit.errors import InputError
+
+__all__ = ["conform", "load_npz", "new_folder", "write_whole"]
+
+# What the operating system may answer to a write, and what the user can do about it.
+_REMEDIES = {
+    errno.ENOSPC: "free some space or choose another place",
+    errno.EDQUOT: "free some of your quota or choose another place",
+    errno.EFBIG: "choose a file system that takes files of this size",
+    errno.EROFS: "choose a place that can be written to",
+    errno.EACCES: "change its permissions or choose a place that you can write to",
+    errno.EPERM: "change its permissions or choose a place that you can write to",
+    errno.EBUSY: "it is a mount point or in use: choose a folder inside it",
+    errno.EIO: "check the disk or choose another place",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOTDIR: "a part of its path is a file: choose another place",
+    errno.EEXIST: "a part of its path is a file: choose another place",
+    errno.ENOTEMPTY: "something else wrote there meanwhile: choose another place",
+}
+
+
+@contextmanager
+def _write_errors(path: Path) -> Iterator[None]:
+    """Turns what the operating system refuses into one InputError that names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _REMEDIES:
+            raise
+        problem = f"cannot be written: {os.strerror(error.errno)}"
+        raise InputError(path, problem, _REMEDIES[error.errno]) from error
+
+
+@contextmanager
+def _parents(path: Path) -> Iterator[None]:
+    """Makes the folders above ``path``; those it made are removed again where the body fails."""
+    missing = [parent for parent in path.parents if not parent.exists()]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for parent in missing:
+            try:
+                parent.rmdir()
+            except OSError:  # not made after all, or in use by someone else meanwhile
+                break
+        raise
+
+
+def _temporary(path: Path, suffix: str) -> Path:
+    # a sibling, so that the rename stays within one file system
+    return path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}{suffix}")
+
+
+def _sync(path: Path) -> None:
+    """Asks for ``path`` (a file or a folder's list of names) to be on the disk before going on."""
+    if path.is_dir():
+        # not every system opens folders, and not every file system syncs them
+        with suppress(OSError):
+            _sync_descriptor(os.open(path, os.O_RDONLY))
+    else:
+        _sync_descriptor(os.open(path, os.O_RDWR))
+
+
+def _sync_descriptor(descriptor: int) -> None:
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_whole(path: str | Path, content: bytes | Callable[[BinaryIO], Any]) -> None:
+    """Write one file, whole or not at all.
+
+    The content goes to a temporary sibling, onto the disk and only then to its name, so that a reader never
+    sees half a file and an older file of that name survives a failure. Missing folders above are made.
+
+    Args:
+        path: the file; an existing one is replaced.
+        content: its bytes, or a function that writes them to the binary file it is given.
+
+    Raises:
+        InputError: ``path`` is a folder or a device, or the system refuses the write (disk full, quota,
+            read-only, permissions).
+    """
+    path = Path(path).resolve()  # through a symbolic link, which should stay one
+    if path.exists() and not path.is_file():
+        raise InputError(path, "is a folder or a device, not a file", "choose another name")
+    part = _temporary(path, ".part")
+    with _write_errors(path), _parents(path):
+        try:
+            with part.open("xb") as file:
+                if callable(content):
+                    content(file)
+                else:
+                    file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+        _sync(path.parent)
+
+
+@contextmanager
+def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = None) -> Iterator[Path]:
+    """A folder that appears whole or not at all.
+
+    ``with new_folder("out") as folder:`` gives a temporary sibling to write into; it takes its name when the
+    body ends, and is removed when the body fails. An older folder is replaced only after the new one is
+    complete. (A power cut between the two renames leaves the older one under ``.out.<hex>.old``.)
+
+    Args:
+        path: the folder; missing folders above are made.
+        overwrite: replace a folder that holds something.
+        marker: name of a file that every folder of this kind holds. A folder without it is not replaced even
+            with ``overwrite``: it would be somebody's home.
+
+    Raises:
+        InputError: the folder holds results already, is no folder, lacks the ``marker``, or the system
+            refuses the write (disk full, quota, read-only, permissions).
+    """
+    path = Path(path).resolve()
+    _check_replaceable(path, overwrite, marker)
+    part = _temporary(path, ".part")
+    with _write_errors(path), _parents(path):
+        try:
+            part.mkdir()
+            yield part
+            for entry in [*part.rglob("*"), part]:
+                _sync(entry)
+            _check_replaceable(path, overwrite, marker)  # once more: the body may have taken hours
+            _take_place(part, path)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+        _sync(path.parent)
+
+
+def _check_replaceable(path: Path, overwrite: bool, marker: str | None) -> None:
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise InputError(path, "is a file, not a folder", "choose another --out")
+    with _write_errors(path):
+        if not any(path.iterdir()):
+            return
+    if not overwrite:
+        raise InputError(path, "holds results already", "choose another --out or pass --overwrite")
+    if marker is not None and not (path / marker).is_file():
+        problem = f"holds files, but no {marker}, so it is not a folder of results and is left alone"
+        raise InputError(path, problem, "choose another --out")
+
+
+def _take_place(part: Path, path: Path) -> None:
+    if not path.exists():
+        part.rename(path)
+        return
+    old = _temporary(path, ".old")
+    path.rename(old)
+    try:
+        part.rename(path)
+    except BaseException:
+        old.rename(path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def load_npz(path: str | Path, required: Mapping[str, int]) -> dict[str, np.ndarray]:
+    """Read every array of an ``.npz``, running no pickled code.
+
+    Args:
+        path: the file.
+        required: name → number of dimensions of each array that must be there.
+
+    Returns:
+        Name → array, also of arrays that were not asked for.
+
+    Raises:
+        InputError: no such file, not an ``.npz``, truncated, Python objects inside, an array missing or of
+            another number of dimensions.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(path, "does not exist", "check the path")
+    if path.is_dir():
+        raise InputError(path, "is a folder, not an .npz file", "check the path")
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            raise InputError(path, "holds one bare array, not an .npz", "check the path")
+        with loaded:
+            found = {name: loaded[name] for name in loaded.files}
+    except InputError:
+        raise
+    except PermissionError as error:
+        raise InputError(path, "cannot be read: permission denied", "change its permissions") from error
+    except (
+        Exception
+    ) as error:  # zip, zlib, header and memory errors alike mean: these bytes are no .npz of ours
+        if "allow_pickle" in str(error):
+            problem = "is a pickle or holds Python objects, which jaxfit does not load"
+            raise InputError(path, problem, "save plain arrays with numpy.savez") from error
+        problem = f"is not a readable .npz: {str(error) or type(error).__name__}"
+        raise InputError(path, problem, "it may be truncated: copy or write it again") from error
+    for name, ndim in required.items():
+        if not isinstance(found.get(name), np.ndarray):
+            raise InputError(path, f"lacks the array {name}", "write the file again with this version")
+        if found[name].ndim != ndim:
+            problem = f"{name} has shape {found[name].shape}, expected {ndim} dimensions"
+            raise InputError(path, problem, "write the file again")
+    return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+
+
+def conform(values: Mapping[str, Any], layout: Mapping[str, tuple[str, Any]]) -> dict[str, np.ndarray]:
+    """Arrays of one container, read-only, with their shapes checked against each other.
+
+    Args:
+        values: name → array-like.
+        layout: name → (shape, dtype). A shape is words such as ``"N T 3"``: a number is that size, and a word
+            means one size wherever it stands.
+
+    Returns:
+        Name → a read-only copy with that dtype.
+
+    Raises:
+        ValueError: an array of another kind or shape, naming it, what was expected and what came.
+    """
+    sizes: dict[str, tuple[int, str]] = {}
+    arrays = {}
+    for name, (shape, dtype) in layout.items():
+        array, dtype = np.array(values[name]), np.dtype(dtype)
+        # an empty list has no kind of its own
+        if array.size and array.dtype.kind not in {"f": "fiu", "i": "iu"}.get(dtype.kind, dtype.kind):
+            raise ValueError(f"{name} must be of type {dtype.name}, not {array.dtype}")
+        words = shape.split()
+        if array.ndim != len(words):
+            raise ValueError(f"{name} must have shape ({', '.join(words)}), not {array.shape}")
+        for axis, (word, size) in enumerate(zip(words, array.shape, strict=True)):
+            expected, origin = (int(word), "") if word.isdigit() else sizes.setdefault(word, (size, name))
+            if size != expected:
+                why = f": {word} is {expected} in {origin}" if origin else ""
+                raise ValueError(
+                    f"{name} must have shape ({', '.join(words)}), not {array.shape}: "
+                    f"axis {axis} should be {expected}{why}"
+                )
+        arrays[name] = array if dtype.kind == "U" else array.astype(dtype)
+        arrays[name].flags.writeable = False
+    return arrays
