@@ -1,0 +1,143 @@
+"""A value of a JSON file that knows where it stands, so that every complaint names file, field and remedy."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+from jaxfit.errors import InputError
+
+__all__ = ["Field", "read_json"]
+
+LARGEST_POSITION_PX = 1e6
+"""No image position lies further out; beyond it lie overflow and mistaken units."""
+
+
+def _shown(value: Any) -> str:
+    text = value if isinstance(value, str) else repr(value)
+    text = f'"{text}"' if isinstance(value, str) else text
+    return text if len(text) <= 40 else text[:37] + "..."
+
+
+def _kind(value: Any) -> str:
+    kinds = {dict: "an object", list: "a list", str: "text", bool: "true or false", type(None): "null"}
+    return kinds.get(type(value), "a number")
+
+
+@dataclass(frozen=True)
+class Field:
+    """One value with its address, such as ``annotations[3].keypoints``.
+
+    Every method that checks raises InputError, naming file, field and what came.
+    """
+
+    source: Path
+    path: str
+    value: Any
+
+    def fail(self, problem: str, remedy: str = "write the file again with correct values") -> NoReturn:
+        """Raises InputError about this field."""
+        raise InputError(self.source, f"{self.path or 'the file'} {problem}", remedy)
+
+    def _expect(self, kind: type | tuple[type, ...], name: str) -> Any:
+        if not isinstance(self.value, kind) or (isinstance(self.value, bool) and kind is not bool):
+            self.fail(f"must be {name}, not {_kind(self.value)} ({_shown(self.value)})")
+        return self.value
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._expect(dict, "an object")
+
+    def __getitem__(self, key: str) -> Field:
+        """The value under ``key``, which must be there."""
+        if key not in self:
+            self.fail(f"lacks the key {key}", f"add {key}: see the description of the format")
+        return Field(self.source, f"{self.path}.{key}" if self.path else key, self.value[key])
+
+    def has(self, key: str) -> bool:
+        """Whether ``key`` is there and not null."""
+        return key in self and self.value[key] is not None
+
+    def __iter__(self) -> Iterator[Field]:
+        """The entries of a list."""
+        for i, value in enumerate(self._expect(list, "a list")):
+            yield Field(self.source, f"{self.path}[{i}]", value)
+
+    def text(self) -> str:
+        """A string."""
+        return self._expect(str, "text")
+
+    def integer(self, lowest: int = -(2**62), highest: int = 2**62) -> int:
+        """A whole number within bounds; 3.0 counts as 3."""
+        value = self._expect((int, float), "a whole number")
+        if value != value or value in (math.inf, -math.inf) or value != int(value):
+            self.fail(f"must be a whole number, not {_shown(value)}")
+        if not lowest <= value <= highest:
+            self.fail(f"is {_shown(value)}, outside {lowest} to {highest}")
+        return int(value)
+
+    def identifier(self) -> int | str:
+        """A whole number or a string that names something."""
+        return self.value if isinstance(self.value, str) else self.integer()
+
+    def numbers(self, count: int | None = None, why: str = "") -> Sequence[float]:
+        """A list of finite numbers.
+
+        Args:
+            count: how many there must be.
+            why: said after a wrong count.
+        """
+        values = self._expect(list, "a list of numbers")
+        if count is not None and len(values) != count:
+            self.fail(f"has {len(values)} numbers, not {count}{why}")
+        for i, value in enumerate(values):
+            if type(value) not in (int, float):
+                Field(self.source, f"{self.path}[{i}]", value)._expect((int, float), "a number")
+            if not -math.inf < value < math.inf:
+                self.fail(f"holds {value} at [{i}]", "leave out what is not known: v = 0, or no annotation")
+        return values
+
+    def positions(self, count: int | None = None, why: str = "") -> Sequence[float]:
+        """A list of numbers that can be positions or lengths in pixels."""
+        values = self.numbers(count, why)
+        for i, value in enumerate(values):
+            if abs(value) > LARGEST_POSITION_PX:
+                self.fail(f"holds {_shown(value)} at [{i}], which is no image position", "give image pixels")
+        return values
+
+
+def read_json(path: Path) -> Field:
+    """The content of a JSON file.
+
+    Raises:
+        InputError: no such file, not text in UTF-8, or not JSON (with line and column).
+    """
+    try:
+        text = path.read_bytes().decode("utf-8-sig")  # some editors put a byte order mark first
+    except FileNotFoundError as error:
+        raise InputError(path, "does not exist", "check the path") from error
+    except IsADirectoryError as error:
+        raise InputError(path, "is a folder, not a JSON file", "give the file inside it") from error
+    except UnicodeDecodeError as error:
+        problem = f"is not UTF-8 text (byte {error.start})"
+        raise InputError(path, problem, "give a JSON file, saved as UTF-8") from error
+    except (OSError, ValueError) as error:
+        raise InputError(path, f"cannot be read: {error}", "check the path and its permissions") from error
+    if not text.strip():
+        raise InputError(path, "is empty", "write it again")
+    try:
+        return Field(path, "", json.loads(text))
+    except json.JSONDecodeError as error:
+        # a file cut off midway breaks where it ends, or at the string or list that the cut left open
+        cut = not text.rstrip().endswith(("}", "]"))
+        remedy = (
+            "the file ends midway: copy or write it again" if cut else "correct the file or write it again"
+        )
+        problem = f"is not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
+        raise InputError(path, problem, remedy) from error
+    except (RecursionError, ValueError) as error:  # nested, or digits, without end
+        problem = "is not usable JSON: nested too deeply or with a number of too many digits"
+        raise InputError(path, problem, "write it again") from error
