@@ -1,0 +1,193 @@
+"""What a fit returns, and the folder of results it is kept in."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxfit.errors import InputError
+from jaxfit.storage import conform, load_npz, new_folder, write_whole
+
+__all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution"]
+
+FORMAT_VERSION = 1
+"""Version of ``poses.npz``; raised where an older reader would misread the file."""
+
+_POSES, _CONFIG, _SUMMARY = "poses.npz", "config.yaml", "summary.json"
+
+_LAYOUT = {
+    "track_id": ("N", np.int64),
+    "frame_index": ("T", np.int64),
+    "valid": ("N T", np.bool_),
+    "global_orient": ("N T 3", np.float32),
+    "body_pose": ("N T J-1 3", np.float32),
+    "transl": ("N T 3", np.float32),
+    "scale": ("N T", np.float32),
+    "bone_length": ("N T J-1", np.float32),
+    "betas": ("N T S", np.float32),
+    "keypoints_3d": ("N T K 3", np.float32),
+    "keypoints_2d": ("N T K 2", np.float32),
+    "crop": ("N T 3", np.float32),
+    "keypoint_names": ("K", np.str_),
+    "joint_names": ("J", np.str_),
+    "status": ("N", np.str_),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Poses of N tracks over T frames; J joints, K keypoints, S shape coefficients.
+
+    NumPy arrays, read-only. What stands where ``valid`` is False means nothing, and may be NaN.
+
+    Raises:
+        ValueError: shapes that contradict each other, naming the array.
+    """
+
+    track_id: np.ndarray
+    """(N,) int64."""
+    frame_index: np.ndarray
+    """(T,) int64: the frames' numbers in the video."""
+    valid: np.ndarray
+    """(N, T) bool: this bird was fitted in this frame."""
+    global_orient: np.ndarray
+    """(N, T, 3) float32: axis-angle in radians, camera frame."""
+    body_pose: np.ndarray
+    """(N, T, J−1, 3) float32: axis-angle in radians, relative to the parent joint."""
+    transl: np.ndarray
+    """(N, T, 3) float32: model units, camera frame of the crop."""
+    scale: np.ndarray
+    """(N, T) float32: size relative to the model."""
+    bone_length: np.ndarray
+    """(N, T, J−1) float32: relative to the rest skeleton."""
+    betas: np.ndarray
+    """(N, T, S) float32: shape coefficients."""
+    keypoints_3d: np.ndarray
+    """(N, T, K, 3) float32: model units, camera frame of the crop."""
+    keypoints_2d: np.ndarray
+    """(N, T, K, 2) float32: image pixels."""
+    crop: np.ndarray
+    """(N, T, 3) float32: x0, y0, size of the square crop in image pixels."""
+    focal: float
+    """Focal length in pixels of the crop the fit works on."""
+    keypoint_names: tuple[str, ...]
+    """K names."""
+    joint_names: tuple[str, ...]
+    """J names, the root first."""
+    loss: Mapping[str, np.ndarray]
+    """Term → (N,) float64: its final value, weighted or not as the fit says."""
+    status: np.ndarray
+    """(N,) str: how each track's fit ended."""
+
+    def __post_init__(self):
+        arrays = conform(vars(self), _LAYOUT)
+        if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
+            bones = arrays["body_pose"].shape[2]
+            raise ValueError(
+                f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}"
+            )
+        loss = {}
+        for term, value in self.loss.items():
+            layout = {"status": _LAYOUT["status"], f"loss[{term}]": ("N", np.float64)}
+            loss[str(term)] = conform({"status": self.status, f"loss[{term}]": value}, layout)[
+                f"loss[{term}]"
+            ]
+        focal = float(self.focal)
+        if not 0 < focal < math.inf:
+            raise ValueError(f"focal must be above 0 and finite, not {focal}")
+        for name in ("keypoint_names", "joint_names"):
+            object.__setattr__(self, name, tuple(str(text) for text in arrays.pop(name)))
+        for name, value in (arrays | {"loss": loss, "focal": focal}).items():
+            object.__setattr__(self, name, value)
+
+
+def save_solution(
+    solution: Solution,
+    config_yaml: str,
+    summary: Mapping[str, Any],
+    folder: str | Path,
+    overwrite: bool = False,
+) -> None:
+    """Write a folder of results, whole or not at all: ``poses.npz``, ``config.yaml`` and ``summary.json``.
+
+    Args:
+        solution: what to write.
+        config_yaml: the configuration as run.
+        summary: metrics, timings, versions; NumPy values are taken, and NaN and infinities become null.
+        folder: where.
+        overwrite: replace an older folder of results, once the new one is complete.
+
+    Raises:
+        InputError: the folder holds results already, or something else, or cannot be written.
+        TypeError: ``summary`` holds what JSON has no form for.
+    """
+    summary_json = json.dumps(_plain(summary), indent=2, allow_nan=False)
+    arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in _LAYOUT}
+    terms = list(solution.loss)
+    arrays["loss"] = (
+        np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
+    )
+    arrays["loss_terms"] = np.array(terms, dtype=np.str_)
+    arrays["focal"] = np.asarray(solution.focal, np.float64)
+    arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
+    with new_folder(folder, overwrite, marker=_POSES) as part:
+        write_whole(part / _POSES, lambda file: np.savez_compressed(file, **arrays))
+        write_whole(part / _CONFIG, config_yaml.encode())
+        write_whole(part / _SUMMARY, summary_json.encode())
+
+
+def _plain(value: Any) -> Any:
+    """``value`` in the types of JSON."""
+    if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
+        value = np.asarray(value).tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def load_solution(folder: str | Path) -> Solution:
+    """Read ``poses.npz`` of a folder of results.
+
+    Args:
+        folder: as ``save_solution`` wrote it.
+
+    Raises:
+        InputError: no such folder, a file that is missing, damaged or of a newer version, or arrays whose
+            shapes contradict each other.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        problem = "is a file, not a folder of results" if folder.exists() else "does not exist"
+        raise InputError(folder, problem, "give the folder that a fit wrote")
+    path = folder / _POSES
+    arrays = load_npz(path, {"format_version": 0})
+    version = arrays["format_version"]
+    if version.dtype.kind not in "iu" or version < 1:
+        raise InputError(
+            path, f"format_version is {version}, expected a whole number from 1", "run the fit again"
+        )
+    if version > FORMAT_VERSION:
+        problem = f"format_version is {version}, newer than this jaxfit reads ({FORMAT_VERSION})"
+        raise InputError(path, problem, "install a newer jaxfit")
+    ndim = {name: len(shape.split()) for name, (shape, _) in _LAYOUT.items()}
+    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0})
+    values: dict[str, Any] = {name: arrays[name] for name in _LAYOUT}
+    terms, loss = arrays["loss_terms"], arrays["loss"]
+    if loss.shape[1] != len(terms):
+        problem = f"loss has shape {loss.shape}, but there are {len(terms)} loss_terms"
+        raise InputError(path, problem, "run the fit again")
+    try:
+        losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
+        return Solution(**values, loss=losses, focal=float(arrays["focal"]))
+    except ValueError as error:
+        raise InputError(path, str(error), "run the fit again") from error
