@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 __all__ = ["weighted_median_filter"]
 
 
 def weighted_median_filter(
-    keypoints_px: Float[Array, "T K 2"], confidence: Float[Array, "T K"], window: int = 5
+    keypoints_px: Float[Array | np.ndarray, "T K 2"],
+    confidence: Float[Array | np.ndarray, "T K"],
+    window: int = 5,
 ) -> Float[Array, "T K 2"]:
     """Weighted median of each keypoint over the frames around it, x and y apart.
 
