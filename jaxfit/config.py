@@ -71,6 +71,8 @@ class StageConfig:
     """Adam's step size, in each parameter's own unit."""
     step_scale: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
     """Factor on the step size of single parameters; three numbers for `transl` (x, y, z)."""
+    blur: float = 1.0
+    """Softness of the silhouette's edge relative to the usual one; below 1 is sharper."""
     keypoints_off: tuple[str, ...] = ()
     """Keypoints (by name) that this stage ignores; names that the model lacks are allowed."""
     override: Mapping[str, Any] = field(default_factory=dict)
@@ -259,6 +261,7 @@ def _check(config: FitConfig) -> None:
         where = f"stages[{i}]"
         require(stage.steps >= 1, f"{where}.steps", f"is {stage.steps}", "1 or more")
         require(stage.learning_rate > 0, f"{where}.learning_rate", f"is {stage.learning_rate}", "above 0")
+        require(stage.blur > 0, f"{where}.blur", f"is {stage.blur}", "above 0")
         require(len(stage.terms) > 0, f"{where}.terms", "is empty", f"known: {', '.join(TERMS)}")
         for name in stage.terms:
             require(name in TERMS, f"{where}.terms", f"names {name!r}", f"known: {', '.join(TERMS)}")

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfit.errors import InputError
 
-__all__ = ["conform", "load_npz", "new_folder", "write_whole"]
+__all__ = ["check_replaceable", "conform", "load_npz", "new_folder", "write_whole"]
 
 # What the operating system may answer to a write, and what the user can do about it.
 _REMEDIES = {
@@ -136,7 +136,7 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
             refuses the write (disk full, quota, read-only, permissions).
     """
     path = Path(path).resolve()
-    _check_replaceable(path, overwrite, marker)
+    check_replaceable(path, overwrite, marker)
     part = _temporary(path, ".part")
     with _write_errors(path), _parents(path):
         try:
@@ -144,14 +144,16 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
             yield part
             for entry in [*part.rglob("*"), part]:
                 _sync(entry)
-            _check_replaceable(path, overwrite, marker)  # once more: the body may have taken hours
+            check_replaceable(path, overwrite, marker)  # once more: the body may have taken hours
             _take_place(part, path)
         finally:
             shutil.rmtree(part, ignore_errors=True)
         _sync(path.parent)
 
 
-def _check_replaceable(path: Path, overwrite: bool, marker: str | None) -> None:
+def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = None) -> None:
+    """Raise `new_folder`'s InputError where it would refuse ``path``: before long work rather than after it."""
+    path = Path(path)
     if not path.exists():
         return
     if not path.is_dir():

@@ -34,6 +34,7 @@ def make(**changes):
         "keypoints_2d": some(K, 2),
         "crop": some(3),
         "focal": 2167.0,
+        "crop_px": 256,
         "keypoint_names": tuple("abcde"),
         "joint_names": ("root", "körper", "head", "tail"),
         "loss": {"keypoints": [1.5, math.nan], "mask": np.array([2.5, 3])},

@@ -13,7 +13,7 @@ from jaxfit.camera import Camera, crop_to_image
 from jaxfit.config import FitConfig
 from jaxfit.errors import InputError
 from jaxfit.fitting.batch import Fitted, fit_batch, frames_per_batch
-from jaxfit.fitting.initialise import initial_pose
+from jaxfit.fitting.initialise import initial_poses
 from jaxfit.fitting.solution import Solution
 from jaxfit.fitting.start import Start
 from jaxfit.fitting.window import Windows, cut_windows, filter_observations, load_evidence
@@ -35,6 +35,7 @@ def fit(
     config: FitConfig,
     start: Start | None = None,
     progress: ProgressTask = silent,
+    source: object = "observations",
 ) -> Solution:
     """Pose every bird of a video (or of a set of photographs).
 
@@ -44,6 +45,7 @@ def fit(
         config: what to do.
         start: where to start; None searches by `config.initialise`.
         progress: where progress is shown.
+        source: what the observations are called in an error.
 
     Returns:
         The poses, with a status for every track: `ok`, `no usable frame` or `diverged`.
@@ -52,12 +54,12 @@ def fit(
         InputError: keypoints that are not the model's, no track with a usable frame, crops that cannot be
             made.
     """
-    observations = check_keypoints(observations, bird.keypoint_names, "observations")
+    observations = check_keypoints(observations, bird.keypoint_names, source)
     observations = filter_observations(observations, config.filter_window)
     windows = cut_windows(observations, config)
     if len(windows) == 0:
         raise InputError(
-            "observations",
+            source,
             f"no track has a frame with {config.min_keypoints} confident keypoints",
             "detect more keypoints, or lower min_keypoints in the config",
         )
@@ -79,51 +81,37 @@ def fit(
     with progress(f"Fitting {birds} birds", steps * len(batches)) as tick:
         for first in batches:
             rows = np.arange(first, min(first + size, len(windows)))
-            part = windows[rows]
+            # every batch has the same shape, so that one compiled program serves all: a short one is filled
+            # up with windows of its own
+            part = windows[np.resize(rows, size)]
             evidence = load_evidence(observations, part, camera.size_px)
             tick(0, "starting poses")
-            poses = [
-                _starting_pose(used, rig, evidence, w, start, part, config, camera) for w in range(len(part))
-            ]
-            poses, evidence = _fill(poses, evidence, size)  # one shape, one compiled program
+            poses = _starting_poses(used, rig, evidence, start, part, config, camera)
             fitted = fit_batch(used, rig, priors, config, camera, evidence, poses, tick)
-            solution.add(rows, jax.tree.map(lambda x, n=len(rows): np.asarray(x)[:n], fitted))
+            solution.add(rows, jax.tree.map(np.asarray, fitted))
     return solution.finish()
 
 
-def _starting_pose(
+def _starting_poses(
     bird: Bird,
     rig: Rig,
     evidence: Evidence,
-    w: int,
     start: Start | None,
     windows: Windows,
     config: FitConfig,
     camera: Camera,
 ) -> Pose:
-    """Hypotheses (H, …) of one window."""
-    if start is not None:
-        pose = start.window_pose(
-            bird, int(windows.track[w]), windows.frame[w], windows.present[w], config.common_size
+    """Starting poses of a batch, with leading axes W, H (hypotheses)."""
+    if start is None:
+        keypoints_px, confidence = jnp.asarray(evidence.keypoints_px), jnp.asarray(evidence.confidence)
+        return initial_poses(
+            bird, rig, keypoints_px, confidence, config.initialise, camera, config.common_size
         )
-        return jax.tree.map(lambda x: x[None], pose)
-    return initial_pose(
-        bird,
-        rig,
-        jnp.asarray(evidence.keypoints_px[w]),
-        jnp.asarray(evidence.confidence[w]),
-        config.initialise,
-        camera,
-        config.common_size,
-    )
-
-
-def _fill(poses: list[Pose], evidence: Evidence, size: int) -> tuple[Pose, Evidence]:
-    """Stack a batch's poses; fill a short batch up with windows in which nothing is seen."""
-    lacking = size - len(poses)
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *poses, *[poses[0]] * lacking)
-    filled = jax.tree.map(lambda x: np.concatenate([x, np.zeros((lacking, *x.shape[1:]), x.dtype)]), evidence)
-    return stacked, filled
+    rows = zip(windows.track, windows.frame, windows.present, strict=True)
+    poses = [
+        start.window_pose(bird, int(n), frame, present, config.common_size) for n, frame, present in rows
+    ]
+    return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *poses)
 
 
 def _without_shape(bird: Bird) -> Bird:
@@ -201,6 +189,7 @@ class _Collector:
             valid=self.valid,
             **self.arrays,
             focal=self.camera.focal_px,
+            crop_px=self.camera.size_px,
             keypoint_names=self.bird.keypoint_names,
             joint_names=self.bird.joint_names,
             loss=self.loss,

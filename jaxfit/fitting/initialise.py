@@ -8,13 +8,14 @@ flipped against its neighbour, and no weight of the temporal terms turns it back
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxfit.camera import Camera
 from jaxfit.config import InitialiseConfig
@@ -23,7 +24,7 @@ from jaxfit.model.kinematics import Rig, joint_transforms, posed_keypoints
 from jaxfit.model.pose import Pose, rest_pose
 from jaxfit.model.rotation import matrix_to_axis_angle, unwrap_axis_angle, view_grid, viewing_axis_rotations
 
-__all__ = ["candidate_orientations", "choose_sequence", "initial_pose", "match_candidates"]
+__all__ = ["candidate_orientations", "choose_sequence", "initial_poses", "match_candidates"]
 
 SIGMA_PX = 30.0
 """Scale of the robust match: mean-pose keypoints lie this far off on a posed bird of 200 pixels."""
@@ -107,18 +108,15 @@ def choose_sequence(
     return jnp.concatenate([before, last[None]])
 
 
-@partial(jax.jit, static_argnames=("top", "hypotheses"))
 def _orientations(
     candidates: Float[Array, "C 3 3"],
     model_keypoints: Float[Array, "K 3"],
     keypoints_px: Float[Array, "T K 2"],
     confidence: Float[Array, "T K"],
-    seen: Bool[Array, "T"],
-    smoothness: float,
-    top: int,
-    hypotheses: int,
+    config: InitialiseConfig,
 ) -> tuple[Float[Array, "H T 3 3"], Float[Array, "H T"]]:
     """Orientations and scales (pixels per model unit) of the H best distinct sequences of one window."""
+    seen = jnp.any(confidence > 0, axis=1)
     frames = jnp.arange(len(seen))
     # a frame without keypoints takes the candidates of its nearest neighbour, at no cost
     nearest = jnp.argmin(jnp.abs(frames[:, None] - frames) + jnp.where(seen, 0, len(seen)), axis=1)
@@ -128,10 +126,10 @@ def _orientations(
     cost = match.cost[nearest]
     blocked = jnp.zeros_like(cost)
     orientations, scales = [], []
-    for _ in range(hypotheses):
-        _, index = jax.lax.top_k(-(cost + blocked), min(top, cost.shape[1]))
+    for _ in range(config.hypotheses):
+        _, index = jax.lax.top_k(-(cost + blocked), min(config.candidates, cost.shape[1]))
         unary = jnp.take_along_axis(cost + blocked, index, axis=1) * seen[:, None]
-        path = choose_sequence(unary, candidates[index], smoothness)
+        path = choose_sequence(unary, candidates[index], config.smoothness)
         chosen = index[frames, path]
         orientations.append(candidates[chosen])
         scales.append(match.scale_px[nearest, chosen])
@@ -140,16 +138,17 @@ def _orientations(
     return jnp.stack(orientations), jnp.stack(scales)
 
 
-def initial_pose(
+@partial(jax.jit, static_argnames=("config", "camera", "common_size"))
+def initial_poses(
     bird: Bird,
     rig: Rig,
-    keypoints_px: Float[Array, "T K 2"],
-    confidence: Float[Array, "T K"],
+    keypoints_px: Float[Array, "W T K 2"],
+    confidence: Float[Array, "W T K"],
     config: InitialiseConfig,
     camera: Camera,
     common_size: bool,
 ) -> Pose:
-    """Starting poses of one window: H hypotheses with the mean body pose, at a fixed depth where scale ≈ 1.
+    """Starting poses of W windows: H hypotheses each, with the mean body pose, at a depth where scale ≈ 1.
 
     Args:
         bird, rig: the model, and the same folded.
@@ -160,44 +159,34 @@ def initial_pose(
         common_size: one scale for the window.
 
     Returns:
-        A Pose with leading axis H, then T.
+        A Pose with leading axes W, H, then T.
 
     Source: Hägerlind et al. 2024, initialisation, for the candidates; the choice over the window is ours.
     """
-    frames = keypoints_px.shape[0]
+    frames = keypoints_px.shape[1]
     rest = rest_pose(bird)
     model_keypoints = posed_keypoints(rig, joint_transforms(rig, rest), rest)
-    orientation, scale_px = _orientations(
-        jnp.asarray(candidate_orientations(config), jnp.float32),
-        model_keypoints,
-        keypoints_px,
-        confidence,
-        jnp.any(confidence > 0, axis=1),
-        config.smoothness,
-        config.candidates,
-        config.hypotheses,
-    )
+    candidates = jnp.asarray(candidate_orientations(config), jnp.float32)
 
-    @jax.vmap
-    def start(R: Float[Array, "T 3 3"], scale_px: Float[Array, "T"]) -> Pose:
+    def start(R, scale_px, keypoints_px, confidence) -> tuple[Array, Array, Array]:
         window_scale_px = jnp.median(scale_px)
         depth = camera.focal_px / window_scale_px
         scale = jnp.ones(1) if common_size else jnp.clip(scale_px / window_scale_px, 0.5, 2.0)
         rotated = jnp.einsum("tij,kj->tki", R, model_keypoints) * scale[:, None, None]
         # the shift that brings the confident keypoints' mean onto the observed mean, at that depth
         weight = confidence[..., None] / jnp.maximum(jnp.sum(confidence, axis=1), 1e-6)[:, None, None]
-        wanted_px = jnp.sum(weight * keypoints_px, axis=1)
-        xy = (wanted_px - camera.centre_px) * depth / camera.focal_px - jnp.sum(weight * rotated, axis=1)[
-            :, :2
-        ]
-        rest_window = rest_pose(bird, frames, common_size)
-        return Pose(
-            global_orient=unwrap_axis_angle(matrix_to_axis_angle(R)),
-            body_pose=rest_window.body_pose,
-            transl=jnp.concatenate([xy[:, :2], jnp.full((frames, 1), depth)], axis=-1),
-            scale=scale,
-            bone_length=rest_window.bone_length,
-            betas=rest_window.betas,
-        )
+        offset_px = jnp.sum(weight * (keypoints_px - camera.centre_px), axis=1)
+        xy = offset_px * depth / camera.focal_px - jnp.sum(weight * rotated, axis=1)[:, :2]
+        transl = jnp.concatenate([xy, jnp.full((frames, 1), depth)], axis=-1)
+        return unwrap_axis_angle(matrix_to_axis_angle(R)), transl, scale
 
-    return start(orientation, scale_px)
+    def window(seen: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        R, scale_px = _orientations(candidates, model_keypoints, *seen, config)
+        return jax.vmap(start, (0, 0, None, None))(R, scale_px, *seen)
+
+    at_once = max(1, 100 // frames)  # a window of 100 frames × 2,400 candidates takes some 100 MB
+    orient, transl, scale = jax.lax.map(window, (keypoints_px, confidence), batch_size=at_once)
+    whole = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (*orient.shape[:2], *x.shape)), rest_pose(bird, frames, common_size)
+    )
+    return dataclasses.replace(whole, global_orient=orient, transl=transl, scale=scale)

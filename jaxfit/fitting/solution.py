@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from jaxfit.errors import InputError
+from jaxfit.model.bird import Bird
+from jaxfit.model.files import load_bird, save_bird
 from jaxfit.storage import conform, load_npz, new_folder, write_whole
 
 __all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution"]
@@ -19,7 +21,7 @@ __all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution"]
 FORMAT_VERSION = 1
 """Version of ``poses.npz``; raised where an older reader would misread the file."""
 
-_POSES, _CONFIG, _SUMMARY = "poses.npz", "config.yaml", "summary.json"
+_POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
 
 _LAYOUT = {
     "track_id": ("N", np.int64),
@@ -80,8 +82,10 @@ class Solution:
     """K names."""
     joint_names: tuple[str, ...]
     """J names, the root first."""
+    crop_px: int
+    """Side in pixels of the crop the fit works on; the camera's centre is its middle."""
     loss: Mapping[str, np.ndarray]
-    """Term → (N,) float64: its final value, weighted or not as the fit says."""
+    """Term → (N,) float64: its weighted share of the final objective, summed over the track's windows."""
     status: np.ndarray
     """(N,) str: how each track's fit ended."""
 
@@ -101,23 +105,28 @@ class Solution:
         focal = float(self.focal)
         if not 0 < focal < math.inf:
             raise ValueError(f"focal must be above 0 and finite, not {focal}")
+        crop_px = int(self.crop_px)
+        if crop_px < 1:
+            raise ValueError(f"crop_px must be 1 or more, not {crop_px}")
         for name in ("keypoint_names", "joint_names"):
             object.__setattr__(self, name, tuple(str(text) for text in arrays.pop(name)))
-        for name, value in (arrays | {"loss": loss, "focal": focal}).items():
+        for name, value in (arrays | {"loss": loss, "focal": focal, "crop_px": crop_px}).items():
             object.__setattr__(self, name, value)
 
 
 def save_solution(
     solution: Solution,
+    bird: Bird,
     config_yaml: str,
     summary: Mapping[str, Any],
     folder: str | Path,
     overwrite: bool = False,
 ) -> None:
-    """Write a folder of results, whole or not at all: ``poses.npz``, ``config.yaml`` and ``summary.json``.
+    """Write a folder of results, whole or not at all: ``poses.npz``, ``config.yaml``, ``summary.json``, ``model.npz``.
 
     Args:
         solution: what to write.
+        bird: the model it was fitted with, kept with it: poses mean nothing without.
         config_yaml: the configuration as run.
         summary: metrics, timings, versions; NumPy values are taken, and NaN and infinities become null.
         folder: where.
@@ -135,11 +144,13 @@ def save_solution(
     )
     arrays["loss_terms"] = np.array(terms, dtype=np.str_)
     arrays["focal"] = np.asarray(solution.focal, np.float64)
+    arrays["crop_px"] = np.asarray(solution.crop_px, np.int64)
     arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
     with new_folder(folder, overwrite, marker=_POSES) as part:
         write_whole(part / _POSES, lambda file: np.savez_compressed(file, **arrays))
         write_whole(part / _CONFIG, config_yaml.encode())
         write_whole(part / _SUMMARY, summary_json.encode())
+        save_bird(bird, part / _MODEL)
 
 
 def _plain(value: Any) -> Any:
@@ -155,8 +166,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def load_solution(folder: str | Path) -> Solution:
-    """Read ``poses.npz`` of a folder of results.
+def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
+    """Read the poses of a folder of results, and the model they belong to.
 
     Args:
         folder: as ``save_solution`` wrote it.
@@ -180,7 +191,7 @@ def load_solution(folder: str | Path) -> Solution:
         problem = f"format_version is {version}, newer than this jaxfit reads ({FORMAT_VERSION})"
         raise InputError(path, problem, "install a newer jaxfit")
     ndim = {name: len(shape.split()) for name, (shape, _) in _LAYOUT.items()}
-    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0})
+    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0, "crop_px": 0})
     values: dict[str, Any] = {name: arrays[name] for name in _LAYOUT}
     terms, loss = arrays["loss_terms"], arrays["loss"]
     if loss.shape[1] != len(terms):
@@ -188,6 +199,11 @@ def load_solution(folder: str | Path) -> Solution:
         raise InputError(path, problem, "run the fit again")
     try:
         losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
-        return Solution(**values, loss=losses, focal=float(arrays["focal"]))
+        focal, crop_px = float(arrays["focal"]), int(arrays["crop_px"])
+        solution = Solution(**values, loss=losses, focal=focal, crop_px=crop_px)
     except ValueError as error:
         raise InputError(path, str(error), "run the fit again") from error
+    bird = load_bird(folder / _MODEL)
+    if (bird.joint_names, bird.keypoint_names) != (solution.joint_names, solution.keypoint_names):
+        raise InputError(folder / _MODEL, f"is another model than that of {_POSES}", "run the fit again")
+    return solution, bird

@@ -95,11 +95,11 @@ def shape_prior(scene: Scene) -> Scalar:
 
 
 def shape_norm(scene: Scene) -> Scalar:
-    """‖β / sd‖₂, not squared: many birds keep the mean shape.
+    """‖β‖₂, not squared: a bird keeps the mean shape unless its outline is worth the step.
 
     Source: Wang et al. 2021, shape regularisation.
     """
-    return safe_norm(scene.pose.betas / scene.priors.shape_sd)
+    return safe_norm(scene.pose.betas)
 
 
 def start_pull(scene: Scene) -> Scalar:

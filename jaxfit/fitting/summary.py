@@ -1,0 +1,40 @@
+"""What a result folder says about itself: what was found, how it was made, how long it took."""
+
+from __future__ import annotations
+
+import platform
+from collections import Counter
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from jaxfit.fitting.solution import Solution
+from jaxfit.model.bird import Bird
+from jaxfit.model.describe import model_hash
+
+__all__ = ["summarise"]
+
+LIBRARIES = ("jaxfit", "jax", "jaxlib", "equinox", "optimistix", "optax", "numpy")
+
+
+def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
+    """What `summary.json` says: counts, status and final objective of every track, timings, versions, model.
+
+    Args:
+        solution: the result.
+        bird: the model it was fitted with.
+        seconds: how long each part took.
+    """
+    return {
+        "tracks": len(solution.track_id),
+        "frames": len(solution.frame_index),
+        "poses": int(solution.valid.sum()),
+        "status": dict(Counter(str(status) for status in solution.status)),
+        "track_status": {int(t): str(s) for t, s in zip(solution.track_id, solution.status, strict=True)},
+        "loss": {name: np.asarray(value).tolist() for name, value in solution.loss.items()},
+        "seconds": {name: round(value, 3) for name, value in seconds.items()},
+        "model": {"name": bird.name, "hash": model_hash(bird)},
+        "versions": {"python": platform.python_version()}
+        | {name: metadata.version(name) for name in LIBRARIES},
+    }
