@@ -1,0 +1,73 @@
+#include "instruction_set.h"
+
+#include <atomic>
+#include <stdexcept>
+
+namespace jaxfit {
+
+extern const Kernels kernels_baseline;
+#ifdef JAXFIT_X86
+extern const Kernels kernels_avx2;
+extern const Kernels kernels_avx512;
+#endif
+
+namespace {
+
+struct Choice {
+  const char* name;
+  const Kernels* kernels;
+};
+
+std::vector<Choice> choices() {
+  std::vector<Choice> found;
+#ifdef JAXFIT_X86
+  __builtin_cpu_init();
+  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+  if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+      __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
+    found.push_back({"avx512", &kernels_avx512});
+  if (avx2) found.push_back({"avx2", &kernels_avx2});
+#endif
+  found.push_back({"baseline", &kernels_baseline});
+  return found;
+}
+
+std::atomic<int>& chosen() {
+  static std::atomic<int> index{0};
+  return index;
+}
+
+const std::vector<Choice>& all_choices() {
+  static const std::vector<Choice> found = choices();
+  return found;
+}
+
+}  // namespace
+
+std::vector<std::string> available_isas() {
+  std::vector<std::string> names;
+  for (const Choice& choice : all_choices()) names.emplace_back(choice.name);
+  return names;
+}
+
+std::string current_isa() { return all_choices()[chosen()].name; }
+
+const Kernels& current_kernels() { return *all_choices()[chosen()].kernels; }
+
+void choose_isa(const std::string& name) {
+  if (name == "auto") {
+    chosen() = 0;
+    return;
+  }
+  std::string names = "auto";
+  for (size_t i = 0; i < all_choices().size(); ++i) {
+    if (name == all_choices()[i].name) {
+      chosen() = static_cast<int>(i);
+      return;
+    }
+    names += std::string(", ") + all_choices()[i].name;
+  }
+  throw std::invalid_argument("instruction set '" + name + "' is not available here: choose one of " + names);
+}
+
+}  // namespace jaxfit
