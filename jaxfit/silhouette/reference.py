@@ -43,36 +43,33 @@ class Blur:
         return Blur(sigma=1e-4 * half**2, radius=half * math.sqrt(1e-4 * math.log(1e4 - 1)))
 
 
-def _segment_distance_squared(pixels, a, b):
-    """Squared distance of pixels (..., 2) from the segment a–b, each (..., 2)."""
-    edge = b - a
-    length_squared = jnp.maximum(jnp.sum(edge**2, -1), 1e-20)
-    along = jnp.clip(jnp.sum((pixels - a) * edge, -1) / length_squared, 0, 1)
-    return jnp.sum((pixels - a - along[..., None] * edge) ** 2, -1)
+def _segment_distance_squared(x, y, a, b):
+    """Squared distance of the pixels (x, y) from the segment a–b; a and b are (x, y) pairs."""
+    edge_x, edge_y = b[0] - a[0], b[1] - a[1]
+    length_squared = jnp.maximum(edge_x**2 + edge_y**2, 1e-20)
+    along = jnp.clip(((x - a[0]) * edge_x + (y - a[1]) * edge_y) / length_squared, 0, 1)
+    return (x - a[0] - along * edge_x) ** 2 + (y - a[1] - along * edge_y) ** 2
 
 
-def _side(pixels, a, b):
+def _side(x, y, a, b):
     """Twice the area of (a, b, pixel), positive where that triangle turns from +x to +y."""
-    return (b[..., 0] - a[..., 0]) * (pixels[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (
-        pixels[..., 0] - a[..., 0]
-    )
+    return (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
 
 
-def _log_transmitted(corners, pixels, size, blur):
-    """log(1 − p) of faces (f, 3, 3) at pixels (size, size, 2), summed over the faces."""
+def _log_transmitted(corners, x, y, size, blur):
+    """log(1 − p) of faces (f, 3, 3) at pixels x (1, size), y (size, 1), summed over the faces: (size, size)."""
     behind = jnp.any(corners[..., 2] <= MIN_DEPTH, -1)
-    xy = corners[..., :2]
-    area = _side(xy[:, 2], xy[:, 0], xy[:, 1])
+    area = _side(corners[:, 2, 0], corners[:, 2, 1], corners[:, 0].T, corners[:, 1].T)
     skipped = behind | (jnp.abs(area) <= MIN_AREA * (size / 2) ** 2)
-    some_triangle = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], xy.dtype)
-    xy = jnp.where(skipped[:, None, None], some_triangle, xy)[:, None, None]
-    a, b, c = xy[..., 0, :], xy[..., 1, :], xy[..., 2, :]
+    some_triangle = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], corners.dtype)
+    xy = jnp.where(skipped[:, None, None], some_triangle, corners[..., :2])[..., None, None]
+    a, b, c = ((xy[:, i, 0], xy[:, i, 1]) for i in range(3))
 
     turn = jnp.sign(area)[:, None, None]
-    inside = (turn * _side(pixels, a, b) > 0) & (turn * _side(pixels, b, c) > 0) & (turn * _side(pixels, c, a) > 0)
-    d = _segment_distance_squared(pixels, a, b)
+    inside = (turn * _side(x, y, a, b) > 0) & (turn * _side(x, y, b, c) > 0) & (turn * _side(x, y, c, a) > 0)
+    d = _segment_distance_squared(x, y, a, b)
     for start, end in ((b, c), (c, a)):  # on a tie the first edge takes the gradient
-        other = _segment_distance_squared(pixels, start, end)
+        other = _segment_distance_squared(x, y, start, end)
         d = jnp.where(other < d, other, d)
     counts = ~skipped[:, None, None] & (inside | (d < blur.radius**2))
     d = jnp.where(counts, jnp.where(inside, -d, d), 0.0)
@@ -81,7 +78,6 @@ def _log_transmitted(corners, pixels, size, blur):
 
 def _log_transmitted_of_mesh(vertices, faces, size, blur):
     centres = jnp.arange(size, dtype=vertices.dtype) + 0.5
-    pixels = jnp.stack(jnp.meshgrid(centres, centres, indexing="xy"), -1)
     xy = jnp.clip(vertices[:, :2], -FAR_AWAY, FAR_AWAY)
     vertices = jnp.concatenate([xy, jax.lax.stop_gradient(vertices[:, 2:])], -1)
 
@@ -97,7 +93,7 @@ def _log_transmitted_of_mesh(vertices, faces, size, blur):
         corners = vertices[indices]
         behind_camera = corners.at[..., 2].set(-1.0)
         corners = jnp.where(is_real[:, None, None], corners, behind_camera)
-        return total + _log_transmitted(corners, pixels, size, blur), None
+        return total + _log_transmitted(corners, centres[None, :], centres[:, None], size, blur), None
 
     start = jnp.zeros((size, size), vertices.dtype)
     return jax.lax.scan(add, start, (chunks, real))[0] if count else start
