@@ -4,9 +4,8 @@
 // silhouette = 1 - Π (1 - p) with p = sigmoid(-d / s). With e = exp(-d / s) this is 1 - 1 / Π (1 + e): no division a
 // face. All lengths are scaled by k = √(log2(e) / s), so that e = 2^(-d).
 //
-// The image is cut into tiles of 16×16 pixels, and a tile into sixteen 4×4 blocks. For each face and tile, one
-// evaluation over the sixteen block *centres* says which blocks the face can reach; those are evaluated pixel by
-// pixel. A block whose every product has passed kSaturated is done: no later face visits it, and it has no gradient,
+// The image is cut into blocks of 4×4 pixels. For each face, one evaluation over sixteen block *centres* at a time, a
+// window of the blocks around the face, says which of them it can reach; those are evaluated pixel by pixel. A block whose every product has passed kSaturated is done: no later face visits it, and it has no gradient,
 // as d silhouette / d d = -Π (1 - p) · p / s vanishes there.
 #include "silhouette.h"
 #include "simd.h"
@@ -19,22 +18,11 @@
 #define KERNELS kernels_baseline
 #endif
 
-#ifdef STATS
-#include <cstdio>
-int g_order = 0;
-long st_faces, st_tiles, st_tests, st_pairs, st_gtiles, st_gpairs, st_gfaces, st_used, st_gused;
-#define COUNT(x, n) x += n
-#else
-#define COUNT(x, n)
-#endif
-
 namespace jaxfit {
 namespace {
 
-constexpr int kTile = 16, kBlock = 4;
+constexpr int kBlock = 4;  // pixels; a block fills a register's sixteen lanes
 constexpr float kSaturated = 1e5f;   // a silhouette is 1 to within 1e-5 from here
-constexpr float kFull = 1e30f;       // products are held below this
-constexpr float kMaxExponent = 60.f;
 constexpr float kFarAway = 1048576.f;  // px; coordinates are clamped to this, so that squares stay finite
 constexpr float kMinDepth = 1e-8f;
 constexpr float kMinArea = 1e-8f;    // of |2·area|, in units of half the image
@@ -46,43 +34,67 @@ struct Faces {
   float shift[3][kLanes], half[3][kLanes];           // minus the edge's middle along its tangent; half its length
   float height[kLanes];                              // distance of vertex 0 from edge 12
   float reach[3][kLanes];                            // blur radius plus a block's half-width across the edge
-  int32_t tile_x0[kLanes], tile_x1[kLanes], tile_y0[kLanes], tile_y1[kLanes];
+  int32_t left[kLanes], right[kLanes], top[kLanes], bottom[kLanes];  // the blocks around the face, inclusive
   int32_t vertex[3][kLanes];
   uint32_t visible;
   uint32_t pad[15];
 };
 
 struct Workspace {
-  float* x;          // scaled vertex coordinates; NaN behind the camera
+  float* x;         // scaled vertex coordinates; NaN behind the camera
   float* y;
-  float* products;   // Π (1 + e) by tile, block, pixel; later the factor of p in the gradient
-  uint32_t* open;    // a bit for each block of a tile that is still to be evaluated
+  float* products;  // Π (1 + e) by block and pixel; later the factor of p in the gradient
+  uint8_t* open;    // a bit for each block that is still to be evaluated, rows of `row_bytes`
   Faces* faces;
-  int64_t tiles, num_chunks;
+  int64_t blocks, row_bytes;  // blocks along a side
+  int64_t num_chunks;
 };
 
 INLINE int64_t round_up(int64_t n) { return (n + kLanes - 1) / kLanes * kLanes; }
 
+struct Layout {
+  int64_t blocks, row_bytes, vertices, products, open, chunks;  // the last four in floats
+  explicit Layout(const Mesh& mesh, int64_t size)
+      : blocks((size + kBlock - 1) / kBlock),
+        row_bytes((blocks + 7) / 8 + 4),  // a row is read four bytes at a time
+        vertices(round_up(mesh.num_vertices)),
+        products(blocks * blocks * kLanes),
+        open(round_up((blocks * row_bytes + 3) / 4)),
+        chunks(round_up(mesh.num_faces) / kLanes) {}
+};
+
+size_t workspace(const Mesh& mesh, int64_t size) {
+  const Layout l(mesh, size);
+  return sizeof(float) * (2 * l.vertices + l.products + l.open) + sizeof(Faces) * l.chunks;
+}
+
 INLINE Workspace carve(const Mesh& mesh, int64_t size, void* memory) {
-  Workspace ws;
-  ws.tiles = (size + kTile - 1) / kTile;
-  ws.num_chunks = round_up(mesh.num_faces) / kLanes;
+  const Layout l(mesh, size);
   float* p = static_cast<float*>(memory);
-  ws.x = p, p += round_up(mesh.num_vertices);
-  ws.y = p, p += round_up(mesh.num_vertices);
-  ws.products = p, p += ws.tiles * ws.tiles * kTile * kTile;
-  ws.open = reinterpret_cast<uint32_t*>(p), p += round_up(ws.tiles * ws.tiles);
+  Workspace ws;
+  ws.x = p, p += l.vertices;
+  ws.y = p, p += l.vertices;
+  ws.products = p, p += l.products;
+  ws.open = reinterpret_cast<uint8_t*>(p), p += l.open;
   ws.faces = reinterpret_cast<Faces*>(p);
+  ws.blocks = l.blocks, ws.row_bytes = l.row_bytes, ws.num_chunks = l.chunks;
   return ws;
 }
 
+INLINE void close(const Workspace& ws, int64_t column, int64_t row) {
+  ws.open[row * ws.row_bytes + column / 8] &= ~(1u << column % 8);
+}
+
 struct Scale {
-  float k, radius, size;  // radius in scaled units, size in pixels
+  float k;       // scaled units a pixel
+  float radius;  // in scaled units
+  float size;    // px
+  float slope;   // -∂(p's exponent) / ∂(scaled distance), the constant factor of the gradient in px
 };
 
 INLINE Scale scale_of(Blur blur, int64_t size) {
   const float k = __builtin_sqrtf(1.44269504088896340736f / blur.sigma);
-  return {k, blur.radius * k, static_cast<float>(size)};
+  return {k, blur.radius * k, static_cast<float>(size), 2.f / (blur.sigma * k)};
 }
 
 // False if any coordinate is not finite.
@@ -166,13 +178,13 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
   f.visible &= bits(visible);
 
   alignas(64) float range[4][kLanes];
-  store(range[0], clamp(low_x, 0, scale.size - 1) * all(1.f / kTile));
-  store(range[1], clamp(high_x, 0, scale.size - 1) * all(1.f / kTile));
-  store(range[2], clamp(low_y, 0, scale.size - 1) * all(1.f / kTile));
-  store(range[3], clamp(high_y, 0, scale.size - 1) * all(1.f / kTile));
+  store(range[0], clamp(low_x, 0, scale.size - 1) * all(1.f / kBlock));
+  store(range[1], clamp(high_x, 0, scale.size - 1) * all(1.f / kBlock));
+  store(range[2], clamp(low_y, 0, scale.size - 1) * all(1.f / kBlock));
+  store(range[3], clamp(high_y, 0, scale.size - 1) * all(1.f / kBlock));
   for (int i = 0; i < kLanes; ++i) {
-    f.tile_x0[i] = static_cast<int32_t>(range[0][i]), f.tile_x1[i] = static_cast<int32_t>(range[1][i]);
-    f.tile_y0[i] = static_cast<int32_t>(range[2][i]), f.tile_y1[i] = static_cast<int32_t>(range[3][i]);
+    f.left[i] = static_cast<int32_t>(range[0][i]), f.right[i] = static_cast<int32_t>(range[1][i]);
+    f.top[i] = static_cast<int32_t>(range[2][i]), f.bottom[i] = static_cast<int32_t>(range[3][i]);
   }
 }
 
@@ -185,9 +197,6 @@ void set_up_faces(const Mesh& mesh, Scale scale, Workspace& ws) {
     f.visible = rest >= kLanes ? 0xFFFFu : (1u << rest) - 1;
     for (int i = 0; i < kLanes; ++i) {
       int64_t id = face;
-#ifdef STATS
-      if (g_order == 1) id = (c * kLanes + i) % n;
-#endif
       for (int v = 0; v < 3; ++v) f.vertex[v][i] = mesh.faces[3 * id + v];
       face += stride;
       if (face >= n) face -= n;
@@ -202,45 +211,71 @@ struct Distances {
   Vec across[3], along[3];
 };
 
-// Where x = -d: the distance squared, negative outside; `beyond` is how far a pixel lies beyond an edge's ends.
-INLINE Vec signed_square(const Distances& at, const Vec half[3]) {
-  Vec square[3];
+// d itself: the smallest squared distance to an edge, negative inside. `clamped` and `beyond` split the position along
+// each edge into the nearest point's and the rest.
+struct Nearest {
+  Vec clamped[3], beyond[3], square[3], smallest, d, minus_d;
+};
+
+INLINE Nearest nearest_edge(const Distances& at, const Vec half[3]) {
+  Nearest n;
   for (int i = 0; i < 3; ++i) {
-    const Vec beyond = max(abs(at.along[i]) - half[i], all(0.f));
-    square[i] = fma(beyond, beyond, at.across[i] * at.across[i]);
+    n.clamped[i] = clamp_to(at.along[i], half[i]);
+    n.beyond[i] = at.along[i] - n.clamped[i];
+    n.square[i] = fma(n.beyond[i], n.beyond[i], at.across[i] * at.across[i]);
   }
-  return with_signs(min(min(square[0], square[1]), square[2]), at.across[0], at.across[1], at.across[2]);
+  n.smallest = min(min(n.square[0], n.square[1]), n.square[2]);
+  n.d = negate_unless_any_negative(n.smallest, at.across[0], at.across[1], at.across[2]);
+  n.minus_d = negate_if_any_negative(n.smallest, at.across[0], at.across[1], at.across[2]);
+  return n;
 }
 
-// Calls visit(distances of the block's pixels, its place in `products`, tile, block) for each open block in reach.
+// How the blocks of a window are numbered: row by row, for each width of a row from 1 to 16.
+struct Windows {
+  alignas(64) float column[kLanes + 1][kLanes], row[kLanes + 1][kLanes];
+  uint8_t column_of[kLanes + 1][kLanes], row_of[kLanes + 1][kLanes];
+  constexpr Windows() : column(), row(), column_of(), row_of() {
+    for (int width = 1; width <= kLanes; ++width)
+      for (int i = 0; i < kLanes; ++i) {
+        column[width][i] = column_of[width][i] = i % width;
+        row[width][i] = row_of[width][i] = i / width;
+      }
+  }
+};
+constexpr Windows kWindows;
+
+// Calls visit(signed distances of the block's pixels, place in `products`, column, row) for each open block in reach.
 template <typename Visit>
-INLINE void for_each_block(const Faces& f, int lane, Scale scale, const Workspace& ws, Vec half[3],
-                           bool forward, Visit visit) {
-  alignas(64) static const float kColumn[kLanes] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
-  alignas(64) static const float kRow[kLanes] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
-  const Vec offset_x = (load(kColumn) - all(1.5f)) * all(scale.k);
-  const Vec offset_y = (load(kRow) - all(1.5f)) * all(scale.k);
-  const Vec centre_x = fma(load(kColumn), all(4 * scale.k), all(2 * scale.k - f.x0[lane]));
-  const Vec centre_y = fma(load(kRow), all(4 * scale.k), all(2 * scale.k - f.y0[lane]));
-  Vec tx[3], ty[3];
+INLINE void for_each_block(const Faces& f, int lane, Scale scale, const Workspace& ws, Visit visit) {
+  const int32_t left = f.left[lane], right = f.right[lane], top = f.top[lane], bottom = f.bottom[lane];
+  const float reach = scale.radius + 2.1213204f * scale.k;  // a block's centre to its corner pixels: 1.5·√2
+  const float block_size = kBlock * scale.k;
+  const Vec offset_x = (load(kWindows.column[4]) - all(1.5f)) * all(scale.k);
+  const Vec offset_y = (load(kWindows.row[4]) - all(1.5f)) * all(scale.k);
+  Vec tx[3], ty[3], half[3];
   Distances offset;
   for (int i = 0; i < 3; ++i) {
     tx[i] = all(f.tx[i][lane]), ty[i] = all(f.ty[i][lane]), half[i] = all(f.half[i][lane]);
     offset.across[i] = tx[i] * offset_y - ty[i] * offset_x;
     offset.along[i] = fma(tx[i], offset_x, ty[i] * offset_y);
   }
-  const float reach = scale.radius + 2.1213204f * scale.k;  // a block's centre to its corner pixels: 1.5·√2
-  const float tile_size = kTile * scale.k;
 
-  for (int32_t row = f.tile_y0[lane]; row <= f.tile_y1[lane]; ++row)
-    for (int32_t column = f.tile_x0[lane]; column <= f.tile_x1[lane]; ++column) {
-      const int64_t tile = row * ws.tiles + column;
-      const uint32_t open = ws.open[tile];
-      COUNT((forward ? st_tiles : st_gtiles), 1);
+  for (int32_t first = left; first <= right; first += kLanes) {
+    const int width = right - first < kLanes ? right - first + 1 : kLanes;
+    const int height = kLanes / width;
+    const float x0 = (static_cast<float>(first) + 0.5f) * block_size - f.x0[lane];
+    const Vec x = fma(load(kWindows.column[width]), all(block_size), all(x0));
+    for (int32_t row = top; row <= bottom; row += height) {
+      uint32_t open = 0;
+      const uint8_t* bytes = ws.open + row * ws.row_bytes + first / 8;
+      for (int i = 0; i < height && row + i <= bottom; ++i, bytes += ws.row_bytes) {
+        uint32_t word;
+        __builtin_memcpy(&word, bytes, 4);
+        open |= (word >> first % 8 & ((1u << width) - 1)) << i * width;
+      }
       if (!open) continue;
-      COUNT(st_tests, 1);
-      const Vec x = centre_x + all(tile_size * static_cast<float>(column));
-      const Vec y = centre_y + all(tile_size * static_cast<float>(row));
+      const float y0 = (static_cast<float>(row) + 0.5f) * block_size - f.y0[lane];
+      const Vec y = fma(load(kWindows.row[width]), all(block_size), all(y0));
       Distances centre;
       alignas(64) float across[3][kLanes], along[3][kLanes];
       for (int i = 0; i < 3; ++i) {
@@ -249,7 +284,7 @@ INLINE void for_each_block(const Faces& f, int lane, Scale scale, const Workspac
         centre.along[i] = fma(tx[i], x, fma(ty[i], y, all(f.shift[i][lane])));
         store(across[i], centre.across[i]), store(along[i], centre.along[i]);
       }
-      const Mask near = (signed_square(centre, half) > all(-reach * reach)) &
+      const Mask near = (all(reach * reach) > nearest_edge(centre, half).d) &
                         (centre.across[0] > all(f.reach[0][lane])) & (centre.across[1] > all(f.reach[1][lane])) &
                         (centre.across[2] > all(f.reach[2][lane]));
       for (uint32_t todo = bits(near) & open; todo; todo &= todo - 1) {
@@ -259,9 +294,11 @@ INLINE void for_each_block(const Faces& f, int lane, Scale scale, const Workspac
           at.across[i] = offset.across[i] + all(across[i][block]);
           at.along[i] = offset.along[i] + all(along[i][block]);
         }
-        visit(at, ws.products + (tile * 16 + block) * kLanes, tile, block);
+        const int64_t c = first + kWindows.column_of[width][block], r = row + kWindows.row_of[width][block];
+        visit(at, nearest_edge(at, half), ws.products + (r * ws.blocks + c) * kLanes, c, r);
       }
     }
+  }
 }
 
 // Fills `products` and closes the blocks that saturate.
@@ -270,86 +307,61 @@ void accumulate_products(Scale scale, Workspace& ws) {
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
     const Faces& f = ws.faces[c];
     for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
-      COUNT(st_faces, 1);
-      Vec half[3];
-      for_each_block(f, __builtin_ctz(todo), scale, ws, half, true,
-                     [&](const Distances& at, float* place, int64_t tile, int block) __attribute__((always_inline)) {
-        const Vec x = signed_square(at, half);
-        const Mask in = x > outside;
-        const Vec product = grow(load(place), exp2(min(x, all(kMaxExponent))), in, kFull);
-        COUNT(st_pairs, 1); COUNT(st_used, __builtin_popcount(bits(in)));
+      for_each_block(f, __builtin_ctz(todo), scale, ws,
+                     [&](const Distances&, const Nearest& n, float* place, int64_t column, int64_t row)
+                         __attribute__((always_inline)) {
+        const Mask in = n.minus_d > outside;
+        const Vec product = grow(load(place), exp2(n.minus_d), in);
         store(place, product);
-        if (!bits(product <= all(kSaturated))) ws.open[tile] &= ~(1u << block);
+        if (!bits(product <= all(kSaturated))) close(ws, column, row);
       });
     }
   }
 }
 
-// Starts every product at 1; pixels that the last tiles have beyond the image count as full.
+// Starts every product at 1; pixels that the last blocks have beyond the image count as full.
 void clear_products(int64_t size, Workspace& ws) {
-  const int64_t n = ws.tiles * ws.tiles;
-  for (int64_t tile = 0; tile < n; ++tile) {
-    const int64_t y0 = tile / ws.tiles * kTile, x0 = tile % ws.tiles * kTile;
-    float* place = ws.products + tile * kTile * kTile;
-    if (x0 + kTile <= size && y0 + kTile <= size) {
-      for (int i = 0; i < 16; ++i) store(place + i * kLanes, all(1.f));
-      ws.open[tile] = 0xFFFFu;
-      continue;
-    }
-    uint32_t open = 0;
-    for (int block = 0; block < 16; ++block)
-      for (int pixel = 0; pixel < 16; ++pixel) {
-        const int64_t x = x0 + block % 4 * kBlock + pixel % 4, y = y0 + block / 4 * kBlock + pixel / 4;
-        const bool in = x < size && y < size;
-        place[block * kLanes + pixel] = in ? 1.f : kFull;
-        if (in) open |= 1u << block;
-      }
-    ws.open[tile] = open;
-  }
+  const int64_t whole = size / kBlock;
+  for (int64_t i = 0; i < ws.blocks * ws.blocks; ++i) store(ws.products + i * kLanes, all(1.f));
+  for (int64_t row = 0; row < ws.blocks; ++row)
+    for (int64_t column = row < whole ? whole : 0; column < ws.blocks; ++column)
+      for (int i = 0; i < kLanes; ++i)
+        if (column * kBlock + i % kBlock >= size || row * kBlock + i / kBlock >= size)
+          ws.products[(row * ws.blocks + column) * kLanes + i] = kFull;
+  for (int64_t i = 0; i < ws.blocks * ws.row_bytes; ++i) ws.open[i] = 0xFF;
 }
 
 // Adds the gradient of every open block; `products` now holds, a pixel, the factor of p · (pixel - nearest point).
 void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
-  const Vec outside = all(-scale.radius * scale.radius);
+  const Vec outside = all(scale.radius * scale.radius);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
     const Faces& f = ws.faces[c];
     for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
       const int lane = __builtin_ctz(todo);
-      Vec half[3];
       // An edge's pull on its ends: across and along it, and both weighted by where along it the pull acts.
       Vec sums[12];
       for (int i = 0; i < 12; ++i) sums[i] = all(0.f);
       bool any = false;
-      for_each_block(f, lane, scale, ws, half, false,
-                     [&](const Distances& at, float* place, int64_t, int) __attribute__((always_inline)) {
+      for_each_block(f, lane, scale, ws,
+                     [&](const Distances& at, const Nearest& n, float* place, int64_t, int64_t)
+                         __attribute__((always_inline)) {
         any = true;
-        Vec beyond[3], clamped[3], square[3];
-        for (int i = 0; i < 3; ++i) {
-          clamped[i] = max(min(at.along[i], half[i]), all(0.f) - half[i]);
-          beyond[i] = at.along[i] - clamped[i];
-          square[i] = fma(beyond[i], beyond[i], at.across[i] * at.across[i]);
-        }
-        const Vec nearest = min(min(square[0], square[1]), square[2]);
-        const Vec x = with_signs(nearest, at.across[0], at.across[1], at.across[2]);
-        const Mask in = x > outside;
-        const Vec e = exp2(min(x, all(kMaxExponent)));
-        const Vec p = e * reciprocal(e + all(1.f));
-        const Vec pull = flip_sign(load(place) * p, x);
-        COUNT(st_gpairs, 1); COUNT(st_gused, __builtin_popcount(bits(in)));
+        const Mask in = outside > n.d;
+        const Vec p = reciprocal(all(1.f) + exp2(n.d));
+        const Vec pull = flip_sign(load(place) * p, n.d);
         Mask mine[3];
-        mine[0] = in & (square[0] <= nearest);
-        mine[1] = without(in & (square[1] <= nearest), mine[0]);
+        mine[0] = in & (n.square[0] <= n.smallest);
+        mine[1] = without(in & (n.square[1] <= n.smallest), mine[0]);
         mine[2] = without(without(in, mine[0]), mine[1]);
         for (int i = 0; i < 3; ++i) {
-          const Vec g = keep(mine[i], pull), gt = g * clamped[i];
+          const Vec g = keep(mine[i], pull), gt = g * n.clamped[i];
           sums[4 * i + 0] = fma(g, at.across[i], sums[4 * i + 0]);
-          sums[4 * i + 1] = fma(g, beyond[i], sums[4 * i + 1]);
+          sums[4 * i + 1] = fma(g, n.beyond[i], sums[4 * i + 1]);
           sums[4 * i + 2] = fma(gt, at.across[i], sums[4 * i + 2]);
-          sums[4 * i + 3] = fma(gt, beyond[i], sums[4 * i + 3]);
+          sums[4 * i + 3] = fma(gt, n.beyond[i], sums[4 * i + 3]);
         }
       });
       if (!any) continue;
-      COUNT(st_gfaces, 1);
       alignas(64) float total[16];
       reduce12(sums, total);
       for (int i = 0; i < 3; ++i) {
@@ -367,19 +379,17 @@ void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
 }
 
 
-// Calls visit(tile, block, place, x0, y0, whole) for every block with a pixel in the image.
+// Calls visit(place in `products`, column, row) for every block.
 template <typename Visit>
-INLINE void for_each_place(int64_t size, const Workspace& ws, Visit visit) {
-  for (int64_t tile = 0; tile < ws.tiles * ws.tiles; ++tile)
-    for (int block = 0; block < 16; ++block) {
-      const int64_t x0 = tile % ws.tiles * kTile + block % 4 * kBlock;
-      const int64_t y0 = tile / ws.tiles * kTile + block / 4 * kBlock;
-      if (x0 < size && y0 < size) visit(tile, block, ws.products + (tile * 16 + block) * kLanes, x0, y0);
-    }
+INLINE void for_each_place(const Workspace& ws, Visit visit) {
+  for (int64_t row = 0; row < ws.blocks; ++row)
+    for (int64_t column = 0; column < ws.blocks; ++column)
+      visit(ws.products + (row * ws.blocks + column) * kLanes, column, row);
 }
 
 // A 4×4 block of a row-major image, `fill` beyond the image's edge.
-INLINE Vec load_block(const float* image, int64_t size, int64_t x0, int64_t y0, float fill) {
+INLINE Vec load_block(const float* image, int64_t size, int64_t column, int64_t row, float fill) {
+  const int64_t x0 = column * kBlock, y0 = row * kBlock;
   alignas(64) float values[kLanes];
   for (int i = 0; i < kLanes; ++i) {
     const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
@@ -388,7 +398,8 @@ INLINE Vec load_block(const float* image, int64_t size, int64_t x0, int64_t y0, 
   return load(values);
 }
 
-INLINE Vec load_block(const uint8_t* image, int64_t size, int64_t x0, int64_t y0, uint8_t fill) {
+INLINE Vec load_block(const uint8_t* image, int64_t size, int64_t column, int64_t row, uint8_t fill) {
+  const int64_t x0 = column * kBlock, y0 = row * kBlock;
   if (x0 + kBlock <= size && y0 + kBlock <= size) return from_bytes(image + y0 * size + x0, size);
   uint8_t values[kLanes];
   for (int i = 0; i < kLanes; ++i) {
@@ -398,30 +409,22 @@ INLINE Vec load_block(const uint8_t* image, int64_t size, int64_t x0, int64_t y0
   return from_bytes(values, kBlock);
 }
 
-INLINE float sum(Vec a) {
-  alignas(64) float lane[kLanes];
-  store(lane, a);
-  for (int width = kLanes / 2; width; width /= 2)
-    for (int i = 0; i < width; ++i) lane[i] += lane[i + width];
-  return lane[0];
-}
-
 // Turns the products into the gradient's factors, given d loss / d silhouette; closes blocks that have none.
-INLINE void set_factor(Vec cotangent, Vec transmitted, Scale scale, Blur blur, float* place, uint32_t& open,
-                       int block) {
+INLINE void set_factor(Vec cotangent, Vec transmitted, Scale scale, const Workspace& ws, float* place, int64_t column,
+                       int64_t row) {
   const Vec factor = cotangent * transmitted;
-  store(place, factor * all(-2.f / (blur.sigma * scale.k)));
-  if (!bits(abs(factor) > all(1.f / kSaturated))) open &= ~(1u << block);
+  store(place, factor * all(scale.slope));
+  if (!bits(abs(factor) > all(1.f / kSaturated))) close(ws, column, row);
 }
 
 template <LossKind kind, typename Pixel>
-float compare(const Pixel* target, Blur blur, int64_t size, Scale scale, Workspace& ws, bool with_gradient) {
+float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, bool with_gradient) {
   double total = 0;
   Vec part = all(0.f);
   const Vec one = all(1.f);
-  for_each_place(size, ws, [&](int64_t tile, int block, float* place, int64_t x0, int64_t y0) __attribute__((always_inline)) {
+  for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     const Vec transmitted = one / load(place);
-    const Vec error = (one - transmitted) - load_block(target, size, x0, y0, static_cast<Pixel>(1));
+    const Vec error = (one - transmitted) - load_block(target, size, column, row, static_cast<Pixel>(1));
     const Vec size_of = abs(error);
     Vec slope;
     if (kind == LossKind::kL1) {
@@ -432,8 +435,8 @@ float compare(const Pixel* target, Blur blur, int64_t size, Scale scale, Workspa
       part = part + select(size_of > one, size_of - all(0.5f), square);
       slope = max(min(error, one), all(-1.f));
     }
-    if (block == 15) total += sum(part), part = all(0.f);
-    if (with_gradient) set_factor(slope, transmitted, scale, blur, place, ws.open[tile], block);
+    if (column % 16 == 15) total += sum(part), part = all(0.f);
+    if (with_gradient) set_factor(slope, transmitted, scale, ws, place, column, row);
   });
   return static_cast<float>(total + sum(part));
 }
@@ -447,7 +450,7 @@ void clear_gradient(float* gradient, int64_t vertices, float value) {
 }
 
 // Prepares `products`; false where a coordinate is not finite.
-bool render(const Mesh& mesh, Blur blur, int64_t size, Scale scale, Workspace& ws) {
+bool render(const Mesh& mesh, int64_t size, Scale scale, Workspace& ws) {
   if (!load_vertices(mesh, scale, ws)) return false;
   set_up_faces(mesh, scale, ws);
   clear_products(size, ws);
@@ -468,12 +471,12 @@ void finish_gradient(const Mesh& mesh, Scale scale, Workspace& ws, float* gradie
 void silhouette(const Mesh& mesh, Blur blur, int64_t size, void* memory, float* image) {
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
-  if (!render(mesh, blur, size, scale, ws)) return fill(image, size * size, __builtin_nanf(""));
-  for_each_place(size, ws, [&](int64_t, int, float* place, int64_t x0, int64_t y0) __attribute__((always_inline)) {
+  if (!render(mesh, size, scale, ws)) return fill(image, size * size, __builtin_nanf(""));
+  for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     alignas(64) float value[kLanes];
     store(value, all(1.f) - all(1.f) / load(place));
     for (int i = 0; i < kLanes; ++i) {
-      const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
+      const int64_t x = column * kBlock + i % kBlock, y = row * kBlock + i / kBlock;
       if (x < size && y < size) image[y * size + x] = value[i];
     }
   });
@@ -483,11 +486,11 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
                          float* gradient) {
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
-  if (!render(mesh, blur, size, scale, ws))
+  if (!render(mesh, size, scale, ws))
     return clear_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
-  for_each_place(size, ws, [&](int64_t tile, int block, float* place, int64_t x0, int64_t y0) __attribute__((always_inline)) {
+  for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     const Vec transmitted = all(1.f) / load(place);
-    set_factor(load_block(cotangent, size, x0, y0, 0.f), transmitted, scale, blur, place, ws.open[tile], block);
+    set_factor(load_block(cotangent, size, column, row, 0.f), transmitted, scale, ws, place, column, row);
   });
   finish_gradient(mesh, scale, ws, gradient);
 }
@@ -496,25 +499,19 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
                float* gradient) {
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
-  if (!render(mesh, blur, size, scale, ws)) {
+  if (!render(mesh, size, scale, ws)) {
     *loss = __builtin_nanf("");
     if (gradient) clear_gradient(gradient, mesh.num_vertices, *loss);
     return;
   }
   const bool l1 = kind == LossKind::kL1, with = gradient != nullptr;
   if (target.bytes)
-    *loss = l1 ? compare<LossKind::kL1>(target.bytes, blur, size, scale, ws, with)
-               : compare<LossKind::kSmoothL1>(target.bytes, blur, size, scale, ws, with);
+    *loss = l1 ? compare<LossKind::kL1>(target.bytes, size, scale, ws, with)
+               : compare<LossKind::kSmoothL1>(target.bytes, size, scale, ws, with);
   else
-    *loss = l1 ? compare<LossKind::kL1>(target.floats, blur, size, scale, ws, with)
-               : compare<LossKind::kSmoothL1>(target.floats, blur, size, scale, ws, with);
+    *loss = l1 ? compare<LossKind::kL1>(target.floats, size, scale, ws, with)
+               : compare<LossKind::kSmoothL1>(target.floats, size, scale, ws, with);
   if (gradient) finish_gradient(mesh, scale, ws, gradient);
-}
-
-size_t workspace(const Mesh& mesh, int64_t size) {
-  const int64_t tiles = (size + kTile - 1) / kTile;
-  return sizeof(float) * (2 * round_up(mesh.num_vertices) + tiles * tiles * kTile * kTile + round_up(tiles * tiles)) +
-         sizeof(Faces) * (round_up(mesh.num_faces) / kLanes);
 }
 
 }  // namespace
