@@ -1,0 +1,106 @@
+// From a face to the blocks that it reaches, and to the distances of their pixels. Part of silhouette.cc.
+#pragma once
+
+#include "faces.h"
+
+namespace jaxfit {
+namespace {
+
+// Sixteen signed distances from one face: to the three edges' lines (`across`, positive inside) and, along each edge,
+// from its middle (`along`).
+struct Distances {
+  Vec across[3], along[3];
+};
+
+// d itself: the smallest squared distance to an edge, negative inside. `clamped` and `beyond` split the position along
+// each edge into the nearest point's and the rest.
+struct Nearest {
+  Vec clamped[3], beyond[3], square[3], smallest, d, minus_d;
+};
+
+INLINE Nearest nearest_edge(const Distances& at, const Vec half[3]) {
+  Nearest n;
+  for (int i = 0; i < 3; ++i) {
+    n.clamped[i] = clamp_to(at.along[i], half[i]);
+    n.beyond[i] = at.along[i] - n.clamped[i];
+    n.square[i] = fma(n.beyond[i], n.beyond[i], at.across[i] * at.across[i]);
+  }
+  n.smallest = min(min(n.square[0], n.square[1]), n.square[2]);
+  n.d = negate_unless_any_negative(n.smallest, at.across[0], at.across[1], at.across[2]);
+  n.minus_d = negate_if_any_negative(n.smallest, at.across[0], at.across[1], at.across[2]);
+  return n;
+}
+
+// How the blocks of a window are numbered: row by row, for each width of a row from 1 to 16.
+struct Windows {
+  alignas(64) float column[kLanes + 1][kLanes], row[kLanes + 1][kLanes];
+  uint8_t column_of[kLanes + 1][kLanes], row_of[kLanes + 1][kLanes];
+  constexpr Windows() : column(), row(), column_of(), row_of() {
+    for (int width = 1; width <= kLanes; ++width)
+      for (int i = 0; i < kLanes; ++i) {
+        column[width][i] = column_of[width][i] = i % width;
+        row[width][i] = row_of[width][i] = i / width;
+      }
+  }
+};
+constexpr Windows kWindows;
+
+// Calls visit(signed distances of the block's pixels, place in `products`, column, row) for each open block in reach.
+template <typename Visit>
+INLINE void for_each_block(const Faces& f, int lane, Scale scale, const Workspace& ws, Visit visit) {
+  const int32_t left = f.left[lane], right = f.right[lane], top = f.top[lane], bottom = f.bottom[lane];
+  const float reach = scale.radius + 2.1213204f * scale.k;  // a block's centre to its corner pixels: 1.5·√2
+  const float block_size = kBlock * scale.k;
+  const Vec offset_x = (load(kWindows.column[4]) - all(1.5f)) * all(scale.k);
+  const Vec offset_y = (load(kWindows.row[4]) - all(1.5f)) * all(scale.k);
+  Vec tx[3], ty[3], half[3];
+  Distances offset;
+  for (int i = 0; i < 3; ++i) {
+    tx[i] = all(f.tx[i][lane]), ty[i] = all(f.ty[i][lane]), half[i] = all(f.half[i][lane]);
+    offset.across[i] = tx[i] * offset_y - ty[i] * offset_x;
+    offset.along[i] = fma(tx[i], offset_x, ty[i] * offset_y);
+  }
+
+  for (int32_t first = left; first <= right; first += kLanes) {
+    const int width = right - first < kLanes ? right - first + 1 : kLanes;
+    const int height = kLanes / width;
+    const float x0 = (static_cast<float>(first) + 0.5f) * block_size - f.x0[lane];
+    const Vec x = fma(load(kWindows.column[width]), all(block_size), all(x0));
+    for (int32_t row = top; row <= bottom; row += height) {
+      uint32_t open = 0;
+      const uint8_t* bytes = ws.open + row * ws.row_bytes + first / 8;
+      for (int i = 0; i < height && row + i <= bottom; ++i, bytes += ws.row_bytes) {
+        uint32_t word;
+        __builtin_memcpy(&word, bytes, 4);
+        open |= (word >> first % 8 & ((1u << width) - 1)) << i * width;
+      }
+      if (!open) continue;
+      const float y0 = (static_cast<float>(row) + 0.5f) * block_size - f.y0[lane];
+      const Vec y = fma(load(kWindows.row[width]), all(block_size), all(y0));
+      Distances centre;
+      alignas(64) float across[3][kLanes], along[3][kLanes];
+      for (int i = 0; i < 3; ++i) {
+        centre.across[i] = tx[i] * y - ty[i] * x;
+        if (i == 1) centre.across[i] = centre.across[i] + all(f.height[lane]);
+        centre.along[i] = fma(tx[i], x, fma(ty[i], y, all(f.shift[i][lane])));
+        store(across[i], centre.across[i]), store(along[i], centre.along[i]);
+      }
+      const Mask near = (all(reach * reach) > nearest_edge(centre, half).d) &
+                        (centre.across[0] > all(f.reach[0][lane])) & (centre.across[1] > all(f.reach[1][lane])) &
+                        (centre.across[2] > all(f.reach[2][lane]));
+      for (uint32_t todo = bits(near) & open; todo; todo &= todo - 1) {
+        const int block = __builtin_ctz(todo);
+        Distances at;
+        for (int i = 0; i < 3; ++i) {
+          at.across[i] = offset.across[i] + all(across[i][block]);
+          at.along[i] = offset.along[i] + all(along[i][block]);
+        }
+        const int64_t c = first + kWindows.column_of[width][block], r = row + kWindows.row_of[width][block];
+        visit(at, nearest_edge(at, half), ws.products + (r * ws.blocks + c) * kLanes, c, r);
+      }
+    }
+  }
+}
+
+}  // namespace
+}  // namespace jaxfit
