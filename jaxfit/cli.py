@@ -75,7 +75,9 @@ def _fit(options: argparse.Namespace) -> None:
     table.title = "objective: final value per frame"
     _print(table)
     counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
-    _print(f"{summary['poses']} poses of {summary['tracks']} birds ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+    _print(
+        f"{summary['poses']} poses of {summary['tracks']} birds ({counts}) in {seconds['fit']:.1f} s → {options.out}"
+    )
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -86,7 +88,12 @@ def _evaluate(options: argparse.Namespace) -> None:
     solution, bird = load_solution(options.result)
     result = evaluate(solution, bird, read_coco(options.truth), terminal, options.truth)
     if options.json:
-        content = {**result.overall, "frames": result.frames, "missing": result.missing, "tracks": result.tracks}
+        content = {
+            **result.overall,
+            "frames": result.frames,
+            "missing": result.missing,
+            "tracks": result.tracks,
+        }
         _print_json(content)
         return
     table = Table("track", "frames", *COLUMNS)
@@ -122,10 +129,7 @@ def _model_info(options: argparse.Namespace) -> None:
     if options.json:
         _print_json(facts)
         return
-    table = Table(show_header=False)
-    for key, value in facts.items():
-        table.add_row(key.replace("_", " "), _fact(value))
-    _print(table)
+    _print_facts(facts)
 
 
 def _bench(options: argparse.Namespace) -> None:
@@ -138,14 +142,13 @@ def _bench(options: argparse.Namespace) -> None:
         mesh = {} if bird is None else {"vertices": bird.vertices, "faces": bird.faces}
         result = bench_silhouette(**mesh)
     else:
-        result = bench_fit(bird, birds=options.birds, frames=options.frames, progress=terminal)
+        if bird is None:
+            raise InputError("bench fit", "needs a bird", "give one by --model, as `jaxfit model import` writes it")
+        result = bench_fit(bird, options.birds, options.frames, progress=terminal)
     if options.json:
         _print_json(result)
         return
-    table = Table(show_header=False)
-    for key, value in result.items():
-        table.add_row(key.replace("_", " "), _fact(value))
-    _print(table)
+    _print_facts(result)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -193,6 +196,15 @@ def _parser() -> argparse.ArgumentParser:
 
 def _print(what: Any) -> None:
     Console(soft_wrap=not isinstance(what, Table), highlight=False).print(what)
+
+
+def _print_facts(facts: dict[str, Any]) -> None:
+    table = Table(show_header=False)
+    table.add_column()
+    table.add_column(overflow="fold")
+    for key, value in facts.items():
+        table.add_row(key.replace("_", " "), _fact(value))
+    _print(table)
 
 
 def _print_json(content: Any) -> None:

@@ -90,9 +90,7 @@ class Observations:
         for (n, t), rle in self.masks.items():
             width, height = self.image_size(n, t)
             if tuple(rle["size"]) != (height, width):
-                raise ValueError(
-                    f"masks[{n}, {t}] is {rle['size']}, its image {[height, width]} (height, width)"
-                )
+                raise ValueError(f"masks[{n}, {t}] is {rle['size']}, its image {[height, width]} (height, width)")
 
     @property
     def num_tracks(self) -> int:
@@ -110,9 +108,7 @@ class Observations:
         return len(self.keypoint_names)
 
     def _position(self, n: int, t: int) -> tuple[int, int]:
-        return range(self.num_tracks)[n], range(self.num_frames)[
-            t
-        ]  # counts from the end too; IndexError outside
+        return range(self.num_tracks)[n], range(self.num_frames)[t]  # counts from the end too; IndexError outside
 
     def mask(self, n: int, t: int) -> np.ndarray | None:
         """The bird's mask, decoded at each call.
@@ -249,7 +245,5 @@ def check_keypoints(observations: Observations, names: Sequence[str], source: ob
         parts = [f"lack {', '.join(missing)}"] if missing else []
         parts += [f"have {', '.join(extra)}, unknown to the model"] if extra else []
         problem = f"keypoints {' and '.join(parts)}"
-        raise InputError(
-            source, problem, "rename the keypoints as the model has them, or choose another model"
-        )
+        raise InputError(source, problem, "rename the keypoints as the model has them, or choose another model")
     return reorder_keypoints(observations, names)

@@ -211,9 +211,7 @@ def load_npz(path: str | Path, required: Mapping[str, int]) -> dict[str, np.ndar
         raise
     except PermissionError as error:
         raise InputError(path, "cannot be read: permission denied", "change its permissions") from error
-    except (
-        Exception
-    ) as error:  # zip, zlib, header and memory errors alike mean: these bytes are no .npz of ours
+    except Exception as error:  # zip, zlib, header and memory errors alike mean: these bytes are no .npz of ours
         if "allow_pickle" in str(error):
             problem = "is a pickle or holds Python objects, which jaxfit does not load"
             raise InputError(path, problem, "save plain arrays with numpy.savez") from error

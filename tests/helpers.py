@@ -1,20 +1,14 @@
-"""What several tests need: a small bird, simulated windows of it, and observations made from them."""
+"""A small bird, and what several tests need of it. Motion and detections come from `jaxfit.simulation`."""
 
-import dataclasses
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 
-from jaxfit.camera import Camera, project
 from jaxfit.model.bird import Bird
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints, posed_vertices
+from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
-from jaxfit.objective.scene import FRAME_AXES
-from jaxfit.observations import Observations, encode_mask
 
-PARTS = {  # joint: parent, joint position, centre and half-axes of its ellipsoid (x side, y to the bill, z up)
+PARTS = {  # joint: parent, position, centre and half-axes of its ellipsoid (x side, y to the bill, z up)
     "root": (None, (0, 0, 0), (0, 0, 0), (2.0, 4.0, 1.8)),
     "neck": ("root", (0, 3, 1), (0, 4.5, 1.8), (1.0, 2.0, 1.0)),
     "head": ("neck", (0, 6, 2.5), (0, 7.2, 2.8), (0.9, 1.8, 0.9)),
@@ -84,61 +78,53 @@ def toy_bird(shapes: int = 2) -> Bird:
     )
 
 
-def smooth_noise(rng, frames: int, size: tuple[int, ...], step: int = 20) -> np.ndarray:
-    """Smooth random curves of unit spread: cosine-blended knots every `step` frames."""
-    knots = rng.normal(size=(frames // step + 2, *size))
-    at = np.arange(frames) / step
-    low, part = at.astype(int), (1 - np.cos(np.pi * (at % 1))) / 2
-    part = part.reshape(-1, *[1] * len(size))
-    return (1 - part) * knots[low] + part * knots[low + 1]
+def skin_by_hand(bird: Bird, pose: Pose):
+    """One frame posed joint by joint with 4×4 matrices in double precision: (V, 3), and the joints (J, 3).
+
+    Everything is scaled before it is skinned, as avian-mesh's own code does it.
+    """
+    angles = np.concatenate([np.asarray(pose.global_orient)[None], np.asarray(pose.body_pose)])
+    scale, bones = float(np.reshape(pose.scale, -1)[0]), [1.0, *np.asarray(pose.bone_length, np.float64)]
+    rest = np.asarray(bird.vertices, np.float64)
+    for beta, direction in zip(np.asarray(pose.betas), np.asarray(bird.shape_basis, np.float64), strict=True):
+        rest = rest + beta * direction
+    joints = np.asarray(bird.joints, np.float64)
+    chain, vertices, posed = [], np.zeros_like(rest), np.zeros_like(joints)
+    for j, parent in enumerate(bird.parents):
+        local = np.eye(4)
+        local[:3, :3] = exp_map(np.asarray(angles[j], np.float64))
+        local[:3, 3] = scale * bones[j] * (joints[j] - (joints[parent] if j else 0))
+        chain.append(local if j == 0 else chain[parent] @ local)
+        moved = scale * (rest - joints[j]) @ chain[j][:3, :3].T + chain[j][:3, 3]
+        vertices += np.asarray(bird.skin_weights, np.float64)[:, [j]] * moved
+        posed[j] = chain[j][:3, 3]
+    transl = np.asarray(pose.transl, np.float64)
+    return vertices + transl, posed + transl
 
 
-def smooth_window(bird: Bird, frames: int, seed: int, depth: float = 200.0, bend: float = 0.7) -> Pose:
-    """True poses of a bird seen from above that turns, leans and bends smoothly within its prior."""
+def random_pose(bird: Bird, seed: int, spread: float = 0.5) -> Pose:
+    """A pose of one frame in which nothing is at rest."""
     rng = np.random.default_rng(seed)
-    from_above = np.array([np.pi, 0, 0])  # z up turned towards the camera
-    heading = rng.uniform(-np.pi, np.pi) + 0.6 * smooth_noise(rng, frames, ())
-    lean = 0.25 * smooth_noise(rng, frames, (3,))
-    cholesky = np.linalg.cholesky(np.asarray(bird.pose_covariance, np.float64))
-    body = np.asarray(bird.pose_mean) + bend * smooth_noise(rng, frames, (len(cholesky),)) @ cholesky.T
-    R = rotation_z(heading) @ exp_map(lean) @ exp_map(from_above)
-    place = rng.normal(size=2) + np.cumsum(0.05 * smooth_noise(rng, frames, (2,)), axis=0)
-    from jaxfit.model.rotation import matrix_to_axis_angle, unwrap_axis_angle
+    bones = bird.num_joints - 1
+
+    def some(*shape):
+        return jnp.asarray(spread * rng.normal(size=shape), jnp.float32)
 
     return Pose(
-        global_orient=unwrap_axis_angle(matrix_to_axis_angle(jnp.asarray(R, jnp.float32))),
-        body_pose=jnp.asarray(body.reshape(frames, -1, 3), jnp.float32),
-        transl=jnp.asarray(np.column_stack([place, np.full(frames, depth)]), jnp.float32),
-        scale=jnp.full(1, rng.uniform(0.9, 1.1), jnp.float32),
-        bone_length=bird.bone_mean,
-        betas=jnp.zeros(bird.num_shapes),
+        global_orient=2 * some(3),
+        body_pose=some(bones, 3),
+        transl=some(3) + jnp.array([0, 0, 150.0]),
+        scale=jnp.asarray(rng.uniform(0.7, 1.4), jnp.float32),
+        bone_length=1 + 0.3 * some(bones),
+        betas=some(bird.num_shapes),
     )
-
-
-def rotation_z(angle):
-    """Rotation matrices about z, by hand."""
-    c, s, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
-    return np.stack(
-        [np.stack([c, -s, zero], -1), np.stack([s, c, zero], -1), np.stack([zero, zero, zero + 1], -1)], -2
-    )
-
-
-def exp_map(axis_angle):
-    """Rotation matrices by scipy: independent of the library's own."""
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_rotvec(axis_angle).as_matrix()
 
 
 def pose_window(bird: Bird, pose: Pose):
     """Posed keypoints and vertices of a window, camera frame: (T, K, 3) and (T, V, 3)."""
     rig = fold_bird(bird)
-    frames = pose.global_orient.shape[0]
-    pose = dataclasses.replace(pose, scale=jnp.broadcast_to(pose.scale, (frames,)))
-    A = jax.vmap(joint_transforms, (None, FRAME_AXES))(rig, pose)
-    keypoints = jax.vmap(posed_keypoints, (None, 0, FRAME_AXES))(rig, A, pose)
-    vertices = jax.vmap(posed_vertices, (None, 0, FRAME_AXES))(rig, A, pose)
-    return np.asarray(keypoints), np.asarray(vertices)
+    A = window_transforms(rig, pose)
+    return np.asarray(window_keypoints(rig, A, pose)), np.asarray(window_vertices(rig, A, pose))
 
 
 def filled_mask(vertices_px, faces, size: int) -> np.ndarray:
@@ -150,44 +136,3 @@ def filled_mask(vertices_px, faces, size: int) -> np.ndarray:
     for triangle in corners:
         cv2.fillConvexPoly(canvas, triangle, 1, shift=8)
     return canvas.astype(bool)
-
-
-def observe(
-    bird: Bird,
-    poses: list[Pose],
-    noise_px: float = 0.0,
-    outliers: float = 0.0,
-    masks: bool = True,
-    seed: int = 0,
-    camera: Camera = Camera(),
-) -> Observations:
-    """Observations of several birds, each in 256-pixel images of its own; noise and outliers are seeded."""
-    rng = np.random.default_rng(seed)
-    birds, frames, size = len(poses), poses[0].global_orient.shape[0], camera.size_px
-    keypoints_px, boxes, rle = [], [], {}
-    for n, pose in enumerate(poses):
-        keypoints, vertices = pose_window(bird, pose)
-        points = np.asarray(project(keypoints, camera))
-        points = points + rng.normal(scale=noise_px, size=points.shape) if noise_px else points
-        if outliers:
-            wrong = rng.random(points.shape[:2]) < outliers
-            points = np.where(wrong[..., None], rng.uniform(0, size, points.shape), points)
-        keypoints_px.append(points)
-        outline = np.asarray(project(vertices, camera))
-        low, high = outline.min(1), outline.max(1)
-        boxes.append(np.concatenate([low, high - low], axis=-1))
-        if masks:
-            for t in range(frames):
-                rle[n, t] = encode_mask(filled_mask(outline[t], bird.faces, size))
-    return Observations(
-        track_id=np.arange(birds),
-        frame_index=np.arange(frames),
-        present=np.ones((birds, frames), bool),
-        keypoints_px=np.asarray(keypoints_px, np.float32),
-        confidence=np.ones((birds, frames, bird.num_keypoints), np.float32),
-        box_px=np.asarray(boxes, np.float32),
-        image_size_px=np.full((frames, 2), size),
-        file_name=np.array([f"{t:06d}.png" for t in range(frames)]),
-        keypoint_names=bird.keypoint_names,
-        masks=rle,
-    )

@@ -13,6 +13,7 @@ from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations, check_keypoints
 from jaxfit.progress import ProgressTask, silent
+from jaxfit.silhouette.hard import hard_mask
 
 __all__ = ["COLUMNS", "Evaluation", "evaluate"]
 
@@ -73,7 +74,7 @@ def evaluate(
         for n, t in zip(*np.nonzero(measured), strict=True):
             at = int(n_truth[n]), int(t_truth[t])
             mask = truth.mask(*at)
-            own = posed.mask(n, t, *truth.image_size(*at))
+            own = hard_mask(posed.vertices_screen(n, t), posed.faces, *truth.image_size(*at))
             own_side[n, t] = metrics.longest_side_of_mask(own)
             true_side[n, t] = truth.box_px[at][2:].max() if mask is None else metrics.longest_side_of_mask(mask)
             if mask is not None:

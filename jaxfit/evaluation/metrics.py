@@ -26,9 +26,7 @@ __all__ = [
 def _points(predicted: Any, observed: Any, visible: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     predicted, observed = np.asarray(predicted, np.float64), np.asarray(observed, np.float64)
     if predicted.shape != observed.shape:
-        raise ValueError(
-            f"predicted and observed must have one shape, not {predicted.shape}, {observed.shape}"
-        )
+        raise ValueError(f"predicted and observed must have one shape, not {predicted.shape}, {observed.shape}")
     visible = np.ones(observed.shape[:-1], bool) if visible is None else np.asarray(visible).astype(bool)
     if visible.shape != observed.shape[:-1]:
         raise ValueError(f"visible must have shape {observed.shape[:-1]}, not {visible.shape}")

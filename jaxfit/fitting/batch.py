@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from jaxfit.camera import Camera
 from jaxfit.config import FitConfig
@@ -109,9 +107,7 @@ def _lanes(evidence: Evidence, hypotheses: int, with_mask: bool) -> Evidence:
     """Evidence for every hypothesis of every window, without masks where nothing looks at them."""
     mask = evidence.mask if with_mask else evidence.mask[..., :0, :0]
     lanes = replace(evidence, mask=mask)
-    return jax.tree.map(
-        lambda x: jnp.asarray(np.repeat(x, hypotheses, axis=0) if hypotheses > 1 else x), lanes
-    )
+    return jax.tree.map(lambda x: jnp.asarray(np.repeat(x, hypotheses, axis=0) if hypotheses > 1 else x), lanes)
 
 
 def _best(final: Report, windows: int, hypotheses: int) -> Array:

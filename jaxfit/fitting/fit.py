@@ -75,9 +75,7 @@ def fit(
     birds = len(np.unique(windows.track))
     solution = _Collector(observations, windows, bird, camera)
     batches = range(0, len(windows), size)
-    logger.info(
-        "%d birds, %d windows of %d frames, %d batches", birds, len(windows), config.window, len(batches)
-    )
+    logger.info("%d birds, %d windows of %d frames, %d batches", birds, len(windows), config.window, len(batches))
     with progress(f"Fitting {birds} birds", steps * len(batches)) as tick:
         for first in batches:
             rows = np.arange(first, min(first + size, len(windows)))
@@ -104,13 +102,9 @@ def _starting_poses(
     """Starting poses of a batch, with leading axes W, H (hypotheses)."""
     if start is None:
         keypoints_px, confidence = jnp.asarray(evidence.keypoints_px), jnp.asarray(evidence.confidence)
-        return initial_poses(
-            bird, rig, keypoints_px, confidence, config.initialise, camera, config.common_size
-        )
+        return initial_poses(bird, rig, keypoints_px, confidence, config.initialise, camera, config.common_size)
     rows = zip(windows.track, windows.frame, windows.present, strict=True)
-    poses = [
-        start.window_pose(bird, int(n), frame, present, config.common_size) for n, frame, present in rows
-    ]
+    poses = [start.window_pose(bird, int(n), frame, present, config.common_size) for n, frame, present in rows]
     return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *poses)
 
 
@@ -138,9 +132,7 @@ class _Collector:
             "keypoints_2d": (keypoints, 2),
             "crop": (3,),
         }
-        self.arrays = {
-            name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()
-        }
+        self.arrays = {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
         self.valid = np.zeros((birds, frames), bool)
         self.loss: dict[str, np.ndarray] = {}
         self.status = np.full(birds, "no usable frame", dtype="<U32")
@@ -172,9 +164,7 @@ class _Collector:
                 "bone_length": pose.bone_length,
                 "betas": betas,
                 "keypoints_3d": fitted.report.keypoints_cam[i][present],
-                "keypoints_2d": crop_to_image(
-                    fitted.report.keypoints_px[i][present], crop, self.camera.size_px
-                ),
+                "keypoints_2d": crop_to_image(fitted.report.keypoints_px[i][present], crop, self.camera.size_px),
                 "crop": crop,
             }
             for name, value in values.items():

@@ -86,9 +86,7 @@ def _similarity(flat, keypoints_px, weight):
     return scale, mean_px - scale[:, None] * mean_flat
 
 
-def choose_sequence(
-    cost: Float[Array, "T M"], rotation: Float[Array, "T M 3 3"], smoothness: float
-) -> Int[Array, "T"]:
+def choose_sequence(cost: Float[Array, "T M"], rotation: Float[Array, "T M 3 3"], smoothness: float) -> Int[Array, "T"]:
     """The candidate of each frame that minimises Σ_t cost + smoothness · Σ_t angle between neighbours.
 
     Exact, by dynamic programming (Viterbi); angles in radians.
@@ -120,9 +118,7 @@ def _orientations(
     frames = jnp.arange(len(seen))
     # a frame without keypoints takes the candidates of its nearest neighbour, at no cost
     nearest = jnp.argmin(jnp.abs(frames[:, None] - frames) + jnp.where(seen, 0, len(seen)), axis=1)
-    match = jax.lax.map(
-        lambda frame: match_candidates(candidates, model_keypoints, *frame), (keypoints_px, confidence)
-    )
+    match = jax.lax.map(lambda frame: match_candidates(candidates, model_keypoints, *frame), (keypoints_px, confidence))
     cost = match.cost[nearest]
     blocked = jnp.zeros_like(cost)
     orientations, scales = [], []

@@ -93,15 +93,11 @@ class Solution:
         arrays = conform(vars(self), _LAYOUT)
         if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
             bones = arrays["body_pose"].shape[2]
-            raise ValueError(
-                f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}"
-            )
+            raise ValueError(f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}")
         loss = {}
         for term, value in self.loss.items():
             layout = {"status": _LAYOUT["status"], f"loss[{term}]": ("N", np.float64)}
-            loss[str(term)] = conform({"status": self.status, f"loss[{term}]": value}, layout)[
-                f"loss[{term}]"
-            ]
+            loss[str(term)] = conform({"status": self.status, f"loss[{term}]": value}, layout)[f"loss[{term}]"]
         focal = float(self.focal)
         if not 0 < focal < math.inf:
             raise ValueError(f"focal must be above 0 and finite, not {focal}")
@@ -139,9 +135,7 @@ def save_solution(
     summary_json = json.dumps(_plain(summary), indent=2, allow_nan=False)
     arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in _LAYOUT}
     terms = list(solution.loss)
-    arrays["loss"] = (
-        np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
-    )
+    arrays["loss"] = np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
     arrays["loss_terms"] = np.array(terms, dtype=np.str_)
     arrays["focal"] = np.asarray(solution.focal, np.float64)
     arrays["crop_px"] = np.asarray(solution.crop_px, np.int64)
@@ -184,9 +178,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     arrays = load_npz(path, {"format_version": 0})
     version = arrays["format_version"]
     if version.dtype.kind not in "iu" or version < 1:
-        raise InputError(
-            path, f"format_version is {version}, expected a whole number from 1", "run the fit again"
-        )
+        raise InputError(path, f"format_version is {version}, expected a whole number from 1", "run the fit again")
     if version > FORMAT_VERSION:
         problem = f"format_version is {version}, newer than this jaxfit reads ({FORMAT_VERSION})"
         raise InputError(path, problem, "install a newer jaxfit")

@@ -15,7 +15,7 @@ from jaxfit.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
-from jaxfit.objective.scene import Evidence, Priors, Scene
+from jaxfit.objective.scene import Evidence, Priors, Raster, Scene
 
 __all__ = ["Problem", "Report", "StageState", "advance", "begin", "report"]
 
@@ -24,7 +24,7 @@ NEVER = 2**30
 
 
 class Problem(NamedTuple):
-    """What a stage needs beside the poses. Everything but `camera` and `backend` is traced."""
+    """What a stage needs beside the poses. Everything but `camera` and `raster` is traced."""
 
     rig: Rig
     priors: Priors
@@ -35,7 +35,7 @@ class Problem(NamedTuple):
     keypoints_on: Float[Array, "K"]
     """1 for the keypoints that this stage looks at, else 0."""
     camera: Camera
-    backend: str
+    raster: Raster
 
 
 class StageState(NamedTuple):
@@ -50,7 +50,7 @@ class StageState(NamedTuple):
 
 def _scene(problem: Problem, pose: Pose, start: Pose, evidence: Evidence) -> Scene:
     seen = eqx.tree_at(lambda e: e.confidence, evidence, evidence.confidence * problem.keypoints_on)
-    return Scene(pose, start, seen, problem.rig, problem.priors, problem.camera, problem.backend)
+    return Scene(pose, start, seen, problem.rig, problem.priors, problem.camera, problem.raster)
 
 
 def _solver(problem: Problem, carried: Any = None) -> optx.OptaxMinimiser:
@@ -72,9 +72,7 @@ def _fixed(pose: Pose, step_size: Pose) -> Pose:
 
 def _loss(pose: Pose, args: Any) -> tuple[Float[Array, ""], None]:
     problem, start, evidence = args
-    return weighted_sum(
-        _scene(problem, _fixed(pose, problem.step_size), start, evidence), problem.settings
-    ), None
+    return weighted_sum(_scene(problem, _fixed(pose, problem.step_size), start, evidence), problem.settings), None
 
 
 STRUCT = jax.ShapeDtypeStruct((), jnp.float32)
@@ -97,9 +95,7 @@ def _moments(state: StageState) -> optax.ScaleByAdamState:
 
 
 @eqx.filter_jit(donate="all-except-first")
-def advance(
-    fixed: tuple[Problem, Evidence, Int[Array, ""]], state: StageState
-) -> tuple[StageState, Array, Array]:
+def advance(fixed: tuple[Problem, Evidence, Int[Array, ""]], state: StageState) -> tuple[StageState, Array, Array]:
     """Take some steps.
 
     Args:

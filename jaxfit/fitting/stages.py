@@ -10,7 +10,8 @@ from jaxfit.fitting.solve import Problem
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
-from jaxfit.objective.scene import Priors
+from jaxfit.objective.scene import Priors, Raster
+from jaxfit.silhouette import Blur
 
 __all__ = ["needs_mask", "stage_problem"]
 
@@ -31,6 +32,7 @@ def stage_problem(
         scale = jnp.asarray(stage.step_scale.get(name, 1.0), jnp.float32)
         return stage.learning_rate * scale if name in stage.free else jnp.zeros_like(scale)
 
+    usual = Blur.for_size(camera.size_px)
     settings = {
         name: {key: jnp.float32(value) for key, value in values.items()}
         for name, values in config.stage_settings(stage).items()
@@ -42,5 +44,5 @@ def stage_problem(
         step_size=Pose(**{name: step_size(name) for name in Pose.__dataclass_fields__}),
         keypoints_on=jnp.array([float(name not in stage.keypoints_off) for name in bird.keypoint_names]),
         camera=camera,
-        backend=config.backend,
+        raster=Raster(Blur(usual.sigma * stage.blur**2, usual.radius * stage.blur), config.backend),
     )

@@ -105,9 +105,7 @@ def load_start(path: str | Path, observations: Observations, bird: Bird) -> Star
     if joints != bird.num_joints:
         raise InputError(path, f"has poses of {joints} joints", f"this bird has {bird.num_joints}")
     if start.betas.shape[2] not in (0, bird.num_shapes):
-        raise InputError(
-            path, f"has {start.betas.shape[2]} shape coefficients", f"this bird has {bird.num_shapes}"
-        )
+        raise InputError(path, f"has {start.betas.shape[2]} shape coefficients", f"this bird has {bird.num_shapes}")
     if start.betas.shape[2] == 0:
         empty = np.zeros((*start.betas.shape[:2], bird.num_shapes), np.float32)
         start = replace(start, betas=empty)
@@ -147,9 +145,7 @@ def _from_rows(path: str | Path, observations: Observations) -> Start:
             f"the observations have {rows} annotations",
         )
     if pose.shape[2] != 3 or transl.shape[1] != 3 or bone.shape[1] != pose.shape[1] - 1:
-        raise InputError(
-            path, f"`init_pose` is {pose.shape}, `init_bone_length` {bone.shape}", "(N, J, 3), (N, J−1)"
-        )
+        raise InputError(path, f"`init_pose` is {pose.shape}, `init_bone_length` {bone.shape}", "(N, J, 3), (N, J−1)")
     if not all(np.isfinite(a).all() for a in (pose, bone, transl)):
         raise InputError(path, "holds NaN or infinite numbers", "remove those rows")
 

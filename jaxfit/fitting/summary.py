@@ -35,6 +35,5 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         "loss": {name: np.asarray(value).tolist() for name, value in solution.loss.items()},
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "model": {"name": bird.name, "hash": model_hash(bird)},
-        "versions": {"python": platform.python_version()}
-        | {name: metadata.version(name) for name in LIBRARIES},
+        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in LIBRARIES},
     }

@@ -76,12 +76,7 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     frame = np.array(frames, int).reshape(len(tracks), config.window)
     present = (frame >= 0) & usable[track[:, None], np.maximum(frame, 0)]
     crop = (
-        np.stack(
-            [
-                _crops(observations, n, f, p, config.crop)
-                for n, f, p in zip(track, frame, present, strict=True)
-            ]
-        )
+        np.stack([_crops(observations, n, f, p, config.crop) for n, f, p in zip(track, frame, present, strict=True)])
         if len(track)
         else np.zeros((0, config.window, 3))
     )
@@ -140,9 +135,7 @@ def _timeline(observations: Observations) -> Int[np.ndarray, "L"]:
     return line
 
 
-def _crops(
-    observations: Observations, n: int, frame, present, config: CropConfig
-) -> Float[np.ndarray, "T 3"]:
+def _crops(observations: Observations, n: int, frame, present, config: CropConfig) -> Float[np.ndarray, "T 3"]:
     if config.mode == "image":
         sizes = {observations.image_size(n, int(t)) for t in frame[present]}
         if len(sizes) > 1 or any(width != height for width, height in sizes):

@@ -86,9 +86,6 @@ def mirror_pairs(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
     index = {name: i for i, name in enumerate(names)}
     pairs = []
     for i, name in enumerate(names):
-        if (
-            name.startswith("left_")
-            and (right := index.get("right_" + name.removeprefix("left_"))) is not None
-        ):
+        if name.startswith("left_") and (right := index.get("right_" + name.removeprefix("left_"))) is not None:
             pairs.append((i, right))
     return tuple(pairs)

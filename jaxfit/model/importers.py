@@ -119,9 +119,7 @@ def _numbers(content: dict[str, Any], key: str, kind: str, source: object) -> np
             raise ValueError(f"{array.dtype} where {'numbers' if kind == 'f' else 'whole numbers'} belong")
         return array.astype(np.float64 if kind == "f" else np.int64)
     except (ValueError, TypeError, OverflowError) as error:
-        raise InputError(
-            source, f"{key}: not an array of numbers: {error}", "use the published file"
-        ) from error
+        raise InputError(source, f"{key}: not an array of numbers: {error}", "use the published file") from error
 
 
 def _prior(content: dict[str, Any], keys: tuple[str, ...], source: object) -> dict[str, np.ndarray]:
@@ -157,16 +155,12 @@ def _assemble(
         ("vert2kpt", (len(keypoint_names), len(parts["V"]))),
     ):
         found = parts[key].shape
-        if len(found) != len(expected) or any(
-            e not in (None, f) for e, f in zip(expected, found, strict=True)
-        ):
+        if len(found) != len(expected) or any(e not in (None, f) for e, f in zip(expected, found, strict=True)):
             shown = str(expected).replace("None", "any")
             raise InputError(source, f"{key}: shape {found}, expected {shown}", f"is this the {name} model?")
     parents, numbers = parts["kintree_table"]
     if not np.array_equal(numbers, np.arange(joints)):
-        raise InputError(
-            source, "kintree_table: its second row must count the joints", "use the published file"
-        )
+        raise InputError(source, "kintree_table: its second row must count the joints", "use the published file")
     basis, variance = shape if shape is not None else (np.zeros((0, len(parts["V"]), 3)), np.zeros(0))
 
     def real(array: np.ndarray) -> Any:

@@ -7,6 +7,7 @@ into a `Rig`: keypoints = (K, J, 4)·A without touching the mesh, vertices = (V,
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -15,7 +16,17 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
 
-__all__ = ["Rig", "fold_bird", "joint_transforms", "posed_joints", "posed_keypoints", "posed_vertices"]
+__all__ = [
+    "Rig",
+    "fold_bird",
+    "joint_transforms",
+    "posed_joints",
+    "posed_keypoints",
+    "posed_vertices",
+    "window_keypoints",
+    "window_transforms",
+    "window_vertices",
+]
 
 
 class Rig(eqx.Module):
@@ -51,9 +62,7 @@ def fold_bird(bird: Bird) -> Rig:
     )
     return Rig(
         joints=jnp.asarray(bird.joints, jnp.float32),
-        keypoint_map=jnp.asarray(
-            np.einsum("kv,vjc->kjc", to_keypoints, per_vertex, optimize=True), jnp.float32
-        ),
+        keypoint_map=jnp.asarray(np.einsum("kv,vjc->kjc", to_keypoints, per_vertex, optimize=True), jnp.float32),
         keypoint_shape_map=jnp.asarray(shape_map, jnp.float32),
         vertex_map=jnp.asarray(per_vertex.transpose(0, 2, 1).reshape(len(weights), -1), jnp.float32),
         skin_weights=jnp.asarray(weights, jnp.float32),
@@ -117,6 +126,31 @@ def posed_joints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array,
     """Joints in the camera frame, model units."""
     unit = _matvec(A[..., :3], rig.joints) + A[..., 3]
     return unit * pose.scale + pose.transl
+
+
+def window_transforms(rig: Rig, pose: Pose) -> Float[Array, "T J 3 4"]:
+    """`joint_transforms` of every frame of a window."""
+    return _each_frame(lambda frame: joint_transforms(rig, frame), pose)
+
+
+def window_keypoints(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T K 3"]:
+    """`posed_keypoints` of every frame of a window."""
+    return _each_frame(lambda frame, A: posed_keypoints(rig, A, frame), pose, A)
+
+
+def window_vertices(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T V 3"]:
+    """`posed_vertices` of every frame of a window."""
+    return _each_frame(lambda frame, A: posed_vertices(rig, A, frame), pose, A)
+
+
+def _each_frame(function, pose: Pose, *framewise: Array):
+    """Map a function of one frame's Pose over a window, whose bone lengths, shape and maybe scale are common."""
+
+    def one(orient, body, transl, scale, *rest):
+        return function(Pose(orient, body, transl, scale, pose.bone_length, pose.betas), *rest)
+
+    scale = jnp.broadcast_to(pose.scale, pose.global_orient.shape[:1])
+    return jax.vmap(one)(pose.global_orient, pose.body_pose, pose.transl, scale, *framewise)
 
 
 def _matmul(a: Float[Array, "*B 3 3"], b: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3 3"]:

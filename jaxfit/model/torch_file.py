@@ -105,8 +105,7 @@ def _read_zip(content: bytes, path: Path) -> dict[str, np.ndarray]:
                 raise InputError(path, "not written on a little-endian machine", REMEDY)
             root, storages = run_pickle(io.BytesIO(entry(pickles[0])), path)
             flat = {
-                key: _storage_array(storage, entry(f"{folder}data/{key}"), 0, path)
-                for key, storage in storages.items()
+                key: _storage_array(storage, entry(f"{folder}data/{key}"), 0, path) for key, storage in storages.items()
             }
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, OSError) as error:
         raise InputError(path, f"a damaged or truncated zip file: {error}", REMEDY) from error

@@ -6,17 +6,17 @@ from functools import cached_property
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxfit.camera import Camera, project, to_screen
 from jaxfit.model.bird import Bird
-from jaxfit.model.kinematics import Rig, joint_transforms, posed_keypoints, posed_vertices
+from jaxfit.model.kinematics import Rig, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
+from jaxfit.silhouette import Blur
 
-__all__ = ["Evidence", "Priors", "Scene", "priors_of"]
+__all__ = ["Evidence", "Priors", "Raster", "Scene", "priors_of"]
 
 
 class Evidence(eqx.Module):
@@ -60,6 +60,13 @@ def priors_of(bird: Bird) -> Priors:
     )
 
 
+class Raster(NamedTuple):
+    """How silhouettes are drawn; static, part of the compiled program."""
+
+    blur: Blur
+    backend: str = "auto"
+
+
 class Scene:
     """One window as the terms see it; what no term asks for is never computed."""
 
@@ -71,27 +78,22 @@ class Scene:
         rig: Rig,
         priors: Priors,
         camera: Camera,
-        backend: str,
+        raster: Raster,
     ):
         self.pose, self.evidence, self.priors = pose, evidence, priors
         self.start = start
         """The pose at which the present stage began."""
-        self.backend = backend
+        self.raster = raster
         self._rig, self._camera = rig, camera
 
     @cached_property
-    def _frames(self) -> Pose:
-        frames = self.pose.global_orient.shape[0]
-        return eqx.tree_at(lambda p: p.scale, self.pose, jnp.broadcast_to(self.pose.scale, (frames,)))
-
-    @cached_property
     def _transforms(self) -> Float[Array, "T J 3 4"]:
-        return jax.vmap(joint_transforms, (None, FRAME_AXES))(self._rig, self._frames)
+        return window_transforms(self._rig, self.pose)
 
     @cached_property
     def keypoints_cam(self) -> Float[Array, "T K 3"]:
         """Posed keypoints, camera frame, model units."""
-        return jax.vmap(posed_keypoints, (None, 0, FRAME_AXES))(self._rig, self._transforms, self._frames)
+        return window_keypoints(self._rig, self._transforms, self.pose)
 
     @cached_property
     def keypoints_px(self) -> Float[Array, "T K 2"]:
@@ -99,20 +101,11 @@ class Scene:
         return project(self.keypoints_cam, self._camera)
 
     @cached_property
-    def vertices_cam(self) -> Float[Array, "T V 3"]:
-        """Posed vertices, camera frame, model units."""
-        return jax.vmap(posed_vertices, (None, 0, FRAME_AXES))(self._rig, self._transforms, self._frames)
-
-    @cached_property
     def vertices_screen(self) -> Float[Array, "T V 3"]:
-        """Posed vertices as (x_px, y_px, z_cam), for the raster core."""
-        return to_screen(self.vertices_cam, self._camera)
+        """Posed vertices as (x_px, y_px, z_cam) in the crop, for the raster core."""
+        return to_screen(window_vertices(self._rig, self._transforms, self.pose), self._camera)
 
     @property
     def faces(self):
         """Vertex indices of each triangle, (F, 3)."""
         return self._rig.faces
-
-
-FRAME_AXES = Pose(global_orient=0, body_pose=0, transl=0, scale=0, bone_length=None, betas=None)  # type: ignore[arg-type]
-"""Which fields of a window's Pose have a frame axis, for vmap over frames."""

@@ -65,7 +65,7 @@ def _mask(scene: Scene, kind: str) -> Scalar:
     weight = scene.evidence.has_mask.astype(jnp.float32)
 
     def frame(vertices_screen, target, weight):
-        return mask_loss(vertices_screen, scene.faces, target, weight, kind=kind, backend=scene.backend)
+        return mask_loss(vertices_screen, scene.faces, target, weight, kind=kind, **scene.raster._asdict())
 
     return jnp.sum(jax.vmap(frame)(scene.vertices_screen, scene.evidence.mask, weight))
 

@@ -1,0 +1,46 @@
+# Every target works as the first command on a fresh clone: it makes the virtual environment it needs.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+export JAXFIT_REFERENCE
+
+.PHONY: install test lint bench demo clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make install   the package with its native kernels, in $(VENV)"
+	@echo "make test      the test suite (under ten minutes on two cores)"
+	@echo "make lint      formatting, lint and types"
+	@echo "make bench     benchmarks against the committed baseline"
+	@echo "make demo      fit real birds and show them (needs JAXFIT_REFERENCE)"
+	@echo "make clean     remove the environment and everything built"
+
+install: $(VENV)/installed
+
+$(VENV)/installed: pyproject.toml $(wildcard kernels/*)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "jaxfit needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)"; exit 1; }
+	@command -v $${CXX:-c++} >/dev/null || \
+	  { echo "No C++ compiler found. Install one (Debian: apt install g++; macOS: xcode-select --install)"; \
+	    echo "or name it: make CXX=/path/to/compiler. Without it jaxfit would run hundreds of times slower."; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --editable ".[dev]"
+	@touch $@
+
+test: install
+	$(BIN)/python -m pytest -n auto
+
+lint: install
+	$(BIN)/ruff check jaxfit tests
+	$(BIN)/ruff format --check jaxfit tests
+	$(BIN)/pyright jaxfit
+
+bench: install
+	$(BIN)/python -m pytest tests/benchmarks -s
+
+demo: install
+	$(BIN)/python -m jaxfit.demo
+
+clean:
+	rm -rf $(VENV) build demo .pytest_cache .ruff_cache .hypothesis
