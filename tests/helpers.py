@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
@@ -76,6 +77,11 @@ def toy_bird(shapes: int = 2) -> Bird:
         keypoint_pairs=_pairs(tuple(KEYPOINTS)),
         name="toy",
     )
+
+
+def exp_map(axis_angle):
+    """Rotation matrices by scipy: independent of the library's own."""
+    return Rotation.from_rotvec(axis_angle).as_matrix()
 
 
 def skin_by_hand(bird: Bird, pose: Pose):

@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import toy_bird
 
 from jaxfit.errors import InputError
 from jaxfit.fitting.solution import FORMAT_VERSION, Solution, load_solution, save_solution
+from jaxfit.model.files import save_bird
 
-N, T, J, K, S = 2, 3, 4, 5, 0
+BIRD = replace(toy_bird(), joint_names=("körper", *toy_bird().joint_names[1:]))
+N, T, J, K, S = 2, 3, BIRD.num_joints, BIRD.num_keypoints, 0
 
 
 def make(**changes):
@@ -35,8 +38,8 @@ def make(**changes):
         "crop": some(3),
         "focal": 2167.0,
         "crop_px": 256,
-        "keypoint_names": tuple("abcde"),
-        "joint_names": ("root", "körper", "head", "tail"),
+        "keypoint_names": BIRD.keypoint_names,
+        "joint_names": BIRD.joint_names,
         "loss": {"keypoints": [1.5, math.nan], "mask": np.array([2.5, 3])},
         "status": ["converged", "no usable frame"],
     }
@@ -48,7 +51,8 @@ def assert_same(a: Solution, b: Solution):
         if isinstance(value, np.ndarray):
             np.testing.assert_array_equal(value, getattr(b, name), err_msg=name)
             assert value.dtype == getattr(b, name).dtype, name
-    assert (a.focal, a.keypoint_names, a.joint_names) == (b.focal, b.keypoint_names, b.joint_names)
+    for name in ("focal", "crop_px", "keypoint_names", "joint_names"):
+        assert getattr(a, name) == getattr(b, name), name
     assert list(a.loss) == list(b.loss)
     for term in a.loss:
         np.testing.assert_array_equal(a.loss[term], b.loss[term])
@@ -60,17 +64,18 @@ def assert_same(a: Solution, b: Solution):
     ids=["plain", "no terms", "shapes", "failed"],
 )
 def test_what_is_saved_is_loaded(tmp_path, changes):
-    save_solution(make(**changes), "a: 1\n", {}, tmp_path / "out")
-    assert_same(load_solution(tmp_path / "out"), make(**changes))
+    save_solution(make(**changes), BIRD, "a: 1\n", {}, tmp_path / "out")
+    solution, bird = load_solution(tmp_path / "out")
+    assert_same(solution, make(**changes))
+    assert bird.joint_names == BIRD.joint_names
+    np.testing.assert_array_equal(bird.vertices, BIRD.vertices)
 
 
 def test_no_birds_at_all(tmp_path):
-    arrays = {
-        name: value[:0] for name, value in vars(make()).items() if getattr(value, "shape", ())[:1] == (N,)
-    }
+    arrays = {name: value[:0] for name, value in vars(make()).items() if getattr(value, "shape", ())[:1] == (N,)}
     empty = replace(make(), **arrays, loss={"mask": np.zeros(0)})
-    save_solution(empty, "", {}, tmp_path / "out")
-    assert_same(load_solution(tmp_path / "out"), empty)
+    save_solution(empty, BIRD, "", {}, tmp_path / "out")
+    assert_same(load_solution(tmp_path / "out")[0], empty)
 
 
 def test_files_of_the_folder(tmp_path):
@@ -82,9 +87,10 @@ def test_files_of_the_folder(tmp_path):
         "nested": {"path": "ü", "ok": True, "none": None, "all": (1, 2)},
         5: [np.bool_(False)],
     }
-    save_solution(make(), "stages: [ü]\n", summary, tmp_path / "out")
+    save_solution(make(), BIRD, "stages: [ü]\n", summary, tmp_path / "out")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "config.yaml",
+        "model.npz",
         "poses.npz",
         "summary.json",
     ]
@@ -109,22 +115,22 @@ def test_files_of_the_folder(tmp_path):
 
 def test_results_are_protected(tmp_path):
     out = tmp_path / "out"
-    save_solution(make(), "first", {}, out)
+    save_solution(make(), BIRD, "first", {}, out)
     with pytest.raises(InputError, match="holds results already"):
-        save_solution(make(), "second", {}, out)
+        save_solution(make(), BIRD, "second", {}, out)
     assert (out / "config.yaml").read_text() == "first"
-    save_solution(make(), "second", {}, out, overwrite=True)
+    save_solution(make(), BIRD, "second", {}, out, overwrite=True)
     assert (out / "config.yaml").read_text() == "second"
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("precious")
     with pytest.raises(InputError, match=r"no poses\.npz"):
-        save_solution(make(), "", {}, tmp_path / "home", overwrite=True)
+        save_solution(make(), BIRD, "", {}, tmp_path / "home", overwrite=True)
     assert (tmp_path / "home" / "thesis.tex").read_text() == "precious"
 
 
 def test_a_summary_that_is_no_json_writes_nothing(tmp_path):
     with pytest.raises(TypeError):
-        save_solution(make(), "", {"path": Path("x")}, tmp_path / "out")
+        save_solution(make(), BIRD, "", {"path": Path("x")}, tmp_path / "out")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -132,13 +138,14 @@ def test_a_summary_that_is_no_json_writes_nothing(tmp_path):
     ("changes", "message"),
     [
         ({"valid": np.ones((N, T + 1), bool)}, "valid must have shape .* T is 3 in frame_index"),
-        ({"body_pose": np.ones((N, T, 3, 4))}, "body_pose must have shape .* axis 3 should be 3"),
-        ({"bone_length": np.ones((N, T, 7))}, "bone_length must have shape .* J-1 is 3 in body_pose"),
-        ({"joint_names": ("root",)}, "joint_names must be 4"),
-        ({"keypoint_names": ("a",)}, "keypoint_names must have shape .* K is 5 in keypoints_3d"),
+        ({"body_pose": np.ones((N, T, J - 1, 4))}, "body_pose must have shape .* axis 3 should be 3"),
+        ({"bone_length": np.ones((N, T, 3))}, "bone_length must have shape .* J-1 is 7 in body_pose"),
+        ({"joint_names": ("root",)}, "joint_names must be 8"),
+        ({"keypoint_names": ("a",)}, "keypoint_names must have shape .* K is 12 in keypoints_3d"),
         ({"status": ["ok"]}, "status must have shape .* N is 2"),
         ({"loss": {"mask": [1.0]}}, r"loss\[mask\] must have shape"),
         ({"focal": 0}, "focal must be above 0"),
+        ({"crop_px": 0}, "crop_px must be 1 or more"),
         ({"scale": np.ones((N, T), complex)}, "scale must be of type float32, not complex128"),
     ],
 )
@@ -162,8 +169,8 @@ def rewrite(folder, **changes):
         ({"betas": None}, "lacks the array betas"),
         ({"scale": np.ones(4)}, r"scale has shape \(4,\), expected 2 dimensions"),
         ({"scale": np.ones((N, T + 1))}, "scale must have shape .* T is 3 in frame_index"),
-        ({"joint_names": np.array(["a"])}, "joint_names must be 4"),
-        ({"joint_names": np.arange(4)}, "joint_names must be of type str, not int64"),
+        ({"joint_names": np.array(["a"])}, "joint_names must be 8"),
+        ({"joint_names": np.arange(J)}, "joint_names must be of type str, not int64"),
         ({"loss_terms": np.array(["a"])}, "loss has shape .* 1 loss_terms"),
         ({"loss": np.ones((5, 2))}, "loss.* must have shape"),
         ({"focal": np.array("x")}, "focal|float"),
@@ -171,11 +178,21 @@ def rewrite(folder, **changes):
     ],
 )
 def test_damaged_folders_are_refused_by_name(tmp_path, changes, message):
-    save_solution(make(), "", {}, tmp_path / "out")
+    save_solution(make(), BIRD, "", {}, tmp_path / "out")
     rewrite(tmp_path / "out", **changes)
     with pytest.raises(InputError, match=message) as caught:
         load_solution(tmp_path / "out")
     assert str(caught.value).startswith(str(tmp_path / "out" / "poses.npz"))
+
+
+def test_a_model_that_is_not_the_poses_is_refused(tmp_path):
+    save_solution(make(), BIRD, "", {}, tmp_path / "out")
+    save_bird(toy_bird(), tmp_path / "out" / "model.npz")
+    with pytest.raises(InputError, match=r"model\.npz: is another model than that of poses\.npz"):
+        load_solution(tmp_path / "out")
+    (tmp_path / "out" / "model.npz").unlink()
+    with pytest.raises(InputError, match=r"model\.npz"):
+        load_solution(tmp_path / "out")
 
 
 def test_what_is_no_folder_of_results(tmp_path):
