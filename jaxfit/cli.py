@@ -27,9 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 2 unusable input, 130 stopped by Ctrl-C."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(format="%(message)s", level=logging.INFO if options.verbose else logging.WARNING)
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxfit"
-    jax.config.update("jax_compilation_cache_dir", str(cache))  # a second run need not compile again
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    use_cache()
     try:
         options.run(options)
     except InputError as error:
@@ -42,6 +40,13 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     return 0
+
+
+def use_cache() -> None:
+    """Keep compiled programs between runs, in the user's cache folder."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxfit"
+    jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
 def _fit(options: argparse.Namespace) -> None:

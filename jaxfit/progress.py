@@ -27,11 +27,11 @@ def terminal(name: str, total: float) -> Iterator[Tick]:
     """A bar with elapsed and remaining time on stderr; plain lines where that is not a terminal."""
     console = Console(stderr=True)
     columns = (
-        TextColumn("{task.description:<22}"),
-        BarColumn(bar_width=30),
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=16),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
-        TextColumn("left"),
+        TextColumn("+"),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
     )
