@@ -1,7 +1,7 @@
 """From a pose to posed joints, keypoints and vertices.
 
 Skinning is linear in the joint transforms A (J, 3, 4), so that everything the fit needs is folded once
-into a `Rig`: keypoints = (K, J, 4)·A without touching the mesh, vertices = (V, 4J)·A in one product.
+into a `Rig`: keypoints = (K, J, 4)·A without touching the mesh, vertices from one (12, J)·(J, V) product.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ class Rig(eqx.Module):
     """Σ_v keypoint_weights · skin_weights · (v, 1): keypoints as a linear map of the joint transforms."""
     keypoint_shape_map: Float[Array, "S K J 3"]
     """The same for each shape direction."""
-    vertex_map: Float[Array, "V 4J"]
-    """skin_weights · (v, 1), ordered coordinate by coordinate: [x·w | y·w | z·w | w]."""
-    skin_weights: Float[Array, "V J"]
-    shape_basis: Float[Array, "S V 3"]
+    vertices: Float[Array, "3 V"]
+    """Rest vertices; here and below V stands last, so that every product runs along it."""
+    skin_weights: Float[Array, "J V"]
+    shape_basis: Float[Array, "S 3 V"]
     faces: Int[Array, "F 3"]
     parents: tuple[int, ...] = eqx.field(static=True)
 
@@ -54,19 +54,17 @@ def fold_bird(bird: Bird) -> Rig:
     to_keypoints = np.asarray(bird.keypoint_weights, np.float64)
     basis = np.asarray(bird.shape_basis, np.float64)
     homogeneous = np.concatenate([np.asarray(bird.vertices, np.float64), np.ones((len(weights), 1))], axis=1)
-    per_vertex = weights[:, :, None] * homogeneous[:, None]  # (V, J, 4)
-    shape_map = (
-        np.stack([np.einsum("kv,vj,vc->kjc", to_keypoints, weights, b, optimize=True) for b in basis])
-        if len(basis)
-        else np.zeros((0, len(to_keypoints), weights.shape[1], 3))
-    )
+
+    def on_keypoints(points):  # Σ_v keypoint_weights · skin_weights · point
+        return jnp.asarray(np.einsum("kv,vj,...vc->...kjc", to_keypoints, weights, points, optimize=True), jnp.float32)
+
     return Rig(
         joints=jnp.asarray(bird.joints, jnp.float32),
-        keypoint_map=jnp.asarray(np.einsum("kv,vjc->kjc", to_keypoints, per_vertex, optimize=True), jnp.float32),
-        keypoint_shape_map=jnp.asarray(shape_map, jnp.float32),
-        vertex_map=jnp.asarray(per_vertex.transpose(0, 2, 1).reshape(len(weights), -1), jnp.float32),
-        skin_weights=jnp.asarray(weights, jnp.float32),
-        shape_basis=jnp.asarray(basis, jnp.float32),
+        keypoint_map=on_keypoints(homogeneous),
+        keypoint_shape_map=on_keypoints(basis),
+        vertices=jnp.asarray(bird.vertices, jnp.float32).T,
+        skin_weights=jnp.asarray(weights.T, jnp.float32),
+        shape_basis=jnp.asarray(basis.transpose(0, 2, 1), jnp.float32),
         faces=jnp.asarray(bird.faces, jnp.int32),
         parents=bird.parents,
     )
@@ -114,11 +112,10 @@ def posed_keypoints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Arr
 
 def posed_vertices(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "V 3"]:
     """Vertices in the camera frame, model units, by linear blend skinning of the joint transforms."""
-    unit = rig.vertex_map @ A.transpose(2, 0, 1).reshape(-1, 3)
-    if rig.shape_basis.shape[0]:
-        displaced = jnp.tensordot(pose.betas, rig.shape_basis, axes=1)  # (V, 3)
-        blended = rig.skin_weights @ A[..., :3].reshape(-1, 9)  # (V, 9)
-        unit = unit + _matvec(blended.reshape(-1, 3, 3), displaced)
+    T = (A.reshape(-1, 12).T @ rig.skin_weights).reshape(3, 4, -1)
+    v = rig.vertices + jnp.tensordot(pose.betas, rig.shape_basis, axes=1)
+    # written out: as a contraction XLA takes ten times as long
+    unit = jnp.stack([T[d, 0] * v[0] + T[d, 1] * v[1] + T[d, 2] * v[2] + T[d, 3] for d in range(3)], axis=-1)
     return unit * pose.scale + pose.transl
 
 
