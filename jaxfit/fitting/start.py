@@ -14,9 +14,22 @@ from jaxfit.fitting.window import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
 from jaxfit.observations import Observations
-from jaxfit.storage import load_npz
+from jaxfit.storage import conform, load_npz
 
 __all__ = ["Start", "load_start"]
+
+_LAYOUT = {
+    "track_id": ("N", np.int64),
+    "frame_index": ("T", np.int64),
+    "global_orient": ("N T 3", np.float32),
+    "body_pose": ("N T J-1 3", np.float32),
+    "transl": ("N T 3", np.float32),
+    "scale": ("N T", np.float32),
+    "bone_length": ("N T J-1", np.float32),
+    "betas": ("N T S", np.float32),
+    "crop": ("N T 3", np.float32),
+}
+_FIELDS = tuple(_LAYOUT)[2:]
 
 
 @dataclass(frozen=True)
@@ -113,24 +126,24 @@ def load_start(path: str | Path, observations: Observations, bird: Bird) -> Star
 
 
 def _from_result(path: str | Path, observations: Observations) -> Start:
-    fields = {
-        "global_orient": 3,
-        "body_pose": 4,
-        "transl": 3,
-        "scale": 2,
-        "bone_length": 3,
-        "betas": 3,
-        "crop": 3,
-    }
-    content = load_npz(path, {"track_id": 1, "frame_index": 1, **fields})
+    content = load_npz(path, {name: len(shape.split()) for name, (shape, _) in _LAYOUT.items()})
+    try:
+        content = conform(content, _LAYOUT)
+    except ValueError as error:
+        raise InputError(path, str(error), "give the poses.npz of a fit") from None
+    fitted = np.isfinite(content["global_orient"]).all(-1)
+    for name in _FIELDS:
+        if not np.isfinite(content[name][fitted]).all():
+            raise InputError(path, f"`{name}` holds NaN or infinite numbers", "give the poses.npz of a fit")
     rows = _positions(observations.track_id, content["track_id"])
     columns = _positions(observations.frame_index, content["frame_index"])
     missing = (rows < 0)[:, None] | (columns < 0)[None]
+    if missing.all():
+        raise InputError(path, "has no pose for any of these birds", "give the start of the same video")
     picked = {}
-    for name in fields:
-        array = content[name].astype(np.float32)[rows][:, columns]
-        array[missing] = np.nan
-        picked[name] = array
+    for name in _FIELDS:
+        picked[name] = content[name][rows][:, columns]
+        picked[name][missing] = np.nan
     return Start(str(path), **picked)
 
 
