@@ -37,7 +37,7 @@ lint: install
 	$(BIN)/pyright jaxfit
 
 bench: install
-	$(BIN)/python -m pytest tests/benchmarks -s
+	$(BIN)/python tests/benchmarks/run.py
 
 demo: install
 	$(BIN)/python -m jaxfit.demo

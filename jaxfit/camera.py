@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 __all__ = ["Camera", "crop_to_image", "image_to_crop", "project", "to_screen"]
@@ -42,14 +43,14 @@ def to_screen(points_cam: Float[Array, "*B 3"], camera: Camera) -> Float[Array, 
 
 
 def crop_to_image(
-    points_px: Float[Array, "*B 2"], crop: Float[Array, "*C 3"], size_px: int = 256
-) -> Float[Array, "*B 2"]:
+    points_px: Float[Array | np.ndarray, "*B 2"], crop: Float[Array | np.ndarray, "*C 3"], size_px: int = 256
+) -> Float[Array | np.ndarray, "*B 2"]:
     """Crop pixels → image pixels; `crop` is (x0, y0, size) in image pixels, one per leading index."""
     return points_px * (crop[..., None, 2:] / size_px) + crop[..., None, :2]
 
 
 def image_to_crop(
-    points_px: Float[Array, "*B 2"], crop: Float[Array, "*C 3"], size_px: int = 256
-) -> Float[Array, "*B 2"]:
+    points_px: Float[Array | np.ndarray, "*B 2"], crop: Float[Array | np.ndarray, "*C 3"], size_px: int = 256
+) -> Float[Array | np.ndarray, "*B 2"]:
     """Image pixels → crop pixels; the inverse of `crop_to_image`."""
     return (points_px - crop[..., None, :2]) * (size_px / crop[..., None, 2:])

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -73,7 +74,7 @@ def _fit(options: argparse.Namespace) -> None:
     table = Table("track", "frames", "objective", "status")
     for column in table.columns[:3]:
         column.justify = "right"
-    total = sum(solution.loss.values())
+    total = np.sum(list(solution.loss.values()), axis=0)
     for n, track in enumerate(solution.track_id):
         frames = int(solution.valid[n].sum())
         table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", str(solution.status[n]))

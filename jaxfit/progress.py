@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -12,7 +12,7 @@ __all__ = ["ProgressTask", "Tick", "silent", "terminal"]
 
 Tick = Callable[[float, str], None]
 """Called with the amount of work just done and a short note."""
-ProgressTask = Callable[[str, float], "contextmanager[Tick]"]
+ProgressTask = Callable[[str, float], AbstractContextManager[Tick]]
 """Opens a task of a given name and total amount of work."""
 
 

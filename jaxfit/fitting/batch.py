@@ -112,6 +112,6 @@ def _lanes(evidence: Evidence, hypotheses: int, with_mask: bool) -> Evidence:
 
 def _best(final: Report, windows: int, hypotheses: int) -> Array:
     """Lane of the hypothesis of least objective, for every window."""
-    total = sum(final.loss.values()).reshape(windows, hypotheses)
+    total = jnp.stack(list(final.loss.values())).sum(axis=0).reshape(windows, hypotheses)
     best = jnp.argmin(jnp.where(jnp.isfinite(total), total, jnp.inf), axis=1)
     return jnp.arange(windows) * hypotheses + best

@@ -59,7 +59,7 @@ def _solver(problem: Problem, carried: Any = None) -> optx.OptaxMinimiser:
 
     adam = optax.scale_by_adam()
     if carried is not None:
-        adam = optax.GradientTransformation(lambda _: carried, adam.update)
+        adam = optax.GradientTransformation(lambda params: carried, adam.update)
     chain = optax.chain(adam, optax.stateless(scale))
     # tolerances of 0: a stage takes exactly its steps, as its source does
     return optx.OptaxMinimiser(optax.apply_if_finite(chain, NEVER), rtol=0.0, atol=0.0)

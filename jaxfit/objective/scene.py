@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -64,7 +64,7 @@ class Raster(NamedTuple):
     """How silhouettes are drawn; static, part of the compiled program."""
 
     blur: Blur
-    backend: str = "auto"
+    backend: Literal["auto", "native", "reference"] = "auto"
 
 
 class Scene:

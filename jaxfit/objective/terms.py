@@ -6,6 +6,8 @@ traced, so that a sweep over them is one compiled program.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -61,7 +63,7 @@ def mask_smooth_l1(scene: Scene) -> Scalar:
     return _mask(scene, "smooth_l1")
 
 
-def _mask(scene: Scene, kind: str) -> Scalar:
+def _mask(scene: Scene, kind: Literal["l1", "smooth_l1"]) -> Scalar:
     weight = scene.evidence.has_mask.astype(jnp.float32)
 
     def frame(vertices_screen, target, weight):

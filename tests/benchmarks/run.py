@@ -1,0 +1,146 @@
+"""Measure speed and quality and compare them with the committed baseline.
+
+Quality is held tight; time is held loosely and as a ratio to a fixed matrix product of the same run, because
+machines differ and are noisy. `--update` writes the baseline anew, `--full` adds the scene of 9 birds × 100 frames
+(some ten minutes on two cores).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from jaxfit import cli, load_config, read_coco
+from jaxfit.benchmarks.fit import bench_fit
+from jaxfit.benchmarks.silhouette import bench_silhouette
+from jaxfit.evaluation.evaluate import evaluate
+from jaxfit.fitting.fit import fit
+from jaxfit.fitting.start import load_start
+from jaxfit.model.sources import import_sources
+from jaxfit.progress import terminal
+
+BASELINE = Path(__file__).with_name("baseline.json")
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One figure: which way is better, and how far from the baseline it may move that way's opposite."""
+
+    name: str
+    value: float
+    unit: str
+    better: str
+    """`less` or `more`."""
+    tolerance: float
+    """Allowed worsening: a share of the baseline for `less`, absolute for `more`."""
+
+    def worse(self, baseline: float) -> bool:
+        """Whether this figure has got worse than tolerated."""
+        if self.better == "less":
+            return self.value > baseline * (1 + self.tolerance)
+        return self.value < baseline - self.tolerance
+
+
+def raster_core() -> Iterator[Metric]:
+    """The mask loss and its gradient on a generated mesh of AVES' size."""
+    result = bench_silhouette()
+    yield Metric("silhouette: loss and gradient", result["ms_per_frame"], "ms/frame", "less", 1.0)
+    yield Metric("silhouette: ratio to matrix product", result["matmul_ratio"], "1", "less", 0.5)
+    yield Metric("silhouette: gradient error", result["gradient_error"], "1", "less", 1.0)
+
+
+def photographs(reference: Path) -> Iterator[Metric]:
+    """Five species of photographs: from a regressor's starting points, and from nothing."""
+    bird = import_sources("aves", [reference / "models" / "aves"])
+    for name in ("aves", "photo"):
+        config, rows, seconds = load_config(name), [], 0.0
+        for path in sorted((reference / "cub").glob("*.json")):
+            observations = read_coco(path)
+            start = load_start(path.with_suffix(".init.npz"), observations, bird) if name == "aves" else None
+            one_step = tuple(dataclasses.replace(stage, steps=1) for stage in config.stages)
+            fit(observations, bird, dataclasses.replace(config, stages=one_step), start)  # compiles
+            began = time.perf_counter()
+            solution = fit(observations, bird, config, start, terminal)
+            seconds += time.perf_counter() - began
+            overall = evaluate(solution, bird, observations).overall
+            rows.append([overall["pck@0.05"], overall["pck@0.10"], overall["iou"]])
+        pck05, pck10, iou = np.mean(rows, axis=0)
+        yield Metric(f"photographs, {name}: PCK@0.05", pck05, "1", "more", 0.005)
+        yield Metric(f"photographs, {name}: PCK@0.10", pck10, "1", "more", 0.005)
+        yield Metric(f"photographs, {name}: IoU", iou, "1", "more", 0.003)
+        yield Metric(f"photographs, {name}: 73 images", seconds, "s", "less", 1.0)
+
+
+def windows(reference: Path) -> Iterator[Metric]:
+    """The paper's setting against single frames, on 2 simulated birds × 100 frames."""
+    bird = import_sources("aves", [reference / "models" / "aves"])
+    results = {
+        name: bench_fit(bird, birds=2, frames=100, config=load_config(name), seed=7, progress=terminal)
+        for name in ("paper", "baseline")
+    }
+    for figure in ("me_p", "me_v", "pa_mpjpe"):
+        ratio = results["paper"][figure] / results["baseline"][figure]
+        yield Metric(f"windows: {figure}, paper", results["paper"][figure], "1", "less", 0.1)
+        yield Metric(f"windows: {figure}, paper over baseline", ratio, "1", "less", 0.1)
+
+
+def scene(reference: Path) -> Iterator[Metric]:
+    """9 birds × 100 frames through the paper's 600 + 400 steps."""
+    bird = import_sources("aves", [reference / "models" / "aves"])
+    result = bench_fit(bird, progress=terminal)
+    yield Metric("scene of 9 birds: fit", result["minutes"], "min", "less", 1.0)
+    yield Metric("scene of 9 birds: first run's compilation", result["compile_s"], "s", "less", 2.0)
+    yield Metric("scene of 9 birds: peak memory", result["peak_memory_gb"], "GB", "less", 0.5)
+
+
+def main() -> int:
+    """Run the benchmarks; 1 where a figure got worse than tolerated."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--update", action="store_true", help="write the baseline anew")
+    parser.add_argument("--full", action="store_true", help="also the scene of 9 birds × 100 frames")
+    parser.add_argument("--json", type=Path, help="also write the figures there")
+    options = parser.parse_args()
+    cli.use_cache()
+    console = Console()
+    reference = Path(os.environ.get("JAXFIT_REFERENCE") or ROOT / ".." / "shared")
+    metrics = list(raster_core())
+    if (reference / "cub").is_dir():
+        metrics += photographs(reference)
+        metrics += windows(reference)
+        metrics += scene(reference) if options.full else ()
+    else:
+        console.print("no reference data (JAXFIT_REFERENCE): only the raster core is measured")
+    known = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
+    table = Table("figure", "value", "baseline", "unit", "better", "")
+    failed = False
+    for metric in metrics:
+        before = known.get(metric.name)
+        worse = before is not None and metric.worse(before)
+        failed |= worse
+        verdict = "WORSE" if worse else "new" if before is None else ""
+        shown = "–" if before is None else f"{before:.4g}"
+        table.add_row(metric.name, f"{metric.value:.4g}", shown, metric.unit, metric.better, verdict)
+    console.print(table)
+    figures = {metric.name: float(f"{metric.value:.6g}") for metric in metrics}
+    if options.json:
+        options.json.write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
+    if options.update:
+        BASELINE.write_text(json.dumps(known | figures, indent=2, ensure_ascii=False) + "\n")
+        return 0
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
