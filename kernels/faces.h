@@ -11,6 +11,7 @@ constexpr int kBlock = 4;  // pixels; a block fills a register's sixteen lanes
 constexpr float kSaturated = 1e5f;   // a silhouette is 1 to within 1e-5 from here
 constexpr float kFarAway = 1048576.f;  // px; coordinates are clamped to this, so that squares stay finite
 constexpr float kMinDepth = 1e-8f;
+constexpr float kShortest = 1e-12f;  // an edge's length below which its corners are one
 constexpr float kMinArea = 1e-8f;    // of |2·area|, in units of half the image
 
 // Sixteen faces, lengths scaled by k, vertices in the order that makes the area positive.
@@ -135,10 +136,12 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
 
   store(f.x0, x0), store(f.y0, y0);
   const Vec ax[3] = {all(0.f), x1, x2}, ay[3] = {all(0.f), y1, y2};
+  Vec shortest = all(kFull);
   for (int i = 0; i < 3; ++i) {
     const int j = (i + 1) % 3;
     const Vec ex = ax[j] - ax[i], ey = ay[j] - ay[i];
-    const Vec length = max(sqrt(fma(ex, ex, ey * ey)), all(1e-12f));
+    const Vec length = max(sqrt(fma(ex, ex, ey * ey)), all(kShortest));
+    shortest = min(shortest, length);
     const Vec inverse = all(1.f) / length;
     const Vec tx = ex * inverse, ty = ey * inverse;
     store(f.tx[i], tx), store(f.ty[i], ty);
@@ -159,8 +162,9 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
   const Vec high_y = (y0 + max(zero, max(y1, y2))) * to_px + shift_high;
   const float half_size = 0.5f * scale.size * scale.k;
   const Vec last = all(scale.size - 1);
-  const Mask visible = (area > all(kMinArea * half_size * half_size)) & (low_x <= last) & (low_y <= last) &
-                       (zero <= high_x) & (zero <= high_y);
+  // Rounding can give an area to a face with two equal corners, so those are told by their edge.
+  const Mask visible = (shortest > all(kShortest)) & (area > all(kMinArea * half_size * half_size)) &
+                       (low_x <= last) & (low_y <= last) & (zero <= high_x) & (zero <= high_y);
   f.visible &= bits(visible);
 
   alignas(64) float range[4][kLanes];

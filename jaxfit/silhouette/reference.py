@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 KINDS = ("l1", "smooth_l1")
 MIN_DEPTH = 1e-8  # a face with a vertex at or behind this depth is skipped
-MIN_AREA = 1e-8  # ... and one whose |2·area| is at most this, in units of half the image
+MIN_AREA = 1e-8  # ... and one whose |2·area| is at most this, in units of half the image, or two corners equal
 FAR_AWAY = 2.0**20  # px; coordinates are clamped to this, so that their squares stay finite
 _FACES_AT_ONCE = 16
 
@@ -60,7 +60,9 @@ def _log_transmitted(corners, x, y, size, blur):
     """log(1 − p) of faces (f, 3, 3) at pixels x (1, size), y (size, 1), summed over the faces: (size, size)."""
     behind = jnp.any(corners[..., 2] <= MIN_DEPTH, -1)
     area = _side(corners[:, 2, 0], corners[:, 2, 1], corners[:, 0].T, corners[:, 1].T)
-    skipped = behind | (jnp.abs(area) <= MIN_AREA * (size / 2) ** 2)
+    # Rounding can give an area to a face with two equal corners.
+    folded = jnp.any(jnp.all(corners[..., :2] == jnp.roll(corners[..., :2], 1, 1), -1), -1)
+    skipped = behind | folded | (jnp.abs(area) <= MIN_AREA * (size / 2) ** 2)
     some_triangle = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], corners.dtype)
     xy = jnp.where(skipped[:, None, None], some_triangle, corners[..., :2])[..., None, None]
     a, b, c = ((xy[:, i, 0], xy[:, i, 1]) for i in range(3))
