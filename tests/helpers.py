@@ -134,11 +134,13 @@ def pose_window(bird: Bird, pose: Pose):
 
 
 def filled_mask(vertices_px, faces, size: int) -> np.ndarray:
-    """Hard mask by filling every projected triangle (OpenCV): independent of the raster core."""
-    import cv2
-
-    canvas = np.zeros((size, size), np.uint8)
-    corners = np.round((vertices_px[np.asarray(faces)] - 0.5) * 256).astype(np.int32)
-    for triangle in corners:
-        cv2.fillConvexPoly(canvas, triangle, 1, shift=8)
-    return canvas.astype(bool)
+    """Hard mask, triangle by triangle: the pixels whose centre lies in any. Independent of the raster core."""
+    canvas = np.zeros((size, size), bool)
+    for a, b, c in np.asarray(vertices_px, np.float64)[np.asarray(faces)]:
+        low = np.clip(np.floor(np.min([a, b, c], axis=0)).astype(int), 0, size)
+        high = np.clip(np.ceil(np.max([a, b, c], axis=0)).astype(int), 0, size)
+        y, x = np.mgrid[low[1] : high[1], low[0] : high[0]] + 0.5
+        sides = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in ((a, b), (b, c), (c, a))]
+        inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
+        canvas[low[1] : high[1], low[0] : high[0]] |= inside
+    return canvas

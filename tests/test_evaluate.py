@@ -1,0 +1,199 @@
+"""The figures of a result: perfect for the truth, what a hand computes for a known error."""
+
+import dataclasses
+import functools
+import math
+
+import numpy as np
+import pytest
+from helpers import filled_mask, pose_window, toy_bird
+
+from jaxfit.camera import Camera, project
+from jaxfit.errors import InputError
+from jaxfit.evaluation.evaluate import COLUMNS, evaluate
+from jaxfit.evaluation.metrics import longest_side_of_mask
+from jaxfit.fitting.posed import PosedBirds
+from jaxfit.fitting.solution import Solution
+from jaxfit.observations import Observations, encode_mask
+from jaxfit.simulation.motion import smooth_motion
+
+BIRD, CAMERA, N, T = toy_bird(), Camera(), 2, 4
+CORNER = np.array([30, 10])
+"""Where the crop's upper left corner lies in the image."""
+WIDTH, HEIGHT = 320, 280
+
+
+def posed():
+    return [smooth_motion(BIRD, T, seed) for seed in range(N)]
+
+
+@functools.cache
+def truth():
+    """What was there, with masks filled triangle by triangle rather than by the raster core."""
+    points, masks, boxes = [], {}, np.zeros((N, T, 4))
+    for n, pose in enumerate(posed()):
+        keypoints, vertices = pose_window(BIRD, pose)
+        points.append(np.asarray(project(keypoints, CAMERA)) + CORNER)
+        for t in range(T):
+            full = np.zeros((HEIGHT, WIDTH), bool)
+            x, y = CORNER
+            own = filled_mask(np.asarray(project(vertices[t], CAMERA)), BIRD.faces, 256)
+            full[y : y + 256, x : x + 256] = own
+            masks[n, t] = encode_mask(full)
+            ys, xs = np.nonzero(full)
+            boxes[n, t] = [xs.min(), ys.min(), np.ptp(xs) + 1, np.ptp(ys) + 1]
+    return Observations(
+        track_id=np.array([5, 3]),
+        frame_index=np.array([10, 11, 12, 14]),
+        present=np.ones((N, T), bool),
+        keypoints_px=np.array(points),
+        confidence=np.ones((N, T, BIRD.num_keypoints)),
+        box_px=boxes,
+        image_size_px=np.full((T, 2), [WIDTH, HEIGHT]),
+        file_name=np.array([f"{t}.png" for t in range(T)]),
+        keypoint_names=BIRD.keypoint_names,
+        masks=masks,
+    )
+
+
+def solution(**changes):
+    poses = posed()
+    keypoints = np.stack([pose_window(BIRD, pose)[0] for pose in poses])
+
+    def every_frame(name):
+        return np.stack([np.broadcast_to(getattr(p, name), (T, *np.shape(getattr(p, name))[-1:])) for p in poses])
+
+    values = {
+        "track_id": [5, 3],
+        "frame_index": [10, 11, 12, 14],
+        "valid": np.ones((N, T), bool),
+        "global_orient": np.stack([p.global_orient for p in poses]),
+        "body_pose": np.stack([p.body_pose for p in poses]),
+        "transl": np.stack([p.transl for p in poses]),
+        "scale": np.stack([np.broadcast_to(p.scale, T) for p in poses]),
+        "bone_length": every_frame("bone_length"),
+        "betas": every_frame("betas"),
+        "keypoints_3d": keypoints,
+        "keypoints_2d": np.asarray(project(keypoints, CAMERA)) + CORNER,
+        "crop": np.broadcast_to([*CORNER, 256.0], (N, T, 3)),
+        "focal": CAMERA.focal_px,
+        "crop_px": 256,
+        "keypoint_names": BIRD.keypoint_names,
+        "joint_names": BIRD.joint_names,
+        "loss": {},
+        "status": ["ok"] * N,
+    }
+    return Solution(**values | changes)
+
+
+def sides():
+    """Longest side of each mask, (N, T)."""
+    seen = truth()
+    return np.array([[longest_side_of_mask(seen.mask(n, t)) for t in range(T)] for n in range(N)])
+
+
+def test_the_truth_is_perfect():
+    result = evaluate(solution(), BIRD, truth())
+    assert tuple(result.overall) == COLUMNS
+    for row in (result.overall, *result.tracks.values()):
+        assert row["pck@0.05"] == row["pck@0.10"] == 1
+        assert row["me_p"] == pytest.approx(0, abs=1e-6)
+        assert row["me_v"] == pytest.approx(0, abs=1e-6)
+        assert row["iou"] > 0.999  # but for a pixel whose centre lies on the outline
+    assert list(result.tracks) == [5, 3]
+    assert [row["frames"] for row in result.tracks.values()] == [T, T]
+    assert (result.frames, result.missing) == (N * T, 0)
+
+
+def test_a_known_error():
+    """All keypoints 6, 8 px off: 10 px of each mask's side; steady, so nothing in velocity."""
+    off = solution(keypoints_2d=solution().keypoints_2d + np.float32([6, 8]))
+    result = evaluate(off, BIRD, truth()).overall
+    own = np.array([[PosedBirds(off, BIRD).vertices_screen(n, t)[:, :2] for t in range(T)] for n in range(N)])
+    extent = np.ptp(own, axis=2).max(-1)
+    np.testing.assert_allclose(extent, sides(), atol=2)  # the mesh's mask has the annotated one's size
+    assert result["me_p"] == pytest.approx(np.sqrt((100 / extent**2).mean()), rel=0.02)
+    assert result["me_v"] == pytest.approx(0, abs=1e-6)
+    assert result["pck@0.05"] == (0.05 * sides() >= 10).mean()
+    assert result["pck@0.10"] == (0.10 * sides() >= 10).mean()
+
+
+def test_velocity_counts_neighbouring_frames_alone():
+    """One frame jumps by 10 px: two pairs of 3 see it; frames 12 and 14 are no neighbours."""
+    points = solution().keypoints_2d.copy()
+    points[0, 1] += [6, 8]
+    result = evaluate(solution(keypoints_2d=points), BIRD, truth())
+    assert result.tracks[5]["me_v"] == pytest.approx(np.sqrt((100 / sides()[0, :2] ** 2).mean()), rel=0.02)
+    points = solution().keypoints_2d.copy()
+    points[0, 3] += [6, 8]
+    assert evaluate(solution(keypoints_2d=points), BIRD, truth()).tracks[5]["me_v"] == pytest.approx(0, abs=1e-6)
+
+
+def test_overlap_of_a_shifted_mesh():
+    moved = solution(crop=solution().crop + np.float32([7, 0, 0]))
+    seen, overlap = truth(), []
+    for n in range(N):
+        for t in range(T):
+            mask = seen.mask(n, t)
+            there = np.roll(mask, 7, axis=1)
+            overlap.append((mask & there).sum() / (mask | there).sum())
+    assert evaluate(moved, BIRD, seen).overall["iou"] == pytest.approx(np.mean(overlap), abs=1e-3)
+
+
+def test_poses_that_are_missing():
+    valid = np.ones((N, T), bool)
+    valid[0, 1:3] = valid[1, 0] = False
+    points = solution().keypoints_2d.copy()
+    points[~valid] = np.nan
+    result = evaluate(solution(valid=valid, keypoints_2d=points), BIRD, truth())
+    assert (result.frames, result.missing) == (5, 3)
+    assert result.tracks[5]["frames"] == 2
+    assert result.overall["pck@0.05"] == 1
+    assert math.isnan(result.tracks[5]["me_v"])  # no two frames in a row are left
+
+
+def test_only_what_both_know_is_measured():
+    """Other tracks and frames, in another order."""
+    part = truth().select(tracks=[1, 0], frames=[1, 2])
+    result = evaluate(solution(), BIRD, part)
+    assert (result.frames, result.missing) == (4, 0)
+    assert result.overall["me_p"] == pytest.approx(0, abs=1e-6)
+    one = evaluate(solution(), BIRD, truth().select(tracks=[1]))
+    assert list(one.tracks) == [3]
+
+
+def test_invisible_keypoints_and_absent_masks_do_not_count():
+    seen = truth()
+    points, confidence = seen.keypoints_px.copy(), seen.confidence.copy()
+    points[:, :, 2] += 50
+    confidence[:, :, 2] = 0
+    masks = {at: rle for at, rle in seen.masks.items() if at[0] == 1}
+    result = evaluate(solution(), BIRD, dataclasses.replace(seen.with_keypoints(points, confidence), masks=masks))
+    assert result.overall["pck@0.05"] == 1
+    assert math.isnan(result.tracks[5]["iou"])
+    assert result.overall["iou"] == result.tracks[3]["iou"] > 0.999
+
+
+def test_nothing_in_common():
+    for changes in ({"track_id": np.array([50, 30])}, {"frame_index": np.arange(4)}):
+        with pytest.raises(InputError, match=r"truth\.json: shares no bird with the result: .*annotations"):
+            evaluate(solution(), BIRD, dataclasses.replace(truth(), **changes), source="truth.json")
+    with pytest.raises(InputError, match=r"shares no bird"):
+        evaluate(solution(valid=np.zeros((N, T), bool)), BIRD, truth())
+    renamed = dataclasses.replace(truth(), keypoint_names=("beak", *BIRD.keypoint_names[1:]))
+    with pytest.raises(InputError, match="lack bill_tip"):
+        evaluate(solution(), BIRD, renamed)
+
+
+def test_progress_counts_the_birds():
+    from contextlib import contextmanager
+
+    ticks = []
+
+    @contextmanager
+    def watch(name, total):
+        ticks.append(total)
+        yield lambda done, note: ticks.append(-done)
+
+    evaluate(solution(), BIRD, truth(), progress=watch)
+    assert ticks == [N * T] + [-1] * (N * T)
