@@ -57,14 +57,14 @@ INLINE void for_each_block(const Faces& f, int lane, Scale scale, const Workspac
   Distances offset;
   for (int i = 0; i < 3; ++i) {
     tx[i] = all(f.tx[i][lane]), ty[i] = all(f.ty[i][lane]), half[i] = all(f.half[i][lane]);
-    offset.across[i] = tx[i] * offset_y - ty[i] * offset_x;
+    offset.across[i] = fms(tx[i], offset_y, ty[i] * offset_x);
     offset.along[i] = fma(tx[i], offset_x, ty[i] * offset_y);
   }
 
   for (int32_t first = left; first <= right; first += kLanes) {
     const int width = right - first < kLanes ? right - first + 1 : kLanes;
     const int height = kLanes / width;
-    const float x0 = (static_cast<float>(first) + 0.5f) * block_size - f.x0[lane];
+    const float x0 = ((static_cast<float>(first) + 0.5f) * kBlock - f.x0[lane]) * scale.k;
     const Vec x = fma(load(kWindows.column[width]), all(block_size), all(x0));
     for (int32_t row = top; row <= bottom; row += height) {
       uint32_t open = 0;
@@ -75,12 +75,12 @@ INLINE void for_each_block(const Faces& f, int lane, Scale scale, const Workspac
         open |= (word >> first % 8 & ((1u << width) - 1)) << i * width;
       }
       if (!open) continue;
-      const float y0 = (static_cast<float>(row) + 0.5f) * block_size - f.y0[lane];
+      const float y0 = ((static_cast<float>(row) + 0.5f) * kBlock - f.y0[lane]) * scale.k;
       const Vec y = fma(load(kWindows.row[width]), all(block_size), all(y0));
       Distances centre;
       alignas(64) float across[3][kLanes], along[3][kLanes];
       for (int i = 0; i < 3; ++i) {
-        centre.across[i] = tx[i] * y - ty[i] * x;
+        centre.across[i] = fms(tx[i], y, ty[i] * x);
         if (i == 1) centre.across[i] = centre.across[i] + all(f.height[lane]);
         centre.along[i] = fma(tx[i], x, fma(ty[i], y, all(f.shift[i][lane])));
         store(across[i], centre.across[i]), store(along[i], centre.along[i]);

@@ -11,12 +11,13 @@ constexpr int kBlock = 4;  // pixels; a block fills a register's sixteen lanes
 constexpr float kSaturated = 1e5f;   // a silhouette is 1 to within 1e-5 from here
 constexpr float kFarAway = 1048576.f;  // px; coordinates are clamped to this, so that squares stay finite
 constexpr float kMinDepth = 1e-8f;
+constexpr float kNegligible = 6.3f;   // scaled; p is below 2^-39 from here
 constexpr float kShortest = 1e-12f;  // an edge's length below which its corners are one
 constexpr float kMinArea = 1e-8f;    // of |2·area|, in units of half the image
 
 // Sixteen faces, lengths scaled by k, vertices in the order that makes the area positive.
 struct Faces {
-  float x0[kLanes], y0[kLanes];                      // the first vertex: the origin of the rest
+  float x0[kLanes], y0[kLanes];                      // the first vertex, in px: the origin of the rest
   float tx[3][kLanes], ty[3][kLanes];                // unit tangents of the edges 01, 12, 20
   float shift[3][kLanes], half[3][kLanes];           // minus the edge's middle along its tangent; half its length
   float height[kLanes];                              // distance of vertex 0 from edge 12
@@ -28,7 +29,7 @@ struct Faces {
 };
 
 struct Workspace {
-  float* x;         // scaled vertex coordinates; NaN behind the camera
+  float* x;         // vertex coordinates in px; NaN behind the camera
   float* y;
   float* products;  // Π (1 + e) by block and pixel; later the factor of p in the gradient
   uint8_t* open;    // a bit for each block that is still to be evaluated, rows of `row_bytes`
@@ -81,19 +82,20 @@ struct Scale {
 
 INLINE Scale scale_of(Blur blur, int64_t size) {
   const float k = __builtin_sqrtf(1.44269504088896340736f / blur.sigma);
-  return {k, blur.radius * k, static_cast<float>(size), 2.f / (blur.sigma * k)};
+  const float radius = blur.radius * k;
+  return {k, radius < kNegligible ? radius : kNegligible, static_cast<float>(size), 2.f / (blur.sigma * k)};
 }
 
 // False if any coordinate is not finite.
-bool load_vertices(const Mesh& mesh, Scale scale, Workspace& ws) {
+bool load_vertices(const Mesh& mesh, Workspace& ws) {
   float zero = 0;  // stays 0 only while every coordinate is finite
   for (int64_t i = 0; i < mesh.num_vertices; ++i) {
     const float* v = mesh.vertices + 3 * i;
     zero += 0 * v[0] + 0 * v[1] + 0 * v[2];
     const float x = v[0] < -kFarAway ? -kFarAway : v[0] > kFarAway ? kFarAway : v[0];
     const float y = v[1] < -kFarAway ? -kFarAway : v[1] > kFarAway ? kFarAway : v[1];
-    ws.x[i] = v[2] > kMinDepth ? x * scale.k : __builtin_nanf("");
-    ws.y[i] = y * scale.k;
+    ws.x[i] = v[2] > kMinDepth ? x : __builtin_nanf("");
+    ws.y[i] = y;
   }
   return zero == 0;
 }
@@ -132,7 +134,10 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
   const Vec x1_old = x1, y1_old = y1;
   x1 = select(turned, x2, x1), y1 = select(turned, y2, y1);
   x2 = select(turned, x1_old, x2), y2 = select(turned, y1_old, y2);
-  area = abs(area);
+  const Vec px_x[2] = {x1, x2}, px_y[2] = {y1, y2};
+  const Mask seen = abs(area) > all(kMinArea * 0.25f * scale.size * scale.size);
+  const Vec k = all(scale.k);
+  x1 = x1 * k, y1 = y1 * k, x2 = x2 * k, y2 = y2 * k, area = abs(area) * k * k;
 
   store(f.x0, x0), store(f.y0, y0);
   const Vec ax[3] = {all(0.f), x1, x2}, ay[3] = {all(0.f), y1, y2};
@@ -152,18 +157,16 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
   }
 
   // Pixel i has its centre at i + 1/2.
-  const Vec to_px = all(1.f / scale.k);
   const Vec margin = all(scale.radius / scale.k);
   const Vec shift_low = margin + all(0.5f), shift_high = margin - all(0.5f);
   const Vec zero = all(0.f);
-  const Vec low_x = (x0 + min(zero, min(x1, x2))) * to_px - shift_low;
-  const Vec low_y = (y0 + min(zero, min(y1, y2))) * to_px - shift_low;
-  const Vec high_x = (x0 + max(zero, max(x1, x2))) * to_px + shift_high;
-  const Vec high_y = (y0 + max(zero, max(y1, y2))) * to_px + shift_high;
-  const float half_size = 0.5f * scale.size * scale.k;
+  const Vec low_x = x0 + min(zero, min(px_x[0], px_x[1])) - shift_low;
+  const Vec low_y = y0 + min(zero, min(px_y[0], px_y[1])) - shift_low;
+  const Vec high_x = x0 + max(zero, max(px_x[0], px_x[1])) + shift_high;
+  const Vec high_y = y0 + max(zero, max(px_y[0], px_y[1])) + shift_high;
   const Vec last = all(scale.size - 1);
   // Rounding can give an area to a face with two equal corners, so those are told by their edge.
-  const Mask visible = (shortest > all(kShortest)) & (area > all(kMinArea * half_size * half_size)) &
+  const Mask visible = (shortest > all(kShortest)) & seen &
                        (low_x <= last) & (low_y <= last) & (zero <= high_x) & (zero <= high_y);
   f.visible &= bits(visible);
 

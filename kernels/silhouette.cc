@@ -171,7 +171,7 @@ void clear_gradient(float* gradient, int64_t vertices, float value) {
 
 // Prepares `products`; false where a coordinate is not finite.
 bool render(const Mesh& mesh, int64_t size, Scale scale, Workspace& ws) {
-  if (!load_vertices(mesh, scale, ws)) return false;
+  if (!load_vertices(mesh, ws)) return false;
   set_up_faces(mesh, scale, ws);
   clear_products(size, ws);
   accumulate_products(scale, ws);

@@ -25,7 +25,7 @@ constexpr float kExpRound[5] = {0.9999992847442627f, 0.6931217908859253f, 0.2402
 //   bits(m)                       a bit a lane
 //   keep(m, a)                    a where m, else 0
 //   without(m, n)                 m and not n
-//   fma(a, b, c)                  a · b + c
+//   fma(a, b, c), fms(a, b, c)    a · b + c, a · b - c
 //   clamp_to(a, limit)            a held to [-limit, limit]
 //   negate_if_any_negative(d, …)  -d where one of the three has a minus sign, else d; d ≥ 0
 //   flip_sign(a, s)               a, negated where s has a minus sign

@@ -31,6 +31,7 @@ INLINE Vec operator-(Vec a, Vec b) { Vec r; EACH(r.q[i] = a.q[i] - b.q[i]); }
 INLINE Vec operator*(Vec a, Vec b) { Vec r; EACH(r.q[i] = a.q[i] * b.q[i]); }
 INLINE Vec operator/(Vec a, Vec b) { Vec r; EACH(r.q[i] = a.q[i] / b.q[i]); }
 INLINE Vec fma(Vec a, Vec b, Vec c) { Vec r; EACH(r.q[i] = a.q[i] * b.q[i] + c.q[i]); }
+INLINE Vec fms(Vec a, Vec b, Vec c) { Vec r; EACH(r.q[i] = a.q[i] * b.q[i] - c.q[i]); }
 #if defined(__SSE2__)
 INLINE Vec min(Vec a, Vec b) { Vec r; EACH(r.q[i] = _mm_min_ps(a.q[i], b.q[i])); }
 INLINE Vec max(Vec a, Vec b) { Vec r; EACH(r.q[i] = _mm_max_ps(a.q[i], b.q[i])); }

@@ -7,9 +7,7 @@ from jaxtyping import Bool, Float
 from jaxfit.silhouette.operator import silhouette
 from jaxfit.silhouette.reference import Blur
 
-SHARP = Blur(
-    sigma=1e-6, radius=1e-3
-)  # far below a pixel: the soft silhouette is 0 or 1 at every pixel's centre
+SHARP = Blur(sigma=1e-6, radius=1e-3)  # far below a pixel: the soft silhouette is 0 or 1 at every pixel's centre
 _covered = eqx.filter_jit(lambda vertices, faces, size: silhouette(vertices, faces, size, blur=SHARP) > 0.5)
 
 

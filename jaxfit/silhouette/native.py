@@ -125,6 +125,4 @@ def mask_loss_and_gradient(
     """`mask_loss` and its gradient with respect to the vertices, in one pass."""
     results = (jax.ShapeDtypeStruct((), jnp.float32), _shape_like(vertices))
     operands = (vertices, faces, target, weight)
-    return _call(
-        "jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind))
-    )
+    return _call("jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))

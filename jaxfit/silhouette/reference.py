@@ -107,8 +107,8 @@ def silhouette(
     """1 − Π (1 − p) over all faces; see `jaxfit.silhouette.silhouette`."""
     finite = jnp.all(jnp.isfinite(vertices))
     image = -jnp.expm1(_log_transmitted_of_mesh(jnp.where(finite, vertices, 0.0), faces, size, blur))
-    # A product, not a choice: the gradient shall be NaN too.
-    return image * jnp.where(finite, 1.0, jnp.nan)
+    # The gradient shall be NaN too, with respect to every x and y.
+    return image + jnp.sum(vertices[:, :2] * jnp.where(finite, 0.0, jnp.nan))
 
 
 def mask_loss(
