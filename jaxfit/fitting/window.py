@@ -96,11 +96,11 @@ def load_evidence(observations: Observations, windows: Windows, size_px: int) ->
             mask[w, t] = cut_mask(full, windows.crop[w, t], size_px)
             has_mask[w, t] = True
     return Evidence(
-        keypoints_px=np.where(confidence[..., None] > 0, keypoints_px, 0).astype(np.float32),  # type: ignore[arg-type]
-        confidence=confidence.astype(np.float32),  # type: ignore[arg-type]
-        mask=mask,  # type: ignore[arg-type]
-        has_mask=has_mask,  # type: ignore[arg-type]
-        present=windows.present,  # type: ignore[arg-type]
+        keypoints_px=np.where(confidence[..., None] > 0, keypoints_px, 0).astype(np.float32),
+        confidence=confidence.astype(np.float32),
+        mask=mask,
+        has_mask=has_mask,
+        present=windows.present,
     )
 
 

@@ -22,14 +22,14 @@ __all__ = ["Evidence", "Priors", "Raster", "Scene", "priors_of"]
 class Evidence(eqx.Module):
     """What was seen of one bird in one window, in crop pixels."""
 
-    keypoints_px: Float[Array, "T K 2"]
-    confidence: Float[Array, "T K"]
+    keypoints_px: Float[Array | np.ndarray, "T K 2"]
+    confidence: Float[Array | np.ndarray, "T K"]
     """In [0, 1]; 0 where the keypoint was not seen."""
-    mask: UInt8[Array, "T H W"]
+    mask: UInt8[Array | np.ndarray, "T H W"]
     """0 or 1."""
-    has_mask: Bool[Array, "T"]
+    has_mask: Bool[Array | np.ndarray, "T"]
     """False where the frame has no mask; such a frame's silhouette is not compared."""
-    present: Bool[Array, "T"]
+    present: Bool[Array | np.ndarray, "T"]
     """False where the bird was not seen at all; such a frame contributes nothing to any term."""
 
 
