@@ -61,7 +61,7 @@ def _fit(options: argparse.Namespace) -> None:
     from jaxfit.storage import check_replaceable
 
     began = time.perf_counter()
-    check_replaceable(options.out, options.overwrite)  # before the work, not after it
+    check_replaceable(options.out, options.overwrite, "poses.npz")  # before the work, not after it
     config = load_config(options.config)
     bird = load_bird(options.model)
     observations = read_coco(options.observations)
