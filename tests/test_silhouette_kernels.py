@@ -126,7 +126,7 @@ def test_many_small_faces_that_share_vertices(each_isa):
     grid = np.stack(np.meshgrid(np.linspace(8, 52, 40), np.linspace(10, 61, 30)), -1).reshape(-1, 2)
     grid = grid + np.random.default_rng(0).normal(size=grid.shape) * 0.3
     corner = (np.arange(29)[:, None] * 40 + np.arange(39)).reshape(-1, 1)
-    faces = np.concatenate([corner + [[0, 1, 40]], corner + [[1, 41, 40]]])
+    faces = np.concatenate([corner + np.array([0, 1, 40]), corner + np.array([1, 41, 40])])
     vertices = jnp.asarray(np.concatenate([grid, np.ones((len(grid), 1))], 1), jnp.float32)
     agree(vertices, jnp.asarray(faces, jnp.int32), random_target(0, 64, np.uint8))
 

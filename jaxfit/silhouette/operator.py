@@ -32,8 +32,8 @@ def silhouette(
     radius of it; d_f is the squared distance in px² to the face's nearest edge, negative inside.
 
     Faces with |2·area| ≤ 1e-8 (size/2)² px² or two equal corners, and those with a vertex at a depth of 1e-8 or less,
-    are skipped. If any coordinate of any vertex is NaN or infinite, the whole image and its gradient are NaN. Coordinates beyond
-    ±2²⁰ px are clamped. The kernels leave a pixel once its S is within 1e-5 of 1.
+    are skipped. If any coordinate of any vertex is NaN or infinite, the whole image and its gradient are NaN.
+    Coordinates beyond ±2²⁰ px are clamped. The kernels leave a pixel once its S is within 1e-5 of 1.
 
     Args:
         vertices_screen: x and y in pixels (x right, y down, pixel centres at i + 0.5), and the depth in the camera

@@ -125,8 +125,6 @@ def mask_loss(
     mask = target if jnp.issubdtype(target.dtype, jnp.floating) else (target != 0).astype(image.dtype)
     error = image - mask
     size_of = jnp.abs(error)
-    if kind == "l1":
-        loss = jnp.sum(size_of)
-    else:
-        loss = jnp.sum(jnp.where(size_of < 1, 0.5 * error**2, size_of - 0.5))
-    return jnp.where(missing, 0.0, loss)
+    if kind == "smooth_l1":
+        size_of = jnp.where(size_of < 1, 0.5 * error**2, size_of - 0.5)
+    return jnp.where(missing, 0.0, jnp.sum(size_of))
