@@ -71,7 +71,7 @@ def evaluate(
     true_side, own_side = overlap.copy(), overlap.copy()
     posed = PosedBirds(solution, bird)
     with progress("Measuring", int(measured.sum())) as tick:
-        for n, t in zip(*np.nonzero(measured), strict=True):
+        for n, t in np.argwhere(measured).tolist():
             at = int(n_truth[n]), int(t_truth[t])
             mask = truth.mask(*at)
             own = hard_mask(posed.vertices_screen(n, t), posed.faces, *truth.image_size(*at))

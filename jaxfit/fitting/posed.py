@@ -32,7 +32,7 @@ class PosedBirds:
         s = self.solution
         x0, y0, size = s.crop[n, t]
         camera = Camera(s.focal * size / s.crop_px, size / 2)
-        pose = Pose(**{name: getattr(s, name)[n, t] for name in Pose.__dataclass_fields__})
+        pose = Pose(**{name: np.asarray(getattr(s, name)[n, t]) for name in Pose.__dataclass_fields__})
         return np.asarray(_screen(self._rig, pose, camera)) + np.array([x0, y0, 0], np.float32)
 
 

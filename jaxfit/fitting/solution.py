@@ -185,6 +185,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     ndim = {name: len(shape.split()) for name, (shape, _) in _LAYOUT.items()}
     arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0, "crop_px": 0})
     values: dict[str, Any] = {name: arrays[name] for name in _LAYOUT}
+    values |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays["loss_terms"], arrays["loss"]
     if loss.shape[1] != len(terms):
         problem = f"loss has shape {loss.shape}, but there are {len(terms)} loss_terms"

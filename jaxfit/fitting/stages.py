@@ -16,6 +16,15 @@ from jaxfit.silhouette import Blur
 __all__ = ["needs_mask", "stage_problem"]
 
 MASK_TERMS = ("mask", "mask_smooth_l1")
+STEP_SHAPES = {
+    "global_orient": (3,),
+    "body_pose": (1, 3),
+    "transl": (3,),
+    "scale": (),
+    "bone_length": (1,),
+    "betas": (1,),
+}
+"""Step sizes are those of one frame, the same for all bones and shape coefficients."""
 
 
 def needs_mask(stage: StageConfig) -> bool:
@@ -28,9 +37,9 @@ def stage_problem(
 ) -> Problem:
     """What the solver needs for one stage; weights, settings and step sizes become traced arrays."""
 
-    def step_size(name: str):
+    def step_size(name: str, shape: tuple[int, ...]):
         scale = jnp.asarray(stage.step_scale.get(name, 1.0), jnp.float32)
-        return stage.learning_rate * scale if name in stage.free else jnp.zeros_like(scale)
+        return jnp.broadcast_to(stage.learning_rate * scale if name in stage.free else 0.0, shape)
 
     usual = Blur.for_size(camera.size_px)
     settings = {
@@ -41,7 +50,7 @@ def stage_problem(
         rig=rig,
         priors=priors,
         settings=settings,
-        step_size=Pose(**{name: step_size(name) for name in Pose.__dataclass_fields__}),
+        step_size=Pose(**{name: step_size(name, shape) for name, shape in STEP_SHAPES.items()}),
         keypoints_on=jnp.array([float(name not in stage.keypoints_off) for name in bird.keypoint_names]),
         camera=camera,
         raster=Raster(Blur(usual.sigma * stage.blur**2, usual.radius * stage.blur), config.backend),

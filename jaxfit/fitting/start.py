@@ -38,10 +38,10 @@ class Start:
 
     source: str
     global_orient: Float[np.ndarray, "N T 3"]
-    body_pose: Float[np.ndarray, "N T J-1 3"]
+    body_pose: Float[np.ndarray, "N T bones 3"]
     transl: Float[np.ndarray, "N T 3"]
     scale: Float[np.ndarray, "N T"]
-    bone_length: Float[np.ndarray, "N T J-1"]
+    bone_length: Float[np.ndarray, "N T bones"]
     betas: Float[np.ndarray, "N T S"]
     crop: Float[np.ndarray, "N T 3"] | None = None
     """Crops that the poses belong to, where the file tells."""

@@ -76,7 +76,9 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     frame = np.array(frames, int).reshape(len(tracks), config.window)
     present = (frame >= 0) & usable[track[:, None], np.maximum(frame, 0)]
     crop = (
-        np.stack([_crops(observations, n, f, p, config.crop) for n, f, p in zip(track, frame, present, strict=True)])
+        np.stack(
+            [_crops(observations, int(n), f, p, config.crop) for n, f, p in zip(track, frame, present, strict=True)]
+        )
         if len(track)
         else np.zeros((0, config.window, 3))
     )

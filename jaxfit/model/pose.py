@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit.model.bird import Bird
@@ -16,20 +17,21 @@ class Pose(eqx.Module):
 
     Rotations are axis-angle in radians, each joint relative to its parent; lengths are in model units,
     camera frame. In a window, `bone_length` and `betas` stay without a frame axis: a bird keeps its
-    skeleton and its shape. `scale` has one entry per frame, or one for the window ("common size").
+    skeleton and its shape. `scale` has one entry per frame, or one for the window ("common size"). Batches
+    put further axes W in front of every field. There are J−1 bones.
     """
 
-    global_orient: Float[Array, "*T 3"]
+    global_orient: Float[Array | np.ndarray, "*T 3"]
     """Rotation model → camera, about the root joint."""
-    body_pose: Float[Array, "*T J-1 3"]
+    body_pose: Float[Array | np.ndarray, "*T bones 3"]
     """Rotation of every other joint against its parent."""
-    transl: Float[Array, "*T 3"]
+    transl: Float[Array | np.ndarray, "*T 3"]
     """Position of the root joint's rest origin in the camera frame."""
-    scale: Float[Array, "*T"]
+    scale: Float[Array | np.ndarray, "*#T"]
     """Size relative to the model's rest size."""
-    bone_length: Float[Array, "J-1"]
+    bone_length: Float[Array | np.ndarray, "*W bones"]
     """Length of each bone relative to the rest skeleton."""
-    betas: Float[Array, "S"]
+    betas: Float[Array | np.ndarray, "*W S"]
     """Shape coefficients."""
 
 

@@ -20,16 +20,16 @@ __all__ = ["Evidence", "Priors", "Raster", "Scene", "priors_of"]
 
 
 class Evidence(eqx.Module):
-    """What was seen of one bird in one window, in crop pixels."""
+    """What was seen of one bird in one window, in crop pixels; batches put further axes in front."""
 
-    keypoints_px: Float[Array | np.ndarray, "T K 2"]
-    confidence: Float[Array | np.ndarray, "T K"]
+    keypoints_px: Float[Array | np.ndarray, "*T K 2"]
+    confidence: Float[Array | np.ndarray, "*T K"]
     """In [0, 1]; 0 where the keypoint was not seen."""
-    mask: UInt8[Array | np.ndarray, "T H W"]
+    mask: UInt8[Array | np.ndarray, "*T H W"]
     """0 or 1."""
-    has_mask: Bool[Array | np.ndarray, "T"]
+    has_mask: Bool[Array | np.ndarray, "*T"]
     """False where the frame has no mask; such a frame's silhouette is not compared."""
-    present: Bool[Array | np.ndarray, "T"]
+    present: Bool[Array | np.ndarray, "*T"]
     """False where the bird was not seen at all; such a frame contributes nothing to any term."""
 
 
@@ -39,8 +39,8 @@ class Priors(NamedTuple):
 
     pose_mean: Float[Array, "D"]
     pose_whitener: Float[Array, "D D"]
-    bone_mean: Float[Array, "J-1"]
-    bone_whitener: Float[Array, "J-1 J-1"]
+    bone_mean: Float[Array, "bones"]
+    bone_whitener: Float[Array, "bones bones"]
     shape_sd: Float[Array, "S"]
 
 

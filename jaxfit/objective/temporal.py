@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from jaxfit.objective.scene import Scene
-from jaxfit.objective.terms import safe_norm
+from jaxfit.objective.terms import Scalar, safe_norm
 
 __all__ = ["acceleration", "velocity"]
 
 
-def velocity(scene: Scene, *, beta_global: float = 10.0, beta_pose: float = 1.0) -> Float[Array, ""]:
+def velocity(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
     """E_vel = Σ_k β_k Σ_i ‖θ_k,i+1 − θ_k,i‖₂ over k = global orientation, body pose.
 
     Source: Hägerlind et al. 2024, velocity term; norms not squared.
@@ -19,7 +18,7 @@ def velocity(scene: Scene, *, beta_global: float = 10.0, beta_pose: float = 1.0)
     return _differences(scene, 1, beta_global, beta_pose)
 
 
-def acceleration(scene: Scene, *, beta_global: float = 10.0, beta_pose: float = 1.0) -> Float[Array, ""]:
+def acceleration(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
     """E_acc = Σ_k β_k Σ_i ‖θ′_k,i+1 − θ′_k,i‖₂ with θ′ the frame-to-frame difference.
 
     Source: Hägerlind et al. 2024, acceleration term; norms not squared.
@@ -27,7 +26,7 @@ def acceleration(scene: Scene, *, beta_global: float = 10.0, beta_pose: float = 
     return _differences(scene, 2, beta_global, beta_pose)
 
 
-def _differences(scene: Scene, order: int, beta_global: float, beta_pose: float) -> Float[Array, ""]:
+def _differences(scene: Scene, order: int, beta_global: Scalar | float, beta_pose: Scalar | float) -> Scalar:
     frames = scene.pose.global_orient.shape[0]
     if frames <= order:
         return jnp.zeros(())

@@ -37,7 +37,7 @@ def geman_mcclure(error: Float[Array, "*B"], sigma: Float[Array, ""] | float) ->
     return sigma**2 * squared / (sigma**2 + squared)
 
 
-def keypoints(scene: Scene, *, sigma_px: float = 50.0) -> Scalar:
+def keypoints(scene: Scene, *, sigma_px: Scalar | float = 50.0) -> Scalar:
     """E_kpt = Σ_t Σ_i c_i · (ρ(e_x) + ρ(e_y)), ρ Geman-McClure, e in crop pixels.
 
     Source: Hägerlind et al. 2024, keypoint term; x and y apart as in Badger et al. 2020.
@@ -101,7 +101,7 @@ def shape_norm(scene: Scene) -> Scalar:
 
     Source: Wang et al. 2021, shape regularisation.
     """
-    return safe_norm(scene.pose.betas)
+    return safe_norm(jnp.asarray(scene.pose.betas))
 
 
 def start_pull(scene: Scene) -> Scalar:
