@@ -1,0 +1,94 @@
+"""Annotations hold: the library runs under jaxtyping's import hook, with every shape and type enforced."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+HOOK = """
+import sys
+import warnings
+warnings.filterwarnings("ignore")
+from jaxtyping import install_import_hook
+# as for every type checker, an int is a float too
+install_import_hook("jaxfit", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+sys.path.insert(0, {tests!r})
+"""
+
+POSE = """
+import jax.numpy as jnp
+import numpy as np
+from helpers import random_pose, toy_bird
+from jaxfit import camera, filtering
+from jaxfit.model import kinematics, pose, rotation
+
+bird = toy_bird()
+rig, one = kinematics.fold_bird(bird), random_pose(bird, 0)
+A = kinematics.joint_transforms(rig, one)
+kinematics.posed_joints(rig, A, one)
+camera.to_screen(kinematics.posed_keypoints(rig, A, one), camera.Camera())
+kinematics.posed_vertices(rig, A, one)
+pose.rest_pose(bird), pose.rest_pose(bird, 3), pose.rest_pose(bird, 3, True)
+R = rotation.axis_angle_to_matrix(jnp.ones((4, 3)))
+rotation.unwrap_axis_angle(rotation.matrix_to_axis_angle(R))
+rotation.geodesic_distance(R, R)
+rotation.view_grid(5, 4), rotation.viewing_axis_rotations(30)
+filtering.weighted_median_filter(np.ones((6, 5, 2), np.float32), np.ones((6, 5), np.float32))
+assert bird.keypoints.shape == (12, 3)
+"""
+
+OBJECTIVE = """
+from scenes import all_settings, every_gradient, scene, seen, window_pose
+from jaxfit.objective.objective import evaluate_terms
+pose = window_pose()
+evaluate_terms(scene(pose, seen()), all_settings())
+every_gradient(pose, pose, seen(), all_settings())
+"""
+
+FIT = """
+from pathlib import Path
+from cli_files import arguments, write_inputs
+from jaxfit.cli import main
+
+folder = Path({folder!r})
+write_inputs(folder)
+(folder / "full.yaml").write_text('''
+base: paper
+window: 6
+crop: {{size_px: 64, focal_px: 541.75}}
+initialise: {{method: so3, turns: 6, directions: 8, hypotheses: 2}}
+terms: {{keypoints: 100, mask: 1, mask_smooth_l1: 1, bone_prior: 1, shape_prior: 1, shape_norm: 1, start_pull: 1}}
+stages:
+  - {{name: a, steps: 2, terms: [keypoints, pose_prior, bone_prior, shape_prior, velocity],
+     free: [global_orient, betas], keep_best: true}}
+  - {{name: b, steps: 2, terms: [keypoints, mask, mask_smooth_l1, shape_norm, start_pull, acceleration],
+     free: [body_pose, bone_length, transl, scale], blur: 0.5, carry_moments: true, keypoints_off: [crown]}}
+''')
+assert main(arguments(folder, folder / "out", config="full.yaml")) == 0
+again = ["--init", str(folder / "out" / "poses.npz")]
+assert main([*arguments(folder, folder / "on", config="full.yaml"), *again]) == 0
+assert main(["evaluate", str(folder / "out"), "--truth", str(folder / "birds.json")]) == 0
+assert main(["model", "info", str(folder / "toy.npz")]) == 0
+"""
+
+
+def enforced(program, **environment):
+    head = HOOK.format(tests=str(Path(__file__).parent))
+    command = [sys.executable, "-c", head + program]
+    return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
+
+
+def test_the_hook_catches_a_wrong_shape():
+    wrong = "import jax.numpy as jnp\nfrom jaxfit.model.rotation import *\naxis_angle_to_matrix(jnp.ones((2, 4)))"
+    done = enforced(wrong)
+    assert done.returncode != 0
+    assert "parameter 'axis_angle'" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["pose", "objective", "fit"])
+def test_annotations_hold(name, tmp_path):
+    program = {"pose": POSE, "objective": OBJECTIVE, "fit": FIT.format(folder=str(tmp_path))}[name]
+    done = enforced(program, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert done.returncode == 0, done.stderr[-3000:]
