@@ -12,7 +12,7 @@ constexpr float kSaturated = 1e5f;   // a silhouette is 1 to within 1e-5 from he
 constexpr float kFarAway = 1048576.f;  // px; coordinates are clamped to this, so that squares stay finite
 constexpr float kMinDepth = 1e-8f;
 constexpr float kNegligible = 6.3f;   // scaled; p is below 2^-39 from here
-constexpr float kShortest = 1e-12f;  // an edge's length below which its corners are one
+constexpr float kShortest = 1e-12f;  // an edge's length is held above this
 constexpr float kMinArea = 1e-8f;    // of |2·area|, in units of half the image
 
 // Sixteen faces, lengths scaled by k, vertices in the order that makes the area positive.
@@ -135,18 +135,17 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
   x1 = select(turned, x2, x1), y1 = select(turned, y2, y1);
   x2 = select(turned, x1_old, x2), y2 = select(turned, y1_old, y2);
   const Vec px_x[2] = {x1, x2}, px_y[2] = {y1, y2};
+  // Exactly 0 where two corners are equal, so long as the compiler forms no fused product here.
   const Mask seen = abs(area) > all(kMinArea * 0.25f * scale.size * scale.size);
   const Vec k = all(scale.k);
   x1 = x1 * k, y1 = y1 * k, x2 = x2 * k, y2 = y2 * k, area = abs(area) * k * k;
 
   store(f.x0, x0), store(f.y0, y0);
   const Vec ax[3] = {all(0.f), x1, x2}, ay[3] = {all(0.f), y1, y2};
-  Vec shortest = all(kFull);
   for (int i = 0; i < 3; ++i) {
     const int j = (i + 1) % 3;
     const Vec ex = ax[j] - ax[i], ey = ay[j] - ay[i];
     const Vec length = max(sqrt(fma(ex, ex, ey * ey)), all(kShortest));
-    shortest = min(shortest, length);
     const Vec inverse = all(1.f) / length;
     const Vec tx = ex * inverse, ty = ey * inverse;
     store(f.tx[i], tx), store(f.ty[i], ty);
@@ -165,8 +164,7 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
   const Vec high_x = x0 + max(zero, max(px_x[0], px_x[1])) + shift_high;
   const Vec high_y = y0 + max(zero, max(px_y[0], px_y[1])) + shift_high;
   const Vec last = all(scale.size - 1);
-  // Rounding can give an area to a face with two equal corners, so those are told by their edge.
-  const Mask visible = (shortest > all(kShortest)) & seen &
+  const Mask visible = seen &
                        (low_x <= last) & (low_y <= last) & (zero <= high_x) & (zero <= high_y);
   f.visible &= bits(visible);
 

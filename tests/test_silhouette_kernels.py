@@ -65,7 +65,7 @@ def loss_of(vertices, faces, target, kind="l1", blur=None, backend="native"):
 loss_and_gradient_of = jax.jit(jax.value_and_grad(loss_of), static_argnames=("kind", "blur", "backend"))
 
 
-def assert_close_gradients(found, expected, tolerance=1e-4):
+def assert_close_gradients(found, expected, tolerance):
     assert np.all(np.isfinite(found))
     assert np.all(found[:, 2] == 0)
     # Where an image is nearly all covered, what the kernels leave out of its saturated pixels shows.
@@ -75,17 +75,19 @@ def assert_close_gradients(found, expected, tolerance=1e-4):
 def agree(vertices, faces, target, kind="l1", blur=None):
     """Checks every kernel against the reference; returns the loss's gradient."""
     size = target.shape[0]
+    # The smaller the image, the sharper its edges, and the more a corner's last bit shows.
+    sharpness = max(1.0, 256 / size)
     cotangent = jax.random.normal(jax.random.key(0), (size, size))
     found, expected = (image_and_pull(vertices, faces, cotangent, size, blur, b) for b in ("native", "reference"))
-    np.testing.assert_allclose(found[0], expected[0], atol=5e-5)
-    assert_close_gradients(found[1], expected[1])
+    np.testing.assert_allclose(found[0], expected[0], atol=4e-5 * sharpness)
+    assert_close_gradients(found[1], expected[1], 5e-5 * sharpness)
 
     found, expected = (
         loss_and_gradient_of(vertices, faces, target, kind=kind, blur=blur, backend=b) for b in ("native", "reference")
     )
     assert found[0] == pytest.approx(float(expected[0]), rel=2e-5, abs=1e-3)
     assert found[0] == loss_of(vertices, faces, target, kind=kind, blur=blur)
-    assert_close_gradients(found[1], expected[1])
+    assert_close_gradients(found[1], expected[1], 5e-5 * sharpness)
     return found[1]
 
 
@@ -105,7 +107,7 @@ def test_random_meshes(each_isa, seed, size, kind, dtype):
 
 
 @needs_kernels
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31), st.sampled_from(ISAS or ("none",)), st.sampled_from(["l1", "smooth_l1"]))
 def test_any_mesh(seed, isa, kind):
     raster.choose_isa(isa)

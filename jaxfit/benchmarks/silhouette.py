@@ -78,8 +78,8 @@ def bench_silhouette(
     frames: int = 100,
     repeats: int = 15,
     size: int = 256,
-    vertices: Float[Array, "V 3"] | None = None,
-    faces: Int[Array, "F 3"] | None = None,
+    vertices: Float[Array | np.ndarray, "V 3"] | None = None,
+    faces: Int[Array | np.ndarray, "F 3"] | None = None,
     reference_frames: int = 1,
 ) -> dict:
     """Times mask loss plus vertex gradient over a batch of frames, and checks the gradient.
@@ -116,7 +116,7 @@ def bench_silhouette(
     faces = jnp.asarray(faces)
     target = raster.silhouette(jnp.asarray(screen), faces, size) > 0.5
 
-    def loss(v, f, backend="auto"):
+    def loss(v, f, backend: raster.Backend = "auto"):
         return raster.mask_loss(v, f, target, backend=backend)
 
     loss_only = jax.jit(jax.vmap(loss, in_axes=(0, None)))

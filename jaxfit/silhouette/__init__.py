@@ -4,10 +4,11 @@
 """
 
 from jaxfit.silhouette.native import available_isas, choose_isa, current_isa, kernels_available
-from jaxfit.silhouette.operator import mask_loss, silhouette
+from jaxfit.silhouette.operator import Backend, mask_loss, silhouette
 from jaxfit.silhouette.reference import Blur
 
 __all__ = [
+    "Backend",
     "Blur",
     "available_isas",
     "choose_isa",

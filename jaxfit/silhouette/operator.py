@@ -1,7 +1,7 @@
 """The differentiable operations: soft silhouette and mask loss of one image; batch them by `vmap`."""
 
 import functools
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -59,7 +59,7 @@ def silhouette(
         raise ValueError(f"size: expected an integer from 1 to {2**14}, got {size!r}")
     blur = Blur.for_size(size) if blur is None else blur
     vertices, faces = _as_operands(vertices_screen, faces)
-    image = _silhouette(vertices, faces, int(size), blur, _choose(backend))
+    image: Any = _silhouette(vertices, faces, int(size), blur, _choose(backend))
     return image.astype(vertices_screen.dtype)
 
 
@@ -115,8 +115,8 @@ def mask_loss(
     vertices, faces = _as_operands(vertices_screen, faces)
     weight = jnp.asarray(weight, jnp.float32)
     switch = jax.lax.stop_gradient(weight)
-    loss = weight * _mask_loss(vertices, faces, target, switch, kind, blur, _choose(backend))
-    return loss.astype(vertices_screen.dtype)
+    loss: Any = _mask_loss(vertices, faces, target, switch, kind, blur, _choose(backend))
+    return (weight * loss).astype(vertices_screen.dtype)
 
 
 def _check_mesh(vertices, faces) -> None:
@@ -152,7 +152,7 @@ def _dispatch(backend: str, native_form, reference_form, *operands):
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
-def _silhouette(vertices, faces, size, blur, backend):
+def _silhouette(vertices, faces, size, blur, backend) -> Any:
     return _dispatch(
         backend,
         lambda v, f: native.silhouette(v, f, size, blur),
@@ -180,11 +180,11 @@ _silhouette.defvjp(_silhouette_forward, _silhouette_backward)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5, 6))
-def _mask_loss(vertices, faces, target, weight, kind, blur, backend):
+def _mask_loss(vertices, faces, target, weight, kind, blur, backend) -> Any:
     return _dispatch(
         backend,
-        lambda *operands: native.mask_loss(*operands, kind, blur),
-        lambda *operands: reference.mask_loss(*operands, kind, blur),
+        lambda v, f, t, w: native.mask_loss(v, f, t, w, kind, blur),
+        lambda v, f, t, w: reference.mask_loss(v, f, t, w, kind, blur),
         vertices,
         faces,
         target,
@@ -195,8 +195,8 @@ def _mask_loss(vertices, faces, target, weight, kind, blur, backend):
 def _mask_loss_forward(vertices, faces, target, weight, kind, blur, backend):
     return _dispatch(
         backend,
-        lambda *operands: native.mask_loss_and_gradient(*operands, kind, blur),
-        lambda *operands: jax.value_and_grad(reference.mask_loss)(*operands, kind, blur),
+        lambda v, f, t, w: native.mask_loss_and_gradient(v, f, t, w, kind, blur),
+        lambda v, f, t, w: jax.value_and_grad(reference.mask_loss)(v, f, t, w, kind, blur),
         vertices,
         faces,
         target,
