@@ -1,8 +1,8 @@
 """The compiled kernels: the only module that loads them and registers them with XLA.
 
 A build without a C++ compiler has none: that is announced once, and the reference takes over. Kernels that are there
-but do not load are an error. The environment variable `JAXFIT_KERNEL_ISA` (auto, avx512, avx2 or baseline) chooses
-the instruction set for the process; by default the best one that the processor has.
+but do not load are an error. The environment variable `JAXFIT_KERNEL_ISA` chooses the instruction set for the process
+(avx512, avx2 or baseline; by default the best one that the processor has), or does without the kernels (none).
 """
 
 import functools
@@ -26,7 +26,10 @@ _logger = logging.getLogger(__name__)
 
 @functools.cache
 def _kernels() -> ModuleType | None:
-    """The extension module, its handlers registered; None, said once, where it was not built."""
+    """The extension module, its handlers registered; None, said once, where it was not built or not wanted."""
+    if os.environ.get(ISA_VARIABLE) == "none":
+        _logger.warning("%s=none: silhouettes run in plain JAX, hundreds of times slower.", ISA_VARIABLE)
+        return None
     if importlib.util.find_spec(_MODULE) is None:
         _logger.warning(
             "jaxfit was installed without its compiled kernels, so silhouettes run in plain JAX, hundreds of times "
@@ -43,12 +46,12 @@ def _kernels() -> ModuleType | None:
 def _require() -> ModuleType:
     kernels = _kernels()
     if kernels is None:
-        raise RuntimeError("jaxfit was installed without its compiled kernels: use backend='auto' or 'reference'")
+        raise RuntimeError("jaxfit runs without its compiled kernels: use backend='auto' or 'reference'")
     return kernels
 
 
 def kernels_available() -> bool:
-    """Whether the compiled kernels were built with this installation."""
+    """Whether the compiled kernels were built with this installation, and are not switched off."""
     return _kernels() is not None
 
 
