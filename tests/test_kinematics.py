@@ -15,7 +15,8 @@ from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_joints, p
 from jaxfit.model.pose import Pose, rest_pose
 from jaxfit.model.sources import import_sources
 
-BIRD = toy_bird()
+AT = np.float32([0.5, -1.0, 2.0])  # a root that is not the origin, or turning about either would be the same
+BIRD = dataclasses.replace(toy_bird(), vertices=toy_bird().vertices + AT, joints=toy_bird().joints + AT)
 RIG = fold_bird(BIRD)
 
 

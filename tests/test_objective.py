@@ -189,9 +189,9 @@ def test_settings_are_traced():
     one_by_one = [float(compiled(settings(*jnp.array(values)))) for values in sweep]
     assert len(traces) == 1
     assert len(set(one_by_one)) == len(sweep)
-    together = jax.vmap(lambda v: total(settings(*v)))(jnp.array(sweep))
+    together = jax.jit(jax.vmap(lambda v: total(settings(*v))))(jnp.array(sweep))
     np.testing.assert_allclose(together, one_by_one, rtol=1e-5)
-    gradient = jax.grad(lambda v: total(settings(*v)))(jnp.array(sweep[0]))
+    gradient = jax.jit(jax.grad(lambda v: total(settings(*v))))(jnp.array(sweep[0]))
     assert np.isfinite(gradient).all()
     assert (np.abs(gradient) > 0).all()
 
