@@ -1,8 +1,6 @@
 """The compiled kernels against the plain JAX reference, on every instruction set."""
 
 import functools
-import logging
-import os
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxfit import silhouette as raster
-from jaxfit.silhouette import native
 
 ISAS = raster.available_isas()
 needs_kernels = pytest.mark.skipif(not ISAS, reason="built without the kernels")
@@ -230,18 +227,6 @@ def test_an_index_out_of_range_is_an_error():
 
 
 @needs_kernels
-def test_choosing_an_instruction_set_that_is_not_there():
-    with pytest.raises(ValueError, match=r"'sse9' is not available here: choose one of auto.*baseline"):
-        raster.choose_isa("sse9")
-    for isa in ISAS:
-        raster.choose_isa(isa)
-        assert raster.current_isa() == isa
-    raster.choose_isa("auto")
-    assert raster.current_isa() == ISAS[0]
-    assert ISAS[-1] == "baseline"
-
-
-@needs_kernels
 def test_only_the_cpu_program_holds_the_call():
     vertices, faces = random_mesh(0, faces=4)
     gradient = jax.jit(jax.grad(lambda v: raster.mask_loss(v, faces, jnp.zeros((16, 16), bool))))
@@ -267,62 +252,3 @@ def test_without_differentiation_only_the_loss_is_computed():
     assert "gradient" not in jax.jit(loss).lower(vertices).as_text()
     once = jax.jit(jax.value_and_grad(loss)).lower(vertices).compile().as_text()
     assert once.count('custom_call_target="jaxfit_mask_loss') == 1
-
-
-class TestWithoutKernels:
-    @pytest.fixture(autouse=True)
-    def no_kernels(self, monkeypatch):
-        native._kernels.cache_clear()
-        monkeypatch.setattr(native, "_MODULE", "jaxfit._kernels_that_were_never_built")
-        yield
-        native._kernels.cache_clear()
-
-    def test_the_reference_takes_over_and_says_so_once(self, caplog):
-        vertices, faces = random_mesh(0, faces=4)
-        with caplog.at_level(logging.WARNING, logger="jaxfit"):
-            images = [raster.silhouette(vertices, faces, 16) for _ in range(2)]
-        np.testing.assert_array_equal(images[0], raster.silhouette(vertices, faces, 16, backend="reference"))
-        assert [r.message.count("without its compiled kernels") for r in caplog.records] == [1]
-        assert raster.available_isas() == ()
-        assert raster.current_isa() is None
-        assert not raster.kernels_available()
-
-    def test_insisting_on_them_is_an_error(self):
-        vertices, faces = random_mesh(0, faces=4)
-        with pytest.raises(RuntimeError, match="without its compiled kernels"):
-            raster.silhouette(vertices, faces, 16, backend="native")
-        with pytest.raises(RuntimeError, match="without its compiled kernels"):
-            raster.choose_isa("auto")
-
-
-def test_broken_kernels_fail_loudly(tmp_path, monkeypatch):
-    (tmp_path / "jaxfit_broken_kernels.py").write_text("raise ImportError('undefined symbol: broken')")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(native, "_MODULE", "jaxfit_broken_kernels")
-    native._kernels.cache_clear()
-    try:
-        vertices, faces = random_mesh(0, faces=4)
-        with pytest.raises(ImportError, match="undefined symbol"):
-            raster.silhouette(vertices, faces, 16)
-    finally:
-        native._kernels.cache_clear()
-
-
-def test_the_environment_chooses_the_instruction_set(monkeypatch):
-    if not ISAS:
-        pytest.skip("built without the kernels")
-    native._kernels.cache_clear()
-    monkeypatch.setenv(native.ISA_VARIABLE, "baseline")
-    assert raster.current_isa() == "baseline"
-    native._kernels.cache_clear()
-    monkeypatch.setenv(native.ISA_VARIABLE, "abacus")
-    with pytest.raises(ValueError, match="'abacus' is not available"):
-        raster.current_isa()
-    monkeypatch.delenv(native.ISA_VARIABLE)
-    native._kernels.cache_clear()
-    assert raster.current_isa() == ISAS[0]
-
-
-@pytest.mark.skipif(not os.environ.get("JAXFIT_REQUIRE_KERNELS"), reason="JAXFIT_REQUIRE_KERNELS is not set")
-def test_the_kernels_were_built():
-    assert raster.kernels_available()
