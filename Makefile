@@ -29,7 +29,7 @@ $(VENV)/installed: pyproject.toml $(wildcard kernels/*)
 	@touch $@
 
 test: install
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: install
 	$(BIN)/ruff check jaxfit tests

@@ -87,8 +87,11 @@ def spins():
     spun = Rotation.from_rotvec(turn[:, None] * [0.6, 0, 0.8])
     above = Rotation.from_matrix(viewing_axis_rotations(50)) * Rotation.from_rotvec([np.pi, 0, 0])
     past_pi = Rotation.from_rotvec(np.linspace(2, 4.3, 50)[:, None] * [0, 0, 1])
+    whole_turn = Rotation.from_rotvec(np.linspace(0, 2 * np.pi, 49)[:, None] * [0, 0, 1])
+    whole_turn = Rotation.concatenate([whole_turn, Rotation.identity(1)])  # no rotation has no axis to go on about
     return {
         "about a fixed axis": spun,
+        "to where it began": whole_turn,
         "seen from above": above,  # every one of them a half turn, of either sign
         "seen from above, leaning": Rotation.from_rotvec(wobble) * above,
         "through π, leaning": past_pi * Rotation.from_rotvec(wobble),

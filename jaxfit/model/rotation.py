@@ -86,7 +86,10 @@ def unwrap_axis_angle(axis_angle: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
         axis = current / jnp.maximum(theta, 1e-9)
         # nearest point of the line of representatives: (θ + 2πk)·axis closest to the predecessor
         k = jnp.round((jnp.dot(previous, axis) - theta) / (2 * jnp.pi))
-        nearest = jnp.where(theta < 1e-6, current, current + 2 * jnp.pi * k * axis)
+        # no rotation has no axis: it is a whole number of turns about the predecessor's
+        length = jnp.linalg.norm(previous)
+        turns = 2 * jnp.pi * jnp.round(length / (2 * jnp.pi)) * previous / jnp.maximum(length, 1e-9)
+        nearest = jnp.where(theta < 1e-6, turns, current + 2 * jnp.pi * k * axis)
         return nearest, nearest
 
     _, unwrapped = jax.lax.scan(step, axis_angle[0], axis_angle)
