@@ -17,9 +17,7 @@ def slow_filter(keypoints, confidence, window):
         frames = range(max(0, t - window // 2), min(T, t + window // 2 + 1))
         for k in range(K):
             for axis in range(2):
-                pairs = sorted(
-                    (keypoints[i, k, axis], confidence[i, k]) for i in frames if confidence[i, k] > 0
-                )
+                pairs = sorted((keypoints[i, k, axis], confidence[i, k]) for i in frames if confidence[i, k] > 0)
                 total = sum(c for _, c in pairs)
                 passed = 0.0
                 for value, c in pairs:
@@ -46,9 +44,7 @@ def test_agrees_with_the_plain_loop(T, window, data):
 
 def one(values, confidence, window):
     keypoints = np.stack([values, -np.asarray(values, float)], -1)[:, None].astype(np.float32)
-    return np.asarray(weighted_median_filter(keypoints, np.asarray(confidence, np.float32)[:, None], window))[
-        :, 0
-    ]
+    return np.asarray(weighted_median_filter(keypoints, np.asarray(confidence, np.float32)[:, None], window))[:, 0]
 
 
 def test_hand_computed():

@@ -140,9 +140,7 @@ def test_results_are_not_overwritten_unasked(tmp_path):
     out.mkdir()
     with new_folder(out) as folder:  # an empty folder is nothing to protect
         (folder / "poses.npz").write_bytes(b"1")
-    with pytest.raises(
-        InputError, match=r"out: holds results already \(choose another --out or pass --overwrite\)"
-    ):
+    with pytest.raises(InputError, match=r"out: holds results already \(choose another --out or pass --overwrite\)"):
         new_folder(out).__enter__()
     with new_folder(out, overwrite=True, marker="poses.npz") as folder:
         (folder / "new").write_bytes(b"2")
@@ -222,10 +220,7 @@ def zipped(content):
     return file.getvalue()
 
 
-HUGE = (
-    b"\x93NUMPY\x01\x00v\x00"
-    + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }".ljust(118)
-)
+HUGE = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }".ljust(118)
 
 
 @pytest.mark.parametrize(
@@ -268,9 +263,7 @@ def test_conform_names_what_disagrees():
     layout = {"a": ("N 3", np.float32), "b": ("N", np.int64)}
     arrays = conform({"a": np.ones((2, 3), int), "b": [1, 2]}, layout)
     assert arrays["a"].dtype == np.float32
-    with pytest.raises(
-        ValueError, match=r"b must have shape \(N\), not \(3,\): axis 0 should be 2: N is 2 in a"
-    ):
+    with pytest.raises(ValueError, match=r"b must have shape \(N\), not \(3,\): axis 0 should be 2: N is 2 in a"):
         conform({"a": np.ones((2, 3)), "b": [1, 2, 3]}, layout)
     with pytest.raises(ValueError, match="axis 1 should be 3"):
         conform({"a": np.ones((2, 4)), "b": [1, 2]}, layout)

@@ -49,9 +49,7 @@ def bench_fit(
     config = load_config("paper") if config is None else config
     poses = [smooth_motion(bird, frames, seed + n) for n in range(birds)]
     observations = detect(bird, poses, NOISE_PX, OUTLIERS, seed)
-    short = dataclasses.replace(
-        config, stages=tuple(dataclasses.replace(stage, steps=1) for stage in config.stages)
-    )
+    short = dataclasses.replace(config, stages=tuple(dataclasses.replace(stage, steps=1) for stage in config.stages))
     began = time.perf_counter()
     fit(observations, bird, short)
     compiled = time.perf_counter()

@@ -89,9 +89,7 @@ def read_coco(path: str | Path) -> Observations:
     return _assemble(root, list(images.values()), categories, found)
 
 
-def _assemble(
-    root: Field, images: list[Image], categories: Categories, found: list[Annotation]
-) -> Observations:
+def _assemble(root: Field, images: list[Image], categories: Categories, found: list[Annotation]) -> Observations:
     first_image: dict[int, Image] = {}
     for image in images:
         first_image.setdefault(image.frame_index, image)

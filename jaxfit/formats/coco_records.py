@@ -129,11 +129,7 @@ def read_annotation(annotation: Field, images: Mapping[int | str, Image], names:
     if annotation.has("segmentation"):
         rle = read_segmentation(annotation["segmentation"], image.height, image.width)
     crowd = annotation.has("iscrowd") and annotation["iscrowd"].integer(0, 1)
-    label = (
-        f"id {annotation['id'].identifier()!r} ({annotation.path})"
-        if annotation.has("id")
-        else annotation.path
-    )
+    label = f"id {annotation['id'].identifier()!r} ({annotation.path})" if annotation.has("id") else annotation.path
     return Annotation(
         label=label,
         track_id=annotation["track_id"].integer(),

@@ -133,9 +133,7 @@ def read_json(path: Path) -> Field:
     except json.JSONDecodeError as error:
         # a file cut off midway breaks where it ends, or at the string or list that the cut left open
         cut = not text.rstrip().endswith(("}", "]"))
-        remedy = (
-            "the file ends midway: copy or write it again" if cut else "correct the file or write it again"
-        )
+        remedy = "the file ends midway: copy or write it again" if cut else "correct the file or write it again"
         problem = f"is not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
         raise InputError(path, problem, remedy) from error
     except (RecursionError, ValueError) as error:  # nested, or digits, without end

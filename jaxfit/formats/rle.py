@@ -52,9 +52,7 @@ def read_segmentation(segmentation: Field, height: int, width: int) -> dict[str,
         problem = f"is corrupt: its runs cover {sum(runs)} pixels of the image's {height * width}"
         segmentation["counts"].fail(problem, _REMEDY)
     # written anew from the checked numbers, so that pycocotools never reads the file's own text
-    return cast(
-        Any, coco_mask.frPyObjects(cast(Any, {"size": [height, width], "counts": runs}), height, width)
-    )
+    return cast(Any, coco_mask.frPyObjects(cast(Any, {"size": [height, width], "counts": runs}), height, width))
 
 
 def _polygon(polygon: Field, height: int, width: int) -> list[float]:
