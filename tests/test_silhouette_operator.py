@@ -66,7 +66,8 @@ def test_gradients_by_finite_differences(backend):
         return lambda v: raster.mask_loss(v, FACES[:1], target, kind=kind, blur=blur, backend=backend)
 
     checked = [loss("l1", 0.0), loss("l1", 1.0), loss("smooth_l1", 0.3), lambda v: jnp.sum(weights * image(v))]
-    for function in checked:
+    # JAX derives the reference's gradients; one loss and the image, which share all of its code, do for it.
+    for function in checked if backend == "native" else (checked[2], checked[3]):
         check_grads(on_xy(function), (middle[:, :2],), 1, modes=["rev"], eps=0.05, rtol=1e-2, atol=1e-2)
 
 

@@ -1,5 +1,7 @@
 """Agreement with PyTorch3D's soft silhouette, for both backends and every instruction set."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,27 +38,37 @@ def relative_error(found, expected):
     return np.linalg.norm(np.asarray(found, np.float64) - expected) / np.linalg.norm(expected)
 
 
+# Compiled once a mesh size and backend.
+@functools.partial(jax.jit, static_argnames="backend")
+def loss_and_gradient(vertices, faces, target, focal, backend):
+    def loss_of(vertices):
+        return raster.mask_loss(project(vertices, focal), faces, target, backend=backend)
+
+    return jax.value_and_grad(loss_of)(vertices)
+
+
+@functools.partial(jax.jit, static_argnames="backend")
+def image_and_gradient(vertices, faces, target, focal, backend):
+    """The image, and the loss's gradient by way of it: this is the kernel that takes a cotangent image."""
+    image, pull = jax.vjp(
+        lambda v: raster.silhouette(project(v, focal), faces, target.shape[0], backend=backend), vertices
+    )
+    return image, pull(jnp.sign(image - target))[0]
+
+
 def check(data, case, backend):
     vertices, faces, target, expected, loss, gradient = (
         data[f"{case}/{name}"] for name in ("vertices", "faces", "target", "silhouette", "loss", "grad_vertices")
     )
-
-    def loss_of(vertices):
-        return raster.mask_loss(project(vertices, data["focal"]), faces, target, backend=backend)
-
-    found_loss, found_gradient = jax.jit(jax.value_and_grad(loss_of))(vertices)
+    found_loss, found_gradient = loss_and_gradient(vertices, faces, target, data["focal"], backend)
     assert found_loss == pytest.approx(float(loss), rel=1e-5)
     assert relative_error(found_gradient, gradient) < 1e-4
-
-    def image_of(vertices):
-        return raster.silhouette(project(vertices, data["focal"]), faces, 256, backend=backend)
-
-    image, pull = jax.vjp(jax.jit(image_of), jnp.asarray(vertices))
-    np.testing.assert_allclose(image, expected, atol=1e-4)
     if backend == "native" or case in SMALL:
-        # The loss once more, by way of the image: this is the kernel that takes a cotangent image.
-        (by_image,) = pull(jnp.sign(image - target))
+        image, by_image = image_and_gradient(vertices, faces, target, data["focal"], backend)
         assert relative_error(by_image, gradient) < 1e-4
+    else:
+        image = raster.silhouette(project(vertices, data["focal"]), faces, len(target), backend=backend)
+    np.testing.assert_allclose(image, expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("case", CASES)

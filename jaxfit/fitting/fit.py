@@ -64,7 +64,7 @@ def fit(
             "detect more keypoints, or lower min_keypoints in the config",
         )
     camera = Camera(config.crop.focal_px, config.crop.size_px / 2, config.crop.size_px)
-    # Without shape directions, skinning is one matrix product: leave them out where nothing moves them.
+    # shape directions that nothing moves would only cost time
     shaped = any("betas" in stage.free for stage in config.stages) or (start is not None and start.has_shape)
     used = bird if shaped else _without_shape(bird)
     rig, priors = fold_bird(used), priors_of(used)
