@@ -145,8 +145,7 @@ def _bench(options: argparse.Namespace) -> None:
 
     bird = load_bird(options.model) if options.model else None
     if options.what == "silhouette":
-        mesh = {} if bird is None else {"vertices": bird.vertices, "faces": bird.faces}
-        result = bench_silhouette(**mesh)
+        result = bench_silhouette(vertices=bird and bird.vertices, faces=bird and bird.faces)
     else:
         if bird is None:
             raise InputError("bench fit", "needs a bird", "give one by --model, as `jaxfit model import` writes it")
