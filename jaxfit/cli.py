@@ -142,13 +142,16 @@ def _bench(options: argparse.Namespace) -> None:
     from jaxfit.benchmarks.fit import bench_fit
     from jaxfit.benchmarks.silhouette import bench_silhouette
     from jaxfit.model.files import load_bird
+    from jaxfit.reference_data import reference_bird
 
     bird = load_bird(options.model) if options.model else None
     if options.what == "silhouette":
         result = bench_silhouette(vertices=bird and bird.vertices, faces=bird and bird.faces)
     else:
+        bird = bird or reference_bird()
         if bird is None:
-            raise InputError("bench fit", "needs a bird", "give one by --model, as `jaxfit model import` writes it")
+            remedy = "give one by --model, as `jaxfit model import` writes it, or set JAXFIT_REFERENCE"
+            raise InputError("bench fit", "needs a bird", remedy)
         result = bench_fit(bird, options.birds, options.frames, progress=terminal)
     if options.json:
         _print_json(result)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import sys
 import time
 from pathlib import Path
@@ -18,8 +17,8 @@ from jaxfit.fitting.fit import fit
 from jaxfit.fitting.solution import save_solution
 from jaxfit.fitting.summary import summarise
 from jaxfit.formats.coco import read_coco
-from jaxfit.model.sources import import_sources
 from jaxfit.progress import terminal
+from jaxfit.reference_data import reference_bird, reference_folder
 from jaxfit.view.sheet import contact_sheet
 
 OUT = Path("demo")
@@ -30,14 +29,13 @@ models/aves and cub, and run it again. (A built-in bird will make this unnecessa
 
 def main() -> int:
     """Fit all species by the shipped config `photo`; leave results and contact sheets in `demo/`."""
-    reference = Path(os.environ.get("JAXFIT_REFERENCE") or Path("..") / "shared")
+    reference, bird = reference_folder(), reference_bird()
     console = Console()
-    if not (reference / "cub").is_dir() or not (reference / "models" / "aves").is_dir():
+    if reference is None or bird is None or not (reference / "cub").is_dir():
         console.print(ABSENT)
         return 0
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     cli.use_cache()
-    bird = import_sources("aves", [reference / "models" / "aves"])
     config = load_config("photo")
     table = Table("species", "birds", "PCK@0.05", "PCK@0.10", "IoU", "seconds", title="without a starting point")
     for column in table.columns[1:]:

@@ -28,6 +28,7 @@ _REMEDIES = {
     errno.EBUSY: "it is a mount point or in use: choose a folder inside it",
     errno.EIO: "check the disk or choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOENT: "choose another place",
     errno.ENOTDIR: "a part of its path is a file: choose another place",
     errno.EEXIST: "a part of its path is a file: choose another place",
     errno.ENOTEMPTY: "something else wrote there meanwhile: choose another place",
@@ -153,7 +154,11 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
 
 def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = None) -> None:
     """Raise `new_folder`'s InputError where it would refuse ``path``: before long work rather than after it."""
-    path = Path(path)
+    path = Path(path).resolve()
+    with _write_errors(path):  # permissions alone do not tell: try
+        probe = _temporary(next(parent for parent in path.parents if parent.exists()) / path.name, ".probe")
+        probe.mkdir()
+        probe.rmdir()
     if not path.exists():
         return
     if not path.is_dir():

@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -27,11 +26,11 @@ from jaxfit.benchmarks.silhouette import bench_silhouette
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.start import load_start
-from jaxfit.model.sources import import_sources
+from jaxfit.model.bird import Bird
 from jaxfit.progress import terminal
+from jaxfit.reference_data import reference_bird, reference_folder
 
 BASELINE = Path(__file__).with_name("baseline.json")
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
@@ -61,9 +60,8 @@ def raster_core() -> Iterator[Metric]:
     yield Metric("silhouette: gradient error", result["gradient_error"], "1", "less", 1.0)
 
 
-def photographs(reference: Path) -> Iterator[Metric]:
+def photographs(bird: Bird, reference: Path) -> Iterator[Metric]:
     """Five species of photographs: from a regressor's starting points, and from nothing."""
-    bird = import_sources("aves", [reference / "models" / "aves"])
     for name in ("aves", "photo"):
         config, rows, seconds = load_config(name), [], 0.0
         for path in sorted((reference / "cub").glob("*.json")):
@@ -83,9 +81,8 @@ def photographs(reference: Path) -> Iterator[Metric]:
         yield Metric(f"photographs, {name}: 73 images", seconds, "s", "less", 1.0)
 
 
-def windows(reference: Path) -> Iterator[Metric]:
+def windows(bird: Bird) -> Iterator[Metric]:
     """The paper's setting against single frames, on 2 simulated birds × 100 frames."""
-    bird = import_sources("aves", [reference / "models" / "aves"])
     results = {
         name: bench_fit(bird, birds=2, frames=100, config=load_config(name), seed=7, progress=terminal)
         for name in ("paper", "baseline")
@@ -96,9 +93,8 @@ def windows(reference: Path) -> Iterator[Metric]:
         yield Metric(f"windows: {figure}, paper over baseline", ratio, "1", "less", 0.1)
 
 
-def scene(reference: Path) -> Iterator[Metric]:
+def scene(bird: Bird) -> Iterator[Metric]:
     """9 birds × 100 frames through the paper's 600 + 400 steps."""
-    bird = import_sources("aves", [reference / "models" / "aves"])
     result = bench_fit(bird, progress=terminal)
     yield Metric("scene of 9 birds: fit", result["minutes"], "min", "less", 1.0)
     yield Metric("scene of 9 birds: first run's compilation", result["compile_s"], "s", "less", 2.0)
@@ -114,12 +110,12 @@ def main() -> int:
     options = parser.parse_args()
     cli.use_cache()
     console = Console()
-    reference = Path(os.environ.get("JAXFIT_REFERENCE") or ROOT / ".." / "shared")
+    reference, bird = reference_folder(), reference_bird()
     metrics = list(raster_core())
-    if (reference / "cub").is_dir():
-        metrics += photographs(reference)
-        metrics += windows(reference)
-        metrics += scene(reference) if options.full else ()
+    if reference is not None and bird is not None:
+        metrics += photographs(bird, reference)
+        metrics += windows(bird)
+        metrics += scene(bird) if options.full else ()
     else:
         console.print("no reference data (JAXFIT_REFERENCE): only the raster core is measured")
     known = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
