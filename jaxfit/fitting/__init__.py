@@ -1,0 +1,1 @@
+"""From observations to poses: windows, starting poses, stages, the solver, results."""

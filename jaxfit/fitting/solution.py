@@ -23,7 +23,7 @@ FORMAT_VERSION = 1
 
 _POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
 
-_LAYOUT = {
+LAYOUT = {
     "track_id": ("N", np.int64),
     "frame_index": ("T", np.int64),
     "valid": ("N T", np.bool_),
@@ -90,13 +90,13 @@ class Solution:
     """(N,) str: how each track's fit ended."""
 
     def __post_init__(self):
-        arrays = conform(vars(self), _LAYOUT)
+        arrays = conform(vars(self), LAYOUT)
         if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
             bones = arrays["body_pose"].shape[2]
             raise ValueError(f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}")
         loss = {}
         for term, value in self.loss.items():
-            layout = {"status": _LAYOUT["status"], f"loss[{term}]": ("N", np.float64)}
+            layout = {"status": LAYOUT["status"], f"loss[{term}]": ("N", np.float64)}
             loss[str(term)] = conform({"status": self.status, f"loss[{term}]": value}, layout)[f"loss[{term}]"]
         focal = float(self.focal)
         if not 0 < focal < math.inf:
@@ -133,7 +133,7 @@ def save_solution(
         TypeError: ``summary`` holds what JSON has no form for.
     """
     summary_json = json.dumps(_plain(summary), indent=2, allow_nan=False)
-    arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in _LAYOUT}
+    arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in LAYOUT}
     terms = list(solution.loss)
     arrays["loss"] = np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
     arrays["loss_terms"] = np.array(terms, dtype=np.str_)
@@ -182,9 +182,9 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     if version > FORMAT_VERSION:
         problem = f"format_version is {version}, newer than this jaxfit reads ({FORMAT_VERSION})"
         raise InputError(path, problem, "install a newer jaxfit")
-    ndim = {name: len(shape.split()) for name, (shape, _) in _LAYOUT.items()}
+    ndim = {name: len(shape.split()) for name, (shape, _) in LAYOUT.items()}
     arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0, "crop_px": 0})
-    values: dict[str, Any] = {name: arrays[name] for name in _LAYOUT}
+    values: dict[str, Any] = {name: arrays[name] for name in LAYOUT}
     values |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays["loss_terms"], arrays["loss"]
     if loss.shape[1] != len(terms):

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfit.errors import InputError
+from jaxfit.fitting.solution import LAYOUT
 from jaxfit.fitting.window import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
@@ -18,18 +19,8 @@ from jaxfit.storage import conform, load_npz
 
 __all__ = ["Start", "load_start"]
 
-_LAYOUT = {
-    "track_id": ("N", np.int64),
-    "frame_index": ("T", np.int64),
-    "global_orient": ("N T 3", np.float32),
-    "body_pose": ("N T J-1 3", np.float32),
-    "transl": ("N T 3", np.float32),
-    "scale": ("N T", np.float32),
-    "bone_length": ("N T J-1", np.float32),
-    "betas": ("N T S", np.float32),
-    "crop": ("N T 3", np.float32),
-}
-_FIELDS = tuple(_LAYOUT)[2:]
+_FIELDS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "crop")
+_LAYOUT = {name: LAYOUT[name] for name in ("track_id", "frame_index", *_FIELDS)}
 
 
 @dataclass(frozen=True)

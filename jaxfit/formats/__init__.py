@@ -1,0 +1,1 @@
+"""Files of observations: readers and writers."""
