@@ -11,29 +11,14 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from cli_files import BIRD, T, arguments, refused, write_inputs
+from cli_files import BIRD, T, arguments, refused
 
 from jaxfit import cli
 from jaxfit.cli import main
 from jaxfit.fitting.solution import load_solution
 from jaxfit.model.files import load_bird
 
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    """The command keeps compiled programs in the user's cache: here in one of the test's own."""
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    yield
-    jax.config.update("jax_compilation_cache_dir", before[0])
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", before[1])
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 @pytest.fixture(scope="module")

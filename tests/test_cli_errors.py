@@ -4,27 +4,11 @@ import json
 import os
 import pickle
 
-import jax
 import numpy as np
 import pytest
-from cli_files import arguments, refused, write_inputs
+from cli_files import arguments, refused
 
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    """The command keeps compiled programs in the user's cache: here in one of the test's own."""
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    yield
-    jax.config.update("jax_compilation_cache_dir", before[0])
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", before[1])
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def first_annotation(**changes):
