@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from dataclasses import replace
 from typing import NamedTuple
@@ -24,7 +23,6 @@ from jaxfit.progress import Tick
 
 __all__ = ["Fitted", "fit_batch", "frames_per_batch"]
 
-logger = logging.getLogger(__name__)
 SECONDS_A_CALL = 1.0
 """How long the solver may run between two looks at progress and Ctrl-C."""
 
