@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfit import native
 from jaxfit import silhouette as raster
-from jaxfit.silhouette import native
 
 ISAS = raster.available_isas()
 needs_kernels = pytest.mark.skipif(not ISAS, reason="built without the kernels")

@@ -13,7 +13,7 @@ from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations, check_keypoints
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.silhouette.hard import hard_mask
+from jaxfit.render import hard_mask
 
 __all__ = ["COLUMNS", "Evaluation", "evaluate"]
 

@@ -11,7 +11,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
 from jaxfit.observations import Observations, encode_mask
-from jaxfit.silhouette.hard import hard_mask
+from jaxfit.render import hard_mask
 
 __all__ = ["detect"]
 

@@ -11,7 +11,7 @@ from jaxfit.fitting.posed import PosedBirds
 from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
-from jaxfit.silhouette.hard import hard_mask
+from jaxfit.render import hard_mask
 from jaxfit.storage import write_whole
 
 __all__ = ["contact_sheet"]
