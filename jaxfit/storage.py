@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfit.errors import InputError
 
-__all__ = ["check_replaceable", "conform", "load_npz", "new_folder", "write_whole"]
+__all__ = ["check_replaceable", "conform", "load_npz", "new_file", "new_folder", "write_whole"]
 
 # What the operating system may answer to a write, and what the user can do about it.
 _REMEDIES = {
@@ -86,14 +86,32 @@ def _sync_descriptor(descriptor: int) -> None:
 
 
 def write_whole(path: str | Path, content: bytes | Callable[[BinaryIO], Any]) -> None:
-    """Write one file, whole or not at all.
-
-    The content goes to a temporary sibling, onto the disk and only then to its name, so that a reader never
-    sees half a file and an older file of that name survives a failure. Missing folders above are made.
+    """Write one file, whole or not at all, as ``new_file`` does.
 
     Args:
         path: the file; an existing one is replaced.
         content: its bytes, or a function that writes them to the binary file it is given.
+
+    Raises:
+        InputError: as ``new_file``.
+    """
+    with new_file(path) as part, part.open("xb") as file:
+        if callable(content):
+            content(file)
+        else:
+            file.write(content)
+
+
+@contextmanager
+def new_file(path: str | Path) -> Iterator[Path]:
+    """A file that appears whole or not at all.
+
+    ``with new_file("out.mp4") as part:`` gives the name of a temporary sibling, which the body makes. When
+    the body ends, it goes onto the disk and only then to its name, so that a reader never sees half a file
+    and an older file of that name survives a failure. Missing folders above are made.
+
+    Args:
+        path: the file; an existing one is replaced.
 
     Raises:
         InputError: ``path`` is a folder or a device, or the system refuses the write (disk full, quota,
@@ -105,13 +123,8 @@ def write_whole(path: str | Path, content: bytes | Callable[[BinaryIO], Any]) ->
     part = _temporary(path, ".part")
     with _write_errors(path), _parents(path):
         try:
-            with part.open("xb") as file:
-                if callable(content):
-                    content(file)
-                else:
-                    file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
+            yield part
+            _sync(part)
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
