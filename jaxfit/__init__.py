@@ -9,7 +9,7 @@ from jaxfit.fitting.fit import fit
 from jaxfit.fitting.solution import Solution, load_solution, save_solution
 from jaxfit.formats.coco import read_coco, write_coco
 from jaxfit.model.bird import Bird
-from jaxfit.model.files import load_bird, save_bird
+from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
 from jaxfit.observations import Observations
 
 __version__ = metadata.version("jaxfit")
@@ -22,9 +22,11 @@ __all__ = [
     "Observations",
     "Solution",
     "evaluate",
+    "find_bird",
     "fit",
     "load_bird",
     "load_config",
+    "load_murre",
     "load_solution",
     "read_coco",
     "save_bird",

@@ -5,7 +5,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from jaxfit.model.bird import Bird
+from jaxfit.model.bird import Bird, free_limits, neutral_colours
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
 
@@ -70,6 +70,8 @@ def toy_bird(shapes: int = 2) -> Bird:
         pose_covariance=0.1 * jnp.eye(3 * bones),
         bone_mean=jnp.ones(bones),
         bone_covariance=0.01 * jnp.eye(bones),
+        vertex_colours=jnp.asarray(neutral_colours(len(vertices))),
+        joint_limits=jnp.asarray(free_limits(bones)),
         parents=tuple(-1 if part[0] is None else names.index(part[0]) for part in PARTS.values()),
         joint_names=names,
         keypoint_names=tuple(KEYPOINTS),

@@ -13,7 +13,7 @@ from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.checks import ARRAY_FIELDS, check_bird
 from jaxfit.model.describe import describe_bird, model_hash
-from jaxfit.model.files import load_bird, save_bird
+from jaxfit.model.files import OPTIONAL_FIELDS, find_bird, load_bird, save_bird
 
 STATIC = ("parents", "joint_names", "keypoint_names", "joint_pairs", "keypoint_pairs", "name")
 
@@ -34,6 +34,8 @@ def tiny_bird(shapes: int = 2, **changes) -> Bird:
         "pose_covariance": half @ half.T,
         "bone_mean": np.ones(3),
         "bone_covariance": np.diag([0.0, 1.0, 2.0]),
+        "vertex_colours": np.array([[0, 0, 0], [1, 1, 1], [0.2, 0.1, 0.1], [0.5, 0.5, 0.5]]),
+        "joint_limits": rng.uniform(0.1, 2, size=(3, 3, 2)) * [-1, 1],
         "parents": (-1, 0, 1, 1),
         "joint_names": ("root", "body", "left_wing", "right_wing"),
         "keypoint_names": ("bill_tip", "left_wingtip", "right_wingtip"),
@@ -121,6 +123,12 @@ BROKEN = {
     "pose_covariance zero": (np.zeros((9, 9)), "zero"),
     "bone_mean": (np.ones(4), "B = 3"),
     "bone_covariance": (np.eye(4), "B = 3"),
+    "vertex_colours": (np.full((4, 3), 1.1), "[0, 1]"),
+    "vertex_colours negative": (np.full((4, 3), -0.1), "[0, 1]"),
+    "vertex_colours count": (np.zeros((5, 3)), "V = 4"),
+    "joint_limits": (np.tile([1.0, -1.0], (3, 3, 1)), "least angle of body"),
+    "joint_limits far": (np.tile([-7.0, 7.0], (3, 3, 1)), "full turn"),
+    "joint_limits shape": (np.zeros((3, 3, 3)), "2 = 2"),
     "parents": ((-1, 0, 3, 1), "parent of joint 2"),
     "parents second root": ((-1, 0, -1, 1), "parent of joint 2"),
     "parents no root": ((0, 0, 1, 1), "root"),
@@ -154,6 +162,7 @@ def test_at_most_eight_joints_move_a_vertex():
         "pose_covariance": np.eye(3 * bones),
         "bone_mean": np.ones(bones),
         "bone_covariance": np.eye(bones),
+        "joint_limits": np.tile([-1.0, 1.0], (bones, 3, 1)),
     }
     eight, nine = np.zeros((4, 10)), np.zeros((4, 10))
     eight[:, :8], nine[:, :9] = 1 / 8, 1 / 9
@@ -194,15 +203,29 @@ def test_objects_are_never_loaded(tmp_path):
     assert canary.exists()  # the object would have acted, had it been loaded
 
 
-@pytest.mark.parametrize("field", ["format_version", *ARRAY_FIELDS, *STATIC])
+REQUIRED = [field for field in ARRAY_FIELDS if field not in OPTIONAL_FIELDS]
+
+
+@pytest.mark.parametrize("field", ["format_version", *REQUIRED, *STATIC])
 def test_every_field_must_be_there(tmp_path, field):
     assert field in refusal(saved(tmp_path, **{field: None}))
+
+
+def test_colours_and_limits_may_be_missing(tmp_path):
+    bird = load_bird(saved(tmp_path, vertex_colours=None, joint_limits=None))
+    np.testing.assert_allclose(bird.vertex_colours, 0.7)
+    np.testing.assert_allclose(bird.joint_limits, np.broadcast_to([-np.pi, np.pi], (3, 3, 2)))
 
 
 @pytest.mark.parametrize("field", ["format_version", *ARRAY_FIELDS, *STATIC])
 def test_every_field_must_have_its_kind(tmp_path, field):
     assert field in refusal(saved(tmp_path, **{field: np.zeros((1, 2, 3, 4))}))
     assert field in refusal(saved(tmp_path, **{field: np.array([b"abc"])}))
+
+
+def test_a_bird_is_found_by_its_name_or_its_path(tmp_path):
+    assert find_bird("murre").name == "murre"
+    assert find_bird(saved(tmp_path)).name == "tiny guillemot"
 
 
 def test_versions(tmp_path):
@@ -231,8 +254,10 @@ def test_the_hash_is_the_content(tmp_path):
         tiny_bird(keypoint_pairs=()),
         tiny_bird(faces=[[0, 2, 1], [0, 1, 3], [0, 3, 2], [2, 3, 1]]),
         tiny_bird(bone_mean=[1, 1, 1 + 1e-6]),
+        tiny_bird(joint_limits=np.tile([-1.0, 1.0], (3, 3, 1))),
     ]
     assert len({known, *map(model_hash, changed)}) == len(changed) + 1
+    assert model_hash(tiny_bird(vertex_colours=np.zeros((4, 3)))) == known
 
 
 def test_description():

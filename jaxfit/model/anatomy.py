@@ -14,7 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = ["AVES_KEYPOINTS", "AVIAN_MESH_KEYPOINTS", "JOINT_NAMES", "mirror_pairs"]
+__all__ = [
+    "AVES_KEYPOINTS",
+    "AVIAN_MESH_KEYPOINTS",
+    "JOINT_NAMES",
+    "MURRE_KEYPOINTS",
+    "MURRE_SKELETON",
+    "mirror_pairs",
+]
 
 JOINT_NAMES = (
     "root",
@@ -79,6 +86,35 @@ AVES_KEYPOINTS = (
     "left_wingtip",
     "right_wingtip",
 )
+
+MURRE_KEYPOINTS = (*AVES_KEYPOINTS, "left_wrist", "right_wrist")
+"""The murre's 20. Hägerlind et al. label 20 points, AVES' 18 and two that they do not name; that these are the
+wrists (carpal joints: the bend of the wing, at the breast side of the folded one) is our choice."""
+
+MURRE_SKELETON = (
+    ("bill_tip", "bill_base"),
+    ("bill_base", "forehead"),
+    ("forehead", "crown"),
+    ("crown", "nape"),
+    ("nape", "back"),
+    ("back", "tail_base"),
+    ("tail_base", "tail_tip"),
+    ("bill_base", "throat"),
+    ("throat", "breast"),
+    ("bill_base", "left_eye"),
+    ("bill_base", "right_eye"),
+    ("left_eye", "crown"),
+    ("right_eye", "crown"),
+    ("back", "left_wrist"),
+    ("back", "right_wrist"),
+    ("left_wrist", "left_wingtip"),
+    ("right_wrist", "right_wingtip"),
+    ("breast", "left_shin"),
+    ("breast", "right_shin"),
+    ("left_shin", "left_foot"),
+    ("right_shin", "right_foot"),
+)
+"""Pairs of the murre's keypoints that a picture joins by lines."""
 
 
 def mirror_pairs(names: Sequence[str]) -> tuple[tuple[int, int], ...]:

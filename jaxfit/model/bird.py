@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["Bird"]
+__all__ = ["Bird", "free_limits", "neutral_colours"]
 
 
 class Bird(eqx.Module):
@@ -42,6 +43,10 @@ class Bird(eqx.Module):
     """Mean bone length, relative to the rest skeleton."""
     bone_covariance: Float[Array, "J-1 J-1"]
     """Covariance of the bone lengths."""
+    vertex_colours: Float[Array, "V 3"]
+    """Colour of each vertex, sRGB in [0, 1]; how the bird looks, which no fit depends on."""
+    joint_limits: Float[Array, "J-1 3 2"]
+    """Least and greatest of each axis-angle component of the body pose, radians; ±π where nothing is known."""
     parents: tuple[int, ...] = eqx.field(static=True)
     """Parent of each joint; −1 for the root."""
     joint_names: tuple[str, ...] = eqx.field(static=True)
@@ -71,3 +76,13 @@ class Bird(eqx.Module):
     def keypoints(self) -> Float[Array, "K 3"]:
         """Rest positions of the keypoints."""
         return jnp.asarray(self.keypoint_weights) @ jnp.asarray(self.vertices)
+
+
+def neutral_colours(vertices: int) -> Float[np.ndarray, "V 3"]:
+    """`vertex_colours` of a model that has none: grey."""
+    return np.full((vertices, 3), 0.7, np.float32)
+
+
+def free_limits(bones: int) -> Float[np.ndarray, "bones 3 2"]:
+    """`joint_limits` of a model that has none: every component may be anything in ±π."""
+    return np.broadcast_to(np.array([-np.pi, np.pi], np.float32), (bones, 3, 2)).copy()

@@ -27,6 +27,8 @@ ARRAY_FIELDS = {
     "pose_covariance": "D D",
     "bone_mean": "B",
     "bone_covariance": "B B",
+    "vertex_colours": "V 3",
+    "joint_limits": "B 3 2",
 }
 """Array fields of `Bird` and their axes: V vertices, F faces, J joints, K keypoints, S shapes, B = J−1 bones,
 D = 3B angles."""
@@ -67,6 +69,8 @@ class _Checker:
         self.require("shape_variance", bool((self.arrays["shape_variance"] > 0).all()), "must be positive")
         for field in ("pose_covariance", "bone_covariance"):
             self.check_covariance(field)
+        self.check_colours()
+        self.check_limits()
 
     def require(self, field: str, holds: object, problem: str) -> None:
         if not holds:
@@ -74,7 +78,7 @@ class _Checker:
 
     def check_shapes(self) -> None:
         bones = max(len(self.bird.parents) - 1, 0)
-        sizes = {"J": bones + 1, "B": bones, "D": 3 * bones, "K": len(self.bird.keypoint_names), "3": 3}
+        sizes = {"J": bones + 1, "B": bones, "D": 3 * bones, "K": len(self.bird.keypoint_names), "3": 3, "2": 2}
         for field, axes in ARRAY_FIELDS.items():
             array = self.arrays[field]
             self.require(field, array.ndim == len(axes.split()), f"shape {array.shape}, expected ({axes})")
@@ -126,3 +130,18 @@ class _Checker:
         # rounding to float32 may push an eigenvalue of 0 a little below it
         problem = f"is not positive semidefinite (eigenvalue {smallest:.3g})"
         self.require(field, smallest >= -1e-5 * size, problem)
+
+    def check_colours(self) -> None:
+        colours = self.arrays["vertex_colours"]
+        least, greatest = float(colours.min()), float(colours.max())
+        problem = f"from {least:.4g} to {greatest:.4g}, sRGB lies in [0, 1]"
+        self.require("vertex_colours", least >= 0 and greatest <= 1, problem)
+
+    def check_limits(self) -> None:
+        limits = self.arrays["joint_limits"]
+        crossed = np.argwhere(limits[..., 0] > limits[..., 1])
+        joint = self.bird.joint_names[crossed[0, 0] + 1] if len(crossed) else ""
+        self.require("joint_limits", not joint, f"the least angle of {joint} exceeds the greatest")
+        far = float(np.abs(limits).max())
+        # no rotation needs a component beyond a full turn
+        self.require("joint_limits", far <= 2 * np.pi + SUM_TOLERANCE, f"{far:.4g} radians is beyond a full turn")

@@ -19,10 +19,12 @@ def model_hash(bird: Bird) -> str:
     """SHA-256 (hexadecimal) of everything that a result can depend on.
 
     It covers arrays (as little-endian float32 and int32), tree, names of joints and keypoints, and pairs. It
-    does not cover `bird.name`, which is only a label, nor how or when the file was written.
+    does not cover `bird.name` and `vertex_colours`, which change no fit, nor how or when the file was written.
     """
     digest = hashlib.sha256(b"jaxfit bird 1\n")
     for field in ARRAY_FIELDS:
+        if field == "vertex_colours":
+            continue
         array = np.ascontiguousarray(getattr(bird, field), "<i4" if field == "faces" else "<f4")
         digest.update(f"{field} {array.shape}\n".encode())
         digest.update(array.tobytes())

@@ -2,7 +2,8 @@
 
 Beside the fields of `Bird` under their own names the file holds `format_version` (now 1); parents and pairs
 are integer arrays, names are arrays of text. A file of a newer version is refused, unknown extra arrays are
-passed over.
+passed over. `vertex_colours` and `joint_limits` may be absent, as they are from files written before birds had
+them: then the bird is grey and its joints turn freely.
 """
 
 from __future__ import annotations
@@ -13,13 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfit.errors import InputError
-from jaxfit.model.bird import Bird
+from jaxfit.model.bird import Bird, free_limits, neutral_colours
 from jaxfit.model.checks import ARRAY_FIELDS, check_bird
 from jaxfit.storage import load_npz, write_whole
 
-__all__ = ["FORMAT_VERSION", "load_bird", "save_bird"]
+__all__ = ["FORMAT_VERSION", "MURRE_PATH", "find_bird", "load_bird", "load_murre", "save_bird"]
 
 FORMAT_VERSION = 1
+MURRE_PATH = Path(__file__).with_name("murre.npz")
+"""The bird that comes with jaxfit; `jaxfit.model.murre.build` writes it."""
+OPTIONAL_FIELDS = ("vertex_colours", "joint_limits")
 STATIC_FIELDS = {
     "parents": 1,
     "joint_names": 1,
@@ -76,6 +80,8 @@ def load_bird(path: Path | str) -> Bird:
         raise InputError(path, problem, "needs a newer jaxfit")
     dimensions = {field: len(axes.split()) for field, axes in ARRAY_FIELDS.items()} | STATIC_FIELDS
     for field, ndim in dimensions.items():
+        if field in OPTIONAL_FIELDS and field not in found:
+            continue
         if field not in found:
             raise InputError(path, f"{field}: missing", "import the model again with `jaxfit model import`")
         kinds = "U" if field in TEXT_FIELDS else "f" if field in ARRAY_FIELDS and field != "faces" else "iu"
@@ -98,7 +104,10 @@ def load_bird(path: Path | str) -> Bird:
         arrays = {
             field: jnp.asarray(whole(found[field]) if field == "faces" else found[field].astype(np.float32))
             for field in ARRAY_FIELDS
+            if field in found
         }
+    arrays.setdefault("vertex_colours", jnp.asarray(neutral_colours(len(found["vertices"]))))
+    arrays.setdefault("joint_limits", jnp.asarray(free_limits(max(len(found["parents"]) - 1, 0))))
     bird = Bird(
         **arrays,
         parents=tuple(int(parent) for parent in found["parents"]),
@@ -109,3 +118,20 @@ def load_bird(path: Path | str) -> Bird:
         name=str(found["name"]),
     )
     return check_bird(bird, path)
+
+
+def load_murre() -> Bird:
+    """The bird that comes with jaxfit: a common guillemot (common murre), *Uria aalge*."""
+    return load_bird(MURRE_PATH)
+
+
+def find_bird(name_or_path: Path | str) -> Bird:
+    """A bird by its name or from its file.
+
+    Args:
+        name_or_path: "murre" for the bird that comes with jaxfit, anything else is the path of an `.npz` file.
+
+    Raises:
+        InputError: as `load_bird`.
+    """
+    return load_murre() if str(name_or_path) == "murre" else load_bird(name_or_path)

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, JOINT_NAMES, mirror_pairs
-from jaxfit.model.bird import Bird
+from jaxfit.model.bird import Bird, free_limits, neutral_colours
 from jaxfit.model.checks import check_bird
 from jaxfit.model.torch_file import read_tensors
 
@@ -178,6 +178,8 @@ def _assemble(
         shape_basis=real(basis),
         shape_variance=real(variance),
         **{field: real(array) for field, array in prior.items()},
+        vertex_colours=jnp.asarray(neutral_colours(len(parts["V"]))),
+        joint_limits=jnp.asarray(free_limits(joints - 1)),
         parents=tuple(int(parent) for parent in parents),
         joint_names=JOINT_NAMES,
         keypoint_names=keypoint_names,
