@@ -117,7 +117,7 @@ ffi::Error silhouette(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi:
   if (!bind_meshes(vertices, faces, batch, blur, meshes, error)) return invalid(error);
   const Kernels& kernels = current_kernels();
   float* out = image->typed_data();
-  return finish(for_each_image(pool, batch.count, [=, &batch, &meshes, &kernels](int64_t i) {
+  return finish(for_each_task(pool, batch.count, [=, &batch, &meshes, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
     kernels.silhouette(mesh, blur, size, scratch(kernels.workspace(mesh, size)), out + i * size * size);
   }));
@@ -137,7 +137,7 @@ ffi::Error silhouette_gradient(ffi::ThreadPool pool, Floats vertices, Indices fa
   const Kernels& kernels = current_kernels();
   const float* from = cotangent.typed_data();
   float* out = gradient->typed_data();
-  return finish(for_each_image(pool, batch.count, [=, &batch, &meshes, &cotangent_at, &kernels](int64_t i) {
+  return finish(for_each_task(pool, batch.count, [=, &batch, &meshes, &cotangent_at, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
     kernels.silhouette_gradient(mesh, blur, size, scratch(kernels.workspace(mesh, size)),
                                 from + cotangent_at.offset(batch, i), out + i * 3 * mesh.num_vertices);
@@ -165,7 +165,7 @@ ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const In
   const Kernels& kernels = current_kernels();
   const float* weights = weight.typed_data();
   float* out = loss->typed_data();
-  return finish(for_each_image(pool, batch.count, [=, &batch, &meshes, &target_at, &weight_at, &kernels](int64_t i) {
+  return finish(for_each_task(pool, batch.count, [=, &batch, &meshes, &target_at, &weight_at, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
     float* slope = gradient ? gradient + i * 3 * mesh.num_vertices : nullptr;
     if (weights[weight_at.offset(batch, i)] == 0) {  // a missing frame costs nothing

@@ -6,9 +6,12 @@
 namespace jaxfit {
 
 extern const Kernels kernels_baseline;
+extern const Renderer renderer_baseline;
 #ifdef JAXFIT_X86
 extern const Kernels kernels_avx2;
+extern const Renderer renderer_avx2;
 extern const Kernels kernels_avx512;
+extern const Renderer renderer_avx512;
 #endif
 
 namespace {
@@ -16,6 +19,7 @@ namespace {
 struct Choice {
   const char* name;
   const Kernels* kernels;
+  const Renderer* renderer;
 };
 
 std::vector<Choice> choices() {
@@ -25,10 +29,10 @@ std::vector<Choice> choices() {
   const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
       __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-    found.push_back({"avx512", &kernels_avx512});
-  if (avx2) found.push_back({"avx2", &kernels_avx2});
+    found.push_back({"avx512", &kernels_avx512, &renderer_avx512});
+  if (avx2) found.push_back({"avx2", &kernels_avx2, &renderer_avx2});
 #endif
-  found.push_back({"baseline", &kernels_baseline});
+  found.push_back({"baseline", &kernels_baseline, &renderer_baseline});
   return found;
 }
 
@@ -53,6 +57,8 @@ std::vector<std::string> available_isas() {
 std::string current_isa() { return all_choices()[chosen()].name; }
 
 const Kernels& current_kernels() { return *all_choices()[chosen()].kernels; }
+
+const Renderer& current_renderer() { return *all_choices()[chosen()].renderer; }
 
 void choose_isa(const std::string& name) {
   if (name == "auto") {

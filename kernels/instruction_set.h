@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "silhouette.h"
+#include "zbuffer.h"
 
 namespace jaxfit {
 
@@ -18,5 +19,6 @@ std::string current_isa();
 void choose_isa(const std::string& name);
 
 const Kernels& current_kernels();
+const Renderer& current_renderer();
 
 }  // namespace jaxfit

@@ -1,10 +1,11 @@
-// The Python module: XLA's handlers as capsules, and the choice of instruction set.
+// The Python module: XLA's handlers as capsules, the renderer, and the choice of instruction set.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
 #include "ffi.h"
 #include "instruction_set.h"
+#include "render.h"
 
 namespace nb = nanobind;
 
@@ -20,6 +21,7 @@ NB_MODULE(_kernels, m) {
     add("jaxfit_mask_loss_and_gradient", jaxfit::mask_loss_and_gradient_handler);
     return found;
   });
+  jaxfit::add_renderer(m);
   m.def("available_isas", &jaxfit::available_isas);
   m.def("current_isa", &jaxfit::current_isa);
   m.def("choose_isa", &jaxfit::choose_isa, nb::arg("name"));

@@ -1,4 +1,4 @@
-// Runs one task an image on XLA's thread pool and on the calling thread.
+// Runs many tasks on a thread pool and on the calling thread.
 #pragma once
 
 #include <algorithm>
@@ -33,11 +33,11 @@ inline void* scratch(size_t bytes) {
 
 // Calls task(i) for each i in [0, count), each on one thread; returns false if one threw.
 //
-// Threads claim images one by one, the caller among them, and the caller waits for claimed images only. So a pool
+// Threads claim tasks one by one, the caller among them, and the caller waits for claimed tasks only. So a pool
 // whose threads are all busy elsewhere slows this down but cannot block it; a helper that starts late finds nothing
 // left to claim, and touches only the state it shares ownership of.
 template <typename Pool, typename Task>
-bool for_each_image(Pool& pool, int64_t count, Task task) {
+bool for_each_task(Pool& pool, int64_t count, Task task) {
   struct State {
     explicit State(int64_t count, Task task) : count(count), task(std::move(task)) {}
     const int64_t count;

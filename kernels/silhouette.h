@@ -4,14 +4,9 @@
 #include <cstddef>
 #include <cstdint>
 
-namespace jaxfit {
+#include "mesh.h"
 
-struct Mesh {
-  const float* vertices;  // (V, 3): x, y in pixels, depth in the camera's frame
-  const int32_t* faces;   // (F, 3), every index in [0, V)
-  int64_t num_vertices;
-  int64_t num_faces;
-};
+namespace jaxfit {
 
 struct Blur {
   float sigma;   // softness s in px²: p = sigmoid(-d / s)

@@ -11,7 +11,6 @@ from jaxfit.render import reference
 __all__ = ["Fragments", "draw", "hard_mask", "interpolate", "zbuffer"]
 
 MAX_SIZE, MAX_SAMPLES = 2**14, 8
-_COMPILED = False
 
 
 class Fragments(NamedTuple):
@@ -56,7 +55,7 @@ def zbuffer(
     _check_size(width, height)
     shape = (len(vertices), height, width)
     face, barycentric, depth = np.empty(shape, np.int32), np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
-    if _COMPILED and kernels_available():
+    if kernels_available():
         require_kernels().zbuffer(vertices, faces, face, barycentric, depth)
     else:
         for i, one in enumerate(vertices):
@@ -76,8 +75,8 @@ def hard_mask(
         raise ValueError(f"vertices_screen: expected shape (V, 3), got {np.shape(vertices_screen)}")
     _check_size(width, height)
     mask = np.zeros((height, width), bool)
-    if _COMPILED and kernels_available():
-        require_kernels().hard_mask(vertices[0], faces, mask)
+    if kernels_available():
+        require_kernels().hard_mask(vertices, faces, mask[None])
     else:
         mask |= reference.raster(vertices[0], faces, width, height, 1)[0] >= 0
     return mask
@@ -118,7 +117,7 @@ def interpolate(
     shape = (len(vertices), height, width)
     values = np.empty((*shape, channels.shape[-1]), np.float32)
     coverage, face = np.empty(shape, np.float32), np.empty(shape, np.int32)
-    if _COMPILED and kernels_available():
+    if kernels_available():
         require_kernels().interpolate(vertices, faces, channels, samples, values, coverage, face)
     else:
         for i, one in enumerate(vertices):
@@ -162,8 +161,8 @@ def draw(
     if channels.shape[-1] != 3:
         raise ValueError(f"colours: expected shape ({vertices.shape[1]}, 3), got {np.shape(colours)}")
     drawn = np.array(image, order="C")
-    if _COMPILED and kernels_available():
-        require_kernels().draw(vertices[0], faces, channels[0], samples, drawn)
+    if kernels_available():
+        require_kernels().draw(vertices, faces, channels[0], samples, drawn)
     else:
         reference.draw(drawn, vertices[0], faces, channels[0], samples)
     return drawn

@@ -38,10 +38,10 @@ def raster(
         near = np.clip(total, inverse_depth.min(), inverse_depth.max())
         # Rounded, so that faces which meet or coincide tie: the first keeps the sample.
         better = (edge >= 0).all(0) & (near.astype(np.float32) > nearness[box].astype(np.float32))
-        weight[0, total == 0], total[total == 0] = 1, 1  # rounded away far outside the image
+        weight[0, total == 0], total[total == 0] = 1, 1  # rounded away, far outside the image
         face[box][better] = index
         nearness[box][better] = near[better]
-        barycentric[box][better] = np.moveaxis(weight / np.where(better, total, 1), 0, -1)[better]
+        barycentric[box][better] = np.moveaxis(weight * (1 / total), 0, -1)[better]
     return face, barycentric, nearness
 
 
@@ -81,7 +81,8 @@ def draw(
     values, coverage, _ = interpolate(vertices, faces, colours, image.shape[1], image.shape[0], samples)
     touched = coverage > 0
     mixed = (1 - coverage[touched, None]) * image[touched] + 255 * values[touched]
-    image[touched] = np.floor(np.clip(mixed + 0.5, 0, 255)).astype(np.uint8)
+    # Rounded to float32 first, so that a half is a half however it was summed.
+    image[touched] = np.clip(mixed.astype(np.float32) + np.float32(0.5), 0, 255).astype(np.uint8)
 
 
 def _by_pixel(samples_of: np.ndarray, samples: int) -> np.ndarray:

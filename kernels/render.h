@@ -1,0 +1,11 @@
+// The renderer's Python functions.
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+namespace jaxfit {
+
+// They fill arrays that the caller has made and checked; jaxfit/render/raster.py is the only one.
+void add_renderer(nanobind::module_& m);
+
+}  // namespace jaxfit

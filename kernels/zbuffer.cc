@@ -1,0 +1,159 @@
+// The z-buffer, compiled once an instruction set (JAXFIT_AVX512, JAXFIT_AVX2, neither).
+//
+// It repeats jaxfit/render/reference.py operation by operation, in double, so that both see the same face at every
+// sample; that needs -ffp-contract=off. First every face writes its nearness (1/depth) and its number where it is the
+// nearest so far; then each sample that was written recomputes the weights of its face. Only tiles of columns that a
+// face has reached are cleared and read again: a few birds in a large image cost what they cover.
+#include "strip.h"
+
+#if defined(JAXFIT_AVX512)
+#define RENDERER renderer_avx512
+#elif defined(JAXFIT_AVX2)
+#define RENDERER renderer_avx2
+#else
+#define RENDERER renderer_baseline
+#endif
+
+namespace jaxfit {
+namespace {
+
+constexpr int64_t kMaxSamples = 8;
+
+// Calls visit(row, column) for every pixel of touched tiles, empty(row, column) for the rest.
+template <typename Visit, typename Empty>
+inline void for_each_pixel(const Strip& s, Visit visit, Empty empty) {
+  for (int64_t row = s.rows.first; row < s.rows.end; ++row)
+    for (int64_t tile = 0; tile < s.tiles; ++tile) {
+      const int64_t end = (tile + 1) * kTile < s.frame.width ? (tile + 1) * kTile : s.frame.width;
+      if (s.touched[tile])
+        for (int64_t column = tile * kTile; column < end; ++column) visit(row, column);
+      else
+        for (int64_t column = tile * kTile; column < end; ++column) empty(row, column);
+    }
+}
+
+void fragments(const Mesh& mesh, Frame frame, Rows rows, void* memory, int32_t* face, float* barycentric,
+               float* depth) {
+  const Strip s = rasterise(mesh, frame, rows, memory);
+  const auto empty = [&](int64_t row, int64_t column) {
+    const int64_t at = row * frame.width + column;
+    face[at] = -1, depth[at] = __builtin_inff();
+    for (int i = 0; i < 3; ++i) barycentric[3 * at + i] = 0;
+  };
+  const auto visit = [&](int64_t row, int64_t column) {
+    const int32_t number = s.face[(row - rows.first) * s.columns + column];
+    if (number < 0) return empty(row, column);
+    const int64_t at = row * frame.width + column;
+    const Face& f = s.faces[number];
+    double weights[3];
+    face[at] = f.index;
+    depth[at] = static_cast<float>(
+        1 / weigh(f, static_cast<double>(column) + 0.5, static_cast<double>(row) + 0.5, weights));
+    for (int i = 0; i < 3; ++i) barycentric[3 * at + i] = static_cast<float>(weights[i]);
+  };
+  for_each_pixel(s, visit, empty);
+}
+
+void mask(const Mesh& mesh, Frame frame, Rows rows, void* memory, uint8_t* mask) {
+  const Strip s = rasterise(mesh, frame, rows, memory);
+  for_each_pixel(
+      s,
+      [&](int64_t row, int64_t column) {
+        if (s.face[(row - rows.first) * s.columns + column] >= 0) mask[row * frame.width + column] = 1;
+      },
+      [](int64_t, int64_t) {});
+}
+
+// One face's share of a pixel: its weights summed over the samples that see it.
+struct Share {
+  const int32_t* corner;
+  double weights[3];
+};
+
+struct Pixel {
+  Share shares[kMaxSamples * kMaxSamples];
+  int count = 0;     // of shares
+  int covered = 0;   // samples
+  int32_t face = -1;  // the nearest sample's
+};
+
+Pixel gather(const Mesh& mesh, const Strip& s, int64_t row, int64_t column) {
+  Pixel pixel;
+  const int64_t n = s.frame.samples;
+  float nearest = -1;
+  int32_t last = -1;
+  for (int64_t line = 0; line < n; ++line) {
+    const int64_t at = ((row - s.rows.first) * n + line) * s.columns + column * n;
+    for (int64_t i = 0; i < n; ++i) {
+      const int32_t number = s.face[at + i];
+      if (number < 0) continue;
+      const Face& f = s.faces[number];
+      double weights[3];
+      weigh(f, static_cast<double>(column * n + i) + 0.5, static_cast<double>(row * n + line) + 0.5, weights);
+      if (number != last || !pixel.count) {
+        last = number;
+        Share& fresh = pixel.shares[pixel.count++];
+        fresh.corner = mesh.faces + 3 * f.index;
+        for (int c = 0; c < 3; ++c) fresh.weights[c] = 0;
+      }
+      for (int c = 0; c < 3; ++c) pixel.shares[pixel.count - 1].weights[c] += weights[c];
+      ++pixel.covered;
+      if (s.near[at + i] > nearest) nearest = s.near[at + i], pixel.face = f.index;
+    }
+  }
+  return pixel;
+}
+
+// Σ weight · attribute over the samples of a pixel.
+double total(const Pixel& pixel, const float* attributes, int64_t channels, int64_t channel) {
+  double sum = 0;
+  for (int i = 0; i < pixel.count; ++i)
+    for (int c = 0; c < 3; ++c)
+      sum += pixel.shares[i].weights[c] *
+             static_cast<double>(attributes[pixel.shares[i].corner[c] * channels + channel]);
+  return sum;
+}
+
+void interpolate(const Mesh& mesh, Frame frame, Rows rows, void* memory, const float* attributes, int64_t channels,
+                 float* values, float* coverage, int32_t* face) {
+  const Strip s = rasterise(mesh, frame, rows, memory);
+  const double samples = static_cast<double>(frame.samples * frame.samples);
+  const auto empty = [&](int64_t row, int64_t column) {
+    const int64_t at = row * frame.width + column;
+    face[at] = -1, coverage[at] = 0;
+    for (int64_t c = 0; c < channels; ++c) values[at * channels + c] = 0;
+  };
+  const auto visit = [&](int64_t row, int64_t column) {
+    const Pixel pixel = gather(mesh, s, row, column);
+    if (!pixel.covered) return empty(row, column);
+    const int64_t at = row * frame.width + column;
+    face[at] = pixel.face, coverage[at] = static_cast<float>(pixel.covered / samples);
+    for (int64_t c = 0; c < channels; ++c)
+      values[at * channels + c] = static_cast<float>(total(pixel, attributes, channels, c) / samples);
+  };
+  for_each_pixel(s, visit, empty);
+}
+
+void draw(const Mesh& mesh, Frame frame, Rows rows, void* memory, const float* colours, uint8_t* image) {
+  const Strip s = rasterise(mesh, frame, rows, memory);
+  const double samples = static_cast<double>(frame.samples * frame.samples);
+  const auto visit = [&](int64_t row, int64_t column) {
+    const Pixel pixel = gather(mesh, s, row, column);
+    if (!pixel.covered) return;
+    uint8_t* at = image + 3 * (row * frame.width + column);
+    for (int c = 0; c < 3; ++c) {
+      // Rounded to float first, so that a half is a half however it was summed.
+      const float mixed = static_cast<float>((1 - pixel.covered / samples) * at[c] +
+                                             255 * (total(pixel, colours, 3, c) / samples));
+      at[c] = static_cast<uint8_t>(mixed > 0 ? mixed < 255 ? mixed + 0.5f : 255.f : 0.f);
+    }
+  };
+  for_each_pixel(s, visit, [](int64_t, int64_t) {});
+}
+
+}  // namespace
+
+extern const Renderer RENDERER;
+const Renderer RENDERER = {workspace, fragments, mask, interpolate, draw};
+
+}  // namespace jaxfit
