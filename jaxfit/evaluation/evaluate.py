@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
+from jaxfit.evaluation.matching import match
+from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.fitting.posed import PosedBirds
 from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
@@ -15,7 +18,7 @@ from jaxfit.observations import Observations, check_keypoints
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.render import hard_mask
 
-__all__ = ["COLUMNS", "Evaluation", "evaluate"]
+__all__ = ["COLUMNS", "COLUMNS_3D", "Evaluation", "evaluate"]
 
 COLUMNS = ("pck@0.05", "pck@0.10", "iou", "me_p", "me_v")
 
@@ -25,13 +28,18 @@ class Evaluation:
     """Metrics of a result; NaN where there is nothing to measure (no mask, no two frames in a row)."""
 
     overall: dict[str, float]
-    """COLUMNS over all birds: PCK and IoU as means over images, me_p and me_v as RMS over keypoints."""
+    """COLUMNS over all birds: PCK and IoU as means over images, me_p and me_v as RMS over keypoints; with true
+    poses also COLUMNS_3D, which `SpatialErrors` defines."""
     tracks: dict[int, dict[str, float]]
     """The same for every track by its id, and the number of its frames as `frames`."""
     frames: int
     """Birds × frames measured."""
     missing: int
     """Annotated birds × frames that the result has no pose for; they enter no metric."""
+    frames_3d: int = 0
+    """Birds × frames measured in space."""
+    points_3d: Literal["", "joints", "keypoints"] = ""
+    """What was measured in space; empty without true poses."""
 
 
 def evaluate(
@@ -40,23 +48,31 @@ def evaluate(
     truth: Observations,
     progress: ProgressTask = silent,
     source: object = "truth",
+    *,
+    truth_solution: Solution | None = None,
+    truth_bird: Bird | None = None,
 ) -> Evaluation:
     """Compare a result with annotations of the same video, matched by track and frame number.
 
     PCK counts visible keypoints within 5 and 10 % of the longer side of the annotated mask (of the box where
     there is no mask); IoU compares the mesh's hard mask with the annotated one; me_p and me_v are relative
-    to the longer side of the mesh's mask.
+    to the longer side of the mesh's mask. True poses add errors in space, also where nothing is annotated.
+
+    Args:
+        solution: the result.
+        bird: its model.
+        truth: the annotations.
+        progress: told of every bird and frame.
+        source: what the truth was read from, for messages.
+        truth_solution: the true poses, in crops that are the real camera (see `SpatialErrors`).
+        truth_bird: their model; None where it is the result's.
 
     Raises:
-        InputError: other keypoints than the model's, or no track and frame in common.
+        InputError: other keypoints than the model's, no track and frame in common, or true poses that are none.
     """
     truth = check_keypoints(truth, bird.keypoint_names, source)
-    columns = {int(frame): t for t, frame in enumerate(truth.frame_index)}
-    rows = {int(track): n for n, track in enumerate(truth.track_id)}
-    n_truth = np.array([rows.get(int(track), -1) for track in solution.track_id])
-    t_truth = np.array([columns.get(int(frame), -1) for frame in solution.frame_index])
-    shared = (n_truth >= 0)[:, None] & (t_truth >= 0)
-    annotated = shared & truth.present[n_truth][:, t_truth]
+    n_truth, t_truth, shared = match(solution, truth.track_id, truth.frame_index)
+    annotated = shared & truth.present[n_truth, t_truth]
     measured = annotated & solution.valid
     if not measured.any():
         raise InputError(
@@ -65,16 +81,20 @@ def evaluate(
             f"against {_some(solution.track_id)}, {_some(solution.frame_index)}",
             "give the annotations of the same video",
         )
-    observed = truth.keypoints_px[n_truth][:, t_truth]
-    visible = (truth.confidence[n_truth][:, t_truth] > 0) & measured[..., None]
+    spatial = None
+    if truth_solution is not None:
+        spatial = SpatialErrors(solution, bird, truth_solution, truth_bird or bird, source)
+    observed = truth.keypoints_px[n_truth, t_truth]
+    visible = (truth.confidence[n_truth, t_truth] > 0) & measured[..., None]
     overlap = np.full(measured.shape, np.nan)
     true_side, own_side = overlap.copy(), overlap.copy()
     posed = PosedBirds(solution, bird)
+    faces = np.asarray(posed.faces)
     with progress("Measuring", int(measured.sum())) as tick:
         for n, t in np.argwhere(measured).tolist():
-            at = int(n_truth[n]), int(t_truth[t])
+            at = int(n_truth[n, 0]), int(t_truth[t])
             mask = truth.mask(*at)
-            own = hard_mask(posed.vertices_screen(n, t), posed.faces, *truth.image_size(*at))
+            own = hard_mask(posed.vertices_screen(n, t), faces, *truth.image_size(*at))
             own_side[n, t] = metrics.longest_side_of_mask(own)
             true_side[n, t] = truth.box_px[at][2:].max() if mask is None else metrics.longest_side_of_mask(mask)
             if mask is not None:
@@ -90,14 +110,22 @@ def evaluate(
             "iou": float(covered.mean()) if covered.size else float("nan"),
             "me_p": metrics.me_p(predicted, seen, vis, own_side[birds]),
             "me_v": metrics.me_v(predicted, seen, vis, own_side[birds], solution.frame_index),
+            **(spatial.row(birds) if spatial else {}),
         }
 
     tracks = {
         int(track): {"frames": float(measured[n].sum()), **row(slice(n, n + 1))}
         for n, track in enumerate(solution.track_id)
-        if measured[n].any()
+        if measured[n].any() or (spatial is not None and spatial.measured[n].any())
     }
-    return Evaluation(row(slice(None)), tracks, int(measured.sum()), int((annotated & ~measured).sum()))
+    return Evaluation(
+        row(slice(None)),
+        tracks,
+        int(measured.sum()),
+        int((annotated & ~measured).sum()),
+        int(spatial.measured.sum()) if spatial else 0,
+        spatial.points if spatial else "",
+    )
 
 
 def _some(numbers: np.ndarray) -> str:

@@ -1,0 +1,40 @@
+"""What a result is measured against, read from wherever it lies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jaxfit.errors import InputError
+from jaxfit.fitting.solution import Solution, load_solution
+from jaxfit.formats.coco import read_coco
+from jaxfit.model.bird import Bird
+from jaxfit.observations import Observations
+
+__all__ = ["read_truth"]
+
+_ANNOTATIONS, _POSES = "truth.json", "truth"
+
+
+def read_truth(path: str | Path) -> tuple[Observations, Solution | None, Bird | None]:
+    """Read annotations, and true poses where there are any.
+
+    Args:
+        path: a COCO file of annotations, or the folder of a simulated scene, which holds them as
+            ``truth.json`` and the true poses as the folder of results ``truth/``.
+
+    Returns:
+        The annotations; the true poses and their model, or None twice for a COCO file.
+
+    Raises:
+        InputError: no such file, a folder without truth, or files that cannot be read.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        return read_coco(path), None, None
+    if not (path / _ANNOTATIONS).is_file():
+        remedy = "give a COCO file of annotations, or the folder of a simulated scene"
+        raise InputError(path, f"is a folder without {_ANNOTATIONS}", remedy)
+    if not (path / _POSES).is_dir():
+        remedy = f"give {path / _ANNOTATIONS} to compare in the image alone"
+        raise InputError(path, f"holds no true poses (a folder {_POSES}/)", remedy)
+    return read_coco(path / _ANNOTATIONS), *load_solution(path / _POSES)
