@@ -160,7 +160,7 @@ Strip rasterise(const Mesh& mesh, Frame frame, Rows rows, void* memory) {
 }
 
 // Perspective-correct weights of the corners at a sample that the face covers; returns 1/depth.
-double weigh(const Face& f, double x, double y, double weights[3]) {
+inline __attribute__((always_inline)) double weigh(const Face& f, double x, double y, double weights[3]) {
   double dx[3], dy[3];
   for (int i = 0; i < 3; ++i) dx[i] = f.x[i] - x, dy[i] = (f.y[i] - y) * f.turn;
   for (int i = 0; i < 3; ++i) {

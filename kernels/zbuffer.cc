@@ -72,16 +72,20 @@ struct Share {
 
 struct Pixel {
   Share shares[kMaxSamples * kMaxSamples];
-  int count = 0;     // of shares
-  int covered = 0;   // samples
-  int32_t face = -1;  // the nearest sample's
+  int count;     // of shares
+  int covered;   // samples
+  int32_t face;  // the nearest sample's, or -1
 };
 
-Pixel gather(const Mesh& mesh, const Strip& s, int64_t row, int64_t column) {
-  Pixel pixel;
+void gather(const Mesh& mesh, const Strip& s, int64_t row, int64_t column, Pixel& pixel) {
   const int64_t n = s.frame.samples;
   float nearest = -1;
   int32_t last = -1;
+  double sum0 = 0, sum1 = 0, sum2 = 0;  // of the share of `last`, in registers
+  const auto close = [&] {
+    if (last >= 0) pixel.shares[pixel.count++] = {mesh.faces + 3 * s.faces[last].index, {sum0, sum1, sum2}};
+  };
+  pixel.count = pixel.covered = 0, pixel.face = -1;
   for (int64_t line = 0; line < n; ++line) {
     const int64_t at = ((row - s.rows.first) * n + line) * s.columns + column * n;
     for (int64_t i = 0; i < n; ++i) {
@@ -90,18 +94,13 @@ Pixel gather(const Mesh& mesh, const Strip& s, int64_t row, int64_t column) {
       const Face& f = s.faces[number];
       double weights[3];
       weigh(f, static_cast<double>(column * n + i) + 0.5, static_cast<double>(row * n + line) + 0.5, weights);
-      if (number != last || !pixel.count) {
-        last = number;
-        Share& fresh = pixel.shares[pixel.count++];
-        fresh.corner = mesh.faces + 3 * f.index;
-        for (int c = 0; c < 3; ++c) fresh.weights[c] = 0;
-      }
-      for (int c = 0; c < 3; ++c) pixel.shares[pixel.count - 1].weights[c] += weights[c];
+      if (number != last) close(), last = number, sum0 = sum1 = sum2 = 0;
+      sum0 += weights[0], sum1 += weights[1], sum2 += weights[2];
       ++pixel.covered;
       if (s.near[at + i] > nearest) nearest = s.near[at + i], pixel.face = f.index;
     }
   }
-  return pixel;
+  close();
 }
 
 // Σ weight · attribute over the samples of a pixel.
@@ -123,8 +122,9 @@ void interpolate(const Mesh& mesh, Frame frame, Rows rows, void* memory, const f
     face[at] = -1, coverage[at] = 0;
     for (int64_t c = 0; c < channels; ++c) values[at * channels + c] = 0;
   };
+  Pixel pixel;
   const auto visit = [&](int64_t row, int64_t column) {
-    const Pixel pixel = gather(mesh, s, row, column);
+    gather(mesh, s, row, column, pixel);
     if (!pixel.covered) return empty(row, column);
     const int64_t at = row * frame.width + column;
     face[at] = pixel.face, coverage[at] = static_cast<float>(pixel.covered / samples);
@@ -137,8 +137,9 @@ void interpolate(const Mesh& mesh, Frame frame, Rows rows, void* memory, const f
 void draw(const Mesh& mesh, Frame frame, Rows rows, void* memory, const float* colours, uint8_t* image) {
   const Strip s = rasterise(mesh, frame, rows, memory);
   const double samples = static_cast<double>(frame.samples * frame.samples);
+  Pixel pixel;
   const auto visit = [&](int64_t row, int64_t column) {
-    const Pixel pixel = gather(mesh, s, row, column);
+    gather(mesh, s, row, column, pixel);
     if (!pixel.covered) return;
     uint8_t* at = image + 3 * (row * frame.width + column);
     for (int c = 0; c < 3; ++c) {
