@@ -21,6 +21,7 @@ __all__ = [
     "MURRE_KEYPOINTS",
     "MURRE_SKELETON",
     "mirror_pairs",
+    "other_side",
 ]
 
 JOINT_NAMES = (
@@ -125,3 +126,11 @@ def mirror_pairs(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
         if name.startswith("left_") and (right := index.get("right_" + name.removeprefix("left_"))) is not None:
             pairs.append((i, right))
     return tuple(pairs)
+
+
+def other_side(name: str) -> str:
+    """`right_foot` for `left_foot` and the reverse; a name without a side is its own."""
+    for side, other in (("left_", "right_"), ("right_", "left_")):
+        if name.startswith(side):
+            return other + name.removeprefix(side)
+    return name

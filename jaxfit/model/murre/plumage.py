@@ -1,0 +1,93 @@
+"""Colours of the breeding plumage, vertex by vertex, and where the keypoints sit."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
+from jaxfit.model.murre.surface import BIB_RINGS, RINGS, Half, Mesh
+from jaxfit.model.murre.wing import CHORD, SPAN
+
+__all__ = ["half_colours", "keypoint_weights"]
+
+BROWN, HEAD = (0.235, 0.180, 0.155), (0.200, 0.150, 0.130)
+WHITE, UNDERWING, DUSKY = (0.94, 0.94, 0.92), (0.86, 0.85, 0.83), (0.50, 0.47, 0.45)
+BILL, LEG, PRIMARIES = (0.11, 0.11, 0.12), (0.24, 0.23, 0.22), (0.170, 0.135, 0.120)
+LAST_BROWN = 4
+"""Last brown column of the loft, from the back; below it the flank is white."""
+BAR = (0.10, 0.46)
+"""Part of the span whose trailing edge, the tips of the secondaries, is white."""
+
+
+def half_colours(half: Half) -> Float[np.ndarray, "H 3"]:
+    """sRGB of every vertex of the left half."""
+    colours = np.empty((len(half.vertices), 3))
+    points = half.wing_index.shape[1]
+    for vertex, (part, (ring, place)) in enumerate(zip(half.part, half.place, strict=True)):
+        if part == 0:
+            colours[vertex] = _body_colour(ring, place)
+        elif part == 1:
+            below = place >= points // 2
+            chord = CHORD[points - 1 - place if below else place]
+            colours[vertex] = _wing_colour(SPAN[ring - 1], chord, below)
+        else:
+            colours[vertex] = WHITE if ring <= 1 else LEG
+    return colours
+
+
+def _body_colour(ring: int, column: int):
+    row = RINGS[ring]
+    if row >= 17.2:
+        return BILL
+    if row > 11:
+        return HEAD
+    if ring >= BIB_RINGS[1] or row < 2.9 or column <= LAST_BROWN:
+        return BROWN
+    return WHITE
+
+
+def _wing_colour(span: float, chord: float, below: bool):
+    if below:
+        return UNDERWING if chord < 0.6 and span < 0.75 else DUSKY
+    if BAR[0] < span < BAR[1] and chord > 0.9:
+        return WHITE
+    return PRIMARIES if span > 0.6 else BROWN
+
+
+def keypoint_weights(half: Half, mesh: Mesh) -> Float[np.ndarray, "K V"]:
+    """Each keypoint as the mean of a few vertices at its place."""
+    body, wing, leg = half.body_index, half.wing_index, half.leg_index
+    rows = lambda row: int(np.argmin(np.abs(RINGS - row)))  # noqa: E731
+    points = wing.shape[1]
+    wrist = 1 + int(np.argmin(np.abs(SPAN - 0.42)))
+    left = {
+        "eye": body[rows(15.1), [3, 4]],
+        "foot": leg[7],
+        "shin": leg[5],
+        "wingtip": wing[-1, [2, 3, points - 3, points - 4]],
+        "wrist": wing[wrist, [0, 1, points - 1]],
+    }
+    middle = {
+        "forehead": body[rows(16.5), 0],
+        "crown": body[rows(15.1), 0],
+        "nape": body[rows(12.7), 0],
+        "back": body[12, 0],
+        "throat": body[rows(13.9), -1],
+        "breast": body[rows(8.55), -1],
+        "bill_base": body[rows(17.25), 0],
+        "bill_tip": body[-1],
+        "tail_base": body[rows(3), 0],
+        "tail_tip": body[0, [0, -1]],
+    }
+    weights = np.zeros((len(MURRE_KEYPOINTS), len(mesh.vertices)))
+    for row, name in zip(weights, MURRE_KEYPOINTS, strict=True):
+        side, _, place = name.partition("_")
+        chosen = left[place] if side in ("left", "right") else middle[name]
+        chosen = np.atleast_1d(chosen)
+        if side == "right":
+            chosen = mesh.mirror[chosen]
+        elif side != "left":
+            chosen = np.union1d(chosen, mesh.mirror[chosen])
+        row[chosen] = 1 / len(chosen)
+    return weights

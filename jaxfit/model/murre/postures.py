@@ -1,0 +1,151 @@
+"""How a murre holds itself: named body poses, each with the pitch that it is held at.
+
+The legs are placed by a plane two-bone solution (hip, knee) so that the tarsi, on which murres rest, and the toes lie
+flat on level ground when the bird is turned about +x by the posture's pitch.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from jaxfit.model.anatomy import JOINT_NAMES, other_side
+from jaxfit.model.murre.skeleton import MIDDLE_AND_LEFT, spread_rotations
+
+__all__ = ["POSTURES", "Posture", "mirrored_pose"]
+
+SIDES = ("left", "right")
+
+
+class Posture(NamedTuple):
+    """A body pose and how it is held."""
+
+    body_pose: Float[np.ndarray, "J-1 3"]
+    """Axis-angle of every joint but the root, radians."""
+    pitch_rad: float
+    """Turn of the whole bird about +x (bill upwards) against level; the rest pose has 0."""
+
+
+def mirrored_pose(body_pose: Float[np.ndarray, "*B J-1 3"]) -> Float[np.ndarray, "*B J-1 3"]:
+    """The mirror image of a body pose: sides exchanged, turns about y and z reversed."""
+    swap = [JOINT_NAMES.index(other_side(name)) - 1 for name in JOINT_NAMES[1:]]
+    return body_pose[..., swap, :] * np.array([1.0, -1.0, -1.0])
+
+
+def _posture(
+    pitch: float,
+    ankles: dict[str, tuple[float, float]] | tuple[float, float] | None = None,
+    spread: float = 0.0,
+    flap: float = 0.0,
+    **turns: tuple[float, float, float],
+) -> Posture:
+    """A posture from degrees.
+
+    Args:
+        pitch: in degrees.
+        ankles: where the ankles are, forwards of and above the root, in centimetres with the bird pitched; both or each
+            side's. None: the legs trail, as in flight.
+        spread: how far the wings are unfolded, 0 to 1.
+        flap: how far the wings are raised, in degrees.
+        turns: axis-angle of joints by name, in degrees; of the left side for both sides.
+    """
+    pose = {name: np.zeros(3) for name in JOINT_NAMES}
+    for name, R in spread_rotations().items():
+        pose[name] = spread * Rotation.from_matrix(R).as_rotvec()
+    pose["left_wing_root"] = np.radians([0.0, flap, 0.0])
+    for name, turn in turns.items():
+        pose[name] = pose[name] + np.radians(turn)
+    for joint in [name for name in JOINT_NAMES if name.startswith("left_")]:
+        pose[joint.replace("left_", "right_")] = pose[joint] * [1, -1, -1]
+    for side in SIDES:
+        if ankles is None:
+            bends = TRAILING
+        else:
+            bends = _leg_bends(np.radians(pitch), ankles[side] if isinstance(ankles, dict) else ankles)
+        for joint, bend in zip(("hip", "knee", "ankle", "foot"), bends, strict=True):
+            pose[f"{side}_{joint}"][0] += bend
+    return Posture(np.stack([pose[name] for name in JOINT_NAMES[1:]]), float(np.radians(pitch)))
+
+
+TRAILING = np.radians([0.0, -25.0, -95.0, -20.0])
+"""Bends of the leg's joints in flight: feet stretched out behind."""
+
+
+def _leg_bends(pitch: float, ankle: tuple[float, float]) -> tuple[float, float, float, float]:
+    """Turns about x of hip, knee, ankle and foot that put the ankle there, tarsus and toes level."""
+    hip, knee, at_ankle, foot = (
+        complex(*MIDDLE_AND_LEFT[f"left_{name}"][1:]) for name in ("hip", "knee", "ankle", "foot")
+    )
+    thigh, tibia = knee - hip, at_ankle - knee
+    target = complex(*ankle) * np.exp(-1j * pitch) - hip
+    distance = np.clip(abs(target), abs(abs(tibia) - abs(thigh)) + 0.05, abs(tibia) + abs(thigh) - 0.05)
+    # the knee keeps to the side of the line hip–ankle that it has at rest: in front
+    cosine = (distance**2 - abs(thigh) ** 2 - abs(tibia) ** 2) / (2 * abs(thigh) * abs(tibia))
+    rest = np.angle(tibia / thigh)
+    bend = np.sign(rest) * np.arccos(np.clip(cosine, -1, 1)) - rest
+    reached = thigh + tibia * np.exp(1j * bend)
+    swing = np.angle(target / reached)
+    tarsus = np.angle(foot - at_ankle)
+    # rest slopes: tarsus as the skeleton has it, toes level
+    return float(swing), float(bend), float(-tarsus - pitch - swing - bend), float(tarsus)
+
+
+STAND, STEP = (-2.9, -8.3), 2.0
+
+POSTURES: dict[str, Posture] = {
+    "standing": _posture(
+        52, STAND, lower_body=(-8, 0, 0), tail=(-14, 0, 0), neck_root=(-14, 0, 0), neck=(-10, 0, 0), head=(-28, 0, 0)
+    ),
+    "alert": _posture(
+        60,
+        (-3.2, -8.3),
+        lower_body=(-10, 0, 0),
+        tail=(-16, 0, 0),
+        neck_root=(-20, 0, 0),
+        neck=(-14, 0, 0),
+        head=(-28, 0, 0),
+    ),
+    "incubating": _posture(
+        27, (-6.4, -4.7), lower_body=(-2, 0, 0), tail=(-6, 0, 0), neck_root=(10, 0, 0), neck=(8, 0, 0), head=(-46, 0, 0)
+    ),
+    "preening_left": _posture(
+        46, STAND, lower_body=(-8, 0, 0), tail=(-12, 0, 0), neck_root=(-5, 10, 45), neck=(0, 15, 60), head=(-20, 0, 60)
+    ),
+    "walking_left": _posture(
+        46,
+        {"left": (STAND[0] + STEP, STAND[1]), "right": (STAND[0] - STEP, STAND[1])},
+        lower_body=(-8, 0, 4),
+        tail=(-12, 0, 0),
+        neck_root=(-12, 0, 0),
+        neck=(-10, 0, 0),
+        head=(-24, 0, 0),
+    ),
+    "wings_up": _posture(8, None, 1.0, 38, head=(-8, 0, 0), neck_root=(-18, 0, 0), neck=(-12, 0, 0)),
+    "wings_down": _posture(8, None, 0.95, -32, head=(-8, 0, 0), neck_root=(-18, 0, 0), neck=(-12, 0, 0)),
+    "wings_half": _posture(
+        52,
+        STAND,
+        0.45,
+        10,
+        lower_body=(-8, 0, 0),
+        tail=(-14, 0, 0),
+        neck_root=(-14, 0, 0),
+        neck=(-10, 0, 0),
+        head=(-28, 0, 0),
+    ),
+    "jab": _posture(
+        34,
+        (-4.5, -7.4),
+        lower_body=(-4, 0, 0),
+        tail=(-8, 0, 0),
+        neck_root=(-38, 0, 0),
+        neck=(-16, 0, 0),
+        head=(14, 0, 0),
+    ),
+}
+for _name in ("preening", "walking"):
+    _left = POSTURES[f"{_name}_left"]
+    POSTURES[f"{_name}_right"] = Posture(mirrored_pose(_left.body_pose), _left.pitch_rad)

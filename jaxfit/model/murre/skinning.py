@@ -1,0 +1,148 @@
+"""Which joints move which vertex of the left half, and by how much.
+
+Body and leg: smooth steps from joint to joint. Wing: the weights are solved for, so that linear blend skinning carries
+the folded sheet into the spread one (`wing`): a feather's tip then follows a mean of hand, forearm and upper arm, as a
+feather does that fans, instead of one bone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import nnls
+
+from jaxfit.model.anatomy import JOINT_NAMES, other_side
+from jaxfit.model.murre.leg import LEG_SHARES
+from jaxfit.model.murre.skeleton import spread_transforms
+from jaxfit.model.murre.surface import ANGLES, RINGS, Half, Mesh
+from jaxfit.model.murre.wing import CHORD, SPAN, spread_sheet
+
+__all__ = ["body_weights", "half_weights", "mirrored_weights", "smooth_step"]
+
+SPINE = (
+    ("tail", "lower_body", 2.6, 4.2),
+    ("lower_body", "upper_body", 4.4, 6.6),
+    ("upper_body", "neck_root", 7.3, 9.1),
+    ("neck_root", "neck", 9.1, 10.8),
+    ("neck", "head", 11.2, 13.2),
+)
+"""Joints from the tail to the head, and where, in rows of `surface.SECTIONS`, one hands over to the next."""
+WING = ("left_wing_root", "left_shoulder", "left_elbow", "left_wrist")
+LEG = {
+    "thigh": {"body": 0.4, "left_knee": 0.6},
+    "tibia": {"left_knee": 1.0},
+    "ankle": {"left_knee": 0.5, "left_ankle": 0.5},
+    "tarsus": {"left_ankle": 1.0},
+    "foot": {"left_ankle": 0.45, "left_foot": 0.55},
+    "toes": {"left_foot": 1.0},
+}
+MAX_JOINTS = 4
+
+
+def half_weights(half: Half) -> Float[np.ndarray, "H J"]:
+    """Weights of every vertex of the left half; rows sum to 1 and hold at most four that are not 0."""
+    weights = np.zeros((len(half.vertices), len(JOINT_NAMES)))
+    for vertex in np.flatnonzero(half.part == 0):
+        ring, column = half.place[vertex]
+        for name, share in body_weights(RINGS[ring], ANGLES[column]).items():
+            weights[vertex, JOINT_NAMES.index(name)] = share
+    stump = weights[half.leg_index[0]].mean(axis=0)
+    for ring, name in enumerate(LEG_SHARES, start=1):
+        for joint, share in LEG[name].items():
+            row = stump if joint == "body" else np.eye(len(JOINT_NAMES))[JOINT_NAMES.index(joint)]
+            weights[half.leg_index[ring]] += share * row
+    columns = [JOINT_NAMES.index(name) for name in WING]
+    weights[np.ix_(half.wing_index[1:].ravel(), columns)] = wing_weights(half).reshape(-1, len(WING))
+    root = half.wing_index[1]
+    weights[root] *= 0.6
+    weights[root, JOINT_NAMES.index("upper_body")] += 0.4
+    return _few(weights)
+
+
+def body_weights(row: float, angle: float) -> dict[str, float]:
+    """Weights of a point of the loft."""
+    weights = {SPINE[0][0]: 1.0}
+    for before, after, start, end in SPINE:
+        share = smooth_step(row, start, end)
+        weights[after] = weights.get(before, 0.0) * share
+        weights[before] = weights.get(before, 0.0) * (1 - share)
+    breast = 0.5 * smooth_step(row, 6.0, 7.5) * (1 - smooth_step(row, 8.0, 9.2)) * smooth_step(float(angle), 1.5, 2.4)
+    weights["chest"] = breast * weights["upper_body"]
+    weights["upper_body"] -= weights["chest"]
+    lower = smooth_step(row, 16.5, 17.3) * float(angle > np.pi / 2)
+    weights["jaw"] = lower * weights["head"]
+    weights["head"] -= weights["jaw"]
+    return {name: share for name, share in weights.items() if share > 0}
+
+
+def wing_weights(half: Half) -> Float[np.ndarray, "U P 4"]:
+    """Weights of the wing's vertices on `WING` that turn the folded wing into the spread one.
+
+    Σ_j w_j (R_j x + t_j) = y for every vertex, folded at x and spread at y, in the least-squares sense, with w ≥ 0,
+    Σ_j w_j = 1, w near a plain guess, and w smooth over the sheet.
+    """
+    folded = half.vertices[half.wing_index[1:]]
+    upper, lower = spread_sheet()
+    spread = np.concatenate([upper, lower[:, ::-1]], axis=1)
+    moved = [folded] + [folded @ R.T + t for R, t in spread_transforms().values()]
+    images = np.stack(moved, axis=-1)  # (U, P, 3, 4)
+    stations, points, joints = len(SPAN), folded.shape[1], len(WING)
+    index = np.arange(stations * points * joints).reshape(stations, points, joints)
+    rows, columns, values, wanted = [], [], [], []
+
+    def equation(at, coefficients, value) -> None:
+        rows.append(np.full(len(at), len(wanted)))
+        columns.append(at)
+        values.append(coefficients)
+        wanted.append(value)
+
+    guess = _guess()
+    chord = np.concatenate([CHORD, CHORD[::-1]])
+    for u in range(stations):
+        for p in range(points):
+            for d in range(3):
+                equation(index[u, p], images[u, p, d], spread[u, p, d])
+            equation(index[u, p], np.full(joints, 100.0), 100.0)
+            for j in range(joints):
+                near = 3.0 if chord[p] < 0.4 else 0.6
+                equation(index[u, p, j : j + 1], np.array([near]), near * guess[u, j])
+                for other in ((u + 1, p), (u, p + 1)):
+                    if other[0] < stations:
+                        at = np.array([index[u, p, j], index[other[0], other[1] % points, j]])
+                        equation(at, np.array([SMOOTH, -SMOOTH]), 0.0)
+    matrix = np.zeros((len(wanted), index.size))
+    np.add.at(matrix, (np.concatenate(rows), np.concatenate(columns)), np.concatenate(values))
+    solved = nnls(matrix.T @ matrix, matrix.T @ np.array(wanted), maxiter=20 * index.size)[0]
+    weights = solved.reshape(stations, points, joints)
+    return weights / weights.sum(axis=-1, keepdims=True)
+
+
+SMOOTH = 3.0
+
+
+def _guess() -> Float[np.ndarray, "U 4"]:
+    hand, fore, arm = smooth_step(SPAN, 0.36, 0.50), smooth_step(SPAN, 0.16, 0.30), smooth_step(SPAN, 0.0, 0.13)
+    return np.stack([1 - arm, arm * (1 - fore), fore * (1 - hand), hand], axis=-1)
+
+
+def mirrored_weights(mesh: Mesh, left: Float[np.ndarray, "H J"]) -> Float[np.ndarray, "V J"]:
+    """Weights of both halves; a vertex in the middle of the bird is moved by both sides alike."""
+    swap = [JOINT_NAMES.index(other_side(name)) for name in JOINT_NAMES]
+    weights = left[mesh.half]
+    weights[mesh.right] = weights[mesh.right][:, swap]
+    middle = mesh.mirror == np.arange(len(mesh.mirror))
+    weights[middle] = (weights[middle] + weights[middle][:, swap]) / 2
+    return weights
+
+
+def _few(weights: np.ndarray) -> np.ndarray:
+    """Keep the largest few weights of every row, and none too small to matter."""
+    least = np.sort(weights, axis=1)[:, [-MAX_JOINTS]]
+    weights = np.where((weights >= least) & (weights > 0.004), weights, 0.0)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def smooth_step(x, start: float, end: float):
+    """0 before `start`, 1 after `end`, smooth between."""
+    t = np.clip((x - start) / (end - start), 0.0, 1.0)
+    return t * t * (3 - 2 * t)

@@ -1,0 +1,191 @@
+"""The murre's mesh: a loft from tail to bill with two slits for the wings and two holes for the legs.
+
+Only the left half is made; its mirror image is joined to it along the middle, so the mesh is symmetric by construction.
+Centimetres, in the axes of `jaxfit.model.anatomy`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.interpolate import PchipInterpolator
+
+from jaxfit.model.murre.leg import leg_rings
+from jaxfit.model.murre.wing import wing_rings
+
+__all__ = ["ANGLES", "Half", "Mesh", "body_rings", "make_half", "mirrored"]
+
+# One section a row: y and z of its centre, the slope of the spine there in degrees, half the width, and the height
+# above and below the centre.
+SECTIONS = np.array(
+    [
+        (-15.3, 1.55, 2, 1.30, 0.12, 0.12),  # tail tip
+        (-14.8, 1.60, 2, 1.90, 0.16, 0.16),
+        (-13.0, 1.80, 2, 2.25, 0.35, 0.40),
+        (-10.8, 2.10, 2, 2.55, 1.20, 1.45),  # tail base
+        (-8.0, 2.30, 2, 3.90, 2.70, 3.00),
+        (-4.0, 2.50, 3, 5.15, 3.90, 4.30),
+        (0.0, 2.75, 4, 5.70, 4.50, 4.95),  # the girth
+        (4.0, 3.20, 9, 5.60, 4.60, 5.10),
+        (7.0, 4.10, 22, 4.95, 4.20, 4.90),
+        (9.0, 5.60, 38, 4.00, 3.40, 4.20),  # breast
+        (10.4, 7.20, 48, 3.20, 2.80, 3.30),
+        (11.6, 8.80, 53, 2.65, 2.45, 2.60),  # neck
+        (12.6, 10.2, 48, 2.35, 2.30, 2.25),
+        (13.8, 11.35, 32, 2.20, 2.25, 2.05),  # nape and throat
+        (15.3, 11.9, 10, 2.10, 2.10, 1.95),  # eyes
+        (16.9, 11.9, -3, 1.65, 1.60, 1.55),
+        (18.2, 11.7, -8, 1.00, 1.05, 1.05),
+        (19.0, 11.55, -8, 0.58, 0.78, 0.75),  # where the feathers end
+        (21.3, 11.25, -7, 0.36, 0.52, 0.48),
+        (23.0, 11.05, -8, 0.18, 0.27, 0.25),
+        (23.7, 10.93, -10, 0.04, 0.05, 0.05),  # bill tip
+    ]
+)
+SLIT = slice(10, 17)
+"""Rings along which the wing is joined on, from its hindmost to its foremost."""
+RINGS = np.array([
+    0, 1, 1.6, 2.3, 3, 3.5, 4.0, 4.5, 5.0, 5.4,
+    *np.interp(np.linspace(-1.2, 7.4, 7), SECTIONS[5:9, 0], np.arange(5.0, 9.0)),
+    8.55, 9.0, 9.12, 9.7, 10.4, 11.2, 12, 12.7, 13.3, 13.9, 14.5, 15.1, 15.8, 16.5, 17, 17.25, 18, 19, 20,
+])  # fmt: skip
+"""Where rings are cut, in rows of `SECTIONS`."""
+ANGLES = np.radians([0, 19, 37, 53, 69, 74, 91, 109, 127, 145, 163, 180])
+"""Around a ring from the middle of the back to the middle of the belly."""
+SLIT_COLUMNS = (3, 4)
+BIB_RINGS = (18, 19)
+"""Two rings close together, along which the brown of the foreneck ends."""
+BIB = {17: 0.45, 18: 1.0, 19: 1.0, 20: 0.75, 21: 0.4, 22: 0.15}
+BIB_REACH = np.interp(np.degrees(ANGLES), [0, 70, 100, 180], [-0.30, -0.30, -0.1, 0.55])
+"""Those rings run higher on the foreneck than at the sides: how far along the spine each column is moved, and the share
+of it that each ring takes."""
+LEG_RINGS, LEG_COLUMNS = (7, 8, 9), (7, 8, 9)
+
+
+class Half(NamedTuple):
+    """The left half of the mesh. Parts: 0 body, 1 wing, 2 leg; `place` says where in its part a vertex lies."""
+
+    vertices: Float[np.ndarray, "H 3"]
+    faces: Int[np.ndarray, "G 3"]
+    part: Int[np.ndarray, "H"]
+    place: Int[np.ndarray, "H 2"]
+    """Body: ring from the tail, column from the back. Wing and leg: ring from the body, point round it."""
+    body_index: Int[np.ndarray, "R C"]
+    wing_index: Int[np.ndarray, "U P"]
+    leg_index: Int[np.ndarray, "L P"]
+
+
+class Mesh(NamedTuple):
+    """Both halves."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    half: Int[np.ndarray, "V"]
+    """The vertex of the left half that each vertex is, or is the mirror image of."""
+    right: np.ndarray
+    """Whether a vertex is a mirror image."""
+    mirror: Int[np.ndarray, "V"]
+    """The other side's vertex; a vertex in the middle is its own."""
+
+
+def sections_at(rows: Float[np.ndarray, "*R"]) -> Float[np.ndarray, "*R 6"]:
+    """`SECTIONS` between its rows; the section's numbers stand last."""
+    return PchipInterpolator(np.arange(len(SECTIONS)), SECTIONS)(rows)
+
+
+def body_rings() -> Float[np.ndarray, "R C 3"]:
+    """Points of the loft's left half, from the tail's ring to the bill's, from the back to the belly."""
+    rows = np.repeat(RINGS[:, None], len(ANGLES), axis=1)
+    for ring, share in BIB.items():
+        rows[ring] += share * BIB_REACH
+    y, z, slope, width, above, below = np.moveaxis(sections_at(rows), -1, 0)
+    slope = np.radians(slope)
+    side, up = np.sin(ANGLES), np.cos(ANGLES)
+    height = np.where(up >= 0, above, below) * up
+    side = np.where(np.abs(side) < 1e-9, 0.0, side)  # the middle lies at exactly x = 0
+    return np.stack([-width * side, y - np.sin(slope) * height, z + np.cos(slope) * height], axis=-1)
+
+
+def make_half() -> Half:
+    """The left half: loft, wing and leg, with shared vertices where they join."""
+    rings = body_rings()
+    rows, columns = rings.shape[:2]
+    inside_leg = (LEG_RINGS[1], LEG_COLUMNS[1])
+    points, part, place, faces = [], [], [], []
+
+    def add(point, which: int, where: tuple[int, int]) -> int:
+        points.append(point)
+        part.append(which)
+        place.append(where)
+        return len(points) - 1
+
+    body = np.full((rows, columns), -1)
+    for i in range(rows):
+        for k in range(columns):
+            if (i, k) != inside_leg:
+                body[i, k] = add(rings[i, k], 0, (i, k))
+    slit = range(*SLIT.indices(rows))
+    for i in range(rows - 1):
+        for k in range(columns - 1):
+            in_slit = i in slit[:-1] and k == SLIT_COLUMNS[0]
+            in_leg = i in LEG_RINGS[:2] and k in LEG_COLUMNS[:2]
+            if not in_slit and not in_leg:
+                _quad(faces, body[i, k], body[i, k + 1], body[i + 1, k + 1], body[i + 1, k])
+    _zip(faces, body[0], flip=True)
+    _zip(faces, body[-1])
+
+    wing_loop = [*body[slit[0] : slit[-1] + 1, SLIT_COLUMNS[0]][::-1], *body[slit[0] : slit[-1] + 1, SLIT_COLUMNS[1]]]
+    wing = _extrude(faces, wing_loop, wing_rings(np.array([points[i] for i in wing_loop])), add, 1)
+    _zip(faces, wing[-1])
+
+    (a, b, c), (p, q, r) = LEG_RINGS, LEG_COLUMNS
+    loop = [(b, r), (c, r), (c, q), (c, p), (b, p), (a, p), (a, q), (a, r)]
+    leg = _extrude(faces, [body[at] for at in loop], leg_rings(), add, 2)
+    _zip(faces, np.roll(leg[-1], 0), start=0)
+    return Half(
+        np.array(points), np.array(faces)[:, ::-1], np.array(part), np.array(place), body, np.array(wing), np.array(leg)
+    )
+
+
+def mirrored(half: Half) -> Mesh:
+    """The whole mesh: the half, and its mirror image with the faces turned round."""
+    count = len(half.vertices)
+    middle = half.vertices[:, 0] == 0
+    copies = np.flatnonzero(~middle)
+    image = np.arange(count)
+    image[copies] = count + np.arange(len(copies))
+    vertices = np.concatenate([half.vertices, half.vertices[copies] * [-1, 1, 1]])
+    faces = np.concatenate([half.faces, image[half.faces][:, ::-1]])
+    mirror = np.concatenate([image, copies])
+    right = np.arange(len(vertices)) >= count
+    return Mesh(vertices, faces, np.concatenate([np.arange(count), copies]), right, mirror)
+
+
+def _quad(faces: list, a: int, b: int, c: int, d: int) -> None:
+    faces += [(a, b, c), (a, c, d)]
+
+
+def _extrude(faces: list, loop: list, rings, add, part: int) -> list:
+    """Join rings of points on to a loop of vertices; all run the same way round."""
+    index = [list(loop)]
+    for j, ring in enumerate(rings, start=1):
+        index.append([add(point, part, (j, p)) for p, point in enumerate(ring)])
+        for p in range(len(ring)):
+            n = (p + 1) % len(ring)
+            _quad(faces, index[-2][p], index[-2][n], index[-1][n], index[-1][p])
+    return index
+
+
+def _zip(faces: list, loop, flip: bool = False, start: int | None = None) -> None:
+    """Close a flat loop by joining the two ends of every rung across it."""
+    loop = list(loop)
+    n = len(loop)
+    # rungs pair the points on either side of the loop's flat ends
+    offset = 0 if start is not None else 1
+    pairs = [(loop[p], loop[(-p if start is not None else n - 1 - p) % n]) for p in range((n + 2 - offset) // 2)]
+    for (a, b), (c, d) in zip(pairs, pairs[1:], strict=False):
+        for face in ((a, c, d), (a, d, b)):
+            if len(set(face)) == 3:
+                faces.append(face[::-1] if flip else face)

@@ -1,0 +1,115 @@
+"""The left wing: the same sheet of feathers folded on the flank and spread, point by point.
+
+A wing is no stack of layers here but one sheet that fans: folded, the wrist lies at the breast, the leading edge runs
+down to it and back along the flank, and the tips of the secondaries lie along the back; spread, the same points form a
+long narrow wing. `skinning` finds the weights that carry the one into the other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import PchipInterpolator
+
+__all__ = ["CHORD", "SPAN", "folded_sheet", "spread_sheet", "wing_rings"]
+
+CHORD = np.array([0.0, 0.17, 0.34, 0.53, 0.75, 0.88, 1.0])
+"""Stations from the leading to the trailing edge, as many as the slit has rings."""
+SPAN = np.array([0.06, 0.13, 0.20, 0.27, 0.34, 0.41, 0.48, 0.55, 0.63, 0.71, 0.79, 0.87, 0.94, 1.0])
+"""Stations from the body to the tip; the wrist is at 0.42."""
+
+# Folded: at a station, y and the arc from the slit down the flank (cm) of the leading and the trailing edge.
+FOLDED = np.array(
+    [
+        (0.00, 7.4, 0.0, -1.2, 0.0),
+        (0.12, 8.0, 1.5, -3.2, -0.2),
+        (0.24, 7.9, 3.2, -5.4, -0.3),
+        (0.42, 6.4, 5.2, -8.4, -0.2),
+        (0.60, 1.8, 5.9, -11.0, 0.0),
+        (0.80, -5.5, 4.6, -13.0, 0.3),
+        (0.94, -11.4, 2.6, -14.0, 0.7),
+        (1.00, -13.6, 1.6, -14.3, 1.1),
+    ]
+)
+# Spread: x and y of the leading and the trailing edge.
+SPREAD = np.array(
+    [
+        (0.00, -4.5, 7.4, -5.0, -1.2),
+        (0.12, -7.6, 8.3, -8.2, -1.5),
+        (0.24, -11.2, 8.8, -11.6, -1.5),
+        (0.42, -16.6, 8.0, -16.6, -1.3),
+        (0.60, -22.2, 6.0, -21.6, -1.7),
+        (0.80, -28.6, 2.7, -27.8, -2.6),
+        (0.94, -32.9, 0.0, -32.2, -3.0),
+        (1.00, -34.6, -1.4, -34.3, -2.5),
+    ]
+)
+# What the folded wing lies on: y, z of the centre, half the width, height above and below.
+BED = np.array(
+    [
+        (-15.0, 2.2, 2.2, 1.1, 1.0),
+        (-11.0, 2.3, 3.1, 1.9, 1.9),
+        (-8.0, 2.35, 4.1, 2.9, 3.0),
+        (-4.0, 2.5, 5.2, 3.95, 4.3),
+        (0.0, 2.8, 5.7, 4.55, 4.95),
+        (4.0, 3.3, 5.65, 4.7, 5.1),
+        (7.0, 4.3, 5.15, 4.5, 5.0),
+        (9.0, 5.4, 4.6, 4.2, 4.7),
+    ]
+)
+SLIT_ANGLE = np.radians(61)
+
+
+def _on_flank(y, arc, off) -> np.ndarray:
+    """A point of the folded wing: y, arc down from the slit, distance off the body."""
+    z, width, above, below = PchipInterpolator(BED[:, 0], BED[:, 1:])(np.clip(y, -15, 9)).T
+    angle = SLIT_ANGLE + arc / np.maximum(width, 3.0)
+    height = np.where(np.cos(angle) >= 0, above, below) * np.cos(angle)
+    across = width * np.sin(angle)
+    normal = np.stack([np.sin(angle), np.cos(angle)])
+    return np.stack([-(across + off * normal[0]), y, z + height + off * normal[1]], axis=-1)
+
+
+def _edges(table, span):
+    return PchipInterpolator(table[:, 0], table[:, 1:])(span)
+
+
+def _thickness(span, chord):
+    """Of the sheet in centimetres: an arm with feathers behind it, thinner towards the tip."""
+    arm = np.interp(span, [0, 0.12, 0.42, 0.7, 1.0], [1.2, 0.95, 0.65, 0.35, 0.15])
+    profile = np.interp(chord, [0, 0.1, 0.3, 0.6, 1.0], [0.45, 0.9, 1.0, 0.5, 0.2])
+    return np.maximum(arm * profile, 0.12)
+
+
+def folded_sheet() -> tuple[Float[np.ndarray, "U C 3"], Float[np.ndarray, "U C 3"]]:
+    """Upper (outer) and lower (inner) side of the folded wing."""
+    front_y, front_arc, back_y, back_arc = (column[:, None] for column in _edges(FOLDED, SPAN).T)
+    y = front_y + CHORD * (back_y - front_y)
+    arc = front_arc + CHORD * (back_arc - front_arc)
+    span = np.broadcast_to(SPAN[:, None], y.shape)
+    gap = np.broadcast_to(0.22 + 0.0 * span, y.shape)
+    thick = _thickness(span, CHORD)
+    shape = (*y.shape, 3)
+    lower = _on_flank(y.ravel(), arc.ravel(), gap.ravel()).reshape(shape)
+    upper = _on_flank(y.ravel(), arc.ravel(), (gap + thick).ravel()).reshape(shape)
+    return upper, lower
+
+
+def spread_sheet() -> tuple[Float[np.ndarray, "U C 3"], Float[np.ndarray, "U C 3"]]:
+    """Upper and lower side of the spread wing."""
+    front_x, front_y, back_x, back_y = (column[:, None] for column in _edges(SPREAD, SPAN).T)
+    x = front_x + CHORD * (back_x - front_x)
+    y = front_y + CHORD * (back_y - front_y)
+    span = np.broadcast_to(SPAN[:, None], y.shape)
+    camber = 0.5 * np.sin(np.pi * CHORD) * (1 - 0.7 * span)
+    z = np.interp(span, [0, 0.2, 1], [5.3, 5.5, 5.0]) + camber - 0.5 * CHORD
+    thick = _thickness(span, CHORD)
+    middle = np.stack([x, y, z], axis=-1)
+    half = np.stack([0 * thick, 0 * thick, thick / 2], axis=-1)
+    return middle + half, middle - half
+
+
+def wing_rings(slit: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "U P 3"]:
+    """The folded wing as rings from the body to the tip: the upper side from the front back, then the lower side forwards."""
+    upper, lower = folded_sheet()
+    return np.concatenate([upper, lower[:, ::-1]], axis=1)
