@@ -200,19 +200,21 @@ def _take_place(part: Path, path: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load_npz(path: str | Path, required: Mapping[str, int]) -> dict[str, np.ndarray]:
+def load_npz(path: str | Path, required: Mapping[str, int], version: int | None = None) -> dict[str, np.ndarray]:
     """Read every array of an ``.npz``, running no pickled code.
 
     Args:
         path: the file.
         required: name → number of dimensions of each array that must be there.
+        version: the newest ``format_version`` that the caller understands, which the file must then hold: a
+            whole number from 1. It is looked at first: a newer file may well have other arrays. None: any file.
 
     Returns:
         Name → array, also of arrays that were not asked for.
 
     Raises:
-        InputError: no such file, not an ``.npz``, truncated, Python objects inside, an array missing or of
-            another number of dimensions.
+        InputError: no such file, not an ``.npz``, truncated, Python objects inside, of a newer version, an array
+            missing or of another number of dimensions.
     """
     path = Path(path)
     if not path.exists():
@@ -235,6 +237,8 @@ def load_npz(path: str | Path, required: Mapping[str, int]) -> dict[str, np.ndar
             raise InputError(path, problem, "save plain arrays with numpy.savez") from error
         problem = f"is not a readable .npz: {str(error) or type(error).__name__}"
         raise InputError(path, problem, "it may be truncated: copy or write it again") from error
+    if version is not None:
+        _check_version(path, found.get("format_version"), version)
     for name, ndim in required.items():
         if not isinstance(found.get(name), np.ndarray):
             raise InputError(path, f"lacks the array {name}", "write the file again with this version")
@@ -242,6 +246,17 @@ def load_npz(path: str | Path, required: Mapping[str, int]) -> dict[str, np.ndar
             problem = f"{name} has shape {found[name].shape}, expected {ndim} dimensions"
             raise InputError(path, problem, "write the file again")
     return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+
+
+def _check_version(path: Path, found: Any, newest: int) -> None:
+    if not isinstance(found, np.ndarray):
+        raise InputError(path, "lacks the array format_version", "write the file again with this version")
+    if found.ndim or found.dtype.kind not in "iu" or found < 1:
+        shown = f"{found!s:.40}"
+        raise InputError(path, f"format_version is {shown}, expected a whole number from 1", "write the file again")
+    if found > newest:
+        problem = f"format_version is {found}, newer than this jaxfit reads ({newest})"
+        raise InputError(path, problem, "it needs a newer jaxfit")
 
 
 def conform(values: Mapping[str, Any], layout: Mapping[str, tuple[str, Any]]) -> dict[str, np.ndarray]:

@@ -163,7 +163,7 @@ def rewrite(folder, **changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format_version": np.int64(FORMAT_VERSION + 1)}, "newer than this jaxfit reads .*install a newer"),
+        ({"format_version": np.int64(FORMAT_VERSION + 1)}, "newer than this jaxfit reads .*needs a newer jaxfit"),
         ({"format_version": np.array("one")}, "format_version is one"),
         ({"format_version": None}, "lacks the array format_version"),
         ({"betas": None}, "lacks the array betas"),

@@ -175,15 +175,8 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         problem = "is a file, not a folder of results" if folder.exists() else "does not exist"
         raise InputError(folder, problem, "give the folder that a fit wrote")
     path = folder / _POSES
-    arrays = load_npz(path, {"format_version": 0})
-    version = arrays["format_version"]
-    if version.dtype.kind not in "iu" or version < 1:
-        raise InputError(path, f"format_version is {version}, expected a whole number from 1", "run the fit again")
-    if version > FORMAT_VERSION:
-        problem = f"format_version is {version}, newer than this jaxfit reads ({FORMAT_VERSION})"
-        raise InputError(path, problem, "install a newer jaxfit")
     ndim = {name: len(shape.split()) for name, (shape, _) in LAYOUT.items()}
-    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0, "crop_px": 0})
+    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0, "crop_px": 0}, FORMAT_VERSION)
     values: dict[str, Any] = {name: arrays[name] for name in LAYOUT}
     values |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays["loss_terms"], arrays["loss"]

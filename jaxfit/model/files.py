@@ -71,13 +71,7 @@ def load_bird(path: Path | str) -> Bird:
             a field missing, or of a wrong shape or content.
     """
     path = Path(path)
-    found = load_npz(path, {"format_version": 0})
-    version = found["format_version"]
-    if version.dtype.kind not in "iu" or version < 1:
-        raise InputError(path, f"format_version: {version!s:.40} is none", "write the file again")
-    if version > FORMAT_VERSION:
-        problem = f"format_version: {version}, this jaxfit reads up to {FORMAT_VERSION}"
-        raise InputError(path, problem, "needs a newer jaxfit")
+    found = load_npz(path, {}, FORMAT_VERSION)
     dimensions = {field: len(axes.split()) for field, axes in ARRAY_FIELDS.items()} | STATIC_FIELDS
     for field, ndim in dimensions.items():
         if field in OPTIONAL_FIELDS and field not in found:
