@@ -28,7 +28,7 @@ from scenes import (
     without,
 )
 
-from jaxfit.objective.objective import TERMS, term_settings, weighted_sum
+from jaxfit.objective.objective import TERMS, compares_masks, evaluate_terms, term_settings, weighted_sum
 from jaxfit.objective.scene import Priors, Scene, priors_of
 from jaxfit.objective.terms import geman_mcclure, pose_prior, safe_norm
 
@@ -224,3 +224,12 @@ def test_whitened_priors():
         W = np.asarray(whitener, np.float64)
         np.testing.assert_allclose(W @ np.asarray(covariance, np.float64) @ W.T, np.eye(len(W)), atol=1e-4)
     np.testing.assert_allclose(PRIORS.shape_sd**2, BIRD.shape_variance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_terms_that_draw_the_silhouette_say_so(name):
+    """A term that is not marked gets empty masks; one that is marked in vain makes its stage slow."""
+    pose = window_pose()
+    one = scene(pose, seen())
+    evaluate_terms(one, {name: {"weight": 1.0, **term_settings(name)}})
+    assert compares_masks(name) == ("vertices_screen" in vars(one))

@@ -10,12 +10,12 @@ from jaxfit.fitting.solve import Problem
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
+from jaxfit.objective.objective import compares_masks
 from jaxfit.objective.scene import Priors, Raster
 from jaxfit.silhouette import Blur
 
 __all__ = ["needs_mask", "stage_problem"]
 
-MASK_TERMS = ("mask", "mask_smooth_l1")
 STEP_SHAPES = {
     "global_orient": (3,),
     "body_pose": (1, 3),
@@ -29,7 +29,7 @@ STEP_SHAPES = {
 
 def needs_mask(stage: StageConfig) -> bool:
     """Whether any of a stage's terms looks at the silhouette."""
-    return any(name in MASK_TERMS for name in stage.terms)
+    return any(compares_masks(name) for name in stage.terms)
 
 
 def stage_problem(

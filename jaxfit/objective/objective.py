@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxfit.objective import temporal, terms
 from jaxfit.objective.scene import Scene
 
-__all__ = ["TERMS", "evaluate_terms", "term_settings", "weighted_sum"]
+__all__ = ["TERMS", "compares_masks", "evaluate_terms", "term_settings", "weighted_sum"]
 
 Term = Callable[..., Float[Array, ""]]
 
@@ -27,7 +27,7 @@ TERMS: Mapping[str, Term] = {
     "velocity": temporal.velocity,
     "acceleration": temporal.acceleration,
 }
-"""Every term by name. To add one: a pure function of the scene, and a line here."""
+"""Every term by name. To add one: a pure function of the scene, marked where it compares masks, and a line here."""
 
 Settings = Mapping[str, Mapping[str, Float[Array, ""] | float]]
 
@@ -36,6 +36,11 @@ def term_settings(name: str) -> dict[str, float]:
     """A term's own settings and their defaults: its keyword arguments."""
     parameters = inspect.signature(TERMS[name]).parameters.values()
     return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
+
+
+def compares_masks(name: str) -> bool:
+    """Whether a term looks at the silhouette, as `terms.compares_masks` marks it."""
+    return getattr(TERMS[name], "compares_masks", False)
 
 
 def evaluate_terms(scene: Scene, settings: Settings) -> dict[str, Float[Array, ""]]:

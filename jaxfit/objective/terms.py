@@ -17,6 +17,7 @@ from jaxfit.silhouette import mask_loss
 
 __all__ = [
     "bone_prior",
+    "compares_masks",
     "geman_mcclure",
     "keypoints",
     "mask",
@@ -47,6 +48,13 @@ def keypoints(scene: Scene, *, sigma_px: Scalar | float = 50.0) -> Scalar:
     return jnp.sum(scene.evidence.confidence * robust)
 
 
+def compares_masks(term):
+    """Marks a term that draws the silhouette: only stages with such a term are given masks."""
+    term.compares_masks = True
+    return term
+
+
+@compares_masks
 def mask(scene: Scene) -> Scalar:
     """E_msk = Σ_t Σ_pixels |soft silhouette − mask|.
 
@@ -55,6 +63,7 @@ def mask(scene: Scene) -> Scalar:
     return _mask(scene, "l1")
 
 
+@compares_masks
 def mask_smooth_l1(scene: Scene) -> Scalar:
     """Σ_t Σ_pixels of smooth-L1 (½e² below 1, so ½e² throughout): the silhouette term of AVES.
 
