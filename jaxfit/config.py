@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -14,12 +13,11 @@ from typing import Any, Literal
 
 import yaml
 
+from jaxfit.config_checks import ConfigKeyError, check_config
 from jaxfit.errors import InputError
-from jaxfit.objective.objective import TERMS, term_settings
+from jaxfit.objective.objective import term_settings
 
 __all__ = ["CropConfig", "FitConfig", "InitialiseConfig", "StageConfig", "config_to_yaml", "load_config"]
-
-PARAMETERS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ class FitConfig:
     """Memory that one batch may take; more birds or frames are fitted in several batches."""
 
     def __post_init__(self):
-        _check(self)
+        check_config(self)
 
     def stage_settings(self, stage: StageConfig) -> dict[str, dict[str, float]]:
         """Weight and settings of each of a stage's terms: defaults, `terms`, then the stage's `override`."""
@@ -128,9 +126,14 @@ def load_config(source: str | Path) -> FitConfig:
     A file may name another as its `base`; what it then says is laid over it, key by key.
 
     Raises:
-        InputError: an unreadable file, an unknown key, a value of the wrong kind, an unknown term.
+        InputError: an unreadable file, an unknown key, a value of the wrong kind, an unknown term; it names the
+            file that holds the key, which may be a base.
     """
-    return _build(FitConfig, _read(str(source), seen=()), str(source), "")
+    values, origins = _read(str(source), seen=())
+    try:
+        return _build(FitConfig, values, "")
+    except ConfigKeyError as error:
+        raise InputError(_origin(origins, error.key, str(source)), error.problem, error.remedy) from None
 
 
 def shipped_configs() -> list[str]:
@@ -144,7 +147,8 @@ def config_to_yaml(config: FitConfig) -> str:
     return yaml.safe_dump(_plain(config), sort_keys=False, allow_unicode=True)
 
 
-def _read(source: str, seen: tuple[str, ...]) -> dict[str, Any]:
+def _read(source: str, seen: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str]]:
+    """A file laid over its bases, and for each key's path the file that it comes from."""
     if source in seen:
         raise InputError(source, "`base` goes in a circle", " → ".join((*seen, source)))
     shipped = shipped_configs()
@@ -164,10 +168,30 @@ def _read(source: str, seen: tuple[str, ...]) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise InputError(source, "holds no mapping of keys to values", "write `key: value` lines")
     base = content.pop("base", None)
-    if base is None:
-        return content
-    beside = Path(source).parent / f"{base}"
-    return _merge(_read(str(beside) if beside.is_file() else str(base), (*seen, source)), content)
+    values, origins = {}, {}
+    if base is not None:
+        beside = Path(source).parent / f"{base}"
+        values, origins = _read(str(beside) if beside.is_file() else str(base), (*seen, source))
+    for path, is_mapping in _paths(content):
+        if not is_mapping:  # it replaces whatever stood there
+            origins = {key: origin for key, origin in origins.items() if not key.startswith(f"{path}.")}
+        origins[path] = source
+    return _merge(values, content), origins
+
+
+def _paths(content: dict[str, Any], where: str = "") -> Iterator[tuple[str, bool]]:
+    """Path of every key, and whether a mapping stands there; lists are taken whole."""
+    for key, value in content.items():
+        yield f"{where}{key}", isinstance(value, dict)
+        if isinstance(value, dict):
+            yield from _paths(value, f"{where}{key}.")
+
+
+def _origin(origins: Mapping[str, str], key: str, top: str) -> str:
+    """The file that says `key`; of a key that no file says, the one that says what it should stand in."""
+    while key and key not in origins:
+        key = key[: max(key.rfind("."), key.rfind("["), 0)]
+    return origins.get(key, top)
 
 
 def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
@@ -178,50 +202,51 @@ def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _build(kind: type, values: Any, source: str, where: str) -> Any:
+def _build(kind: type, values: Any, where: str) -> Any:
     """A dataclass from plain values; every key and value is checked against its fields."""
     if not isinstance(values, dict):
-        raise InputError(source, f"{where or 'the config'} must be a mapping, not {type(values).__name__}")
+        raise ConfigKeyError(
+            where.rstrip("."), f"{where or 'the config'} must be a mapping, not {type(values).__name__}"
+        )
     hints = typing.get_type_hints(kind)
     names = [f.name for f in dataclasses.fields(kind)]
     for key in values:
         if key not in names:
-            raise InputError(source, f"unknown key `{where}{key}`", f"known here: {', '.join(names)}")
+            raise ConfigKeyError(f"{where}{key}", f"unknown key `{where}{key}`", f"known here: {', '.join(names)}")
     for f in dataclasses.fields(kind):
         required = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
         if required and f.name not in values:
-            raise InputError(source, f"`{where}{f.name}` is missing", "add it, or start from `base: paper`")
-    built = {key: _value(hints[key], value, source, f"{where}{key}") for key, value in values.items()}
-    try:
-        return kind(**built)
-    except InputError as error:
-        raise InputError(source, error.problem, error.remedy) from None
+            raise ConfigKeyError(
+                f"{where}{f.name}", f"`{where}{f.name}` is missing", "add it, or start from `base: paper`"
+            )
+    built = {key: _value(hints[key], value, f"{where}{key}") for key, value in values.items()}
+    return kind(**built)
 
 
-def _value(hint: Any, value: Any, source: str, where: str) -> Any:
+def _value(hint: Any, value: Any, where: str) -> Any:
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
-        return _build(typing.cast(type, hint), value, source, f"{where}.")
+        return _build(typing.cast(type, hint), value, f"{where}.")
     if origin is Literal:
         if value not in arguments:
-            raise InputError(source, f"`{where}` is {value!r}", f"one of {', '.join(arguments)}")
+            raise ConfigKeyError(where, f"`{where}` is {value!r}", f"one of {', '.join(arguments)}")
         return value
     if origin is tuple:
         if not isinstance(value, list):
-            raise InputError(source, f"`{where}` must be a list, not {value!r}")
-        return tuple(_value(arguments[0], v, source, f"{where}[{i}]") for i, v in enumerate(value))
+            raise ConfigKeyError(where, f"`{where}` must be a list, not {value!r}")
+        return tuple(_value(arguments[0], v, f"{where}[{i}]") for i, v in enumerate(value))
     if origin is types.UnionType:
         return tuple(value) if isinstance(value, list) else value
     if origin is Mapping:
         if not isinstance(value, dict):
-            raise InputError(source, f"`{where}` must be a mapping, not {value!r}")
-        return {k: _value(arguments[1], v, source, f"{where}.{k}") for k, v in value.items()}
+            raise ConfigKeyError(where, f"`{where}` must be a mapping, not {value!r}")
+        return {k: _value(arguments[1], v, f"{where}.{k}") for k, v in value.items()}
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if hint is Any:
         return value
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        raise InputError(source, f"`{where}` is {value!r}", f"a value of type {hint.__name__} is expected")
+        raise ConfigKeyError(where, f"`{where}` is {value!r}", f"a value of type {hint.__name__} is expected")
     return value
 
 
@@ -237,63 +262,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [_plain(v) for v in value]
     return value
-
-
-def _check(config: FitConfig) -> None:
-    """What types alone do not say; wrong use raises InputError naming the key."""
-
-    def require(holds: bool, key: str, problem: str, remedy: str = "") -> None:
-        if not holds:
-            raise InputError("config", f"`{key}` {problem}", remedy)
-
-    require(config.window >= 1, "window", f"is {config.window}", "1 or more frames")
-    odd = config.filter_window >= 1 and config.filter_window % 2 == 1
-    require(odd, "filter_window", f"is {config.filter_window}", "an odd number of frames; 1 is off")
-    require(config.crop.size_px >= 16, "crop.size_px", f"is {config.crop.size_px}", "16 or more")
-    require(0 < config.crop.focal_px < math.inf, "crop.focal_px", f"is {config.crop.focal_px}", "above 0")
-    require(0 <= config.crop.padding < math.inf, "crop.padding", f"is {config.crop.padding}", "0 or more")
-    require(config.min_keypoints >= 1, "min_keypoints", f"is {config.min_keypoints}", "1 or more")
-    require(0 < config.memory_gb < math.inf, "memory_gb", f"is {config.memory_gb}", "above 0")
-    for key in ("turns", "directions", "candidates", "hypotheses"):
-        value = getattr(config.initialise, key)
-        require(value >= 1, f"initialise.{key}", f"is {value}", "1 or more")
-    smoothness = config.initialise.smoothness
-    require(0 <= smoothness < math.inf, "initialise.smoothness", f"is {smoothness}", "0 or more")
-    require(len(config.stages) > 0, "stages", "is empty", "a fit needs a stage")
-    _check_terms(require, "terms", config.terms)
-    for i, stage in enumerate(config.stages):
-        where = f"stages[{i}]"
-        require(stage.steps >= 1, f"{where}.steps", f"is {stage.steps}", "1 or more")
-        rate = stage.learning_rate
-        require(0 < rate < math.inf, f"{where}.learning_rate", f"is {rate}", "above 0")
-        require(0 < stage.blur < math.inf, f"{where}.blur", f"is {stage.blur}", "above 0")
-        require(len(stage.terms) > 0, f"{where}.terms", "is empty", f"known: {', '.join(TERMS)}")
-        for name in stage.terms:
-            require(name in TERMS, f"{where}.terms", f"names {name!r}", f"known: {', '.join(TERMS)}")
-        for key in ("free", "step_scale"):
-            for name in getattr(stage, key):
-                known = name in PARAMETERS
-                require(known, f"{where}.{key}", f"names {name!r}", f"known: {', '.join(PARAMETERS)}")
-        for name, factor in stage.step_scale.items():
-            numbers = factor if isinstance(factor, tuple) else (factor,)
-            fits = all(_is_number(n) for n in numbers) and len(numbers) in (1, 3)
-            fits = fits and (len(numbers) == 1 or name == "transl")
-            require(fits, f"{where}.step_scale.{name}", f"is {factor!r}", "a number, 0 or more; three for transl")
-        _check_terms(require, f"{where}.override", stage.override)
-
-
-def _check_terms(require: Any, where: str, terms: Mapping[str, Any]) -> None:
-    for name, value in terms.items():
-        require(name in TERMS, f"{where}.{name}", "is not a term", f"known: {', '.join(TERMS)}")
-        known = ("weight", *term_settings(name))
-        for key, number in (value if isinstance(value, dict) else {"weight": value}).items():
-            place = f"{where}.{name}.{key}"
-            require(key in known, place, "is not a setting of this term", f"known: {', '.join(known)}")
-            require(_is_number(number), place, f"is {number!r}", "a number, 0 or more")
-            # the robust term divides by it
-            require(key != "sigma_px" or number > 0, place, f"is {number!r}", "above 0")
-
-
-def _is_number(value: Any) -> bool:
-    """A finite number, 0 or more; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf

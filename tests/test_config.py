@@ -152,6 +152,43 @@ def test_mistakes_are_named(tmp_path, text, names):
         assert name in message, f"{name!r} is not in {message!r}"
 
 
+@pytest.mark.parametrize(
+    ("base", "top", "guilty"),
+    [
+        ("windws: 3", "window: 5", "base"),
+        ("window: ten", "filter_window: 1", "base"),
+        ("window: 0", "filter_window: 1", "base"),
+        ("window: 10", "window: 0", "top"),
+        ("crop: {padding: -1}", "crop: {size_px: 64}", "base"),
+        ("crop: {padding: 1}", "crop: {padding: -1}", "top"),
+        ("crop: {pading: 1}", "crop: {padding: 1}", "base"),
+        ("crop: {padding: 1}", "crop: 7", "top"),
+        ("crop: 7", "window: 3", "base"),
+        ("terms: {mask: -1}", "terms: {velocity: 1}", "base"),
+        ("terms: {keypoints: {sigma_px: 0}}", "terms: {keypoints: {weight: 2}}", "base"),
+        ("terms: {keypoints: {weight: 2}}", "terms: {keypoints: -1}", "top"),
+        ("terms: {keypoints: {weight: 2}}", "terms: {keypoints: {sigma_px: 0}}", "top"),
+        ("stages: [{name: a, steps: 0, terms: [mask]}]", "window: 3", "base"),
+        ("stages: [{name: a, terms: [mask]}]", "window: 3", "base"),
+        ("stages: []", "stages: [{name: a, steps: 1, terms: [masks]}]", "top"),
+        ("window: [1,", "window: 3", "base"),
+    ],
+)
+def test_mistakes_in_a_base_name_the_base(tmp_path, base, top, guilty):
+    """Two files and a shipped one below them; the key is blamed on the file that says it."""
+    files = {"base": written(tmp_path, f"base: paper\n{base}\n", "base.yaml")}
+    files["top"] = written(tmp_path, f"base: base.yaml\n{top}\n", "top.yaml")
+    with pytest.raises(InputError) as caught:
+        load_config(files["top"])
+    assert str(caught.value).startswith(f"{files[guilty]}: ")
+
+
+def test_what_no_file_says_is_missing_in_the_top_one(tmp_path):
+    written(tmp_path, "window: 3\n", "base.yaml")
+    with pytest.raises(InputError, match=r"top\.yaml: `stages` is missing"):
+        load_config(written(tmp_path, "base: base.yaml\n", "top.yaml"))
+
+
 def test_a_config_in_code_is_checked_too():
     with pytest.raises(InputError, match="`window` is 0"):
         dataclasses.replace(load_config("paper"), window=0)

@@ -1,0 +1,90 @@
+"""What a config must hold beyond the types of its fields."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from jaxfit.errors import InputError
+from jaxfit.objective.objective import TERMS, term_settings
+
+if TYPE_CHECKING:
+    from jaxfit.config import FitConfig
+
+__all__ = ["PARAMETERS", "ConfigKeyError", "check_config"]
+
+PARAMETERS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
+"""What a stage may leave free."""
+
+
+class ConfigKeyError(InputError):
+    """An InputError about one key, by its path such as ``stages[0].steps``; reading a file adds the file's name."""
+
+    def __init__(self, key: str, problem: str, remedy: str = ""):
+        self.key = key
+        super().__init__("config", problem, remedy)
+
+
+def check_config(config: FitConfig) -> None:
+    """What types alone do not say.
+
+    Raises:
+        ConfigKeyError: a value that makes no fit.
+    """
+
+    def require(holds: bool, key: str, problem: str, remedy: str = "") -> None:
+        if not holds:
+            raise ConfigKeyError(key, f"`{key}` {problem}", remedy)
+
+    require(config.window >= 1, "window", f"is {config.window}", "1 or more frames")
+    odd = config.filter_window >= 1 and config.filter_window % 2 == 1
+    require(odd, "filter_window", f"is {config.filter_window}", "an odd number of frames; 1 is off")
+    require(config.crop.size_px >= 16, "crop.size_px", f"is {config.crop.size_px}", "16 or more")
+    require(0 < config.crop.focal_px < math.inf, "crop.focal_px", f"is {config.crop.focal_px}", "above 0")
+    require(0 <= config.crop.padding < math.inf, "crop.padding", f"is {config.crop.padding}", "0 or more")
+    require(config.min_keypoints >= 1, "min_keypoints", f"is {config.min_keypoints}", "1 or more")
+    require(0 < config.memory_gb < math.inf, "memory_gb", f"is {config.memory_gb}", "above 0")
+    for key in ("turns", "directions", "candidates", "hypotheses"):
+        value = getattr(config.initialise, key)
+        require(value >= 1, f"initialise.{key}", f"is {value}", "1 or more")
+    smoothness = config.initialise.smoothness
+    require(0 <= smoothness < math.inf, "initialise.smoothness", f"is {smoothness}", "0 or more")
+    require(len(config.stages) > 0, "stages", "is empty", "a fit needs a stage")
+    _check_terms(require, "terms", config.terms)
+    for i, stage in enumerate(config.stages):
+        where = f"stages[{i}]"
+        require(stage.steps >= 1, f"{where}.steps", f"is {stage.steps}", "1 or more")
+        rate = stage.learning_rate
+        require(0 < rate < math.inf, f"{where}.learning_rate", f"is {rate}", "above 0")
+        require(0 < stage.blur < math.inf, f"{where}.blur", f"is {stage.blur}", "above 0")
+        require(len(stage.terms) > 0, f"{where}.terms", "is empty", f"known: {', '.join(TERMS)}")
+        for name in stage.terms:
+            require(name in TERMS, f"{where}.terms", f"names {name!r}", f"known: {', '.join(TERMS)}")
+        for key in ("free", "step_scale"):
+            for name in getattr(stage, key):
+                known = name in PARAMETERS
+                require(known, f"{where}.{key}", f"names {name!r}", f"known: {', '.join(PARAMETERS)}")
+        for name, factor in stage.step_scale.items():
+            numbers = factor if isinstance(factor, tuple) else (factor,)
+            fits = all(_is_number(n) for n in numbers) and len(numbers) in (1, 3)
+            fits = fits and (len(numbers) == 1 or name == "transl")
+            require(fits, f"{where}.step_scale.{name}", f"is {factor!r}", "a number, 0 or more; three for transl")
+        _check_terms(require, f"{where}.override", stage.override)
+
+
+def _check_terms(require: Any, where: str, terms: Mapping[str, Any]) -> None:
+    for name, value in terms.items():
+        require(name in TERMS, f"{where}.{name}", "is not a term", f"known: {', '.join(TERMS)}")
+        known = ("weight", *term_settings(name))
+        for key, number in (value if isinstance(value, dict) else {"weight": value}).items():
+            place = f"{where}.{name}.{key}"
+            require(key in known, place, "is not a setting of this term", f"known: {', '.join(known)}")
+            require(_is_number(number), place, f"is {number!r}", "a number, 0 or more")
+            # the robust term divides by it
+            require(key != "sigma_px" or number > 0, place, f"is {number!r}", "above 0")
+
+
+def _is_number(value: Any) -> bool:
+    """A finite number, 0 or more; true and false are none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
