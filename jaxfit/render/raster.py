@@ -3,7 +3,7 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
+from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 
 from jaxfit.native import kernels_available, require_kernels
 from jaxfit.render import reference
@@ -27,7 +27,7 @@ class Fragments(NamedTuple):
 
 
 def zbuffer(
-    vertices_screen: Float[np.ndarray, "*B V 3"], faces: Int[np.ndarray, "F 3"], width: int, height: int
+    vertices_screen: Float[Array | np.ndarray, "*B V 3"], faces: Int[Array | np.ndarray, "F 3"], width: int, height: int
 ) -> Fragments:
     """The nearest face at every pixel's centre.
 
@@ -64,7 +64,7 @@ def zbuffer(
 
 
 def hard_mask(
-    vertices_screen: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], width: int, height: int
+    vertices_screen: Float[Array | np.ndarray, "V 3"], faces: Int[Array | np.ndarray, "F 3"], width: int, height: int
 ) -> Bool[np.ndarray, "{height} {width}"]:
     """The pixels whose centre lies inside the projection of some face, its edges included.
 
@@ -83,9 +83,9 @@ def hard_mask(
 
 
 def interpolate(
-    vertices_screen: Float[np.ndarray, "*B V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    attributes: Float[np.ndarray, "*B V C"],
+    vertices_screen: Float[Array | np.ndarray, "*B V 3"],
+    faces: Int[Array | np.ndarray, "F 3"],
+    attributes: Float[Array | np.ndarray, "... V C"],
     width: int,
     height: int,
     samples: int = 2,
@@ -127,9 +127,9 @@ def interpolate(
 
 def draw(
     image: UInt8[np.ndarray, "H W 3"],
-    vertices_screen: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    colours: Float[np.ndarray, "V 3"],
+    vertices_screen: Float[Array | np.ndarray, "V 3"],
+    faces: Int[Array | np.ndarray, "F 3"],
+    colours: Float[Array | np.ndarray, "V 3"],
     samples: int = 2,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A mesh over an image, anti-aliased: (1 − coverage) · image + 255 · interpolated colours, rounded.

@@ -1,7 +1,9 @@
 """Colours of a lit mesh, vertex by vertex."""
 
+import math
+
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Array, Float, Float32, Int
 
 __all__ = ["shade", "vertex_normals"]
 
@@ -10,7 +12,7 @@ LIGHT = (-0.4, -0.8, -0.6)
 
 
 def vertex_normals(
-    vertices: Float[np.ndarray, "*B V 3"], faces: Int[np.ndarray, "F 3"]
+    vertices: Float[Array | np.ndarray, "*B V 3"], faces: Int[Array | np.ndarray, "F 3"]
 ) -> Float32[np.ndarray, "*B V 3"]:
     """Unit normals: the sum of the normals of a vertex' faces, each weighted by the face's area.
 
@@ -28,7 +30,7 @@ def vertex_normals(
     corners = vertices[..., faces, :]
     doubled = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
     batch, count = vertices.shape[:-2], vertices.shape[-2]
-    flat = doubled.reshape(-1, len(faces), 3)
+    flat = doubled.reshape(math.prod(batch), len(faces), 3)
     sums = np.zeros((len(flat), count, 3))
     for b, normals in enumerate(flat):
         for axis in range(3):
@@ -39,9 +41,9 @@ def vertex_normals(
 
 
 def shade(
-    vertices: Float[np.ndarray, "V 3"],
-    faces: Int[np.ndarray, "F 3"],
-    colours: Float[np.ndarray, "V 3"],
+    vertices: Float[Array | np.ndarray, "V 3"],
+    faces: Int[Array | np.ndarray, "F 3"],
+    colours: Float[Array | np.ndarray, "V 3"],
     light: tuple[float, float, float] = LIGHT,
     ambient: float = 0.45,
 ) -> Float32[np.ndarray, "V 3"]:

@@ -22,6 +22,7 @@ from rich.table import Table
 
 from jaxfit import cli, load_config, read_coco
 from jaxfit.benchmarks.fit import bench_fit
+from jaxfit.benchmarks.render import bench_render
 from jaxfit.benchmarks.silhouette import bench_silhouette
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
@@ -58,6 +59,15 @@ def raster_core() -> Iterator[Metric]:
     yield Metric("silhouette: loss and gradient", result["ms_per_frame"], "ms/frame", "less", 1.0)
     yield Metric("silhouette: ratio to matrix product", result["matmul_ratio"], "1", "less", 0.5)
     yield Metric("silhouette: gradient error", result["gradient_error"], "1", "less", 1.0)
+
+
+def renderer() -> Iterator[Metric]:
+    """The z-buffer on crops and the overlay of nine birds on a full frame, of the same generated mesh."""
+    result = bench_render()
+    yield Metric("render: crop", 1e3 / result["crops_per_s"], "ms", "less", 1.0)
+    yield Metric("render: anti-aliased crop", 1e3 / result["interpolated_crops_per_s"], "ms", "less", 1.0)
+    yield Metric("render: 9 birds on a full frame", result["full_frame_ms"], "ms", "less", 1.0)
+    yield Metric("render: one bird's mask in a full frame", result["mask_ms"], "ms", "less", 1.0)
 
 
 def photographs(bird: Bird, reference: Path) -> Iterator[Metric]:
@@ -111,13 +121,13 @@ def main() -> int:
     cli.use_cache()
     console = Console()
     reference, bird = reference_folder(), reference_bird()
-    metrics = list(raster_core())
+    metrics = [*raster_core(), *renderer()]
     if reference is not None and bird is not None:
         metrics += photographs(bird, reference)
         metrics += windows(bird)
         metrics += scene(bird) if options.full else ()
     else:
-        console.print("no reference data (JAXFIT_REFERENCE): only the raster core is measured")
+        console.print("no reference data (JAXFIT_REFERENCE): only the raster core and the renderer are measured")
     known = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
     table = Table("figure", "value", "baseline", "unit", "better", "")
     failed = False
