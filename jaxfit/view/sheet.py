@@ -11,7 +11,7 @@ from jaxfit.fitting.posed import PosedBirds
 from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
-from jaxfit.render import hard_mask
+from jaxfit.render import draw, hard_mask, shade
 from jaxfit.storage import write_whole
 
 __all__ = ["contact_sheet"]
@@ -20,6 +20,9 @@ TILE_PX = 256
 PAPER, SEEN, OUTLINE, FITTED, DETECTED = (250, 250, 250), (205, 205, 205), (60, 140, 30), (40, 40, 220), (30, 30, 30)
 """Colours, BGR: background, annotated mask, outline of the mesh, its keypoints, annotated keypoints."""
 
+PLUMAGE = (0.85, 0.9, 0.95)
+"""The mesh, BGR in [0, 1]."""
+
 
 def contact_sheet(
     solution: Solution, bird: Bird, observations: Observations, path: str | Path, columns: int = 4, most: int = 24
@@ -27,7 +30,7 @@ def contact_sheet(
     """Draw birds of a result as pairs of tiles and write them as one PNG.
 
     Left tile: the annotated mask (grey) and keypoints (black rings), the fitted mesh's outline (green) and
-    keypoints (red), joined to the annotated ones. Right tile: the mesh, shaded from the camera's side.
+    keypoints (red), joined to the annotated ones. Right tile: the mesh as the camera sees it, lit from above.
 
     Args:
         solution, bird: a result and its model.
@@ -80,19 +83,15 @@ def _evidence(posed: PosedBirds, observations: Observations, n: int, t: int) -> 
 
 
 def _mesh(posed: PosedBirds, n: int, t: int) -> np.ndarray:
-    """The mesh from the camera, far faces first, each shaded by how far it faces the camera."""
-    tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8)
+    """The mesh from the camera, lit."""
     screen, faces = posed.vertices_screen(n, t), np.asarray(posed.faces)
-    crop = posed.solution.crop[n, t]
-    depth_px = screen[:, 2] * (posed.solution.focal / np.median(screen[:, 2]))
-    corners = np.column_stack([_to_tile(screen[:, :2], crop), depth_px])[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    facing = np.abs(normal[:, 2]) / np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
-    shade = (70 + 150 * facing)[:, None] * np.array([0.95, 0.98, 1.0])
-    for f in np.argsort(-corners[..., 2].mean(1)):
-        points = np.round((corners[f, :, :2] - 0.5) * (1 << SHIFT)).astype(np.int32)
-        cv2.fillConvexPoly(tile, points, shade[f].tolist(), cv2.LINE_AA, SHIFT)
-    return tile
+    solution, depth = posed.solution, screen[:, 2:]
+    tile_px = _to_tile(screen[:, :2], solution.crop[n, t])
+    focal_px = solution.focal * TILE_PX / solution.crop_px
+    vertices_cam = np.concatenate([(tile_px - TILE_PX / 2) * depth / focal_px, depth], axis=1)
+    colours = shade(vertices_cam, faces, np.broadcast_to(PLUMAGE, screen.shape))
+    tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8)
+    return draw(tile, np.concatenate([tile_px, depth], axis=1), faces, colours, samples=3)
 
 
 SHIFT = 4  # OpenCV draws at sixteenths of a pixel; its pixel centres are whole numbers, ours are halves
