@@ -35,8 +35,8 @@ def build(poses, crop=WHOLE, **changes):
         return np.stack([np.broadcast_to(value, (T, *value.shape[-1:])) for value in values])
 
     values = {
-        "track_id": [5, 3],
-        "frame_index": FRAMES,
+        "track_id": np.array([5, 3]),
+        "frame_index": np.array(FRAMES),
         "valid": np.ones((N, T), bool),
         **{name: np.stack([getattr(p, name) for p in poses]) for name in ("global_orient", "body_pose", "transl")},
         "scale": np.stack([np.broadcast_to(p.scale, T) for p in poses]),
@@ -50,7 +50,7 @@ def build(poses, crop=WHOLE, **changes):
         "keypoint_names": BIRD.keypoint_names,
         "joint_names": BIRD.joint_names,
         "loss": {},
-        "status": ["ok"] * N,
+        "status": np.array(["ok"] * N),
     }
     return Solution(**values | changes)
 
@@ -142,8 +142,8 @@ def test_without_the_correction_the_bird_is_turned():
 
 def joints_by_hand(pose):
     def one(t):
-        at = dataclasses.replace(pose, **{f: getattr(pose, f)[t] for f in ("global_orient", "body_pose", "transl")})
-        return skin_by_hand(BIRD, dataclasses.replace(at, scale=pose.scale[t]))[1]
+        now = {f: getattr(pose, f)[t] for f in ("global_orient", "body_pose", "transl", "scale")}
+        return skin_by_hand(BIRD, dataclasses.replace(pose, **now))[1]
 
     return np.array([one(t) for t in range(T)])
 
@@ -286,11 +286,11 @@ def test_a_truth_that_is_none(changes, message):
 def test_crop_rotation_by_hand():
     """45° to the right: ahead is right and forward, down stays down, right is right and backward."""
     half = math.sqrt(0.5)
-    R = crop_rotation([1100, 200], [100, 200], 1000)
+    R = crop_rotation([1100, 200], [100, 200], 1000.0)
     np.testing.assert_allclose(R, [[half, 0, half], [0, 1, 0], [-half, 0, half]], atol=1e-12)
-    np.testing.assert_array_equal(crop_rotation([100, 200], [100, 200], 1000), np.eye(3))
+    np.testing.assert_array_equal(crop_rotation([100, 200], [100, 200], 1000.0), np.eye(3))
     centres = np.random.default_rng(0).uniform(-3000, 3000, (5, 4, 2))
-    R = crop_rotation(centres, [0, 0], 1000)
+    R = crop_rotation(centres, [0, 0], 1000.0)
     np.testing.assert_allclose(R @ np.swapaxes(R, -1, -2), np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
     ahead = R[..., 2]
     np.testing.assert_allclose(1000 * ahead[..., :2] / ahead[..., 2:], centres, atol=1e-8)
