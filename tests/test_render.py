@@ -119,6 +119,9 @@ def test_a_batch_is_its_images(each_isa):
         np.testing.assert_array_equal(shared[0][i], one[0])
     empty = render.zbuffer(vertices[:0], faces, 40, 30)
     assert empty.face.shape == (0, 3, 30, 40)
+    nothing = render.interpolate(np.zeros((0, 3)), faces[:0], np.zeros((0, 2)), 40, 30)
+    assert [a.shape for a in nothing] == [(30, 40, 2), (30, 40), (30, 40)]
+    assert not nothing[1].any()
 
 
 def test_shared_edges_have_no_holes(each_isa):

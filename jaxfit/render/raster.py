@@ -1,5 +1,6 @@
 """The z-buffer renderer's operations: NumPy in, NumPy out, nothing differentiable."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -68,6 +69,8 @@ def hard_mask(
 ) -> Bool[np.ndarray, "{height} {width}"]:
     """The pixels whose centre lies inside the projection of some face, its edges included.
 
+    It costs what the mesh covers, however large the image.
+
     Args, skipped faces and errors are those of `zbuffer`, for one mesh.
     """
     vertices, faces, batch = _mesh(vertices_screen, faces)
@@ -122,7 +125,8 @@ def interpolate(
     else:
         for i, one in enumerate(vertices):
             values[i], coverage[i], face[i] = reference.interpolate(one, faces, channels[i], width, height, samples)
-    return tuple(a.reshape(batch + a.shape[1:]) for a in (values, coverage, face))  # pyright: ignore[reportReturnType]
+    values, coverage, face = (a.reshape(batch + a.shape[1:]) for a in (values, coverage, face))
+    return values, coverage, face
 
 
 def draw(
@@ -184,7 +188,7 @@ def _mesh(vertices_screen: Any, faces: Any) -> tuple[np.ndarray, np.ndarray, tup
         raise ValueError(f"faces: expected indices in [0, {count}), got {indices.min()} to {indices.max()}")
     with np.errstate(over="ignore"):  # too far for float32: infinite, so its faces are skipped
         vertices = np.ascontiguousarray(vertices, np.float32)
-    return vertices.reshape(-1, count, 3), np.ascontiguousarray(indices, np.int32), batch
+    return vertices.reshape(math.prod(batch), count, 3), np.ascontiguousarray(indices, np.int32), batch
 
 
 def _attributes(attributes: Any, batch: tuple[int, ...], count: int, name: str = "attributes") -> np.ndarray:
@@ -199,7 +203,7 @@ def _attributes(attributes: Any, batch: tuple[int, ...], count: int, name: str =
         full = None
     if full is None or found.ndim < 2 or found.shape[-2] != count:
         raise ValueError(f"{name}: expected shape ({', '.join(map(str, wanted))}, channels), got {found.shape}")
-    return np.ascontiguousarray(full, np.float32).reshape(-1, count, found.shape[-1])
+    return np.ascontiguousarray(full, np.float32).reshape(math.prod(batch), count, found.shape[-1])
 
 
 def _check_size(width: Any, height: Any) -> None:
