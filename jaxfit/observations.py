@@ -19,6 +19,7 @@ _LAYOUT = {
     "present": ("N T", np.bool_),
     "keypoints_px": ("N T K 2", np.float32),
     "confidence": ("N T K", np.float32),
+    "occluded": ("N T K", np.bool_),
     "box_px": ("N T 4", np.float32),
     "image_size_px": ("T 2", np.int64),
     "file_name": ("T", np.str_),
@@ -64,9 +65,14 @@ class Observations:
     own_images: Mapping[tuple[int, int], tuple[str, int, int]] = field(default_factory=dict)
     """(n, t) → file name, width, height, where a bird stands in another image than the frame's first: sets of
     photographs, in which every bird is frame 0 of an image of its own. Empty for video."""
+    occluded: np.ndarray | None = None
+    """(N, T, K) bool: the keypoint's place is known although something hides it. None stands for nowhere."""
+    amodal_masks: Mapping[tuple[int, int], Mapping[str, Any]] = field(default_factory=dict)
+    """(n, t) → run lengths of the whole bird, hidden parts included, where that is known: in simulated truth."""
 
     def __post_init__(self):
-        values = {**vars(self), "keypoint_names": list(self.keypoint_names)}
+        occluded = np.zeros(np.shape(self.confidence), bool) if self.occluded is None else self.occluded
+        values = {**vars(self), "keypoint_names": list(self.keypoint_names), "occluded": occluded}
         arrays = conform(values, _LAYOUT)
         names = tuple(str(name) for name in arrays.pop("keypoint_names"))
         if len(np.unique(arrays["track_id"])) < len(arrays["track_id"]):
@@ -87,10 +93,12 @@ class Observations:
             arrays[name] = values
         for name, value in (arrays | {"keypoint_names": names}).items():
             object.__setattr__(self, name, value)
-        for (n, t), rle in self.masks.items():
-            width, height = self.image_size(n, t)
-            if tuple(rle["size"]) != (height, width):
-                raise ValueError(f"masks[{n}, {t}] is {rle['size']}, its image {[height, width]} (height, width)")
+        for name in ("masks", "amodal_masks"):
+            for (n, t), rle in getattr(self, name).items():
+                width, height = self.image_size(n, t)
+                if tuple(rle["size"]) != (height, width):
+                    problem = f"{name}[{n}, {t}] is {rle['size']}, its image {[height, width]} (height, width)"
+                    raise ValueError(problem)
 
     @property
     def num_tracks(self) -> int:
@@ -120,10 +128,11 @@ class Observations:
         Returns:
             (H, W) bool in the pixels of its image, or None where there is no mask.
         """
-        from pycocotools import mask as coco_mask
+        return _decode(self.masks.get(self._position(n, t)))
 
-        rle = self.masks.get(self._position(n, t))
-        return None if rle is None else coco_mask.decode(cast(Any, rle)).astype(bool)
+    def whole_mask(self, n: int, t: int) -> np.ndarray | None:
+        """The mask of the bird with its hidden parts, where that is known; else ``mask``."""
+        return _decode(self.amodal_masks.get(self._position(n, t))) if self.amodal_masks else self.mask(n, t)
 
     def image_size(self, n: int, t: int) -> tuple[int, int]:
         """Width and height in pixels of the image that track ``n`` stands in at frame ``t``."""
@@ -176,7 +185,8 @@ class Observations:
             if "T" in shape:
                 array = array.take(columns, axis=shape.split().index("T"))
             picked[name] = array
-        return replace(self, **picked, masks=moved(self.masks), own_images=moved(self.own_images))
+        mappings = {name: moved(getattr(self, name)) for name in ("masks", "amodal_masks", "own_images")}
+        return replace(self, **picked, **mappings)
 
     def with_keypoints(self, keypoints_px: Any, confidence: Any) -> Observations:
         """The same birds with other keypoints, such as filtered ones.
@@ -189,6 +199,12 @@ class Observations:
             ValueError: as the class does.
         """
         return replace(self, keypoints_px=np.asarray(keypoints_px), confidence=np.asarray(confidence))
+
+
+def _decode(rle: Mapping[str, Any] | None) -> np.ndarray | None:
+    from pycocotools import mask as coco_mask
+
+    return None if rle is None else coco_mask.decode(cast(Any, rle)).astype(bool)
 
 
 def encode_mask(mask: Any) -> dict[str, Any]:
@@ -224,6 +240,7 @@ def reorder_keypoints(observations: Observations, names: Sequence[str]) -> Obser
         keypoint_names=tuple(names),
         keypoints_px=observations.keypoints_px[:, :, order],
         confidence=observations.confidence[:, :, order],
+        occluded=cast(np.ndarray, observations.occluded)[:, :, order],
         skeleton=tuple((new[a], new[b]) for a, b in observations.skeleton),
     )
 

@@ -26,7 +26,7 @@ from __future__ import annotations
 import json
 import logging
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -102,7 +102,7 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
     row = {track: n for n, track in enumerate(tracks)}
     column = {frame: t for t, frame in enumerate(frames)}
 
-    keypoints = np.zeros((N, T, K, 3), np.float32)
+    keypoints = np.zeros((N, T, K, 4), np.float32)
     box = np.zeros((N, T, 4), np.float32)
     holder: dict[tuple[int, int], Annotation] = {}
     for annotation in found:
@@ -130,6 +130,8 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
         keypoint_names=categories.names,
         skeleton=categories.skeleton,
         masks={cell: a.rle for cell, a in holder.items() if a.rle is not None},
+        amodal_masks={cell: a.amodal_rle for cell, a in holder.items() if a.amodal_rle is not None},
+        occluded=keypoints[..., 3] > 0,
         own_images={
             cell: (a.image.file_name, a.image.width, a.image.height)
             for cell, a in holder.items()
@@ -163,7 +165,8 @@ def write_coco(observations: Observations, path: str | Path) -> None:
     annotations = []
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
         confidence = observations.confidence[n, t]
-        visible = np.where(confidence > 0, 2.0, 0.0)
+        hidden = cast(np.ndarray, observations.occluded)[n, t]
+        visible = np.where(confidence > 0, np.where(hidden, 1.0, 2.0), 0.0)
         keypoints = np.concatenate([_shortest(observations.keypoints_px[n, t]), visible[:, None]], axis=-1)
         annotation = {
             "id": len(annotations) + 1,
@@ -176,12 +179,13 @@ def write_coco(observations: Observations, path: str | Path) -> None:
             "keypoint_scores": _shortest(confidence).tolist(),
             "num_keypoints": int((confidence > 0).sum()),
         }
-        rle = observations.masks.get((n, t))
-        if rle is not None:
-            size, counts = rle["size"], rle["counts"]
-            counts = counts.decode("ascii") if isinstance(counts, bytes) else counts
-            annotation["segmentation"] = {"size": [int(side) for side in size], "counts": counts}
-            annotation["area"] = sum(run_lengths(counts)[1::2])
+        for key, masks in (("segmentation", observations.masks), ("amodal_segmentation", observations.amodal_masks)):
+            if (n, t) in masks:
+                size, counts = masks[n, t]["size"], masks[n, t]["counts"]
+                counts = counts.decode("ascii") if isinstance(counts, bytes) else counts
+                annotation[key] = {"size": [int(side) for side in size], "counts": counts}
+        if "segmentation" in annotation:
+            annotation["area"] = sum(run_lengths(annotation["segmentation"]["counts"])[1::2])
         annotations.append(annotation)
     skeleton = [[a + 1, b + 1] for a, b in observations.skeleton]
     category = {"id": 1, "name": "bird", "keypoints": list(observations.keypoint_names), "skeleton": skeleton}

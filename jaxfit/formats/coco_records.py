@@ -37,11 +37,13 @@ class Annotation:
     track_id: int
     image: Image
     keypoints: np.ndarray
-    """(K, 3): x, y in image pixels, confidence."""
+    """(K, 4): x, y in image pixels, confidence, 1 where something hides the keypoint."""
     box: list[float]
     """x, y, width, height in image pixels."""
     rle: dict[str, Any] | None
     """The mask's run lengths."""
+    amodal_rle: dict[str, Any] | None
+    """Run lengths of the whole bird, hidden parts included."""
 
 
 def read_images(images: Field) -> dict[int | str, Image]:
@@ -125,9 +127,10 @@ def read_annotation(annotation: Field, images: Mapping[int | str, Image], names:
     if min(box[2:]) <= 0:
         problem = f"has width {box[2]} and height {box[3]}, which must be above 0"
         annotation["bbox"].fail(problem, "give the bird's box, or remove the annotation")
-    rle = None
-    if annotation.has("segmentation"):
-        rle = read_segmentation(annotation["segmentation"], image.height, image.width)
+    rle, amodal_rle = (
+        read_segmentation(annotation[key], image.height, image.width) if annotation.has(key) else None
+        for key in ("segmentation", "amodal_segmentation")
+    )
     crowd = annotation.has("iscrowd") and annotation["iscrowd"].integer(0, 1)
     label = f"id {annotation['id'].identifier()!r} ({annotation.path})" if annotation.has("id") else annotation.path
     return Annotation(
@@ -137,14 +140,17 @@ def read_annotation(annotation: Field, images: Mapping[int | str, Image], names:
         keypoints=_read_keypoints(annotation, len(names)),
         box=list(box),
         rle=None if crowd else rle,
+        amodal_rle=None if crowd else amodal_rle,
     )
 
 
 def _read_keypoints(annotation: Field, num_keypoints: int) -> np.ndarray:
     why = f" (x, y, v for each of the category's {num_keypoints} keypoints)"
     values = annotation["keypoints"].positions(3 * num_keypoints, why)
-    keypoints = np.array(values, dtype=np.float64).reshape(-1, 3)
+    keypoints = np.zeros((num_keypoints, 4))
+    keypoints[:, :3] = np.array(values, dtype=np.float64).reshape(-1, 3)
     visibility = keypoints[:, 2].copy()
+    keypoints[:, 3] = visibility == 1
     if (visibility < 0).any():
         annotation["keypoints"].fail(f"has visibility {visibility.min()}", "write 0, 1 or 2")
     keypoints[:, 2] = 1

@@ -1,0 +1,193 @@
+"""What detectors would report of a scene: keypoints, confidences and masks with the faults that real ones have.
+
+The model, per bird; side is the longer side of its box, in pixels:
+
+- jitter: σ = JITTER · side + MOTION · |velocity a frame| (blur), × HIDDEN where the keypoint is not seen. 60 % of its
+  variance is correlated in time (AR(1), ρ = 0.85), the rest is white;
+- gross outliers, in runs of some frames: the keypoint lands on a neighbour's of that name, or anywhere in the box;
+- left and right swapped, for all pairs of a bird or for one, in runs;
+- missing keypoints, mostly hidden ones, and whole frames without a detection, in runs;
+- confidence falls with the error that was made, but through noise: some wrong points are trusted, some right ones
+  are not;
+- masks: of the visible part, eroded or grown by an amount that drifts, with ragged borders, now and then torn at
+  the tips, and now and then merged with a touching neighbour.
+
+The figures are estimates of what networks for animals do on video, not measured on any; they were set before anything
+was fitted to what they give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxfit.observations import Observations, encode_mask
+
+__all__ = ["detect_noisily"]
+
+JITTER, MOTION, HIDDEN = 0.012, 0.15, 2.5
+CORRELATED, RHO = 0.6, 0.85
+OUTLIERS_SEEN, OUTLIERS_HIDDEN = 0.015, 0.06
+SWAPS_ALL, SWAPS_ONE = 0.008, 0.006
+MISSING_SEEN, MISSING_HIDDEN, MISSING_FRAMES = 0.015, 0.35, 0.012
+RUN_FRAMES = 4.0
+"""Mean length of a run of outliers, swaps, gaps or mergers."""
+RAGGED, MERGED = 0.02, 0.02
+"""Spread of the mask's border as a share of the side; share of frames in which touching masks merge."""
+
+
+def detect_noisily(
+    truth: Observations,
+    seen: Bool[np.ndarray, "N T K"],
+    keypoint_pairs: Sequence[tuple[int, int]],
+    seed: int,
+) -> Observations:
+    """Observations as detectors would give them of true ones.
+
+    Args:
+        truth: exact keypoints, boxes and visible masks.
+        seen: whether the camera sees the keypoint.
+        keypoint_pairs: (left, right).
+        seed: the same seed gives the same faults.
+    """
+    rng = np.random.default_rng((seed, 3))
+    N, T, K = truth.confidence.shape
+    labelled = truth.confidence > 0
+    exact = truth.keypoints_px.astype(np.float64)
+    side = np.where(truth.present, truth.box_px[..., 2:].max(-1), 1.0)[..., None]
+    moved = np.zeros((N, T, K))
+    moved[:, 1:] = np.where(labelled[:, 1:] & labelled[:, :-1], np.linalg.norm(np.diff(exact, axis=1), axis=-1), 0)
+    sigma = (JITTER * side + MOTION * np.minimum(moved, 0.2 * side)) * np.where(seen, 1, HIDDEN)
+    points = exact + sigma[..., None] * _jitter(rng, (N, T, K, 2))
+
+    for all_pairs, rate in ((True, SWAPS_ALL), (False, SWAPS_ONE)):
+        for left, right in keypoint_pairs:
+            if all_pairs and (left, right) != keypoint_pairs[0]:
+                continue
+            when = _runs(rng, rate, (N, T))
+            pairs = keypoint_pairs if all_pairs else [(left, right)]
+            for a, b in pairs:
+                swapped = np.where(when[..., None, None], points[:, :, [b, a]], points[:, :, [a, b]])
+                points[:, :, [a, b]] = swapped
+
+    rate = np.where(seen, OUTLIERS_SEEN, OUTLIERS_HIDDEN)
+    wrong = _runs(rng, rate, (N, T, K))
+    points = np.where(wrong[..., None], _elsewhere(rng, truth, exact), points)
+
+    error = np.linalg.norm(points - exact, axis=-1) / side
+    trust = 2.2 - 22 * error - 0.9 * ~seen + 0.8 * rng.normal(size=(N, T, K)) - 0.9 * (rng.random((N, T, K)) < 0.04)
+    confidence = 1 / (1 + np.exp(-trust))
+    missing = _runs(rng, np.where(seen, MISSING_SEEN, MISSING_HIDDEN), (N, T, K)) | (confidence < 0.08)
+    # a detector finds a bird by what is to be seen of it
+    area = np.array([[_area(truth, n, t) for t in range(T)] for n in range(N)])
+    found = truth.present & ~_runs(rng, MISSING_FRAMES, (N, T)) & (area > 0.02 * side[..., 0] ** 2)
+    confidence = np.where(labelled & ~missing & found[..., None], confidence, 0)
+
+    masks, boxes = _masks(rng, truth, found)
+    found &= boxes[..., 2] > 0
+    confidence = np.where(found[..., None], confidence, 0)
+    return Observations(
+        track_id=truth.track_id,
+        frame_index=truth.frame_index,
+        present=found,
+        keypoints_px=points.astype(np.float32),
+        confidence=confidence.astype(np.float32),
+        box_px=boxes,
+        image_size_px=truth.image_size_px,
+        file_name=truth.file_name,
+        keypoint_names=truth.keypoint_names,
+        skeleton=truth.skeleton,
+        masks=masks,
+    )
+
+
+def _jitter(rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "N T *rest"]:
+    """Unit noise, part of it correlated from frame to frame."""
+    slow = rng.normal(size=shape)
+    for t in range(1, shape[1]):
+        slow[:, t] = RHO * slow[:, t - 1] + np.sqrt(1 - RHO**2) * slow[:, t]
+    return np.sqrt(CORRELATED) * slow + np.sqrt(1 - CORRELATED) * rng.normal(size=shape)
+
+
+def _runs(rng: np.random.Generator, rate, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T *rest"]:
+    """Events along the second axis that hold `rate` of the time in runs of about RUN_FRAMES."""
+    rate = np.broadcast_to(rate, shape)
+    begins = rng.random(shape) < rate / (RUN_FRAMES * (1 - rate) + rate)
+    stays = rng.random(shape) < 1 - 1 / RUN_FRAMES
+    on = begins.copy()
+    on[:, 0] = rng.random((shape[0], *shape[2:])) < rate[:, 0]
+    for t in range(1, shape[1]):
+        on[:, t] |= on[:, t - 1] & stays[:, t]
+    return on
+
+
+def _elsewhere(rng: np.random.Generator, truth: Observations, exact: np.ndarray) -> np.ndarray:
+    """Where outliers land: on the nearest neighbour's keypoint of that name, or anywhere in the bird's own box."""
+    N, T, K = exact.shape[:3]
+    low, size = truth.box_px[..., None, :2], truth.box_px[..., None, 2:]
+    anywhere = low + rng.uniform(-0.1, 1.1, exact.shape) * size
+    if N < 2:
+        return anywhere
+    centre = truth.box_px[..., :2] + truth.box_px[..., 2:] / 2
+    distance = np.linalg.norm(centre[:, None] - centre[None], axis=-1)  # N N T
+    distance = np.where(truth.present[None] & ~np.eye(N, dtype=bool)[..., None], distance, np.inf)
+    nearest = distance.argmin(1)  # N T
+    theirs = exact[nearest, np.arange(T)]
+    near = np.take_along_axis(distance, nearest[:, None], 1)[:, 0] < 1.5 * truth.box_px[..., 2:].max(-1)
+    stolen = (rng.random((N, T, K)) < 0.4) & near[..., None]
+    return np.where(stolen[..., None], theirs, anywhere)
+
+
+def _area(truth: Observations, n: int, t: int) -> float:
+    from pycocotools import mask as coco_mask
+
+    rle = truth.masks.get((n, t))
+    return 0.0 if rle is None else float(coco_mask.area(cast(Any, rle)))
+
+
+def _masks(rng: np.random.Generator, truth: Observations, found: np.ndarray):
+    """Masks with drifting, ragged borders, and their boxes (x, y, width, height)."""
+    N, T = found.shape
+    drift = _jitter(rng, (N, T))
+    merged = _runs(rng, MERGED, (N, T))
+    boxes = np.zeros((N, T, 4), np.float32)
+    masks = {}
+    for n, t in np.argwhere(found).tolist():
+        mask = truth.mask(n, t)
+        if mask is None:
+            continue
+        side = float(truth.box_px[n, t, 2:].max())
+        if merged[n, t]:
+            mask = _with_neighbour(truth, n, t, mask, max(2, int(0.02 * side)))
+        margin = int(0.08 * side) + 4
+        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+        top, bottom = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, mask.shape[0])
+        left, right = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, mask.shape[1])
+        part = np.ascontiguousarray(mask[top:bottom, left:right]).astype(np.uint8)
+        # signed distance to the border, moved by the drift and by smooth noise: thin tips get lost
+        inside = cv2.distanceTransform(part, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - part, cv2.DIST_L2, 3)
+        field = rng.normal(size=(8 + part.shape[0] // 8, 8 + part.shape[1] // 8)).astype(np.float32)
+        field = cv2.resize(field, part.shape[::-1], interpolation=cv2.INTER_CUBIC)
+        reported = inside + RAGGED * side * (0.35 * drift[n, t] - 0.25 + 0.5 * field) > 0
+        whole = np.zeros(mask.shape, bool)
+        whole[top:bottom, left:right] = reported
+        if not whole.any():
+            continue
+        rows, columns = np.flatnonzero(whole.any(1)), np.flatnonzero(whole.any(0))
+        boxes[n, t] = columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]
+        masks[n, t] = encode_mask(whole)
+    return masks, boxes
+
+
+def _with_neighbour(truth: Observations, n: int, t: int, mask: np.ndarray, reach_px: int) -> np.ndarray:
+    """The mask together with the first neighbour's that touches it."""
+    grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach_px + 1,) * 2, np.uint8)) > 0
+    for other in range(truth.num_tracks):
+        theirs = truth.mask(other, t) if other != n else None
+        if theirs is not None and (grown & theirs).any():
+            return mask | theirs
+    return mask

@@ -1,0 +1,238 @@
+"""A simulated scene in a folder: footage, truth, and what detectors would report."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxfit import __version__
+from jaxfit.camera import Camera
+from jaxfit.errors import InputError
+from jaxfit.fitting.solution import Solution, save_solution
+from jaxfit.formats.coco import write_coco
+from jaxfit.model.anatomy import MURRE_SKELETON
+from jaxfit.model.bird import Bird
+from jaxfit.model.describe import model_hash
+from jaxfit.observations import Observations, encode_mask
+from jaxfit.progress import ProgressTask, silent
+from jaxfit.simulation.behaviour import BEHAVIOURS
+from jaxfit.simulation.flock import Actor, act
+from jaxfit.simulation.footage import Footage
+from jaxfit.simulation.ledge import random_light
+from jaxfit.simulation.noise import detect_noisily
+from jaxfit.simulation.viewpoint import Viewpoint, look_down
+from jaxfit.simulation.visibility import see
+from jaxfit.storage import new_folder, write_whole
+from jaxfit.video import VideoWriter
+
+__all__ = ["DETECTIONS", "FOOTAGE", "MARKER", "Scene", "simulate", "stage_scene"]
+
+FOOTAGE, DETECTIONS, TRUTH, TRUE_POSES, MARKER = "footage.mp4", "detections.json", "truth.json", "truth", "scene.json"
+LEDGE_DEPTH = 62.0
+"""From the edge to the wall, model units (1.24 m)."""
+LARGEST_SIDE, SMALLEST_SIDE = 8192, 160
+
+
+class Scene(NamedTuple):
+    """A scene before it is filmed."""
+
+    actors: list[Actor]
+    view: Viewpoint
+    truth: Observations
+    """Exact keypoints, visible and whole masks; boxes around the whole birds."""
+    poses: Solution
+    """Exact poses, in the real camera."""
+    detections: Observations
+    """What detectors would report."""
+
+
+def stage_scene(
+    bird: Bird,
+    birds: int = 7,
+    frames: int = 100,
+    size: tuple[int, int] = (2592, 1520),
+    fps: float = 25.0,
+    seed: int = 0,
+    progress: ProgressTask = silent,
+) -> Scene:
+    """Let birds live on a ledge and say exactly what is to be seen of them.
+
+    Args:
+        bird: the model, with names of joints as `jaxfit.load_murre` has them.
+        birds: on the ledge, at least 1.
+        frames: length, at least 2.
+        size: width and height of the picture in pixels.
+        fps: frames a second.
+        seed: 0 or more; the same seed gives the same scene.
+        progress: told of every frame.
+
+    Raises:
+        InputError: a number that makes no sense.
+    """
+    _check(birds, frames, size, fps, seed)
+    view = look_down(np.random.default_rng((seed, 0)), *size, LEDGE_DEPTH)
+    actors = act(bird, birds, frames, fps, LEDGE_DEPTH, view, seed)
+    vertices = np.stack([actor.vertices_world for actor in actors], axis=1)  # T N V 3
+    keypoints = np.einsum("kv,tnvc->tnkc", np.asarray(bird.keypoint_weights, np.float64), vertices, optimize=True)
+    K = bird.num_keypoints
+    points, inside, seen = np.zeros((birds, frames, K, 2)), *np.zeros((2, birds, frames, K), bool)
+    boxes, whole, visible = np.zeros((birds, frames, 4), np.float32), {}, {}
+    faces = np.asarray(bird.faces)
+    with progress("Staging the scene", frames) as tick:
+        for t in range(frames):
+            seen_now = see(vertices[t], keypoints[t], faces, view)
+            points[:, t], inside[:, t], seen[:, t] = seen_now.keypoints_px, seen_now.inside, seen_now.seen
+            for n in range(birds):
+                if not seen_now.whole[n].any():
+                    continue  # flown out of the picture
+                whole[n, t], boxes[n, t] = encode_mask(seen_now.whole[n]), _box(seen_now.whole[n])
+                if seen_now.visible[n].any():
+                    visible[n, t] = encode_mask(seen_now.visible[n])
+            tick(1, "")
+    present = boxes[..., 2] > 0
+    labelled = inside & present[..., None]
+    truth = Observations(
+        track_id=np.arange(1, birds + 1),
+        frame_index=np.arange(frames),
+        present=present,
+        keypoints_px=np.where(labelled[..., None], points, 0).astype(np.float32),
+        confidence=labelled.astype(np.float32),
+        box_px=boxes,
+        image_size_px=np.tile(size, (frames, 1)),
+        file_name=np.array([f"{FOOTAGE}#{t}" for t in range(frames)]),
+        keypoint_names=bird.keypoint_names,
+        skeleton=_skeleton(bird),
+        masks=visible,
+        amodal_masks=whole,
+        occluded=labelled & ~seen,
+    )
+    poses = _true_poses(bird, actors, view, truth, points, np.swapaxes(keypoints, 0, 1))
+    detections = detect_noisily(truth, seen, bird.keypoint_pairs, seed)
+    return Scene(actors, view, truth, poses, detections)
+
+
+def simulate(
+    bird: Bird,
+    folder: str | Path,
+    birds: int = 7,
+    frames: int = 100,
+    size: tuple[int, int] = (2592, 1520),
+    fps: float = 25.0,
+    seed: int = 0,
+    codec: str = "auto",
+    overwrite: bool = False,
+    progress: ProgressTask = silent,
+) -> Scene:
+    """Stage a scene, film it, and write everything; the same arguments give the same bytes.
+
+    The folder then holds `footage.mp4`; `truth.json`, exact annotations as COCO (visible masks as `segmentation`,
+    whole ones as `amodal_segmentation`, hidden keypoints with visibility 1); `truth/`, exact poses as a result;
+    `detections.json`, what detectors would report (see `jaxfit.simulation.noise`); `scene.json`, the camera and what
+    each bird does when.
+
+    Args:
+        folder: to make, whole or not at all.
+        codec: as `VideoWriter` takes it.
+        overwrite: replace an earlier scene of that name.
+        bird, birds, frames, size, fps, seed, progress: as for `stage_scene`.
+
+    Raises:
+        InputError: a number that makes no sense, or the folder cannot be written.
+    """
+    with new_folder(folder, overwrite, marker=MARKER) as part:
+        scene = stage_scene(bird, birds, frames, size, fps, seed, progress)
+        rng = np.random.default_rng((seed, 4))
+        film = Footage(bird, scene.actors, scene.view, LEDGE_DEPTH, random_light(rng), seed)
+        with progress("Filming", frames) as tick, VideoWriter(part / FOOTAGE, size, fps, codec) as video:
+            for t in range(frames):
+                video.write(film.frame(t))
+                tick(1, "")
+        write_coco(scene.truth, part / TRUTH)
+        write_coco(scene.detections, part / DETECTIONS)
+        origin = "simulated: these poses are the truth, not a fit"
+        facts = {"origin": origin, "jaxfit": __version__, "model": model_hash(bird)}
+        save_solution(scene.poses, bird, f"# {origin}\n", facts, part / TRUE_POSES)
+        write_whole(part / MARKER, json.dumps(_description(scene, birds, frames, size, fps, seed), indent=2).encode())
+    return scene
+
+
+def _skeleton(bird: Bird) -> tuple[tuple[int, int], ...]:
+    names = bird.keypoint_names
+    return tuple((names.index(a), names.index(b)) for a, b in MURRE_SKELETON if a in names and b in names)
+
+
+def _check(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> None:
+    def require(name: str, value: object, holds: bool, remedy: str) -> None:
+        if not holds:
+            raise InputError(f"simulate: {name}", f"{value} makes no scene", remedy)
+
+    require("birds", birds, 1 <= birds <= 60, "give 1 to 60 birds")
+    require("frames", frames, 2 <= frames <= 100_000, "give 2 frames or more")
+    remedy = f"give width and height as in 2592x1520, even, {SMALLEST_SIDE} to {LARGEST_SIDE} pixels"
+    sides_fit = len(size) == 2 and all(SMALLEST_SIDE <= side <= LARGEST_SIDE and side % 2 == 0 for side in size)
+    require("size", "x".join(map(str, size)), sides_fit, remedy)
+    require("fps", fps, 5 <= fps <= 240, "give 5 to 240 frames a second")
+    require("seed", seed, 0 <= seed < 2**32, "give a whole number from 0")
+
+
+def _box(mask: np.ndarray) -> list[int]:
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    return [columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]]
+
+
+def _true_poses(
+    bird: Bird, actors: list[Actor], view: Viewpoint, truth: Observations, points_px: np.ndarray, keypoints_world
+) -> Solution:
+    """The actors' poses as a result whose crop is the whole picture, so that its camera is the real one."""
+    N, T = truth.present.shape
+
+    def stack(name: str) -> np.ndarray:
+        return np.stack([np.asarray(getattr(actor.pose, name)) for actor in actors])
+
+    def each_frame(name: str) -> np.ndarray:
+        values = stack(name)
+        return np.broadcast_to(values[:, None], (N, T, *values.shape[1:]))
+
+    crop_px = Camera().size_px
+    return Solution(
+        track_id=truth.track_id,
+        frame_index=truth.frame_index,
+        valid=truth.present,
+        global_orient=stack("global_orient"),
+        body_pose=stack("body_pose"),
+        transl=stack("transl"),
+        scale=np.broadcast_to(stack("scale"), (N, T)),
+        bone_length=each_frame("bone_length"),
+        betas=each_frame("betas"),
+        keypoints_3d=view.to_camera(keypoints_world),
+        keypoints_2d=points_px,
+        crop=np.broadcast_to(view.crop, (N, T, 3)),
+        keypoint_names=bird.keypoint_names,
+        joint_names=bird.joint_names,
+        status=np.full(N, "ok"),
+        loss={},
+        focal=view.focal_px * crop_px / float(view.crop[2]),
+        crop_px=crop_px,
+    )
+
+
+def _description(scene: Scene, birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> dict:
+    """What `scene.json` says: how the scene was made, its camera, and what each bird does from which frame on."""
+    acts = {}
+    for track, actor in zip(scene.truth.track_id.tolist(), scene.actors, strict=True):
+        starts = np.flatnonzero(np.diff(actor.behaviour, prepend=-1))
+        acts[track] = [{"from_frame": int(t), "behaviour": BEHAVIOURS[actor.behaviour[t]]} for t in starts]
+    return {
+        "made_by": f"jaxfit {__version__}, simulated",
+        "arguments": {"birds": birds, "frames": frames, "size": list(size), "fps": fps, "seed": seed},
+        "camera": {
+            "R_cam_world": scene.view.R_cam_world.tolist(),
+            "position_world": scene.view.position_world.tolist(),
+            "focal_px": scene.view.focal_px,
+            "units": "model units; world z up, ledge at z = 0",
+        },
+        "behaviour": acts,
+    }
