@@ -13,7 +13,7 @@ ROUND = np.radians(np.arange(0, 360, 45))
 LEG_SHARES = ("thigh", "tibia", "tibia", "ankle", "tarsus", "tarsus", "foot", "toes", "toes")
 """What each ring of the leg belongs to."""
 TOES = {0: (1.75, 3.9), 1: (0.95, 3.75), 2: (0.0, 5.0), 3: (-1.0, 4.1), 4: (-2.0, 4.5)}
-"""Ends of the inner, middle and outer toe (0, 2, 4) and of the webs between: sideways and forwards of the toes' root."""
+"""Ends of the inner, middle and outer toe (0, 2, 4) and of the webs between: sideways and forwards of the root."""
 
 
 def leg_rings() -> Float[np.ndarray, "L 8 3"]:
@@ -26,7 +26,7 @@ def leg_rings() -> Float[np.ndarray, "L 8 3"]:
         _ring(knee + 0.55 * tibia, unit[0] + [0, 0, -0.8], 1.15, 1.35),
         _ring(knee + 0.78 * tibia, unit[0] + [0, 0, -0.3], 0.72, 0.85),
         _ring(knee + 0.93 * tibia, unit[0], 0.45, 0.5),
-        _ring(ankle, unit[0] + unit[1], 0.42, 0.5),
+        _ring(ankle, unit[0] + unit[1], 0.40, 0.42),
         _ring(ankle + 0.2 * tarsus, unit[1], 0.34, 0.40),
         _ring(ankle + 0.7 * tarsus, unit[1], 0.34, 0.36),
         _ring(foot, unit[1] + unit[2], 0.50, 0.36),
@@ -36,7 +36,7 @@ def leg_rings() -> Float[np.ndarray, "L 8 3"]:
         for p in range(8):
             side, forward = TOES[p if p <= 4 else 8 - p]
             thick = 0.26 * (1.15 - 0.75 * reach) * (0.0 if p in (0, 4) else 1.0 if p in (2, 6) else 0.6)
-            sole = foot[2] - 0.22
+            sole = foot[2] - 0.40
             ring[p] = (
                 foot[0] + side * (0.25 + 0.75 * reach),
                 foot[1] + forward * reach,

@@ -13,9 +13,14 @@ __all__ = ["half_colours", "keypoint_weights"]
 
 BROWN, HEAD = (0.235, 0.180, 0.155), (0.200, 0.150, 0.130)
 WHITE, UNDERWING, DUSKY = (0.94, 0.94, 0.92), (0.86, 0.85, 0.83), (0.50, 0.47, 0.45)
+BLACK = (0.03, 0.03, 0.03)
 BILL, LEG, PRIMARIES = (0.11, 0.11, 0.12), (0.24, 0.23, 0.22), (0.170, 0.135, 0.120)
 LAST_BROWN = 4
 """Last brown column of the loft, from the back; below it the flank is white."""
+EYE = (int(np.argmin(np.abs(RINGS - 15.1))), 4)
+"""Ring and column of the left eye."""
+SHOULDER = {BIB_RINGS[0] - 3: 5, BIB_RINGS[0] - 2: 6, BIB_RINGS[0] - 1: 7, BIB_RINGS[0]: 8}
+"""The same just behind the bib, whose brown runs down the sides of the neck to the bend of the wing."""
 BAR = (0.10, 0.46)
 """Part of the span whose trailing edge, the tips of the secondaries, is white."""
 
@@ -30,7 +35,7 @@ def half_colours(half: Half) -> Float[np.ndarray, "H 3"]:
         elif part == 1:
             below = place >= points // 2
             chord = CHORD[points - 1 - place if below else place]
-            colours[vertex] = _wing_colour(SPAN[ring - 1], chord, below)
+            colours[vertex] = _wing_colour(float(SPAN[ring - 1]), float(chord), bool(below))
         else:
             colours[vertex] = WHITE if ring <= 1 else LEG
     return colours
@@ -40,15 +45,19 @@ def _body_colour(ring: int, column: int):
     row = RINGS[ring]
     if row >= 17.2:
         return BILL
+    if (ring, column) == EYE:
+        return BLACK
     if row > 11:
         return HEAD
-    if ring >= BIB_RINGS[1] or row < 2.9 or column <= LAST_BROWN:
+    if ring >= BIB_RINGS[1] or row < 2.9 or column <= SHOULDER.get(ring, LAST_BROWN):
         return BROWN
     return WHITE
 
 
 def _wing_colour(span: float, chord: float, below: bool):
     if below:
+        if chord < 0.1:
+            return BROWN
         return UNDERWING if chord < 0.6 and span < 0.75 else DUSKY
     if BAR[0] < span < BAR[1] and chord > 0.9:
         return WHITE
@@ -62,7 +71,7 @@ def keypoint_weights(half: Half, mesh: Mesh) -> Float[np.ndarray, "K V"]:
     points = wing.shape[1]
     wrist = 1 + int(np.argmin(np.abs(SPAN - 0.42)))
     left = {
-        "eye": body[rows(15.1), [3, 4]],
+        "eye": body[EYE],
         "foot": leg[7],
         "shin": leg[5],
         "wingtip": wing[-1, [2, 3, points - 3, points - 4]],

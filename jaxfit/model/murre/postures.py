@@ -55,7 +55,9 @@ def _posture(
     pose = {name: np.zeros(3) for name in JOINT_NAMES}
     for name, R in spread_rotations().items():
         pose[name] = spread * Rotation.from_matrix(R).as_rotvec()
-    pose["left_wing_root"] = np.radians([0.0, flap, 0.0])
+    pose["left_wing_root"] = np.radians([0.0, ROOT_SHARE * flap, 0.0])
+    raised = Rotation.from_euler("y", (1 - ROOT_SHARE) * flap, degrees=True)
+    pose["left_shoulder"] = (raised * Rotation.from_rotvec(pose["left_shoulder"])).as_rotvec()
     for name, turn in turns.items():
         pose[name] = pose[name] + np.radians(turn)
     for joint in [name for name in JOINT_NAMES if name.startswith("left_")]:
@@ -70,6 +72,8 @@ def _posture(
     return Posture(np.stack([pose[name] for name in JOINT_NAMES[1:]]), float(np.radians(pitch)))
 
 
+ROOT_SHARE = 0.5
+"""Share of a raised wing's turn that its root takes; the shoulder takes the rest."""
 TRAILING = np.radians([0.0, -25.0, -95.0, -20.0])
 """Bends of the leg's joints in flight: feet stretched out behind."""
 
@@ -93,23 +97,29 @@ def _leg_bends(pitch: float, ankle: tuple[float, float]) -> tuple[float, float, 
     return float(swing), float(bend), float(-tarsus - pitch - swing - bend), float(tarsus)
 
 
-STAND, STEP = (-2.9, -8.3), 2.0
+STAND, STEP = (-2.9, -8.5), 2.0
 
 POSTURES: dict[str, Posture] = {
     "standing": _posture(
-        52, STAND, lower_body=(-8, 0, 0), tail=(-14, 0, 0), neck_root=(-14, 0, 0), neck=(-10, 0, 0), head=(-28, 0, 0)
+        50, STAND, lower_body=(-10, 0, 0), tail=(-20, 0, 0), neck_root=(-13, 0, 0), neck=(-13, 0, 0), head=(-24, 0, 0)
     ),
     "alert": _posture(
-        60,
-        (-3.2, -8.3),
-        lower_body=(-10, 0, 0),
-        tail=(-16, 0, 0),
+        57,
+        (-3.2, -9.1),
+        lower_body=(-14, 0, 0),
+        tail=(-26, 0, 0),
         neck_root=(-20, 0, 0),
         neck=(-14, 0, 0),
         head=(-28, 0, 0),
     ),
     "incubating": _posture(
-        27, (-6.4, -4.7), lower_body=(-2, 0, 0), tail=(-6, 0, 0), neck_root=(10, 0, 0), neck=(8, 0, 0), head=(-46, 0, 0)
+        27,
+        (-6.4, -4.3),
+        lower_body=(-5, 0, 0),
+        tail=(-16, 0, 0),
+        neck_root=(10, 0, 0),
+        neck=(8, 0, 0),
+        head=(-46, 0, 0),
     ),
     "preening_left": _posture(
         46, STAND, lower_body=(-8, 0, 0), tail=(-12, 0, 0), neck_root=(-5, 10, 45), neck=(0, 15, 60), head=(-20, 0, 60)
@@ -126,15 +136,15 @@ POSTURES: dict[str, Posture] = {
     "wings_up": _posture(8, None, 1.0, 38, head=(-8, 0, 0), neck_root=(-18, 0, 0), neck=(-12, 0, 0)),
     "wings_down": _posture(8, None, 0.95, -32, head=(-8, 0, 0), neck_root=(-18, 0, 0), neck=(-12, 0, 0)),
     "wings_half": _posture(
-        52,
+        50,
         STAND,
         0.45,
-        10,
-        lower_body=(-8, 0, 0),
-        tail=(-14, 0, 0),
-        neck_root=(-14, 0, 0),
-        neck=(-10, 0, 0),
-        head=(-28, 0, 0),
+        22,
+        lower_body=(-10, 0, 0),
+        tail=(-20, 0, 0),
+        neck_root=(-13, 0, 0),
+        neck=(-13, 0, 0),
+        head=(-24, 0, 0),
     ),
     "jab": _posture(
         34,

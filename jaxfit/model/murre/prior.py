@@ -1,8 +1,8 @@
 """The murre's pose prior and joint limits: designed from the postures, not learnt from birds.
 
 Poses are drawn between pairs of postures, with a little independent noise at every joint, each with its mirror image.
-Their mean and covariance are the Gaussian prior. It prefers what murres on a ledge do, standing above all, and leaves the
-wings room along the way in which they unfold.
+Their mean and covariance are the Gaussian prior. It prefers what murres on a ledge do, standing above all, and leaves
+the wings room along the way in which they unfold.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def pose_prior() -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
     """Mean and covariance of the flattened body pose.
 
     For poses a + s (b − a) with a and b drawn by `SHARES` and s evenly from [0, 1], the moments are known exactly:
-    E = Σ p_a x_a and Cov = (2/3) Σ p_a (x_a − E)(x_a − E)ᵀ, since E[(1 − s)² + s²] = 2/3. Nothing is sampled, so the prior
-    is the same on every machine.
+    E = Σ p_a x_a and Cov = (2/3) Σ p_a (x_a − E)(x_a − E)ᵀ, since E[(1 − s)² + s²] = 2/3. Nothing is sampled, so the
+    prior is the same on every machine.
     """
     names = list(SHARES)
     poses = np.stack([POSTURES[name].body_pose for name in names])

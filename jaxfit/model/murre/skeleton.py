@@ -34,10 +34,10 @@ MIDDLE_AND_LEFT = {
     "left_knee": (-3.0, -1.5, -0.3),
     "left_ankle": (-3.3, -7.0, -4.0),
     "left_foot": (-3.3, -4.2, -6.5),
-    "left_wing_root": (0.0, 7.0, 5.2),
-    "left_shoulder": (-2.8, 7.0, 5.2),
-    "left_elbow": (-5.5, 0.0, 4.2),
-    "left_wrist": (-6.4, 5.8, 1.1),
+    "left_wing_root": (0.0, 7.6, 5.2),
+    "left_shoulder": (-2.8, 7.6, 5.2),
+    "left_elbow": (-5.3, 0.6, 4.3),
+    "left_wrist": (-6.0, 7.0, 1.4),
     "neck_root": (0.0, 7.6, 4.6),
     "neck": (0.0, 10.0, 7.2),
     "head": (0.0, 12.5, 10.9),
@@ -60,7 +60,7 @@ class Frame(NamedTuple):
 
 
 WING_BONES = ("left_shoulder", "left_elbow", "left_wrist")
-WING_TIP = (-1.9, -14.3, 3.0)
+WING_TIP = (-1.6, -12.7, 3.4)
 """Tip of the longest primary of the folded wing."""
 FOLDED_ABOVE = ((-0.85, 0.0, 0.5), (-0.95, 0.1, 0.25), (-0.97, 0.0, 0.25))
 SPREAD = (

@@ -36,7 +36,11 @@ LEG = {
     "foot": {"left_ankle": 0.45, "left_foot": 0.55},
     "toes": {"left_foot": 1.0},
 }
+HINGE = {"upper_body": 0.45, "left_wing_root": 0.2, "left_shoulder": 0.35}
+"""Weights of the wing's first ring."""
 MAX_JOINTS = 4
+SMOOTH = 2.0
+"""How strongly neighbours on the wing share their weights, in centimetres of misfit for a whole weight."""
 
 
 def half_weights(half: Half) -> Float[np.ndarray, "H J"]:
@@ -44,7 +48,7 @@ def half_weights(half: Half) -> Float[np.ndarray, "H J"]:
     weights = np.zeros((len(half.vertices), len(JOINT_NAMES)))
     for vertex in np.flatnonzero(half.part == 0):
         ring, column = half.place[vertex]
-        for name, share in body_weights(RINGS[ring], ANGLES[column]).items():
+        for name, share in body_weights(float(RINGS[ring]), float(ANGLES[column])).items():
             weights[vertex, JOINT_NAMES.index(name)] = share
     stump = weights[half.leg_index[0]].mean(axis=0)
     for ring, name in enumerate(LEG_SHARES, start=1):
@@ -52,10 +56,10 @@ def half_weights(half: Half) -> Float[np.ndarray, "H J"]:
             row = stump if joint == "body" else np.eye(len(JOINT_NAMES))[JOINT_NAMES.index(joint)]
             weights[half.leg_index[ring]] += share * row
     columns = [JOINT_NAMES.index(name) for name in WING]
-    weights[np.ix_(half.wing_index[1:].ravel(), columns)] = wing_weights(half).reshape(-1, len(WING))
-    root = half.wing_index[1]
-    weights[root] *= 0.6
-    weights[root, JOINT_NAMES.index("upper_body")] += 0.4
+    weights[half.wing_index[1:].ravel()[:, None], columns] = wing_weights(half).reshape(-1, len(WING))
+    weights[half.wing_index[1]] = 0.0
+    for name, share in HINGE.items():
+        weights[half.wing_index[1], JOINT_NAMES.index(name)] = share
     return _few(weights)
 
 
@@ -66,7 +70,7 @@ def body_weights(row: float, angle: float) -> dict[str, float]:
         share = smooth_step(row, start, end)
         weights[after] = weights.get(before, 0.0) * share
         weights[before] = weights.get(before, 0.0) * (1 - share)
-    breast = 0.5 * smooth_step(row, 6.0, 7.5) * (1 - smooth_step(row, 8.0, 9.2)) * smooth_step(float(angle), 1.5, 2.4)
+    breast = 0.5 * smooth_step(row, 6.0, 7.5) * (1 - smooth_step(row, 8.0, 9.2)) * smooth_step(angle, 1.5, 2.4)
     weights["chest"] = breast * weights["upper_body"]
     weights["upper_body"] -= weights["chest"]
     lower = smooth_step(row, 16.5, 17.3) * float(angle > np.pi / 2)
@@ -104,7 +108,7 @@ def wing_weights(half: Half) -> Float[np.ndarray, "U P 4"]:
                 equation(index[u, p], images[u, p, d], spread[u, p, d])
             equation(index[u, p], np.full(joints, 100.0), 100.0)
             for j in range(joints):
-                near = 3.0 if chord[p] < 0.4 else 0.6
+                near = 1.0 if chord[p] < 0.4 else 0.5
                 equation(index[u, p, j : j + 1], np.array([near]), near * guess[u, j])
                 for other in ((u + 1, p), (u, p + 1)):
                     if other[0] < stations:
@@ -115,9 +119,6 @@ def wing_weights(half: Half) -> Float[np.ndarray, "U P 4"]:
     solved = nnls(matrix.T @ matrix, matrix.T @ np.array(wanted), maxiter=20 * index.size)[0]
     weights = solved.reshape(stations, points, joints)
     return weights / weights.sum(axis=-1, keepdims=True)
-
-
-SMOOTH = 3.0
 
 
 def _guess() -> Float[np.ndarray, "U 4"]:

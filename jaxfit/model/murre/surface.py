@@ -6,6 +6,7 @@ Centimetres, in the axes of `jaxfit.model.anatomy`.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +22,8 @@ __all__ = ["ANGLES", "Half", "Mesh", "body_rings", "make_half", "mirrored"]
 # above and below the centre.
 SECTIONS = np.array(
     [
-        (-15.3, 1.55, 2, 1.30, 0.12, 0.12),  # tail tip
-        (-14.8, 1.60, 2, 1.90, 0.16, 0.16),
+        (-15.3, 1.55, 2, 0.95, 0.12, 0.12),  # tail tip
+        (-14.8, 1.60, 2, 1.75, 0.16, 0.16),
         (-13.0, 1.80, 2, 2.25, 0.35, 0.40),
         (-10.8, 2.10, 2, 2.55, 1.20, 1.45),  # tail base
         (-8.0, 2.30, 2, 3.90, 2.70, 3.00),
@@ -38,8 +39,8 @@ SECTIONS = np.array(
         (15.3, 11.9, 10, 2.10, 2.10, 1.95),  # eyes
         (16.9, 11.9, -3, 1.65, 1.60, 1.55),
         (18.2, 11.7, -8, 1.00, 1.05, 1.05),
-        (19.0, 11.55, -8, 0.58, 0.78, 0.75),  # where the feathers end
-        (21.3, 11.25, -7, 0.36, 0.52, 0.48),
+        (19.0, 11.55, -8, 0.56, 0.70, 0.66),  # where the feathers end
+        (21.3, 11.25, -7, 0.35, 0.48, 0.44),
         (23.0, 11.05, -8, 0.18, 0.27, 0.25),
         (23.7, 10.93, -10, 0.04, 0.05, 0.05),  # bill tip
     ]
@@ -58,7 +59,7 @@ SLIT_COLUMNS = (3, 4)
 BIB_RINGS = (18, 19)
 """Two rings close together, along which the brown of the foreneck ends."""
 BIB = {17: 0.45, 18: 1.0, 19: 1.0, 20: 0.75, 21: 0.4, 22: 0.15}
-BIB_REACH = np.interp(np.degrees(ANGLES), [0, 70, 100, 180], [-0.30, -0.30, -0.1, 0.55])
+BIB_REACH = np.interp(np.degrees(ANGLES), [0, 75, 100, 125, 150, 180], [-0.3, -0.3, -0.15, 0.15, 0.42, 0.5])
 """Those rings run higher on the foreneck than at the sides: how far along the spine each column is moved, and the share
 of it that each ring takes."""
 LEG_RINGS, LEG_COLUMNS = (7, 8, 9), (7, 8, 9)
@@ -143,7 +144,7 @@ def make_half() -> Half:
     (a, b, c), (p, q, r) = LEG_RINGS, LEG_COLUMNS
     loop = [(b, r), (c, r), (c, q), (c, p), (b, p), (a, p), (a, q), (a, r)]
     leg = _extrude(faces, [body[at] for at in loop], leg_rings(), add, 2)
-    _zip(faces, np.roll(leg[-1], 0), start=0)
+    _zip(faces, leg[-1], pointed=True)
     return Half(
         np.array(points), np.array(faces)[:, ::-1], np.array(part), np.array(place), body, np.array(wing), np.array(leg)
     )
@@ -178,14 +179,12 @@ def _extrude(faces: list, loop: list, rings, add, part: int) -> list:
     return index
 
 
-def _zip(faces: list, loop, flip: bool = False, start: int | None = None) -> None:
-    """Close a flat loop by joining the two ends of every rung across it."""
+def _zip(faces: list, loop, flip: bool = False, pointed: bool = False) -> None:
+    """Close a flat loop by rungs across it; a pointed one ends in single points instead of rungs."""
     loop = list(loop)
     n = len(loop)
-    # rungs pair the points on either side of the loop's flat ends
-    offset = 0 if start is not None else 1
-    pairs = [(loop[p], loop[(-p if start is not None else n - 1 - p) % n]) for p in range((n + 2 - offset) // 2)]
-    for (a, b), (c, d) in zip(pairs, pairs[1:], strict=False):
+    rungs = [(loop[p], loop[-p if pointed else n - 1 - p]) for p in range(n // 2 + pointed)]
+    for (a, b), (c, d) in pairwise(rungs):
         for face in ((a, c, d), (a, d, b)):
             if len(set(face)) == 3:
                 faces.append(face[::-1] if flip else face)

@@ -1,7 +1,7 @@
 """How one murre differs from another: shape directions and bone lengths.
 
-Designed from the ranges in `measurements`, not learnt: one unit of a coefficient is one standard deviation, a quarter of
-the range from the least to the greatest measurement.
+Designed from the ranges in `measurements`, not learnt: one unit of a coefficient is one standard deviation, a quarter
+of the range from the least to the greatest measurement.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from jaxfit.model.murre.surface import RINGS, Half, sections_at
 __all__ = ["SHAPES", "bone_prior", "half_shapes"]
 
 SHAPES = ("girth", "neck thickness", "bill length", "wing length", "tail length")
+PIVOT = (0.0, 0.0, 2.8)
+"""What the girth grows away from."""
 BONE_DEVIATION, SIDES_AGREE = 0.05, 0.9
 
 
@@ -30,9 +32,8 @@ def relative_deviation(name: str) -> float:
 def half_shapes(half: Half, weights: Float[np.ndarray, "H J"]) -> Float[np.ndarray, "S H 3"]:
     """Displacement in centimetres of every vertex of the left half by one unit of each direction."""
     v, basis = half.vertices, np.zeros((len(SHAPES), *half.vertices.shape))
-    middle = np.array([PIVOT[0], PIVOT[1], PIVOT[2]])
     trunk = smooth_step(v[:, 1], -13.0, -5.0) * (1 - smooth_step(v[:, 1], 7.0, 11.0)) * (half.part < 2)
-    basis[0] = relative_deviation("body_width") * trunk[:, None] * (v - middle) * [1, 0, 1]
+    basis[0] = relative_deviation("body_width") * trunk[:, None] * (v - PIVOT) * [1, 0, 1]
 
     body = half.part == 0
     row = RINGS[half.place[body, 0]]
@@ -56,10 +57,6 @@ def half_shapes(half: Half, weights: Float[np.ndarray, "H J"]) -> Float[np.ndarr
     basis[4] = relative_deviation("tail") * behind[:, None] * [0.0, -1.0, 0.0]
     basis[:, v[:, 0] == 0, 0] = 0
     return basis
-
-
-PIVOT = (0.0, 0.0, 2.8)
-"""What the girth grows away from."""
 
 
 def bone_prior() -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B B"]]:

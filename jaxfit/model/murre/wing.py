@@ -22,13 +22,13 @@ SPAN = np.array([0.06, 0.13, 0.20, 0.27, 0.34, 0.41, 0.48, 0.55, 0.63, 0.71, 0.7
 FOLDED = np.array(
     [
         (0.00, 7.4, 0.0, -1.2, 0.0),
-        (0.12, 8.0, 1.5, -3.2, -0.2),
-        (0.24, 7.9, 3.2, -5.4, -0.3),
-        (0.42, 6.4, 5.2, -8.4, -0.2),
-        (0.60, 1.8, 5.9, -11.0, 0.0),
-        (0.80, -5.5, 4.6, -13.0, 0.3),
-        (0.94, -11.4, 2.6, -14.0, 0.7),
-        (1.00, -13.6, 1.6, -14.3, 1.1),
+        (0.12, 7.9, 1.5, -2.2, 1.3),
+        (0.24, 8.2, 2.9, -4.4, 0.6),
+        (0.42, 7.5, 4.9, -7.4, -0.3),
+        (0.60, 3.2, 5.9, -9.8, -0.6),
+        (0.80, -4.0, 4.7, -11.6, -0.2),
+        (0.94, -9.8, 2.7, -12.5, 0.3),
+        (1.00, -12.0, 1.4, -12.7, 0.7),
     ]
 )
 # Spread: x and y of the leading and the trailing edge.
@@ -47,8 +47,8 @@ SPREAD = np.array(
 # What the folded wing lies on: y, z of the centre, half the width, height above and below.
 BED = np.array(
     [
-        (-15.0, 2.2, 2.2, 1.1, 1.0),
-        (-11.0, 2.3, 3.1, 1.9, 1.9),
+        (-15.0, 2.2, 1.7, 1.0, 1.0),
+        (-11.0, 2.3, 2.9, 1.75, 1.9),
         (-8.0, 2.35, 4.1, 2.9, 3.0),
         (-4.0, 2.5, 5.2, 3.95, 4.3),
         (0.0, 2.8, 5.7, 4.55, 4.95),
@@ -58,6 +58,7 @@ BED = np.array(
     ]
 )
 SLIT_ANGLE = np.radians(61)
+HINGE = 0.35
 
 
 def _on_flank(y, arc, off) -> np.ndarray:
@@ -76,7 +77,7 @@ def _edges(table, span):
 
 def _thickness(span, chord):
     """Of the sheet in centimetres: an arm with feathers behind it, thinner towards the tip."""
-    arm = np.interp(span, [0, 0.12, 0.42, 0.7, 1.0], [1.2, 0.95, 0.65, 0.35, 0.15])
+    arm = np.interp(span, [0, 0.12, 0.42, 0.7, 1.0], [1.1, 0.85, 0.55, 0.32, 0.15])
     profile = np.interp(chord, [0, 0.1, 0.3, 0.6, 1.0], [0.45, 0.9, 1.0, 0.5, 0.2])
     return np.maximum(arm * profile, 0.12)
 
@@ -87,7 +88,7 @@ def folded_sheet() -> tuple[Float[np.ndarray, "U C 3"], Float[np.ndarray, "U C 3
     y = front_y + CHORD * (back_y - front_y)
     arc = front_arc + CHORD * (back_arc - front_arc)
     span = np.broadcast_to(SPAN[:, None], y.shape)
-    gap = np.broadcast_to(0.22 + 0.0 * span, y.shape)
+    gap = 0.05 + 0.12 * np.minimum(1, span / 0.2) * np.sin(np.pi * np.clip(CHORD, 0.05, 0.7))
     thick = _thickness(span, CHORD)
     shape = (*y.shape, 3)
     lower = _on_flank(y.ravel(), arc.ravel(), gap.ravel()).reshape(shape)
@@ -110,6 +111,14 @@ def spread_sheet() -> tuple[Float[np.ndarray, "U C 3"], Float[np.ndarray, "U C 3
 
 
 def wing_rings(slit: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "U P 3"]:
-    """The folded wing as rings from the body to the tip: the upper side from the front back, then the lower side forwards."""
+    """The folded wing as rings from body to tip: the upper side from the front back, then the lower side forwards.
+
+    The first ring is the hinge: the slit's own outline, drawn a little together and out of the body, so that it can
+    turn half-way with the wing in either direction.
+    """
     upper, lower = folded_sheet()
-    return np.concatenate([upper, lower[:, ::-1]], axis=1)
+    rings = np.concatenate([upper, lower[:, ::-1]], axis=1)
+    across = (slit + slit[::-1]) / 2  # the middle between upper and lower side
+    outwards = np.array([-np.sin(SLIT_ANGLE), 0.0, np.cos(SLIT_ANGLE)])
+    rings[0] = slit + 0.3 * (across - slit) + HINGE * outwards
+    return rings
