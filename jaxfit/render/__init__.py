@@ -6,6 +6,4 @@
 from jaxfit.render.raster import Fragments, draw, hard_mask, interpolate, zbuffer
 from jaxfit.render.shading import shade, vertex_normals
 
-cover = hard_mask
-
-__all__ = ["Fragments", "cover", "draw", "hard_mask", "interpolate", "shade", "vertex_normals", "zbuffer"]
+__all__ = ["Fragments", "draw", "hard_mask", "interpolate", "shade", "vertex_normals", "zbuffer"]
