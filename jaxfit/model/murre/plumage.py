@@ -84,7 +84,7 @@ def keypoint_weights(half: Half, mesh: Mesh) -> Float[np.ndarray, "K V"]:
         "back": body[12, 0],
         "throat": body[rows(13.9), -1],
         "breast": body[rows(8.55), -1],
-        "bill_base": body[rows(17.25), 0],
+        "bill_base": body[rows(17.0), 0],
         "bill_tip": body[-1],
         "tail_base": body[rows(3), 0],
         "tail_tip": body[0, [0, -1]],

@@ -108,9 +108,9 @@ POSTURES: dict[str, Posture] = {
         (-3.2, -9.1),
         lower_body=(-14, 0, 0),
         tail=(-26, 0, 0),
-        neck_root=(-20, 0, 0),
-        neck=(-14, 0, 0),
-        head=(-28, 0, 0),
+        neck_root=(-16, 0, 0),
+        neck=(0, 0, 0),
+        head=(-38, 0, 0),
     ),
     "incubating": _posture(
         27,

@@ -108,7 +108,7 @@ def wing_weights(half: Half) -> Float[np.ndarray, "U P 4"]:
                 equation(index[u, p], images[u, p, d], spread[u, p, d])
             equation(index[u, p], np.full(joints, 100.0), 100.0)
             for j in range(joints):
-                near = 1.0 if chord[p] < 0.4 else 0.5
+                near = 0.5
                 equation(index[u, p, j : j + 1], np.array([near]), near * guess[u, j])
                 for other in ((u + 1, p), (u, p + 1)):
                     if other[0] < stations:

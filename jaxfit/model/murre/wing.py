@@ -22,11 +22,11 @@ SPAN = np.array([0.06, 0.13, 0.20, 0.27, 0.34, 0.41, 0.48, 0.55, 0.63, 0.71, 0.7
 FOLDED = np.array(
     [
         (0.00, 7.4, 0.0, -1.2, 0.0),
-        (0.12, 7.9, 1.5, -2.2, 1.3),
-        (0.24, 8.2, 2.9, -4.4, 0.6),
-        (0.42, 7.5, 4.9, -7.4, -0.3),
-        (0.60, 3.2, 5.9, -9.8, -0.6),
-        (0.80, -4.0, 4.7, -11.6, -0.2),
+        (0.12, 7.9, 1.5, -2.4, 0.40),
+        (0.24, 8.2, 2.9, -4.6, 0.30),
+        (0.42, 7.5, 4.9, -7.4, 0.05),
+        (0.60, 3.2, 5.9, -9.8, -0.25),
+        (0.80, -4.0, 4.7, -11.6, -0.1),
         (0.94, -9.8, 2.7, -12.5, 0.3),
         (1.00, -12.0, 1.4, -12.7, 0.7),
     ]
@@ -58,7 +58,8 @@ BED = np.array(
     ]
 )
 SLIT_ANGLE = np.radians(61)
-HINGE = 0.35
+HINGE = (0.42, 0.04)
+"""How far the upper and the lower side of the hinge stand out of the body, in centimetres."""
 
 
 def _on_flank(y, arc, off) -> np.ndarray:
@@ -120,5 +121,6 @@ def wing_rings(slit: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "U P 3"]:
     rings = np.concatenate([upper, lower[:, ::-1]], axis=1)
     across = (slit + slit[::-1]) / 2  # the middle between upper and lower side
     outwards = np.array([-np.sin(SLIT_ANGLE), 0.0, np.cos(SLIT_ANGLE)])
-    rings[0] = slit + 0.3 * (across - slit) + HINGE * outwards
+    out = np.repeat(HINGE, len(slit) // 2)
+    rings[0] = slit + 0.3 * (across - slit) + out[:, None] * outwards
     return rings
