@@ -7,8 +7,8 @@ The model, per bird; side is the longer side of its box, in pixels:
 - gross outliers, in runs of some frames: the keypoint lands on a neighbour's of that name, or anywhere in the box;
 - left and right swapped, for all pairs of a bird or for one, in runs;
 - missing keypoints, mostly hidden ones, and whole frames without a detection, in runs;
-- confidence falls with the error that was made, but through noise: some wrong points are trusted, some right ones
-  are not;
+- confidence falls with the jitter that was made, and most outliers are doubted, but through noise: swaps and some
+  outliers are trusted, some right points are not;
 - masks: of the visible part, eroded or grown by an amount that drifts, with ragged borders, now and then torn at
   the tips, and now and then merged with a touching neighbour.
 
@@ -31,7 +31,7 @@ __all__ = ["detect_noisily"]
 
 JITTER, MOTION, HIDDEN = 0.012, 0.15, 2.5
 CORRELATED, RHO = 0.6, 0.85
-OUTLIERS_SEEN, OUTLIERS_HIDDEN = 0.015, 0.06
+OUTLIERS_SEEN, OUTLIERS_HIDDEN, OUTLIERS_DOUBTED = 0.015, 0.06, 0.65
 SWAPS_ALL, SWAPS_ONE = 0.008, 0.006
 MISSING_SEEN, MISSING_HIDDEN, MISSING_FRAMES = 0.015, 0.35, 0.012
 RUN_FRAMES = 4.0
@@ -63,6 +63,7 @@ def detect_noisily(
     moved[:, 1:] = np.where(labelled[:, 1:] & labelled[:, :-1], np.linalg.norm(np.diff(exact, axis=1), axis=-1), 0)
     sigma = (JITTER * side + MOTION * np.minimum(moved, 0.2 * side)) * np.where(seen, 1, HIDDEN)
     points = exact + sigma[..., None] * _jitter(rng, (N, T, K, 2))
+    error = np.linalg.norm(points - exact, axis=-1) / side
 
     for all_pairs, rate in ((True, SWAPS_ALL), (False, SWAPS_ONE)):
         for left, right in keypoint_pairs:
@@ -78,8 +79,8 @@ def detect_noisily(
     wrong = _runs(rng, rate, (N, T, K))
     points = np.where(wrong[..., None], _elsewhere(rng, truth, exact), points)
 
-    error = np.linalg.norm(points - exact, axis=-1) / side
-    trust = 2.2 - 22 * error - 0.9 * ~seen + 0.8 * rng.normal(size=(N, T, K)) - 0.9 * (rng.random((N, T, K)) < 0.04)
+    doubted = wrong & (rng.random((N, T, K)) < OUTLIERS_DOUBTED)
+    trust = 2.2 - 22 * error - 0.9 * ~seen - 2.6 * doubted + 0.8 * rng.normal(size=(N, T, K))
     confidence = 1 / (1 + np.exp(-trust))
     missing = _runs(rng, np.where(seen, MISSING_SEEN, MISSING_HIDDEN), (N, T, K)) | (confidence < 0.08)
     # a detector finds a bird by what is to be seen of it
