@@ -31,13 +31,13 @@ class Measurement(NamedTuple):
 MEASUREMENTS = {
     "total_length": Measurement(38.0, 46.0, 42.5, "Collins 38–46; HBW 38–43; bill tip to tail tip, neck stretched"),
     "wingspan": Measurement(61.0, 73.0, 67.3, "Collins 61–73; BWP 64–70"),
-    "wing": Measurement(19.0, 21.6, 19.6, "BWP, Pyle: folded wing, wrist to the tip of the longest primary"),
+    "wing": Measurement(19.0, 21.6, 19.9, "BWP, Pyle: folded wing, wrist to the tip of the longest primary"),
     "bill": Measurement(4.2, 5.1, 4.7, "BWP, Pyle: culmen, from the feathers to the tip"),
     "tarsus": Measurement(3.5, 4.1, 3.8, "BWP, Pyle"),
     "tail": Measurement(4.0, 5.3, 4.8, "BWP, Pyle"),
     "middle_toe": Measurement(4.4, 5.6, 5.0, "BWP: middle toe with claw; APPROXIMATE"),
     "humerus": Measurement(7.4, 9.4, 7.5, "proportions of auk skeletons; APPROXIMATE, the feathered length is shorter"),
-    "forearm": Measurement(5.8, 7.4, 7.1, "proportions of auk skeletons; APPROXIMATE"),
+    "forearm": Measurement(5.8, 7.4, 6.7, "proportions of auk skeletons; APPROXIMATE"),
     "body_width": Measurement(
         10.0, 12.5, 11.4, "photographs, and 0.95–1.05 kg at the density of a plumed bird; APPROXIMATE"
     ),

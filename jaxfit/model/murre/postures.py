@@ -98,11 +98,17 @@ def _leg_bends(pitch: float, ankle: tuple[float, float]) -> tuple[float, float, 
 
 
 STAND, STEP = (-2.9, -8.5), 2.0
+UPRIGHT = {
+    "lower_body": (-10, 0, 0),
+    "tail": (-20, 0, 0),
+    "neck_root": (-13, 0, 0),
+    "neck": (-13, 0, 0),
+    "head": (-24, 0, 0),
+}
+"""How back, neck and head go with standing."""
 
 POSTURES: dict[str, Posture] = {
-    "standing": _posture(
-        50, STAND, lower_body=(-10, 0, 0), tail=(-20, 0, 0), neck_root=(-13, 0, 0), neck=(-13, 0, 0), head=(-24, 0, 0)
-    ),
+    "standing": _posture(50, STAND, **UPRIGHT),
     "alert": _posture(
         57,
         (-3.2, -9.1),
@@ -135,17 +141,9 @@ POSTURES: dict[str, Posture] = {
     ),
     "wings_up": _posture(8, None, 1.0, 38, head=(-8, 0, 0), neck_root=(-18, 0, 0), neck=(-12, 0, 0)),
     "wings_down": _posture(8, None, 0.95, -32, head=(-8, 0, 0), neck_root=(-18, 0, 0), neck=(-12, 0, 0)),
-    "wings_half": _posture(
-        50,
-        STAND,
-        0.45,
-        22,
-        lower_body=(-10, 0, 0),
-        tail=(-20, 0, 0),
-        neck_root=(-13, 0, 0),
-        neck=(-13, 0, 0),
-        head=(-24, 0, 0),
-    ),
+    "wings_half": _posture(50, STAND, 0.45, 22, **UPRIGHT),
+    "flapping_up": _posture(48, STAND, 0.95, 34, **UPRIGHT),
+    "flapping_down": _posture(48, STAND, 0.85, -12, **UPRIGHT),
     "jab": _posture(
         34,
         (-4.5, -7.4),

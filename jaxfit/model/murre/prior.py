@@ -16,8 +16,9 @@ from jaxfit.model.murre.postures import POSTURES, mirrored_pose
 __all__ = ["SHARES", "joint_limits", "pose_prior"]
 
 SHARES = {
-    "standing": 0.34, "alert": 0.12, "incubating": 0.16, "preening_left": 0.06, "preening_right": 0.06,
-    "walking_left": 0.06, "walking_right": 0.06, "jab": 0.05, "wings_half": 0.03, "wings_up": 0.03, "wings_down": 0.03,
+    "standing": 0.33, "alert": 0.12, "incubating": 0.16, "preening_left": 0.06, "preening_right": 0.06,
+    "walking_left": 0.06, "walking_right": 0.06, "jab": 0.05, "wings_half": 0.03, "wings_up": 0.02, "wings_down": 0.02,
+    "flapping_up": 0.015, "flapping_down": 0.015,
 }  # fmt: skip
 """How often a bird is near each posture."""
 NOISE = {"neck_root": 0.12, "neck": 0.15, "head": 0.18, "hip": 0.10, "knee": 0.12, "ankle": 0.15, "foot": 0.15}

@@ -37,7 +37,7 @@ MIDDLE_AND_LEFT = {
     "left_wing_root": (0.0, 7.6, 5.2),
     "left_shoulder": (-2.8, 7.6, 5.2),
     "left_elbow": (-5.3, 0.6, 4.3),
-    "left_wrist": (-6.0, 7.0, 1.4),
+    "left_wrist": (-6.0, 7.0, 2.4),
     "neck_root": (0.0, 7.6, 4.6),
     "neck": (0.0, 10.0, 7.2),
     "head": (0.0, 12.5, 10.9),

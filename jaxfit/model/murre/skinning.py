@@ -15,7 +15,7 @@ from jaxfit.model.anatomy import JOINT_NAMES, other_side
 from jaxfit.model.murre.leg import LEG_SHARES
 from jaxfit.model.murre.skeleton import spread_transforms
 from jaxfit.model.murre.surface import ANGLES, RINGS, Half, Mesh
-from jaxfit.model.murre.wing import CHORD, SPAN, spread_sheet
+from jaxfit.model.murre.wing import SPAN, spread_sheet
 
 __all__ = ["body_weights", "half_weights", "mirrored_weights", "smooth_step"]
 
@@ -39,8 +39,9 @@ LEG = {
 HINGE = {"upper_body": 0.45, "left_wing_root": 0.2, "left_shoulder": 0.35}
 """Weights of the wing's first ring."""
 MAX_JOINTS = 4
-SMOOTH = 2.0
-"""How strongly neighbours on the wing share their weights, in centimetres of misfit for a whole weight."""
+SMOOTH, NEAR = 2.0, 0.5
+"""How strongly neighbours on the wing share their weights, and how strongly those keep to a plain guess: both in
+centimetres of misfit for a whole weight."""
 
 
 def half_weights(half: Half) -> Float[np.ndarray, "H J"]:
@@ -101,15 +102,13 @@ def wing_weights(half: Half) -> Float[np.ndarray, "U P 4"]:
         wanted.append(value)
 
     guess = _guess()
-    chord = np.concatenate([CHORD, CHORD[::-1]])
     for u in range(stations):
         for p in range(points):
             for d in range(3):
                 equation(index[u, p], images[u, p, d], spread[u, p, d])
             equation(index[u, p], np.full(joints, 100.0), 100.0)
             for j in range(joints):
-                near = 0.5
-                equation(index[u, p, j : j + 1], np.array([near]), near * guess[u, j])
+                equation(index[u, p, j : j + 1], np.array([NEAR]), NEAR * guess[u, j])
                 for other in ((u + 1, p), (u, p + 1)):
                     if other[0] < stations:
                         at = np.array([index[u, p, j], index[other[0], other[1] % points, j]])
