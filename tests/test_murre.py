@@ -242,6 +242,9 @@ def test_postures_look_as_they_are_called():
     assert bill["jab"][1] > bill["standing"][1]
     assert bill["preening_left"][0] < -1 < 1 < bill["preening_right"][0]
     assert bill["preening_left"][1] < posed["preening_left"]["breast"][1] - 5
+    body = vertices_of("upper_body", "chest", "left_wing_root", "left_shoulder", "left_elbow", "left_wrist")
+    vertices, _ = posed_cm(*POSTURES["preening_left"])
+    assert np.linalg.norm(vertices[body] - bill["preening_left"], axis=1).min() < 2.5  # the bill reaches the feathers
     assert posed["walking_left"]["left_foot"][1] > posed["walking_left"]["right_foot"][1] + 3
     for name, sign in (("wings_up", 1), ("wings_down", -1)):
         tip, wrist = posed[name]["left_wingtip"], posed[name]["left_wrist"]

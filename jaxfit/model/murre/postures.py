@@ -40,6 +40,7 @@ def _posture(
     ankles: dict[str, tuple[float, float]] | tuple[float, float] | None = None,
     spread: float = 0.0,
     flap: float = 0.0,
+    /,
     **turns: tuple[float, float, float],
 ) -> Posture:
     """A posture from degrees.
@@ -128,7 +129,13 @@ POSTURES: dict[str, Posture] = {
         head=(-46, 0, 0),
     ),
     "preening_left": _posture(
-        46, STAND, lower_body=(-8, 0, 0), tail=(-12, 0, 0), neck_root=(-5, 10, 45), neck=(0, 15, 60), head=(-20, 0, 60)
+        46,
+        STAND,
+        lower_body=(-8, 0, 0),
+        tail=(-12, 0, 0),
+        neck_root=(-5, 10, 50),
+        neck=(-15, 15, 62),
+        head=(-50, 0, 52),
     ),
     "walking_left": _posture(
         46,
