@@ -1,8 +1,10 @@
 """How large a common guillemot is: the numbers that the model is made from, in centimetres, and where they come from.
 
-`low` and `high` bound what the sources give for adults of the species (all subspecies and both sexes, which differ
-little); `used` is this model's. Ranges marked APPROXIMATE are no one's table: they are our reading of figures,
-photographs and the proportions of auk skeletons, good to a tenth or two of their value.
+`low` and `high` bound adults of the species (all subspecies and both sexes, which differ little); `used` is this
+model's. Total length and wingspan are ranges as published. Wing, bill, tarsus and tail are the usual values of the
+handbooks named, rounded outwards by us and not transcribed from their tables: good enough to build a bird, not to be
+cited. Those marked APPROXIMATE are no one's table: our reading of photographs and of the proportions of auk skeletons,
+good to a tenth or two of their value.
 
 Sources:
     BWP: Cramp, S. (ed.) 1985, *The Birds of the Western Palearctic*, vol. IV, Uria aalge.
