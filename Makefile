@@ -12,7 +12,7 @@ help:
 	@echo "make test      the test suite (under ten minutes on two cores)"
 	@echo "make lint      formatting, lint and types"
 	@echo "make bench     benchmarks against the committed baseline"
-	@echo "make demo      fit real birds and show them (needs JAXFIT_REFERENCE)"
+	@echo "make demo      simulate a short scene, fit it and show it"
 	@echo "make clean     remove the environment and everything built"
 
 install: $(VENV)/installed
@@ -40,7 +40,7 @@ bench: install
 	$(BIN)/python tests/benchmarks/run.py
 
 demo: install
-	$(BIN)/python -m jaxfit.demo
+	$(BIN)/jaxfit demo
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache .ruff_cache .hypothesis

@@ -1,61 +1,65 @@
-"""Fit real birds and show them: five species of photographs from the reference data."""
+"""Simulate a short scene, fit it as the paper does, measure it against the truth, and draw it."""
 
 from __future__ import annotations
 
-import logging
-import sys
 import time
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
-from jaxfit import cli
 from jaxfit.config import config_to_yaml, load_config
-from jaxfit.evaluation.evaluate import evaluate
+from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.solution import save_solution
 from jaxfit.fitting.summary import summarise
-from jaxfit.formats.coco import read_coco
+from jaxfit.model.files import load_murre
 from jaxfit.progress import terminal
-from jaxfit.reference_data import reference_bird, reference_folder
-from jaxfit.view.sheet import contact_sheet
+from jaxfit.simulation.scene import FOOTAGE, simulate
+from jaxfit.storage import check_replaceable
+from jaxfit.tables import evaluation_tables, show
+from jaxfit.view.overlay import overlay
 
-OUT = Path("demo")
-ABSENT = """\
-The demo fits photographs of birds that are not part of jaxfit. Set JAXFIT_REFERENCE to the folder that holds
-models/aves and cub, and run it again. (A built-in bird will make this unnecessary.)"""
+__all__ = ["run_demo"]
 
-
-def main() -> int:
-    """Fit all species by the shipped config `photo`; leave results and contact sheets in `demo/`."""
-    reference, bird = reference_folder(), reference_bird()
-    console = Console()
-    if reference is None or bird is None or not (reference / "cub").is_dir():
-        console.print(ABSENT)
-        return 0
-    logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    cli.use_cache()
-    config = load_config("photo")
-    table = Table("species", "birds", "PCK@0.05", "PCK@0.10", "IoU", "seconds", title="without a starting point")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for path in sorted((reference / "cub").glob("*.json")):
-        observations = read_coco(path)
-        began = time.perf_counter()
-        solution = fit(observations, bird, config, progress=terminal, source=path)
-        seconds = time.perf_counter() - began
-        overall = evaluate(solution, bird, observations).overall
-        folder = OUT / path.stem
-        summary = summarise(solution, bird, {"fit": seconds}) | {"metrics": overall}
-        save_solution(solution, bird, config_to_yaml(config), summary, folder, overwrite=True)
-        contact_sheet(solution, bird, observations, folder / "birds.png")
-        figures = [f"{overall[name]:.3f}" for name in ("pck@0.05", "pck@0.10", "iou")]
-        table.add_row(path.stem, str(observations.num_tracks), *figures, f"{seconds:.0f}")
-    console.print(table)
-    console.print(f"results and a contact sheet (birds.png) for each species → {OUT.resolve()}", soft_wrap=True)
-    return 0
+BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def run_demo(folder: Path) -> Evaluation:
+    """Leave a scene, its fit, an overlay video and a contact sheet in a folder, and print what was found.
+
+    Args:
+        folder: for `scene/`, `result/`, `overlay.mp4` and `overlay.png`; an earlier demo there is replaced.
+
+    Raises:
+        InputError: the folder cannot be written, or holds something else under these names.
+    """
+    began = time.perf_counter()
+    scene_folder, result_folder, video = folder / "scene", folder / "result", folder / "overlay.mp4"
+    check_replaceable(result_folder, True, "poses.npz")
+    bird, config = load_murre(), load_config("paper")
+    show(f"{BIRDS} murres on a ledge, {FRAMES} frames, simulated; what detectors would report of them is fitted")
+    scene = simulate(bird, scene_folder, BIRDS, FRAMES, SIZE, seed=SEED, overwrite=True, progress=terminal)
+    fitting = time.perf_counter()
+    solution = fit(scene.detections, bird, config, progress=terminal, source=scene_folder)
+    seconds = {"fit": time.perf_counter() - fitting}
+    result = evaluate(solution, bird, scene.truth, terminal, scene_folder, truth_solution=scene.poses)
+    summary = summarise(solution, bird, seconds) | {"metrics": result.overall}
+    save_solution(solution, bird, config_to_yaml(config), summary, result_folder, overwrite=True)
+    overlay(
+        solution,
+        bird,
+        scene_folder / FOOTAGE,
+        video,
+        observations=scene.detections,
+        side_views=True,
+        progress=terminal,
+    )
+    for table in evaluation_tables(result):
+        show(table)
+    show(f"done in {time.perf_counter() - began:.0f} s, of which the fit took {seconds['fit']:.0f}. Look at")
+    for name, what in (
+        (video, "the fitted birds on the footage, and each from its side"),
+        (video.with_suffix(".png"), "a contact sheet"),
+        (result_folder, "poses.npz, summary.json"),
+        (scene_folder, "footage, truth and detections"),
+    ):
+        show(f"  {name}: {what}")
+    return result

@@ -84,6 +84,8 @@ class Observations:
             raise ValueError("confidence must lie in [0, 1]")
         if confidence[~present].any():
             raise ValueError("confidence must be 0 where present is False")
+        arrays["occluded"] = arrays["occluded"] & (confidence > 0)
+        arrays["occluded"].flags.writeable = False
         for name, needed in (("keypoints_px", confidence > 0), ("box_px", present)):
             # absent values are 0, so that no NaN of theirs can reach a sum
             values = np.where(needed[..., None], arrays[name], np.float32(0))

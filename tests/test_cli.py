@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from cli_files import BIRD, T, arguments, refused
 
-from jaxfit import cli
+from jaxfit import cli, commands
 from jaxfit.cli import main
 from jaxfit.fitting.solution import load_solution
 from jaxfit.model.files import load_bird
@@ -153,7 +153,7 @@ def test_ctrl_c_leaves_nothing_behind(fitted, inputs, tmp_path, capsys, monkeypa
 
         yield tick
 
-    monkeypatch.setattr(cli, "terminal", impatient)
+    monkeypatch.setattr(commands, "terminal", impatient)
     before = contents(fitted)
     refused(capsys, arguments(inputs, tmp_path / "out"), "stopped", code=130, alone=False)
     refused(capsys, [*arguments(inputs, fitted), "--overwrite"], "stopped", code=130, alone=False)

@@ -24,8 +24,10 @@ def assert_same(a: Observations, b: Observations):
     assert (a.keypoint_names, a.skeleton) == (b.keypoint_names, b.skeleton)
     assert a.own_images == b.own_images
     assert a.masks.keys() == b.masks.keys()
-    for n, t in a.masks:
+    assert a.amodal_masks.keys() == b.amodal_masks.keys()
+    for n, t in {*a.masks, *a.amodal_masks}:
         np.testing.assert_array_equal(a.mask(n, t), b.mask(n, t))
+        np.testing.assert_array_equal(a.whole_mask(n, t), b.whole_mask(n, t))
 
 
 def test_reads_tracks_and_frames_in_order(tmp_path):
@@ -47,6 +49,26 @@ def test_confidence_is_the_score_where_the_keypoint_is_there(tmp_path):
     np.testing.assert_array_equal(seen.confidence[1, 0], [0.75, 0, 0])  # the last has a score but v = 0
     np.testing.assert_array_equal(seen.keypoints_px[1, 1], [[10, 5], [20.5, 6.25], [0, 0]])
     assert seen.usable(1).tolist() == [[True, False, False], [True, True, True]]
+
+
+def test_what_is_hidden_keeps_its_place(tmp_path):
+    """Visibility 1 is a keypoint that something hides; the whole mask stands beside the visible one."""
+    hiding = content()
+    part = uncompressed(MASK & (MASK.cumsum(1) < 3))
+    changes = {"keypoints": [1, 2, 1, 3, 4, 2, 0, 0, 0], "segmentation": part, "amodal_segmentation": compressed(MASK)}
+    hiding["annotations"] = [annotation(1, 6, 2, **changes)]
+    seen = read_coco(saved(tmp_path, hiding))
+    cell = tuple(np.argwhere(seen.present)[0])
+    np.testing.assert_array_equal(seen.occluded[cell], [True, False, False])
+    np.testing.assert_array_equal(seen.whole_mask(*cell), MASK)
+    assert (seen.mask(*cell) & ~MASK).sum() == 0
+    assert seen.mask(*cell).sum() < MASK.sum()
+    write_coco(seen, tmp_path / "again.json")
+    again = read_coco(tmp_path / "again.json")
+    assert_same(seen, again)
+    kept = again.select(tracks=[cell[0]], frames=[cell[1]])
+    np.testing.assert_array_equal(kept.whole_mask(0, 0), MASK)
+    assert kept.occluded.tolist() == [[[True, False, False]]]
 
 
 def test_masks_of_all_kinds(tmp_path):

@@ -55,7 +55,7 @@ def evaluate(
     """Compare a result with annotations of the same video, matched by track and frame number.
 
     PCK counts visible keypoints within 5 and 10 % of the longer side of the annotated mask (of the box where
-    there is no mask); IoU compares the mesh's hard mask with the annotated one; me_p and me_v are relative
+    there is no mask); IoU compares the mesh's hard mask with the annotated one (the whole one where it is known); me_p and me_v are relative
     to the longer side of the mesh's mask. True poses add errors in space, also where nothing is annotated.
 
     Args:
@@ -93,7 +93,7 @@ def evaluate(
     with progress("Measuring", int(measured.sum())) as tick:
         for n, t in np.argwhere(measured).tolist():
             at = int(n_truth[n, 0]), int(t_truth[t])
-            mask = truth.mask(*at)
+            mask = truth.whole_mask(*at)
             own = hard_mask(posed.vertices_screen(n, t), faces, *truth.image_size(*at))
             own_side[n, t] = metrics.longest_side_of_mask(own)
             true_side[n, t] = truth.box_px[at][2:].max() if mask is None else metrics.longest_side_of_mask(mask)

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from reference_data import reference_bird, reference_folder
 from rich.console import Console
 from rich.table import Table
 
@@ -29,7 +30,6 @@ from jaxfit.fitting.fit import fit
 from jaxfit.fitting.start import load_start
 from jaxfit.model.bird import Bird
 from jaxfit.progress import terminal
-from jaxfit.reference_data import reference_bird, reference_folder
 
 BASELINE = Path(__file__).with_name("baseline.json")
 

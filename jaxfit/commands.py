@@ -1,0 +1,163 @@
+"""The commands: each is one short function that calls the library and prints what came of it."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+
+from jaxfit.config import config_to_yaml, load_config
+from jaxfit.errors import InputError
+from jaxfit.formats.coco import read_coco
+from jaxfit.model.files import find_bird, save_bird
+from jaxfit.progress import terminal
+from jaxfit.tables import evaluation_tables, plain_json, right_aligned, show, show_facts
+
+__all__ = ["bench", "demo", "evaluate", "fit", "model_import", "model_info", "model_view", "overlay", "simulate"]
+
+
+def fit(options: argparse.Namespace) -> None:
+    from jaxfit.fitting.fit import fit
+    from jaxfit.fitting.solution import save_solution
+    from jaxfit.fitting.start import load_start
+    from jaxfit.fitting.summary import summarise
+    from jaxfit.storage import check_replaceable
+
+    began = time.perf_counter()
+    check_replaceable(options.out, options.overwrite, "poses.npz")  # before the work, not after it
+    config = load_config(options.config)
+    bird = find_bird(options.model)
+    observations = read_coco(options.observations)
+    start = load_start(options.init, observations, bird) if options.init else None
+    read = time.perf_counter()
+    solution = fit(observations, bird, config, start, terminal, source=options.observations)
+    seconds = {"read": read - began, "fit": time.perf_counter() - read}
+    summary = summarise(solution, bird, seconds)
+    save_solution(solution, bird, config_to_yaml(config), summary, options.out, options.overwrite)
+    table = right_aligned("track", "frames", "objective")
+    table.add_column("status")
+    total = np.sum(list(solution.loss.values()), axis=0)
+    for n, track in enumerate(solution.track_id):
+        frames = int(solution.valid[n].sum())
+        table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", str(solution.status[n]))
+    table.title = "objective: final value per frame"
+    show(table)
+    counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
+    show(f"{summary['poses']} poses of {summary['tracks']} birds ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+
+
+def evaluate(options: argparse.Namespace) -> None:
+    from jaxfit.evaluation.evaluate import evaluate
+    from jaxfit.evaluation.truth import read_truth
+    from jaxfit.fitting.solution import load_solution
+
+    solution, bird = load_solution(options.result)
+    truth, poses, truth_bird = read_truth(options.truth)
+    result = evaluate(solution, bird, truth, terminal, options.truth, truth_solution=poses, truth_bird=truth_bird)
+    if options.json:
+        counts = {"frames": result.frames, "missing": result.missing, "frames_3d": result.frames_3d}
+        print(plain_json({**result.overall, **counts, "tracks": result.tracks}))  # noqa: T201
+        return
+    for table in evaluation_tables(result):
+        show(table)
+    if result.missing:
+        show(f"{result.missing} annotated birds have no pose in this result and enter no figure")
+
+
+def simulate(options: argparse.Namespace) -> None:
+    from jaxfit.simulation.scene import simulate
+
+    began = time.perf_counter()
+    scene = simulate(
+        find_bird("murre"),
+        options.out,
+        birds=options.birds,
+        frames=options.frames,
+        size=_size(options.size),
+        fps=options.fps,
+        seed=options.seed,
+        codec=options.codec,
+        overwrite=options.overwrite,
+        progress=terminal,
+    )
+    boxes, found = int(scene.truth.present.sum()), int(scene.detections.present.sum())
+    show(
+        f"{options.birds} birds over {options.frames} frames: {boxes} true poses, {found} detections, "
+        f"in {time.perf_counter() - began:.0f} s → {options.out}"
+    )
+
+
+def overlay(options: argparse.Namespace) -> None:
+    from jaxfit.fitting.solution import load_solution
+    from jaxfit.view.overlay import overlay
+
+    solution, bird = load_solution(options.result)
+    observations = read_coco(options.observations) if options.observations else None
+    overlay(
+        solution,
+        bird,
+        options.video,
+        options.out,
+        observations=observations,
+        side_views=options.side_views,
+        codec=options.codec,
+        progress=terminal,
+    )
+    show(f"overlay → {options.out}, contact sheet → {options.out.with_suffix('.png')}")
+
+
+def demo(options: argparse.Namespace) -> None:
+    from jaxfit.demo import run_demo
+
+    run_demo(options.out)
+
+
+def model_import(options: argparse.Namespace) -> None:
+    from jaxfit.model.sources import import_sources
+
+    bird = import_sources(options.kind, options.sources)
+    save_bird(bird, options.out)
+    show(f"{bird.name}: {bird.vertices.shape[0]} vertices, {bird.num_keypoints} keypoints → {options.out}")
+
+
+def model_info(options: argparse.Namespace) -> None:
+    from jaxfit.model.describe import describe_bird
+
+    facts = describe_bird(find_bird(options.file))
+    if options.json:
+        print(plain_json(facts))  # noqa: T201
+    else:
+        show_facts(facts)
+
+
+def model_view(options: argparse.Namespace) -> None:
+    from jaxfit.view.six_views import six_views
+
+    six_views(find_bird(options.file), options.out, options.posture)
+    show(f"six views → {options.out}")
+
+
+def bench(options: argparse.Namespace) -> None:
+    from jaxfit.benchmarks.fit import bench_fit
+    from jaxfit.benchmarks.render import bench_render
+    from jaxfit.benchmarks.silhouette import bench_silhouette
+
+    bird = find_bird(options.model) if options.model else None
+    if options.what == "silhouette":
+        result = bench_silhouette(vertices=bird and bird.vertices, faces=bird and bird.faces)
+    elif options.what == "render":
+        result = bench_render(bird)
+    else:
+        result = bench_fit(bird or find_bird("murre"), options.birds, options.frames, progress=terminal)
+    if options.json:
+        print(plain_json(result))  # noqa: T201
+    else:
+        show_facts(result)
+
+
+def _size(text: str) -> tuple[int, int]:
+    sides = text.lower().replace("×", "x").split("x")
+    if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
+        raise InputError("simulate: size", f"{text!r} is none", "give width and height as in 2592x1520")
+    return int(sides[0]), int(sides[1])

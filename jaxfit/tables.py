@@ -1,0 +1,109 @@
+"""What people read on the terminal: tables that align, and JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from jaxfit.evaluation.evaluate import COLUMNS, Evaluation
+
+__all__ = ["evaluation_tables", "plain_json", "right_aligned", "show", "show_facts"]
+
+_IN_SPACE = {
+    "mpjpe": "MPJPE",
+    "mpjpe/length": "% length",
+    "pa_mpjpe": "PA-MPJPE",
+    "pa_mpjpe/length": "% length",
+    "orientation_deg": "orient. °",
+    "acceleration": "accel.",
+    "size_error": "size %",
+}
+"""Figures in space that the table shows, and their headings."""
+_PERCENT = ("mpjpe/length", "pa_mpjpe/length", "size_error")
+
+
+def show(what: Any) -> None:
+    """Print a table or a line of text."""
+    Console(soft_wrap=not isinstance(what, Table), highlight=False).print(what)
+
+
+def right_aligned(*columns: str, **options: Any) -> Table:
+    """A table whose columns are all numbers."""
+    table = Table(**options)
+    for column in columns:
+        table.add_column(column, justify="right")
+    return table
+
+
+def evaluation_tables(result: Evaluation) -> list[Table]:
+    """What `evaluate` found, a row for every track: in the picture, and in space where that was measured."""
+    tables = [right_aligned("track", "frames", *COLUMNS)]
+    for track, row in result.tracks.items():
+        tables[0].add_row(str(track), f"{row['frames']:.0f}", *(_figure(row[name]) for name in COLUMNS))
+    tables[0].add_section()
+    tables[0].add_row("all", str(result.frames), *(_figure(result.overall[name]) for name in COLUMNS))
+    tables[0].caption = (
+        "PCK: share of keypoints within 5 or 10 % of the annotated mask's longer side; IoU: mesh against mask; "
+        "me_p, me_v: RMS position and velocity error over the mesh mask's longer side"
+    )
+    if result.points_3d:
+        space = right_aligned("track", *_IN_SPACE.values())
+        for track, row in result.tracks.items():
+            space.add_row(str(track), *_in_space(row))
+        space.add_section()
+        space.add_row("all", *_in_space(result.overall))
+        space.caption = (
+            f"in space, over {result.points_3d}: mean error in model units and per cent of body length, about the root "
+            "and up to one size a track; PA: after aligning every frame; orientation in degrees; acceleration error in "
+            "units per frame²; error of the apparent size"
+        )
+        tables.append(space)
+    return tables
+
+
+def _in_space(row: dict[str, float]) -> list[str]:
+    shown = []
+    for name in _IN_SPACE:
+        value = row[name] * (100 if name in _PERCENT else 1)
+        places = 1 if name in (*_PERCENT, "orientation_deg") else 3
+        shown.append("–" if math.isnan(value) else f"{value:.{places}f}")
+    return shown
+
+
+def show_facts(facts: dict[str, Any]) -> None:
+    """Print names and values in two columns."""
+    table = Table(show_header=False)
+    table.add_column()
+    table.add_column(overflow="fold")
+    for key, value in facts.items():
+        table.add_row(key.replace("_", " "), _fact(value))
+    show(table)
+
+
+def plain_json(content: Any) -> str:
+    """JSON in which what is not a number is null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {str(k): plain(v) for k, v in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(content), indent=2)
+
+
+def _figure(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.4f}"
+
+
+def _fact(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, list):
+        return ", ".join("/".join(map(str, v)) if isinstance(v, list) else _fact(v) for v in value)
+    return "–" if value is None else str(value)
