@@ -125,9 +125,8 @@ def _walk(bird: Performer, until_s: float, target) -> None:
 def _flap(bird: Performer, until_s: float, _target) -> None:
     bird.to("wings_half", 0.25)
     for _ in range(int(bird.rng.integers(3, 7))):
-        upright = POSTURES["standing"].pitch_rad
-        bird.to(_pitched("wings_up", upright), FLAP_S)
-        bird.to(_pitched("wings_down", upright), FLAP_S)
+        bird.to("flapping_up", FLAP_S)
+        bird.to("flapping_down", FLAP_S)
     bird.to("wings_half", 0.2)
     bird.to("standing", 0.35)
     _stand(bird, until_s, None)
