@@ -73,6 +73,12 @@ class Performer:
         pose = POSTURES[posture] if isinstance(posture, str) else posture
         self.keys.append(replace(self.now, time_s=self.now.time_s + seconds, posture=pose, **changes))
 
+    def face(self, posture: str, target: tuple[float, float]) -> None:
+        """Turn towards a place, the shorter way round and no faster than a bird does."""
+        x, y = np.subtract(target, self.now.feet)
+        turn = (np.arctan2(-x, y) - self.now.heading + np.pi) % (2 * np.pi) - np.pi  # model +y looks to (−sin, cos)
+        self.to(posture, 0.25 + 0.25 * abs(turn), heading=self.now.heading + turn)
+
     def perform(self, behaviour: str, until_s: float, target: tuple[float, float] | None = None) -> None:
         """Perform one behaviour, then hold its last key no later than the next one begins."""
         self.labels.append((self.now.time_s, behaviour))
@@ -105,12 +111,8 @@ def _preen(bird: Performer, until_s: float, _target) -> None:
 
 def _walk(bird: Performer, until_s: float, target) -> None:
     if target is not None:
-        # model +y turned by the heading: (−sin, cos)
-        x, y = np.subtract(target, bird.now.feet)
-        turn = np.arctan2(-x, y) - bird.now.heading
-        heading = bird.now.heading + (turn + np.pi) % (2 * np.pi) - np.pi
-        bird.to("standing", 0.25 + 0.25 * abs(heading - bird.now.heading), heading=heading)
-        way = np.hypot(x, y)
+        bird.face("standing", target)
+        way = np.hypot(*np.subtract(target, bird.now.feet))
     else:
         way = bird.rng.uniform(8, 20)
     foot = 0
@@ -134,10 +136,7 @@ def _flap(bird: Performer, until_s: float, _target) -> None:
 
 def _jab(bird: Performer, until_s: float, target) -> None:
     if target is not None:
-        x, y = np.subtract(target, bird.now.feet)
-        turn = np.arctan2(-x, y) - bird.now.heading
-        heading = bird.now.heading + (turn + np.pi) % (2 * np.pi) - np.pi
-        bird.to("alert", 0.35, heading=heading)
+        bird.face("alert", target)
     for _ in range(int(bird.rng.integers(2, 4))):
         bird.to("jab", 0.16)
         bird.to(blend("alert", "jab", 0.3), 0.2)
@@ -160,9 +159,9 @@ REACH = 17.0
 def _fly_off(bird: Performer, until_s: float, _target) -> None:
     """Turns to the edge, leaps and flies away from the wall; afterwards it is out of the picture."""
     outward = np.pi + bird.rng.uniform(-0.4, 0.4)
-    heading = bird.now.heading + (outward - bird.now.heading + np.pi) % (2 * np.pi) - np.pi
-    bird.to("standing", 0.3 + 0.2 * abs(heading - bird.now.heading), heading=heading)
+    bird.face("standing", tuple(np.add(bird.now.feet, [-np.sin(outward), np.cos(outward)])))
     bird.to("wings_half", 0.2)
+    heading = bird.now.heading
     flight, way, speed, beat = POSTURES["wings_up"].pitch_rad, 0.0, 20.0, 0
     start, ahead = np.array(bird.now.feet), np.array([-np.sin(heading), np.cos(heading)])
     upright = bird.now.posture.pitch_rad
