@@ -11,7 +11,7 @@ from jaxfit.benchmarks.fit import bench_fit
 from jaxfit.fitting.fit import fit
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
-from jaxfit.view.sheet import FITTED, OUTLINE, SEEN, TILE_PX, contact_sheet
+from jaxfit.view.sheet import ON_PAPER_FITTED, OUTLINE, SEEN, TILE_PX, contact_sheet
 
 BIRD = toy_bird(shapes=0)
 
@@ -31,7 +31,7 @@ def test_every_pair_of_tiles_is_drawn(tmp_path):
     tiles = sheet.reshape(2, TILE_PX, 3, 2, TILE_PX, 3).transpose(0, 2, 3, 1, 4, 5).reshape(6, 2, TILE_PX, TILE_PX, 3)
     for pair in range(4):
         evidence, mesh = tiles[pair]
-        for colour in (SEEN, OUTLINE, FITTED):
+        for colour in (SEEN, OUTLINE, ON_PAPER_FITTED):
             near = np.abs(evidence.astype(int) - colour).sum(-1) < 60  # thin lines are blended
             assert near.any()
         covered = (mesh != mesh[0, 0]).any(-1)

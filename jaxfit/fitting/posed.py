@@ -29,13 +29,52 @@ class PosedBirds:
 
     def vertices_screen(self, n: int, t: int) -> Float[np.ndarray, "V 3"]:
         """Vertices as x, y in image pixels and depth in model units."""
-        s = self.solution
-        x0, y0, size = s.crop[n, t]
-        camera = Camera(s.focal * size / s.crop_px, size / 2)
-        pose = Pose(**{name: np.asarray(getattr(s, name)[n, t]) for name in Pose.__dataclass_fields__})
-        return np.asarray(_screen(self._rig, pose, camera)) + np.array([x0, y0, 0], np.float32)
+        screen, x0_y0 = _screen(self._rig, self._pose(n, t), self._camera(n, t)), self.solution.crop[n, t, :2]
+        return np.asarray(screen) + np.append(x0_y0, np.float32(0))
+
+    def vertices_cam_window(self, n: int, frames: slice = slice(None)) -> Float[np.ndarray, "T V 3"]:
+        """Vertices in the camera frame of the crop, model units, of many frames in one compiled call.
+
+        Args:
+            n: position of the track.
+            frames: positions of the frames. Slices of one length share one program.
+
+        Returns:
+            One mesh a frame; what stands where the solution is not valid means nothing, and may be NaN.
+        """
+        return np.asarray(_window_cam(self._rig, self._pose(n, frames)))
+
+    def vertices_screen_window(self, n: int, frames: slice = slice(None)) -> Float[np.ndarray, "T V 3"]:
+        """`vertices_screen` of many frames in one compiled call; arguments as `vertices_cam_window`."""
+        return self.to_image(self.vertices_cam_window(n, frames), n, frames)
+
+    def to_image(
+        self, vertices_cam: Float[np.ndarray, "T V 3"], n: int, frames: slice = slice(None)
+    ) -> Float[np.ndarray, "T V 3"]:
+        """From the camera frame of the track's crops (model units) to image pixels and depth.
+
+        Depths of 1e-3 and less are divided by as 1e-3.
+        """
+        s, crop = self.solution, self.solution.crop[n, frames][:, None]
+        size = crop[..., 2:]
+        scale = s.focal * size / s.crop_px / np.maximum(vertices_cam[..., 2:], 1e-3)
+        xy = vertices_cam[..., :2] * scale + size / 2 + crop[..., :2]
+        return np.concatenate([xy, vertices_cam[..., 2:]], axis=-1).astype(np.float32)
+
+    def _pose(self, n: int, t: int | slice) -> Pose:
+        return Pose(**{name: np.asarray(getattr(self.solution, name)[n, t]) for name in Pose.__dataclass_fields__})
+
+    def _camera(self, n: int, t: int) -> Camera:
+        size = self.solution.crop[n, t, 2]
+        return Camera(self.solution.focal * size / self.solution.crop_px, size / 2)
 
 
 @jax.jit
 def _screen(rig: Rig, pose: Pose, camera: Camera) -> Float[Array, "V 3"]:
     return to_screen(posed_vertices(rig, joint_transforms(rig, pose), pose), camera)
+
+
+@jax.jit
+def _window_cam(rig: Rig, pose: Pose) -> Float[Array, "T V 3"]:
+    # bone lengths and shape may differ from frame to frame here: windows of a track have their own
+    return jax.vmap(lambda frame: posed_vertices(rig, joint_transforms(rig, frame), frame))(pose)

@@ -2,101 +2,165 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jaxfit.fitting.posed import PosedBirds
 from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
 from jaxfit.render import draw, hard_mask, shade
-from jaxfit.storage import write_whole
+from jaxfit.view.detected import Detected
+from jaxfit.view.marks import DETECTED, FITTED, INK, PAPER, dot, line, ring, tag, text, track_colour, write_png
 
-__all__ = ["contact_sheet"]
+__all__ = ["contact_sheet", "cut_tiles", "sheet_pairs"]
 
 TILE_PX = 256
-PAPER, SEEN, OUTLINE, FITTED, DETECTED = (250, 250, 250), (205, 205, 205), (60, 140, 30), (40, 40, 220), (30, 30, 30)
-"""Colours, BGR: background, annotated mask, outline of the mesh, its keypoints, annotated keypoints."""
+SEEN, OUTLINE = (205, 205, 205), (60, 140, 30)
+ON_PAPER_FITTED, ON_PAPER_DETECTED = (40, 40, 220), (30, 30, 30)
+"""Colours, BGR: annotated mask, outline of the mesh, its keypoints, annotated keypoints."""
+PALE = (0.85, 0.9, 0.95)
+"""What the mesh's own colours are lightened with, BGR in [0, 1]: on dark plumage no light shows the form."""
 
-PLUMAGE = (0.85, 0.9, 0.95)
-"""The mesh, BGR in [0, 1]."""
+
+def sheet_pairs(solution: Solution, frames: int = 4, most: int = 24) -> list[list[tuple[int, int]]]:
+    """Which birds a sheet of a video shows: a row for each track, evenly spaced among the frames it is fitted in.
+
+    Args:
+        solution: the result.
+        frames: in a row.
+        most: rows at most, taken evenly over the tracks that have a valid frame.
+
+    Returns:
+        Rows of positions (n, t).
+    """
+    tracks = np.flatnonzero(solution.valid.any(1))
+    tracks = tracks[np.unique(np.linspace(0, len(tracks) - 1, most).astype(int))] if len(tracks) else tracks
+    rows = []
+    for n in tracks.tolist():
+        own = np.flatnonzero(solution.valid[n])
+        picks = own[np.unique(((np.arange(frames) + 0.5) / frames * len(own)).astype(int))]
+        rows.append([(n, t) for t in picks.tolist()])
+    return rows
+
+
+def cut_tiles(
+    posed: PosedBirds, picture: UInt8[np.ndarray, "H W 3"], pairs: list[tuple[int, int]]
+) -> dict[tuple[int, int], UInt8[np.ndarray, "S S 3"]]:
+    """The places of birds in the picture of their frame, as `contact_sheet` takes them; black beyond its edges."""
+    tiles = {}
+    for n, t in pairs:
+        x0, y0, size = _window(posed, n, t)
+        zoom = TILE_PX / size
+        # pixel centres lie at halves here and at whole numbers in OpenCV
+        place = np.array([[zoom, 0, (0.5 - x0) * zoom - 0.5], [0, zoom, (0.5 - y0) * zoom - 0.5]])
+        tiles[n, t] = cv2.warpAffine(picture, place, (TILE_PX, TILE_PX), flags=cv2.INTER_LINEAR)
+    return tiles
 
 
 def contact_sheet(
-    solution: Solution, bird: Bird, observations: Observations, path: str | Path, columns: int = 4, most: int = 24
+    solution: Solution,
+    bird: Bird,
+    observations: Observations | None,
+    path: str | Path,
+    columns: int = 4,
+    most: int = 24,
+    footage: Mapping[tuple[int, int], UInt8[np.ndarray, "S S 3"]] | None = None,
 ) -> None:
     """Draw birds of a result as pairs of tiles and write them as one PNG.
 
     Left tile: the annotated mask (grey) and keypoints (black rings), the fitted mesh's outline (green) and
-    keypoints (red), joined to the annotated ones. Right tile: the mesh as the camera sees it, lit from above.
+    keypoints (red), joined to the annotated ones. With footage: its picture, with the mesh's outline in the
+    track's colour, fitted keypoints as white dots and annotated ones as yellow rings. Right tile: the mesh as
+    the camera sees it, lit from above.
 
     Args:
         solution, bird: a result and its model.
-        observations: what it was fitted to, with the same tracks and frames.
+        observations: what it was fitted to; tracks and frames are found by their numbers.
         path: PNG file to write.
         columns: pairs in a row.
-        most: pairs at most, taken evenly over birds and frames.
+        most: pairs at most, taken evenly over birds and frames; with footage, rows at most.
+        footage: (n, t) → tile of the footage, of `cut_tiles`; the sheet then has a row for each track
+            (`sheet_pairs`).
+
+    Raises:
+        InputError: the system refuses the write.
     """
     posed = PosedBirds(solution, bird)
-    pairs = np.argwhere(solution.valid)
-    pairs = pairs[np.unique(np.linspace(0, len(pairs) - 1, most).astype(int))]
-    tiles = [np.hstack([_evidence(posed, observations, n, t), _mesh(posed, n, t)]) for n, t in pairs]
+    if footage is not None:
+        rows = sheet_pairs(solution, columns, most)
+    else:
+        pairs = [(int(n), int(t)) for n, t in np.argwhere(solution.valid)]
+        picks = np.unique(np.linspace(0, len(pairs) - 1, most).astype(int)).tolist() if pairs else []
+        rows = [[pairs[i] for i in picks[start : start + columns]] for start in range(0, len(picks), columns)]
+    detected = Detected(solution, observations)
+    colours = 0.55 * np.asarray(bird.vertex_colours)[:, ::-1] + 0.45 * np.array(PALE)
     blank = np.full((TILE_PX, 2 * TILE_PX, 3), PAPER, np.uint8)
-    tiles += [blank] * (-len(tiles) % columns)
-    sheet = np.vstack([np.hstack(tiles[i : i + columns]) for i in range(0, len(tiles), columns)])
-    written, png = cv2.imencode(".png", sheet)
-    if not written:
-        raise RuntimeError("OpenCV could not encode a PNG")
-    write_whole(Path(path), png.tobytes())
+    drawn = []
+    for row in rows or [[]]:
+        tiles = []
+        for n, t in row:
+            ground = None if footage is None else footage.get((n, t))
+            tiles.append(np.hstack([_evidence(posed, detected, n, t, ground), _mesh(posed, n, t, colours)]))
+        drawn.append(np.hstack(tiles + [blank] * (columns - len(row))))
+    write_png(path, np.vstack(drawn))
 
 
-def _to_tile(points_px: np.ndarray, crop: np.ndarray) -> np.ndarray:
-    return (points_px - crop[:2]) * (TILE_PX / crop[2])
+def _window(posed: PosedBirds, n: int, t: int) -> Float[np.ndarray, "3"]:
+    """x0, y0 and size of the square that a tile shows: the crop, unless the bird is lost in it."""
+    crop = posed.solution.crop[n, t]
+    points = posed.solution.keypoints_2d[n, t]
+    low, high = points.min(0), points.max(0)
+    size = 1.5 * float((high - low).max())
+    return crop if crop[2] < 2 * size else np.array([*((low + high - size) / 2), size], np.float32)
 
 
-def _evidence(posed: PosedBirds, observations: Observations, n: int, t: int) -> np.ndarray:
-    solution, crop = posed.solution, posed.solution.crop[n, t]
-    tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8)
-    mask = observations.mask(n, t)
+def _to_tile(points_px: np.ndarray, window: np.ndarray) -> np.ndarray:
+    return (points_px - window[:2]) * (TILE_PX / window[2])
+
+
+def _evidence(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np.ndarray | None) -> np.ndarray:
+    solution, window = posed.solution, _window(posed, n, t)
+    tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8) if footage is None else footage.copy()
+    mask = detected.mask(n, t) if footage is None else None
     if mask is not None:
-        zoom = TILE_PX / crop[2]
-        place = np.array([[zoom, 0, -crop[0] * zoom], [0, zoom, -crop[1] * zoom]])
+        zoom = TILE_PX / window[2]
+        place = np.array([[zoom, 0, -window[0] * zoom], [0, zoom, -window[1] * zoom]])
         seen = cv2.warpAffine(mask.astype(np.uint8), place, (TILE_PX, TILE_PX), flags=cv2.INTER_NEAREST)
         tile[seen > 0] = SEEN
     screen = posed.vertices_screen(n, t)
-    screen = np.column_stack([_to_tile(screen[:, :2], crop), screen[:, 2]])
+    screen = np.column_stack([_to_tile(screen[:, :2], window), screen[:, 2]])
     covered = hard_mask(screen, posed.faces, TILE_PX, TILE_PX).astype(np.uint8)
     contours, _ = cv2.findContours(covered, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(tile, contours, -1, OUTLINE, 1, cv2.LINE_AA)
-    fitted = _to_tile(solution.keypoints_2d[n, t], crop)
-    detected = _to_tile(observations.keypoints_px[n, t], crop)
-    for k in np.flatnonzero(observations.confidence[n, t] > 0):
-        a, b = _fixed(fitted[k]), _fixed(detected[k])
-        cv2.line(tile, a, b, FITTED, 1, cv2.LINE_AA, SHIFT)
-        cv2.circle(tile, b, 3 << SHIFT, DETECTED, 1, cv2.LINE_AA, SHIFT)
-        cv2.circle(tile, a, 2 << SHIFT, FITTED, -1, cv2.LINE_AA, SHIFT)
-    name = f"bird {solution.track_id[n]}  frame {solution.frame_index[t]}"
-    cv2.putText(tile, name, (6, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.38, DETECTED, 1, cv2.LINE_AA)
+    cv2.drawContours(tile, contours, -1, OUTLINE if footage is None else track_colour(n), 1, cv2.LINE_AA)
+    fitted = _to_tile(solution.keypoints_2d[n, t], window)
+    places, confidence = detected.keypoints(n, t)
+    near = _to_tile(places, window)
+    rim, fill = (ON_PAPER_DETECTED, ON_PAPER_FITTED) if footage is None else (DETECTED, FITTED)
+    for k in np.flatnonzero(confidence > 0):
+        line(tile, fitted[k], near[k], fill)
+        if footage is None:
+            ring(tile, near[k], 3, rim, edge=None)
+        else:
+            ring(tile, near[k], 4.5, rim)
+    for k in range(len(fitted)) if footage is not None else np.flatnonzero(confidence > 0):
+        dot(tile, fitted[k], 2, fill, None if footage is None else INK)
+    name, frame = f"bird {solution.track_id[n]}", f"frame {solution.frame_index[t]}"
+    if footage is None:
+        text(tile, f"{name}  {frame}", 6, 11, 11, ON_PAPER_DETECTED)
+    else:
+        tag(tile, f"{name}  {frame}", 4, 13, 12, track_colour(n))
     return tile
 
 
-def _mesh(posed: PosedBirds, n: int, t: int) -> np.ndarray:
+def _mesh(posed: PosedBirds, n: int, t: int, colours: Float[np.ndarray, "V 3"]) -> np.ndarray:
     """The mesh from the camera, lit."""
-    screen, faces = posed.vertices_screen(n, t), np.asarray(posed.faces)
-    solution, depth = posed.solution, screen[:, 2:]
-    tile_px = _to_tile(screen[:, :2], solution.crop[n, t])
-    focal_px = solution.focal * TILE_PX / solution.crop_px
-    vertices_cam = np.concatenate([(tile_px - TILE_PX / 2) * depth / focal_px, depth], axis=1)
-    colours = shade(vertices_cam, faces, np.broadcast_to(PLUMAGE, screen.shape))
+    screen, faces, window = posed.vertices_screen(n, t), np.asarray(posed.faces), _window(posed, n, t)
+    lit = shade(posed.vertices_cam_window(n, slice(t, t + 1))[0], faces, colours)
     tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8)
-    return draw(tile, np.concatenate([tile_px, depth], axis=1), faces, colours, samples=3)
-
-
-SHIFT = 4  # OpenCV draws at sixteenths of a pixel; its pixel centres are whole numbers, ours are halves
-
-
-def _fixed(point: np.ndarray) -> tuple[int, int]:
-    x, y = np.clip(np.round((point - 0.5) * (1 << SHIFT)), -(2**14), 2**14)
-    return int(x), int(y)
+    tile_px = _to_tile(screen[:, :2], window)
+    return draw(tile, np.concatenate([tile_px, screen[:, 2:]], axis=1), faces, lit, samples=3)

@@ -1,0 +1,80 @@
+"""The line below an overlay's picture: which frame it is and what the signs mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from jaxfit.view.birds import Style
+from jaxfit.view.marks import DETECTED, FITTED, PAPER, dot, line, ring, tag, text, text_width, track_colour
+
+__all__ = ["Legend"]
+
+_Sign = Callable[[np.ndarray, float, float, float], None]
+
+
+class Legend:
+    """Laid out once, in as many lines as the width needs; drawn with each frame's number.
+
+    Args:
+        width: pixels.
+        style: of the overlay.
+        detected: say what rings are.
+        side_views: say how the side views stand.
+    """
+
+    def __init__(self, width: int, style: Style, detected: bool, side_views: bool):
+        self._style, size = style, style.text_px
+        entries: list[tuple[_Sign, str]] = [(self._number, "bird (track)"), (self._mesh, "fitted bird")]
+        entries.append((self._fitted, "fitted keypoint"))
+        if detected:
+            entries.append((self._detected, "detected keypoint"))
+        if side_views:
+            entries.append((lambda *_: None, "below: each bird from its left, upright as birds stand"))
+        gap, left, right, row = 1.2 * size, 0.8 * size, width - 0.8 * size, 0
+        x = left + text_width("frame 000000   00:00:00.00", size) + 2 * gap
+        places = []
+        for sign, words in entries:
+            wide = 2.6 * size + text_width(words, size)
+            if x + wide > right and x > left:
+                x, row = left, row + 1
+            places.append((sign, words, x, row))
+            x += wide + 1.5 * gap
+        self._line = 2.2 * size
+        self.height = round((row + 1) * self._line)
+        self._ground = np.full((self.height, width, 3), PAPER, np.uint8)
+        for sign, words, x, row in places:
+            middle = (row + 0.5) * self._line
+            sign(self._ground, x, middle, size)
+            text(self._ground, words, x + (2.1 * size if words[:5] != "below" else 0), middle, size)
+
+    def draw(self, number: int, seconds: float) -> UInt8[np.ndarray, "H W 3"]:
+        """The line for the frame of this number and time from the video's start."""
+        image, size = self._ground.copy(), self._style.text_px
+        minutes, rest = divmod(seconds, 60)
+        hours, minutes = divmod(int(minutes), 60)
+        clock = f"{hours}:{minutes:02d}:{rest:05.2f}" if hours else f"{minutes}:{rest:05.2f}"
+        text(image, f"frame {number}", 0.8 * size, 0.5 * self._line, size)
+        text(image, clock, 1.6 * size + text_width("frame 000000", size), 0.5 * self._line, size, (110, 110, 110))
+        return image
+
+    def _number(self, image, x, y, size):
+        tag(image, "1", x + 0.2 * size, y, 0.85 * size, track_colour(0))
+
+    def _mesh(self, image, x, y, size):
+        shape = np.round([[x + 0.9 * size + 0.85 * size * np.cos(a), y + 0.5 * size * np.sin(a)] for a in _TURN])
+        cv2.fillPoly(image, [shape.astype(np.int32)], (195, 185, 170), cv2.LINE_AA)
+        cv2.polylines(image, [shape.astype(np.int32)], True, track_colour(0), self._style.line_px + 1, cv2.LINE_AA)
+
+    def _fitted(self, image, x, y, size):
+        line(image, (x, y + 0.3 * size), (x + 1.7 * size, y - 0.3 * size), (150, 150, 150))
+        dot(image, (x + 0.85 * size, y), self._style.dot_px + 0.5, FITTED)
+
+    def _detected(self, image, x, y, size):
+        ring(image, (x + 0.85 * size, y), self._style.ring_px, DETECTED, max(1, round(self._style.unit)))
+
+
+_TURN = np.linspace(0, 2 * np.pi, 40)

@@ -1,0 +1,223 @@
+"""A result drawn over its video: what `jaxfit overlay` writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from jaxfit.errors import InputError
+from jaxfit.fitting.posed import PosedBirds
+from jaxfit.fitting.solution import Solution
+from jaxfit.model.bird import Bird
+from jaxfit.observations import Observations
+from jaxfit.progress import ProgressTask, silent
+from jaxfit.render import shade
+from jaxfit.video import VideoInfo, VideoWriter, probe_video, read_frames
+from jaxfit.view.birds import DrawnBird, Style, draw_birds, draw_keypoints, draw_number
+from jaxfit.view.detected import Detected
+from jaxfit.view.legend import Legend
+from jaxfit.view.marks import skeleton_pairs, tinted
+from jaxfit.view.sheet import contact_sheet, cut_tiles, sheet_pairs
+from jaxfit.view.side import SideViews
+
+__all__ = ["Overlay", "overlay"]
+
+CHUNK = 32  # frames whose meshes are posed in one call: memory stays small, however long the video
+FOLDER_FPS = 25.0
+
+
+class Overlay(NamedTuple):
+    """What was written."""
+
+    video: Path
+    sheet: Path
+    """Contact sheet, PNG."""
+    frames: int
+    size_px: tuple[int, int]
+    """Width and height of the video, as written."""
+    fps: float
+    codec: str
+    """Name of `jaxfit.video.CODECS`."""
+    fallback: bool
+    """Whether the codec is another than the one asked for; a warning says so."""
+
+
+def overlay(
+    solution: Solution,
+    bird: Bird,
+    video: str | Path,
+    out: str | Path,
+    *,
+    observations: Observations | None = None,
+    side_views: bool = False,
+    max_width: int | None = 1920,
+    codec: str = "auto",
+    progress: ProgressTask = silent,
+) -> Overlay:
+    """Draw the birds of a result over its video, and a contact sheet beside it.
+
+    From the first frame of the result to its last: meshes, see-through and outlined in the track's colour, fitted
+    keypoints as dots, detected ones as rings, the track's number at the head. Where birds overlap, see `draw_birds`
+    for which hides the other. Below the picture stand the frame's number and what the signs mean and, if asked for,
+    every bird from its left (`SideViews`). A result of every n-th frame gives a video of those alone, n times slower
+    in frames a second; frames that the result lacks in between show the footage.
+
+    Args:
+        solution: the result.
+        bird: its model.
+        video: the file, or folder of images, that the result belongs to.
+        out: ``.mp4`` or ``.webm`` to write; the contact sheet has the same name and ends in ``.png``.
+        observations: detected keypoints to draw.
+        side_views: add the strip of side views.
+        max_width: wider video is made smaller to this many pixels; None keeps its size.
+        codec: of `VideoWriter`.
+        progress: told of every frame.
+
+    Returns:
+        What was written.
+
+    Raises:
+        ValueError: `max_width` below 16, or a codec that `out` cannot hold.
+        InputError: no such video; the result does not belong to it (its frames are not in the video, or most of
+            its birds lie outside of the picture, or `observations` are of pictures of another size); a result
+            without a single valid pose; the system refuses the write. Nothing is written then.
+    """
+    video, out = Path(video), Path(out)
+    if max_width is not None and max_width < 16:
+        raise ValueError(f"max_width must be 16 or more, or None, not {max_width}")
+    info = probe_video(video)
+    _check_belongs(solution, observations, video, info)
+    drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
+    numbers = solution.frame_index
+    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    first, last = int(numbers[0]), int(numbers[-1])
+    fps = (info.fps or FOLDER_FPS) / step
+    wanted = [pair for row in sheet_pairs(solution) for pair in row]
+    tiles = {}
+    with (
+        VideoWriter(out, drawing.size_px, fps, codec) as writer,
+        progress("overlay", (last - first) // step + 1) as tick,
+    ):
+        number = None
+        for number, picture in read_frames(video, first, last + 1, step):
+            t = int(np.searchsorted(numbers, number))
+            here = t if numbers[t] == number else None
+            tiles |= cut_tiles(drawing.posed, picture, [(n, at) for n, at in wanted if at == here])
+            writer.write(drawing.frame(picture, number, here, number / (fps * step)))
+            tick(1, f"frame {number}")
+        if info.frames is None and number != last:
+            raise _too_short(video, solution, 0 if number is None else number + 1)
+    contact_sheet(solution, bird, observations, out.with_suffix(".png"), footage=tiles)
+    return Overlay(
+        out,
+        out.with_suffix(".png"),
+        writer.frames,
+        writer.written_size_px,
+        float(writer.fps),
+        writer.codec,
+        writer.fallback,
+    )
+
+
+class _Drawing:
+    """Draws frame after frame, in increasing order."""
+
+    def __init__(
+        self,
+        solution: Solution,
+        bird: Bird,
+        observations: Observations | None,
+        side_views: bool,
+        info: VideoInfo,
+        max_width: int | None,
+    ):
+        width, height = info.size_px
+        self.zoom = 1.0 if max_width is None else min(1.0, max_width / width)
+        self.picture_px = round(width * self.zoom), max(1, round(height * self.zoom))
+        self.solution, self.posed = solution, PosedBirds(solution, bird)
+        self.style = Style.of_width(self.picture_px[0])
+        self._faces = np.asarray(bird.faces)
+        self._colours = [tinted(np.asarray(bird.vertex_colours), n) for n in range(len(solution.track_id))]
+        self._pairs = skeleton_pairs(solution.keypoint_names)
+        self._detected = Detected(solution, observations)
+        text_px = self.style.text_px
+        self._legend = Legend(self.picture_px[0], self.style, observations is not None, side_views)
+        self._side = SideViews(solution, bird, self.picture_px[0], text_px) if side_views else None
+        strip = 0 if self._side is None else self._side.height
+        self.size_px = self.picture_px[0], self.picture_px[1] + self._legend.height + strip
+        self._start, self._cam = 0, np.zeros((0, 0, 0, 3), np.float32)
+
+    def frame(
+        self, picture: UInt8[np.ndarray, "H W 3"], number: int, t: int | None, seconds: float
+    ) -> UInt8[np.ndarray, "H2 W2 3"]:
+        """The picture of a frame with everything drawn; `t` is its position in the result, if it is in it."""
+        image = picture.copy() if self.zoom == 1 else cv2.resize(picture, self.picture_px, interpolation=cv2.INTER_AREA)
+        shown = np.zeros(len(self.solution.track_id), bool) if t is None else self.solution.valid[:, t]
+        birds = [] if t is None else [self._bird(n, t) for n in np.flatnonzero(shown).tolist()]
+        crops = self.solution.crop[shown, t] if t is not None else np.zeros((0, 3))
+        draw_birds(image, birds, self._faces, self.style, one_camera=bool((crops == crops[:1]).all()))
+        for bird in birds:
+            draw_keypoints(image, bird, self._pairs, self.style)
+        taken: list[tuple[float, float, float, float]] = []
+        for bird in birds:
+            draw_number(image, bird, self.solution.keypoint_names, self.style, taken)
+        parts = [image, self._legend.draw(number, seconds)]
+        if self._side is not None:
+            meshes = [self._vertices_cam(n, t) for n in range(len(shown))] if t is not None else []
+            parts.append(self._side.draw(t or 0, shown, meshes))
+        return np.vstack(parts)
+
+    def _bird(self, n: int, t: int) -> DrawnBird:
+        cam, span = self._vertices_cam(n, t), slice(t, t + 1)
+        shrink = np.array([self.zoom, self.zoom, 1], np.float32)
+        places, confidence = self._detected.keypoints(n, t)
+        return DrawnBird(
+            position=n,
+            name=str(self.solution.track_id[n]),
+            screen=self.posed.to_image(cam[None], n, span)[0] * shrink,
+            colours=shade(cam, self._faces, self._colours[n]),
+            keypoints_px=self.solution.keypoints_2d[n, t] * self.zoom,
+            detected_px=places[confidence > 0] * self.zoom,
+        )
+
+    def _vertices_cam(self, n: int, t: int) -> Float[np.ndarray, "V 3"]:
+        """Of the chunk of frames that holds `t`, which is posed when its first frame comes."""
+        if not self._start <= t < self._start + self._cam.shape[1]:
+            # the last chunk reaches back instead of being shorter: one length, one compilation
+            self._start = max(0, min(t, len(self.solution.frame_index) - CHUNK))
+            span = slice(self._start, self._start + CHUNK)
+            self._cam = np.stack([self.posed.vertices_cam_window(i, span) for i in range(len(self.solution.track_id))])
+        return self._cam[n, t - self._start]
+
+
+def _check_belongs(solution: Solution, observations: Observations | None, video: Path, info: VideoInfo) -> None:
+    if not solution.valid.any():
+        raise InputError("result", "holds no valid pose: there is nothing to draw", "see its status by track")
+    if info.frames is not None and int(solution.frame_index[-1]) >= info.frames:
+        raise _too_short(video, solution, info.frames)
+    width, height = info.size_px
+    remedy = "give the video that the result was fitted to"
+    if observations is not None and len(observations.frame_index):
+        seen = tuple(int(side) for side in observations.image_size_px[0])
+        if seen != info.size_px:
+            problem = f"is {width}×{height}, but the observations are of {seen[0]}×{seen[1]} pictures"
+            raise InputError(video, problem, remedy)
+    points = solution.keypoints_2d[solution.valid]
+    inside = ((points >= 0) & (points <= [width, height])).all(-1).mean()
+    if inside < 0.5:
+        low, high = np.percentile(points.reshape(-1, 2), [5, 95], axis=0).round().astype(int)
+        problem = (
+            f"is {width}×{height}, but {1 - inside:.0%} of the result's keypoints lie outside of that: "
+            f"x from {low[0]} to {high[0]}, y from {low[1]} to {high[1]}"
+        )
+        raise InputError(video, problem, remedy)
+
+
+def _too_short(video: Path, solution: Solution, frames: int) -> InputError:
+    first, last = int(solution.frame_index[0]), int(solution.frame_index[-1])
+    problem = f"has {frames} frames, but the result has frames {first} to {last}, counted from 0"
+    return InputError(video, problem, "give the video that the result was fitted to")
