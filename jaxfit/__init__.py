@@ -11,6 +11,8 @@ from jaxfit.formats.coco import read_coco, write_coco
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
 from jaxfit.observations import Observations
+from jaxfit.simulation.scene import Scene, simulate, stage_scene
+from jaxfit.view.overlay import overlay
 
 __version__ = metadata.version("jaxfit")
 
@@ -20,6 +22,7 @@ __all__ = [
     "FitConfig",
     "InputError",
     "Observations",
+    "Scene",
     "Solution",
     "evaluate",
     "find_bird",
@@ -28,8 +31,11 @@ __all__ = [
     "load_config",
     "load_murre",
     "load_solution",
+    "overlay",
     "read_coco",
     "save_bird",
     "save_solution",
+    "simulate",
+    "stage_scene",
     "write_coco",
 ]
