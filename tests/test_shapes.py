@@ -74,6 +74,18 @@ assert main(["evaluate", str(folder / "out"), "--truth", str(folder / "birds.jso
 assert main(["model", "info", str(folder / "toy.npz")]) == 0
 """
 
+SCENE = """
+from pathlib import Path
+from jaxfit.cli import main
+
+folder = Path({folder!r})
+scene, out = str(folder / "scene"), str(folder / "o.mp4")
+assert main(["simulate", "--birds", "2", "--frames", "3", "--size", "320x200", "--out", scene]) == 0
+assert main(["evaluate", scene + "/truth", "--truth", scene]) == 0
+assert main(["overlay", scene + "/truth", "--video", scene + "/footage.mp4", "--side-views", "--out", out]) == 0
+assert main(["model", "view", "murre", "--out", str(folder / "views.png")]) == 0
+"""
+
 
 def enforced(program, **environment):
     head = HOOK.format(tests=str(Path(__file__).parent))
@@ -88,8 +100,9 @@ def test_the_hook_catches_a_wrong_shape():
     assert "parameter 'axis_angle'" in done.stderr
 
 
-@pytest.mark.parametrize("name", ["objective", "fit"])
+@pytest.mark.parametrize("name", ["objective", "fit", "scene"])
 def test_annotations_hold(name, tmp_path):
-    program = {"objective": POSE + OBJECTIVE, "fit": FIT.format(folder=str(tmp_path))}[name]
+    program = {"objective": POSE + OBJECTIVE, "fit": FIT, "scene": SCENE}[name]
+    program = program if name == "objective" else program.format(folder=str(tmp_path))
     done = enforced(program, XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert done.returncode == 0, done.stderr[-3000:]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxfit import __version__
 from jaxfit.camera import Camera
 from jaxfit.errors import InputError
 from jaxfit.fitting.solution import Solution, save_solution
@@ -31,6 +31,7 @@ from jaxfit.video import VideoWriter
 __all__ = ["DETECTIONS", "FOOTAGE", "MARKER", "Scene", "simulate", "stage_scene"]
 
 FOOTAGE, DETECTIONS, TRUTH, TRUE_POSES, MARKER = "footage.mp4", "detections.json", "truth.json", "truth", "scene.json"
+VERSION = metadata.version("jaxfit")
 LEDGE_DEPTH = 62.0
 """From the edge to the wall, model units (1.24 m)."""
 LARGEST_SIDE, SMALLEST_SIDE = 8192, 160
@@ -153,7 +154,7 @@ def simulate(
         write_coco(scene.truth, part / TRUTH)
         write_coco(scene.detections, part / DETECTIONS)
         origin = "simulated: these poses are the truth, not a fit"
-        facts = {"origin": origin, "jaxfit": __version__, "model": model_hash(bird)}
+        facts = {"origin": origin, "jaxfit": VERSION, "model": model_hash(bird)}
         save_solution(scene.poses, bird, f"# {origin}\n", facts, part / TRUE_POSES)
         write_whole(part / MARKER, json.dumps(_description(scene, birds, frames, size, fps, seed), indent=2).encode())
     return scene
@@ -226,7 +227,7 @@ def _description(scene: Scene, birds: int, frames: int, size: tuple[int, int], f
         starts = np.flatnonzero(np.diff(actor.behaviour, prepend=-1))
         acts[track] = [{"from_frame": int(t), "behaviour": BEHAVIOURS[actor.behaviour[t]]} for t in starts]
     return {
-        "made_by": f"jaxfit {__version__}, simulated",
+        "made_by": f"jaxfit {VERSION}, simulated",
         "arguments": {"birds": birds, "frames": frames, "size": list(size), "fps": fps, "seed": seed},
         "camera": {
             "R_cam_world": scene.view.R_cam_world.tolist(),
