@@ -10,12 +10,16 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from jaxfit.render import interpolate
-from jaxfit.view.marks import DETECTED, FITTED, INK, dot, line, ring, tag, text_width, track_colour
+from jaxfit.view.marks import DETECTED, FITTED, dot, line, ring, tag, text_width, track_colour
 
-__all__ = ["DrawnBird", "Style", "draw_birds", "draw_keypoints", "draw_number"]
+__all__ = ["DrawnBird", "Numbers", "Style", "draw_birds", "draw_keypoints"]
 
 HEAD = ("crown", "forehead", "nape", "left_eye", "right_eye", "bill_base", "neck", "bill_tip")
 """Keypoints that a bird's number may stand at, the best first."""
+_TURNS = np.radians([50, -50, 85, -85, 0, 120, -120])
+"""Ways from the head to its number, against straight ahead, where the bill is."""
+_REACHES = (2.6, 4.2, 6.0)
+"""From the head to its number, in heights of a word."""
 _STEP = 100.0  # depth between two layers; a bird is 1 deep there, so that perspective has no part in it
 
 
@@ -23,29 +27,21 @@ class Style(NamedTuple):
     """How birds are drawn; lengths in pixels of the picture."""
 
     unit: float
-    """Width of a thin line; everything else follows it."""
+    """Width of a thin line, which suits the picture."""
+    mark_px: float
+    """Radius of a fitted keypoint, which suits the birds."""
     opacity: float = 0.6
     """Of the meshes over the footage."""
 
     @classmethod
-    def of_width(cls, width: int, opacity: float = 0.6) -> Style:
-        """That suits a picture of this width."""
-        return cls(max(width / 1280, 0.75), opacity)
+    def suited(cls, width: int, bird_px: float, opacity: float = 0.6) -> Style:
+        """For a picture of this width and birds of this length."""
+        return cls(max(width / 1280, 0.75), float(np.clip(bird_px / 70, 1.4, 4)), opacity)
 
     @property
     def text_px(self) -> float:
         """Height of words."""
         return max(11.0, 13 * self.unit)
-
-    @property
-    def dot_px(self) -> float:
-        """Radius of a fitted keypoint."""
-        return max(1.6, 1.9 * self.unit)
-
-    @property
-    def ring_px(self) -> float:
-        """Radius of a detected keypoint."""
-        return max(3.2, 4.2 * self.unit)
 
     @property
     def line_px(self) -> int:
@@ -149,40 +145,55 @@ def draw_keypoints(
     image: UInt8[np.ndarray, "H W 3"], bird: DrawnBird, pairs: Sequence[tuple[int, int]], style: Style
 ) -> None:
     """Fitted keypoints as dots that lines join, detected ones as rings."""
-    points = bird.keypoints_px
-    for a, b in pairs:
-        line(image, points[a], points[b], FITTED, max(1, round(0.7 * style.unit)))
+    points, radius = bird.keypoints_px, style.mark_px
+    low = np.clip(np.floor(points.min(0)) - 2, 0, [image.shape[1], image.shape[0]]).astype(int)
+    high = np.clip(np.ceil(points.max(0)) + 2, 0, [image.shape[1], image.shape[0]]).astype(int)
+    if (high > low).all():
+        box = image[low[1] : high[1], low[0] : high[0]]
+        lined = box.copy()
+        for a, b in pairs:
+            line(lined, points[a] - low, points[b] - low, FITTED, max(1, round(0.7 * style.unit)))
+        cv2.addWeighted(lined, 0.6, box, 0.4, 0, dst=box)
     for point in bird.detected_px:
-        ring(image, point, style.ring_px, DETECTED, max(1, round(style.unit)))
+        ring(image, point, max(2.2 * radius, 3.2), DETECTED, max(1, round(0.6 * radius)))
     for point in points:
-        dot(image, point, style.dot_px, FITTED)
+        dot(image, point, radius, FITTED)
 
 
-def draw_number(
-    image: UInt8[np.ndarray, "H W 3"],
-    bird: DrawnBird,
-    keypoint_names: Sequence[str],
-    style: Style,
-    taken: list[tuple[float, float, float, float]],
-) -> None:
-    """The bird's number beyond its head, clear of the plates in `taken`, to which its own is added."""
-    height, width = image.shape[:2]
-    body = bird.screen[:, :2].mean(0)
-    named = [keypoint_names.index(name) for name in HEAD if name in keypoint_names]
-    head = bird.keypoints_px[named[0]] if named else bird.screen[bird.screen[:, 1].argmin(), :2]
-    if not ((head > 0) & (head < [width, height])).all():
-        return
-    size = style.text_px
-    away = (head - body) / max(float(np.linalg.norm(head - body)), 1e-6)
-    w, h = text_width(bird.name, size) + 0.9 * size, 1.7 * size
-    reach = 4.2 * size
-    for _ in range(12):
-        centre = np.clip(head + reach * away, [w / 2 + 1, h / 2 + 1], [width - w / 2 - 1, height - h / 2 - 1])
-        plate = (centre[0] - w / 2, centre[1] - h / 2, centre[0] + w / 2, centre[1] + h / 2)
-        if not any(plate[0] < o[2] and o[0] < plate[2] and plate[1] < o[3] and o[1] < plate[3] for o in taken):
-            break
-        reach += 0.8 * size
-    taken.append(plate)
-    line(image, head, centre, INK, style.line_px + 2)
-    line(image, head, centre, track_colour(bird.position), style.line_px)
-    tag(image, bird.name, plate[0], centre[1], size, track_colour(bird.position))
+class Numbers:
+    """Places each bird's number near its head, clear of other numbers and birds, and where it was before if it can."""
+
+    def __init__(self, keypoint_names: Sequence[str], style: Style):
+        named = [keypoint_names.index(name) for name in HEAD if name in keypoint_names]
+        self._head, self._style = named[0] if named else None, style
+        self._last: dict[int, int] = {}
+
+    def draw(self, image: UInt8[np.ndarray, "H W 3"], birds: Sequence[DrawnBird]) -> None:
+        """Into the picture, for all birds of a frame."""
+        if not birds:
+            return
+        height, width = image.shape[:2]
+        size, taken = self._style.text_px, np.zeros((0, 4))
+        points = np.concatenate([bird.keypoints_px for bird in birds])
+        for bird in birds:
+            top = bird.screen[bird.screen[:, 1].argmin(), :2]
+            head = top if self._head is None else bird.keypoints_px[self._head]
+            if not ((head > 0) & (head < [width, height])).all():
+                continue
+            half = np.array([text_width(bird.name, size) / 2 + 0.45 * size, 0.85 * size])
+            ahead = head - bird.screen[:, :2].mean(0)
+            angle = np.arctan2(ahead[1], ahead[0]) + _TURNS
+            places = head + np.outer(_REACHES, [size, size]).repeat(len(_TURNS), 0) * np.tile(
+                np.column_stack([np.cos(angle), np.sin(angle)]), (len(_REACHES), 1)
+            )
+            places = np.clip(places, half + 1, [width, height] - half - 1)
+            plates = np.concatenate([places - half, places + half], axis=1)
+            low, high = plates[:, None, :2], plates[:, None, 2:]
+            cost = ((points > low - 2) & (points < high + 2)).all(-1).sum(1) + 0.25 * np.arange(len(plates))
+            cost += 10 * ((low < taken[:, 2:]) & (high > taken[:, :2])).all(-1).sum(1)
+            if bird.position in self._last:
+                cost[self._last[bird.position]] -= 3
+            best = self._last[bird.position] = int(cost.argmin())
+            taken = np.concatenate([taken, plates[best : best + 1]])
+            line(image, head, places[best], track_colour(bird.position), self._style.line_px)
+            tag(image, bird.name, plates[best, 0], places[best, 1], size, track_colour(bird.position))

@@ -71,10 +71,10 @@ class Legend:
 
     def _fitted(self, image, x, y, size):
         line(image, (x, y + 0.3 * size), (x + 1.7 * size, y - 0.3 * size), (150, 150, 150))
-        dot(image, (x + 0.85 * size, y), self._style.dot_px + 0.5, FITTED)
+        dot(image, (x + 0.85 * size, y), 0.17 * size, FITTED)
 
     def _detected(self, image, x, y, size):
-        ring(image, (x + 0.85 * size, y), self._style.ring_px, DETECTED, max(1, round(self._style.unit)))
+        ring(image, (x + 0.85 * size, y), 0.34 * size, DETECTED, max(1, round(0.1 * size)))
 
 
 _TURN = np.linspace(0, 2 * np.pi, 40)

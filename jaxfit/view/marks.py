@@ -103,7 +103,7 @@ def ring(
     """A circle, with an edge on both sides of it so that it shows on any ground."""
     at = fixed(point_px)
     if edge is not None:
-        cv2.circle(image, at, round(radius * (1 << SHIFT)), edge, width + 2, cv2.LINE_AA, SHIFT)
+        cv2.circle(image, at, round(radius * (1 << SHIFT)), edge, width + 1, cv2.LINE_AA, SHIFT)
     cv2.circle(image, at, round(radius * (1 << SHIFT)), colour, width, cv2.LINE_AA, SHIFT)
 
 

@@ -17,7 +17,7 @@ from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.render import shade
 from jaxfit.video import VideoInfo, VideoWriter, probe_video, read_frames
-from jaxfit.view.birds import DrawnBird, Style, draw_birds, draw_keypoints, draw_number
+from jaxfit.view.birds import DrawnBird, Numbers, Style, draw_birds, draw_keypoints
 from jaxfit.view.detected import Detected
 from jaxfit.view.legend import Legend
 from jaxfit.view.marks import skeleton_pairs, tinted
@@ -138,8 +138,12 @@ class _Drawing:
         width, height = info.size_px
         self.zoom = 1.0 if max_width is None else min(1.0, max_width / width)
         self.picture_px = round(width * self.zoom), max(1, round(height * self.zoom))
+        # far faster, and as good where every pixel still counts
+        self._shrink = cv2.INTER_LINEAR if self.zoom > 0.6 else cv2.INTER_AREA
         self.solution, self.posed = solution, PosedBirds(solution, bird)
-        self.style = Style.of_width(self.picture_px[0])
+        extent = np.ptp(solution.keypoints_2d[solution.valid], axis=1).max(-1)
+        self.style = Style.suited(self.picture_px[0], float(np.median(extent)) * self.zoom)
+        self._numbers = Numbers(solution.keypoint_names, self.style)
         self._faces = np.asarray(bird.faces)
         self._colours = [tinted(np.asarray(bird.vertex_colours), n) for n in range(len(solution.track_id))]
         self._pairs = skeleton_pairs(solution.keypoint_names)
@@ -155,16 +159,14 @@ class _Drawing:
         self, picture: UInt8[np.ndarray, "H W 3"], number: int, t: int | None, seconds: float
     ) -> UInt8[np.ndarray, "H2 W2 3"]:
         """The picture of a frame with everything drawn; `t` is its position in the result, if it is in it."""
-        image = picture.copy() if self.zoom == 1 else cv2.resize(picture, self.picture_px, interpolation=cv2.INTER_AREA)
+        image = picture.copy() if self.zoom == 1 else cv2.resize(picture, self.picture_px, interpolation=self._shrink)
         shown = np.zeros(len(self.solution.track_id), bool) if t is None else self.solution.valid[:, t]
         birds = [] if t is None else [self._bird(n, t) for n in np.flatnonzero(shown).tolist()]
         crops = self.solution.crop[shown, t] if t is not None else np.zeros((0, 3))
         draw_birds(image, birds, self._faces, self.style, one_camera=bool((crops == crops[:1]).all()))
         for bird in birds:
             draw_keypoints(image, bird, self._pairs, self.style)
-        taken: list[tuple[float, float, float, float]] = []
-        for bird in birds:
-            draw_number(image, bird, self.solution.keypoint_names, self.style, taken)
+        self._numbers.draw(image, birds)
         parts = [image, self._legend.draw(number, seconds)]
         if self._side is not None:
             meshes = [self._vertices_cam(n, t) for n in range(len(shown))] if t is not None else []

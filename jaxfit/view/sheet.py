@@ -132,7 +132,7 @@ def _evidence(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np
         place = np.array([[zoom, 0, -window[0] * zoom], [0, zoom, -window[1] * zoom]])
         seen = cv2.warpAffine(mask.astype(np.uint8), place, (TILE_PX, TILE_PX), flags=cv2.INTER_NEAREST)
         tile[seen > 0] = SEEN
-    screen = posed.vertices_screen(n, t)
+    screen = posed.vertices_screen_window(n, slice(t, t + 1))[0]
     screen = np.column_stack([_to_tile(screen[:, :2], window), screen[:, 2]])
     covered = hard_mask(screen, posed.faces, TILE_PX, TILE_PX).astype(np.uint8)
     contours, _ = cv2.findContours(covered, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -159,8 +159,9 @@ def _evidence(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np
 
 def _mesh(posed: PosedBirds, n: int, t: int, colours: Float[np.ndarray, "V 3"]) -> np.ndarray:
     """The mesh from the camera, lit."""
-    screen, faces, window = posed.vertices_screen(n, t), np.asarray(posed.faces), _window(posed, n, t)
-    lit = shade(posed.vertices_cam_window(n, slice(t, t + 1))[0], faces, colours)
+    here, faces, window = slice(t, t + 1), np.asarray(posed.faces), _window(posed, n, t)
+    cam = posed.vertices_cam_window(n, here)
+    screen, lit = posed.to_image(cam, n, here)[0], shade(cam[0], faces, colours)
     tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8)
     tile_px = _to_tile(screen[:, :2], window)
     return draw(tile, np.concatenate([tile_px, screen[:, 2:]], axis=1), faces, lit, samples=3)

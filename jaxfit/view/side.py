@@ -16,6 +16,8 @@ from jaxfit.view.marks import PAPER, tag, text, tinted, track_colour
 
 __all__ = ["SideViews", "up_direction"]
 
+LIGHT = (-0.35, -0.6, -0.7)
+"""From the bird towards the light: above the camera's left shoulder."""
 FOOT_WORDS = ("foot", "toe", "shin", "ankle")
 
 
@@ -106,6 +108,8 @@ def draw_parallel(
     points_px: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
     colours: Float[np.ndarray, "V 3"],
+    samples: int = 2,
+    light: tuple[float, float, float] = LIGHT,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A lit mesh in parallel projection over a copy of the picture.
 
@@ -113,10 +117,12 @@ def draw_parallel(
         image: the ground.
         points_px: right of, below and behind the picture's middle, pixels.
         faces, colours: of the mesh; the colours' channels are in the picture's order.
+        samples: as for `jaxfit.render.draw`.
+        light: as for `jaxfit.render.shade`.
     """
     middle = np.array([image.shape[1] / 2, image.shape[0] / 2, 10 * max(image.shape)])
-    lit = shade(points_px, faces, colours)
-    return draw(image, (points_px + middle).astype(np.float32), faces, lit, samples=3)
+    lit = shade(points_px, faces, colours, light)
+    return draw(image, (points_px + middle).astype(np.float32), faces, lit, samples)
 
 
 def _left(bird: Bird) -> Float[np.ndarray, "3"]:
