@@ -56,7 +56,8 @@ def evaluate(
 
     PCK counts visible keypoints within 5 and 10 % of the longer side of the annotated mask (of the box where
     there is no mask); IoU compares the mesh's hard mask with the annotated one, the whole bird's where that is
-    known; me_p and me_v are relative to the longer side of the mesh's mask. True poses add errors in space, also where nothing is annotated.
+    known; me_p and me_v are relative to the longer side of the mesh's mask. True poses add errors in space, also
+    where nothing is annotated.
 
     Args:
         solution: the result.

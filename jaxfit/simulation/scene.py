@@ -181,7 +181,8 @@ def _check(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int
 
 def _box(mask: np.ndarray) -> list[int]:
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    return [columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]]
+    box = columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]
+    return [int(side) for side in box]
 
 
 def _true_poses(

@@ -23,13 +23,13 @@ SIDES = ("left", "right")
 class Posture(NamedTuple):
     """A body pose and how it is held."""
 
-    body_pose: Float[np.ndarray, "J-1 3"]
+    body_pose: Float[np.ndarray, "bones 3"]
     """Axis-angle of every joint but the root, radians."""
     pitch_rad: float
     """Turn of the whole bird about +x (bill upwards) against level; the rest pose has 0."""
 
 
-def mirrored_pose(body_pose: Float[np.ndarray, "*B J-1 3"]) -> Float[np.ndarray, "*B J-1 3"]:
+def mirrored_pose(body_pose: Float[np.ndarray, "*B bones 3"]) -> Float[np.ndarray, "*B bones 3"]:
     """The mirror image of a body pose: sides exchanged, turns about y and z reversed."""
     swap = [JOINT_NAMES.index(other_side(name)) - 1 for name in JOINT_NAMES[1:]]
     return body_pose[..., swap, :] * np.array([1.0, -1.0, -1.0])
