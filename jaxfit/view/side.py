@@ -56,7 +56,7 @@ class SideViews:
         N, valid = len(solution.track_id), solution.valid
         self.solution, self.text_px, self.width = solution, text_px, width
         self.columns = max(1, min(N, max(2, width // 150), 8))
-        self.tile_px = min(width // self.columns, max(width // 5, 64))
+        self.tile_px = min(width // self.columns, max(width // 5, 128))
         self.height = math.ceil(N / self.columns) * self.tile_px
         self._faces = np.asarray(bird.faces)
         self._colours = [tinted(np.asarray(bird.vertex_colours), n, 0.75) for n in range(N)]
