@@ -23,6 +23,7 @@ __all__ = [
     "posed_joints",
     "posed_keypoints",
     "posed_vertices",
+    "window_joints",
     "window_keypoints",
     "window_transforms",
     "window_vertices",
@@ -133,6 +134,11 @@ def window_transforms(rig: Rig, pose: Pose) -> Float[Array, "T J 3 4"]:
 def window_keypoints(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T K 3"]:
     """`posed_keypoints` of every frame of a window."""
     return _each_frame(lambda frame, A: posed_keypoints(rig, A, frame), pose, A)
+
+
+def window_joints(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T J 3"]:
+    """`posed_joints` of every frame of a window."""
+    return _each_frame(lambda frame, A: posed_joints(rig, A, frame), pose, A)
 
 
 def window_vertices(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T V 3"]:

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 from scipy.spatial.transform import Rotation
 
 from jaxfit.model.bird import Bird
-from jaxfit.model.kinematics import fold_bird, posed_joints, window_transforms, window_vertices
+from jaxfit.model.kinematics import fold_bird, window_joints, window_transforms, window_vertices
 from jaxfit.model.murre import POSTURES
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import unwrap_axis_angle
@@ -148,7 +148,7 @@ class _Body:
         rig = fold_bird(bird)
         A = window_transforms(rig, pose)
         self.vertices = np.asarray(window_vertices(rig, A, pose), np.float64)  # about the root
-        joints = np.stack([_joints(rig, A, pose, t) for t in range(frames)])
+        joints = np.asarray(window_joints(rig, A, pose), np.float64)
         names = bird.joint_names
         feet = joints[:, [names.index("left_foot"), names.index("right_foot")]].mean(1)
         airborne = np.clip(motion.altitude / 3.0, 0, 1)[:, None]
@@ -172,11 +172,6 @@ class _Body:
             betas=self.pose.betas,
         )
         return Actor(pose, self.vertices + place[:, None], self.motion.behaviour)
-
-
-def _joints(rig, A, pose: Pose, t: int) -> np.ndarray:
-    one = Pose(pose.global_orient[t], pose.body_pose[t], pose.transl[t], pose.scale[0], pose.bone_length, pose.betas)
-    return np.asarray(posed_joints(rig, A[t], one))
 
 
 def _separate(bodies: Sequence[_Body], rounds: int = 12) -> None:
