@@ -1,27 +1,14 @@
 """The renderer's benchmark: crops of one bird, and full frames of several."""
 
 import os
-import statistics
-import time
-from collections.abc import Callable
 
 import numpy as np
 
 from jaxfit import native, render
-from jaxfit.benchmarks.silhouette import bird_like_mesh, jittered_frames
+from jaxfit.benchmarks.silhouette import bird_like_mesh, jittered_frames, median_seconds
 from jaxfit.model.bird import Bird
 
 CROP_PX, FRAME_PX, BIRD_PX = 256, (2592, 1520), 350
-
-
-def _median_seconds(run: Callable[[], object], repeats: int) -> float:
-    run()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
 
 
 def _seen(vertices: np.ndarray, longest_px: float) -> np.ndarray:
@@ -60,8 +47,8 @@ def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, rep
 
     middle = np.array([CROP_PX / 2, CROP_PX / 2, 0], np.float32)
     batch = jittered_frames(_seen(vertices, 0.7 * CROP_PX) + middle, crops, CROP_PX)
-    zbuffer_s = _median_seconds(lambda: render.zbuffer(batch, faces, CROP_PX, CROP_PX), repeats)
-    interpolate_s = _median_seconds(lambda: render.interpolate(batch, faces, colours, CROP_PX, CROP_PX), repeats)
+    zbuffer_s = median_seconds(lambda: render.zbuffer(batch, faces, CROP_PX, CROP_PX), repeats)
+    interpolate_s = median_seconds(lambda: render.interpolate(batch, faces, colours, CROP_PX, CROP_PX), repeats)
 
     width, height = FRAME_PX
     columns = int(np.ceil(np.sqrt(birds)))
@@ -70,12 +57,12 @@ def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, rep
     flock = (_seen(vertices, BIRD_PX) + places).reshape(-1, 3)
     flock_faces = np.concatenate([faces[::2] + i * len(vertices) for i in range(birds)])
     flock_colours, frame = np.tile(colours, (birds, 1)), np.full((height, width, 3), 128, np.uint8)
-    frame_s = _median_seconds(lambda: render.draw(frame, flock, flock_faces, flock_colours), repeats)
+    frame_s = median_seconds(lambda: render.draw(frame, flock, flock_faces, flock_colours), repeats)
     one = flock[: len(vertices)]
     return {
         "crops_per_s": crops / zbuffer_s,
         "interpolated_crops_per_s": crops / interpolate_s,
-        "mask_ms": 1e3 * _median_seconds(lambda: render.hard_mask(one, faces, width, height), repeats),
+        "mask_ms": 1e3 * median_seconds(lambda: render.hard_mask(one, faces, width, height), repeats),
         "full_frames_per_s": 1 / frame_s,
         "full_frame_ms": 1e3 * frame_s,
         "faces": len(faces),
