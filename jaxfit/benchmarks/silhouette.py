@@ -64,7 +64,8 @@ def jittered_frames(vertices: Float[np.ndarray, "V 3"], frames: int, size: int, 
     return np.concatenate([xy, np.broadcast_to(vertices[:, 2:], (frames, len(vertices), 1))], -1).astype(np.float32)
 
 
-def _seconds(run: Callable[[], object], repeats: int) -> float:
+def median_seconds(run: Callable[[], object], repeats: int) -> float:
+    """Median time of one run, in seconds; a first one, which may compile, does not count."""
     jax.block_until_ready(run())
     times = []
     for _ in range(repeats):
@@ -123,13 +124,13 @@ def bench_silhouette(
     with_gradient = jax.jit(jax.vmap(jax.value_and_grad(loss), in_axes=(0, None)))
 
     def time_of(count: int, chosen) -> dict:
-        seconds = _seconds(lambda: with_gradient(batch[:count], chosen), repeats)
+        seconds = median_seconds(lambda: with_gradient(batch[:count], chosen), repeats)
         return {"frames": count, "faces": len(chosen), "ms_per_frame": 1e3 * seconds / count}
 
     whole = time_of(frames, faces)
     a = jax.random.normal(jax.random.key(0), (1024, 1024))
     matmul = jax.jit(lambda a: a @ a)
-    matmul_ms = 1e3 * _seconds(lambda: matmul(a), repeats)
+    matmul_ms = 1e3 * median_seconds(lambda: matmul(a), repeats)
 
     counts = sorted({max(1, frames // 4), max(1, frames // 2)})
     # Every second or fourth face covers the same bird, so that only the number changes.
@@ -138,7 +139,7 @@ def bench_silhouette(
 
     return {
         **whole,
-        "loss_ms_per_frame": 1e3 * _seconds(lambda: loss_only(batch, faces), repeats) / frames,
+        "loss_ms_per_frame": 1e3 * median_seconds(lambda: loss_only(batch, faces), repeats) / frames,
         "size": size,
         "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "isa": raster.current_isa(),
