@@ -279,6 +279,7 @@ def test_a_video_that_is_not_the_results(tmp_path):
     small = film(tmp_path / "small.mp4", size=(100, 60))
     refused("small.mp4", "100×60", "keypoints lie outside", video=small)
     refused("f.mp4", "320×200", "640×400", observations=detections((640, 400)))
+    refused("none of the result's birds", observations=dataclasses.replace(detections(), track_id=np.array([5])))
     refused("nothing.mp4", "does not exist", video=tmp_path / "nothing.mp4")
     (tmp_path / "text.mp4").write_text("no video")
     refused("text.mp4", "no video", video=tmp_path / "text.mp4")

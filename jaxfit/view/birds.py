@@ -76,8 +76,9 @@ def draw_birds(
 
     Which of two birds hides the other: where all share one camera, the z-buffer decides, pixel by pixel. A fit
     knows no bird's distance, since each has a crop camera and a size of its own; there the bird whose lower edge
-    is lower in the picture hides the other, as it must where all stand on level ground and the camera is upright,
-    however steeply it looks down.
+    is lower in the picture hides the other, as where birds stand on level ground and the camera is upright,
+    however steeply it looks down. In simulated scenes seen from above this was right for 80 % of overlapping
+    pairs, the order of true mean distances for 84 %, and distances from sizes that are 5 % off for 67 %.
 
     Args:
         image: is drawn into.

@@ -203,7 +203,13 @@ def _check_belongs(solution: Solution, observations: Observations | None, video:
         raise _too_short(video, solution, info.frames)
     width, height = info.size_px
     remedy = "give the video that the result was fitted to"
-    if observations is not None and len(observations.frame_index):
+    if observations is not None:
+        if not (
+            np.isin(solution.track_id, observations.track_id).any()
+            and np.isin(solution.frame_index, observations.frame_index).any()
+        ):
+            problem = "hold none of the result's birds: no track or no frame has the same number"
+            raise InputError("observations", problem, "give the file that the result was fitted to")
         seen = tuple(int(side) for side in observations.image_size_px[0])
         if seen != info.size_px:
             problem = f"is {width}×{height}, but the observations are of {seen[0]}×{seen[1]} pictures"

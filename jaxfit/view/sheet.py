@@ -116,7 +116,7 @@ def _window(posed: PosedBirds, n: int, t: int) -> Float[np.ndarray, "3"]:
     points = posed.solution.keypoints_2d[n, t]
     low, high = points.min(0), points.max(0)
     size = 1.5 * float((high - low).max())
-    return crop if crop[2] < 2 * size else np.array([*((low + high - size) / 2), size], np.float32)
+    return crop if crop[2] < 1.4 * size else np.array([*((low + high - size) / 2), size], np.float32)
 
 
 def _to_tile(points_px: np.ndarray, window: np.ndarray) -> np.ndarray:

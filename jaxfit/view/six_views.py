@@ -36,8 +36,8 @@ VIEWS = {  # name → the picture's right and down, in the bird's axes: x right,
 def six_views(bird: Bird, path: str | Path, posture: Posture | str | None = None) -> None:
     """Draw a bird from its left, right, front, back, above and below at one scale, and write it as a PNG.
 
-    Parallel projection, lit from the viewer's side; the bird looks along +y with +z up, as the published models do. Above and
-    below, its head is at the top.
+    Parallel projection, lit from the viewer's side; the bird looks along +y with +z up, as the published models do.
+    Above and below, its head is at the top.
 
     Args:
         bird: the model. The murre's scale is in centimetres, that of others in model units.
