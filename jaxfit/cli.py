@@ -86,6 +86,7 @@ def _fitting(add) -> None:
     overlay.add_argument("--out", type=Path, required=True, help="video to write; its contact sheet stands beside it")
     overlay.add_argument("--observations", type=Path, metavar="OBS.json", help="draw the detected keypoints too")
     overlay.add_argument("--side-views", action="store_true", help="show every bird from the side as well")
+    overlay.add_argument("--frame", type=int, help="draw this frame alone, as a picture (.png or .jpg)")
     overlay.add_argument("--codec", default="auto", choices=CODECS)
     overlay.set_defaults(run=commands.overlay)
 
@@ -121,5 +122,7 @@ def _models(add) -> None:
     view = actions.add_parser("view", help="draw a model from six sides")
     view.add_argument("file", metavar="MODEL", help=MODEL)
     view.add_argument("--out", type=Path, required=True, help="PNG to write")
-    view.add_argument("--posture", help="of the murre: standing, incubating, … (default: the rest pose)")
+    view.add_argument(
+        "--posture", help="of the murre: standing, incubating, … (default: standing; other models at rest)"
+    )
     view.set_defaults(run=commands.model_view)

@@ -90,20 +90,16 @@ def simulate(options: argparse.Namespace) -> None:
 
 def overlay(options: argparse.Namespace) -> None:
     from jaxfit.fitting.solution import load_solution
-    from jaxfit.view.overlay import overlay
+    from jaxfit.view.overlay import overlay, overlay_frame
 
     solution, bird = load_solution(options.result)
-    observations = read_coco(options.observations) if options.observations else None
-    overlay(
-        solution,
-        bird,
-        options.video,
-        options.out,
-        observations=observations,
-        side_views=options.side_views,
-        codec=options.codec,
-        progress=terminal,
-    )
+    seen = read_coco(options.observations) if options.observations else None
+    drawn = {"observations": seen, "side_views": options.side_views}
+    if options.frame is not None:
+        overlay_frame(solution, bird, options.video, options.frame, options.out, **drawn)
+        show(f"frame {options.frame} → {options.out}")
+        return
+    overlay(solution, bird, options.video, options.out, codec=options.codec, progress=terminal, **drawn)
     show(f"overlay → {options.out}, contact sheet → {options.out.with_suffix('.png')}")
 
 
@@ -132,8 +128,11 @@ def model_info(options: argparse.Namespace) -> None:
 
 
 def model_view(options: argparse.Namespace) -> None:
+    from jaxfit.model.murre import POSTURES
     from jaxfit.view.six_views import six_views
 
+    if options.posture and options.posture not in POSTURES:
+        raise InputError("model view: posture", f"{options.posture!r} is none", f"known are {', '.join(POSTURES)}")
     six_views(find_bird(options.file), options.out, options.posture)
     show(f"six views → {options.out}")
 

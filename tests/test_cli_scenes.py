@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import pytest
 from cli_files import refused
 
@@ -42,6 +43,17 @@ def test_an_overlay_of_the_truth(scene, tmp_path, capsys):
     said = capsys.readouterr().out.replace("\n", "")
     assert str(out) in said
     assert str(out.with_suffix(".png")) in said
+
+
+def test_a_frame_of_the_overlay(scene, tmp_path, capsys):
+    out = tmp_path / "frame.png"
+    command = ["overlay", str(scene / "truth"), "--video", str(scene / "footage.mp4"), "--out", str(out), "--frame"]
+    assert main([*command, "3"]) == 0
+    picture = cv2.imread(str(out))
+    assert picture.shape[1] == 480
+    refused(capsys, [*command, "5"], "no frame 5")
+    command[command.index(str(out))] = str(tmp_path / "frame.tiff")
+    refused(capsys, [*command, "3"], "frame.tiff", ".png")
 
 
 def test_overlays_that_cannot_be_drawn(scene, tmp_path, capsys):

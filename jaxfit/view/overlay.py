@@ -16,6 +16,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.render import shade
+from jaxfit.storage import write_whole
 from jaxfit.video import VideoInfo, VideoWriter, probe_video, read_frames
 from jaxfit.view.birds import DrawnBird, Numbers, Style, draw_birds, draw_keypoints
 from jaxfit.view.detected import Detected
@@ -24,7 +25,7 @@ from jaxfit.view.marks import skeleton_pairs, tinted
 from jaxfit.view.sheet import contact_sheet, cut_tiles, sheet_pairs
 from jaxfit.view.side import SideViews
 
-__all__ = ["Overlay", "overlay"]
+__all__ = ["Overlay", "overlay", "overlay_frame"]
 
 CHUNK = 32  # frames whose meshes are posed in one call: memory stays small, however long the video
 FOLDER_FPS = 25.0
@@ -121,6 +122,44 @@ def overlay(
         writer.codec,
         writer.fallback,
     )
+
+
+def overlay_frame(
+    solution: Solution,
+    bird: Bird,
+    video: str | Path,
+    frame_index: int,
+    out: str | Path,
+    *,
+    observations: Observations | None = None,
+    side_views: bool = False,
+    max_width: int | None = 1920,
+) -> None:
+    """Draw one frame as `overlay` does, and write it as a picture.
+
+    Args:
+        frame_index: its number in the video.
+        out: ``.png`` or ``.jpg``.
+        solution, bird, video, observations, side_views, max_width: as for `overlay`.
+
+    Raises:
+        InputError: as `overlay` does; the result lacks the frame; `out` is neither kind of picture.
+    """
+    video, out = Path(video), Path(out)
+    info = probe_video(video)
+    _check_belongs(solution, observations, video, info)
+    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise InputError(out, f"a picture cannot end in {out.suffix!r}", "give a name that ends in .png or .jpg")
+    if frame_index not in solution.frame_index:
+        problem = f"has no frame {frame_index}: its frames are {solution.frame_index[0]} to {solution.frame_index[-1]}"
+        raise InputError("result", problem, "give one of them")
+    drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
+    for number, picture in read_frames(video, frame_index, frame_index + 1):
+        t, seconds = int(np.searchsorted(solution.frame_index, number)), number / (info.fps or FOLDER_FPS)
+        _, encoded = cv2.imencode(out.suffix, drawing.frame(picture, number, t, seconds))
+        write_whole(out, encoded.tobytes())
+        return
+    raise _too_short(video, solution, 0)
 
 
 class _Drawing:
