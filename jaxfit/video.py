@@ -79,7 +79,7 @@ class VideoWriter:
         if suited is None:
             raise InputError(self.path, "is named as no video", f"end it in {' or '.join(CONTAINERS)}")
         if codec not in ("auto", *suited):
-            raise ValueError(f"codec must be one of {', '.join(suited)} in a {self.path.suffix} file, not {codec!r}")
+            raise InputError(self.path, f"{codec} does not go into such a file", f"choose {' or '.join(suited)}")
         width, height = (int(side) for side in size_px)
         if not (1 <= width <= 16384 and 1 <= height <= 16384):
             raise ValueError(f"size_px must be a width and a height within 1 and 16384, not {size_px}")

@@ -167,7 +167,7 @@ def test_a_full_disk(tmp_path):
     ("change", "message"),
     [
         ({"codec": "h265"}, "codec must be auto or one of h264, vp9, mpeg4, not 'h265'"),
-        ({"path": "a.webm", "codec": "h264"}, r"codec must be one of vp9 in a \.webm file"),
+        ({"path": "a.webm", "codec": "h264"}, r"a\.webm: h264 does not go into such a file \(choose vp9"),
         ({"path": "a.avi"}, r"a\.avi: is named as no video \(end it in \.mp4 or \.webm"),
         ({"path": "a"}, "is named as no video"),
         ({"size_px": (0, 4)}, "size_px must be"),

@@ -78,7 +78,7 @@ def skeleton_pairs(keypoint_names: Sequence[str]) -> list[tuple[int, int]]:
     return [(index[a], index[b]) for a, b in MURRE_SKELETON if a in index and b in index]
 
 
-def fixed(point_px: Float[np.ndarray, "2"]) -> tuple[int, int]:
+def fixed(point_px: Float[np.ndarray, "2"] | tuple[float, float]) -> tuple[int, int]:
     """A position in image pixels as OpenCV takes it with `SHIFT`."""
     x, y = np.clip(np.round((np.asarray(point_px, np.float64) - 0.5) * (1 << SHIFT)), -(2**19), 2**19)
     return int(x), int(y)
