@@ -85,7 +85,8 @@ def overlay(
         ValueError: `max_width` below 16.
         InputError: no such video; the result does not belong to it (its frames are not in the video, or most of
             its birds lie outside of the picture, or `observations` are of pictures of another size); a result
-            without a single valid pose; a codec that `out` cannot hold; the system refuses the write. Nothing is written then.
+            without a single valid pose; a codec that `out` cannot hold; the system refuses the
+            write. Nothing is written then.
     """
     video, out = Path(video), Path(out)
     if max_width is not None and max_width < 16:
