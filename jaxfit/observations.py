@@ -134,7 +134,8 @@ class Observations:
 
     def whole_mask(self, n: int, t: int) -> np.ndarray | None:
         """The mask of the bird with its hidden parts, where that is known; else ``mask``."""
-        return _decode(self.amodal_masks.get(self._position(n, t))) if self.amodal_masks else self.mask(n, t)
+        whole = _decode(self.amodal_masks.get(self._position(n, t)))
+        return self.mask(n, t) if whole is None else whole
 
     def image_size(self, n: int, t: int) -> tuple[int, int]:
         """Width and height in pixels of the image that track ``n`` stands in at frame ``t``."""

@@ -99,7 +99,7 @@ class VideoWriter:
         self.codec, self.fallback = found, found != wanted
         if self.fallback:
             note = "" if found != "mpeg4" else "; players show it, browsers do not"
-            _logger.warning("%s: no %s encoder here, written as %s%s", self.path, wanted, found, note)
+            _logger.warning("%s: no %s encoder here, written as %s%s", self.path.name, wanted, found, note)
         self._stream: Any = None
         self._writing = self._write()
 

@@ -15,7 +15,7 @@ from scipy.interpolate import PchipInterpolator
 
 from jaxfit.model.murre import POSTURES, Posture
 
-__all__ = ["BEHAVIOURS", "Key", "Motion", "Performer", "motion_of"]
+__all__ = ["BEHAVIOURS", "REACH", "Key", "Motion", "Performer", "motion_of"]
 
 BEHAVIOURS = ("stand", "incubate", "preen", "walk", "flap", "approach", "jab", "fly_off")
 STEP_S = 0.28
@@ -149,7 +149,7 @@ def _approach(bird: Performer, until_s: float, target) -> None:
         distance = max(float(np.hypot(*offset)), 1e-6)
         if distance > REACH:
             _walk(bird, until_s, tuple(np.add(target, offset * REACH / distance)))
-    _jab(bird, until_s, target)
+    bird.perform("jab", until_s, target)
 
 
 REACH = 17.0

@@ -16,7 +16,7 @@ from jaxfit.model.kinematics import fold_bird, window_joints, window_transforms,
 from jaxfit.model.murre import POSTURES
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import unwrap_axis_angle
-from jaxfit.simulation.behaviour import Key, Motion, Performer, motion_of
+from jaxfit.simulation.behaviour import REACH, Key, Motion, Performer, motion_of
 from jaxfit.simulation.motion import smooth_noise
 from jaxfit.simulation.viewpoint import Viewpoint
 
@@ -24,6 +24,12 @@ __all__ = ["Actor", "act"]
 
 SPACING = 13.0
 """Least distance between standing places, model units (26 cm): shoulder to shoulder."""
+FROM_EDGE, FROM_WALL = 7.0, 9.0
+"""How near to edge and wall feet stand, model units."""
+KNOT_S = 0.8
+"""Time in which a bird's small movements change."""
+YIELD_S = 0.6
+"""Time in which a bird makes room."""
 SWAY = 0.035
 """Standard deviation of each joint angle's own movement, radians."""
 BODY = (("lower_body", "chest", 2.9), ("chest", "neck", 2.3), ("neck", "head", 1.9))
@@ -56,10 +62,10 @@ def act(bird: Bird, birds: int, frames: int, fps: float, ledge_depth: float, vie
     """
     rng = np.random.default_rng((seed, 1))
     places = _places(rng, birds, ledge_depth, view)
-    performers = _perform(rng, places, frames / fps)
+    performers = _perform(rng, places, ledge_depth, frames / fps)
     motions = [motion_of(performer, frames, fps) for performer in performers]
-    bodies = [_Body(bird, motion, rng) for motion in motions]
-    _separate(bodies)
+    bodies = [_Body(bird, motion, rng, KNOT_S * fps) for motion in motions]
+    _separate(bodies, YIELD_S * fps)
     return [body.actor(view) for body in bodies]
 
 
@@ -73,8 +79,8 @@ def _places(rng: np.random.Generator, birds: int, depth: float, view: Viewpoint)
                 angle, reach = rng.uniform(0, 2 * np.pi), rng.uniform(spacing, 1.3 * spacing)
                 spot = np.add(places[rng.integers(len(places))], reach * np.array([np.cos(angle), np.sin(angle)]))
             else:
-                spot = np.array([rng.uniform(-half, half), rng.uniform(8, depth - 10)])
-            inside = abs(spot[0]) <= half and 6 <= spot[1] <= depth - 9
+                spot = np.array([rng.uniform(-half, half), rng.uniform(FROM_EDGE, depth - FROM_WALL)])
+            inside = abs(spot[0]) <= half and FROM_EDGE <= spot[1] <= depth - FROM_WALL
             if inside and all(np.hypot(*np.subtract(spot, other)) >= spacing for other in places):
                 places.append((float(spot[0]), float(spot[1])))
                 break
@@ -83,7 +89,9 @@ def _places(rng: np.random.Generator, birds: int, depth: float, view: Viewpoint)
     return places
 
 
-def _perform(rng: np.random.Generator, places: Sequence[tuple[float, float]], seconds: float) -> list[Performer]:
+def _perform(
+    rng: np.random.Generator, places: Sequence[tuple[float, float]], depth: float, seconds: float
+) -> list[Performer]:
     leading = ["preen", "walk", "approach", "flap", "incubate", "fly_off", "stand"]
     usual, weights = ["stand", "preen", "walk", "flap", "approach", "incubate"], [0.4, 0.22, 0.12, 0.06, 0.1, 0.1]
     performers = []
@@ -94,7 +102,7 @@ def _perform(rng: np.random.Generator, places: Sequence[tuple[float, float]], se
         if first != "incubate":
             bird.perform("stand", rng.uniform(0.0, 0.6))
         while bird.now.time_s < seconds and first is not None:
-            target = _target(rng, n, places, first)
+            target = _target(rng, n, places, depth, first)
             last = bird.now.time_s + rng.uniform(1.0, 2.5) >= seconds
             bird.perform(first, seconds if last else bird.now.time_s + rng.uniform(1.5, 3.5), target)
             if first == "fly_off":
@@ -104,17 +112,20 @@ def _perform(rng: np.random.Generator, places: Sequence[tuple[float, float]], se
     return performers
 
 
-def _target(rng: np.random.Generator, n: int, places: Sequence[tuple[float, float]], behaviour: str):
-    """Where the behaviour leads: to the nearest neighbour, or to a free spot near by."""
+def _target(rng: np.random.Generator, n: int, places: Sequence[tuple[float, float]], depth: float, behaviour: str):
+    """Where the behaviour leads: to a neighbour, or to a free spot near by."""
     own = np.array(places[n])
     others = np.array([place for i, place in enumerate(places) if i != n]).reshape(-1, 2)
-    if behaviour in ("approach", "jab") and len(others):
-        return tuple(others[np.argmin(np.linalg.norm(others - own, axis=1))])
+    if behaviour == "approach" and len(others):
+        distance = np.linalg.norm(others - own, axis=1)
+        far_enough = np.where(distance > REACH + 4, distance, distance + 100)  # one to walk to, if there is one
+        return tuple(others[np.argmin(far_enough)])
     if behaviour == "walk":
         # of some random spots the one that is farthest from everybody
         spots = own + rng.uniform(9, 22) * np.array(
             [[np.cos(a), 0.5 * np.sin(a)] for a in rng.uniform(0, 2 * np.pi, 12)]
         )
+        spots[:, 1] = np.clip(spots[:, 1], FROM_EDGE, depth - FROM_WALL)
         room = [np.min(np.linalg.norm(others - spot, axis=1), initial=99.0) for spot in spots]
         return tuple(spots[int(np.argmax(room))])
     return None
@@ -123,13 +134,13 @@ def _target(rng: np.random.Generator, n: int, places: Sequence[tuple[float, floa
 class _Body:
     """One bird's curves, turned into poses that stand on the ledge."""
 
-    def __init__(self, bird: Bird, motion: Motion, rng: np.random.Generator):
+    def __init__(self, bird: Bird, motion: Motion, rng: np.random.Generator, frames_a_knot: float):
         frames = len(motion.pitch)
         self.motion, self.shift = motion, np.zeros((frames, 2))
         low, high = np.moveaxis(np.asarray(bird.joint_limits, np.float64), -1, 0)
-        sway = SWAY * smooth_noise(rng, frames, motion.body_pose.shape[1:])
+        sway = SWAY * smooth_noise(rng, frames, motion.body_pose.shape[1:], frames_a_knot)
         self.body_pose = np.clip(motion.body_pose + sway, low, high)
-        lean = 0.04 * smooth_noise(rng, frames, (3,))
+        lean = 0.04 * smooth_noise(rng, frames, (3,), frames_a_knot)
         self.R_world_root = (
             Rotation.from_rotvec(motion.heading[:, None] * [0, 0, 1] + lean * [0, 0, 1])
             * Rotation.from_rotvec((motion.pitch + lean[:, 0])[:, None] * [1, 0, 0])
@@ -174,7 +185,7 @@ class _Body:
         return Actor(pose, self.vertices + place[:, None], self.motion.behaviour)
 
 
-def _separate(bodies: Sequence[_Body], rounds: int = 12) -> None:
+def _separate(bodies: Sequence[_Body], frames: float, rounds: int = 12) -> None:
     """Push birds apart along the ledge where their bodies would overlap, smoothly over time."""
     for _ in range(rounds):
         pushes = [np.zeros_like(body.shift) for body in bodies]
@@ -187,7 +198,7 @@ def _separate(bodies: Sequence[_Body], rounds: int = 12) -> None:
         if max(np.abs(push).max() for push in pushes) < 0.02:
             break
         for body, push in zip(bodies, pushes, strict=True):
-            body.shift += _smooth_envelope(push)
+            body.shift += _smooth_envelope(push, frames)
 
 
 def _overlap(a: _Body, b: _Body) -> Float[np.ndarray, "T 2"]:
@@ -212,8 +223,9 @@ def _overlap(a: _Body, b: _Body) -> Float[np.ndarray, "T 2"]:
     return worst[:, None] * direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-6)
 
 
-def _smooth_envelope(push: Float[np.ndarray, "T 2"], frames: int = 15) -> Float[np.ndarray, "T 2"]:
+def _smooth_envelope(push: Float[np.ndarray, "T 2"], frames: float) -> Float[np.ndarray, "T 2"]:
     """A smooth curve that is nowhere much below the push, so that birds yield before they are touched."""
-    up = maximum_filter1d(np.maximum(push, 0), frames, axis=0)
-    down = maximum_filter1d(np.maximum(-push, 0), frames, axis=0)
+    window = max(1, round(frames))
+    up = maximum_filter1d(np.maximum(push, 0), window, axis=0)
+    down = maximum_filter1d(np.maximum(-push, 0), window, axis=0)
     return gaussian_filter1d(up - down, frames / 4, axis=0)

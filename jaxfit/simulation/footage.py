@@ -15,6 +15,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.render import hard_mask, interpolate, vertex_normals
 from jaxfit.simulation.flock import Actor
 from jaxfit.simulation.ledge import Light, paint_ledge
+from jaxfit.simulation.motion import smooth_noise
 from jaxfit.simulation.texture import Noise, smoothstep
 from jaxfit.simulation.viewpoint import Viewpoint
 
@@ -54,7 +55,7 @@ class Footage:
         # each bird a little lighter or darker, not of another hue
         self._colours = np.clip(self._colours.mean(-1, keepdims=True) * 0.3 + self._colours * 0.7, 0.012, 0.9)
         self._grain = rng.normal(size=(2 * 256 + view.height, 2 * 256 + view.width)).astype(np.float32)
-        self._flicker = np.exp(0.01 * np.cumsum(rng.normal(size=len(actors[0].behaviour))) / 3)
+        self._flicker = 1 + 0.01 * smooth_noise(rng, len(actors[0].behaviour))
         self._noise = float(rng.uniform(0.004, 0.014))
         self._softness_px = float(rng.uniform(0.3, 0.8)) * view.width / 2592
         self._offsets = rng.integers(0, 512, (len(actors[0].behaviour), 2))
@@ -64,14 +65,18 @@ class Footage:
     def frame(self, t: int) -> UInt8[np.ndarray, "H W 3"]:
         """Frame t as a camera would give it; blue, green, red."""
         now = np.stack([actor.vertices_world[t] for actor in self.actors])
-        later = np.stack([actor.vertices_world[min(t + 1, len(actor.vertices_world) - 1)] for actor in self.actors])
-        travel = np.linalg.norm((self.view.to_screen(later) - self.view.to_screen(now))[..., :2], axis=-1)
+        last = len(self._offsets) - 1
+        before, after = (
+            np.stack([actor.vertices_world[i] for actor in self.actors]) for i in (max(t - 1, 0), min(t + 1, last))
+        )
+        velocity = (after - before) / max(min(t + 1, last) - max(t - 1, 0), 1)
+        travel = np.linalg.norm((self.view.to_screen(now + velocity) - self.view.to_screen(now))[..., :2], axis=-1)
         moments = int(np.clip(np.ceil(SHUTTER * travel.max() / BLUR_STEP_PX), 1, 4))
         picture = self._with_shadows(now)
         total: np.ndarray | None = None
         for i in range(moments):
-            share = SHUTTER * i / moments
-            drawn = self._with_birds(picture, (1 - share) * now + share * later)
+            share = SHUTTER * ((i + 0.5) / moments - 0.5)  # the truth is that of the middle of the exposure
+            drawn = self._with_birds(picture, now + share * velocity)
             total = drawn if total is None else total + drawn
         assert total is not None
         return self._expose(total / moments, t)

@@ -13,20 +13,23 @@ from jaxfit.model.rotation import unwrap_axis_angle
 
 __all__ = ["smooth_motion", "smooth_noise"]
 
-FRAMES_A_KNOT = 20
+FRAMES_A_KNOT = 20.0
 """A new random target every 20 frames: at 25 frames/s, movements of about a second."""
 
 
-def smooth_noise(rng: np.random.Generator, frames: int, shape: tuple[int, ...] = ()) -> Float[np.ndarray, "T *shape"]:
+def smooth_noise(
+    rng: np.random.Generator, frames: int, shape: tuple[int, ...] = (), frames_a_knot: float = FRAMES_A_KNOT
+) -> Float[np.ndarray, "T *shape"]:
     """Smooth random curves of about unit spread: standard normal knots, joined by cosine ramps.
 
     Args:
         rng: source of randomness.
         frames: length T.
         shape: independent curves.
+        frames_a_knot: time between knots.
     """
-    knots = rng.normal(size=(frames // FRAMES_A_KNOT + 2, *shape))
-    at = np.arange(frames) / FRAMES_A_KNOT
+    knots = rng.normal(size=(int(frames / frames_a_knot) + 2, *shape))
+    at = np.arange(frames) / frames_a_knot
     low = at.astype(int)
     ramp = ((1 - np.cos(np.pi * (at - low))) / 2).reshape(-1, *[1] * len(shape))
     return (1 - ramp) * knots[low] + ramp * knots[low + 1]

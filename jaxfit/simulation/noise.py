@@ -4,13 +4,17 @@ The model, per bird; side is the longer side of its box, in pixels:
 
 - jitter: σ = JITTER · side + MOTION · |velocity a frame| (blur), × HIDDEN where the keypoint is not seen. 60 % of its
   variance is correlated in time (AR(1), ρ = 0.85), the rest is white;
-- gross outliers, in runs of some frames: the keypoint lands on a neighbour's of that name, or anywhere in the box;
+- gross outliers, in runs of some frames: the keypoint lands on a neighbour's of that name as that was detected, or
+  somewhere in the box, and stays there while the run lasts;
 - left and right swapped, for all pairs of a bird or for one, in runs;
 - missing keypoints, mostly hidden ones, and whole frames without a detection, in runs;
 - confidence falls with the jitter that was made, and most outliers are doubted, but through noise: swaps and some
   outliers are trusted, some right points are not;
 - masks: of the visible part, eroded or grown by an amount that drifts, with ragged borders, now and then torn at
   the tips, and now and then merged with a touching neighbour.
+
+Rates hold for keypoints in the picture. What it leaves out: tracks are the true ones, without exchanged identities,
+false or double birds; confidence follows the error that was made more closely than a network's would.
 
 The figures are estimates of what networks for animals do on video, not measured on any; they were set before anything
 was fitted to what they give.
@@ -31,13 +35,15 @@ __all__ = ["detect_noisily"]
 
 JITTER, MOTION, HIDDEN = 0.012, 0.15, 2.5
 CORRELATED, RHO = 0.6, 0.85
-OUTLIERS_SEEN, OUTLIERS_HIDDEN, OUTLIERS_DOUBTED = 0.015, 0.06, 0.65
+OUTLIERS_SEEN, OUTLIERS_HIDDEN, OUTLIERS_DOUBTED, STOLEN = 0.015, 0.06, 0.65, 0.4
 SWAPS_ALL, SWAPS_ONE = 0.008, 0.006
 MISSING_SEEN, MISSING_HIDDEN, MISSING_FRAMES = 0.015, 0.35, 0.012
+GRAIN = 0.04
+"""Size of the border's bumps as a share of the side."""
 RUN_FRAMES = 4.0
 """Mean length of a run of outliers, swaps, gaps or mergers."""
-RAGGED, MERGED = 0.02, 0.02
-"""Spread of the mask's border as a share of the side; share of frames in which touching masks merge."""
+ERODED, DRIFT, RAGGED, MERGED = 0.005, 0.007, 0.01, 0.02
+"""Shares of the side: the border's mean inset, its drift over time, its raggedness; share of frames that may merge."""
 
 
 def detect_noisily(
@@ -65,21 +71,16 @@ def detect_noisily(
     points = exact + sigma[..., None] * _jitter(rng, (N, T, K, 2))
     error = np.linalg.norm(points - exact, axis=-1) / side
 
-    for all_pairs, rate in ((True, SWAPS_ALL), (False, SWAPS_ONE)):
-        for left, right in keypoint_pairs:
-            if all_pairs and (left, right) != keypoint_pairs[0]:
-                continue
-            when = _runs(rng, rate, (N, T))
-            pairs = keypoint_pairs if all_pairs else [(left, right)]
-            for a, b in pairs:
-                swapped = np.where(when[..., None, None], points[:, :, [b, a]], points[:, :, [a, b]])
-                points[:, :, [a, b]] = swapped
+    everybody = _runs(rng, SWAPS_ALL, (N, T))
+    for left, right in keypoint_pairs:
+        both = labelled[:, :, left] & labelled[:, :, right]
+        when = ((everybody | _runs(rng, SWAPS_ONE, (N, T))) & both)[..., None]
+        a, b = points[:, :, left], points[:, :, right]
+        points[:, :, left], points[:, :, right] = np.where(when, b, a), np.where(when, a, b)
 
-    rate = np.where(seen, OUTLIERS_SEEN, OUTLIERS_HIDDEN)
-    wrong = _runs(rng, rate, (N, T, K))
-    points = np.where(wrong[..., None], _elsewhere(rng, truth, exact), points)
-
-    doubted = wrong & (rng.random((N, T, K)) < OUTLIERS_DOUBTED)
+    wrong = _runs(rng, np.where(seen, OUTLIERS_SEEN, OUTLIERS_HIDDEN), (N, T, K))
+    points = np.where(wrong[..., None], _elsewhere(rng, truth, points, wrong), points)
+    doubted = wrong & (_held(rng.random((N, T, K)), wrong) < OUTLIERS_DOUBTED)
     trust = 2.2 - 22 * error - 0.9 * ~seen - 2.6 * doubted + 0.8 * rng.normal(size=(N, T, K))
     confidence = 1 / (1 + np.exp(-trust))
     missing = _runs(rng, np.where(seen, MISSING_SEEN, MISSING_HIDDEN), (N, T, K)) | (confidence < 0.08)
@@ -126,21 +127,32 @@ def _runs(rng: np.random.Generator, rate, shape: tuple[int, ...]) -> Bool[np.nda
     return on
 
 
-def _elsewhere(rng: np.random.Generator, truth: Observations, exact: np.ndarray) -> np.ndarray:
-    """Where outliers land: on the nearest neighbour's keypoint of that name, or anywhere in the bird's own box."""
-    N, T, K = exact.shape[:3]
+def _held(values: np.ndarray, on: Bool[np.ndarray, "N T K"]) -> np.ndarray:
+    """Values (N, T, K, …) that stay the same for as long as a run goes on."""
+    held = values.copy()
+    for t in range(1, on.shape[1]):
+        goes_on = (on[:, t] & on[:, t - 1]).reshape(*on[:, t].shape, *[1] * (values.ndim - 3))
+        held[:, t] = np.where(goes_on, held[:, t - 1], held[:, t])
+    return held
+
+
+def _elsewhere(
+    rng: np.random.Generator, truth: Observations, points: Float[np.ndarray, "N T K 2"], wrong: np.ndarray
+) -> Float[np.ndarray, "N T K 2"]:
+    """Where outliers land: on the nearest neighbour's keypoint as it was detected, or anywhere in the own box."""
+    N, T, K = wrong.shape
     low, size = truth.box_px[..., None, :2], truth.box_px[..., None, 2:]
-    anywhere = low + rng.uniform(-0.1, 1.1, exact.shape) * size
+    anywhere = low + _held(rng.uniform(-0.1, 1.1, points.shape), wrong) * size
     if N < 2:
         return anywhere
     centre = truth.box_px[..., :2] + truth.box_px[..., 2:] / 2
     distance = np.linalg.norm(centre[:, None] - centre[None], axis=-1)  # N N T
     distance = np.where(truth.present[None] & ~np.eye(N, dtype=bool)[..., None], distance, np.inf)
-    nearest = distance.argmin(1)  # N T
-    theirs = exact[nearest, np.arange(T)]
+    nearest, frames = distance.argmin(1), np.arange(T)  # N T
     near = np.take_along_axis(distance, nearest[:, None], 1)[:, 0] < 1.5 * truth.box_px[..., 2:].max(-1)
-    stolen = (rng.random((N, T, K)) < 0.4) & near[..., None]
-    return np.where(stolen[..., None], theirs, anywhere)
+    to_be_taken = near[..., None] & (truth.confidence > 0)[nearest, frames]
+    stolen = (_held(rng.random((N, T, K)), wrong) < STOLEN) & to_be_taken
+    return np.where(stolen[..., None], points[nearest, frames], anywhere)
 
 
 def _area(truth: Observations, n: int, t: int) -> float:
@@ -171,9 +183,10 @@ def _masks(rng: np.random.Generator, truth: Observations, found: np.ndarray):
         part = np.ascontiguousarray(mask[top:bottom, left:right]).astype(np.uint8)
         # signed distance to the border, moved by the drift and by smooth noise: thin tips get lost
         inside = cv2.distanceTransform(part, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - part, cv2.DIST_L2, 3)
-        field = rng.normal(size=(8 + part.shape[0] // 8, 8 + part.shape[1] // 8)).astype(np.float32)
+        patch = max(2, round(GRAIN * side))
+        field = rng.normal(size=[4 + length // patch for length in part.shape]).astype(np.float32)
         field = cv2.resize(field, part.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        reported = inside + RAGGED * side * (0.35 * drift[n, t] - 0.25 + 0.5 * field) > 0
+        reported = inside + side * (DRIFT * drift[n, t] - ERODED + RAGGED * field) > 0
         whole = np.zeros(mask.shape, bool)
         whole[top:bottom, left:right] = reported
         if not whole.any():

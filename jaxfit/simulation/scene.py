@@ -35,6 +35,8 @@ VERSION = metadata.version("jaxfit")
 LEDGE_DEPTH = 62.0
 """From the edge to the wall, model units (1.24 m)."""
 LARGEST_SIDE, SMALLEST_SIDE = 8192, 160
+MOST_POSES = 14_000
+"""Birds × frames that fit in memory on a small machine."""
 
 
 class Scene(NamedTuple):
@@ -171,9 +173,11 @@ def _check(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int
             raise InputError(f"simulate: {name}", f"{value} makes no scene", remedy)
 
     require("birds", birds, 1 <= birds <= 60, "give 1 to 60 birds")
-    require("frames", frames, 2 <= frames <= 100_000, "give 2 frames or more")
-    remedy = f"give width and height as in 2592x1520, even, {SMALLEST_SIDE} to {LARGEST_SIDE} pixels"
+    longest = MOST_POSES // birds
+    require("frames", frames, 2 <= frames <= longest, f"give 2 to {longest} frames, and film more as further scenes")
+    remedy = f"give width and height as in 2592x1520, even, {SMALLEST_SIDE} to {LARGEST_SIDE} pixels, at most 3:1"
     sides_fit = len(size) == 2 and all(SMALLEST_SIDE <= side <= LARGEST_SIDE and side % 2 == 0 for side in size)
+    sides_fit = sides_fit and max(size) <= 3 * min(size)
     require("size", "x".join(map(str, size)), sides_fit, remedy)
     require("fps", fps, 5 <= fps <= 240, "give 5 to 240 frames a second")
     require("seed", seed, 0 <= seed < 2**32, "give a whole number from 0")
