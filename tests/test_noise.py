@@ -139,3 +139,33 @@ def test_the_seed_decides(truth, seen, detected):
     again, other = (detect_noisily(truth, seen, PAIRS, seed) for seed in (1, 2))
     np.testing.assert_array_equal(again.keypoints_px, detected.keypoints_px)
     assert (other.keypoints_px != detected.keypoints_px).any()
+
+
+def test_outliers_stay_while_their_run_lasts(detected, truth):
+    offset = detected.keypoints_px - truth.keypoints_px
+    far = (np.linalg.norm(offset, axis=-1) > 12) & (detected.confidence > 0)
+    far[..., :6] = False  # pairs may be swapped
+    both = far[:, 1:] & far[:, :-1]
+    step = np.linalg.norm(np.diff(detected.keypoints_px, axis=1), axis=-1)[both]
+    assert len(step) > 50
+    assert np.median(step) < 4
+
+
+def test_nothing_points_to_where_nothing_is(truth, seen):
+    """A keypoint outside the picture has no place: no swap and no neighbour's outlier may take it."""
+    confidence = truth.confidence.copy()
+    confidence[1, :, [0, 9]] = 0
+    partly = truth.with_keypoints(truth.keypoints_px, confidence)
+    detected = detect_noisily(partly, seen, PAIRS, seed=4)
+    used = detected.confidence > 0
+    assert not used[1, :, 0].any()
+    assert np.linalg.norm(detected.keypoints_px[used], axis=-1).min() > 20
+
+
+def test_stolen_keypoints_are_the_neighbours_detected_ones(detected, truth):
+    used = detected.confidence > 0
+    for n, other in ((0, 1), (1, 0)):
+        distance = np.linalg.norm(detected.keypoints_px[n] - truth.keypoints_px[other], axis=-1)
+        near = used[n] & (distance < 5)
+        assert near.sum() > 10
+        assert distance[near].min() > 1e-4
