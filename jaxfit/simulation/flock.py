@@ -22,8 +22,8 @@ from jaxfit.simulation.viewpoint import Viewpoint
 
 __all__ = ["Actor", "act"]
 
-SPACING = 13.0
-"""Least distance between standing places, model units (26 cm): shoulder to shoulder."""
+SPACING = 9.0
+"""Least distance between standing places, model units (18 cm): shoulder to shoulder."""
 FROM_EDGE, FROM_WALL = 7.0, 9.0
 """How near to edge and wall feet stand, model units."""
 KNOT_S = 0.8
@@ -75,7 +75,7 @@ def _places(rng: np.random.Generator, birds: int, depth: float, view: Viewpoint)
     spacing, places = SPACING, []
     while len(places) < birds:
         for _ in range(200):
-            if places and rng.random() < 0.7:
+            if places and rng.random() < 0.75:
                 angle, reach = rng.uniform(0, 2 * np.pi), rng.uniform(spacing, 1.3 * spacing)
                 spot = np.add(places[rng.integers(len(places))], reach * np.array([np.cos(angle), np.sin(angle)]))
             else:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 __all__ = ["UNITS_ACROSS", "Viewpoint", "look_down"]
 
-UNITS_ACROSS = 150.0
+UNITS_ACROSS = 125.0
 """Model units across the picture at the ledge: a bird of 21 units is then a seventh of the width long."""
 
 
@@ -65,7 +65,7 @@ def look_down(rng: np.random.Generator, width: int, height: int, depth: float) -
     right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
     distance = rng.uniform(230, 270)
     # a narrow picture sees as much of the ledge from front to back as a wide one from side to side
-    across = max(UNITS_ACROSS, 100 * width / height)
+    across = max(UNITS_ACROSS, 85 * width / height)
     return Viewpoint(
         R_cam_world=np.array([right, down, forward]),
         position_world=np.array([0, 0.45 * depth, 8]) - distance * forward,
