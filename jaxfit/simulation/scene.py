@@ -216,6 +216,7 @@ def _true_poses(
         keypoints_3d=view.to_camera(keypoints_world),
         keypoints_2d=points_px,
         crop=np.broadcast_to(view.crop, (N, T, 3)),
+        image_size_px=np.where(truth.present[..., None], truth.image_size_px[None], 0),
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
         status=np.full(N, "ok"),

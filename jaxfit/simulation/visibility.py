@@ -13,7 +13,7 @@ from jaxfit.simulation.viewpoint import Viewpoint
 __all__ = ["View", "see"]
 
 NEAR_SURFACE = 0.6
-"""A keypoint this far behind the nearest surface still counts as seen, model units (1.2 cm)."""
+"""A keypoint this far behind its own bird's surface still counts as seen, model units (1.2 cm)."""
 
 
 class View(NamedTuple):
@@ -56,5 +56,6 @@ def see(
     points = view.to_screen(keypoints_world)
     inside = np.all((points[..., :2] >= 0) & (points[..., :2] < [view.width, view.height]), axis=-1)
     column, row = (np.clip(points[..., i].astype(int), 0, side - 1) for i, side in enumerate(shape[::-1]))
-    seen = inside & (points[..., 2] <= depth[row, column] + NEAR_SURFACE)
+    behind = np.where(owner[row, column] == np.arange(N)[:, None], NEAR_SURFACE, 0)  # its own surface, not another's
+    seen = inside & (points[..., 2] <= depth[row, column] + behind)
     return View(whole, [owner == n for n in range(N)], points[..., :2], inside, seen)
