@@ -1,4 +1,4 @@
-"""Files and folders written whole or not at all, and arrays read back with their layout checked."""
+"""Files and folders written whole or not at all, and arrays whose layout is checked."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfit.errors import InputError
 
-__all__ = ["check_replaceable", "conform", "load_npz", "new_file", "new_folder", "write_whole"]
+__all__ = ["check_replaceable", "conform", "new_file", "new_folder", "write_whole"]
 
 # What the operating system may answer to a write, and what the user can do about it.
 _REMEDIES = {
@@ -146,8 +146,8 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
             with ``overwrite``: it would be somebody's home.
 
     Raises:
-        InputError: the folder holds results already, is no folder, lacks the ``marker``, or the system
-            refuses the write (disk full, quota, read-only, permissions).
+        InputError: the folder holds results already, is no folder, lacks the ``marker``, is the current folder or
+            one above it, or the system refuses the write (disk full, quota, read-only, permissions).
     """
     path = Path(path).resolve()
     check_replaceable(path, overwrite, marker)
@@ -168,6 +168,8 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
 def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = None) -> None:
     """Raise `new_folder`'s InputError where it would refuse ``path``: before long work rather than after it."""
     path = Path(path).resolve()
+    if _holds_current(path):  # renamed over, it would leave the shell in a folder that is gone
+        raise InputError(path, "is the folder you are in, or one above it", "name a folder inside it")
     with _write_errors(path):  # permissions alone do not tell: try
         probe = _temporary(next(parent for parent in path.parents if parent.exists()) / path.name, ".probe")
         probe.mkdir()
@@ -186,6 +188,14 @@ def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = No
         raise InputError(path, problem, "choose another --out")
 
 
+def _holds_current(path: Path) -> bool:
+    try:
+        here = Path.cwd().resolve()
+    except FileNotFoundError:  # somebody removed it
+        return False
+    return path == here or path in here.parents
+
+
 def _take_place(part: Path, path: Path) -> None:
     if not path.exists():
         part.rename(path)
@@ -198,65 +208,6 @@ def _take_place(part: Path, path: Path) -> None:
         old.rename(path)
         raise
     shutil.rmtree(old, ignore_errors=True)
-
-
-def load_npz(path: str | Path, required: Mapping[str, int], version: int | None = None) -> dict[str, np.ndarray]:
-    """Read every array of an ``.npz``, running no pickled code.
-
-    Args:
-        path: the file.
-        required: name → number of dimensions of each array that must be there.
-        version: the newest ``format_version`` that the caller understands, which the file must then hold: a
-            whole number from 1. It is looked at first: a newer file may well have other arrays. None: any file.
-
-    Returns:
-        Name → array, also of arrays that were not asked for.
-
-    Raises:
-        InputError: no such file, not an ``.npz``, truncated, Python objects inside, of a newer version, an array
-            missing or of another number of dimensions.
-    """
-    path = Path(path)
-    if not path.exists():
-        raise InputError(path, "does not exist", "check the path")
-    if path.is_dir():
-        raise InputError(path, "is a folder, not an .npz file", "check the path")
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            raise InputError(path, "holds one bare array, not an .npz", "check the path")
-        with loaded:
-            found = {name: loaded[name] for name in loaded.files}
-    except InputError:
-        raise
-    except PermissionError as error:
-        raise InputError(path, "cannot be read: permission denied", "change its permissions") from error
-    except Exception as error:  # zip, zlib, header and memory errors alike mean: these bytes are no .npz of ours
-        if "allow_pickle" in str(error):
-            problem = "is a pickle or holds Python objects, which jaxfit does not load"
-            raise InputError(path, problem, "save plain arrays with numpy.savez") from error
-        problem = f"is not a readable .npz: {str(error) or type(error).__name__}"
-        raise InputError(path, problem, "it may be truncated: copy or write it again") from error
-    if version is not None:
-        _check_version(path, found.get("format_version"), version)
-    for name, ndim in required.items():
-        if not isinstance(found.get(name), np.ndarray):
-            raise InputError(path, f"lacks the array {name}", "write the file again with this version")
-        if found[name].ndim != ndim:
-            problem = f"{name} has shape {found[name].shape}, expected {ndim} dimensions"
-            raise InputError(path, problem, "write the file again")
-    return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
-
-
-def _check_version(path: Path, found: Any, newest: int) -> None:
-    if not isinstance(found, np.ndarray):
-        raise InputError(path, "lacks the array format_version", "write the file again with this version")
-    if found.ndim or found.dtype.kind not in "iu" or found < 1:
-        shown = f"{found!s:.40}"
-        raise InputError(path, f"format_version is {shown}, expected a whole number from 1", "write the file again")
-    if found > newest:
-        problem = f"format_version is {found}, newer than this jaxfit reads ({newest})"
-        raise InputError(path, problem, "it needs a newer jaxfit")
 
 
 def conform(values: Mapping[str, Any], layout: Mapping[str, tuple[str, Any]]) -> dict[str, np.ndarray]:

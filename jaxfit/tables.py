@@ -11,7 +11,7 @@ from rich.table import Table
 
 from jaxfit.evaluation.evaluate import COLUMNS, Evaluation
 
-__all__ = ["evaluation_tables", "plain_json", "right_aligned", "show", "show_facts"]
+__all__ = ["counted", "evaluation_tables", "plain_json", "right_aligned", "show", "show_facts"]
 
 _IN_SPACE = {
     "mpjpe": "MPJPE",
@@ -31,6 +31,11 @@ def show(what: Any) -> None:
     Console(soft_wrap=not isinstance(what, Table), highlight=False).print(what)
 
 
+def counted(count: int, noun: str) -> str:
+    """`1 bird`, `2 birds`."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def right_aligned(*columns: str, **options: Any) -> Table:
     """A table whose columns are all numbers."""
     table = Table(**options)
@@ -48,7 +53,8 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
     tables[0].add_row("all", str(result.frames), *(_figure(result.overall[name]) for name in COLUMNS))
     tables[0].caption = (
         "PCK: share of keypoints within 5 or 10 % of the annotated mask's longer side; IoU: mesh against mask; "
-        "me_p, me_v: RMS position and velocity error over the mesh mask's longer side"
+        "me_p, me_v: RMS position and velocity error over the mesh mask's longer side; "
+        "all of annotated keypoints, hidden ones included"
     )
     if result.points_3d:
         space = right_aligned("track", *_IN_SPACE.values())

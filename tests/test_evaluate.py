@@ -76,6 +76,7 @@ def solution(**changes):
         "keypoints_3d": keypoints,
         "keypoints_2d": np.asarray(project(keypoints, CAMERA)) + CORNER,
         "crop": np.broadcast_to([*CORNER, 256.0], (N, T, 3)),
+        "image_size_px": np.broadcast_to([WIDTH, HEIGHT], (N, T, 2)),
         "focal": CAMERA.focal_px,
         "crop_px": 256,
         "keypoint_names": BIRD.keypoint_names,
@@ -183,6 +184,38 @@ def test_nothing_in_common():
     renamed = dataclasses.replace(truth(), keypoint_names=("beak", *BIRD.keypoint_names[1:]))
     with pytest.raises(InputError, match="lack bill_tip"):
         evaluate(solution(), BIRD, renamed)
+
+
+def test_pictures_of_another_size():
+    larger = dataclasses.replace(truth(), image_size_px=np.full((T, 2), [640, 400]), masks={})
+    with pytest.raises(InputError, match=r"truth: has track 5, frame 10 in a picture of 640×400, but .* 320×280"):
+        evaluate(solution(), BIRD, larger)
+    sizes = np.zeros((N, T, 2), int)
+    sizes[1] = WIDTH, HEIGHT
+    one = truth().select(tracks=[1])
+    assert evaluate(solution(image_size_px=sizes), BIRD, one).frames == T  # of matched birds alone
+
+
+def test_poses_that_the_truth_lacks():
+    valid = np.ones((N, T), bool)
+    valid[1, 0] = False
+    result = evaluate(solution(valid=valid), BIRD, truth().select(tracks=[1]))
+    assert (result.frames, result.missing, result.unmatched) == (T - 1, 1, T)
+    assert evaluate(solution(), BIRD, truth().select(frames=[0, 2])).unmatched == 2 * N
+    assert evaluate(solution(), BIRD, truth()).unmatched == 0
+    confidence = truth().confidence * valid[..., None]
+    away = dataclasses.replace(truth(), present=valid, confidence=confidence, masks={})
+    assert evaluate(solution(), BIRD, away).unmatched == 0  # the truth may annotate a frame in part
+
+
+def test_the_truth_of_another_video_is_told(caplog):
+    evaluate(solution(), BIRD, truth(), source="t.json")
+    assert not caplog.records
+    elsewhere = solution(crop=solution().crop + np.float32([200, 0, 0]))
+    evaluate(elsewhere, BIRD, truth(), source="t.json")
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    assert "where t.json has one (median IoU 0.00)" in record.message
 
 
 def test_progress_counts_the_birds():

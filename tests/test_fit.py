@@ -200,6 +200,8 @@ def test_boxes_in_a_large_image(observed, tmp_path):
     large = in_a_large_image(observed)
     result = fit(large, BIRD, config(mode="box"))
     assert (result.crop[..., 2] != SIZE).all(), "the crop is scaled, or this tests nothing"
+    np.testing.assert_array_equal(result.image_size_px[result.valid], np.tile([400, 300], (result.valid.sum(), 1)))
+    assert not result.image_size_px[~result.valid].any()
     apart = np.linalg.norm(result.keypoints_2d - keypoints_of(truths()) - np.array([210, 90]), axis=-1)
     assert apart.max() < 0.5
     assert evaluate(result, BIRD, large).overall["iou"] > 0.9

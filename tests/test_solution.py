@@ -36,6 +36,7 @@ def make(**changes):
         "keypoints_3d": some(K, 3),
         "keypoints_2d": some(K, 2),
         "crop": some(3),
+        "image_size_px": rng.integers(1, 4000, (N, T, 2)),
         "focal": 2167.0,
         "crop_px": 256,
         "keypoint_names": BIRD.keypoint_names,

@@ -44,6 +44,7 @@ def build(poses, crop=WHOLE, **changes):
         "keypoints_3d": np.stack([pose_window(BIRD, pose)[0] for pose in poses]),
         "keypoints_2d": np.zeros((N, T, K, 2)),
         "crop": np.broadcast_to(np.asarray(crop, float), (N, T, 3)),
+        "image_size_px": np.full((N, T, 2), 256),
         "focal": 2167.0,
         "crop_px": 256,
         "keypoint_names": BIRD.keypoint_names,

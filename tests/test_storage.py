@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from jaxfit.errors import InputError
-from jaxfit.storage import conform, load_npz, new_folder, write_whole
+from jaxfit.npz import load_npz
+from jaxfit.storage import conform, new_folder, write_whole
 
 
 def names(folder):
@@ -181,6 +182,20 @@ def test_a_failed_exchange_puts_the_old_folder_back(tmp_path, monkeypatch):
         fill(out, lambda folder: (folder / "file").write_bytes(b"new"), overwrite=True)
     assert (out / "file").read_bytes() == b"old"
     assert names(tmp_path) == ["out"]
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_the_current_folder_stays(tmp_path, monkeypatch, overwrite):
+    here = tmp_path / "above" / "here"
+    here.mkdir(parents=True)
+    monkeypatch.chdir(here)
+    for path in (".", here, "..", tmp_path):
+        with pytest.raises(InputError, match=r"is the folder you are in.*name a folder inside it"):
+            fill(path, lambda folder: None, overwrite=overwrite)
+    fill("inside", lambda folder: None)
+    fill("../beside", lambda folder: None)
+    assert names(tmp_path / "above") == ["beside", "here"]
+    assert names(here) == ["inside"]
 
 
 def test_a_file_stands_in_the_way(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,7 +21,12 @@ from jaxfit.render import hard_mask
 
 __all__ = ["COLUMNS", "COLUMNS_3D", "Evaluation", "evaluate"]
 
+_logger = logging.getLogger(__name__)
+
 COLUMNS = ("pck@0.05", "pck@0.10", "iou", "me_p", "me_v")
+_REMEDY = "give the annotations of the same video"
+_HARDLY = 0.05
+"""Median IoU below which a result has nothing to do with its truth, however badly it was fitted."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +42,8 @@ class Evaluation:
     """Birds × frames measured."""
     missing: int
     """Annotated birds × frames that the result has no pose for; they enter no metric."""
+    unmatched: int = 0
+    """Poses × frames of the result whose track or frame the truth lacks; they enter no metric."""
     frames_3d: int = 0
     """Birds × frames measured in space."""
     points_3d: Literal["", "joints", "keypoints"] = ""
@@ -54,10 +62,10 @@ def evaluate(
 ) -> Evaluation:
     """Compare a result with annotations of the same video, matched by track and frame number.
 
-    PCK counts visible keypoints within 5 and 10 % of the longer side of the annotated mask (of the box where
-    there is no mask); IoU compares the mesh's hard mask with the annotated one, the whole bird's where that is
-    known; me_p and me_v are relative to the longer side of the mesh's mask. True poses add errors in space, also
-    where nothing is annotated.
+    PCK counts annotated keypoints, hidden ones included, within 5 and 10 % of the longer side of the annotated mask
+    (of the box where there is no mask); IoU compares the mesh's hard mask with the annotated one, the whole bird's
+    where that is known; me_p and me_v, of the same keypoints, are relative to the longer side of the mesh's mask.
+    True poses add errors in space, also where nothing is annotated.
 
     Args:
         solution: the result.
@@ -69,7 +77,8 @@ def evaluate(
         truth_bird: their model; None where it is the result's.
 
     Raises:
-        InputError: other keypoints than the model's, no track and frame in common, or true poses that are none.
+        InputError: other keypoints than the model's, no track and frame in common, pictures of another size, or
+            true poses that are none.
     """
     truth = check_keypoints(truth, bird.keypoint_names, source)
     n_truth, t_truth, shared = match(solution, truth.track_id, truth.frame_index)
@@ -80,13 +89,14 @@ def evaluate(
             source,
             f"shares no bird with the result: tracks {_some(truth.track_id)}, frames {_some(truth.frame_index)} "
             f"against {_some(solution.track_id)}, {_some(solution.frame_index)}",
-            "give the annotations of the same video",
+            _REMEDY,
         )
+    _check_sizes(solution, truth, measured, (n_truth, t_truth), source)
     spatial = None
     if truth_solution is not None:
         spatial = SpatialErrors(solution, bird, truth_solution, truth_bird or bird, source)
     observed = truth.keypoints_px[n_truth, t_truth]
-    visible = (truth.confidence[n_truth, t_truth] > 0) & measured[..., None]
+    annotated_points = (truth.confidence[n_truth, t_truth] > 0) & measured[..., None]
     overlap = np.full(measured.shape, np.nan)
     true_side, own_side = overlap.copy(), overlap.copy()
     posed = PosedBirds(solution, bird)
@@ -102,8 +112,19 @@ def evaluate(
                 overlap[n, t] = metrics.iou(own, mask)
             tick(1, "")
 
+    overlaps = overlap[np.isfinite(overlap)]
+    if overlaps.size and np.median(overlaps) < _HARDLY:
+        _logger.warning(
+            "hardly any bird of the result lies where %s has one (median IoU %.2f): is it the truth of another video?",
+            source,
+            np.median(overlaps),
+        )
+    unmatched = solution.valid & ~shared
+    if spatial is not None:
+        unmatched &= ~spatial.measured
+
     def row(birds) -> dict[str, float]:
-        predicted, seen, vis = solution.keypoints_2d[birds], observed[birds], visible[birds]
+        predicted, seen, vis = solution.keypoints_2d[birds], observed[birds], annotated_points[birds]
         covered = overlap[birds][np.isfinite(overlap[birds])]
         return {
             "pck@0.05": metrics.pck(predicted, seen, vis, true_side[birds], 0.05),
@@ -124,9 +145,23 @@ def evaluate(
         tracks,
         int(measured.sum()),
         int((annotated & ~measured).sum()),
+        int(unmatched.sum()),
         int(spatial.measured.sum()) if spatial else 0,
         spatial.points if spatial else "",
     )
+
+
+def _check_sizes(
+    solution: Solution, truth: Observations, measured: np.ndarray, at: tuple[np.ndarray, np.ndarray], source: object
+) -> None:
+    for n, t in np.argwhere(measured).tolist():
+        own, true = tuple(solution.image_size_px[n, t].tolist()), truth.image_size(int(at[0][n, 0]), int(at[1][t]))
+        if own != true:
+            problem = (
+                f"has track {solution.track_id[n]}, frame {solution.frame_index[t]} in a picture of "
+                f"{true[0]}×{true[1]}, but the result was fitted to one of {own[0]}×{own[1]}"
+            )
+            raise InputError(source, problem, _REMEDY)
 
 
 def _some(numbers: np.ndarray) -> str:

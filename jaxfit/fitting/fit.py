@@ -76,7 +76,7 @@ def fit(
     solution = _Collector(observations, windows, bird, camera)
     batches = range(0, len(windows), size)
     logger.info("%d birds, %d windows of %d frames, %d batches", birds, len(windows), config.window, len(batches))
-    with progress(f"Fitting {birds} birds", steps * len(batches)) as tick:
+    with progress(f"Fitting {birds} {'bird' if birds == 1 else 'birds'}", steps * len(batches)) as tick:
         for first in batches:
             rows = np.arange(first, min(first + size, len(windows)))
             # every batch has the same shape, so that one compiled program serves all: a short one is filled
@@ -134,6 +134,7 @@ class _Collector:
         }
         self.arrays = {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
         self.valid = np.zeros((birds, frames), bool)
+        self.image_size_px = np.zeros((birds, frames, 2), np.int64)
         self.loss: dict[str, np.ndarray] = {}
         self.status = np.full(birds, "no usable frame", dtype="<U32")
 
@@ -170,6 +171,7 @@ class _Collector:
             for name, value in values.items():
                 self.arrays[name][n, at] = value
             self.valid[n, at] = True
+            self.image_size_px[n, at] = [self.observations.image_size(int(n), int(t)) for t in at]
 
     def finish(self) -> Solution:
         """The solution of all windows added."""
@@ -178,6 +180,7 @@ class _Collector:
             frame_index=self.observations.frame_index,
             valid=self.valid,
             **self.arrays,
+            image_size_px=self.image_size_px,
             focal=self.camera.focal_px,
             crop_px=self.camera.size_px,
             keypoint_names=self.bird.keypoint_names,

@@ -14,7 +14,8 @@ import numpy as np
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
-from jaxfit.storage import conform, load_npz, new_folder, write_whole
+from jaxfit.npz import load_npz
+from jaxfit.storage import conform, new_folder, write_whole
 
 __all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution"]
 
@@ -36,6 +37,7 @@ LAYOUT = {
     "keypoints_3d": ("N T K 3", np.float32),
     "keypoints_2d": ("N T K 2", np.float32),
     "crop": ("N T 3", np.float32),
+    "image_size_px": ("N T 2", np.int64),
     "keypoint_names": ("K", np.str_),
     "joint_names": ("J", np.str_),
     "status": ("N", np.str_),
@@ -76,6 +78,8 @@ class Solution:
     """(N, T, K, 2) float32: image pixels."""
     crop: np.ndarray
     """(N, T, 3) float32: x0, y0, size of the square crop in image pixels."""
+    image_size_px: np.ndarray
+    """(N, T, 2) int64: width, height of the picture that the bird stands in; 0 where not valid."""
     focal: float
     """Focal length in pixels of the crop the fit works on."""
     keypoint_names: tuple[str, ...]

@@ -14,8 +14,9 @@ from jaxfit.fitting.solution import LAYOUT
 from jaxfit.fitting.window import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
+from jaxfit.npz import load_npz
 from jaxfit.observations import Observations
-from jaxfit.storage import conform, load_npz
+from jaxfit.storage import conform
 
 __all__ = ["Start", "load_start"]
 

@@ -16,7 +16,8 @@ import numpy as np
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird, free_limits, neutral_colours
 from jaxfit.model.checks import ARRAY_FIELDS, check_bird
-from jaxfit.storage import load_npz, write_whole
+from jaxfit.npz import load_npz
+from jaxfit.storage import write_whole
 
 __all__ = ["FORMAT_VERSION", "MURRE_PATH", "find_bird", "load_bird", "load_murre", "save_bird"]
 
