@@ -5,15 +5,33 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
+from typing import NoReturn
 
 import jax
 
 from jaxfit import __version__, commands
 from jaxfit.errors import InputError
 
-__all__ = ["main", "use_cache"]
+__all__ = ["main", "run", "use_cache"]
+
+STOPPED = 130
+
+
+def run() -> NoReturn:
+    """The command as installed: `main` on the terminal's arguments, which ends the process."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's kill cleans up as Ctrl-C does
+    code = main()
+    if code == STOPPED:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError):  # the reader of our output may be gone
+                stream.flush()
+        # XLA's threads still compute what was interrupted, and crash where the interpreter is taken down below them
+        os._exit(code)
+    sys.exit(code)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -27,8 +45,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"jaxfit: {error}", file=sys.stderr)  # noqa: T201
         return 2
     except KeyboardInterrupt:
-        print("jaxfit: stopped; nothing was written", file=sys.stderr)  # noqa: T201
-        return 130
+        print("jaxfit: stopped; nothing half-written is left", file=sys.stderr)  # noqa: T201
+        return STOPPED
     except BrokenPipeError:  # the reader of our output went away
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -88,6 +106,7 @@ def _fitting(add) -> None:
     overlay.add_argument("--side-views", action="store_true", help="show every bird from the side as well")
     overlay.add_argument("--frame", type=int, help="draw this frame alone, as a picture (.png or .jpg)")
     overlay.add_argument("--codec", default="auto", choices=CODECS)
+    overlay.add_argument("--overwrite", action="store_true", help="replace earlier files of these names")
     overlay.set_defaults(run=commands.overlay)
 
 

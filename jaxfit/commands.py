@@ -12,7 +12,7 @@ from jaxfit.errors import InputError
 from jaxfit.formats.coco import read_coco
 from jaxfit.model.files import find_bird, save_bird
 from jaxfit.progress import terminal
-from jaxfit.tables import evaluation_tables, plain_json, right_aligned, show, show_facts
+from jaxfit.tables import counted, evaluation_tables, plain_json, right_aligned, show, show_facts
 
 __all__ = ["bench", "demo", "evaluate", "fit", "model_import", "model_info", "model_view", "overlay", "simulate"]
 
@@ -43,8 +43,9 @@ def fit(options: argparse.Namespace) -> None:
         table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", str(solution.status[n]))
     table.title = "objective: final value per frame"
     show(table)
+    poses, birds = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird")
     counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
-    show(f"{summary['poses']} poses of {summary['tracks']} birds ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+    show(f"{poses} of {birds} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
 
 
 def evaluate(options: argparse.Namespace) -> None:
@@ -56,13 +57,15 @@ def evaluate(options: argparse.Namespace) -> None:
     truth, poses, truth_bird = read_truth(options.truth)
     result = evaluate(solution, bird, truth, terminal, options.truth, truth_solution=poses, truth_bird=truth_bird)
     if options.json:
-        counts = {"frames": result.frames, "missing": result.missing, "frames_3d": result.frames_3d}
+        counts = {name: getattr(result, name) for name in ("frames", "missing", "unmatched", "frames_3d")}
         print(plain_json({**result.overall, **counts, "tracks": result.tracks}))  # noqa: T201
         return
     for table in evaluation_tables(result):
         show(table)
     if result.missing:
-        show(f"{result.missing} annotated birds have no pose in this result and enter no figure")
+        show(f"no figure counts {counted(result.missing, 'annotated bird')} without a pose in this result")
+    if result.unmatched:
+        show(f"no figure counts {counted(result.unmatched, 'pose')} of tracks or frames that the truth lacks")
 
 
 def simulate(options: argparse.Namespace) -> None:
@@ -83,8 +86,8 @@ def simulate(options: argparse.Namespace) -> None:
     )
     boxes, found = int(scene.truth.present.sum()), int(scene.detections.present.sum())
     show(
-        f"{options.birds} birds over {options.frames} frames: {boxes} true poses, {found} detections, "
-        f"in {time.perf_counter() - began:.0f} s → {options.out}"
+        f"{counted(options.birds, 'bird')} over {counted(options.frames, 'frame')}: {counted(boxes, 'true pose')}, "
+        f"{counted(found, 'detection')}, in {time.perf_counter() - began:.0f} s → {options.out}"
     )
 
 
@@ -94,7 +97,7 @@ def overlay(options: argparse.Namespace) -> None:
 
     solution, bird = load_solution(options.result)
     seen = read_coco(options.observations) if options.observations else None
-    drawn = {"observations": seen, "side_views": options.side_views}
+    drawn = {"observations": seen, "side_views": options.side_views, "overwrite": options.overwrite}
     if options.frame is not None:
         overlay_frame(solution, bird, options.video, options.frame, options.out, **drawn)
         show(f"frame {options.frame} → {options.out}")

@@ -6,13 +6,14 @@ import time
 from pathlib import Path
 
 from jaxfit.config import config_to_yaml, load_config
+from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.solution import save_solution
 from jaxfit.fitting.summary import summarise
 from jaxfit.model.files import load_murre
 from jaxfit.progress import terminal
-from jaxfit.simulation.scene import FOOTAGE, simulate
+from jaxfit.simulation.scene import FOOTAGE, MARKER, simulate
 from jaxfit.storage import check_replaceable
 from jaxfit.tables import evaluation_tables, show
 from jaxfit.view.overlay import overlay
@@ -29,10 +30,12 @@ def run_demo(folder: Path) -> Evaluation:
         folder: for `scene/`, `result/`, `overlay.mp4` and `overlay.png`; an earlier demo there is replaced.
 
     Raises:
-        InputError: the folder cannot be written, or holds something else under these names.
+        InputError: the folder cannot be written, or holds something else than an earlier demo.
     """
     began = time.perf_counter()
     scene_folder, result_folder, video = folder / "scene", folder / "result", folder / "overlay.mp4"
+    _check_folder(folder)
+    check_replaceable(scene_folder, True, MARKER)
     check_replaceable(result_folder, True, "poses.npz")
     bird, config = load_murre(), load_config("paper")
     show(f"{BIRDS} murres on a ledge, {FRAMES} frames, simulated; what detectors would report of them is fitted")
@@ -50,6 +53,7 @@ def run_demo(folder: Path) -> Evaluation:
         video,
         observations=scene.detections,
         side_views=True,
+        overwrite=True,
         progress=terminal,
     )
     for table in evaluation_tables(result):
@@ -63,3 +67,13 @@ def run_demo(folder: Path) -> Evaluation:
     ):
         show(f"  {name}: {what}")
     return result
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise InputError(folder, "is a file, not a folder", "choose another --out")
+    if any(folder.iterdir()) and not (folder / "scene" / MARKER).is_file():
+        problem = "holds files, but no earlier demo, and is left alone"
+        raise InputError(folder, problem, "choose another --out, new or empty")

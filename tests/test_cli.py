@@ -3,8 +3,10 @@
 import errno
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -59,7 +61,7 @@ def test_the_config_as_run_gives_the_same_again(fitted, inputs, tmp_path):
     np.testing.assert_array_equal(a.keypoints_2d, b.keypoints_2d)
 
 
-def test_evaluate(fitted, inputs, capsys):
+def test_evaluate(fitted, inputs, tmp_path, capsys):
     capsys.readouterr()
     assert main(["evaluate", str(fitted), "--truth", str(inputs / "birds.json"), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
@@ -74,7 +76,13 @@ def test_evaluate(fitted, inputs, capsys):
     table = capsys.readouterr().out
     assert "pck@0.05" in table
     assert f"{result['me_p']:.4f}" in table
-    assert f"{T} annotated birds have no pose" in table
+    assert f"{T} annotated birds without a pose" in table
+    assert "the truth lacks" not in table
+    content = json.loads((inputs / "birds.json").read_text())
+    content["annotations"] = [a for a in content["annotations"] if a["track_id"] == 4]
+    (tmp_path / "one.json").write_text(json.dumps(content))
+    assert main(["evaluate", str(fitted), "--truth", str(tmp_path / "one.json")]) == 0
+    assert f"{T} poses of tracks or frames that the truth lacks" in capsys.readouterr().out
 
 
 def test_fit_goes_on_from_an_earlier_result(fitted, inputs, tmp_path):
@@ -159,6 +167,24 @@ def test_ctrl_c_leaves_nothing_behind(fitted, inputs, tmp_path, capsys, monkeypa
     refused(capsys, [*arguments(inputs, fitted), "--overwrite"], "stopped", code=130, alone=False)
     assert [p.name for p in tmp_path.iterdir() if p.name != "cache"] == []
     assert contents(fitted) == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_process_ends_in_order(number, tmp_path):
+    """A real one, stopped while it works."""
+    script = Path(sys.executable).with_name("jaxfit")
+    command = [script, "simulate", "--frames", "1000", "--out", "scene"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        patience = time.monotonic() + 120
+        while not list(tmp_path.glob(".scene.*.part")):
+            assert process.poll() is None
+            assert time.monotonic() < patience
+            time.sleep(0.1)
+        process.send_signal(number)
+        said = process.communicate()[1]
+    assert process.returncode == 130, said
+    assert said.endswith("jaxfit: stopped; nothing half-written is left\n")
+    assert not list(tmp_path.glob("*scene*"))
 
 
 def test_results_that_cannot_be_evaluated(fitted, inputs, tmp_path, capsys):

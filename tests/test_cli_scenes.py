@@ -41,6 +41,8 @@ def test_an_overlay_of_the_truth(scene, tmp_path, capsys):
     assert probe_video(out).frames == 5
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr().out.replace("\n", "")
+    refused(capsys, command, "overlay.mp4", "exists already", "--overwrite")
+    assert main([*command, "--overwrite"]) == 0
     assert str(out) in said
     assert str(out.with_suffix(".png")) in said
 
@@ -51,7 +53,8 @@ def test_a_frame_of_the_overlay(scene, tmp_path, capsys):
     assert main([*command, "3"]) == 0
     picture = cv2.imread(str(out))
     assert picture.shape[1] == 480
-    refused(capsys, [*command, "5"], "no frame 5")
+    refused(capsys, [*command, "3"], "frame.png", "--overwrite")
+    refused(capsys, [*command, "5", "--overwrite"], "no frame 5")
     command[command.index(str(out))] = str(tmp_path / "frame.tiff")
     refused(capsys, [*command, "3"], "frame.tiff", ".png")
 
@@ -91,6 +94,19 @@ def test_the_murre_has_six_sides(tmp_path, capsys):
     assert out.read_bytes().startswith(b"\x89PNG")
     refused(capsys, ["model", "view", "murre", "--posture", "dancing", "--out", str(out)], "dancing", "standing")
     assert main(["model", "info", "murre"]) == 0
+
+
+def test_the_demo_leaves_other_folders_alone(tmp_path, capsys):
+    (tmp_path / "overlay.mp4").write_text("precious")
+    refused(capsys, ["demo", "--out", str(tmp_path)], "no earlier demo")
+    refused(capsys, ["demo", "--out", str(tmp_path / "overlay.mp4")], "is a file")
+    assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == ["overlay.mp4"]
+
+
+def test_one_bird_is_singular(tmp_path, capsys):
+    size = ["--size", "480x280"]
+    assert main(["simulate", "--birds", "1", "--frames", "2", *size, "--out", str(tmp_path / "one")]) == 0
+    assert "1 bird over 2 frames: " in capsys.readouterr().out
 
 
 def test_the_demo_leaves_what_it_names(tmp_path, monkeypatch, capsys):

@@ -52,6 +52,7 @@ def solution(**changes) -> Solution:
         "keypoints_3d": keypoints,
         "keypoints_2d": crop_px * crop[:, :, None, 2:] / 256 + crop[:, :, None, :2],
         "crop": crop,
+        "image_size_px": np.where(valid[..., None], [WIDTH, HEIGHT], 0),
         "focal": CAMERA.focal_px,
         "crop_px": 256,
         "keypoint_names": BIRD.keypoint_names,
@@ -239,10 +240,9 @@ def test_vertices_of_a_window_are_those_of_its_frames():
 def test_long_results_are_posed_chunk_by_chunk(tmp_path):
     """Longer than a chunk and no multiple of it: every frame still shows its own pose."""
     frames, still = CHUNK + 5, solution()
-    names = ("valid", "global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
-    many = {
-        name: np.repeat(getattr(still, name)[:1, :1], frames, 1) for name in (*names, "keypoints_3d", "keypoints_2d")
-    }
+    names = ("valid", "global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "image_size_px")
+    names += ("keypoints_3d", "keypoints_2d")
+    many = {name: np.repeat(getattr(still, name)[:1, :1], frames, 1) for name in names}
     crop = np.repeat(still.crop[:1, :1], frames, 1).copy()
     crop[:, :, 0] += np.arange(frames)  # it walks to the right, a pixel a frame
     many["keypoints_2d"] = many["keypoints_2d"] + (crop - still.crop[:1, :1])[:, :, None, :2]
@@ -277,8 +277,10 @@ def test_a_video_that_is_not_the_results(tmp_path):
     refused("short.mp4", f"has {T} frames", f"{FIRST} to {last}", video=film(tmp_path / "short.mp4", T))
     refused("short.webm", f"has {T} frames", last, video=film(tmp_path / "short.webm", T))  # learnt only at the end
     small = film(tmp_path / "small.mp4", size=(100, 60))
-    refused("small.mp4", "100×60", "keypoints lie outside", video=small)
-    refused("f.mp4", "320×200", "640×400", observations=detections((640, 400)))
+    refused("small.mp4: is 100×60", "fitted to pictures of 320×200", "give the video", video=small)
+    large = film(tmp_path / "large.mp4", size=(640, 400))  # all keypoints lie in it
+    refused("large.mp4: is 640×400", "fitted to pictures of 320×200", video=large)
+    refused("observations", "640×400", "320×200", observations=detections((640, 400)))
     refused("none of the result's birds", observations=dataclasses.replace(detections(), track_id=np.array([5])))
     refused("nothing.mp4", "does not exist", video=tmp_path / "nothing.mp4")
     (tmp_path / "text.mp4").write_text("no video")

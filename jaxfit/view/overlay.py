@@ -19,6 +19,7 @@ from jaxfit.render import shade
 from jaxfit.storage import write_whole
 from jaxfit.video import VideoInfo, VideoWriter, probe_video, read_frames
 from jaxfit.view.birds import DrawnBird, Numbers, Style, draw_birds, draw_keypoints
+from jaxfit.view.checks import check_belongs, check_outputs, too_short
 from jaxfit.view.detected import Detected
 from jaxfit.view.legend import Legend
 from jaxfit.view.marks import skeleton_pairs, tinted
@@ -57,6 +58,7 @@ def overlay(
     side_views: bool = False,
     max_width: int | None = 1920,
     codec: str = "auto",
+    overwrite: bool = False,
     progress: ProgressTask = silent,
 ) -> Overlay:
     """Draw the birds of a result over its video, and a contact sheet beside it.
@@ -76,6 +78,7 @@ def overlay(
         side_views: add the strip of side views.
         max_width: wider video is made smaller to this many pixels; None keeps its size.
         codec: of `VideoWriter`.
+        overwrite: replace files of these names; never the footage.
         progress: told of every frame.
 
     Returns:
@@ -83,16 +86,17 @@ def overlay(
 
     Raises:
         ValueError: `max_width` below 16.
-        InputError: no such video; the result does not belong to it (its frames are not in the video, or most of
-            its birds lie outside of the picture, or `observations` are of pictures of another size); a result
-            without a single valid pose; a codec that `out` cannot hold; the system refuses the
-            write. Nothing is written then.
+        InputError: no such video; the result does not belong to it (its frames are not in the video, or it was
+            fitted to pictures of another size, or `observations` are of such or of other birds); a result without a
+            single valid pose; files of these names that `overwrite` does not give away, or that are the footage; a
+            codec that `out` cannot hold; the system refuses the write. Nothing is written then.
     """
     video, out = Path(video), Path(out)
     if max_width is not None and max_width < 16:
         raise ValueError(f"max_width must be 16 or more, or None, not {max_width}")
     info = probe_video(video)
-    _check_belongs(solution, observations, video, info)
+    check_outputs([out, out.with_suffix(".png")], video, overwrite)
+    check_belongs(solution, observations, video, info)
     drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
     numbers = solution.frame_index
     step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
@@ -112,7 +116,7 @@ def overlay(
             writer.write(drawing.frame(picture, number, here, number / (fps * step)))
             tick(1, f"frame {number}")
         if info.frames is None and number != last:
-            raise _too_short(video, solution, 0 if number is None else number + 1)
+            raise too_short(video, solution, 0 if number is None else number + 1)
     contact_sheet(solution, bird, observations, out.with_suffix(".png"), footage=tiles)
     return Overlay(
         out,
@@ -135,20 +139,22 @@ def overlay_frame(
     observations: Observations | None = None,
     side_views: bool = False,
     max_width: int | None = 1920,
+    overwrite: bool = False,
 ) -> None:
     """Draw one frame as `overlay` does, and write it as a picture.
 
     Args:
         frame_index: its number in the video.
         out: ``.png`` or ``.jpg``.
-        solution, bird, video, observations, side_views, max_width: as for `overlay`.
+        solution, bird, video, observations, side_views, max_width, overwrite: as for `overlay`.
 
     Raises:
         InputError: as `overlay` does; the result lacks the frame; `out` is neither kind of picture.
     """
     video, out = Path(video), Path(out)
     info = probe_video(video)
-    _check_belongs(solution, observations, video, info)
+    check_outputs([out], video, overwrite)
+    check_belongs(solution, observations, video, info)
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(out, f"a picture cannot end in {out.suffix!r}", "give a name that ends in .png or .jpg")
     if frame_index not in solution.frame_index:
@@ -160,7 +166,7 @@ def overlay_frame(
         _, encoded = cv2.imencode(out.suffix, drawing.frame(picture, number, t, seconds))
         write_whole(out, encoded.tobytes())
         return
-    raise _too_short(video, solution, 0)
+    raise too_short(video, solution, 0)
 
 
 class _Drawing:
@@ -234,38 +240,3 @@ class _Drawing:
             span = slice(self._start, self._start + CHUNK)
             self._cam = np.stack([self.posed.vertices_cam_window(i, span) for i in range(len(self.solution.track_id))])
         return self._cam[n, t - self._start]
-
-
-def _check_belongs(solution: Solution, observations: Observations | None, video: Path, info: VideoInfo) -> None:
-    if not solution.valid.any():
-        raise InputError("result", "holds no valid pose: there is nothing to draw", "see its status by track")
-    if info.frames is not None and int(solution.frame_index[-1]) >= info.frames:
-        raise _too_short(video, solution, info.frames)
-    width, height = info.size_px
-    remedy = "give the video that the result was fitted to"
-    if observations is not None:
-        if not (
-            np.isin(solution.track_id, observations.track_id).any()
-            and np.isin(solution.frame_index, observations.frame_index).any()
-        ):
-            problem = "hold none of the result's birds: no track or no frame has the same number"
-            raise InputError("observations", problem, "give the file that the result was fitted to")
-        seen = tuple(int(side) for side in observations.image_size_px[0])
-        if seen != info.size_px:
-            problem = f"is {width}×{height}, but the observations are of {seen[0]}×{seen[1]} pictures"
-            raise InputError(video, problem, remedy)
-    points = solution.keypoints_2d[solution.valid]
-    inside = ((points >= 0) & (points <= [width, height])).all(-1).mean()
-    if inside < 0.5:
-        low, high = np.percentile(points.reshape(-1, 2), [5, 95], axis=0).round().astype(int)
-        problem = (
-            f"is {width}×{height}, but {1 - inside:.0%} of the result's keypoints lie outside of that: "
-            f"x from {low[0]} to {high[0]}, y from {low[1]} to {high[1]}"
-        )
-        raise InputError(video, problem, remedy)
-
-
-def _too_short(video: Path, solution: Solution, frames: int) -> InputError:
-    first, last = int(solution.frame_index[0]), int(solution.frame_index[-1])
-    problem = f"has {frames} frames, but the result has frames {first} to {last}, counted from 0"
-    return InputError(video, problem, "give the video that the result was fitted to")

@@ -1,0 +1,69 @@
+"""Whether a video is the one that a result belongs to, and whether an overlay may take the names it asks for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxfit.errors import InputError
+from jaxfit.fitting.solution import Solution
+from jaxfit.observations import Observations
+from jaxfit.video import VideoInfo
+
+__all__ = ["check_belongs", "check_outputs", "too_short"]
+
+_REMEDY = "give the video that the result was fitted to"
+
+
+def check_belongs(solution: Solution, observations: Observations | None, video: Path, info: VideoInfo) -> None:
+    """Raise InputError where the result, the video or the observations are not of the same pictures."""
+    if not solution.valid.any():
+        raise InputError("result", "holds no valid pose: there is nothing to draw", "see its status by track")
+    if info.frames is not None and int(solution.frame_index[-1]) >= info.frames:
+        raise too_short(video, solution, info.frames)
+    width, height = info.size_px
+    sizes = solution.image_size_px[solution.valid]
+    other = sizes[(sizes != info.size_px).any(1)]
+    if len(other):
+        problem = f"is {width}×{height}, but the result was fitted to pictures of {other[0, 0]}×{other[0, 1]}"
+        raise InputError(video, problem, _REMEDY)
+    if observations is None:
+        return
+    remedy = "give the file that the result was fitted to"
+    if not (
+        np.isin(solution.track_id, observations.track_id).any()
+        and np.isin(solution.frame_index, observations.frame_index).any()
+    ):
+        problem = "hold none of the result's birds: no track or no frame has the same number"
+        raise InputError("observations", problem, remedy)
+    seen = tuple(int(side) for side in observations.image_size_px[0])
+    if seen != info.size_px:
+        problem = f"are of {seen[0]}×{seen[1]} pictures, but the video is {width}×{height}"
+        raise InputError("observations", problem, remedy)
+
+
+def check_outputs(outputs: list[Path], video: Path, overwrite: bool) -> None:
+    """Raise InputError where writing would destroy the footage, or something else unasked.
+
+    Args:
+        outputs: the files to write.
+        video: the footage, which exists: nothing may take its place, nor join its images.
+        overwrite: other files of these names may be replaced.
+    """
+    for out in outputs:
+        if out.exists() and out.samefile(video):
+            raise InputError(out, "is the video itself, which would be lost", "choose another --out")
+        if video.is_dir() and video.resolve() in out.resolve().parents:
+            raise InputError(out, f"lies among the video's images in {video}", "choose an --out elsewhere")
+        if out.exists() and not out.is_file():
+            raise InputError(out, "is a folder or a device, not a file", "choose another --out")
+        if out.exists() and not overwrite:
+            raise InputError(out, "exists already", "choose another --out or pass --overwrite")
+
+
+def too_short(video: Path, solution: Solution, frames: int) -> InputError:
+    """The error of a video of so many frames, which are fewer than the result's."""
+    first, last = int(solution.frame_index[0]), int(solution.frame_index[-1])
+    problem = f"has {frames} frames, but the result has frames {first} to {last}, counted from 0"
+    return InputError(video, problem, _REMEDY)
