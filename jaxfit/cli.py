@@ -23,8 +23,21 @@ STOPPED = 130
 
 def run() -> NoReturn:
     """The command as installed: `main` on the terminal's arguments, which ends the process."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # a batch system's kill cleans up as Ctrl-C does
-    code = main()
+    asked: list[int] = []
+
+    def stop(number: int, _frame: object) -> None:
+        asked.append(number)
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):  # a batch system's kill cleans up as Ctrl-C does
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell has it for its background jobs
+            signal.signal(number, stop)
+    try:
+        code = main()
+    except Exception:
+        if not asked:
+            raise
+        code = _stopped()  # compiled code made an error of its own of the interrupt
     if code == STOPPED:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError):  # the reader of our output may be gone
@@ -45,12 +58,16 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"jaxfit: {error}", file=sys.stderr)  # noqa: T201
         return 2
     except KeyboardInterrupt:
-        print("jaxfit: stopped; nothing half-written is left", file=sys.stderr)  # noqa: T201
-        return STOPPED
+        return _stopped()
     except BrokenPipeError:  # the reader of our output went away
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     return 0
+
+
+def _stopped() -> int:
+    print("jaxfit: stopped; nothing half-written is left", file=sys.stderr)  # noqa: T201
+    return STOPPED
 
 
 def use_cache() -> None:

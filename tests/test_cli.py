@@ -187,6 +187,25 @@ def test_a_stopped_process_ends_in_order(number, tmp_path):
     assert not list(tmp_path.glob("*scene*"))
 
 
+def test_an_interrupt_that_compiled_code_turns_into_an_error():
+    code = """
+import os, signal, time
+from jaxfit import cli
+
+def main():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        raise TypeError from None
+
+cli.main = main
+cli.run()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; nothing half-written is left\n")
+
+
 def test_results_that_cannot_be_evaluated(fitted, inputs, tmp_path, capsys):
     truth = str(inputs / "birds.json")
     refused(capsys, ["evaluate", str(tmp_path / "absent"), "--truth", truth], "absent")
