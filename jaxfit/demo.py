@@ -20,7 +20,7 @@ from jaxfit.view.overlay import overlay
 
 __all__ = ["run_demo"]
 
-BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 0
+BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 4
 
 
 def run_demo(folder: Path) -> Evaluation:
