@@ -22,6 +22,13 @@ def reference_dir() -> Path:
     return folder.resolve()
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _programs_of_one_module():
+    """Compiled programs go when their module is done: a process may hold only so many pieces of memory."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
     """The command keeps compiled programs in the user's cache: here in one of the test's own."""

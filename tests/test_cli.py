@@ -169,11 +169,16 @@ def test_ctrl_c_leaves_nothing_behind(fitted, inputs, tmp_path, capsys, monkeypa
     assert contents(fitted) == before
 
 
+# shells start background jobs, and so perhaps these tests, with signals ignored
+HEED = "import os, signal, sys; signal.signal(int(sys.argv[1]), signal.SIG_DFL); os.execv(sys.argv[2], sys.argv[2:])"
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_stopped_process_ends_in_order(number, tmp_path):
     """A real one, stopped while it works."""
     script = Path(sys.executable).with_name("jaxfit")
-    command = [script, "simulate", "--frames", "1000", "--out", "scene"]
+    command = [sys.executable, "-c", HEED, str(int(number)), script, "simulate", "--frames", "1000", "--out", "scene"]
+
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
         patience = time.monotonic() + 120
         while not list(tmp_path.glob(".scene.*.part")):
@@ -181,7 +186,7 @@ def test_a_stopped_process_ends_in_order(number, tmp_path):
             assert time.monotonic() < patience
             time.sleep(0.1)
         process.send_signal(number)
-        said = process.communicate()[1]
+        said = process.communicate(timeout=60)[1]
     assert process.returncode == 130, said
     assert said.endswith("jaxfit: stopped; nothing half-written is left\n")
     assert not list(tmp_path.glob("*scene*"))
@@ -202,6 +207,7 @@ def main():
 cli.main = main
 cli.run()
 """
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{code}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; nothing half-written is left\n")
 
