@@ -1,0 +1,5 @@
+"""Keypoints of birds that were found already: crops of single birds, and the networks that look at them."""
+
+from jaxfit.perception.keypoints.crops import Crop, crop_bird
+
+__all__ = ["Crop", "crop_bird"]
