@@ -230,8 +230,11 @@ def test_vertices_of_a_window_are_those_of_its_frames():
     posed = PosedBirds(solution(), BIRD)
     for n in range(N):
         whole = posed.vertices_screen_window(n)
-        by_frame = np.stack([posed.vertices_screen(n, t) for t in range(T)])
-        np.testing.assert_allclose(whole, by_frame, rtol=1e-5, atol=2e-3)
+        vertices = pose_window(BIRD, smooth_motion(BIRD, T, n))[1]
+        x0, y0, size = CROPS[n]
+        by_hand = [*np.moveaxis(np.asarray(project(vertices, CAMERA)) * size / 256 + [x0, y0], -1, 0), vertices[..., 2]]
+        np.testing.assert_allclose(whole, np.stack(by_hand, axis=-1), rtol=1e-5, atol=2e-3)
+        np.testing.assert_allclose(posed.vertices_screen(n, 1), whole[1], rtol=1e-6, atol=1e-4)
         np.testing.assert_array_equal(posed.vertices_screen_window(n, slice(2, 4)).shape, (2, *whole.shape[1:]))
         filled = filled_mask(whole[0, :, :2], BIRD.faces, WIDTH)[:HEIGHT]
         assert (filled != masks(0)[n]).sum() <= 3  # pixels whose centre lies on an edge

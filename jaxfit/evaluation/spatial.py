@@ -166,8 +166,7 @@ def _apparent_size(solution: Solution, bird: Bird) -> np.ndarray:
 
 def _joints(solution: Solution, bird: Bird) -> np.ndarray:
     """Joints in the camera frame of the crop, (N, T, J, 3)."""
-    poses = Pose(**{name: np.asarray(getattr(solution, name)) for name in Pose.__dataclass_fields__})
-    return np.asarray(_pose_joints(fold_bird(bird), poses), np.float64)
+    return np.asarray(_pose_joints(fold_bird(bird), solution.pose), np.float64)
 
 
 @jax.jit

@@ -6,7 +6,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfit.camera import Camera, to_screen
 from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig, fold_bird, joint_transforms, posed_vertices
@@ -29,8 +28,7 @@ class PosedBirds:
 
     def vertices_screen(self, n: int, t: int) -> Float[np.ndarray, "V 3"]:
         """Vertices as x, y in image pixels and depth in model units."""
-        screen, x0_y0 = _screen(self._rig, self._pose(n, t), self._camera(n, t)), self.solution.crop[n, t, :2]
-        return np.asarray(screen) + np.append(x0_y0, np.float32(0))
+        return self.vertices_screen_window(n, slice(t, t + 1))[0]
 
     def vertices_cam_window(self, n: int, frames: slice = slice(None)) -> Float[np.ndarray, "T V 3"]:
         """Vertices in the camera frame of the crop, model units, of many frames in one compiled call.
@@ -42,7 +40,8 @@ class PosedBirds:
         Returns:
             One mesh a frame; what stands where the solution is not valid means nothing, and may be NaN.
         """
-        return np.asarray(_window_cam(self._rig, self._pose(n, frames)))
+        pose = jax.tree.map(lambda values: values[n, frames], self.solution.pose)
+        return np.asarray(_window_cam(self._rig, pose))
 
     def vertices_screen_window(self, n: int, frames: slice = slice(None)) -> Float[np.ndarray, "T V 3"]:
         """`vertices_screen` of many frames in one compiled call; arguments as `vertices_cam_window`."""
@@ -60,18 +59,6 @@ class PosedBirds:
         scale = s.focal * size / s.crop_px / np.maximum(vertices_cam[..., 2:], 1e-3)
         xy = vertices_cam[..., :2] * scale + size / 2 + crop[..., :2]
         return np.concatenate([xy, vertices_cam[..., 2:]], axis=-1).astype(np.float32)
-
-    def _pose(self, n: int, t: int | slice) -> Pose:
-        return Pose(**{name: np.asarray(getattr(self.solution, name)[n, t]) for name in Pose.__dataclass_fields__})
-
-    def _camera(self, n: int, t: int) -> Camera:
-        size = self.solution.crop[n, t, 2]
-        return Camera(self.solution.focal * size / self.solution.crop_px, size / 2)
-
-
-@jax.jit
-def _screen(rig: Rig, pose: Pose, camera: Camera) -> Float[Array, "V 3"]:
-    return to_screen(posed_vertices(rig, joint_transforms(rig, pose), pose), camera)
 
 
 @jax.jit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
+from jaxfit.model.pose import Pose
 from jaxfit.npz import load_npz
 from jaxfit.storage import conform, new_folder, write_whole
 
@@ -112,6 +113,11 @@ class Solution:
             object.__setattr__(self, name, tuple(str(text) for text in arrays.pop(name)))
         for name, value in (arrays | {"loss": loss, "focal": focal, "crop_px": crop_px}).items():
             object.__setattr__(self, name, value)
+
+    @property
+    def pose(self) -> Pose:
+        """The poses as the model takes them: every field (N, T, …)."""
+        return Pose(**{field.name: getattr(self, field.name) for field in fields(Pose)})
 
 
 def save_solution(

@@ -132,7 +132,7 @@ def _evidence(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np
         place = np.array([[zoom, 0, -window[0] * zoom], [0, zoom, -window[1] * zoom]])
         seen = cv2.warpAffine(mask.astype(np.uint8), place, (TILE_PX, TILE_PX), flags=cv2.INTER_NEAREST)
         tile[seen > 0] = SEEN
-    screen = posed.vertices_screen_window(n, slice(t, t + 1))[0]
+    screen = posed.vertices_screen(n, t)
     screen = np.column_stack([_to_tile(screen[:, :2], window), screen[:, 2]])
     covered = hard_mask(screen, posed.faces, TILE_PX, TILE_PX).astype(np.uint8)
     contours, _ = cv2.findContours(covered, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
