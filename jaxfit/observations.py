@@ -20,6 +20,7 @@ _LAYOUT = {
     "keypoints_px": ("N T K 2", np.float32),
     "confidence": ("N T K", np.float32),
     "occluded": ("N T K", np.bool_),
+    "score": ("N T", np.float32),
     "box_px": ("N T 4", np.float32),
     "image_size_px": ("T 2", np.int64),
     "file_name": ("T", np.str_),
@@ -36,8 +37,8 @@ class Observations:
 
     Raises:
         ValueError: shapes that contradict each other, a ``track_id`` twice, a ``frame_index`` that does not
-            increase, a confidence outside [0, 1] or where nothing is present, a position that is not finite,
-            a mask that is not of its image's size.
+            increase, a confidence or score outside [0, 1] or where nothing is present, a position that is not
+            finite, a mask that is not of its image's size.
     """
 
     track_id: np.ndarray
@@ -69,10 +70,14 @@ class Observations:
     """(N, T, K) bool: the keypoint's place is known although something hides it. None stands for nowhere."""
     amodal_masks: Mapping[tuple[int, int], Mapping[str, Any]] = field(default_factory=dict)
     """(n, t) → run lengths of the whole bird, hidden parts included, where that is known: in simulated truth."""
+    score: np.ndarray | None = None
+    """(N, T) float32 in [0, 1]: a detector's trust in the bird as a whole; 0 where not present. None stands for 1
+    where present."""
 
     def __post_init__(self):
         occluded = np.zeros(np.shape(self.confidence), bool) if self.occluded is None else self.occluded
-        values = {**vars(self), "keypoint_names": list(self.keypoint_names), "occluded": occluded}
+        score = np.asarray(self.present, np.float32) if self.score is None else self.score
+        values = {**vars(self), "keypoint_names": list(self.keypoint_names), "occluded": occluded, "score": score}
         arrays = conform(values, _LAYOUT)
         names = tuple(str(name) for name in arrays.pop("keypoint_names"))
         if len(np.unique(arrays["track_id"])) < len(arrays["track_id"]):
@@ -80,10 +85,11 @@ class Observations:
         if (np.diff(arrays["frame_index"]) <= 0).any():
             raise ValueError("frame_index must increase")
         confidence, present = arrays["confidence"], arrays["present"]
-        if not ((confidence >= 0) & (confidence <= 1)).all():
-            raise ValueError("confidence must lie in [0, 1]")
-        if confidence[~present].any():
-            raise ValueError("confidence must be 0 where present is False")
+        for name in ("confidence", "score"):
+            if not ((arrays[name] >= 0) & (arrays[name] <= 1)).all():
+                raise ValueError(f"{name} must lie in [0, 1]")
+            if arrays[name][~present].any():
+                raise ValueError(f"{name} must be 0 where present is False")
         arrays["occluded"] = arrays["occluded"] & (confidence > 0)
         arrays["occluded"].flags.writeable = False
         for name, needed in (("keypoints_px", confidence > 0), ("box_px", present)):

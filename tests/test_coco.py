@@ -51,6 +51,18 @@ def test_confidence_is_the_score_where_the_keypoint_is_there(tmp_path):
     assert seen.usable(1).tolist() == [[True, False, False], [True, True, True]]
 
 
+def test_a_bird_has_a_score(tmp_path):
+    """0.1 is no float32: what is written is what a person gave. Without a score it is 1, and none is written."""
+    scored = content()
+    scored["annotations"][1]["score"] = 0.1
+    seen = read_coco(saved(tmp_path, scored))
+    np.testing.assert_array_equal(seen.score, np.float32([[1, 1, 0], [0.1, 1, 1]]))
+    write_coco(seen, tmp_path / "again.json")
+    written = json.loads((tmp_path / "again.json").read_text())["annotations"]
+    assert [annotation.get("score") for annotation in written] == [None, None, 0.1, None, None]
+    assert_same(read_coco(tmp_path / "again.json"), seen)
+
+
 def test_what_is_hidden_keeps_its_place(tmp_path):
     """Visibility 1 is a keypoint that something hides; the whole mask stands beside the visible one."""
     hiding = content()
@@ -162,6 +174,7 @@ def test_round_trip_of_anything(tmp_path_factory, seed):
         file_name=[f"ü {t}.png" for t in range(T)],
         keypoint_names=[f"k{k}" for k in range(K)],
         masks=masks,
+        score=rng.random((N, T), np.float32) * present,
     )
     path = tmp_path_factory.mktemp("coco") / "file.json"
     write_coco(seen, path)

@@ -53,6 +53,12 @@ def test_what_is_missing_is_zero():
     np.testing.assert_array_equal(seen.box_px[1, 0], 0)
 
 
+def test_a_score_goes_with_its_bird():
+    np.testing.assert_array_equal(make().score, make().present)  # full trust where nobody says otherwise
+    scored = make(score=[[0.1, 0.2, 0.3], [0, 0.5, 0.6]])
+    np.testing.assert_array_equal(scored.select([1], [1, 2]).score, np.float32([[0.5, 0.6]]))
+
+
 def test_nothing_can_be_changed():
     seen = make()
     with pytest.raises(ValueError, match="read-only"):
@@ -75,6 +81,9 @@ def test_nothing_can_be_changed():
         ({"confidence": np.full((2, 3, 3), 1.5)}, r"in \[0, 1\]"),
         ({"confidence": np.full((2, 3, 3), np.nan)}, r"in \[0, 1\]"),
         ({"confidence": np.ones((2, 3, 3))}, "0 where present is False"),
+        ({"score": np.full((2, 3), 1.5)}, r"score must lie in \[0, 1\]"),
+        ({"score": np.ones((2, 3))}, "score must be 0 where present is False"),
+        ({"score": np.ones(2)}, r"score must have shape \(N, T\)"),
         ({"keypoints_px": np.full((2, 3, 3, 2), np.nan)}, "keypoints_px must be finite"),
         ({"box_px": np.full((2, 3, 4), np.inf)}, "box_px must be finite"),
         ({"masks": {(0, 0): encode_mask(MASK.T)}}, r"masks\[0, 0\]"),

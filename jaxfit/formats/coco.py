@@ -7,12 +7,12 @@ The file is an object with
   from 0 where a 0 occurs);
 - ``annotations``: ``image_id``, ``category_id``, ``track_id``, ``bbox`` [x, y, width, height] and
   ``keypoints`` [x, y, v, …] in image pixels, optionally ``segmentation`` (run lengths or polygons),
-  ``keypoint_scores`` (K numbers in [0, 1]), ``iscrowd``, ``id``.
+  ``keypoint_scores`` (K numbers in [0, 1]), ``score`` (of the bird as a whole, in [0, 1]), ``iscrowd``, ``id``.
 
 What a reader has to decide:
 
 - Confidence is the score where ``v > 0`` and 0 where ``v = 0``: COCO puts a keypoint that is not there at
-  (0, 0), whatever its score. Without scores it is 1 where ``v > 0``.
+  (0, 0), whatever its score. Without scores it is 1 where ``v > 0``. An annotation without ``score`` has 1.
 - The first category that has keypoints is the bird. Categories with the same keypoints in the same order,
   such as several species, are read with it; annotations of all others are left out, and one warning says how
   many.
@@ -103,7 +103,7 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
     column = {frame: t for t, frame in enumerate(frames)}
 
     keypoints = np.zeros((N, T, K, 4), np.float32)
-    box = np.zeros((N, T, 4), np.float32)
+    box, score = np.zeros((N, T, 4), np.float32), np.zeros((N, T), np.float32)
     holder: dict[tuple[int, int], Annotation] = {}
     for annotation in found:
         cell = row[annotation.track_id], column[annotation.image.frame_index]
@@ -115,7 +115,7 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
             )
         holder[cell] = annotation
         keypoints[cell] = annotation.keypoints
-        box[cell] = annotation.box
+        box[cell], score[cell] = annotation.box, annotation.score
     present = np.zeros((N, T), bool)
     present[tuple(np.array(list(holder)).T)] = True
     return Observations(
@@ -132,6 +132,7 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
         masks={cell: a.rle for cell, a in holder.items() if a.rle is not None},
         amodal_masks={cell: a.amodal_rle for cell, a in holder.items() if a.amodal_rle is not None},
         occluded=keypoints[..., 3] > 0,
+        score=score,
         own_images={
             cell: (a.image.file_name, a.image.width, a.image.height)
             for cell, a in holder.items()
@@ -163,6 +164,7 @@ def write_coco(observations: Observations, path: str | Path) -> None:
     for t, (width, height) in enumerate(observations.image_size_px.tolist()):
         image_id(t, str(observations.file_name[t]), width, height)  # the frame's own image before the others
     annotations = []
+    scores = cast(np.ndarray, observations.score)
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
         confidence = observations.confidence[n, t]
         hidden = cast(np.ndarray, observations.occluded)[n, t]
@@ -179,6 +181,8 @@ def write_coco(observations: Observations, path: str | Path) -> None:
             "keypoint_scores": _shortest(confidence).tolist(),
             "num_keypoints": int((confidence > 0).sum()),
         }
+        if scores[n, t] != 1:
+            annotation["score"] = float(_shortest(scores[n, t]))
         for key, masks in (("segmentation", observations.masks), ("amodal_segmentation", observations.amodal_masks)):
             if (n, t) in masks:
                 size, counts = masks[n, t]["size"], masks[n, t]["counts"]

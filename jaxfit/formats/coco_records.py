@@ -44,6 +44,8 @@ class Annotation:
     """The mask's run lengths."""
     amodal_rle: dict[str, Any] | None
     """Run lengths of the whole bird, hidden parts included."""
+    score: float
+    """Trust in the bird as a whole."""
 
 
 def read_images(images: Field) -> dict[int | str, Image]:
@@ -141,6 +143,7 @@ def read_annotation(annotation: Field, images: Mapping[int | str, Image], names:
         box=list(box),
         rle=None if crowd else rle,
         amodal_rle=None if crowd else amodal_rle,
+        score=annotation["score"].number(0, 1, "scale the scores to 0 to 1") if annotation.has("score") else 1.0,
     )
 
 

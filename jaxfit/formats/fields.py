@@ -79,6 +79,13 @@ class Field:
             self.fail(f"is {_shown(value)}, outside {lowest} to {highest}")
         return int(value)
 
+    def number(self, lowest: float, highest: float, remedy: str) -> float:
+        """A number within bounds."""
+        value = self._expect((int, float), "a number")
+        if not lowest <= value <= highest:  # nor NaN
+            self.fail(f"is {_shown(value)}, outside {lowest:g} to {highest:g}", remedy)
+        return float(value)
+
     def identifier(self) -> int | str:
         """A whole number or a string that names something."""
         return self.value if isinstance(self.value, str) else self.integer()
