@@ -1,23 +1,30 @@
-"""What a fit can be told: frozen dataclasses, read from YAML files that hold overrides only."""
+"""What a fit, and a reconstruction as a whole, can be told; YAML files hold overrides only."""
 
 from __future__ import annotations
 
-import dataclasses
-import types
-import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
-from jaxfit.config_checks import ConfigKeyError, check_config
+from jaxfit.config_checks import check_config
+from jaxfit.config_file import OWN_FILE, config_to_yaml, read_config, require, shipped_files
 from jaxfit.errors import InputError
 from jaxfit.objective.objective import term_settings
+from jaxfit.perception.config import TrackConfig
 
-__all__ = ["CropConfig", "FitConfig", "InitialiseConfig", "StageConfig", "config_to_yaml", "load_config"]
+__all__ = [
+    "CropConfig",
+    "FitConfig",
+    "InitialiseConfig",
+    "OverlayConfig",
+    "ReconstructConfig",
+    "StageConfig",
+    "config_to_yaml",
+    "load_config",
+    "load_reconstruct_config",
+    "shipped_configs",
+]
 
 
 @dataclass(frozen=True)
@@ -120,145 +127,64 @@ class FitConfig:
         return settings
 
 
+@dataclass(frozen=True)
+class OverlayConfig:
+    """How a reconstruction is drawn over its video."""
+
+    write: bool = True
+    """Whether to write the overlay and its contact sheet at all."""
+    side_views: bool = True
+    """A strip below the picture that shows every bird from its left."""
+    detections: bool = True
+    """Rings around the detected keypoints beside the fitted ones."""
+    max_width_px: int | None = 1920
+    """Wider footage is drawn smaller; null keeps its size."""
+    codec: Literal["auto", "h264", "vp9", "mpeg4"] = "auto"
+    """Of the overlay; `auto` takes H.264 where this installation has it."""
+
+    def __post_init__(self):
+        narrow = self.max_width_px is not None and self.max_width_px < 16
+        require(not narrow, "max_width_px", f"is {self.max_width_px}", "16 or more, or null")
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """Everything about a reconstruction from video; `configs/reconstruct.yaml` spells it out."""
+
+    fit: FitConfig = field(metadata=OWN_FILE)
+    """How birds are posed: the name of a config of a fit, or its keys over a `base`."""
+    track: TrackConfig = field(default_factory=TrackConfig)
+    """How birds are found and followed."""
+    overlay: OverlayConfig = OverlayConfig()
+
+
 def load_config(source: str | Path) -> FitConfig:
-    """Read a config by the name of a shipped one (`paper`) or the path of a YAML file.
+    """Read a fit's config by the name of a shipped one (`paper`) or the path of a YAML file.
 
     A file may name another as its `base`; what it then says is laid over it, key by key.
 
     Raises:
-        InputError: an unreadable file, an unknown key, a value of the wrong kind, an unknown term; it names the
-            file that holds the key, which may be a base.
+        InputError: as `read_config`.
     """
-    values, origins = _read(str(source), seen=())
-    try:
-        return _build(FitConfig, values, "")
-    except ConfigKeyError as error:
-        raise InputError(_origin(origins, error.key, str(source)), error.problem, error.remedy) from None
+    return read_config(FitConfig, source, "paper")
+
+
+def load_reconstruct_config(source: str | Path = "reconstruct") -> ReconstructConfig:
+    """Read the config of a reconstruction, or of tracking alone: a shipped one's name or a YAML file's path.
+
+    Raises:
+        InputError: as `read_config`; the name of a fit's config.
+    """
+    if source in shipped_configs():
+        remedy = f"write a file of `base: reconstruct` and `fit: {source}`, and give that"
+        raise InputError(source, "says how to fit, but not how to track", remedy)
+    return read_config(ReconstructConfig, source, "reconstruct")
 
 
 def shipped_configs() -> list[str]:
-    """Names of the configs that come with jaxfit."""
-    folder = resources.files("jaxfit") / "configs"
-    return sorted(f.name.removesuffix(".yaml") for f in folder.iterdir() if f.name.endswith(".yaml"))
-
-
-def config_to_yaml(config: FitConfig) -> str:
-    """The whole config, defaults included, as a YAML text that `load_config` reads back."""
-    return yaml.safe_dump(_plain(config), sort_keys=False, allow_unicode=True)
-
-
-def _read(source: str, seen: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str]]:
-    """A file laid over its bases, and for each key's path the file that it comes from."""
-    if source in seen:
-        raise InputError(source, "`base` goes in a circle", " → ".join((*seen, source)))
-    shipped = shipped_configs()
-    try:
-        if source in shipped:
-            text = (resources.files("jaxfit") / "configs" / f"{source}.yaml").read_text(encoding="utf-8")
-        else:
-            text = Path(source).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            source, f"cannot read this config: {error}", f"give a YAML file or one of {', '.join(shipped)}"
-        ) from None
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise InputError(source, f"is not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict):
-        raise InputError(source, "holds no mapping of keys to values", "write `key: value` lines")
-    base = content.pop("base", None)
-    values, origins = {}, {}
-    if base is not None:
-        beside = Path(source).parent / f"{base}"
-        values, origins = _read(str(beside) if beside.is_file() else str(base), (*seen, source))
-    for path, is_mapping in _paths(content):
-        if not is_mapping:  # it replaces whatever stood there
-            origins = {key: origin for key, origin in origins.items() if not key.startswith(f"{path}.")}
-        origins[path] = source
-    return _merge(values, content), origins
-
-
-def _paths(content: dict[str, Any], where: str = "") -> Iterator[tuple[str, bool]]:
-    """Path of every key, and whether a mapping stands there; lists are taken whole."""
-    for key, value in content.items():
-        yield f"{where}{key}", isinstance(value, dict)
-        if isinstance(value, dict):
-            yield from _paths(value, f"{where}{key}.")
-
-
-def _origin(origins: Mapping[str, str], key: str, top: str) -> str:
-    """The file that says `key`; of a key that no file says, the one that says what it should stand in."""
-    while key and key not in origins:
-        key = key[: max(key.rfind("."), key.rfind("["), 0)]
-    return origins.get(key, top)
-
-
-def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    merged = dict(below)
-    for key, value in above.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merge(merged[key], value) if both else value
-    return merged
-
-
-def _build(kind: type, values: Any, where: str) -> Any:
-    """A dataclass from plain values; every key and value is checked against its fields."""
-    if not isinstance(values, dict):
-        raise ConfigKeyError(
-            where.rstrip("."), f"{where or 'the config'} must be a mapping, not {type(values).__name__}"
-        )
-    hints = typing.get_type_hints(kind)
-    names = [f.name for f in dataclasses.fields(kind)]
-    for key in values:
-        if key not in names:
-            raise ConfigKeyError(f"{where}{key}", f"unknown key `{where}{key}`", f"known here: {', '.join(names)}")
-    for f in dataclasses.fields(kind):
-        required = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-        if required and f.name not in values:
-            raise ConfigKeyError(
-                f"{where}{f.name}", f"`{where}{f.name}` is missing", "add it, or start from `base: paper`"
-            )
-    built = {key: _value(hints[key], value, f"{where}{key}") for key, value in values.items()}
-    return kind(**built)
-
-
-def _value(hint: Any, value: Any, where: str) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
-        return _build(typing.cast(type, hint), value, f"{where}.")
-    if origin is Literal:
-        if value not in arguments:
-            raise ConfigKeyError(where, f"`{where}` is {value!r}", f"one of {', '.join(arguments)}")
-        return value
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise ConfigKeyError(where, f"`{where}` must be a list, not {value!r}")
-        return tuple(_value(arguments[0], v, f"{where}[{i}]") for i, v in enumerate(value))
-    if origin is types.UnionType:
-        return tuple(value) if isinstance(value, list) else value
-    if origin is Mapping:
-        if not isinstance(value, dict):
-            raise ConfigKeyError(where, f"`{where}` must be a mapping, not {value!r}")
-        return {k: _value(arguments[1], v, f"{where}.{k}") for k, v in value.items()}
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if hint is Any:
-        return value
-    if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigKeyError(where, f"`{where}` is {value!r}", f"a value of type {hint.__name__} is expected")
-    return value
+    """Names of the configs of fits that come with jaxfit."""
+    return [name for name in shipped_files() if name != "reconstruct"]
 
 
 def _as_settings(value: Any) -> dict[str, float]:
     return {k: float(v) for k, v in (value if isinstance(value, dict) else {"weight": value}).items()}
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
-    return value

@@ -6,24 +6,16 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from jaxfit.errors import InputError
+from jaxfit.config_file import require
 from jaxfit.objective.objective import TERMS, term_settings
 
 if TYPE_CHECKING:
     from jaxfit.config import FitConfig
 
-__all__ = ["PARAMETERS", "ConfigKeyError", "check_config"]
+__all__ = ["PARAMETERS", "check_config"]
 
 PARAMETERS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
 """What a stage may leave free."""
-
-
-class ConfigKeyError(InputError):
-    """An InputError about one key, by its path such as ``stages[0].steps``; reading a file adds the file's name."""
-
-    def __init__(self, key: str, problem: str, remedy: str = ""):
-        self.key = key
-        super().__init__("config", problem, remedy)
 
 
 def check_config(config: FitConfig) -> None:
@@ -32,11 +24,6 @@ def check_config(config: FitConfig) -> None:
     Raises:
         ConfigKeyError: a value that makes no fit.
     """
-
-    def require(holds: bool, key: str, problem: str, remedy: str = "") -> None:
-        if not holds:
-            raise ConfigKeyError(key, f"`{key}` {problem}", remedy)
-
     require(config.window >= 1, "window", f"is {config.window}", "1 or more frames")
     odd = config.filter_window >= 1 and config.filter_window % 2 == 1
     require(odd, "filter_window", f"is {config.filter_window}", "an odd number of frames; 1 is off")
@@ -51,7 +38,7 @@ def check_config(config: FitConfig) -> None:
     smoothness = config.initialise.smoothness
     require(0 <= smoothness < math.inf, "initialise.smoothness", f"is {smoothness}", "0 or more")
     require(len(config.stages) > 0, "stages", "is empty", "a fit needs a stage")
-    _check_terms(require, "terms", config.terms)
+    _check_terms("terms", config.terms)
     for i, stage in enumerate(config.stages):
         where = f"stages[{i}]"
         require(stage.steps >= 1, f"{where}.steps", f"is {stage.steps}", "1 or more")
@@ -70,10 +57,10 @@ def check_config(config: FitConfig) -> None:
             fits = all(_is_number(n) for n in numbers) and len(numbers) in (1, 3)
             fits = fits and (len(numbers) == 1 or name == "transl")
             require(fits, f"{where}.step_scale.{name}", f"is {factor!r}", "a number, 0 or more; three for transl")
-        _check_terms(require, f"{where}.override", stage.override)
+        _check_terms(f"{where}.override", stage.override)
 
 
-def _check_terms(require: Any, where: str, terms: Mapping[str, Any]) -> None:
+def _check_terms(where: str, terms: Mapping[str, Any]) -> None:
     for name, value in terms.items():
         require(name in TERMS, f"{where}.{name}", "is not a term", f"known: {', '.join(TERMS)}")
         known = ("weight", *term_settings(name))
