@@ -11,9 +11,10 @@ from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.solution import save_solution
 from jaxfit.fitting.summary import summarise
+from jaxfit.formats.scene_folder import FOOTAGE, MARKER
 from jaxfit.model.files import load_murre
 from jaxfit.progress import terminal
-from jaxfit.simulation.scene import FOOTAGE, MARKER, simulate
+from jaxfit.simulation.scene import simulate
 from jaxfit.storage import check_replaceable
 from jaxfit.tables import evaluation_tables, show
 from jaxfit.view.overlay import overlay

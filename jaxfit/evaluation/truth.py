@@ -7,12 +7,11 @@ from pathlib import Path
 from jaxfit.errors import InputError
 from jaxfit.fitting.solution import Solution, load_solution
 from jaxfit.formats.coco import read_coco
+from jaxfit.formats.scene_folder import TRUE_POSES, TRUTH
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
 
 __all__ = ["read_truth"]
-
-_ANNOTATIONS, _POSES = "truth.json", "truth"
 
 
 def read_truth(path: str | Path) -> tuple[Observations, Solution | None, Bird | None]:
@@ -31,10 +30,10 @@ def read_truth(path: str | Path) -> tuple[Observations, Solution | None, Bird | 
     path = Path(path)
     if not path.is_dir():
         return read_coco(path), None, None
-    if not (path / _ANNOTATIONS).is_file():
+    if not (path / TRUTH).is_file():
         remedy = "give a COCO file of annotations, or the folder of a simulated scene"
-        raise InputError(path, f"is a folder without {_ANNOTATIONS}", remedy)
-    if not (path / _POSES).is_dir():
-        remedy = f"give {path / _ANNOTATIONS} to compare in the image alone"
-        raise InputError(path, f"holds no true poses (a folder {_POSES}/)", remedy)
-    return read_coco(path / _ANNOTATIONS), *load_solution(path / _POSES)
+        raise InputError(path, f"is a folder without {TRUTH}", remedy)
+    if not (path / TRUE_POSES).is_dir():
+        remedy = f"give {path / TRUTH} to compare in the image alone"
+        raise InputError(path, f"holds no true poses (a folder {TRUE_POSES}/)", remedy)
+    return read_coco(path / TRUTH), *load_solution(path / TRUE_POSES)

@@ -13,6 +13,7 @@ from jaxfit.camera import Camera
 from jaxfit.errors import InputError
 from jaxfit.fitting.solution import Solution, save_solution
 from jaxfit.formats.coco import write_coco
+from jaxfit.formats.scene_folder import DETECTIONS, FOOTAGE, MARKER, TRUE_POSES, TRUTH
 from jaxfit.model.anatomy import MURRE_SKELETON
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
@@ -28,9 +29,8 @@ from jaxfit.simulation.visibility import see
 from jaxfit.storage import new_folder, write_whole
 from jaxfit.video import VideoWriter
 
-__all__ = ["DETECTIONS", "FOOTAGE", "MARKER", "Scene", "simulate", "stage_scene"]
+__all__ = ["Scene", "simulate", "stage_scene"]
 
-FOOTAGE, DETECTIONS, TRUTH, TRUE_POSES, MARKER = "footage.mp4", "detections.json", "truth.json", "truth", "scene.json"
 VERSION = metadata.version("jaxfit")
 LEDGE_DEPTH = 62.0
 """From the edge to the wall, model units (1.24 m)."""
