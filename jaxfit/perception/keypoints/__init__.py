@@ -1,5 +1,6 @@
 """Keypoints of birds that were found already: crops of single birds, and the networks that look at them."""
 
 from jaxfit.perception.keypoints.crops import Crop, crop_bird
+from jaxfit.perception.keypoints.detector import load_keypoint_detector
 
-__all__ = ["Crop", "crop_bird"]
+__all__ = ["Crop", "crop_bird", "load_keypoint_detector"]

@@ -1,0 +1,135 @@
+"""What the exporter of a keypoint network wrote into its file, as key and value of ONNX' `metadata_props`.
+
+| key | value | without it |
+|---|---|---|
+| `keypoint_names` | names, by comma, in the order of the output | they must be given |
+| `mean`, `std` | one number or three, by comma, in 0–255, in the network's colour order | see `pictures` |
+| `colour` | `rgb` or `bgr`, the order that the network takes | `rgb` |
+| `input_size` | `width,height`, where the network leaves its own open | `256,256` |
+| `activation` | `none`, `sigmoid` or `softmax`: what turns its output into confidences | `none` |
+| `alignment` | where cells of a heatmap lie, see `ALIGNMENTS` | `centres`; with offsets `deeplabcut` |
+| `locref_std` | pixels that an offset of 1 stands for | 7.2801, DeepLabCut's |
+| `pad_px`, `dilate_px` | the crops that it was trained on, see `crops` | 40, 70 |
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+from jaxfit.errors import InputError
+from jaxfit.perception.onnx_model import OnnxModel
+
+__all__ = ["ACTIVATIONS", "ALIGNMENTS", "Notes", "read_notes"]
+
+ACTIVATIONS = ("none", "sigmoid", "softmax")
+
+ALIGNMENTS = ("centres", "deeplabcut", "msra", "udp")
+"""Where the centre of cell i lies, in pixels of W a side (centres at i + 0.5), if w cells cover it:
+
+- `centres`: (i + 0.5) · W/w, the cells divide the picture among themselves;
+- `deeplabcut`: (i + 0.5) · stride + 0.5, since its coordinates count pixel centres at whole numbers;
+- `msra`: i · W/w + 0.5, as MMPose's heatmaps of that name (SimpleBaseline, HRNet);
+- `udp`: i · (W − 1)/(w − 1) + 0.5, as MMPose's of that name (ViTPose): outermost cells on outermost pixels.
+
+Source: `HeatmapPredictor` of DeepLabCut 3, `MSRAHeatmap` and `UDPHeatmap` of MMPose 1."""
+
+T = TypeVar("T")
+
+
+class Notes(NamedTuple):
+    """The table above, read; None where the file does not say."""
+
+    keypoint_names: tuple[str, ...] | None
+    mean: tuple[float, ...] | None
+    std: tuple[float, ...] | None
+    colour: str
+    input_size: tuple[int, int] | None
+    activation: str
+    alignment: str | None
+    locref_std: float
+    pad_px: int | None
+    dilate_px: int | None
+
+
+def read_notes(model: OnnxModel) -> Notes:
+    """What the file says of its network.
+
+    Raises:
+        InputError: a value that is not what its key stands for.
+    """
+
+    def value(key: str, read: Callable[[str], T], default: Any = None) -> T:
+        text = model.metadata.get(key)
+        if text is None:
+            return default
+        try:
+            return read(text)
+        except ValueError as error:
+            raise InputError(model.path, f"its metadata `{key}` is {text[:100]!r}", f"expected {error}") from error
+
+    return Notes(
+        keypoint_names=value("keypoint_names", _names),
+        mean=value("mean", _colour_values),
+        std=value("std", lambda text: _positive(_colour_values(text))),
+        colour=value("colour", _one_of("rgb", "bgr"), "rgb"),
+        input_size=value("input_size", _size),
+        activation=value("activation", _one_of(*ACTIVATIONS), "none"),
+        alignment=value("alignment", _one_of(*ALIGNMENTS)),
+        locref_std=value("locref_std", lambda text: _positive(_numbers(text, 1))[0], 7.2801),
+        pad_px=value("pad_px", _pixels),
+        dilate_px=value("dilate_px", _pixels),
+    )
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise ValueError("names, separated by commas")
+    return names
+
+
+def _one_of(*words: str) -> Callable[[str], str]:
+    def read(text: str) -> str:
+        if text not in words:
+            raise ValueError(", ".join(words[:-1]) + " or " + words[-1])
+        return text
+
+    return read
+
+
+def _numbers(text: str, *counts: int) -> tuple[float, ...]:
+    problem = f"{' or '.join(map(str, counts))} number(s), separated by commas"
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise ValueError(problem) from error
+    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
+        raise ValueError(problem)
+    return numbers
+
+
+def _colour_values(text: str) -> tuple[float, ...]:
+    numbers = _numbers(text, 1, 3)
+    return numbers * 3 if len(numbers) == 1 else numbers
+
+
+def _positive(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    if min(numbers) <= 0:
+        raise ValueError("more than 0")
+    return numbers
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, height = _numbers(text, 2)
+    if width < 1 or height < 1:
+        raise ValueError("width,height in pixels")
+    return int(width), int(height)
+
+
+def _pixels(text: str) -> int:
+    (number,) = _numbers(text, 1)
+    if number < 0:
+        raise ValueError("0 or more pixels")
+    return round(number)
