@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from helpers import exp_map
 
-from jaxfit.model.anatomy import JOINT_NAMES, MURRE_KEYPOINTS, MURRE_SKELETON, other_side
+from jaxfit.model.anatomy import JOINT_NAMES, MURRE_KEYPOINTS, MURRE_SKELETON, other_side, skeleton_pairs
 from jaxfit.model.checks import ARRAY_FIELDS
 from jaxfit.model.files import MURRE_PATH, load_murre
 from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints, posed_vertices
@@ -160,6 +160,8 @@ def test_keypoints_lie_where_they_are_named():
     assert apart(KEYPOINTS["left_wrist"], JOINTS["left_wrist"]) < 2.0
     np.testing.assert_allclose(np.asarray(BIRD.keypoint_weights).sum(axis=1), 1, atol=1e-6)
     assert {name for pair in MURRE_SKELETON for name in pair} == set(MURRE_KEYPOINTS)
+    assert len(skeleton_pairs(MURRE_KEYPOINTS)) == len(MURRE_SKELETON)
+    assert skeleton_pairs(["crown", "left_eye", "beak", "nape", "back"]) == ((0, 3), (3, 4), (1, 0))
 
 
 @pytest.mark.parametrize("name", POSTURES)

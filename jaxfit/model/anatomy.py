@@ -22,6 +22,7 @@ __all__ = [
     "MURRE_SKELETON",
     "mirror_pairs",
     "other_side",
+    "skeleton_pairs",
 ]
 
 JOINT_NAMES = (
@@ -134,3 +135,9 @@ def other_side(name: str) -> str:
         if name.startswith(side):
             return other + name.removeprefix(side)
     return name
+
+
+def skeleton_pairs(keypoint_names: Sequence[str]) -> tuple[tuple[int, int], ...]:
+    """Indices of the keypoints that `MURRE_SKELETON` joins, of those that a model has."""
+    index = {name: k for k, name in enumerate(keypoint_names)}
+    return tuple((index[a], index[b]) for a, b in MURRE_SKELETON if a in index and b in index)

@@ -14,7 +14,7 @@ from jaxfit.errors import InputError
 from jaxfit.fitting.solution import Solution, save_solution
 from jaxfit.formats.coco import write_coco
 from jaxfit.formats.scene_folder import DETECTIONS, FOOTAGE, MARKER, TRUE_POSES, TRUTH
-from jaxfit.model.anatomy import MURRE_SKELETON
+from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
 from jaxfit.observations import Observations, encode_mask
@@ -107,7 +107,7 @@ def stage_scene(
         image_size_px=np.tile(size, (frames, 1)),
         file_name=np.array([f"{FOOTAGE}#{t}" for t in range(frames)]),
         keypoint_names=bird.keypoint_names,
-        skeleton=_skeleton(bird),
+        skeleton=skeleton_pairs(bird.keypoint_names),
         masks=visible,
         amodal_masks=whole,
         occluded=labelled & ~seen,
@@ -160,11 +160,6 @@ def simulate(
         save_solution(scene.poses, bird, f"# {origin}\n", facts, part / TRUE_POSES)
         write_whole(part / MARKER, json.dumps(_description(scene, birds, frames, size, fps, seed), indent=2).encode())
     return scene
-
-
-def _skeleton(bird: Bird) -> tuple[tuple[int, int], ...]:
-    names = bird.keypoint_names
-    return tuple((names.index(a), names.index(b)) for a, b in MURRE_SKELETON if a in names and b in names)
 
 
 def _check(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfit.model.anatomy import MURRE_SKELETON
 from jaxfit.storage import write_whole
 
 __all__ = [
@@ -21,7 +19,6 @@ __all__ = [
     "dot",
     "line",
     "ring",
-    "skeleton_pairs",
     "tag",
     "text",
     "text_width",
@@ -70,12 +67,6 @@ def tinted(vertex_colours: Float[np.ndarray, "V 3"], n: int, share: float = PLUM
     """A model's colours (red, green, blue) with the track's among them: blue, green, red in [0, 1]."""
     own = np.asarray(vertex_colours, np.float32)[:, ::-1]
     return share * own + (1 - share) * np.array(track_colour(n), np.float32) / 255
-
-
-def skeleton_pairs(keypoint_names: Sequence[str]) -> list[tuple[int, int]]:
-    """The pairs of keypoints that lines join, of those that the model has."""
-    index = {name: k for k, name in enumerate(keypoint_names)}
-    return [(index[a], index[b]) for a, b in MURRE_SKELETON if a in index and b in index]
 
 
 def fixed(point_px: Float[np.ndarray, "2"] | tuple[float, float]) -> tuple[int, int]:

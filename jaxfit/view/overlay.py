@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from jaxfit.errors import InputError
 from jaxfit.fitting.posed import PosedBirds
 from jaxfit.fitting.solution import Solution
+from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
@@ -22,7 +23,7 @@ from jaxfit.view.birds import DrawnBird, Numbers, Style, draw_birds, draw_keypoi
 from jaxfit.view.checks import check_belongs, check_outputs, too_short
 from jaxfit.view.detected import Detected
 from jaxfit.view.legend import Legend
-from jaxfit.view.marks import skeleton_pairs, tinted
+from jaxfit.view.marks import tinted
 from jaxfit.view.sheet import contact_sheet, cut_tiles, sheet_pairs
 from jaxfit.view.side import SideViews
 
