@@ -80,7 +80,15 @@ class Performer:
         self.to(posture, 0.25 + 0.25 * abs(turn), heading=self.now.heading + turn)
 
     def perform(self, behaviour: str, until_s: float, target: tuple[float, float] | None = None) -> None:
-        """Perform one behaviour, then hold its last key no later than the next one begins."""
+        """Write the keys of one behaviour, from the last key on; the next one begins at its last key.
+
+        Args:
+            behaviour: one of BEHAVIOURS.
+            until_s: when it should end. A walk that arrives ends before; what has begun, such as a wingbeat, is
+                finished after.
+            target: x, y in the world: where a walk leads to, or whom an approach or a jab is meant for. Only a
+                walk needs one.
+        """
         self.labels.append((self.now.time_s, behaviour))
         _ACTS[behaviour](self, until_s, target)
 
@@ -110,12 +118,8 @@ def _preen(bird: Performer, until_s: float, _target) -> None:
 
 
 def _walk(bird: Performer, until_s: float, target) -> None:
-    if target is not None:
-        bird.face("standing", target)
-        way = np.hypot(*np.subtract(target, bird.now.feet))
-    else:
-        way = bird.rng.uniform(8, 20)
-    foot = 0
+    bird.face("standing", target)
+    way, foot = np.hypot(*np.subtract(target, bird.now.feet)), 0
     while bird.now.time_s < until_s and way > 0:
         ahead = min(STEP_UNITS, way) * np.array([-np.sin(bird.now.heading), np.cos(bird.now.heading)])
         step = f"walking_{('left', 'right')[foot]}"
