@@ -192,11 +192,8 @@ def _value(hint: Any, value: Any, where: str, base: str) -> Any:
         if not isinstance(value, list):
             raise ConfigKeyError(where, f"`{where}` must be a list, not {value!r}")
         return tuple(_value(arguments[0], v, f"{where}[{i}]", base) for i, v in enumerate(value))
-    if origin is types.UnionType and type(None) in arguments:
-        (kind,) = (argument for argument in arguments if argument is not type(None))
-        return None if value is None else _value(kind, value, where, base)
     if origin is types.UnionType:
-        return tuple(value) if isinstance(value, list) else value
+        return _one_of(arguments, value, where, base)
     if origin is Mapping:
         if not isinstance(value, dict):
             raise ConfigKeyError(where, f"`{where}` must be a mapping, not {value!r}")
@@ -208,6 +205,15 @@ def _value(hint: Any, value: Any, where: str, base: str) -> Any:
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
         raise ConfigKeyError(where, f"`{where}` is {value!r}", f"a value of type {hint.__name__} is expected")
     return value
+
+
+def _one_of(kinds: tuple[Any, ...], value: Any, where: str, base: str) -> Any:
+    if value is None and type(None) in kinds:
+        return None
+    for kind in kinds:
+        if (typing.get_origin(kind) is tuple) == isinstance(value, list) and kind is not type(None):
+            return _value(kind, value, where, base)
+    raise ConfigKeyError(where, f"`{where}` is {value!r}")
 
 
 def _plain(value: Any) -> Any:

@@ -66,7 +66,7 @@ def test_a_fit_has_bases_of_its_own(tmp_path, text, of, changes):
         ("track: {segmentor: x}", ["`track.segmentor`", "segmenter"]),
         ("track: {segmenter: {path: x}}", ["`track.segmenter.path`", "file"]),
         ("track: {segmenter: {classes: bird}}", ["`track.segmenter.classes`", "list"]),
-        ("track: {segmenter: {min_score: 2}}", ["`track.segmenter.min_score`", "2", "within 0 and 1"]),
+        ("track: {segmenter: {min_score: 2.5}}", ["`track.segmenter.min_score`", "2", "within 0 and 1"]),
         ("track: {segmenter: {min_score: .nan}}", ["`track.segmenter.min_score`", "nan"]),
         ("track: {segmenter: {tile_px: 8}}", ["`track.segmenter.tile_px`", "8"]),
         ("track: {segmenter: {tile_px: wide}}", ["`track.segmenter.tile_px`", "wide", "int"]),

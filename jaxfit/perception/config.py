@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 from jaxfit.config_file import require
 
 __all__ = ["FramesConfig", "KeypointsConfig", "SegmenterConfig", "TrackConfig", "TrackerConfig"]
+
+
+def _require_share(key: str, value: float | None, remedy: str) -> None:
+    require(value is None or 0 <= value <= 1, key, f"is {value}", remedy)
 
 
 @dataclass(frozen=True)
@@ -35,18 +38,20 @@ class SegmenterConfig:
     file: str = "builtin"
     """`builtin` (murres, trained on simulated footage), an ONNX file, or `detector.onnx+saliency.onnx`."""
     kind: str = "auto"
-    """Layout of its output; `auto` tells it from the file's inputs and outputs."""
+    """Layout of its output (bottom_up, rf_detr, mask_rcnn, yolo, yolox+saliency); `auto` tells it from the file."""
+    names: tuple[str, ...] = ()
+    """All its classes in their order, where the file does not say them."""
     classes: tuple[str, ...] = ()
-    """Classes to look for, by name; none stands for the birds among them."""
-    min_score: float = 0.5
-    """Instances that the network trusts less are left out."""
+    """Classes to look for, by name; none stands for `bird`, or the only class there is."""
+    min_score: float | None = None
+    """Instances that the network trusts less are left out, within [0, 1]; null takes what suits its layout."""
     tile_px: int | None = None
-    """Side of the tiles that a large frame is cut into, so that small birds stay large enough; null takes it whole."""
-    tile_overlap: float = 0.2
-    """Share of a tile that it has in common with the next one."""
+    """Side of the tiles that large frames are cut into, so that birds stay large enough; null takes frames whole."""
+    tile_overlap: float = 0.25
+    """Share of a tile that it has in common with the next one; wider than a bird is best."""
 
     def __post_init__(self):
-        require(0 <= self.min_score <= 1, "min_score", f"is {self.min_score}", "a number within 0 and 1")
+        _require_share("min_score", self.min_score, "a number within 0 and 1, or null")
         require(self.tile_px is None or self.tile_px >= 32, "tile_px", f"is {self.tile_px}", "32 or more, or null")
         require(0 <= self.tile_overlap < 1, "tile_overlap", f"is {self.tile_overlap}", "0 or more and below 1")
 
@@ -58,19 +63,21 @@ class KeypointsConfig:
     file: str = "builtin"
     """`builtin` (the murre's, trained on simulated footage) or an ONNX file."""
     kind: str = "auto"
-    """Layout of its output; `auto` tells it from the file's inputs and outputs."""
-    names: tuple[str, ...] = ()
-    """Its keypoints in the order of its output; none takes those that the file says, or the murre's."""
-    pad_px: float = 40.0
-    """Margin around a bird's mask that its crop shows, image pixels."""
-    dilate_px: int = 70
-    """Side of the square by which the mask is dilated before all else is blanked, image pixels."""
-    batch: int = 8
-    """Crops that the network is given at once."""
+    """Layout of its output (heatmap, deeplabcut, simcc); `auto` tells it from the file's inputs and outputs."""
+    names: str | tuple[str, ...] = ()
+    """Its keypoints in the order of its output, or `murre`, `aves`, `avian-mesh`; none takes those the file says."""
+    pad_px: int | None = None
+    """Margin around a bird's mask that its crop shows, image pixels; null takes the file's, or the paper's 40."""
+    dilate_px: int | None = None
+    """Side of the square that the mask is dilated by before all else is blanked, image pixels; null takes the file's,
+    or the paper's 70."""
+    batch: int = 16
+    """Crops that the network is given at once, where it leaves that open."""
 
     def __post_init__(self):
-        require(0 <= self.pad_px < math.inf, "pad_px", f"is {self.pad_px}", "0 or more")
-        require(self.dilate_px >= 0, "dilate_px", f"is {self.dilate_px}", "0 or more")
+        for name in ("pad_px", "dilate_px"):
+            value = getattr(self, name)
+            require(value is None or value >= 0, name, f"is {value}", "0 or more, or null")
         require(self.batch >= 1, "batch", f"is {self.batch}", "1 or more")
 
 
@@ -79,15 +86,18 @@ class TrackerConfig:
     """What tells which bird of one frame is which of the next."""
 
     name: str = "iou"
-    """`iou` (the paper's), or `bytetrack` or `ocsort` of the optional `trackers` package."""
+    """`iou` (the paper's); `bytetrack`, `ocsort` or `botsort` of the optional `trackers` package."""
     memory: int = 5
     """Frames for which a bird may be missed without losing its identity."""
     min_iou: float = 0.1
-    """Least overlap of two boxes of the same bird in consecutive frames."""
+    """Boxes of the same bird overlap by more than this from frame to frame."""
+    min_score: float = 0.6
+    """Instances that the network trusts less begin no track; `iou` takes all."""
 
     def __post_init__(self):
         require(self.memory >= 0, "memory", f"is {self.memory}", "0 or more frames")
-        require(0 <= self.min_iou <= 1, "min_iou", f"is {self.min_iou}", "a number within 0 and 1")
+        for name in ("min_iou", "min_score"):
+            _require_share(name, getattr(self, name), "a number within 0 and 1")
 
 
 @dataclass(frozen=True)
