@@ -38,15 +38,16 @@ class PictureInput(NamedTuple):
         """Blue-green-red pictures as the network takes them: (N, 3, h, w), or (N, h, w, 3) if `channels_last`."""
         if self.rgb:
             pictures = pictures[..., ::-1]
+        mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
+        if not self.channels_last:  # first of all: bytes are moved, and long rows reckoned, ten times as fast
+            pictures, mean, std = pictures.transpose(0, 3, 1, 2), mean[:, None, None], std[:, None, None]
+        pictures = np.ascontiguousarray(pictures)
         if self.number is np.uint8:
-            numbers = pictures
-        else:
-            numbers = pictures.astype(np.float32)
-            numbers -= np.array(self.mean, np.float32)
-            numbers /= np.array(self.std, np.float32)
-        if not self.channels_last:
-            numbers = numbers.transpose(0, 3, 1, 2)
-        return np.ascontiguousarray(numbers, dtype=self.number)
+            return pictures
+        numbers = pictures.astype(np.float32)
+        numbers -= mean
+        numbers /= std
+        return numbers.astype(self.number, copy=False)
 
 
 def picture_input(model: OnnxModel, notes: Notes) -> PictureInput:
