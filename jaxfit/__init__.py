@@ -1,18 +1,22 @@
 """jaxfit: temporally consistent 3D pose and shape of birds from ordinary video, on a CPU."""
 
-from importlib import metadata
+from __future__ import annotations
 
-from jaxfit.config import FitConfig, load_config
-from jaxfit.errors import InputError
-from jaxfit.evaluation.evaluate import Evaluation, evaluate
-from jaxfit.fitting.fit import fit
-from jaxfit.fitting.solution import Solution, load_solution, save_solution
-from jaxfit.formats.coco import read_coco, write_coco
-from jaxfit.model.bird import Bird
-from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
-from jaxfit.observations import Observations
-from jaxfit.simulation.scene import Scene, simulate, stage_scene
-from jaxfit.view.overlay import overlay
+from importlib import import_module, metadata
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # for type checkers and editors
+    from jaxfit.config import FitConfig, load_config
+    from jaxfit.errors import InputError
+    from jaxfit.evaluation.evaluate import Evaluation, evaluate
+    from jaxfit.fitting.fit import fit
+    from jaxfit.fitting.solution import Solution, load_solution, save_solution
+    from jaxfit.formats.coco import read_coco, write_coco
+    from jaxfit.model.bird import Bird
+    from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
+    from jaxfit.observations import Observations
+    from jaxfit.simulation.scene import Scene, simulate, stage_scene
+    from jaxfit.view.overlay import overlay
 
 __version__ = metadata.version("jaxfit")
 
@@ -39,3 +43,31 @@ __all__ = [
     "stage_scene",
     "write_coco",
 ]
+
+_HOMES = {
+    "config": ("FitConfig", "load_config"),
+    "errors": ("InputError",),
+    "evaluation.evaluate": ("Evaluation", "evaluate"),
+    "fitting.fit": ("fit",),
+    "fitting.solution": ("Solution", "load_solution", "save_solution"),
+    "formats.coco": ("read_coco", "write_coco"),
+    "model.bird": ("Bird",),
+    "model.files": ("find_bird", "load_bird", "load_murre", "save_bird"),
+    "observations": ("Observations",),
+    "simulation.scene": ("Scene", "simulate", "stage_scene"),
+    "view.overlay": ("overlay",),
+}
+"""Module → the public names that it holds, each imported at its first use: together they take seconds."""
+
+if not TYPE_CHECKING:  # there, a name that is none stays an error
+
+    def __getattr__(name: str) -> Any:
+        for home, names in _HOMES.items():
+            if name in names:
+                value = globals()[name] = getattr(import_module(f"jaxfit.{home}"), name)
+                return value
+        raise AttributeError(f"module 'jaxfit' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

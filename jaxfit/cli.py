@@ -1,4 +1,7 @@
-"""The command line: what can be asked, and how failures are told."""
+"""The command line: what can be asked, and how failures are told.
+
+A parser names the function of `jaxfit.commands` that runs: those modules are imported once a command is known.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
-import jax
-
-from jaxfit import __version__, commands
+from jaxfit import __version__
 from jaxfit.errors import InputError
 
 __all__ = ["main", "run", "use_cache"]
@@ -51,9 +52,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 2 unusable input, 130 stopped by Ctrl-C."""
     options = _parser().parse_args(arguments)
     logging.basicConfig(format="%(message)s", level=logging.INFO if options.verbose else logging.WARNING)
-    use_cache()
     try:
-        options.run(options)
+        use_cache()
+        from jaxfit import commands  # here, so that help and refusals need not wait for all that commands import
+
+        getattr(commands, options.run)(options)
     except InputError as error:
         print(f"jaxfit: {error}", file=sys.stderr)  # noqa: T201
         return 2
@@ -72,6 +75,8 @@ def _stopped() -> int:
 
 def use_cache() -> None:
     """Keep compiled programs between runs, in the user's cache folder."""
+    import jax
+
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxfit"
     jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
@@ -95,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--birds", type=int, default=9, help="fit: birds (default 9)")
     bench.add_argument("--frames", type=int, default=100, help="fit: frames a bird (default 100)")
     bench.add_argument("--json", action="store_true")
-    bench.set_defaults(run=commands.bench)
+    bench.set_defaults(run="bench")
     return parser
 
 
@@ -107,13 +112,13 @@ def _fitting(add) -> None:
     fit.add_argument("--init", type=Path, help="starting poses (.npz): a regressor's, or an earlier poses.npz")
     fit.add_argument("--out", type=Path, required=True, help="folder for the result")
     fit.add_argument("--overwrite", action="store_true", help="replace an earlier result in that folder")
-    fit.set_defaults(run=commands.fit)
+    fit.set_defaults(run="fit")
 
     evaluate = add("evaluate", help="compare a result with annotations, or with a simulated scene's truth")
     evaluate.add_argument("result", type=Path, metavar="DIR")
     evaluate.add_argument("--truth", type=Path, required=True, help="COCO file of annotations, or a simulated scene")
     evaluate.add_argument("--json", action="store_true", help="print JSON instead of tables")
-    evaluate.set_defaults(run=commands.evaluate)
+    evaluate.set_defaults(run="evaluate")
 
     overlay = add("overlay", help="draw a result on its video")
     overlay.add_argument("result", type=Path, metavar="DIR")
@@ -124,7 +129,7 @@ def _fitting(add) -> None:
     overlay.add_argument("--frame", type=int, help="draw this frame alone, as a picture (.png or .jpg)")
     overlay.add_argument("--codec", default="auto", choices=CODECS)
     overlay.add_argument("--overwrite", action="store_true", help="replace earlier files of these names")
-    overlay.set_defaults(run=commands.overlay)
+    overlay.set_defaults(run="overlay")
 
 
 def _simulation(add) -> None:
@@ -137,11 +142,11 @@ def _simulation(add) -> None:
     simulate.add_argument("--seed", type=int, default=0, help="another seed gives another scene (default 0)")
     simulate.add_argument("--codec", default="auto", choices=CODECS)
     simulate.add_argument("--overwrite", action="store_true", help="replace an earlier scene in that folder")
-    simulate.set_defaults(run=commands.simulate)
+    simulate.set_defaults(run="simulate")
 
     demo = add("demo", help="simulate a short scene, fit it, and show what came of it")
     demo.add_argument("--out", type=Path, default=Path("demo"), help="folder for everything (default demo)")
-    demo.set_defaults(run=commands.demo)
+    demo.set_defaults(run="demo")
 
 
 def _models(add) -> None:
@@ -150,15 +155,15 @@ def _models(add) -> None:
     importer.add_argument("kind", choices=("avian-mesh", "aves"))
     importer.add_argument("sources", type=Path, nargs="+", help="its files, or the folder that holds them")
     importer.add_argument("--out", type=Path, required=True, help="model file to write (.npz)")
-    importer.set_defaults(run=commands.model_import)
+    importer.set_defaults(run="model_import")
     info = actions.add_parser("info", help="what a model holds")
     info.add_argument("file", metavar="MODEL", help=MODEL)
     info.add_argument("--json", action="store_true")
-    info.set_defaults(run=commands.model_info)
+    info.set_defaults(run="model_info")
     view = actions.add_parser("view", help="draw a model from six sides")
     view.add_argument("file", metavar="MODEL", help=MODEL)
     view.add_argument("--out", type=Path, required=True, help="PNG to write")
     view.add_argument(
         "--posture", help="of the murre: standing, incubating, … (default: standing; other models at rest)"
     )
-    view.set_defaults(run=commands.model_view)
+    view.set_defaults(run="model_view")

@@ -7,7 +7,6 @@ import time
 
 import numpy as np
 
-from jaxfit.config import config_to_yaml, load_config
 from jaxfit.errors import InputError
 from jaxfit.formats.coco import read_coco
 from jaxfit.model.files import find_bird, save_bird
@@ -18,6 +17,7 @@ __all__ = ["bench", "demo", "evaluate", "fit", "model_import", "model_info", "mo
 
 
 def fit(options: argparse.Namespace) -> None:
+    from jaxfit.config import config_to_yaml, load_config
     from jaxfit.fitting.fit import fit
     from jaxfit.fitting.solution import save_solution
     from jaxfit.fitting.start import load_start

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
 
-from jaxfit.evaluation.evaluate import COLUMNS, Evaluation
+if TYPE_CHECKING:
+    from jaxfit.evaluation.evaluate import Evaluation
 
 __all__ = ["counted", "evaluation_tables", "plain_json", "right_aligned", "show", "show_facts"]
 
@@ -46,6 +47,8 @@ def right_aligned(*columns: str, **options: Any) -> Table:
 
 def evaluation_tables(result: Evaluation) -> list[Table]:
     """What `evaluate` found, a row for every track: in the picture, and in space where that was measured."""
+    from jaxfit.evaluation.evaluate import COLUMNS
+
     tables = [right_aligned("track", "frames", *COLUMNS)]
     for track, row in result.tracks.items():
         tables[0].add_row(str(track), f"{row['frames']:.0f}", *(_figure(row[name]) for name in COLUMNS))

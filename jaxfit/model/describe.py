@@ -7,7 +7,6 @@ import json
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from jaxfit.model.bird import Bird
 from jaxfit.model.checks import ARRAY_FIELDS
@@ -44,6 +43,8 @@ def describe_bird(bird: Bird) -> dict[str, Any]:
         `max_influences` (joints that move one vertex); `pose_prior_variance`, `bone_prior_variance` and
         `shape_variance`: smallest and largest eigenvalue (rad², 1, 1; None without shapes).
     """
+    import trimesh  # here: few need this function, and it takes half a second
+
     vertices, faces = np.asarray(bird.vertices), np.asarray(bird.faces)
     minimum, maximum = vertices.min(axis=0), vertices.max(axis=0)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
