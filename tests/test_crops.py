@@ -71,7 +71,7 @@ def test_there_and_back():
     points = np.random.default_rng(1).uniform(-50, 300, (2, 5, 2))
     np.testing.assert_allclose(crop.to_crop(crop.to_image(points)), points)
     np.testing.assert_allclose(crop.to_image(np.zeros(2)), [crop.x0, crop.y0])
-    np.testing.assert_allclose(crop.to_image(np.array([192, 256])), [crop.x0 + crop.width, crop.y0 + crop.height])
+    np.testing.assert_allclose(crop.to_image(np.array([192.0, 256.0])), [crop.x0 + crop.width, crop.y0 + crop.height])
 
 
 def test_shrinking_does_not_alias():

@@ -120,4 +120,4 @@ def _names(model: OnnxModel, count: int, given: Sequence[str] | str | None) -> S
 
 
 def _given(*values: int | None) -> int:
-    return round(next(value for value in values if value is not None))
+    return next(value for value in values if value is not None)
