@@ -18,7 +18,7 @@ from jaxfit.model.pose import Pose
 from jaxfit.npz import load_npz
 from jaxfit.storage import conform, new_folder, write_whole
 
-__all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution"]
+__all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution", "write_solution"]
 
 FORMAT_VERSION = 1
 """Version of ``poses.npz``; raised where an older reader would misread the file."""
@@ -142,6 +142,12 @@ def save_solution(
         InputError: the folder holds results already, or something else, or cannot be written.
         TypeError: ``summary`` holds what JSON has no form for.
     """
+    with new_folder(folder, overwrite, marker=_POSES) as part:
+        write_solution(solution, bird, config_yaml, summary, part)
+
+
+def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Mapping[str, Any], folder: Path) -> None:
+    """The files that `save_solution` writes, into a folder that exists: one that is still being made."""
     summary_json = json.dumps(_plain(summary), indent=2, allow_nan=False)
     arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in LAYOUT}
     terms = list(solution.loss)
@@ -150,11 +156,10 @@ def save_solution(
     arrays["focal"] = np.asarray(solution.focal, np.float64)
     arrays["crop_px"] = np.asarray(solution.crop_px, np.int64)
     arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
-    with new_folder(folder, overwrite, marker=_POSES) as part:
-        write_whole(part / _POSES, lambda file: np.savez_compressed(file, **arrays))
-        write_whole(part / _CONFIG, config_yaml.encode())
-        write_whole(part / _SUMMARY, summary_json.encode())
-        save_bird(bird, part / _MODEL)
+    write_whole(folder / _POSES, lambda file: np.savez_compressed(file, **arrays))
+    write_whole(folder / _CONFIG, config_yaml.encode())
+    write_whole(folder / _SUMMARY, summary_json.encode())
+    save_bird(bird, folder / _MODEL)
 
 
 def _plain(value: Any) -> Any:

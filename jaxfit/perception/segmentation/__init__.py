@@ -1,5 +1,5 @@
 """From a frame to its instances: networks of several layouts behind one protocol."""
 
-from jaxfit.perception.segmentation.load import KINDS, load_segmenter
+from jaxfit.perception.segmentation.load import KINDS, load_segmenter, segmenter_files
 
-__all__ = ["KINDS", "load_segmenter"]
+__all__ = ["KINDS", "load_segmenter", "segmenter_files"]

@@ -16,7 +16,7 @@ from jaxfit.perception.segmentation.tiles import Tiled
 from jaxfit.perception.segmentation.yolo import YoloSeg
 from jaxfit.perception.segmentation.yolox import Yolox
 
-__all__ = ["BUILTIN", "KINDS", "load_segmenter"]
+__all__ = ["BUILTIN", "KINDS", "load_segmenter", "segmenter_files"]
 
 BUILTIN = Path(__file__).parents[1] / "networks" / "segmenter.onnx"
 """The network that the package brings along."""
@@ -93,6 +93,14 @@ def load_segmenter(
     return segmenter if tile_px is None else Tiled(segmenter, tile_px, tile_overlap)
 
 
+def segmenter_files(spec: str) -> list[Path]:
+    """The one or two files that a `spec` of `load_segmenter` stands for."""
+    first, plus, second = spec.partition(".onnx+")
+    if plus and not Path(spec).is_file():
+        return [Path(first + ".onnx"), Path(second)]
+    return [BUILTIN if spec == "builtin" else Path(spec)]
+
+
 def _load(
     spec: str,
     kind: str,
@@ -101,17 +109,16 @@ def _load(
     names: Sequence[str] | None,
     threads: int | None,
 ) -> Segmenter:
-    first, plus, second = spec.partition(".onnx+")
-    if plus and not Path(spec).is_file():
+    path, *second = segmenter_files(spec)
+    if second:
         if kind not in ("auto", "yolox+saliency"):
             raise InputError(spec, f"names two files, but {kind} is one", "give one file, or kind auto")
-        detector, saliency = OnnxModel(first + ".onnx", threads), OnnxModel(second, threads)
+        detector, saliency = OnnxModel(path, threads), OnnxModel(second[0], threads)
         if not Yolox.fits(detector):
             raise _unknown(detector, "YOLOX detector: one output (1, cells of strides 8, 16, 32, 5 + classes)")
         if not Saliency.fits(saliency):
             raise _unknown(saliency, "saliency: first output (1, 1, h, w)")
         return DetectorAndSaliency(Yolox(detector, classes, min_score, names), Saliency(saliency))
-    path = BUILTIN if spec == "builtin" else Path(spec)
     model = OnnxModel(path, threads)
     wanted = {name: _KINDS[name] for name in _KINDS if kind in ("auto", name)}
     for candidate in wanted.values():
