@@ -1,28 +1,25 @@
-"""Frames out of a video or a folder of images, and into a video that players and browsers show."""
+"""Frames into a video that players and browsers show."""
 
 from __future__ import annotations
 
 import logging
 import math
-import re
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import av
-import av.error
-import cv2
 import numpy as np
-from av.video.reformatter import ColorRange, Colorspace, Interpolation
+from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
+from jaxfit.decoding import EXACT
 from jaxfit.errors import InputError
 from jaxfit.storage import new_file
 
-__all__ = ["CODECS", "VideoInfo", "VideoWriter", "probe_video", "read_frames"]
+__all__ = ["CODECS", "VideoWriter"]
 
 _logger = logging.getLogger(__name__)
 
@@ -36,13 +33,10 @@ CODECS = {
 Without ``cpu-independent`` x264 wrote other bytes in every third run, on one machine and even by one thread."""
 CONTAINERS = {".mp4": ("h264", "vp9", "mpeg4"), ".webm": ("vp9",)}
 """A file's ending decides the container; its codecs, the first that this installation has being taken."""
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 # As many on every machine: some encoders split a picture by threads, and with it the bytes they write.
 _THREADS = 4
 _BT709 = 1  # the number of matrix, primaries and transfer alike in H.273
-_NUMBERS = re.compile(r"(\d*)(\D+|$)")
-_EXACT = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.BITEXACT
 
 
 class VideoWriter:
@@ -155,7 +149,7 @@ class VideoWriter:
             format="yuv420p",
             dst_colorspace=Colorspace.ITU709,
             dst_color_range=ColorRange.MPEG,
-            interpolation=_EXACT,
+            interpolation=EXACT,
         )
         picture.pts, picture.time_base = self.frames, 1 / self.fps
         self._container.mux(self._stream.encode(picture))
@@ -171,124 +165,3 @@ def _has_encoder(codec: str) -> bool:
     except ValueError:  # PyAV's UnknownCodecError
         return False
     return True
-
-
-class VideoInfo(NamedTuple):
-    """What a video says of itself."""
-
-    frames: int | None
-    """How many; None where the container does not say (``.webm``, streams)."""
-    fps: float | None
-    """Frames a second, their mean; None for a folder of images."""
-    size_px: tuple[int, int]
-    """Width and height; of a folder's first image."""
-
-
-def probe_video(path: str | Path) -> VideoInfo:
-    """Count, rate and size of a video or a folder of images, without reading the frames.
-
-    Raises:
-        InputError: as ``read_frames``.
-    """
-    path = _existing(path)
-    if path.is_dir():
-        files = _image_files(path)
-        height, width = _read_image(files[0]).shape[:2]
-        return VideoInfo(len(files), None, (width, height))
-    with _opened(path) as (_, stream):
-        rate = stream.average_rate or stream.guessed_rate
-        return VideoInfo(stream.frames or None, float(rate) if rate else None, (stream.width, stream.height))
-
-
-def read_frames(
-    path: str | Path, start: int = 0, stop: int | None = None, step: int = 1
-) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
-    """The frames of a video, or of a folder of images in the order of their names (2 before 10).
-
-    Frames are counted as they are decoded, from the first: what stands before ``start`` and between steps is
-    decoded, though not converted, so that a number always means the same picture. A file that breaks off ends
-    the frames with a warning. Frames come as they are stored: a rotation that the file asks players for is
-    warned of and not applied.
-
-    Args:
-        path: a file of any kind that FFmpeg reads, or a folder of images.
-        start: number of the first frame wanted.
-        stop: number of the frame to stop before; None reads to the end.
-        step: every how many-th frame.
-
-    Yields:
-        Number and (H, W, 3) uint8 blue-green-red picture of each frame.
-
-    Raises:
-        ValueError: a negative start or stop, a step below 1.
-        InputError: no such file or folder, no video, no video stream, no image in the folder, an image or a first
-            frame that cannot be read.
-    """
-    if start < 0 or (stop is not None and stop < 0) or step < 1:
-        raise ValueError(f"start and stop must be 0 or more and step 1 or more, not {start}, {stop}, {step}")
-    path = _existing(path)
-    wanted = range(start, sys.maxsize if stop is None else stop, step)
-    if path.is_dir():
-        files = _image_files(path)
-        return ((i, _read_image(files[i])) for i in wanted[: len(range(start, len(files), step))])
-    return _decode(path, wanted)
-
-
-def _decode(path: Path, wanted: range) -> Iterator[tuple[int, np.ndarray]]:
-    count, problem = 0, ""
-    with _opened(path) as (container, stream):
-        try:
-            for frame in container.decode(stream):
-                if count >= wanted.stop:
-                    return
-                if count == 0 and frame.rotation:
-                    _logger.warning("%s: is to be shown turned by %d°; its frames are not", path, frame.rotation)
-                if count in wanted:
-                    yield count, frame.to_ndarray(format="bgr24", interpolation=_EXACT)
-                count += 1
-        except av.error.FFmpegError as error:
-            problem = f": {error.strerror}"
-        if count == 0:
-            raise InputError(path, f"no frame can be decoded{problem}", "it may be incomplete or damaged")
-        if problem or count < stream.frames:
-            _logger.warning("%s: breaks off after %d of %s frames%s", path, count, stream.frames or "more", problem)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """The container and its first video stream."""
-    try:
-        # a playlist may name addresses: nothing but files is opened
-        container = av.open(str(path), options={"protocol_whitelist": "file"})
-    except av.error.FFmpegError as error:
-        problem = f"is no video that can be read: {error.strerror}"
-        raise InputError(path, problem, "it may be incomplete, or of another kind") from error
-    with container:
-        if not container.streams.video:
-            raise InputError(path, "holds no video stream", "give a video or a folder of images")
-        stream = container.streams.video[0]
-        if stream.codec_context is None:
-            raise InputError(path, "is coded in a way that this PyAV cannot decode", "convert it to H.264")
-        stream.thread_type = "AUTO"
-        yield container, stream
-
-
-def _existing(path: str | Path) -> Path:
-    path = Path(path).absolute()  # "concat:…" and the like are files here, not protocols
-    if not path.exists():
-        raise InputError(path, "does not exist", "give a video or a folder of images")
-    return path
-
-
-def _image_files(folder: Path) -> list[Path]:
-    files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
-    if not files:
-        raise InputError(folder, "holds no images", f"their names end in {', '.join(IMAGE_SUFFIXES)}")
-    return sorted(files, key=lambda file: [(int(n or 0), text) for n, text in _NUMBERS.findall(file.name)])
-
-
-def _read_image(file: Path) -> np.ndarray:
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR)
-    if image is None:
-        raise InputError(file, "is no image that can be read", "remove or replace it")
-    return image

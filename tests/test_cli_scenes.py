@@ -9,7 +9,7 @@ from cli_files import refused
 
 from jaxfit import demo, load_config
 from jaxfit.cli import main
-from jaxfit.video import probe_video
+from jaxfit.frames import probe_video
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 SMALL = ["--birds", "2", "--frames", "5", "--size", "480x280"]

@@ -14,10 +14,11 @@ from jaxfit.camera import Camera, project
 from jaxfit.errors import InputError
 from jaxfit.fitting.posed import PosedBirds
 from jaxfit.fitting.solution import Solution
+from jaxfit.frames import probe_video, read_frames
 from jaxfit.observations import Observations
 from jaxfit.render import hard_mask
 from jaxfit.simulation.motion import smooth_motion
-from jaxfit.video import VideoWriter, probe_video, read_frames
+from jaxfit.video import VideoWriter
 from jaxfit.view.birds import DrawnBird, Style, draw_birds
 from jaxfit.view.marks import TRACK_COLOURS
 from jaxfit.view.overlay import CHUNK, overlay
@@ -108,7 +109,7 @@ def drawn(tmp_path_factory):
         side_views=True,
         progress=progress,
     )
-    return made, [frame.astype(int) for _, frame in read_frames(made.video)], ticks
+    return made, [frame.picture.astype(int) for frame in read_frames(made.video)], ticks
 
 
 def masks(t):
@@ -161,7 +162,7 @@ def test_detected_keypoints_are_rings(drawn):
     made, frames, _ = drawn
     plain = overlay(solution(), BIRD, made.video.parents[1] / "film.mp4", made.video.parent / "plain.mp4")
     assert plain.size_px[1] < made.size_px[1]
-    for t, (_, frame) in enumerate(read_frames(plain.video)):
+    for t, frame, _ in read_frames(plain.video):
         x, y = np.round(detections().keypoints_px[0, t, 0]).astype(int)
         box = slice(y - 6, y + 6), slice(x - 6, x + 6)
         assert np.abs(frames[t][box] - frame[box]).sum(-1).max() > 60
@@ -222,7 +223,7 @@ def test_only_every_second_frame_and_a_small_picture(tmp_path):
         max_width=160,
     )
     assert (made.frames, made.fps, made.size_px[0]) == (T, FPS / 2, 160)
-    for _, frame in read_frames(made.video):
+    for _, frame, _ in read_frames(made.video):
         assert np.abs(frame[: HEIGHT // 2].astype(int) - GREY).max() > 60
 
 
@@ -251,7 +252,7 @@ def test_long_results_are_posed_chunk_by_chunk(tmp_path):
     many["keypoints_2d"] = many["keypoints_2d"] + (crop - still.crop[:1, :1])[:, :, None, :2]
     long = dataclasses.replace(still, **many, crop=crop, track_id=[4], frame_index=np.arange(frames), status=["ok"])
     made = overlay(long, BIRD, film(tmp_path / "f.mp4", frames), tmp_path / "o.mp4")
-    middles = [np.flatnonzero(changed(frame.astype(int)).sum(0) > 3).mean() for _, frame in read_frames(made.video)]
+    middles = [np.flatnonzero(changed(frame.astype(int)).sum(0) > 3).mean() for _, frame, _ in read_frames(made.video)]
     np.testing.assert_allclose(np.diff(middles), 1, atol=6)  # the number may change sides
     assert middles[-1] - middles[0] == pytest.approx(frames - 1, abs=6)
 

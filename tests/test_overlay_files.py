@@ -6,7 +6,7 @@ import pytest
 from test_overlay import BIRD, FIRST, HEIGHT, WIDTH, T, film, solution
 
 from jaxfit.errors import InputError
-from jaxfit.video import probe_video
+from jaxfit.frames import probe_video
 from jaxfit.view.overlay import overlay, overlay_frame
 
 

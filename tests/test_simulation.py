@@ -14,6 +14,7 @@ from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.truth import read_truth
 from jaxfit.fitting.posed import PosedBirds
 from jaxfit.formats.coco import read_coco
+from jaxfit.frames import read_frames
 from jaxfit.render import hard_mask
 from jaxfit.simulation.behaviour import BEHAVIOURS
 from jaxfit.simulation.flock import act
@@ -21,7 +22,6 @@ from jaxfit.simulation.footage import Footage
 from jaxfit.simulation.ledge import random_light
 from jaxfit.simulation.scene import LEDGE_DEPTH, simulate, stage_scene
 from jaxfit.simulation.viewpoint import look_down
-from jaxfit.video import read_frames
 
 MURRE = load_murre()
 SIZE = (480, 280)
@@ -180,7 +180,7 @@ def test_a_scene_reads_back(tmp_path):
     scene = simulate(MURRE, tmp_path / "s", birds=2, frames=5, size=SIZE, seed=6)
     frames = list(read_frames(tmp_path / "s" / "footage.mp4"))
     assert len(frames) == 5
-    assert frames[0][1].shape == (*SIZE[::-1], 3)
+    assert frames[0].picture.shape == (*SIZE[::-1], 3)
     truth, poses, bird = read_truth(tmp_path / "s")
     np.testing.assert_array_equal(truth.occluded, scene.truth.occluded)
     np.testing.assert_allclose(truth.keypoints_px, scene.truth.keypoints_px, atol=1e-3)

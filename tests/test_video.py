@@ -4,33 +4,14 @@ import logging
 import re
 
 import av
-import cv2
 import numpy as np
 import pytest
+from films import COUNT, FPS, SIZE, frames, write
 
 from jaxfit import video
 from jaxfit.errors import InputError
-from jaxfit.video import VideoInfo, VideoWriter, probe_video, read_frames
-
-SIZE, FPS, COUNT = (64, 48), 12.5, 30
-
-
-def frames(size=SIZE, count=COUNT):
-    """Colour fields that move, smooth enough for 4:2:0, with a patch of pure red, green and blue each."""
-    rng = np.random.default_rng(0)
-    field = cv2.resize(rng.integers(40, 215, (4, 6, 3), dtype=np.uint8), size, interpolation=cv2.INTER_LINEAR)
-    for i in range(count):
-        frame = np.roll(field, i, axis=1)
-        for channel in range(3):
-            frame[8:24, 16 * channel : 16 * channel + 16] = 255 * np.eye(3, dtype=np.uint8)[channel]
-        yield frame
-
-
-def write(path, codec="auto", size=SIZE, count=COUNT):
-    with VideoWriter(path, size, FPS, codec) as writer:
-        for frame in frames(size, count):
-            writer.write(frame)
-    return writer
+from jaxfit.frames import VideoInfo, probe_video, read_frames
+from jaxfit.video import VideoWriter
 
 
 @pytest.mark.parametrize(
@@ -44,8 +25,8 @@ def test_round_trip(tmp_path, name, codec, written):
     known = None if name == "a.webm" else COUNT
     assert probe_video(path) == VideoInfo(known, FPS, SIZE)
     read = list(read_frames(path))
-    assert [i for i, _ in read] == list(range(COUNT))
-    for (_, frame), sent in zip(read, frames(), strict=True):
+    assert [frame.index for frame in read] == list(range(COUNT))
+    for (_, frame, _), sent in zip(read, frames(), strict=True):
         assert frame.shape == sent.shape
         assert frame.dtype == np.uint8
         error = frame.astype(int) - sent
@@ -80,7 +61,7 @@ def test_a_keyframe_every_second_and_the_index_first(tmp_path):
 def test_odd_sides_are_padded(tmp_path):
     writer = write(tmp_path / "a.mp4", size=(63, 47), count=2)
     assert (writer.size_px, writer.written_size_px) == ((63, 47), (64, 48))
-    (_, frame), _ = read_frames(tmp_path / "a.mp4")
+    frame = next(iter(read_frames(tmp_path / "a.mp4"))).picture
     assert frame.shape == (48, 64, 3)
     sent = next(frames((63, 47), 1)).astype(int)
     assert np.abs(frame[:47, :63] - sent).mean() < 12
@@ -194,71 +175,3 @@ def test_frames_that_do_not_fit(tmp_path):
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(InputError, match="is a folder"), VideoWriter(tmp_path / "folder.mp4", SIZE, FPS):
         pass
-
-
-def test_some_frames(tmp_path):
-    write(tmp_path / "a.mp4")
-    every = dict(read_frames(tmp_path / "a.mp4"))
-    for start, stop, step in ((5, None, 1), (0, 7, 3), (20, 1000, 4), (40, None, 1), (3, 3, 1), (29, None, 5)):
-        some = dict(read_frames(tmp_path / "a.mp4", start, stop, step))
-        assert list(some) == list(range(COUNT))[start:stop:step]
-        for i, frame in some.items():
-            np.testing.assert_array_equal(frame, every[i])
-    for wrong in ((-1, None, 1), (0, -1, 1), (0, None, 0)):
-        with pytest.raises(ValueError, match="step 1 or more"):
-            read_frames(tmp_path / "a.mp4", *wrong)
-
-
-def test_a_folder_of_images(tmp_path):
-    for i, frame in enumerate(frames(count=12)):
-        cv2.imwrite(str(tmp_path / f"frame{i}.png"), frame)  # 10 stands before 2 in plain order
-    (tmp_path / "notes.txt").write_text("none of these")
-    assert probe_video(tmp_path) == VideoInfo(12, None, SIZE)
-    read = list(read_frames(tmp_path, 1, None, 2))
-    assert [i for i, _ in read] == [1, 3, 5, 7, 9, 11]
-    for (_, frame), sent in zip(read, list(frames(count=12))[1::2], strict=True):
-        np.testing.assert_array_equal(frame, sent)
-    assert list(read_frames(tmp_path, 50)) == []
-    (tmp_path / "frame3.png").write_bytes(b"no image")
-    with pytest.raises(InputError, match=r"frame3\.png: is no image"):
-        list(read_frames(tmp_path))
-
-
-def test_a_file_that_breaks_off(tmp_path, caplog):
-    write(tmp_path / "a.mp4")
-    whole = (tmp_path / "a.mp4").read_bytes()
-    (tmp_path / "b.mp4").write_bytes(whole[: len(whole) * 3 // 4])
-    with caplog.at_level(logging.WARNING, "jaxfit"):
-        read = list(read_frames(tmp_path / "b.mp4"))
-    assert 0 < len(read) < COUNT
-    assert [i for i, _ in read] == list(range(len(read)))
-    assert "breaks off after" in caplog.text
-    for size, problem in ((60, "(is|holds) no video"), (whole.find(b"mdat") + 8, "no frame can be decoded")):
-        (tmp_path / "c.mp4").write_bytes(whole[:size])
-        with pytest.raises(InputError, match=rf"c\.mp4: {problem}"):
-            list(read_frames(tmp_path / "c.mp4"))
-
-
-def test_what_is_no_video(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.mp4: does not exist"):
-        read_frames(tmp_path / "absent.mp4")
-    with pytest.raises(InputError, match="holds no images"):
-        read_frames(tmp_path)
-    for name, content in (("a.mp4", b"no video at all"), ("b.mp4", b""), ("c.txt", b"some words")):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match="is no video that can be read"):
-            list(read_frames(tmp_path / name))
-    with av.open(str(tmp_path / "sound.wav"), "w") as container:
-        stream = container.add_stream("pcm_s16le", rate=8000)
-        sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
-        sound.rate = 8000
-        container.mux(stream.encode(sound))
-    with pytest.raises(InputError, match="holds no video stream"):
-        list(read_frames(tmp_path / "sound.wav"))
-
-
-def test_a_playlist_opens_no_address(tmp_path):
-    text = "#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\nhttp://127.0.0.1:9/a.ts\n#EXT-X-ENDLIST\n"
-    (tmp_path / "a.m3u8").write_text(text)
-    with pytest.raises(InputError):
-        list(read_frames(tmp_path / "a.m3u8"))

@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxfit.errors import InputError
 from jaxfit.fitting.solution import Solution
+from jaxfit.frames import VideoInfo
 from jaxfit.observations import Observations
-from jaxfit.video import VideoInfo
 
 __all__ = ["check_belongs", "check_outputs", "too_short"]
 

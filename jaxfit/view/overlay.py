@@ -12,13 +12,14 @@ from jaxtyping import Float, UInt8
 from jaxfit.errors import InputError
 from jaxfit.fitting.posed import PosedBirds
 from jaxfit.fitting.solution import Solution
+from jaxfit.frames import VideoInfo, probe_video, read_frames
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.render import shade
 from jaxfit.storage import write_whole
-from jaxfit.video import VideoInfo, VideoWriter, probe_video, read_frames
+from jaxfit.video import VideoWriter
 from jaxfit.view.birds import DrawnBird, Numbers, Style, draw_birds, draw_keypoints
 from jaxfit.view.checks import check_belongs, check_outputs, too_short
 from jaxfit.view.detected import Detected
@@ -110,7 +111,7 @@ def overlay(
         progress("overlay", (last - first) // step + 1) as tick,
     ):
         number = None
-        for number, picture in read_frames(video, first, last + 1, step):
+        for number, picture, _ in read_frames(video, first, last + 1, step):
             t = int(np.searchsorted(numbers, number))
             here = t if numbers[t] == number else None
             tiles |= cut_tiles(drawing.posed, picture, [(n, at) for n, at in wanted if at == here])
@@ -162,7 +163,7 @@ def overlay_frame(
         problem = f"has no frame {frame_index}: its frames are {solution.frame_index[0]} to {solution.frame_index[-1]}"
         raise InputError("result", problem, "give one of them")
     drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
-    for number, picture in read_frames(video, frame_index, frame_index + 1):
+    for number, picture, _ in read_frames(video, frame_index, frame_index + 1):
         t, seconds = int(np.searchsorted(solution.frame_index, number)), number / (info.fps or FOLDER_FPS)
         _, encoded = cv2.imencode(out.suffix, drawing.frame(picture, number, t, seconds))
         write_whole(out, encoded.tobytes())
