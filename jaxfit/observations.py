@@ -37,8 +37,8 @@ class Observations:
 
     Raises:
         ValueError: shapes that contradict each other, a ``track_id`` twice, a ``frame_index`` that does not
-            increase, a confidence or score outside [0, 1] or where nothing is present, a position that is not
-            finite, a mask that is not of its image's size.
+            increase, a confidence or score outside [0, 1], a confidence where nothing is present, a position that
+            is not finite, a mask that is not of its image's size.
     """
 
     track_id: np.ndarray
@@ -88,13 +88,14 @@ class Observations:
         for name in ("confidence", "score"):
             if not ((arrays[name] >= 0) & (arrays[name] <= 1)).all():
                 raise ValueError(f"{name} must lie in [0, 1]")
-            if arrays[name][~present].any():
-                raise ValueError(f"{name} must be 0 where present is False")
+        if confidence[~present].any():
+            raise ValueError("confidence must be 0 where present is False")
         arrays["occluded"] = arrays["occluded"] & (confidence > 0)
         arrays["occluded"].flags.writeable = False
-        for name, needed in (("keypoints_px", confidence > 0), ("box_px", present)):
+        needed = {"keypoints_px": confidence[..., None] > 0, "box_px": present[..., None], "score": present}
+        for name, there in needed.items():
             # absent values are 0, so that no NaN of theirs can reach a sum
-            values = np.where(needed[..., None], arrays[name], np.float32(0))
+            values = np.where(there, arrays[name], np.float32(0))
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite where it is not missing")
             values.flags.writeable = False
