@@ -1,0 +1,102 @@
+"""The training loop that both networks share."""
+
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from jaxfit.progress import ProgressTask, silent
+from jaxfit.training.scenes import LabelledFrames
+
+__all__ = ["Schedule", "train"]
+
+
+class Schedule(NamedTuple):
+    """How long and how fast."""
+
+    steps: int
+    batch: int
+    learning_rate: float
+    """AdamW's at its height: it rises over the first tenth and falls as a cosine (one cycle)."""
+    weight_decay: float = 0.02
+
+
+class _Samples(Dataset):
+    """Sample i depends on the seed and i alone, whatever the number of workers."""
+
+    def __init__(self, draw: Callable[..., Any], frames: LabelledFrames, seed: int, count: int):
+        self._draw, self._frames, self._seed, self._count = draw, frames, seed, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, i: int) -> Any:
+        return self._draw(np.random.default_rng((self._seed, i)), self._frames)
+
+
+def train(
+    network: nn.Module,
+    draw: Callable[[np.random.Generator, LabelledFrames], Any],
+    loss: Callable[[dict[str, Tensor], Any], dict[str, Tensor]],
+    frames: LabelledFrames,
+    schedule: Schedule,
+    seed: int = 0,
+    progress: ProgressTask = silent,
+    name: str = "Training",
+) -> dict[str, float]:
+    """Train a network in place, on a GPU where there is one, in bfloat16 where the processor has it.
+
+    Args:
+        network: maps a batch of `picture` to maps by name.
+        draw: makes one sample, a NamedTuple of arrays that begins with `picture`.
+        loss: the parts of the loss of a batch.
+        frames: what samples are drawn from.
+        schedule: length and speed.
+        seed: of the samples; the network's own numbers are the caller's.
+        progress: told of every step and the loss.
+        name: of the task.
+
+    Returns:
+        Each part of the loss, averaged over the last tenth.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network.to(device).train()
+    network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    samples = _Samples(draw, frames, seed, schedule.steps * schedule.batch)
+    loader = DataLoader(
+        samples, schedule.batch, num_workers=1, prefetch_factor=4, worker_init_fn=_one_thread, pin_memory=False
+    )
+    optimiser = torch.optim.AdamW(network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay)
+    rates = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, schedule.learning_rate, schedule.steps, pct_start=0.1, cycle_momentum=False
+    )
+    recent: list[dict[str, float]] = []
+    with progress(name, schedule.steps) as tick:
+        for sample in loader:
+            sample = type(sample)(*(part.to(device) for part in sample))
+            picture = sample.picture.contiguous(memory_format=torch.channels_last)
+            with torch.autocast(device.type, torch.bfloat16):
+                maps = network(picture)
+            parts = loss(maps, sample)
+            optimiser.zero_grad(set_to_none=True)
+            torch.stack(list(parts.values())).sum().backward()
+            nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+            optimiser.step()
+            rates.step()
+            recent = [*recent[-(schedule.steps // 10) :], {key: float(part.detach()) for key, part in parts.items()}]
+            tick(1, " ".join(f"{key} {np.mean([r[key] for r in recent[-50:]]):.4f}" for key in recent[-1]))
+    network.cpu().eval()
+    return {key: float(np.mean([values[key] for values in recent])) for key in recent[-1]}
+
+
+def _one_thread(_worker: int) -> None:
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
