@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from jaxfit.errors import InputError
+from jaxfit.masks import decode_mask, encode_mask
 from jaxfit.storage import conform
 
 __all__ = ["Observations", "check_keypoints", "encode_mask", "reorder_keypoints"]
@@ -137,12 +138,13 @@ class Observations:
         Returns:
             (H, W) bool in the pixels of its image, or None where there is no mask.
         """
-        return _decode(self.masks.get(self._position(n, t)))
+        rle = self.masks.get(self._position(n, t))
+        return None if rle is None else decode_mask(rle)
 
     def whole_mask(self, n: int, t: int) -> np.ndarray | None:
         """The mask of the bird with its hidden parts, where that is known; else ``mask``."""
-        whole = _decode(self.amodal_masks.get(self._position(n, t)))
-        return self.mask(n, t) if whole is None else whole
+        rle = self.amodal_masks.get(self._position(n, t))
+        return self.mask(n, t) if rle is None else decode_mask(rle)
 
     def image_size(self, n: int, t: int) -> tuple[int, int]:
         """Width and height in pixels of the image that track ``n`` stands in at frame ``t``."""
@@ -209,29 +211,6 @@ class Observations:
             ValueError: as the class does.
         """
         return replace(self, keypoints_px=np.asarray(keypoints_px), confidence=np.asarray(confidence))
-
-
-def _decode(rle: Mapping[str, Any] | None) -> np.ndarray | None:
-    from pycocotools import mask as coco_mask
-
-    return None if rle is None else coco_mask.decode(cast(Any, rle)).astype(bool)
-
-
-def encode_mask(mask: Any) -> dict[str, Any]:
-    """Run lengths of a mask, as ``Observations.masks`` holds them.
-
-    Args:
-        mask: (H, W) bool, pixels of the image.
-
-    Raises:
-        ValueError: ``mask`` has not two dimensions.
-    """
-    from pycocotools import mask as coco_mask
-
-    mask = np.asarray(mask)
-    if mask.ndim != 2:
-        raise ValueError(f"mask must have shape (H, W), not {mask.shape}")
-    return cast(Any, coco_mask.encode(np.asfortranarray(mask.astype(bool).astype(np.uint8))))
 
 
 def reorder_keypoints(observations: Observations, names: Sequence[str]) -> Observations:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jaxfit.observations import encode_mask
+from jaxfit.masks import encode_patch
 
 __all__ = ["Instance", "KeypointDetector", "Segmenter", "instance_of"]
 
@@ -35,10 +35,7 @@ class Instance(NamedTuple):
 
     def encode(self, width: int, height: int) -> dict[str, Any]:
         """Run lengths over a frame of that size, as `Observations.masks` holds them."""
-        whole = np.zeros((height, width), bool, order="F")
-        h, w = self.mask.shape
-        whole[self.y0 : self.y0 + h, self.x0 : self.x0 + w] = self.mask
-        return encode_mask(whole)
+        return encode_patch(self.mask, self.x0, self.y0, width, height)
 
 
 def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int = 0, y0: int = 0) -> Instance | None:
