@@ -19,6 +19,7 @@ __all__ = ["BottomUp"]
 
 LONGER_SIDE_PX = 864
 """Of the network's input, where its metadata (`longer_side`) does not say: 6.9 for 2 cm of a ledge 2.5 m wide."""
+LARGEST_SIDE_PX = 8192
 MULTIPLE = 32
 OFFSET_UNIT_PX = 32.0
 LEAST_PEAK = 0.2
@@ -51,7 +52,12 @@ class BottomUp:
     def __init__(self, model: OnnxModel, classes: Sequence[str] | None = None, min_score: float | None = None):
         self._model = model
         self._input = image_input(model)
-        self._longer_side_px = int(model.metadata.get("longer_side", LONGER_SIDE_PX))
+        told = model.metadata.get("longer_side", str(LONGER_SIDE_PX))
+        if not (told.isdecimal() and 1 <= int(told) <= LARGEST_SIDE_PX):
+            raise InputError(
+                model.path, f"its metadata `longer_side` is {told[:40]!r}", "export it with a side in pixels"
+            )
+        self._longer_side_px = int(told)
         self._min_score = 0.4 if min_score is None else min_score
         names = names_of(model, None, None)
         if len(names) != 1:
