@@ -1,10 +1,14 @@
 """A small bird, and what several tests need of it. Motion and detections come from `jaxfit.simulation`."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from jaxfit.camera import Camera, crop_to_image, project
+from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird, free_limits, neutral_colours
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
@@ -133,6 +137,43 @@ def pose_window(bird: Bird, pose: Pose):
     rig = fold_bird(bird)
     A = window_transforms(rig, pose)
     return np.asarray(window_keypoints(rig, A, pose)), np.asarray(window_vertices(rig, A, pose))
+
+
+def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> Solution:
+    """A result that holds windows of poses, a track each, as the default camera sees them in these crops.
+
+    `crop` is x0, y0, size for all, or (N, 1, 3), (N, T, 3). All is valid, in pictures of the crop's size; whatever
+    else a test wants it replaces.
+    """
+    N, T = len(poses), len(poses[0].global_orient)
+
+    def every_frame(name: str, ndim: int) -> np.ndarray:
+        values = [np.asarray(getattr(pose, name)) for pose in poses]
+        return np.stack([np.broadcast_to(value, (T, *value.shape[value.ndim - ndim :])) for value in values])
+
+    keypoints = np.stack([pose_window(bird, pose)[0] for pose in poses])
+    crop, camera = np.broadcast_to(np.asarray(crop, float), (N, T, 3)), Camera()
+    return Solution(
+        track_id=np.arange(1, N + 1),
+        frame_index=np.arange(T),
+        valid=np.ones((N, T), bool),
+        global_orient=every_frame("global_orient", 1),
+        body_pose=every_frame("body_pose", 2),
+        transl=every_frame("transl", 1),
+        scale=every_frame("scale", 0),
+        bone_length=every_frame("bone_length", 1),
+        betas=every_frame("betas", 1),
+        keypoints_3d=keypoints,
+        keypoints_2d=crop_to_image(np.asarray(project(keypoints, camera)), crop, camera.size_px),
+        crop=crop,
+        image_size_px=np.full((N, T, 2), camera.size_px),
+        keypoint_names=bird.keypoint_names,
+        joint_names=bird.joint_names,
+        status=np.full(N, "ok"),
+        loss={},
+        focal=camera.focal_px,
+        crop_px=camera.size_px,
+    )
 
 
 def filled_mask(vertices_px, faces, size: int) -> np.ndarray:

@@ -6,14 +6,13 @@ import math
 
 import numpy as np
 import pytest
-from helpers import filled_mask, pose_window, toy_bird
+from helpers import filled_mask, pose_window, solution_of, toy_bird
 
 from jaxfit.camera import Camera, project
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import COLUMNS, evaluate
 from jaxfit.evaluation.metrics import longest_side_of_mask
 from jaxfit.fitting.posed import PosedBirds
-from jaxfit.fitting.solution import Solution
 from jaxfit.observations import Observations, encode_mask
 from jaxfit.simulation.motion import smooth_motion
 
@@ -57,34 +56,18 @@ def truth():
 
 
 def solution(**changes):
-    poses = posed()
-    keypoints = np.stack([pose_window(BIRD, pose)[0] for pose in poses])
+    return dataclasses.replace(known(), **changes)
 
-    def every_frame(name):
-        return np.stack([np.broadcast_to(getattr(p, name), (T, *np.shape(getattr(p, name))[-1:])) for p in poses])
 
-    values = {
-        "track_id": [5, 3],
-        "frame_index": [10, 11, 12, 14],
-        "valid": np.ones((N, T), bool),
-        "global_orient": np.stack([p.global_orient for p in poses]),
-        "body_pose": np.stack([p.body_pose for p in poses]),
-        "transl": np.stack([p.transl for p in poses]),
-        "scale": np.stack([np.broadcast_to(p.scale, T) for p in poses]),
-        "bone_length": every_frame("bone_length"),
-        "betas": every_frame("betas"),
-        "keypoints_3d": keypoints,
-        "keypoints_2d": np.asarray(project(keypoints, CAMERA)) + CORNER,
-        "crop": np.broadcast_to([*CORNER, 256.0], (N, T, 3)),
-        "image_size_px": np.broadcast_to([WIDTH, HEIGHT], (N, T, 2)),
-        "focal": CAMERA.focal_px,
-        "crop_px": 256,
-        "keypoint_names": BIRD.keypoint_names,
-        "joint_names": BIRD.joint_names,
-        "loss": {},
-        "status": ["ok"] * N,
-    }
-    return Solution(**values | changes)
+@functools.cache
+def known():
+    """A result that is the truth."""
+    return dataclasses.replace(
+        solution_of(BIRD, posed(), [*CORNER, 256]),
+        track_id=np.array([5, 3]),
+        frame_index=np.array([10, 11, 12, 14]),
+        image_size_px=np.full((N, T, 2), [WIDTH, HEIGHT]),
+    )
 
 
 def sides():

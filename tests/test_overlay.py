@@ -7,7 +7,7 @@ import functools
 import cv2
 import numpy as np
 import pytest
-from helpers import filled_mask, pose_window, toy_bird
+from helpers import filled_mask, pose_window, solution_of, toy_bird
 from scipy.spatial.transform import Rotation
 
 from jaxfit.camera import Camera, project
@@ -37,31 +37,15 @@ GREY = 120
 def solution(**changes) -> Solution:
     """Two birds beside each other; the second is away in the third frame."""
     poses = [smooth_motion(BIRD, T, seed) for seed in range(N)]
-    keypoints = np.stack([pose_window(BIRD, pose)[0] for pose in poses])
     valid = np.ones((N, T), bool)
     valid[1, 2] = False
-    crop = np.broadcast_to(np.array(CROPS, np.float32)[:, None], (N, T, 3))
-    crop_px = np.asarray(project(keypoints, CAMERA))
     values = {
-        "track_id": [4, 11],
+        "track_id": np.array([4, 11]),
         "frame_index": np.arange(FIRST, FIRST + T),
         "valid": valid,
-        **{name: np.stack([getattr(p, name) for p in poses]) for name in ("global_orient", "body_pose", "transl")},
-        "scale": np.stack([np.broadcast_to(p.scale, T) for p in poses]),
-        "bone_length": np.stack([np.broadcast_to(p.bone_length, (T, BIRD.num_joints - 1)) for p in poses]),
-        "betas": np.zeros((N, T, 0)),
-        "keypoints_3d": keypoints,
-        "keypoints_2d": crop_px * crop[:, :, None, 2:] / 256 + crop[:, :, None, :2],
-        "crop": crop,
         "image_size_px": np.where(valid[..., None], [WIDTH, HEIGHT], 0),
-        "focal": CAMERA.focal_px,
-        "crop_px": 256,
-        "keypoint_names": BIRD.keypoint_names,
-        "joint_names": BIRD.joint_names,
-        "loss": {},
-        "status": ["ok"] * N,
     }
-    return Solution(**values | changes)
+    return dataclasses.replace(solution_of(BIRD, poses, np.array(CROPS)[:, None]), **values | changes)
 
 
 def detections(size=(WIDTH, HEIGHT)) -> Observations:

@@ -7,12 +7,11 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import pose_window, skin_by_hand, toy_bird
+from helpers import pose_window, skin_by_hand, solution_of, toy_bird
 from scipy.spatial.transform import Rotation
 
 from jaxfit.errors import InputError
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
-from jaxfit.fitting.solution import Solution
 from jaxfit.model.pose import Pose
 
 OFFSET = np.float32([1, -2, 3])  # the root does not lie in the model's origin
@@ -28,31 +27,8 @@ WHOLE = [*(CENTRE - SCENE / 2), SCENE]
 
 def build(poses, crop=WHOLE, **changes):
     """A solution of N poses, each of T frames."""
-
-    def every_frame(name):
-        values = [np.asarray(getattr(pose, name)) for pose in poses]
-        return np.stack([np.broadcast_to(value, (T, *value.shape[-1:])) for value in values])
-
-    values = {
-        "track_id": np.array([5, 3]),
-        "frame_index": np.array(FRAMES),
-        "valid": np.ones((N, T), bool),
-        **{name: np.stack([getattr(p, name) for p in poses]) for name in ("global_orient", "body_pose", "transl")},
-        "scale": np.stack([np.broadcast_to(p.scale, T) for p in poses]),
-        "bone_length": every_frame("bone_length"),
-        "betas": every_frame("betas"),
-        "keypoints_3d": np.stack([pose_window(BIRD, pose)[0] for pose in poses]),
-        "keypoints_2d": np.zeros((N, T, K, 2)),
-        "crop": np.broadcast_to(np.asarray(crop, float), (N, T, 3)),
-        "image_size_px": np.full((N, T, 2), 256),
-        "focal": 2167.0,
-        "crop_px": 256,
-        "keypoint_names": BIRD.keypoint_names,
-        "joint_names": BIRD.joint_names,
-        "loss": {},
-        "status": np.array(["ok"] * N),
-    }
-    return Solution(**values | changes)
+    numbered = {"track_id": np.array([5, 3]), "frame_index": np.array(FRAMES)}
+    return dataclasses.replace(solution_of(BIRD, poses, crop), **numbered | changes)
 
 
 def random_poses(seed, scale=1.2):
