@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from jaxfit import __version__
+from jaxfit.codecs import CODECS
 from jaxfit.errors import InputError
 
 __all__ = ["main", "run", "use_cache"]
@@ -83,7 +84,7 @@ def use_cache() -> None:
 
 
 MODEL = "`murre`, or a model file (.npz) as `jaxfit model import` writes it"
-CODECS = ("auto", "h264", "vp9", "mpeg4")
+CODEC_NAMES = ("auto", *CODECS)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -127,7 +128,7 @@ def _fitting(add) -> None:
     overlay.add_argument("--observations", type=Path, metavar="OBS.json", help="draw the detected keypoints too")
     overlay.add_argument("--side-views", action="store_true", help="show every bird from the side as well")
     overlay.add_argument("--frame", type=int, help="draw this frame alone, as a picture (.png or .jpg)")
-    overlay.add_argument("--codec", default="auto", choices=CODECS)
+    overlay.add_argument("--codec", default="auto", choices=CODEC_NAMES)
     overlay.add_argument("--overwrite", action="store_true", help="replace earlier files of these names")
     overlay.set_defaults(run="overlay")
 
@@ -140,7 +141,7 @@ def _simulation(add) -> None:
     simulate.add_argument("--size", default="2592x1520", help="of the picture, pixels (default 2592x1520)")
     simulate.add_argument("--fps", type=float, default=25, help="frames a second (default 25)")
     simulate.add_argument("--seed", type=int, default=0, help="another seed gives another scene (default 0)")
-    simulate.add_argument("--codec", default="auto", choices=CODECS)
+    simulate.add_argument("--codec", default="auto", choices=CODEC_NAMES)
     simulate.add_argument("--overwrite", action="store_true", help="replace an earlier scene in that folder")
     simulate.set_defaults(run="simulate")
 

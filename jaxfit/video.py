@@ -15,24 +15,14 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
+from jaxfit.codecs import CODECS, CONTAINERS
 from jaxfit.decoding import EXACT
 from jaxfit.errors import InputError
 from jaxfit.storage import new_file
 
-__all__ = ["CODECS", "VideoWriter"]
+__all__ = ["VideoWriter"]
 
 _logger = logging.getLogger(__name__)
-
-CODECS = {
-    "h264": ("libx264", {"preset": "veryfast", "crf": "23", "x264-params": "cpu-independent=1"}),
-    "vp9": ("libvpx-vp9", {"deadline": "realtime", "cpu-used": "8", "row-mt": "1", "crf": "32", "b": "0"}),
-    "mpeg4": ("mpeg4", {"qmin": "3", "qmax": "5"}),
-}
-"""Name → encoder and its settings. Browsers play h264 and vp9; mpeg4 only players.
-
-Without ``cpu-independent`` x264 wrote other bytes in every third run, on one machine and even by one thread."""
-CONTAINERS = {".mp4": ("h264", "vp9", "mpeg4"), ".webm": ("vp9",)}
-"""A file's ending decides the container; its codecs, the first that this installation has being taken."""
 
 # As many on every machine: some encoders split a picture by threads, and with it the bytes they write.
 _THREADS = 4

@@ -45,7 +45,7 @@ class Overlay(NamedTuple):
     """Width and height of the video, as written."""
     fps: float
     codec: str
-    """Name of `jaxfit.video.CODECS`."""
+    """Name of `jaxfit.codecs.CODECS`."""
     fallback: bool
     """Whether the codec is another than the one asked for; a warning says so."""
 
