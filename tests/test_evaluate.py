@@ -11,6 +11,7 @@ from helpers import filled_mask, pose_window, solution_of, toy_bird
 from jaxfit.camera import Camera, project
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import COLUMNS, evaluate
+from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.metrics import longest_side_of_mask
 from jaxfit.fitting.posed import PosedBirds
 from jaxfit.observations import Observations, encode_mask
@@ -189,6 +190,18 @@ def test_poses_that_the_truth_lacks():
     confidence = truth().confidence * valid[..., None]
     away = dataclasses.replace(truth(), present=valid, confidence=confidence, masks={})
     assert evaluate(solution(), BIRD, away).unmatched == 0  # the truth may annotate a frame in part
+
+
+def test_a_bird_without_a_track_is_missing():
+    result = evaluate(solution(track_id=[5, 99]), BIRD, truth())
+    assert (result.frames, result.missing, result.unmatched) == (T, T, T)
+
+
+def test_tracks_named_by_a_tracker():
+    """The same figures as with the truth's ids, once the tracks are matched."""
+    own, matching = match_tracks(solution(track_id=[3, 8]), truth())
+    assert (matching.by, matching.follows) == ("overlap", {3: 5, 8: 3})
+    assert evaluate(own, BIRD, truth()) == evaluate(solution(), BIRD, truth())
 
 
 def test_the_truth_of_another_video_is_told(caplog):

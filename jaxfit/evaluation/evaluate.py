@@ -41,7 +41,8 @@ class Evaluation:
     frames: int
     """Birds × frames measured."""
     missing: int
-    """Annotated birds × frames that the result has no pose for; they enter no metric."""
+    """Annotated birds × frames that the result has no pose for, also those of tracks that it lacks; they enter no
+    metric."""
     unmatched: int = 0
     """Poses × frames of the result whose track or frame the truth lacks; they enter no metric."""
     frames_3d: int = 0
@@ -60,7 +61,9 @@ def evaluate(
     truth_solution: Solution | None = None,
     truth_bird: Bird | None = None,
 ) -> Evaluation:
-    """Compare a result with annotations of the same video, matched by track and frame number.
+    """Compare a result with annotations of the same video, matched by track id and frame number.
+
+    Tracks that a tracker named are given the truth's ids by `match_tracks` first.
 
     PCK counts annotated keypoints, hidden ones included, within 5 and 10 % of the longer side of the annotated mask
     (of the box where there is no mask); IoU compares the mesh's hard mask with the annotated one, the whole bird's
@@ -144,7 +147,7 @@ def evaluate(
         row(slice(None)),
         tracks,
         int(measured.sum()),
-        int((annotated & ~measured).sum()),
+        int(truth.present.sum() - measured.sum()),
         int(unmatched.sum()),
         int(spatial.measured.sum()) if spatial else 0,
         spatial.points if spatial else "",
