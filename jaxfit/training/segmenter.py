@@ -31,8 +31,8 @@ SIDE_PX = 288
 """Of the square pictures learnt from."""
 PIXELS_A_UNIT = 4.2, 11.5
 """Scales learnt, pixels across 2 cm in the network's input; a ledge 2.5 m across on 864 pixels has 6.9."""
-CENTRE_SIGMA = 0.07
-"""Width of a centre's peak, as a share of the root of its bird's area times four."""
+CENTRE_SIGMA = 0.14
+"""Width of a centre's peak, as a share of the root of its bird's area."""
 LEAST_AREA_PX = 20
 """Birds of which less is seen than this are neither learnt as birds nor as ground."""
 
@@ -113,9 +113,9 @@ def _targets(owner: np.ndarray) -> tuple[np.ndarray, ...]:
             certain[mine] = 0
             continue
         x, y = at[columns].mean(), at[rows].mean()
-        sigma = max(CENTRE_SIGMA * 4 * np.sqrt(area) / 2, 2.5)
+        sigma = max(CENTRE_SIGMA * np.sqrt(area), 2.5)
         peak = np.exp(-((at - y)[:, None] ** 2 + (at - x)[None] ** 2) / (2 * sigma**2))
-        centre = np.maximum(centre, peak)
+        centre = np.maximum(centre, peak.astype(np.float32))
         offset[0][mine], offset[1][mine] = (x - at[columns]) / OFFSET_UNIT_PX, (y - at[rows]) / OFFSET_UNIT_PX
         pulls[mine] = 1 / len(rows)
     low = cv2.erode(cells, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)

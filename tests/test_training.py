@@ -1,0 +1,193 @@
+"""Training on simulated frames: labels, samples, losses and what is exported. Needs the extra `train`."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
+
+from jaxfit.errors import InputError  # noqa: E402
+from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
+from jaxfit.perception.keypoints import load_keypoint_detector  # noqa: E402
+from jaxfit.perception.onnx_model import OnnxModel  # noqa: E402
+from jaxfit.perception.segmentation import load_segmenter  # noqa: E402
+from jaxfit.training import keypoints, scenes, segmenter  # noqa: E402
+from jaxfit.training.augment import randomise  # noqa: E402
+from jaxfit.training.networks import FeaturePyramid  # noqa: E402
+from jaxfit.training.scenes import FRAMES_A_SCENE, LabelledFrames, film_scenes, load_frames  # noqa: E402
+from jaxfit.training.train import train_network  # noqa: E402
+
+K = len(MURRE_KEYPOINTS)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames") / "frames"
+    film_scenes(folder, range(1), workers=1)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def frames(folder):
+    return load_frames(folder)
+
+
+def two_squares():
+    """Two white squares on black, 10 pixels to the unit: bird 1 left, bird 2 right, keypoints along the diagonal."""
+    pictures, owner = np.zeros((1, 400, 600, 3), np.uint8), np.zeros((1, 400, 600), np.uint8)
+    points, seen = np.zeros((1, 3, K, 2), np.float32), np.zeros((1, 3, K), np.uint8)
+    for n, x0 in enumerate((100, 300)):
+        owner[0, 150:250, x0 : x0 + 100] = n + 1
+        pictures[0, 150:250, x0 : x0 + 100] = 255
+        points[0, n] = np.linspace((x0 + 5, 155), (x0 + 95, 245), K)
+        seen[0, n] = 2
+    return LabelledFrames(pictures, owner, points, seen, np.array([10.0], np.float32))
+
+
+def test_labels_agree_with_each_other(frames):
+    assert frames.pictures.shape[0] == FRAMES_A_SCENE
+    assert frames.pictures.std() > 10
+    seen = np.argwhere(frames.seen == 2)
+    assert len(seen) > 100
+    own = 0
+    for s, n, k in seen:
+        x, y = frames.keypoints_px[s, n, k].astype(int)
+        own += (frames.owner[s, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] == n + 1).any()
+    assert own > 0.99 * len(seen)  # what is seen of a bird lies on it; the thinnest tips fall between pixels
+
+
+def test_the_same_seed_gives_the_same_frames(frames):
+    again = scenes._film(0)
+    assert np.array_equal(again.owner, frames.owner)
+    assert np.array_equal(again.pictures, frames.pictures)
+
+
+def test_randomised_birds_stay_where_they_are():
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 256, (96, 96, 3), np.uint8)
+    birds = np.zeros((96, 96), bool)
+    birds[30:60, 30:60] = True
+    results = [randomise(np.random.default_rng(i), picture, birds) for i in range(40)]
+    assert all(result.shape == picture.shape and result.dtype == np.uint8 for result in results)
+    assert np.array_equal(results[3], randomise(np.random.default_rng(3), picture, birds))
+    assert np.std([result.mean() for result in results]) > 10
+
+
+def test_segmenter_targets():
+    """Every cell of a square points to its middle, wherever it was turned to."""
+    tried = 0
+    for i in range(12):
+        sample = segmenter.draw_sample(np.random.default_rng(i), two_squares())
+        side = segmenter.SIDE_PX // segmenter.STRIDE
+        at = (np.indices((side, side))[::-1] + 0.5) * segmenter.STRIDE
+        ends = at + sample.offset * segmenter.OFFSET_UNIT_PX
+        birds = sample.pulls[0] > 0
+        weights = np.unique(np.round(sample.pulls[0][birds], 8))
+        assert len(weights) == np.round(sample.pulls.sum())  # each bird weighs 1, both are of another size as cut
+        for weight in weights:
+            mine = np.abs(sample.pulls[0] - weight) < 1e-7
+            assert ends[:, mine].std(axis=1).max() < 1e-3
+            tried += 1
+        assert sample.foreground[0][birds].mean() > 0.9
+    assert tried > 8
+
+
+def test_keypoint_targets():
+    """Keypoints lie on the diagonal of a square, evenly, also when it is turned, mirrored and cut."""
+    for i in range(12):
+        sample = keypoints.draw_sample(np.random.default_rng(i), two_squares())
+        place = sample.place
+        order = keypoints._MIRRORED
+        for candidate in (place, place[order]):
+            steps = np.diff(candidate, axis=0)
+            if np.ptp(steps, axis=0).max() < 1e-3:
+                break
+        else:
+            pytest.fail("the keypoints are no longer on a line")
+        assert np.hypot(*steps.mean(0)) * (K - 1) * keypoints.STRIDE > 60  # the square fills much of its crop
+        assert (sample.present == ((place >= 0) & (place < 48)).all(-1)).all()
+
+
+def test_losses_are_least_where_the_maps_are_right():
+    sample = segmenter.draw_sample(np.random.default_rng(1), two_squares())
+    batch = segmenter.SegmenterSample(*(torch.from_numpy(part)[None] for part in sample))
+    right = {
+        "foreground": 20 * (batch.foreground - 0.5),
+        "centre": batch.centre.clone(),
+        "offset": batch.offset.clone(),
+    }
+    best = segmenter.loss(right, batch)
+    assert best["centre"] < 1e-9
+    assert best["offset"] < 1e-9
+    for name in right:
+        worse = segmenter.loss({**right, name: right[name] + 1.0}, batch)
+        assert worse[name] > best[name]
+
+    crop = keypoints.draw_sample(np.random.default_rng(1), two_squares())
+    crops = keypoints.KeypointSample(*(torch.from_numpy(part)[None] for part in crop))
+    logits = torch.full((1, K, 48, 48), -30.0)
+    centres = torch.arange(48) + 0.5
+    for k, (x, y) in enumerate(crop.place):
+        if crop.present[k]:
+            logits[0, k] = 20 - ((centres - x) ** 2 + (centres[:, None] - y) ** 2) / (2 * keypoints.SIGMA_CELLS**2)
+    nowhere = torch.full((1, K, 48, 48), -30.0)
+    near = keypoints.loss({"logits": logits}, crops)["place"]
+    flat = keypoints.loss({"logits": torch.zeros(1, K, 48, 48)}, crops)["place"]
+    assert flat == pytest.approx(np.log(48 * 48 + 1), rel=1e-4)  # every place as likely as any other
+    assert near < 0.5 * flat
+    assert near < keypoints.loss({"logits": nowhere}, crops)["place"]
+
+
+def test_peaks_are_probabilities():
+    class Logits(torch.nn.Module):
+        def forward(self, pictures):
+            logits = torch.full((1, 3, 12, 12), -20.0)
+            logits[0, 0, 5, 7] = 20.0  # surely here
+            logits[0, 1, 3, 3] = 0.0  # here or nowhere
+            return {"logits": logits}
+
+    maps = keypoints.Peaks(Logits(), 3)(torch.zeros(1, 3, 48, 48))[0]
+    assert maps[0, 5, 7] == pytest.approx(1, abs=1e-3)
+    assert maps[1, 3, 3] == pytest.approx(0.5, abs=1e-3)
+    assert maps[2].max() < 1e-3
+    assert maps[0].argmax() == 5 * 12 + 7
+
+
+def test_pyramid_strides():
+    network = FeaturePyramid((4, 8, 12), (0, 1, 1), (8, 6), {"a": 2, "b": 1}).eval()
+    maps = network(torch.zeros(1, 3, 32, 48))
+    assert {name: tuple(map_.shape) for name, map_ in maps.items()} == {"a": (1, 2, 16, 24), "b": (1, 1, 16, 24)}
+
+
+def test_a_segmenter_learns_and_is_read_back(folder, frames, tmp_path):
+    losses = train_network("segmenter", tmp_path / "s.onnx", folder, scenes=1, steps=10)
+    assert set(losses) == {"foreground", "centre", "offset"}
+    model = OnnxModel(tmp_path / "s.onnx")
+    assert "no real footage" in model.metadata["trained_on"]
+    assert "/" not in "".join(model.metadata.values()).replace("<", "")  # nobody's paths
+    assert load_segmenter(tmp_path / "s.onnx").class_names == ("bird",)
+    outputs = model(np.zeros((1, 3, 64, 96), np.float32))
+    assert outputs["foreground"].shape == (1, 1, 32, 48)
+    assert (tmp_path / "s.onnx").stat().st_size < 3.5e6
+
+
+def test_keypoints_are_learnt_and_read_back(folder, tmp_path):
+    train_network("keypoints", tmp_path / "k.onnx", folder, scenes=1, steps=10)
+    detector = load_keypoint_detector(tmp_path / "k.onnx")
+    assert detector.keypoint_names == MURRE_KEYPOINTS
+    assert (tmp_path / "k.onnx").stat().st_size < 4.8e6
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"scenes": 0}, "scenes"),
+        ({"scenes": 3}, "holds 1 scenes"),
+        ({"steps": 3}, "steps"),
+        ({"path": "n.pt"}, ".onnx"),
+    ],
+)
+def test_refusals(folder, tmp_path, arguments, said):
+    path = tmp_path / arguments.pop("path", "n.onnx")
+    with pytest.raises(InputError, match=said):
+        train_network("segmenter", path, folder, **{"scenes": 1, **arguments})
+    assert not path.exists()
