@@ -18,13 +18,15 @@ def write_graph(
     constants: Mapping[str, np.ndarray] | None = None,
     metadata: Mapping[str, str] | None = None,
     kind: int = TensorProto.FLOAT,
+    output_kinds: Mapping[str, int] | None = None,
 ) -> Path:
-    """Names with their shapes (a word or None for a free side); inputs are of `kind`, outputs floats."""
+    """Names with their shapes (a word or None for a free side); inputs are of `kind`, outputs floats unless told."""
+    kinds = dict.fromkeys(outputs, TensorProto.FLOAT) | dict(output_kinds or {})
     graph = helper.make_graph(
         nodes,
         "test",
         [helper.make_tensor_value_info(name, kind, shape) for name, shape in inputs.items()],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in outputs.items()],
+        [helper.make_tensor_value_info(name, kinds[name], shape) for name, shape in outputs.items()],
         [numpy_helper.from_array(value, name) for name, value in (constants or {}).items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)
@@ -55,3 +57,29 @@ def write_constant(
         nodes.append(helper.make_node("Add", [f"{name}_value", f"{name}_zeros"], [name]))
     shapes = {name: (input_shape[0], *np.shape(value)) for name, value in outputs.items()}
     return write_graph(path, {"input": input_shape}, shapes, nodes, constants, metadata, kind)
+
+
+def write_reading(
+    path: Path,
+    input_shape: Sequence,
+    outputs: Mapping[str, np.ndarray],
+    read: Mapping[str, Mapping[tuple[int, ...], tuple[int, ...]]],
+    metadata: Mapping[str, str] | None = None,
+    kind: int = TensorProto.FLOAT,
+) -> Path:
+    """A network whose outputs are constant but for what it reads of its input.
+
+    `read`: output → index into it → index of the input whose value stands there.
+    """
+    nodes, constants = [helper.make_node("Cast", ["images"], ["numbers"], to=TensorProto.FLOAT)], {}
+    for name, value in outputs.items():
+        constants[f"{name}_value"] = np.asarray(value, np.float32)
+        if name not in read:
+            nodes.append(helper.make_node("Identity", [f"{name}_value"], [name]))
+            continue
+        constants[f"{name}_to"] = np.array(list(read[name]), np.int64)
+        constants[f"{name}_from"] = np.array(list(read[name].values()), np.int64)
+        nodes.append(helper.make_node("GatherND", ["numbers", f"{name}_from"], [f"{name}_read"]))
+        nodes.append(helper.make_node("ScatterND", [f"{name}_value", f"{name}_to", f"{name}_read"], [name]))
+    shapes = {name: np.shape(value) for name, value in outputs.items()}
+    return write_graph(path, {"images": input_shape}, shapes, nodes, constants, metadata, kind)
