@@ -18,7 +18,7 @@ from av.video.reformatter import Interpolation
 from jaxtyping import UInt8
 
 from jaxfit.errors import InputError
-from jaxfit.timeline import Place, Timeline
+from jaxfit.timeline import Packet, Place, Timeline
 
 __all__ = ["EXACT", "Frame", "decode", "frame_rate", "opened"]
 
@@ -27,10 +27,11 @@ _logger = logging.getLogger(__name__)
 EXACT = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.BITEXACT
 """Colours are converted alike on every machine."""
 
-_LISTED = ("mov,mp4,m4a,3gp,3g2,mj2", "avi")  # containers that list their packets
-_STAMPED = ("mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm")  # every packet has a time stamp of its own: seeks are exact
+_MATROSKA = "matroska,webm"
+_STAMPED = ("mov,mp4,m4a,3gp,3g2,mj2", _MATROSKA)  # every packet has a time stamp of its own: seeks are exact
 _REORDERED = ("h264", "hevc")  # AVI has no time stamps, and nothing makes up right ones for these
 _CHUNK_HEADER = 8  # bytes between what AVI's index names and the packet
+_MOST_HEADERS = 1024  # bytes between packets of Matroska that need no explanation
 
 
 class Frame(NamedTuple):
@@ -69,14 +70,14 @@ def decode(path: Path, wanted: range, stopped: Callable[[], bool]) -> Generator[
             return
     with opened(path) as (container, stream):
         line = _timeline(container, stream)
-        yield from _read(path, container, stream, container.demux(stream), line, wanted, stopped)
+        yield from _read(path, container, stream, _demuxed(container, stream), line, wanted, stopped)
 
 
 def _read(
     path: Path,
     container: Any,
     stream: Any,
-    packets: Iterator[Any],
+    packets: Iterator[tuple[Any, bool]],
     line: Timeline,
     wanted: range,
     stopped: Callable[[], bool],
@@ -114,21 +115,19 @@ def _read(
     _warn_if_short(path, container, stream, line, problem)
 
 
-def _decoded(packets: Iterator[Any], stream: Any, line: Timeline, stopped: Callable[[], bool]) -> Iterator[Any]:
+def _decoded(
+    packets: Iterator[tuple[Any, bool]], stream: Any, line: Timeline, stopped: Callable[[], bool]
+) -> Iterator[Any]:
     """Pictures as the decoder gives them; every packet is told to the timeline before."""
     problem = None
     packets = _checked_by_index(packets, stream, line)
     while not stopped():
         try:
-            packet = next(packets, None)
+            packet, torn = next(packets, (None, False))
         except av.error.FFmpegError as error:  # of the container: what is in the decoder still comes
-            problem, packet = error, None
-        if packet is not None and not packet.size:
-            if packet.dts is not None:
-                continue  # AVI's way to repeat a picture
-            packet = None  # the container's last one
+            problem, packet, torn = error, None, False
         if packet is not None:
-            _add(line, packet)
+            _add(line, packet, torn)
         try:
             pictures = stream.decode(packet)  # nothing more empties the decoder
         except av.error.FFmpegError:  # of one packet: its frame is missed when the next comes
@@ -140,25 +139,40 @@ def _decoded(packets: Iterator[Any], stream: Any, line: Timeline, stopped: Calla
         raise problem
 
 
-def _add(line: Timeline, packet: Any) -> Any:
+def _add(line: Timeline, packet: Any, torn: bool) -> Packet | None:
     # VP8 has packets that only serve as references: a bit of their first byte says so
     hidden = packet.stream.codec_context.name == "vp8" and not memoryview(packet)[0] & 0x10
     if hidden or packet.is_discard:
         line.skipped += 1
         return None
-    return line.add(packet.pts, packet.is_keyframe, corrupt=packet.is_corrupt)
+    return line.add(packet.pts, packet.is_keyframe, corrupt=packet.is_corrupt, torn=torn)
 
 
-def _checked_by_index(packets: Iterator[Any], stream: Any, line: Timeline) -> Iterator[Any]:
+def _demuxed(container: Any, stream: Any) -> Iterator[tuple[Any, bool]]:
+    """The packets of a stream, none of them empty, and whether bytes were skipped before each."""
+    matroska, end, torn = container.format.name == _MATROSKA, None, False
+    # only all streams together fill a file
+    for packet in container.demux() if matroska else container.demux(stream):
+        if not packet.size:  # AVI's way to repeat a picture; the last of every stream
+            continue
+        if matroska and packet.pos is not None:
+            torn = torn or (end is not None and packet.pos - end > _MOST_HEADERS)
+            end = packet.pos + packet.size
+        if packet.stream_index == stream.index:
+            yield packet, torn
+            torn = False
+
+
+def _checked_by_index(packets: Iterator[tuple[Any, bool]], stream: Any, line: Timeline) -> Iterator[tuple[Any, bool]]:
     """AVI counts packets to know their time: where damage hides some, its index tells the right one."""
     index = stream.index_entries
     if stream.container.format.name != "avi" or len(index) < max(1, stream.frames):
         yield from packets
         return
     at, trusted = 0, None
-    for packet in packets:
+    for packet, torn in packets:
         trusted = packet.pos == index[0].pos + _CHUNK_HEADER if trusted is None else trusted
-        if trusted and packet.size and packet.pos is not None and packet.dts is not None:
+        if trusted and packet.pos is not None and packet.dts is not None:
             while at < len(index) and index[at].pos + _CHUNK_HEADER < packet.pos:
                 if index[at].size:
                     line.add(index[at].timestamp, index[at].is_keyframe, lost=True)
@@ -168,27 +182,27 @@ def _checked_by_index(packets: Iterator[Any], stream: Any, line: Timeline) -> It
             shift, at = index[at].timestamp - packet.dts, at + 1
             packet.pts = None if packet.pts is None else packet.pts + shift
             packet.dts += shift
-        yield packet
+        yield packet, torn
 
 
 def _begin(
     container: Any, stream: Any, start: int, stopped: Callable[[], bool]
-) -> tuple[Iterator[Any], Timeline] | None:
+) -> tuple[Iterator[tuple[Any, bool]], Timeline] | None:
     """Packets from a keyframe before a frame on, or from the first; None where the keyframe is not found again."""
     if not start or container.format.name not in _STAMPED:
-        return container.demux(stream), _timeline(container, stream)
+        return _demuxed(container, stream), _timeline(container, stream)
     found = _keyframe(container, stream, start, stopped)
     if found is None:
         return None
     place, mark = found
     try:
         container.seek(place.stamp, stream=stream)
-        packets = container.demux(stream)
-        for packet in packets:
+        packets = _demuxed(container, stream)
+        for packet, _ in packets:
             if stopped():
                 return None
             if _mark(packet) == mark:
-                return chain([packet], packets), _timeline(container, stream, place)
+                return chain([(packet, False)], packets), _timeline(container, stream, place)
     except av.error.FFmpegError:
         pass
     return None
@@ -200,10 +214,10 @@ def _keyframe(container: Any, stream: Any, start: int, stopped: Callable[[], boo
     waiting: dict[int, tuple] = {}
     found: deque[tuple[Place, tuple]] = deque(maxlen=3)
     try:
-        for packet in container.demux(stream):
+        for packet, torn in _demuxed(container, stream):
             if stopped():
                 return None
-            added = _add(line, packet) if packet.size else None
+            added = _add(line, packet, torn)
             if not line.stamped:
                 return None
             if added is not None and added.starts:
@@ -227,7 +241,8 @@ def _mark(packet: Any) -> tuple:
 
 def _timeline(container: Any, stream: Any, place: Place | None = None) -> Timeline:
     rate, kind = frame_rate(stream), container.format.name
-    interval = float(1 / (rate * stream.time_base)) if rate and kind not in _LISTED else None
+    # where a hole in the file is noticed, its frames can be counted; mp4 and AVI list their packets
+    interval = float(1 / (rate * stream.time_base)) if rate and kind == _MATROSKA else None
     return Timeline(interval, not (kind == "avi" and stream.codec_context.name in _REORDERED), place)
 
 

@@ -173,7 +173,7 @@ def _ahead(source: Callable[[Callable[[], bool]], Generator[Frame | int, None, N
     finally:
         stopping.set()
         free.release()
-        if thread.ident is not None and thread is not current_thread():  # a garbage collection may end it anywhere
+        if thread.is_alive() and thread is not current_thread():  # a garbage collection may end it anywhere
             thread.join()
 
 

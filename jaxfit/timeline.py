@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 __all__ = ["Packet", "Place", "Timeline"]
 
+_REORDER = 16  # pictures that codecs hold back at most, to show them in another order
+
 
 class Packet(NamedTuple):
     """What numbering needs of a packet; they sort by time."""
@@ -41,16 +43,16 @@ class Timeline:
     """Gives every packet its number, in the order of time stamps, and every decoded picture that of its packet.
 
     A number is a rank: how many of the file's packets are to be shown earlier. It needs no frame rate, holds for a
-    variable one, and does not change when a picture cannot be decoded. Two cases differ. Where packets themselves are
-    lost and the container keeps no list of them, a gap in steps that were even so far counts as the frames that
-    the rate puts there; where steps are uneven, nobody can know, and the count goes on. Where time stamps are
+    variable one, and does not change when a picture cannot be decoded. Two cases differ. Where damage hides packets
+    and the container keeps no list of them, a gap in steps that were even so far counts as the frames that the
+    rate puts there; where steps are uneven, nobody can know, and the count goes on. Where time stamps are
     missing or contradict each other, pictures are counted as they are decoded.
 
     A picture that is damaged or does not come spoils what is decoded after it, up to the next keyframe: decoders
     do not say which of these pictures repeat the damage.
 
     Args:
-        interval: ticks between frames, to find gaps by; None where the container lists its packets.
+        interval: ticks between frames, to fill gaps by; None where that is unknown.
         stamped: False where time stamps are known to be guesses.
         place: the keyframe that the first packet is; None begins the file.
     """
@@ -70,13 +72,22 @@ class Timeline:
         self._interval = interval
         self._steady = place is None or place.steady
         self._order = self._group = 0
+        self._torn = -math.inf
         self._key_stamp = -math.inf
         self._pending: list[Packet] = []
         self._held: deque[tuple[int, Packet, Any]] = deque()
         self._spoilt: dict[int, int] = {}
 
-    def add(self, stamp: int | None, starts: bool, *, lost: bool = False, corrupt: bool = False) -> Packet | None:
-        """Take a packet, in the order of the file; None where its frame comes before the place to begin at."""
+    def add(
+        self, stamp: int | None, starts: bool, *, lost: bool = False, corrupt: bool = False, torn: bool = False
+    ) -> Packet | None:
+        """Take a packet, in the order of the file; None where its frame comes before the place to begin at.
+
+        Args:
+            stamp, starts, lost: as `Packet` has them.
+            corrupt: the container knows it as damaged.
+            torn: the container skipped bytes before it, and whatever packets were in them.
+        """
         if self.stamped and (stamp is None or (self.last is not None and stamp <= self.last)):
             self._count()
         if self.stamped and stamp is not None and stamp < self._floor:
@@ -89,9 +100,12 @@ class Timeline:
         packet = Packet(stamp, self._order, groups, starts, lost)
         self._order += 1
         heapq.heappush(self._pending, packet)
-        if lost:  # the time stamps of its neighbours are guesses
-            self._spoil(min((one for one in self._pending if groups[-1] in one.groups), key=lambda one: one.order))
-        elif corrupt:
+        if torn:
+            self._torn = packet.order
+        if lost:  # what is in the decoder comes out of order, if it comes
+            for one in self._pending:
+                self._spoil(one)
+        elif corrupt or (torn and not starts):
             self._spoil(packet)
         return packet
 
@@ -116,8 +130,10 @@ class Timeline:
                     return  # damage upsets the order, too: its number was given up already
                 self._count()
         if not self.stamped:
-            came = [packet.stamp for packet in self._pending if not packet.lost]
-            stamp = min(came) if came else self._order
+            came = [packet for packet in self._pending if not packet.lost]
+            # a keyframe is known again: whatever was to be shown before it has not come
+            keys = [packet for packet in came if packet.starts] if picture.key_frame else []
+            stamp = min(keys or came).stamp if came else self._order
             if not came:
                 self.add(None, picture.key_frame)
         self._miss(math.inf if stamp is None else stamp)
@@ -160,11 +176,9 @@ class Timeline:
             return 0
         steps = (packet.stamp - self.last) / self._interval
         # time stamps are rounded to whole ticks, of which an interval may have few
-        self._steady = abs(steps - round(steps)) * self._interval <= 1 + 0.02 * self._interval and round(steps) >= 1
-        lost = round(steps) - 1 if self._steady else 0
-        if lost and not packet.starts:
-            self._spoil(packet)
-        return lost
+        even = abs(steps - round(steps)) * self._interval <= 1 + 0.02 * self._interval
+        self._steady = even and (round(steps) == 1 or packet.order <= self._torn + _REORDER)
+        return max(0, round(steps) - 1) if self._steady else 0
 
     def _miss(self, before: float) -> None:
         for number, packet, there in self.settle(before):
