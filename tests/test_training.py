@@ -12,11 +12,13 @@ from jaxfit.perception.onnx_model import OnnxModel  # noqa: E402
 from jaxfit.perception.segmentation import load_segmenter  # noqa: E402
 from jaxfit.training import keypoints, scenes, segmenter  # noqa: E402
 from jaxfit.training.augment import randomise  # noqa: E402
+from jaxfit.training.loop import Schedule  # noqa: E402
 from jaxfit.training.networks import FeaturePyramid  # noqa: E402
 from jaxfit.training.scenes import FRAMES_A_SCENE, LabelledFrames, film_scenes, load_frames  # noqa: E402
 from jaxfit.training.train import train_network  # noqa: E402
 
 K = len(MURRE_KEYPOINTS)
+QUICK = Schedule(20, 2, 1e-3)
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +161,7 @@ def test_pyramid_strides():
 
 
 def test_a_segmenter_learns_and_is_read_back(folder, frames, tmp_path):
-    losses = train_network("segmenter", tmp_path / "s.onnx", folder, scenes=1, steps=10)
+    losses = train_network("segmenter", tmp_path / "s.onnx", folder, scenes=1, schedule=QUICK)
     assert set(losses) == {"foreground", "centre", "offset"}
     model = OnnxModel(tmp_path / "s.onnx")
     assert "no real footage" in model.metadata["trained_on"]
@@ -171,7 +173,7 @@ def test_a_segmenter_learns_and_is_read_back(folder, frames, tmp_path):
 
 
 def test_keypoints_are_learnt_and_read_back(folder, tmp_path):
-    train_network("keypoints", tmp_path / "k.onnx", folder, scenes=1, steps=10)
+    train_network("keypoints", tmp_path / "k.onnx", folder, scenes=1, schedule=QUICK)
     detector = load_keypoint_detector(tmp_path / "k.onnx")
     assert detector.keypoint_names == MURRE_KEYPOINTS
     assert (tmp_path / "k.onnx").stat().st_size < 4.8e6
@@ -182,7 +184,7 @@ def test_keypoints_are_learnt_and_read_back(folder, tmp_path):
     [
         ({"scenes": 0}, "scenes"),
         ({"scenes": 3}, "holds 1 scenes"),
-        ({"steps": 3}, "steps"),
+        ({"schedule": QUICK._replace(steps=3)}, "steps"),
         ({"path": "n.pt"}, ".onnx"),
     ],
 )

@@ -33,7 +33,7 @@ def train_network(
     path: str | Path,
     frames_folder: str | Path,
     scenes: int = SCENES,
-    steps: int | None = None,
+    schedule: Schedule | None = None,
     seed: int = 0,
     progress: ProgressTask = silent,
 ) -> dict[str, float]:
@@ -44,7 +44,7 @@ def train_network(
         path: the `.onnx` file to write; an earlier one is replaced.
         frames_folder: where the simulated frames are, or are filmed to; about 32 MB a scene.
         scenes: how many to learn from, at most 900.
-        steps: of training; None takes those of `SCHEDULES`.
+        schedule: of training; None takes that of `SCHEDULES`.
         seed: of the network's first numbers and of the samples.
         progress: told of scenes and steps.
 
@@ -57,11 +57,11 @@ def train_network(
     """
     if which not in SCHEDULES:
         raise ValueError(f"which must be one of {', '.join(SCHEDULES)}, not {which!r}")
-    schedule = SCHEDULES[which]._replace(steps=steps or SCHEDULES[which].steps)
+    schedule = schedule or SCHEDULES[which]
     if not 1 <= scenes <= 900:
         raise InputError("train: scenes", f"{scenes} is no number to learn from", "give 1 to 900")
-    if schedule.steps < 10:
-        raise InputError("train: steps", f"{schedule.steps} teach nothing", "give 10 or more")
+    if schedule.steps < 20:
+        raise InputError("train: steps", f"{schedule.steps} teach nothing", "give 20 or more")
     if Path(path).suffix != ".onnx":
         raise InputError(path, "is named as no network", "end it in .onnx")
     frames = _frames(Path(frames_folder), scenes, progress)
