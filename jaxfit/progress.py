@@ -12,18 +12,18 @@ __all__ = ["ProgressTask", "Tick", "silent", "terminal"]
 
 Tick = Callable[[float, str], None]
 """Called with the amount of work just done and a short note."""
-ProgressTask = Callable[[str, float], AbstractContextManager[Tick]]
-"""Opens a task of a given name and total amount of work."""
+ProgressTask = Callable[[str, float | None], AbstractContextManager[Tick]]
+"""Opens a task of a given name and total amount of work; None where nobody knows it."""
 
 
 @contextmanager
-def silent(_name: str, _total: float) -> Iterator[Tick]:
+def silent(_name: str, _total: float | None) -> Iterator[Tick]:
     """Report nothing."""
     yield lambda _done, _note: None
 
 
 @contextmanager
-def terminal(name: str, total: float) -> Iterator[Tick]:
+def terminal(name: str, total: float | None) -> Iterator[Tick]:
     """A bar with elapsed and remaining time on stderr; plain lines where that is not a terminal."""
     console = Console(stderr=True)
     columns = (
