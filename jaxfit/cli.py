@@ -115,9 +115,15 @@ def _fitting(add) -> None:
     fit.add_argument("--overwrite", action="store_true", help="replace an earlier result in that folder")
     fit.set_defaults(run="fit")
 
-    evaluate = add("evaluate", help="compare a result with annotations, or with a simulated scene's truth")
-    evaluate.add_argument("result", type=Path, metavar="DIR")
+    evaluate = add("evaluate", help="compare a result, or observations, with annotations or a scene's truth")
+    evaluate.add_argument("result", type=Path, metavar="DIR|OBS.json")
     evaluate.add_argument("--truth", type=Path, required=True, help="COCO file of annotations, or a simulated scene")
+    evaluate.add_argument(
+        "--match",
+        choices=("auto", "ids", "overlap"),
+        default="auto",
+        help="whose track of DIR is whose (default auto: by ids, unless a track follows another bird than its id's)",
+    )
     evaluate.add_argument("--json", action="store_true", help="print JSON instead of tables")
     evaluate.set_defaults(run="evaluate")
 

@@ -50,22 +50,49 @@ def fit(options: argparse.Namespace) -> None:
 
 def evaluate(options: argparse.Namespace) -> None:
     from jaxfit.evaluation.evaluate import evaluate
+    from jaxfit.evaluation.matching import match_tracks
     from jaxfit.evaluation.truth import read_truth
     from jaxfit.fitting.solution import load_solution
+    from jaxfit.observation_tables import matching_line
 
+    if options.result.is_file():
+        _evaluate_observations(options)
+        return
     solution, bird = load_solution(options.result)
     truth, poses, truth_bird = read_truth(options.truth)
+    solution, matching = match_tracks(solution, truth, options.match, options.truth)
     result = evaluate(solution, bird, truth, terminal, options.truth, truth_solution=poses, truth_bird=truth_bird)
     if options.json:
         counts = {name: getattr(result, name) for name in ("frames", "missing", "unmatched", "frames_3d")}
-        print(plain_json({**result.overall, **counts, "tracks": result.tracks}))  # noqa: T201
+        named = {"matched_by": matching.by, "follows": matching.follows}
+        print(plain_json({**result.overall, **counts, "tracks": result.tracks, **named}))  # noqa: T201
         return
     for table in evaluation_tables(result):
         show(table)
+    if matching.by == "overlap":
+        show(matching_line(matching))
     if result.missing:
         show(f"no figure counts {counted(result.missing, 'annotated bird')} without a pose in this result")
     if result.unmatched:
         show(f"no figure counts {counted(result.unmatched, 'pose')} of tracks or frames that the truth lacks")
+
+
+def _evaluate_observations(options: argparse.Namespace) -> None:
+    from dataclasses import asdict
+
+    from jaxfit.evaluation.observed import evaluate_observations
+    from jaxfit.evaluation.truth import read_truth
+    from jaxfit.observation_tables import observation_tables, uncounted_lines
+
+    result = evaluate_observations(read_coco(options.result), read_truth(options.truth)[0], options.truth)
+    if options.json:
+        keypoints = {name: row._asdict() for name, row in result.keypoints.items()}
+        print(plain_json(asdict(result) | {"keypoints": keypoints}))  # noqa: T201
+        return
+    for table in observation_tables(result):
+        show(table)
+    for line in uncounted_lines(result):
+        show(line)
 
 
 def simulate(options: argparse.Namespace) -> None:
