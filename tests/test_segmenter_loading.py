@@ -126,6 +126,8 @@ def test_a_detector_needs_a_network_for_the_masks(tmp_path, path):
         load(f"{masks}+{masks}")
     with pytest.raises(InputError, match="saliency: first output"):
         load(f"{path}+{path}")
+    with pytest.raises(InputError, match="is one file"):
+        load(path, kind="yolox+saliency")
     with pytest.raises(InputError, match="yolo is one"):
         load(f"{path}+{masks}", kind="yolo")
 

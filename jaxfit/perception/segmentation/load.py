@@ -119,6 +119,8 @@ def _load(
         if not Saliency.fits(saliency):
             raise _unknown(saliency, "saliency: first output (1, 1, h, w)")
         return DetectorAndSaliency(Yolox(detector, classes, min_score, names), Saliency(saliency))
+    if kind == "yolox+saliency":
+        raise InputError(spec, f"is one file, but {kind} is two", "give detector.onnx+saliency.onnx")
     model = OnnxModel(path, threads)
     wanted = {name: _KINDS[name] for name in _KINDS if kind in ("auto", name)}
     for candidate in wanted.values():
