@@ -283,5 +283,5 @@ def opened(path: Path) -> Iterator[tuple[Any, Any]]:
         stream: Any = found[0]
         if stream.codec_context is None:
             raise InputError(path, "is coded in a way that this PyAV cannot decode", "convert it to H.264")
-        stream.thread_type = "AUTO"
+        stream.thread_type = "SLICE"  # several frames at once would leave it to chance which damage is noticed
         yield container, stream
