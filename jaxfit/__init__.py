@@ -6,7 +6,7 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for type checkers and editors
-    from jaxfit.config import FitConfig, load_config
+    from jaxfit.config import FitConfig, ReconstructConfig, load_config, load_reconstruct_config
     from jaxfit.errors import InputError
     from jaxfit.evaluation.evaluate import Evaluation, evaluate
     from jaxfit.fitting.fit import fit
@@ -15,6 +15,12 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.model.bird import Bird
     from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
     from jaxfit.observations import Observations
+    from jaxfit.perception.config import TrackConfig
+    from jaxfit.perception.keypoints import load_keypoint_detector
+    from jaxfit.perception.segmentation import load_segmenter
+    from jaxfit.perception.track import track_video
+    from jaxfit.pipeline import Reconstruction, reconstruct
+    from jaxfit.quality import track_quality
     from jaxfit.simulation.scene import Scene, simulate, stage_scene
     from jaxfit.view.overlay import overlay
 
@@ -26,26 +32,35 @@ __all__ = [
     "FitConfig",
     "InputError",
     "Observations",
+    "ReconstructConfig",
+    "Reconstruction",
     "Scene",
     "Solution",
+    "TrackConfig",
     "evaluate",
     "find_bird",
     "fit",
     "load_bird",
     "load_config",
+    "load_keypoint_detector",
     "load_murre",
+    "load_reconstruct_config",
+    "load_segmenter",
     "load_solution",
     "overlay",
     "read_coco",
+    "reconstruct",
     "save_bird",
     "save_solution",
     "simulate",
     "stage_scene",
+    "track_quality",
+    "track_video",
     "write_coco",
 ]
 
 _HOMES = {
-    "config": ("FitConfig", "load_config"),
+    "config": ("FitConfig", "ReconstructConfig", "load_config", "load_reconstruct_config"),
     "errors": ("InputError",),
     "evaluation.evaluate": ("Evaluation", "evaluate"),
     "fitting.fit": ("fit",),
@@ -54,6 +69,12 @@ _HOMES = {
     "model.bird": ("Bird",),
     "model.files": ("find_bird", "load_bird", "load_murre", "save_bird"),
     "observations": ("Observations",),
+    "perception.config": ("TrackConfig",),
+    "perception.keypoints": ("load_keypoint_detector",),
+    "perception.segmentation": ("load_segmenter",),
+    "perception.track": ("track_video",),
+    "pipeline": ("Reconstruction", "reconstruct"),
+    "quality": ("track_quality",),
     "simulation.scene": ("Scene", "simulate", "stage_scene"),
     "view.overlay": ("overlay",),
 }

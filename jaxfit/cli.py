@@ -92,6 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
     parser.add_argument("-v", "--verbose", action="store_true", help="say more about what is done")
     add = parser.add_subparsers(required=True, metavar="COMMAND").add_parser
+    _perception(add)
     _fitting(add)
     _simulation(add)
     _models(add)
@@ -103,6 +104,40 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--json", action="store_true")
     bench.set_defaults(run="bench")
     return parser
+
+
+def _perception(add) -> None:
+    track = add("track", help="find and follow the birds of a video, and their keypoints")
+    _what_to_track(track)
+    track.add_argument("--out", type=Path, required=True, metavar="OBS.json", help="COCO file to write")
+    track.add_argument("--overwrite", action="store_true", help="replace an earlier file of that name")
+    track.set_defaults(run="track")
+
+    reconstruct = add("reconstruct", help="track the birds of a video, pose and draw them")
+    _what_to_track(reconstruct)
+    reconstruct.add_argument("--model", default="murre", help=f"{MODEL} (default murre)")
+    reconstruct.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result")
+    reconstruct.add_argument("--overwrite", action="store_true", help="replace an earlier result in that folder")
+    reconstruct.set_defaults(run="reconstruct")
+
+
+def _what_to_track(command: argparse.ArgumentParser) -> None:
+    command.add_argument("video", type=Path, metavar="VIDEO", help="a video, or a folder of frames")
+    command.add_argument(
+        "--config", default="reconstruct", help="YAML file with a `base: reconstruct`, which names every knob"
+    )
+    command.add_argument(
+        "--segmenter",
+        metavar="S.onnx",
+        help="network that finds birds, or detector.onnx+saliency.onnx (default: built in)",
+    )
+    command.add_argument(
+        "--keypoints", metavar="K.onnx", help="network that finds the keypoints of each (default: built in)"
+    )
+    command.add_argument("--classes", metavar="NAMES", help="classes to look for, by comma (default bird)")
+    command.add_argument("--start", type=int, metavar="FRAME", help="first frame, counted from 0")
+    command.add_argument("--stop", type=int, metavar="FRAME", help="frame to stop before")
+    command.add_argument("--step", type=int, metavar="N", help="look at every N-th frame")
 
 
 def _fitting(add) -> None:

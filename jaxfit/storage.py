@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfit.errors import InputError
 
-__all__ = ["check_replaceable", "conform", "new_file", "new_folder", "write_whole"]
+__all__ = ["check_replaceable", "check_writable", "conform", "new_file", "new_folder", "write_whole"]
 
 # What the operating system may answer to a write, and what the user can do about it.
 _REMEDIES = {
@@ -170,10 +170,7 @@ def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = No
     path = Path(path).resolve()
     if _holds_current(path):  # renamed over, it would leave the shell in a folder that is gone
         raise InputError(path, "is the folder you are in, or one above it", "name a folder inside it")
-    with _write_errors(path):  # permissions alone do not tell: try
-        probe = _temporary(next(parent for parent in path.parents if parent.exists()) / path.name, ".probe")
-        probe.mkdir()
-        probe.rmdir()
+    check_writable(path)
     if not path.exists():
         return
     if not path.is_dir():
@@ -186,6 +183,15 @@ def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = No
     if marker is not None and not (path / marker).is_file():
         problem = f"holds files, but no {marker}, so it is not a folder of results and is left alone"
         raise InputError(path, problem, "choose another --out")
+
+
+def check_writable(path: str | Path) -> None:
+    """Raise InputError where nothing can be made beside a file or folder to write: before long work."""
+    path = Path(path).resolve()
+    with _write_errors(path):  # permissions alone do not tell: try
+        probe = _temporary(next(parent for parent in path.parents if parent.exists()) / path.name, ".probe")
+        probe.mkdir()
+        probe.rmdir()
 
 
 def _holds_current(path: Path) -> bool:

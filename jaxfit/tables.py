@@ -9,10 +9,14 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from jaxfit.quality import track_quality
+
 if TYPE_CHECKING:
     from jaxfit.evaluation.evaluate import Evaluation
+    from jaxfit.fitting.solution import Solution
+    from jaxfit.observations import Observations
 
-__all__ = ["counted", "evaluation_tables", "plain_json", "right_aligned", "show", "show_facts"]
+__all__ = ["counted", "evaluation_tables", "plain_json", "right_aligned", "show", "show_facts", "track_table"]
 
 _IN_SPACE = {
     "mpjpe": "MPJPE",
@@ -72,6 +76,24 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
         )
         tables.append(space)
     return tables
+
+
+def track_table(observations: Observations, solution: Solution | None = None) -> Table:
+    """What is known of every track: how much was seen of it, how well, and how its fit ended."""
+    table = right_aligned("bird", "frames", "coverage", "confidence", "jitter")
+    table.caption = (
+        "coverage: share of the frames from a bird's first to its last in which it was seen; confidence: mean over all "
+        "keypoints; jitter: median second difference of keypoints over the longer side of the box"
+    )
+    status = None
+    if solution is not None:
+        table.add_column("status")
+        status = dict(zip(solution.track_id.tolist(), solution.status.tolist(), strict=True))
+    for row in track_quality(observations):
+        jitter = "–" if row.jitter is None else f"{row.jitter:.4f}"
+        cells = [str(row.track_id), str(row.frames), f"{row.coverage:.2f}", f"{row.mean_confidence:.2f}", jitter]
+        table.add_row(*cells, *([] if status is None else [str(status[row.track_id])]))
+    return table
 
 
 def _in_space(row: dict[str, float]) -> list[str]:
