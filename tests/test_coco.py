@@ -195,7 +195,7 @@ def test_real_annotations(reference_dir, tmp_path):
 
 
 @settings(max_examples=200, deadline=None)
-@given(runs=st.lists(st.integers(0, 2**31), min_size=1, max_size=12))
+@given(runs=st.lists(st.integers(0, 2**24), min_size=1, max_size=12))  # more, and pycocotools writes past its buffer
 def test_run_lengths_as_pycocotools_writes_them(runs):
     text = coco_mask.frPyObjects({"size": [1, 1], "counts": runs}, 1, 1)["counts"]
     assert run_lengths(text.decode()) == runs

@@ -51,9 +51,11 @@ def fit(
         The poses, with a status for every track: `ok`, `no usable frame` or `diverged`.
 
     Raises:
-        InputError: keypoints that are not the model's, no track with a usable frame, crops that cannot be
-            made.
+        InputError: no bird, keypoints that are not the model's, no track with a usable frame, crops that cannot
+            be made.
     """
+    if not observations.num_tracks:
+        raise InputError(source, "holds no bird", "look for birds in other footage, or with another network")
     observations = check_keypoints(observations, bird.keypoint_names, source)
     observations = filter_observations(observations, config.filter_window)
     windows = cut_windows(observations, config)

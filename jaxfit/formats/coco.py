@@ -9,6 +9,10 @@ The file is an object with
   ``keypoints`` [x, y, v, …] in image pixels, optionally ``segmentation`` (run lengths or polygons),
   ``keypoint_scores`` (K numbers in [0, 1]), ``score`` (of the bird as a whole, in [0, 1]), ``iscrowd``, ``id``.
 
+What is written has ``tracks`` besides, for whoever looks into the file: ``id``, ``category_id`` and the figures of
+``jaxfit.quality.TrackQuality``. They follow from the rest, so that reading leaves them aside, as it does ``tracks`` of
+any other content.
+
 What a reader has to decide:
 
 - Confidence is the score where ``v > 0`` and 0 where ``v = 0``: COCO puts a keypoint that is not there at
@@ -16,6 +20,8 @@ What a reader has to decide:
 - The first category that has keypoints is the bird. Categories with the same keypoints in the same order,
   such as several species, are read with it; annotations of all others are left out, and one warning says how
   many.
+- A file without any annotation is a video without a bird; one whose annotations are all of other categories is
+  refused.
 - A crowd (``iscrowd`` 1) has no mask: its region covers several birds.
 - Several images may share a ``frame_index`` (photographs, several videos); each track keeps its own image.
 - Unknown keys are ignored.
@@ -41,6 +47,7 @@ from jaxfit.formats.coco_records import (
 from jaxfit.formats.fields import Field, read_json
 from jaxfit.formats.rle import run_lengths
 from jaxfit.observations import Observations, check_keypoints, reorder_keypoints
+from jaxfit.quality import track_quality
 from jaxfit.storage import write_whole
 
 __all__ = ["check_keypoints", "read_coco", "reorder_keypoints", "write_coco"]
@@ -58,7 +65,7 @@ def read_coco(path: str | Path) -> Observations:
 
     Returns:
         Observations with tracks in the order of ``track_id`` and frames in that of ``frame_index``,
-        also those without a bird.
+        also those without a bird; perhaps no track at all.
 
     Raises:
         InputError: a file that cannot be read or whose content contradicts itself, naming file, field and
@@ -81,11 +88,9 @@ def read_coco(path: str | Path) -> Observations:
             annotation["category_id"].fail(f"is {category!r}, which no category has", "add the category")
     if left_out:
         _log.warning("%s: left out %d annotations of categories without the bird's keypoints", path, left_out)
-    if not found:
-        Field(Path(path), "annotations", None).fail(
-            "hold no bird" + (f" ({left_out} of other categories)" if left_out else ""),
-            "run detection on footage with a bird in it, or choose another file",
-        )
+        if not found:
+            problem = f"hold no bird ({left_out} of other categories)"
+            root["annotations"].fail(problem, "run detection on footage with a bird in it, or choose another file")
     return _assemble(root, list(images.values()), categories, found)
 
 
@@ -117,9 +122,10 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
         keypoints[cell] = annotation.keypoints
         box[cell], score[cell] = annotation.box, annotation.score
     present = np.zeros((N, T), bool)
-    present[tuple(np.array(list(holder)).T)] = True
+    for cell in holder:
+        present[cell] = True
     return Observations(
-        track_id=np.array(tracks),
+        track_id=np.array(tracks, np.int64),
         frame_index=np.array(frames),
         present=present,
         keypoints_px=keypoints[..., :2],
@@ -193,7 +199,12 @@ def write_coco(observations: Observations, path: str | Path) -> None:
         annotations.append(annotation)
     skeleton = [[a + 1, b + 1] for a, b in observations.skeleton]
     category = {"id": 1, "name": "bird", "keypoints": list(observations.keypoint_names), "skeleton": skeleton}
-    content = {"images": list(images.values()), "categories": [category], "annotations": annotations}
+    tracks = []
+    for quality in track_quality(observations):
+        figures = quality._asdict()
+        track = {"id": figures.pop("track_id"), "category_id": 1}
+        tracks.append(track | {key: round(v, 6) if isinstance(v, float) else v for key, v in figures.items()})
+    content = {"images": list(images.values()), "categories": [category], "annotations": annotations, "tracks": tracks}
     write_whole(path, json.dumps(content, allow_nan=False).encode())
 
 
