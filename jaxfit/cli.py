@@ -95,6 +95,7 @@ def _parser() -> argparse.ArgumentParser:
     _perception(add)
     _fitting(add)
     _simulation(add)
+    _training(add)
     _models(add)
     bench = add("bench", help="measure speed on this machine")
     bench.add_argument("what", choices=("silhouette", "render", "fit"))
@@ -189,6 +190,20 @@ def _simulation(add) -> None:
     demo = add("demo", help="simulate a short scene, fit it, and show what came of it")
     demo.add_argument("--out", type=Path, default=Path("demo"), help="folder for everything (default demo)")
     demo.set_defaults(run="demo")
+
+
+def _training(add) -> None:
+    train = add("train", help="train a built-in network anew on simulated footage (needs the extra `train`)")
+    train.add_argument("network", choices=("segmenter", "keypoints"))
+    train.add_argument("--out", type=Path, required=True, metavar="N.onnx", help="network to write")
+    train.add_argument(
+        "--frames", type=Path, default=Path("training_frames"), help="folder to film to, or filmed before (5 GB)"
+    )
+    train.add_argument("--scenes", type=int, default=160, help="to learn from, 10 frames each (default 160)")
+    train.add_argument("--steps", type=int, help="of training (default: as the built-in one was trained)")
+    train.add_argument("--seed", type=int, default=0, help="of first weights and of samples (default 0)")
+    train.add_argument("--overwrite", action="store_true", help="replace an earlier file of that name")
+    train.set_defaults(run="train")
 
 
 def _models(add) -> None:

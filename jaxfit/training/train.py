@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.progress import ProgressTask, silent
+from jaxfit.storage import check_writable
 from jaxfit.training import keypoints, segmenter
 from jaxfit.training.export import export_onnx
 from jaxfit.training.loop import Schedule, train
@@ -64,6 +65,7 @@ def train_network(
         raise InputError("train: steps", f"{schedule.steps} teach nothing", "give 20 or more")
     if Path(path).suffix != ".onnx":
         raise InputError(path, "is named as no network", "end it in .onnx")
+    check_writable(path)  # before the work, not after it
     frames = _frames(Path(frames_folder), scenes, progress)
     torch.manual_seed(seed)
     if which == "segmenter":

@@ -28,7 +28,7 @@ NEIGHBOURHOOD = 7
 """Side, in cells, of the square within which a centre is the highest."""
 LEAST_FOREGROUND = 0.1
 """Cells below this belong to nobody; masks are cut at 0.5, between cells."""
-FARTHEST_PX = 45.0
+FARTHEST_PX = 60.0
 """A cell that points to a place this far from every centre belongs to nobody, pixels of the input."""
 LEAST_CELLS = 12
 """Smaller birds are specks."""
