@@ -2,6 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+EXTRAS ?= dev
 export JAXFIT_REFERENCE
 
 .PHONY: install test lint bench demo clean
@@ -25,7 +26,7 @@ $(VENV)/installed: pyproject.toml $(wildcard kernels/*)
 	    echo "or name it: make CXX=/path/to/compiler. Without it jaxfit would run hundreds of times slower."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
-	$(BIN)/python -m pip install --editable ".[dev]"
+	$(BIN)/python -m pip install --editable ".[$(EXTRAS)]"
 	@touch $@
 
 test: install

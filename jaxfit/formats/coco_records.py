@@ -13,7 +13,7 @@ from jaxfit.formats.rle import read_segmentation
 
 __all__ = ["Annotation", "Categories", "Image", "read_annotation", "read_categories", "read_images"]
 
-_LARGEST_SIDE_PX = 32768
+_LARGEST_SIDE_PX = 16384  # larger masks' run lengths outgrow what pycocotools reserves for them
 _TRACK_REMEDY = "give every annotation its bird's track_id; for photographs, a number of its own"
 _FRAME_REMEDY = "give every image its frame's number in the video; for photographs, 0"
 
