@@ -13,7 +13,7 @@ help:
 	@echo "make test      the test suite (under ten minutes on two cores)"
 	@echo "make lint      formatting, lint and types"
 	@echo "make bench     benchmarks against the committed baseline"
-	@echo "make demo      simulate a short scene, fit it and show it"
+	@echo "make demo      simulate a short scene, reconstruct it from its footage and show it"
 	@echo "make clean     remove the environment and everything built"
 
 install: $(VENV)/installed

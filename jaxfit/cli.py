@@ -187,7 +187,7 @@ def _simulation(add) -> None:
     simulate.add_argument("--overwrite", action="store_true", help="replace an earlier scene in that folder")
     simulate.set_defaults(run="simulate")
 
-    demo = add("demo", help="simulate a short scene, fit it, and show what came of it")
+    demo = add("demo", help="simulate a short scene, reconstruct it from its footage, and show what came of it")
     demo.add_argument("--out", type=Path, default=Path("demo"), help="folder for everything (default demo)")
     demo.set_defaults(run="demo")
 

@@ -1,72 +1,71 @@
-"""Simulate a short scene, fit it as the paper does, measure it against the truth, and draw it."""
+"""Simulate a short scene, reconstruct it from its footage alone, and measure what came of it against the truth."""
 
 from __future__ import annotations
 
 import time
 from pathlib import Path
 
-from jaxfit.config import config_to_yaml, load_config
+from jaxfit.config import load_reconstruct_config
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
-from jaxfit.fitting.fit import fit
-from jaxfit.fitting.solution import save_solution
-from jaxfit.fitting.summary import summarise
+from jaxfit.evaluation.matching import match_tracks
+from jaxfit.evaluation.observed import evaluate_observations
 from jaxfit.formats.scene_folder import FOOTAGE, MARKER
 from jaxfit.model.files import load_murre
+from jaxfit.observation_tables import matching_line, observation_tables
+from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.progress import terminal
 from jaxfit.simulation.scene import simulate
-from jaxfit.storage import check_replaceable
-from jaxfit.tables import evaluation_tables, show
-from jaxfit.view.overlay import overlay
+from jaxfit.storage import check_replaceable, write_whole
+from jaxfit.tables import evaluation_tables, plain_json, show, track_table
 
 __all__ = ["run_demo"]
 
-BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 4
+BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 1003
+METRICS = "evaluation.json"
 
 
 def run_demo(folder: Path) -> Evaluation:
-    """Leave a scene, its fit, an overlay video and a contact sheet in a folder, and print what was found.
+    """Leave a scene and what was made of its footage in a folder, and print how well it agrees with the truth.
 
     Args:
-        folder: for `scene/`, `result/`, `overlay.mp4` and `overlay.png`; an earlier demo there is replaced.
+        folder: for `scene/`, `result/` and `evaluation.json`; an earlier demo there is replaced.
 
     Raises:
         InputError: the folder cannot be written, or holds something else than an earlier demo.
     """
     began = time.perf_counter()
-    scene_folder, result_folder, video = folder / "scene", folder / "result", folder / "overlay.mp4"
+    scene_folder, result_folder = folder / "scene", folder / "result"
     _check_folder(folder)
     check_replaceable(scene_folder, True, MARKER)
     check_replaceable(result_folder, True, "poses.npz")
-    bird, config = load_murre(), load_config("paper")
-    show(f"{BIRDS} murres on a ledge, {FRAMES} frames, simulated; what detectors would report of them is fitted")
+    bird, config = load_murre(), load_reconstruct_config()
+    show(f"{BIRDS} murres on a ledge, {FRAMES} frames, simulated; then reconstructed from the footage alone")
     scene = simulate(bird, scene_folder, BIRDS, FRAMES, SIZE, seed=SEED, overwrite=True, progress=terminal)
-    fitting = time.perf_counter()
-    solution = fit(scene.detections, bird, config, progress=terminal, source=scene_folder)
-    seconds = {"fit": time.perf_counter() - fitting}
+    done = reconstruct(scene_folder / FOOTAGE, result_folder, bird, config, overwrite=True, progress=terminal)
+    found = done.tracking.observations
+    seen = evaluate_observations(found, scene.truth, scene_folder)
+    solution, matching = match_tracks(done.solution, scene.truth, "overlap", scene_folder)
     result = evaluate(solution, bird, scene.truth, terminal, scene_folder, truth_solution=scene.poses)
-    summary = summarise(solution, bird, seconds) | {"metrics": result.overall}
-    save_solution(solution, bird, config_to_yaml(config), summary, result_folder, overwrite=True)
-    overlay(
-        solution,
-        bird,
-        scene_folder / FOOTAGE,
-        video,
-        observations=scene.detections,
-        side_views=True,
-        overwrite=True,
-        progress=terminal,
-    )
+    metrics = {"detection": seen.detection, "tracking": seen.tracking, **result.overall}
+    write_whole(folder / METRICS, plain_json(metrics).encode())
+    show(track_table(found, done.solution))
+    for table in observation_tables(seen):
+        show(table)
+    show(matching_line(matching))
     for table in evaluation_tables(result):
         show(table)
-    show(f"done in {time.perf_counter() - began:.0f} s, of which the fit took {seconds['fit']:.0f}. Look at")
-    for name, what in (
-        (video, "the fitted birds on the footage, and each from its side"),
-        (video.with_suffix(".png"), "a contact sheet"),
-        (result_folder, "poses.npz, summary.json"),
-        (scene_folder, "footage, truth and detections"),
+    seconds = done.summary["seconds"]
+    parts = ", ".join(f"{name} {seconds[name]:.0f}" for name in ("track", "fit", "overlay"))
+    show(f"done in {time.perf_counter() - began:.0f} s ({parts}). Look at")
+    for path, what in (
+        (result_folder / OVERLAY, "the posed birds on the footage, and each from its side"),
+        ((result_folder / OVERLAY).with_suffix(".png"), "a contact sheet"),
+        (result_folder, "observations.json, poses.npz, summary.json"),
+        (scene_folder, "footage and truth"),
+        (folder / METRICS, "the figures above"),
     ):
-        show(f"  {name}: {what}")
+        show(f"  {path}: {what}")
     return result
 
 

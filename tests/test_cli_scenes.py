@@ -7,9 +7,12 @@ import cv2
 import pytest
 from cli_files import refused
 
-from jaxfit import demo, load_config
+from jaxfit import Observations, demo, load_reconstruct_config, pipeline, read_coco
 from jaxfit.cli import main
 from jaxfit.frames import probe_video
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
+from jaxfit.perception import track
+from jaxfit.perception.instances import instance_of
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 SMALL = ["--birds", "2", "--frames", "5", "--size", "480x280"]
@@ -109,21 +112,51 @@ def test_one_bird_is_singular(tmp_path, capsys):
     assert "1 bird over 2 frames: " in capsys.readouterr().out
 
 
+class TrueToTheScene:
+    """Stands in for both networks: the truth of a demo's scene, frame after frame."""
+
+    class_names, keypoint_names = ("bird",), MURRE_KEYPOINTS
+
+    def __init__(self, folder):
+        self.truth, self.t = folder / "scene" / "truth.json", -1
+
+    def __call__(self, frame, instances=None):
+        if instances is None:
+            self.truth = self.truth if isinstance(self.truth, Observations) else read_coco(self.truth)
+            self.t += 1
+            masks = {n: self.truth.mask(n, self.t) for n in range(self.truth.num_tracks)}
+            self.found = {n: instance_of(mask, 0.9, "bird") for n, mask in masks.items() if mask is not None}
+            return list(self.found.values())
+        rows = [next(n for n, bird in self.found.items() if bird is instance) for instance in instances]
+        return self.truth.keypoints_px[rows, self.t], self.truth.confidence[rows, self.t]
+
+
 def test_the_demo_leaves_what_it_names(tmp_path, monkeypatch, capsys):
     (tmp_path / "quick.yaml").write_text(
-        "base: paper\nstages:\n"
-        "  - {name: only, steps: 30, terms: [keypoints, pose_prior], step_scale: {transl: [1, 1, 0]}}\n"
+        "base: reconstruct\ntrack: {min_track_frames: 2}\nfit:\n  base: paper\n  stages:\n"
+        "    - {name: only, steps: 30, terms: [keypoints, pose_prior], step_scale: {transl: [1, 1, 0]}}\n"
     )
-    monkeypatch.setattr(demo, "load_config", lambda _: load_config(str(tmp_path / "quick.yaml")))
+
+    def open_one(_):
+        opened.append(TrueToTheScene(tmp_path / "demo"))
+        return opened[-1]
+
+    opened = []
+    monkeypatch.setattr(demo, "load_reconstruct_config", lambda: load_reconstruct_config(tmp_path / "quick.yaml"))
+    monkeypatch.setattr(pipeline, "open_keypoint_detector", open_one)
+    monkeypatch.setattr(track, "open_segmenter", lambda _: opened[-1])
+    monkeypatch.setattr(pipeline, "network_files", lambda _: {})
     monkeypatch.setattr(demo, "BIRDS", 2)
     monkeypatch.setattr(demo, "FRAMES", 5)
     monkeypatch.setattr(demo, "SIZE", (480, 280))
     for _ in range(2):  # a second demo replaces the first
         assert main(["demo", "--out", str(tmp_path / "demo")]) == 0
     said = capsys.readouterr().out.replace("\n", "")
-    for name in ("overlay.mp4", "overlay.png", "result", "scene"):
+    for name in ("result/overlay.mp4", "result/overlay.png", "result", "scene", "evaluation.json"):
         assert (tmp_path / "demo" / name).exists()
         assert str(tmp_path / "demo" / name) in said
     assert "PA-MPJPE" in said
-    metrics = json.loads((tmp_path / "demo" / "result" / "summary.json").read_text())["metrics"]
+    metrics = json.loads((tmp_path / "demo" / "evaluation.json").read_text())
     assert metrics["mpjpe"] > 0
+    assert metrics["detection"]["mean_iou"] == 1
+    assert metrics["tracking"]["idf1"] == 1

@@ -75,9 +75,10 @@ class OnnxModel:
         names = [port.name for port in self.outputs]
         feed = {port.name: value for port, value in zip(self.inputs, inputs, strict=True)}
         try:
-            return dict(zip(names, self._session.run(names, feed), strict=True))
+            values: list[Any] = self._session.run(names, feed)
         except Exception as error:
             raise InputError(self.path, f"cannot be run: {_brief(error)}", "its layout may be another one") from error
+        return dict(zip(names, values, strict=True))
 
     def describe(self) -> str:
         """Inputs and outputs with their shapes, for messages."""
