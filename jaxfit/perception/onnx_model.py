@@ -75,7 +75,7 @@ class OnnxModel:
         names = [port.name for port in self.outputs]
         feed = {port.name: value for port, value in zip(self.inputs, inputs, strict=True)}
         try:
-            values: list[Any] = self._session.run(names, feed)
+            values: Any = self._session.run(names, feed)
         except Exception as error:
             raise InputError(self.path, f"cannot be run: {_brief(error)}", "its layout may be another one") from error
         return dict(zip(names, values, strict=True))
