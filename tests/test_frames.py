@@ -2,7 +2,6 @@
 
 import collections
 import gc
-import itertools
 import logging
 import signal
 import threading
@@ -277,18 +276,22 @@ def test_the_thread_ends_with_the_reading(films):
 
 def test_an_interrupt():
     main, ended = threading.main_thread(), []
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 
     def source(stopped):
         try:
-            for i in itertools.count():
+            for i in range(10**6):
                 if i == 10:
                     signal.pthread_kill(main.ident, signal.SIGINT)
                 yield i
         finally:
             ended.append(True)
 
-    with pytest.raises(KeyboardInterrupt):
-        collections.deque(_ahead(source), maxlen=1)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            collections.deque(_ahead(source), maxlen=1)
+    finally:
+        signal.signal(signal.SIGINT, before)
     gc.collect()
     assert ended
     assert not threads()

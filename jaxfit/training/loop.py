@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.training.scenes import LabelledFrames
+from jaxfit.training.scenes import LabelledFrames, load_frames
 
 __all__ = ["Schedule", "train"]
 
@@ -32,13 +33,16 @@ class Schedule(NamedTuple):
 class _Samples(Dataset):
     """Sample i depends on the seed and i alone, whatever the number of workers."""
 
-    def __init__(self, draw: Callable[..., Any], frames: LabelledFrames, seed: int, count: int):
-        self._draw, self._frames, self._seed, self._count = draw, frames, seed, count
+    def __init__(self, draw: Callable[..., Any], folder: Path, seed: int, count: int):
+        self._draw, self._folder, self._seed, self._count = draw, folder, seed, count
+        self._frames: LabelledFrames | None = None
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, i: int) -> Any:
+        if self._frames is None:  # opened by the worker, not sent to it
+            self._frames = load_frames(self._folder)
         return self._draw(np.random.default_rng((self._seed, i)), self._frames)
 
 
@@ -46,7 +50,7 @@ def train(
     network: nn.Module,
     draw: Callable[[np.random.Generator, LabelledFrames], Any],
     loss: Callable[[dict[str, Tensor], Any], dict[str, Tensor]],
-    frames: LabelledFrames,
+    frames_folder: Path,
     schedule: Schedule,
     seed: int = 0,
     progress: ProgressTask = silent,
@@ -56,9 +60,9 @@ def train(
 
     Args:
         network: maps a batch of `picture` to maps by name.
-        draw: makes one sample, a NamedTuple of arrays that begins with `picture`.
+        draw: makes one sample, a NamedTuple of arrays that begins with `picture`; a function of a module.
         loss: the parts of the loss of a batch.
-        frames: what samples are drawn from.
+        frames_folder: what samples are drawn from, as `film_scenes` leaves it.
         schedule: length and speed.
         seed: of the samples; the network's own numbers are the caller's.
         progress: told of every step and the loss.
@@ -70,9 +74,14 @@ def train(
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.to(device).train()
     network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    samples = _Samples(draw, frames, seed, schedule.steps * schedule.batch)
+    samples = _Samples(draw, frames_folder, seed, schedule.steps * schedule.batch)
     loader = DataLoader(
-        samples, schedule.batch, num_workers=1, prefetch_factor=4, worker_init_fn=_one_thread, pin_memory=False
+        samples,
+        schedule.batch,
+        num_workers=1,
+        prefetch_factor=4,
+        worker_init_fn=_one_thread,
+        multiprocessing_context="spawn",  # JAX's threads do not survive a fork
     )
     optimiser = torch.optim.AdamW(network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay)
     rates = torch.optim.lr_scheduler.OneCycleLR(

@@ -72,7 +72,8 @@ def train_network(
         network, module = segmenter.segmenter_network(), segmenter
     else:
         network, module = keypoints.keypoint_network(), keypoints
-    losses = train(network, module.draw_sample, module.loss, frames, schedule, seed, progress, f"Training {which}")
+    folder = Path(frames_folder)
+    losses = train(network, module.draw_sample, module.loss, folder, schedule, seed, progress, f"Training {which}")
     facts = {
         "trained_by": f"jaxfit {metadata.version('jaxfit')} train {which}",
         "trained_on": f"{len(frames.pictures)} simulated frames of {scenes} scenes; no real footage",
