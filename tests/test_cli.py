@@ -221,7 +221,10 @@ def test_results_that_cannot_be_evaluated(fitted, inputs, tmp_path, capsys):
     for annotation in content["annotations"]:
         annotation["track_id"] += 100
     (tmp_path / "others.json").write_text(json.dumps(content))
-    refused(capsys, ["evaluate", str(fitted), "--truth", str(tmp_path / "others.json")], "shares no bird")
+    others = ["--truth", str(tmp_path / "others.json")]
+    refused(capsys, ["evaluate", str(fitted), *others, "--match", "ids"], "shares no bird")
+    assert main(["evaluate", str(fitted), *others]) == 0  # the same birds by other names, in the same places
+    assert "4 → 104" in capsys.readouterr().out
 
 
 def test_compiled_programs_are_kept_for_the_next_run(tmp_path):

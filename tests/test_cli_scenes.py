@@ -134,7 +134,7 @@ class TrueToTheScene:
 def test_the_demo_leaves_what_it_names(tmp_path, monkeypatch, capsys):
     (tmp_path / "quick.yaml").write_text(
         "base: reconstruct\ntrack: {min_track_frames: 2}\nfit:\n  base: paper\n  stages:\n"
-        "    - {name: only, steps: 30, terms: [keypoints, pose_prior], step_scale: {transl: [1, 1, 0]}}\n"
+        "    - {name: only, steps: 200, terms: [keypoints, pose_prior], step_scale: {transl: [1, 1, 0]}}\n"
     )
 
     def open_one(_):
