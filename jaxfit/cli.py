@@ -31,6 +31,15 @@ def run() -> NoReturn:
         asked.append(number)
         raise KeyboardInterrupt
 
+    def insist(swallowed: sys.UnraisableHookArgs) -> None:
+        """An interrupt that met a callback of the garbage collector is lost there: it comes again."""
+        if not asked or not issubclass(swallowed.exc_type, KeyboardInterrupt):
+            sys.__unraisablehook__(swallowed)
+            return
+        signal.signal(signal.SIGALRM, stop)
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+
+    sys.unraisablehook = insist
     for number in (signal.SIGINT, signal.SIGTERM):  # a batch system's kill cleans up as Ctrl-C does
         if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell has it for its background jobs
             signal.signal(number, stop)

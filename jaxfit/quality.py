@@ -67,8 +67,9 @@ def track_quality(observations: Observations) -> list[TrackQuality]:
     return found
 
 
-def _second_differences(observations: Observations, step: int) -> Float[np.ndarray, "N T-2 K"]:
-    """Length of the second difference in longer sides of the box; NaN where it is not known."""
+def _second_differences(observations: Observations, step: int) -> Float[np.ndarray, "N M K"]:
+    """Length of the second difference at each of the M = T − 2 inner frames, in longer sides of the box; NaN where it
+    is not known."""
     points = observations.keypoints_px.astype(np.float64)
     known = observations.confidence >= CONFIDENT
     side = observations.box_px[:, 1:-1, 2:].max(-1)

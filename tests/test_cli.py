@@ -212,6 +212,32 @@ cli.run()
     assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; nothing half-written is left\n")
 
 
+def test_an_interrupt_that_the_garbage_collector_loses():
+    code = """
+import gc, os, signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from jaxfit import cli
+
+def lose(phase, info):
+    gc.callbacks.remove(lose)
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.01)
+
+def main():
+    gc.callbacks.append(lose)
+    try:
+        gc.collect()
+        time.sleep(60)
+    except KeyboardInterrupt:
+        return cli._stopped()
+
+cli.main = main
+cli.run()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=50)
+    assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; nothing half-written is left\n")
+
+
 def test_results_that_cannot_be_evaluated(fitted, inputs, tmp_path, capsys):
     truth = str(inputs / "birds.json")
     refused(capsys, ["evaluate", str(tmp_path / "absent"), "--truth", truth], "absent")
