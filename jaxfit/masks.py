@@ -7,7 +7,16 @@ from typing import Any, cast
 
 import numpy as np
 
-__all__ = ["decode_mask", "encode_mask", "encode_patch"]
+__all__ = ["box_of_mask", "decode_mask", "encode_mask", "encode_patch"]
+
+
+def box_of_mask(mask: np.ndarray) -> tuple[int, int, int, int] | None:
+    """The tight box of an (H, W) mask: x, y of its first pixel, width, height; None of an empty mask."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not len(rows):
+        return None
+    x0, y0 = int(columns[0]), int(rows[0])
+    return x0, y0, int(columns[-1]) + 1 - x0, int(rows[-1]) + 1 - y0
 
 
 def decode_mask(rle: Mapping[str, Any]) -> np.ndarray:

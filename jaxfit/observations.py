@@ -9,10 +9,10 @@ from typing import Any, cast
 import numpy as np
 
 from jaxfit.errors import InputError
-from jaxfit.masks import decode_mask, encode_mask
+from jaxfit.masks import decode_mask
 from jaxfit.storage import conform
 
-__all__ = ["Observations", "check_keypoints", "encode_mask", "reorder_keypoints"]
+__all__ = ["Observations", "check_keypoints", "reorder_keypoints"]
 
 _LAYOUT = {
     "track_id": ("N", np.int64),

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from jaxfit.observations import encode_mask
+from jaxfit.masks import encode_mask
 
 MASK = np.zeros((20, 30), bool)
 MASK[4:12, 5:25] = True

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from jaxfit.observations import Observations, encode_mask
+from jaxfit.masks import encode_mask
+from jaxfit.observations import Observations
 
 WIDTH, HEIGHT = 120, 100
 

@@ -14,7 +14,8 @@ from pycocotools import mask as coco_mask
 from jaxfit.errors import InputError
 from jaxfit.formats.coco import read_coco, write_coco
 from jaxfit.formats.rle import run_lengths
-from jaxfit.observations import Observations, encode_mask
+from jaxfit.masks import encode_mask
+from jaxfit.observations import Observations
 
 
 def assert_same(a: Observations, b: Observations):

@@ -9,7 +9,7 @@ from rectangles import HEIGHT, WIDTH, birds, steady
 
 from jaxfit.errors import InputError
 from jaxfit.evaluation.observed import evaluate_observations
-from jaxfit.observations import encode_mask
+from jaxfit.masks import encode_mask
 
 HERE, THERE, AWAY = (10, 10, 20, 10), (60, 10, 20, 10), (10, 60, 20, 10)
 PERFECT = pytest.approx({"ap50": 1, "ap50-95": 1, "precision": 1, "recall": 1, "mean_iou": 1})

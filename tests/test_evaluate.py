@@ -14,7 +14,8 @@ from jaxfit.evaluation.evaluate import COLUMNS, evaluate
 from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.metrics import longest_side_of_mask
 from jaxfit.fitting.posed import PosedBirds
-from jaxfit.observations import Observations, encode_mask
+from jaxfit.masks import encode_mask
+from jaxfit.observations import Observations
 from jaxfit.simulation.motion import smooth_motion
 
 BIRD, CAMERA, N, T = toy_bird(), Camera(), 2, 4

@@ -19,10 +19,10 @@ from jaxfit.fitting.fit import fit
 from jaxfit.fitting.solution import save_solution
 from jaxfit.fitting.start import load_start
 from jaxfit.fitting.window import cut_windows, load_evidence
+from jaxfit.masks import encode_mask
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.pose import Pose
 from jaxfit.objective.scene import priors_of
-from jaxfit.observations import encode_mask
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
 

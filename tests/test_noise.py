@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from jaxfit.observations import Observations, encode_mask
+from jaxfit.masks import encode_mask
+from jaxfit.observations import Observations
 from jaxfit.simulation import noise
 from jaxfit.simulation.noise import detect_noisily
 

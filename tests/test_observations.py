@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxfit.errors import InputError
-from jaxfit.observations import Observations, check_keypoints, encode_mask, reorder_keypoints
+from jaxfit.masks import encode_mask
+from jaxfit.observations import Observations, check_keypoints, reorder_keypoints
 
 MASK = np.zeros((6, 8), bool)
 MASK[1:4, 2:7] = True

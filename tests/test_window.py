@@ -10,7 +10,8 @@ from jaxfit.config import CropConfig, load_config
 from jaxfit.errors import InputError
 from jaxfit.filtering import weighted_median_filter
 from jaxfit.fitting.window import cut_mask, cut_windows, filter_observations, load_evidence
-from jaxfit.observations import Observations, encode_mask
+from jaxfit.masks import encode_mask
+from jaxfit.observations import Observations
 
 K, WIDTH, HEIGHT = 5, 400, 300
 

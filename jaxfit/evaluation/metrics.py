@@ -10,6 +10,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxfit.masks import box_of_mask
+
 __all__ = [
     "iou",
     "longest_side_of_mask",
@@ -142,8 +144,8 @@ def longest_side_of_mask(mask: Any) -> float:
     mask = np.asarray(mask).astype(bool)
     if mask.ndim != 2:
         raise ValueError(f"mask must have shape (H, W), not {mask.shape}")
-    used = [np.flatnonzero(mask.any(axis)) for axis in (0, 1)]
-    return float(max(u[-1] - u[0] + 1 for u in used)) if used[0].size else float("nan")
+    box = box_of_mask(mask)
+    return float(max(box[2:])) if box else float("nan")
 
 
 def me_p(predicted: Any, observed: Any, visible: Any, longest_side: Any) -> float:

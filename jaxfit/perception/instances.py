@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jaxfit.masks import encode_patch
+from jaxfit.masks import box_of_mask, encode_patch
 
 __all__ = ["Instance", "KeypointDetector", "Segmenter", "instance_of"]
 
@@ -46,12 +46,11 @@ def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int
         score, label: as `Instance` has them.
         x0, y0: where that part begins in the frame, pixels; 0 or more.
     """
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not len(rows):
+    box = box_of_mask(mask)
+    if box is None:
         return None
-    top, left = int(rows[0]), int(columns[0])
-    tight = mask[top : rows[-1] + 1, left : columns[-1] + 1]
-    return Instance(tight, x0 + left, y0 + top, float(score), label)
+    left, top, width, height = box
+    return Instance(mask[top : top + height, left : left + width], x0 + left, y0 + top, float(score), label)
 
 
 class Segmenter(Protocol):

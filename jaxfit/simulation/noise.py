@@ -29,7 +29,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit.observations import Observations, encode_mask
+from jaxfit.masks import box_of_mask, encode_patch
+from jaxfit.observations import Observations
 
 __all__ = ["detect_noisily"]
 
@@ -177,9 +178,9 @@ def _masks(rng: np.random.Generator, truth: Observations, found: np.ndarray):
         if merged[n, t]:
             mask = _with_neighbour(truth, n, t, mask, max(2, int(0.02 * side)))
         margin = int(0.08 * side) + 4
-        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        top, bottom = max(rows[0] - margin, 0), min(rows[-1] + margin + 1, mask.shape[0])
-        left, right = max(columns[0] - margin, 0), min(columns[-1] + margin + 1, mask.shape[1])
+        x, y, width, height = cast(tuple[int, int, int, int], box_of_mask(mask))
+        top, bottom = max(y - margin, 0), min(y + height + margin, mask.shape[0])
+        left, right = max(x - margin, 0), min(x + width + margin, mask.shape[1])
         part = np.ascontiguousarray(mask[top:bottom, left:right]).astype(np.uint8)
         # signed distance to the border, moved by the drift and by smooth noise: thin tips get lost
         inside = cv2.distanceTransform(part, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - part, cv2.DIST_L2, 3)
@@ -187,13 +188,11 @@ def _masks(rng: np.random.Generator, truth: Observations, found: np.ndarray):
         field = rng.normal(size=[4 + length // patch for length in part.shape]).astype(np.float32)
         field = cv2.resize(field, part.shape[::-1], interpolation=cv2.INTER_CUBIC)
         reported = inside + side * (DRIFT * drift[n, t] - ERODED + RAGGED * field) > 0
-        whole = np.zeros(mask.shape, bool)
-        whole[top:bottom, left:right] = reported
-        if not whole.any():
+        box = box_of_mask(reported)
+        if box is None:
             continue
-        rows, columns = np.flatnonzero(whole.any(1)), np.flatnonzero(whole.any(0))
-        boxes[n, t] = columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]
-        masks[n, t] = encode_mask(whole)
+        boxes[n, t] = left + box[0], top + box[1], *box[2:]
+        masks[n, t] = encode_patch(reported, left, top, mask.shape[1], mask.shape[0])
     return masks, boxes
 
 

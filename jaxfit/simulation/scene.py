@@ -14,10 +14,11 @@ from jaxfit.errors import InputError
 from jaxfit.fitting.solution import Solution, save_solution
 from jaxfit.formats.coco import write_coco
 from jaxfit.formats.scene_folder import DETECTIONS, FOOTAGE, MARKER, TRUE_POSES, TRUTH
+from jaxfit.masks import box_of_mask, encode_mask
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
-from jaxfit.observations import Observations, encode_mask
+from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.simulation.behaviour import BEHAVIOURS
 from jaxfit.simulation.flock import Actor, act
@@ -25,7 +26,7 @@ from jaxfit.simulation.footage import Footage
 from jaxfit.simulation.ledge import random_light
 from jaxfit.simulation.noise import detect_noisily
 from jaxfit.simulation.viewpoint import Viewpoint, look_down
-from jaxfit.simulation.visibility import see
+from jaxfit.simulation.visibility import keypoints_of, see
 from jaxfit.storage import new_folder, write_whole
 from jaxfit.video import VideoWriter
 
@@ -79,7 +80,7 @@ def stage_scene(
     view = look_down(np.random.default_rng((seed, 0)), *size, LEDGE_DEPTH)
     actors = act(bird, birds, frames, fps, LEDGE_DEPTH, view, seed)
     vertices = np.stack([actor.vertices_world for actor in actors], axis=1)  # T N V 3
-    keypoints = np.einsum("kv,tnvc->tnkc", np.asarray(bird.keypoint_weights, np.float64), vertices, optimize=True)
+    keypoints = keypoints_of(bird, vertices)
     K = bird.num_keypoints
     points, inside, seen = np.zeros((birds, frames, K, 2)), *np.zeros((2, birds, frames, K), bool)
     boxes, whole, visible = np.zeros((birds, frames, 4), np.float32), {}, {}
@@ -89,9 +90,10 @@ def stage_scene(
             seen_now = see(vertices[t], keypoints[t], faces, view)
             points[:, t], inside[:, t], seen[:, t] = seen_now.keypoints_px, seen_now.inside, seen_now.seen
             for n in range(birds):
-                if not seen_now.whole[n].any():
+                box = box_of_mask(seen_now.whole[n])
+                if box is None:
                     continue  # flown out of the picture
-                whole[n, t], boxes[n, t] = encode_mask(seen_now.whole[n]), _box(seen_now.whole[n])
+                whole[n, t], boxes[n, t] = encode_mask(seen_now.whole[n]), box
                 if seen_now.visible[n].any():
                     visible[n, t] = encode_mask(seen_now.visible[n])
             tick(1, "")
@@ -176,12 +178,6 @@ def _check(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int
     require("size", "x".join(map(str, size)), sides_fit, remedy)
     require("fps", fps, 5 <= fps <= 240, "give 5 to 240 frames a second")
     require("seed", seed, 0 <= seed < 2**32, "give a whole number from 0")
-
-
-def _box(mask: np.ndarray) -> list[int]:
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    box = columns[0], rows[0], columns[-1] + 1 - columns[0], rows[-1] + 1 - rows[0]
-    return [int(side) for side in box]
 
 
 def _true_poses(

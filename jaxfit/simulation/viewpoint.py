@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["UNITS_ACROSS", "Viewpoint", "look_down"]
+__all__ = ["UNITS_ACROSS", "Viewpoint", "camera_axes", "look_down"]
 
 UNITS_ACROSS = 125.0
 """Model units across the picture at the ledge: a bird of 21 units is then a seventh of the width long."""
@@ -50,6 +50,22 @@ class Viewpoint(NamedTuple):
         return np.array([(self.width - side) / 2, (self.height - side) / 2, side], np.float32)
 
 
+def camera_axes(pitch_deg: float, yaw_deg: float, roll_deg: float) -> Float[np.ndarray, "3 3"]:
+    """Right, down and forward of a camera in the world, as rows: R_cam_world.
+
+    Args:
+        pitch_deg: how far it looks below the horizontal.
+        yaw_deg: how far it looks to the right of the wall's normal.
+        roll_deg: how far it is turned about its viewing axis.
+    """
+    pitch, yaw, roll = np.radians([pitch_deg, yaw_deg, roll_deg])
+    forward = np.array([np.cos(pitch) * np.sin(yaw), np.cos(pitch) * np.cos(yaw), -np.sin(pitch)])
+    right = np.array([np.cos(yaw), -np.sin(yaw), 0])
+    down = np.cross(forward, right)
+    right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
+    return np.array([right, down, forward])
+
+
 def look_down(rng: np.random.Generator, width: int, height: int, depth: float) -> Viewpoint:
     """A camera above a ledge, as over an instrumented cliff: 62° to 74° below the horizontal, 5 m away.
 
@@ -58,17 +74,13 @@ def look_down(rng: np.random.Generator, width: int, height: int, depth: float) -
         width, height: of the picture, pixels.
         depth: of the ledge from edge to wall, model units.
     """
-    pitch, yaw, roll = np.radians([rng.uniform(62, 74), rng.uniform(-10, 10), rng.uniform(-3, 3)])
-    forward = np.array([np.cos(pitch) * np.sin(yaw), np.cos(pitch) * np.cos(yaw), -np.sin(pitch)])
-    right = np.array([np.cos(yaw), -np.sin(yaw), 0])
-    down = np.cross(forward, right)
-    right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
+    R_cam_world = camera_axes(rng.uniform(62, 74), rng.uniform(-10, 10), rng.uniform(-3, 3))
     distance = rng.uniform(230, 270)
     # a narrow picture sees as much of the ledge from front to back as a wide one from side to side
     across = max(UNITS_ACROSS, 85 * width / height)
     return Viewpoint(
-        R_cam_world=np.array([right, down, forward]),
-        position_world=np.array([0, 0.45 * depth, 8]) - distance * forward,
+        R_cam_world=R_cam_world,
+        position_world=np.array([0, 0.45 * depth, 8]) - distance * R_cam_world[2],
         focal_px=width * distance / across,
         width=width,
         height=height,

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.model.bird import Bird
 from jaxfit.render import hard_mask, zbuffer
 from jaxfit.simulation.viewpoint import Viewpoint
 
-__all__ = ["View", "see"]
+__all__ = ["View", "keypoints_of", "see"]
 
 NEAR_SURFACE = 0.6
 """A keypoint this far behind its own bird's surface still counts as seen, model units (1.2 cm)."""
@@ -28,6 +29,12 @@ class View(NamedTuple):
     """The keypoint lies in the picture."""
     seen: Bool[np.ndarray, "N K"]
     """Inside, and neither behind another bird nor behind its own."""
+
+
+def keypoints_of(bird: Bird, vertices_world: Float[np.ndarray, "T N V 3"]) -> Float[np.ndarray, "T N K 3"]:
+    """The keypoints of posed birds."""
+    weights = np.asarray(bird.keypoint_weights, np.float64)
+    return np.einsum("kv,tnvc->tnkc", weights, vertices_world, optimize=True)
 
 
 def see(

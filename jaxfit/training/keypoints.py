@@ -22,6 +22,7 @@ from jaxfit.model.anatomy import MURRE_KEYPOINTS, other_side
 from jaxfit.perception.instances import Instance, instance_of
 from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX, crop_bird
 from jaxfit.training.augment import randomise
+from jaxfit.training.cuts import random_turn, surroundings
 from jaxfit.training.networks import FeaturePyramid
 from jaxfit.training.scenes import LabelledFrames
 
@@ -99,8 +100,7 @@ def _turned(
         Picture in another light, the bird, its keypoints in pixels, whether each is seen, and pixels of the paper's
         footage for one of these.
     """
-    owner = frames.owner[s]
-    bird = instance_of(owner == n + 1, 1.0, "")
+    bird = instance_of(frames.owner[s] == n + 1, 1.0, "")
     if bird is None:
         return None
     h, w = bird.mask.shape
@@ -110,20 +110,12 @@ def _turned(
     margin = 2 * PAD_PX * one
     factor = SIDE_PX / (max(h, w) + margin) * rng.uniform(0.9, 1.1)
     middle = np.array([bird.x0 + w / 2, bird.y0 + h / 2])
-    angle = np.radians(rng.uniform(-20, 20))
-    turn = factor * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn, mirrored = random_turn(rng, factor, 20)
     points, seen = frames.keypoints_px[s, n], frames.seen[s, n]
-    if rng.random() < 0.5:
-        turn[:, 0] *= -1
+    if mirrored:
         points, seen = points[_MIRRORED], seen[_MIRRORED]
-    reach = 0.75 * (max(h, w) + 2 * margin)
-    low = np.maximum(np.floor(middle - reach), 0).astype(int)
-    high = np.ceil(middle + reach).astype(int)
-    part = slice(low[1], high[1]), slice(low[0], high[0])
-    picture, owner = np.ascontiguousarray(frames.pictures[s][part]), np.ascontiguousarray(owner[part])
+    picture, owner, low = surroundings(frames, s, middle, 0.75 * (max(h, w) + 2 * margin), factor)
     side = int(1.5 * SIDE_PX)
-    if factor < 1:
-        picture = cv2.GaussianBlur(picture, (0, 0), 0.45 * np.sqrt(1 / factor**2 - 0.75))
     affine = np.column_stack([turn, side / 2 - turn @ (middle - low)])
     shift = affine[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts pixel centres from 0
     warp = np.column_stack([affine[:, :2], affine[:, 2] + shift])

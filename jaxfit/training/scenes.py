@@ -19,8 +19,8 @@ from jaxfit.simulation.flock import act
 from jaxfit.simulation.footage import Footage
 from jaxfit.simulation.ledge import random_light
 from jaxfit.simulation.scene import LEDGE_DEPTH
-from jaxfit.simulation.viewpoint import Viewpoint
-from jaxfit.simulation.visibility import see
+from jaxfit.simulation.viewpoint import Viewpoint, camera_axes
+from jaxfit.simulation.visibility import keypoints_of, see
 from jaxfit.storage import new_folder
 
 __all__ = ["FRAMES_A_SCENE", "LabelledFrames", "film_scenes", "load_frames"]
@@ -107,7 +107,7 @@ def _film(seed: int) -> LabelledFrames:
     footage = Footage(bird, actors, view, LEDGE_DEPTH, random_light(rng), seed)
     shown = range(int(rng.integers(EVERY)), T, EVERY)
     vertices = np.stack([actor.vertices_world for actor in actors], axis=1)
-    keypoints = np.einsum("kv,tnvc->tnkc", np.asarray(bird.keypoint_weights, np.float64), vertices, optimize=True)
+    keypoints = keypoints_of(bird, vertices)
     faces = np.asarray(bird.faces)
     frames = list(_look(footage, shown, vertices, keypoints, faces, view))
     pictures, owner, points, seen = (np.stack(values) for values in zip(*frames, strict=True))
@@ -126,14 +126,10 @@ def _look(footage: Footage, shown: range, vertices, keypoints, faces, view: View
 
 def _random_view(rng: np.random.Generator) -> tuple[Viewpoint, float]:
     """A camera anywhere between steeply above and obliquely in front, near or far, at any zoom."""
-    pitch, yaw, roll = np.radians([rng.uniform(42, 82), rng.uniform(-25, 25), rng.uniform(-6, 6)])
-    forward = np.array([np.cos(pitch) * np.sin(yaw), np.cos(pitch) * np.cos(yaw), -np.sin(pitch)])
-    right = np.array([np.cos(yaw), -np.sin(yaw), 0])
-    down = np.cross(forward, right)
-    right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
+    R_cam_world = camera_axes(rng.uniform(42, 82), rng.uniform(-25, 25), rng.uniform(-6, 6))
     distance = rng.uniform(130, 400)
     across = float(np.exp(rng.uniform(np.log(48), np.log(130))))
     aim = np.array([rng.uniform(-6, 6), rng.uniform(0.35, 0.55) * LEDGE_DEPTH, 6])
     focal_px = WIDTH * distance / across
-    view = Viewpoint(np.array([right, down, forward]), aim - distance * forward, focal_px, WIDTH, HEIGHT)
+    view = Viewpoint(R_cam_world, aim - distance * R_cam_world[2], focal_px, WIDTH, HEIGHT)
     return view, WIDTH / across

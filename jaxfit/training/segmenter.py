@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from jaxfit.training.augment import randomise
+from jaxfit.training.cuts import random_turn, surroundings
 from jaxfit.training.networks import FeaturePyramid
 from jaxfit.training.scenes import LabelledFrames
 
@@ -78,20 +79,12 @@ def _turned(
     rng: np.random.Generator, frames: LabelledFrames, s: int, middle: np.ndarray, factor: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """A square around `middle` at that scale, turned and perhaps mirrored: picture and owner."""
-    angle = np.radians(rng.uniform(-15, 15))
-    turn = factor * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    if rng.random() < 0.5:
-        turn[:, 0] *= -1
-    reach = 0.65 * SIDE_PX / factor  # a little more than the corners of the square need
-    low = np.maximum(np.floor(middle - reach), 0).astype(int)
-    high = np.maximum(np.ceil(middle + reach), 0).astype(int)
-    part = slice(low[1], high[1]), slice(low[0], high[0])
-    picture, owner = np.ascontiguousarray(frames.pictures[s][part]), np.ascontiguousarray(frames.owner[s][part])
+    turn, _ = random_turn(rng, factor, 15)
+    # a little more than the corners of the square need
+    picture, owner, low = surroundings(frames, s, middle, 0.65 * SIDE_PX / factor, factor)
     size = (SIDE_PX, SIDE_PX)
     if not owner.size:
         return np.zeros((*size, 3), np.uint8), np.zeros(size, np.uint8)
-    if factor < 1:  # no finer detail than the smaller picture can hold
-        picture = cv2.GaussianBlur(picture, (0, 0), 0.45 * np.sqrt(1 / factor**2 - 0.75))
     affine = np.column_stack([turn, SIDE_PX / 2 - turn @ (middle - low)])
     picture = cv2.warpAffine(picture, affine, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     return picture, cv2.warpAffine(owner, affine, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)

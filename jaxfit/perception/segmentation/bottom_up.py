@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import cast
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.errors import InputError
+from jaxfit.masks import box_of_mask
 from jaxfit.perception.instances import Instance
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.classes import choose_classes, names_of
@@ -44,12 +46,19 @@ class BottomUp:
     Args:
         classes: names that are kept; None takes the only class there is.
         min_score: least score, the centre's height times the mean foreground; None takes 0.4.
+        names: of its one class, where the file does not hold it.
 
     Raises:
         InputError: another input, or other classes than asked for.
     """
 
-    def __init__(self, model: OnnxModel, classes: Sequence[str] | None = None, min_score: float | None = None):
+    def __init__(
+        self,
+        model: OnnxModel,
+        classes: Sequence[str] | None = None,
+        min_score: float | None = None,
+        names: Sequence[str] | None = None,
+    ):
         self._model = model
         self._input = image_input(model)
         told = model.metadata.get("longer_side", str(LONGER_SIDE_PX))
@@ -59,11 +68,16 @@ class BottomUp:
             )
         self._longer_side_px = int(told)
         self._min_score = 0.4 if min_score is None else min_score
-        names = names_of(model, None, None)
-        if len(names) != 1:
-            raise InputError(model.path, f"names {len(names)} classes", "give a network of one class")
-        (self._label,) = choose_classes(model.path, names, classes).values()
+        found = names_of(model, names, None)
+        if len(found) != 1:
+            raise InputError(model.path, f"names {len(found)} classes", "give a network of one class")
+        (self._label,) = choose_classes(model.path, found, classes).values()
         self.class_names = (self._label,)
+
+    @staticmethod
+    def fits(model: OnnxModel) -> bool:
+        """Whether a network has this layout, by its outputs."""
+        return {"foreground", "centre", "offset"} <= {port.name for port in model.outputs}
 
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
         """As `Segmenter`."""
@@ -99,8 +113,8 @@ class BottomUp:
         score = float(np.clip(peak, 0, 1) * foreground[sure].mean())
         if score < self._min_score:
             return None
-        rows, columns = np.flatnonzero(mine.any(1)), np.flatnonzero(mine.any(0))
-        box = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float32)
+        x0, y0, width, height = cast(tuple[int, int, int, int], box_of_mask(mine))
+        box = np.array([x0, y0, x0 + width, y0 + height], np.float32)
         cells = np.array(foreground.shape[::-1], np.float32)
         box_px = placement.boxes_px(box[None] * np.tile(placement.input_px / cells, 2))[0]
         return placement.instance(np.where(mine, foreground, 0), box_px, 0.5, score, self._label)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from jaxfit.errors import InputError
 from jaxfit.perception.instances import Segmenter
 from jaxfit.perception.onnx_model import OnnxModel
+from jaxfit.perception.segmentation.bottom_up import BottomUp
 from jaxfit.perception.segmentation.mask_rcnn import MaskRcnn
 from jaxfit.perception.segmentation.rf_detr import RfDetrSeg
 from jaxfit.perception.segmentation.saliency import DetectorAndSaliency, Saliency
@@ -29,20 +30,8 @@ class _Kind(NamedTuple):
     load: Callable[[OnnxModel, Sequence[str] | None, float | None, Sequence[str] | None], Segmenter]
 
 
-def _bottom_up(
-    model: OnnxModel, classes: Sequence[str] | None, min_score: float | None, names: Sequence[str] | None
-) -> Segmenter:
-    from jaxfit.perception.segmentation.bottom_up import BottomUp
-
-    return BottomUp(model, classes, min_score)
-
-
-def _is_bottom_up(model: OnnxModel) -> bool:
-    return {"foreground", "centre", "offset"} <= {port.name for port in model.outputs}
-
-
 _KINDS = {
-    "bottom_up": _Kind("outputs foreground, centre, offset", _is_bottom_up, _bottom_up),
+    "bottom_up": _Kind("outputs foreground, centre, offset", BottomUp.fits, BottomUp),
     "rf_detr": _Kind(
         "outputs dets (1, queries, 4), labels (1, queries, slots), masks (1, queries, h, w)", RfDetrSeg.fits, RfDetrSeg
     ),
