@@ -43,6 +43,14 @@ def test_two_birds_that_touch(tmp_path):
     assert second.box_px.tolist() == [120, 72, 84, 36]
 
 
+def test_cells_belong_to_the_centre_they_point_to_and_not_to_the_nearest(tmp_path):
+    # the long one's left end lies right below the other's centre, and beyond it
+    path = write(tmp_path / "net.onnx", maps_of(((10, 8, 20, 18), 0.9), ((2, 18, 58, 22), 0.8)))
+    first, second = load_segmenter(path)(np.zeros((96, 128, 3), np.uint8))
+    assert first.box_px.tolist() == [20, 16, 20, 20]
+    assert second.box_px.tolist() == [4, 36, 112, 8]
+
+
 def test_a_bird_in_two_pieces_is_one(tmp_path):
     maps = maps_of(((10, 10, 30, 16), 0.9))
     maps["foreground"][0, :, 18:22] = 0  # something stands in front of it
