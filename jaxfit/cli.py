@@ -1,6 +1,6 @@
 """The command line: what can be asked, and how failures are told.
 
-A parser names the function of `jaxfit.commands` that runs: those modules are imported once a command is known.
+A parser names the function of `jaxfit.commands` that runs: its module is imported once a command is known.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
@@ -64,9 +65,9 @@ def main(arguments: list[str] | None = None) -> int:
     logging.basicConfig(format="%(message)s", level=logging.INFO if options.verbose else logging.WARNING)
     try:
         use_cache()
-        from jaxfit import commands  # here, so that help and refusals need not wait for all that commands import
-
-        getattr(commands, options.run)(options)
+        module, command = options.run.split(".")
+        # here, so that help and refusals need not wait for all that commands import
+        getattr(import_module(f"jaxfit.commands.{module}"), command)(options)
     except InputError as error:
         print(f"jaxfit: {error}", file=sys.stderr)  # noqa: T201
         return 2
@@ -112,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--birds", type=int, default=9, help="fit: birds (default 9)")
     bench.add_argument("--frames", type=int, default=100, help="fit: frames a bird (default 100)")
     bench.add_argument("--json", action="store_true")
-    bench.set_defaults(run="bench")
+    bench.set_defaults(run="bench.bench")
     return parser
 
 
@@ -121,14 +122,14 @@ def _perception(add) -> None:
     _what_to_track(track)
     track.add_argument("--out", type=Path, required=True, metavar="OBS.json", help="COCO file to write")
     track.add_argument("--overwrite", action="store_true", help="replace an earlier file of that name")
-    track.set_defaults(run="track")
+    track.set_defaults(run="perception.track")
 
     reconstruct = add("reconstruct", help="track the birds of a video, pose and draw them")
     _what_to_track(reconstruct)
     reconstruct.add_argument("--model", default="murre", help=f"{MODEL} (default murre)")
     reconstruct.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the result")
     reconstruct.add_argument("--overwrite", action="store_true", help="replace an earlier result in that folder")
-    reconstruct.set_defaults(run="reconstruct")
+    reconstruct.set_defaults(run="perception.reconstruct")
 
 
 def _what_to_track(command: argparse.ArgumentParser) -> None:
@@ -158,7 +159,7 @@ def _fitting(add) -> None:
     fit.add_argument("--init", type=Path, help="starting poses (.npz): a regressor's, or an earlier poses.npz")
     fit.add_argument("--out", type=Path, required=True, help="folder for the result")
     fit.add_argument("--overwrite", action="store_true", help="replace an earlier result in that folder")
-    fit.set_defaults(run="fit")
+    fit.set_defaults(run="fitting.fit")
 
     evaluate = add("evaluate", help="compare a result, or observations, with annotations or a scene's truth")
     evaluate.add_argument("result", type=Path, metavar="DIR|OBS.json")
@@ -170,7 +171,7 @@ def _fitting(add) -> None:
         help="whose track of DIR is whose (default auto: by ids, unless a track follows another bird than its id's)",
     )
     evaluate.add_argument("--json", action="store_true", help="print JSON instead of tables")
-    evaluate.set_defaults(run="evaluate")
+    evaluate.set_defaults(run="fitting.evaluate")
 
     overlay = add("overlay", help="draw a result on its video")
     overlay.add_argument("result", type=Path, metavar="DIR")
@@ -181,7 +182,7 @@ def _fitting(add) -> None:
     overlay.add_argument("--frame", type=int, help="draw this frame alone, as a picture (.png or .jpg)")
     overlay.add_argument("--codec", default="auto", choices=CODEC_NAMES)
     overlay.add_argument("--overwrite", action="store_true", help="replace earlier files of these names")
-    overlay.set_defaults(run="overlay")
+    overlay.set_defaults(run="fitting.overlay")
 
 
 def _simulation(add) -> None:
@@ -194,11 +195,11 @@ def _simulation(add) -> None:
     simulate.add_argument("--seed", type=int, default=0, help="another seed gives another scene (default 0)")
     simulate.add_argument("--codec", default="auto", choices=CODEC_NAMES)
     simulate.add_argument("--overwrite", action="store_true", help="replace an earlier scene in that folder")
-    simulate.set_defaults(run="simulate")
+    simulate.set_defaults(run="simulation.simulate")
 
     demo = add("demo", help="simulate a short scene, reconstruct it from its footage, and show what came of it")
     demo.add_argument("--out", type=Path, default=Path("demo"), help="folder for everything (default demo)")
-    demo.set_defaults(run="demo")
+    demo.set_defaults(run="simulation.demo")
 
 
 def _training(add) -> None:
@@ -212,7 +213,7 @@ def _training(add) -> None:
     train.add_argument("--steps", type=int, help="of training (default: as the built-in one was trained)")
     train.add_argument("--seed", type=int, default=0, help="of first weights and of samples (default 0)")
     train.add_argument("--overwrite", action="store_true", help="replace an earlier file of that name")
-    train.set_defaults(run="train")
+    train.set_defaults(run="training.train")
 
 
 def _models(add) -> None:
@@ -221,15 +222,15 @@ def _models(add) -> None:
     importer.add_argument("kind", choices=("avian-mesh", "aves"))
     importer.add_argument("sources", type=Path, nargs="+", help="its files, or the folder that holds them")
     importer.add_argument("--out", type=Path, required=True, help="model file to write (.npz)")
-    importer.set_defaults(run="model_import")
+    importer.set_defaults(run="models.model_import")
     info = actions.add_parser("info", help="what a model holds")
     info.add_argument("file", metavar="MODEL", help=MODEL)
     info.add_argument("--json", action="store_true")
-    info.set_defaults(run="model_info")
+    info.set_defaults(run="models.model_info")
     view = actions.add_parser("view", help="draw a model from six sides")
     view.add_argument("file", metavar="MODEL", help=MODEL)
     view.add_argument("--out", type=Path, required=True, help="PNG to write")
     view.add_argument(
         "--posture", help="of the murre: standing, incubating, … (default: standing; other models at rest)"
     )
-    view.set_defaults(run="model_view")
+    view.set_defaults(run="models.model_view")

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from cli_files import BIRD, T, arguments, refused
 
-from jaxfit import cli, commands
+from jaxfit import cli
 from jaxfit.cli import main
+from jaxfit.commands import fitting
 from jaxfit.fitting.solution import load_solution
 from jaxfit.model.files import load_bird
 
@@ -161,7 +162,7 @@ def test_ctrl_c_leaves_nothing_behind(fitted, inputs, tmp_path, capsys, monkeypa
 
         yield tick
 
-    monkeypatch.setattr(commands, "terminal", impatient)
+    monkeypatch.setattr(fitting, "terminal", impatient)
     before = contents(fitted)
     refused(capsys, arguments(inputs, tmp_path / "out"), "stopped", code=130, alone=False)
     refused(capsys, [*arguments(inputs, fitted), "--overwrite"], "stopped", code=130, alone=False)

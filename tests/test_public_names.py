@@ -48,7 +48,9 @@ def test_what_needs_no_library_loads_none(arguments, code, said):
 
 def test_commands_load_what_they_need():
     """No command waits for the video libraries or the objective unless it uses them."""
-    code = "import sys, jaxfit.commands; print(*sys.modules)"
+    code = "import pkgutil, sys, jaxfit.commands as c\n"
+    code += "for m in pkgutil.iter_modules(c.__path__): __import__(f'jaxfit.commands.{m.name}')\n"
+    code += "print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "jaxfit.model.files" in loaded
     assert not set(loaded) & {"av", "cv2", "trimesh", "jaxfit.objective.objective", "jaxfit.evaluation.evaluate"}
