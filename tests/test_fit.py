@@ -14,7 +14,7 @@ from jaxfit.camera import Camera, project
 from jaxfit.config import config_to_yaml, load_config
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import evaluate
-from jaxfit.fitting.batch import fit_batch, frames_per_batch
+from jaxfit.fitting.batch import Lanes, fit_batch, frames_per_batch
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.solution import save_solution
 from jaxfit.fitting.start import load_start
@@ -259,7 +259,8 @@ def test_the_better_hypothesis_goes_on(observed, after_first):
     rig, priors = fold_bird(BIRD), priors_of(BIRD)
     for lanes in ((truth, flipped), (flipped, truth)):
         start = jax.tree.map(lambda *x: np.stack(x)[None], *lanes)
-        fitted = fit_batch(BIRD, rig, priors, settings, CAMERA, evidence, start, lambda *_: None)
+        only = Lanes(*np.zeros((3, 1), int))
+        fitted = fit_batch(BIRD, rig, priors, [settings], CAMERA, evidence, start, only, lambda *_: None)
         assert fitted.pose.global_orient.shape == (1, T, 3)
         assert not fitted.diverged.any()
         apart = np.linalg.norm(np.asarray(fitted.report.keypoints_px) - keypoints_of([truth]), axis=-1)

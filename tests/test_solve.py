@@ -13,7 +13,7 @@ from helpers import toy_bird
 from jaxfit.camera import Camera, project
 from jaxfit.config import FitConfig, StageConfig
 from jaxfit.fitting.solve import advance, begin, report
-from jaxfit.fitting.stages import stage_problem
+from jaxfit.fitting.stages import stage_knobs, stage_problem
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import weighted_sum
@@ -37,7 +37,11 @@ STEP = {"global_orient": 0.02, "body_pose": 0.02, "transl": np.array([0.02, 0.01
 
 
 def problem(stage=FIRST, config=CONFIG):
-    return stage_problem(config, stage, BIRD, RIG, PRIORS, CAMERA)
+    return stage_problem(config, stage, RIG, PRIORS, CAMERA)
+
+
+def knobs(stage=FIRST, config=CONFIG, lanes=B):
+    return stacked([stage_knobs(config, stage, BIRD.keypoint_names)] * lanes)
 
 
 def stacked(values):
@@ -75,18 +79,18 @@ def solve(stages, start, evidence, chunks=(STEPS,)):
     """Run stages as the fit does; final poses, losses before the last step, refused steps."""
     before, pose = None, start
     for stage in stages:
-        own = problem(stage)
+        own = problem(stage), knobs(stage, lanes=len(evidence.present))
         # the solver gives up what it is given: keep the caller's start
-        state = begin(own, jax.tree.map(jnp.copy, pose), evidence, before if stage.carry_moments else None)
+        state = begin(*own, jax.tree.map(jnp.copy, pose), evidence, before if stage.carry_moments else None)
         for steps in chunks:
-            state, loss, refused = advance((own, evidence, jnp.int32(steps)), state)
+            state, loss, refused = advance((*own, evidence, jnp.int32(steps)), state)
         pose, before = state.pose, state
     return jax.tree.map(np.asarray, (pose, loss, refused))
 
 
 def total(pose, start, evidence):
-    own = problem()
-    return weighted_sum(Scene(pose, start, evidence, RIG, PRIORS, CAMERA, own.raster), own.settings)
+    settings = CONFIG.stage_settings(FIRST)
+    return weighted_sum(Scene(pose, start, evidence, RIG, PRIORS, CAMERA, problem().raster), settings)
 
 
 @jax.jit
@@ -191,7 +195,7 @@ def test_keypoints_that_are_off():
 
 def test_the_report_is_weighted_and_of_the_poses_given():
     start, evidence = case()
-    result = report(problem(), start, start, evidence)
+    result = report(problem(), knobs(), start, start, evidence)
     assert set(result.loss) == set(FIRST.terms)
     np.testing.assert_allclose(sum(result.loss.values()), loss_and_gradient(start, evidence)[0], rtol=1e-5)
     prior = (np.asarray(start.body_pose).reshape(B, -1) ** 2).sum(1) / 0.1  # the toy bird's own
@@ -212,9 +216,9 @@ def test_one_program_for_any_steps_weights_and_rates(caplog):
     ]
     with caplog.at_level(logging.WARNING), jax.log_compiles():
         for stage, config in others:
-            own = problem(stage, config)
-            state = begin(own, jax.tree.map(jnp.copy, start), evidence, None)
-            advance((own, evidence, jnp.int32(3)), state)
+            own = problem(stage, config), knobs(stage, config)
+            state = begin(*own, jax.tree.map(jnp.copy, start), evidence, None)
+            advance((*own, evidence, jnp.int32(3)), state)
         assert not compiled(caplog, "advance")
         assert not compiled(caplog, "begin")
         shorter = jax.tree.map(lambda x: x[:1], (start, evidence))

@@ -73,7 +73,7 @@ def saved(tmp_path, arrays, name="start.npz"):
 def poses(start, common_size=False, observations=None):
     observations = observed() if observations is None else observations
     windows = cut_windows(observations, CONFIG)
-    start = start.at_crops(observations, windows)
+    start.check_crops(observations, windows)
     lines = zip(windows.track, windows.frame, windows.present, strict=True)
     windowed = [start.window_pose(BIRD, int(n), frame, present, common_size) for n, frame, present in lines]
     return jax.tree.map(np.asarray, windowed)

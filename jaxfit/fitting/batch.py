@@ -3,36 +3,37 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from jaxfit.camera import Camera
 from jaxfit.config import FitConfig
-from jaxfit.fitting.solve import Problem, Report, StageState, advance, begin, report
-from jaxfit.fitting.stages import needs_mask, stage_problem
+from jaxfit.fitting.solve import Knobs, Problem, Report, StageState, advance, begin, report
+from jaxfit.fitting.stages import needs_mask, stage_knobs, stage_problem
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.scene import Evidence, Priors
 from jaxfit.progress import Tick
 
-__all__ = ["Fitted", "fit_batch", "frames_per_batch"]
+__all__ = ["Fitted", "Lanes", "fit_batch", "frames_per_batch"]
 
 SECONDS_A_CALL = 1.0
 """How long the solver may run between two looks at progress and Ctrl-C."""
 
 
 class Fitted(NamedTuple):
-    """What became of a batch of W windows."""
+    """What became of a batch of L lanes, as NumPy arrays."""
 
     pose: Pose
     report: Report
-    diverged: Bool[np.ndarray, "W"]
+    diverged: Bool[np.ndarray, "L"]
     """Whether any step was refused because its gradient was not finite, or the end itself is not."""
 
 
@@ -42,56 +43,106 @@ def frames_per_batch(bird: Bird, config: FitConfig) -> int:
     return max(int(config.memory_gb * 1e9 / per_frame), 1)
 
 
+class Lanes(NamedTuple):
+    """A batch of L lanes: each one window under one config."""
+
+    config: Int[np.ndarray, "L"]
+    """Position of its config; all configs of a batch are one `program`."""
+    evidence: Int[np.ndarray, "L"]
+    """Row of the evidence that it is fitted to."""
+    start: Int[np.ndarray, "L"]
+    """Row of the starting poses. Lanes of one start are computed once for as long as their knobs are equal too:
+    only lanes of one row of evidence may share one."""
+
+
 def fit_batch(
     bird: Bird,
     rig: Rig,
     priors: Priors,
-    config: FitConfig,
+    configs: Sequence[FitConfig],
     camera: Camera,
     evidence: Evidence,
     start: Pose,
+    lanes: Lanes,
     tick: Tick,
 ) -> Fitted:
-    """Run all stages on W windows.
+    """Run all stages on L lanes.
 
     Args:
-        evidence: leading axis W (NumPy; masks are sent to a stage only where it needs them).
-        start: leading axes W, H: H hypotheses of each window.
+        configs: equal but for what their knobs hold, see `stages.program`.
+        evidence: leading axis E (NumPy; masks are sent to a stage only where it needs them).
+        start: leading axes S, H: H hypotheses of each start.
+        lanes: which window under which config each lane is.
         tick: told the steps done.
     """
-    windows, hypotheses = start.global_orient.shape[:2]
-    pose = jax.tree.map(lambda x: x.reshape(windows * hypotheses, *x.shape[2:]), start)
-    refused = jnp.zeros(windows * hypotheses, int)
+    starts, hypotheses = start.global_orient.shape[:2]
+    pose = jax.tree.map(lambda x: x.reshape(starts * hypotheses, *x.shape[2:]), start)
+    refused = jnp.zeros(starts * hypotheses, int)
     before: StageState | None = None
-    for i, stage in enumerate(config.stages):
-        problem = stage_problem(config, stage, bird, rig, priors, camera)
-        seen = _lanes(evidence, hypotheses, needs_mask(stage))
-        state = begin(problem, pose, seen, before if stage.carry_moments else None)
-        state, new_refused = _run(problem, seen, state, stage.steps, stage.name, tick)
+    row = lanes.start  # of each lane in what is computed, hypotheses side by side
+    stages = configs[0].stages
+    for i, stage in enumerate(stages):
+        problem = stage_problem(configs[0], stage, rig, priors, camera)
+        each = [stage_knobs(config, config.stages[i], bird.keypoint_names) for config in configs]
+        first, now = _distinct(row, lanes.config, each)
+        pose, before, refused = _rows((pose, before, refused), row[first], hypotheses)
+        row = now
+        knobs = _side_by_side([each[k] for k in lanes.config[first]], hypotheses)
+        seen = _seen(evidence, lanes.evidence[first], hypotheses, needs_mask(stage))
+        state = begin(problem, knobs, pose, seen, before if stage.carry_moments else None)
+        state, new_refused = _run((problem, knobs, seen), state, stage.steps, stage.name, tick)
         refused = refused + new_refused
-        last = i == len(config.stages) - 1
+        last = i == len(stages) - 1
         if hypotheses > 1 and (stage.keep_best or last):
-            keep = _best(report(problem, state.pose, state.start, seen), windows, hypotheses)
-            state, refused = jax.tree.map(lambda x, keep=keep: x[keep], (state, refused))
+            keep = _best(report(problem, knobs, state.pose, state.start, seen), len(first), hypotheses)
+            state, refused, knobs, seen = jax.tree.map(lambda x, keep=keep: x[keep], (state, refused, knobs, seen))
             hypotheses = 1
-            seen = _lanes(evidence, 1, needs_mask(stage))
         pose, before = state.pose, state
         if last:
-            final = report(problem, pose, state.start, seen)
-    total = sum(np.asarray(value) for value in final.loss.values())
-    return Fitted(pose, final, (np.asarray(refused) > 0) | ~np.isfinite(total))
+            final = report(problem, knobs, pose, state.start, seen)
+    pose, final, refused = jax.tree.map(lambda x: np.asarray(x)[row], (pose, final, refused))
+    total = sum(value for value in final.loss.values())
+    return Fitted(pose, final, (refused > 0) | ~np.isfinite(total))
+
+
+def _distinct(
+    row: Int[np.ndarray, "L"], config: Int[np.ndarray, "L"], knobs: Sequence[Knobs]
+) -> tuple[Int[np.ndarray, "D"], Int[np.ndarray, "L"]]:
+    """The first lane of each of D distinct ones, and each lane's row among those: lanes that stood in one row and
+    have equal knobs stay together."""
+    held = [b"".join(np.asarray(x).tobytes() for x in jax.tree.leaves(each)) for each in knobs]
+    rows: dict[tuple[int, bytes], int] = {}
+    now = np.array([rows.setdefault((int(r), held[k]), len(rows)) for r, k in zip(row, config, strict=True)])
+    return np.unique(now, return_index=True)[1], now
+
+
+def _rows(tree: Any, rows: Int[np.ndarray, "D"], hypotheses: int) -> Any:
+    """Rows of everything, with all their hypotheses."""
+    at = jnp.asarray((rows[:, None] * hypotheses + np.arange(hypotheses)).ravel())
+    return jax.tree.map(lambda x: x[at], tree)
+
+
+def _side_by_side(knobs: Sequence[Knobs], hypotheses: int) -> Knobs:
+    return jax.tree.map(lambda *x: jnp.asarray(np.repeat(np.stack(x), hypotheses, axis=0)), *knobs)
+
+
+def _seen(evidence: Evidence, rows: Int[np.ndarray, "D"], hypotheses: int, with_mask: bool) -> Evidence:
+    """Evidence for every hypothesis of every row, without masks where nothing looks at them."""
+    mask = evidence.mask if with_mask else evidence.mask[..., :0, :0]
+    at = np.repeat(rows, hypotheses)
+    return jax.tree.map(lambda x: jnp.asarray(x[at]), replace(evidence, mask=mask))
 
 
 def _run(
-    problem: Problem, evidence: Evidence, state: StageState, steps: int, name: str, tick: Tick
+    fixed: tuple[Problem, Knobs, Evidence], state: StageState, steps: int, name: str, tick: Tick
 ) -> tuple[StageState, Array]:
     """Take a stage's steps in calls of about a second, so that progress shows and Ctrl-C works."""
     done, chunk = 0, 1
-    refused = jnp.zeros(evidence.present.shape[0], int)
+    refused = jnp.zeros(state.pose.global_orient.shape[0], int)
     while done < steps:
         take = min(chunk, steps - done)
         began = time.perf_counter()
-        state, loss, refused = advance((problem, evidence, jnp.int32(take)), state)
+        state, loss, refused = advance((*fixed, jnp.int32(take)), state)
         mean_loss = float(jnp.mean(loss))  # waits for the result
         seconds = time.perf_counter() - began
         done += take
@@ -99,13 +150,6 @@ def _run(
         # the first call compiles: it says nothing about speed
         chunk = 2 if done == take else max(1, min(4 * take, int(SECONDS_A_CALL * take / seconds)))
     return state, refused
-
-
-def _lanes(evidence: Evidence, hypotheses: int, with_mask: bool) -> Evidence:
-    """Evidence for every hypothesis of every window, without masks where nothing looks at them."""
-    mask = evidence.mask if with_mask else evidence.mask[..., :0, :0]
-    lanes = replace(evidence, mask=mask)
-    return jax.tree.map(lambda x: jnp.asarray(np.repeat(x, hypotheses, axis=0) if hypotheses > 1 else x), lanes)
 
 
 def _best(final: Report, windows: int, hypotheses: int) -> Array:

@@ -1,4 +1,8 @@
-"""One stage of the fit: optimistix' Adam on a batch of windows, as one compiled program."""
+"""One stage of the fit: optimistix' Adam on a batch of windows, as one compiled program.
+
+A lane is one window under one config: what configs may set without another program (`Knobs`) differs from lane to
+lane, so that a sweep is one batch.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int
@@ -17,25 +22,30 @@ from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
 from jaxfit.objective.scene import Evidence, Priors, Raster, Scene
 
-__all__ = ["Problem", "Report", "StageState", "advance", "begin", "report"]
+__all__ = ["Knobs", "Problem", "Report", "StageState", "advance", "begin", "report"]
 
 NEVER = 2**30
 """Non-finite steps in a row that a lane may refuse: a diverging bird stands still and leaves others alone."""
 
 
 class Problem(NamedTuple):
-    """What a stage needs beside the poses. Everything but `camera` and `raster` is traced."""
+    """What all lanes of a stage share. `rig` and `priors` are traced, `camera` and `raster` part of the program."""
 
     rig: Rig
     priors: Priors
-    settings: dict[str, dict[str, Float[Array, ""]]]
+    camera: Camera
+    raster: Raster
+
+
+class Knobs(NamedTuple):
+    """What each lane has of its own, all traced; a batch of B lanes puts an axis B in front."""
+
+    settings: dict[str, dict[str, Float[Array | np.ndarray, "*B"]]]
     """Weight and settings of the active terms."""
     step_size: Pose
     """Adam's step for every parameter, shaped to broadcast against it; 0 keeps it fixed."""
-    keypoints_on: Float[Array, "K"]
+    keypoints_on: Float[Array | np.ndarray, "*B K"]
     """1 for the keypoints that this stage looks at, else 0."""
-    camera: Camera
-    raster: Raster
 
 
 class StageState(NamedTuple):
@@ -48,14 +58,14 @@ class StageState(NamedTuple):
     """The solver's state: moments and counters."""
 
 
-def _scene(problem: Problem, pose: Pose, start: Pose, evidence: Evidence) -> Scene:
-    seen = eqx.tree_at(lambda e: e.confidence, evidence, evidence.confidence * problem.keypoints_on)
+def _scene(problem: Problem, knobs: Knobs, pose: Pose, start: Pose, evidence: Evidence) -> Scene:
+    seen = eqx.tree_at(lambda e: e.confidence, evidence, evidence.confidence * knobs.keypoints_on)
     return Scene(pose, start, seen, problem.rig, problem.priors, problem.camera, problem.raster)
 
 
-def _solver(problem: Problem, carried: Any = None) -> optx.OptaxMinimiser:
+def _solver(knobs: Knobs, carried: Any = None) -> optx.OptaxMinimiser:
     def scale(updates, _):
-        return jax.tree.map(lambda update, step: -step * update, updates, problem.step_size)
+        return jax.tree.map(lambda update, step: -step * update, updates, knobs.step_size)
 
     adam = optax.scale_by_adam()
     if carried is not None:
@@ -71,23 +81,23 @@ def _fixed(pose: Pose, step_size: Pose) -> Pose:
 
 
 def _loss(pose: Pose, args: Any) -> tuple[Float[Array, ""], None]:
-    problem, start, evidence = args
-    return weighted_sum(_scene(problem, _fixed(pose, problem.step_size), start, evidence), problem.settings), None
+    problem, knobs, start, evidence = args
+    return weighted_sum(_scene(problem, knobs, _fixed(pose, knobs.step_size), start, evidence), knobs.settings), None
 
 
 STRUCT = jax.ShapeDtypeStruct((), jnp.float32)
 
 
 @eqx.filter_jit
-def begin(problem: Problem, pose: Pose, evidence: Evidence, before: StageState | None) -> StageState:
+def begin(problem: Problem, knobs: Knobs, pose: Pose, evidence: Evidence, before: StageState | None) -> StageState:
     """Start a stage at `pose`; with `before`, Adam goes on with that stage's moments."""
 
-    def one(pose, evidence, carried):
-        solver = _solver(problem, carried)
-        state = solver.init(_loss, pose, (problem, pose, evidence), {}, STRUCT, None, frozenset())
+    def one(knobs, pose, evidence, carried):
+        solver = _solver(knobs, carried)
+        state = solver.init(_loss, pose, (problem, knobs, pose, evidence), {}, STRUCT, None, frozenset())
         return StageState(pose, pose, state)
 
-    return jax.vmap(one)(pose, evidence, None if before is None else _moments(before))
+    return jax.vmap(one)(knobs, pose, evidence, None if before is None else _moments(before))
 
 
 def _moments(state: StageState) -> optax.ScaleByAdamState:
@@ -95,22 +105,24 @@ def _moments(state: StageState) -> optax.ScaleByAdamState:
 
 
 @eqx.filter_jit(donate="all-except-first")
-def advance(fixed: tuple[Problem, Evidence, Int[Array, ""]], state: StageState) -> tuple[StageState, Array, Array]:
+def advance(
+    fixed: tuple[Problem, Knobs, Evidence, Int[Array, ""]], state: StageState
+) -> tuple[StageState, Array, Array]:
     """Take some steps.
 
     Args:
-        fixed: the problem, the evidence (B, …) and the number of steps, traced.
+        fixed: the problem, knobs and evidence (B, …) and the number of steps, traced.
         state: given up; use the returned one.
 
     Returns:
-        The new state, each window's loss before its last step (B,), and how many of its steps so far were
+        The new state, each lane's loss before its last step (B,), and how many of its steps so far were
         refused because the gradient was not finite (B,).
     """
-    problem, evidence, steps = fixed
-    solver = _solver(problem)
+    problem, knobs, evidence, steps = fixed
 
-    def one(state: StageState, evidence: Evidence):
-        args = (problem, state.start, evidence)
+    def one(knobs: Knobs, state: StageState, evidence: Evidence):
+        solver = _solver(knobs)
+        args = (problem, knobs, state.start, evidence)
 
         def step(_, carry):
             pose, solver_state = carry
@@ -119,7 +131,7 @@ def advance(fixed: tuple[Problem, Evidence, Int[Array, ""]], state: StageState) 
 
         return jax.lax.fori_loop(0, steps, step, (state.pose, state.solver))
 
-    pose, solver_state = jax.vmap(one)(state, evidence)
+    pose, solver_state = jax.vmap(one)(knobs, state, evidence)
     refused = solver_state.opt_state.total_notfinite
     return StageState(pose, state.start, solver_state), solver_state.f, refused
 
@@ -135,13 +147,13 @@ class Report(NamedTuple):
 
 
 @eqx.filter_jit
-def report(problem: Problem, pose: Pose, start: Pose, evidence: Evidence) -> Report:
+def report(problem: Problem, knobs: Knobs, pose: Pose, start: Pose, evidence: Evidence) -> Report:
     """Evaluate poses as they are (the solver itself only knows the loss before its last step)."""
 
-    def one(pose, start, evidence):
-        scene = _scene(problem, pose, start, evidence)
-        values = evaluate_terms(scene, problem.settings)
-        weighted = {name: problem.settings[name]["weight"] * value for name, value in values.items()}
+    def one(knobs, pose, start, evidence):
+        scene = _scene(problem, knobs, pose, start, evidence)
+        values = evaluate_terms(scene, knobs.settings)
+        weighted = {name: knobs.settings[name]["weight"] * value for name, value in values.items()}
         return Report(weighted, scene.keypoints_cam, scene.keypoints_px)
 
-    return jax.vmap(one)(pose, start, evidence)
+    return jax.vmap(one)(knobs, pose, start, evidence)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from jaxfit.camera import Camera
-from jaxfit.config import FitConfig, StageConfig
-from jaxfit.fitting.solve import Problem
-from jaxfit.model.bird import Bird
+from jaxfit.config import FitConfig, InitialiseConfig, StageConfig
+from jaxfit.fitting.solve import Knobs, Problem
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import compares_masks
 from jaxfit.objective.scene import Priors, Raster
 from jaxfit.silhouette import Blur
 
-__all__ = ["needs_mask", "stage_problem"]
+__all__ = ["needs_mask", "program", "stage_knobs", "stage_problem"]
 
 STEP_SHAPES = {
     "global_orient": (3,),
@@ -32,26 +34,49 @@ def needs_mask(stage: StageConfig) -> bool:
     return any(compares_masks(name) for name in stage.terms)
 
 
-def stage_problem(
-    config: FitConfig, stage: StageConfig, bird: Bird, rig: Rig, priors: Priors, camera: Camera
-) -> Problem:
-    """What the solver needs for one stage; weights, settings and step sizes become traced arrays."""
-
-    def step_size(name: str, shape: tuple[int, ...]):
-        scale = jnp.asarray(stage.step_scale.get(name, 1.0), jnp.float32)
-        return jnp.broadcast_to(stage.learning_rate * scale if name in stage.free else 0.0, shape)
-
+def stage_problem(config: FitConfig, stage: StageConfig, rig: Rig, priors: Priors, camera: Camera) -> Problem:
+    """What the lanes of one stage share."""
     usual = Blur.for_size(camera.size_px)
-    settings = {
-        name: {key: jnp.float32(value) for key, value in values.items()}
-        for name, values in config.stage_settings(stage).items()
-    }
-    return Problem(
-        rig=rig,
-        priors=priors,
-        settings=settings,
+    raster = Raster(Blur(usual.sigma * stage.blur**2, usual.radius * stage.blur), config.backend)
+    return Problem(rig, priors, camera, raster)
+
+
+def stage_knobs(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[str]) -> Knobs:
+    """What one config may set in a stage without another program, as NumPy arrays of one lane."""
+
+    def step_size(name: str, shape: tuple[int, ...]) -> np.ndarray:
+        scale = np.asarray(stage.step_scale.get(name, 1.0), np.float32)
+        return np.array(np.broadcast_to(stage.learning_rate * scale if name in stage.free else 0.0, shape), np.float32)
+
+    return Knobs(
+        settings={
+            name: {key: np.array(value, np.float32) for key, value in values.items()}
+            for name, values in config.stage_settings(stage).items()
+        },
         step_size=Pose(**{name: step_size(name, shape) for name, shape in STEP_SHAPES.items()}),
-        keypoints_on=jnp.array([float(name not in stage.keypoints_off) for name in bird.keypoint_names]),
-        camera=camera,
-        raster=Raster(Blur(usual.sigma * stage.blur**2, usual.radius * stage.blur), config.backend),
+        keypoints_on=np.array([name not in stage.keypoints_off for name in keypoint_names], np.float32),
+    )
+
+
+def program(config: FitConfig) -> FitConfig:
+    """The config without what its knobs hold and what only prepares the data: equal ones share compiled programs."""
+    stages = tuple(
+        replace(
+            stage,
+            free=tuple(name for name in stage.free if name == "betas"),  # it decides whether there are any
+            learning_rate=1.0,
+            step_scale={},
+            keypoints_off=(),
+            override={},
+        )
+        for stage in config.stages
+    )
+    return replace(
+        config,
+        stages=stages,
+        terms={},
+        filter_window=1,
+        min_keypoints=1,
+        crop=replace(config.crop, padding=0.0),
+        initialise=InitialiseConfig(hypotheses=config.initialise.hypotheses),
     )

@@ -43,8 +43,8 @@ class Start:
         """Whether any shape coefficient is not zero."""
         return bool(np.any(np.nan_to_num(self.betas)))
 
-    def at_crops(self, observations: Observations, windows: Windows) -> Start:
-        """The same, checked: every window has a start, in the crop that the window uses.
+    def check_crops(self, observations: Observations, windows: Windows) -> None:
+        """Check that every window has a start, in the crop that the window uses.
 
         Raises:
             InputError: a window without any starting pose, or poses of other crops.
@@ -62,7 +62,6 @@ class Start:
                         f"`crop` of track {observations.track_id[n]} is {apart:.0f} pixels off this config's",
                         "use the window and crop settings that made the file",
                     )
-        return self
 
     def window_pose(
         self,

@@ -16,7 +16,7 @@ from jaxfit.filtering import weighted_median_filter
 from jaxfit.objective.scene import Evidence
 from jaxfit.observations import Observations
 
-__all__ = ["Windows", "cut_windows", "filter_observations", "load_evidence"]
+__all__ = ["Windows", "cut_windows", "filter_observations", "load_evidence", "load_keypoints"]
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,7 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
 
 def load_evidence(observations: Observations, windows: Windows, size_px: int) -> Evidence:
     """Keypoints and masks of some windows in crop pixels (NumPy, with a leading W axis)."""
-    track, frame = windows.track[:, None], np.maximum(windows.frame, 0)
-    keypoints_px = image_to_crop(observations.keypoints_px[track, frame], windows.crop, size_px)
-    confidence = observations.confidence[track, frame] * windows.present[..., None]
+    keypoints_px, confidence = load_keypoints(observations, windows, size_px)
     mask = np.zeros((*windows.frame.shape, size_px, size_px), np.uint8)
     has_mask = np.zeros(windows.frame.shape, bool)
     for w, t in zip(*np.nonzero(windows.present), strict=True):
@@ -98,12 +96,23 @@ def load_evidence(observations: Observations, windows: Windows, size_px: int) ->
             mask[w, t] = cut_mask(full, windows.crop[w, t], size_px)
             has_mask[w, t] = True
     return Evidence(
-        keypoints_px=np.where(confidence[..., None] > 0, keypoints_px, 0).astype(np.float32),
-        confidence=confidence.astype(np.float32),
+        keypoints_px=keypoints_px,
+        confidence=confidence,
         mask=mask,
         has_mask=has_mask,
         present=windows.present,
     )
+
+
+def load_keypoints(
+    observations: Observations, windows: Windows, size_px: int
+) -> tuple[Float[np.ndarray, "W T K 2"], Float[np.ndarray, "W T K"]]:
+    """Keypoints of some windows in crop pixels, 0 where not seen, and their confidence."""
+    track, frame = windows.track[:, None], np.maximum(windows.frame, 0)
+    keypoints_px = image_to_crop(observations.keypoints_px[track, frame], windows.crop, size_px)
+    confidence = observations.confidence[track, frame] * windows.present[..., None]
+    seen = np.where(confidence[..., None] > 0, keypoints_px, 0)
+    return seen.astype(np.float32), confidence.astype(np.float32)
 
 
 def cut_mask(mask: Bool[np.ndarray, "H W"], crop: Float[np.ndarray, "3"], size_px: int) -> np.ndarray:
