@@ -183,7 +183,7 @@ def load_reconstruct_config(source: str | Path = "reconstruct") -> ReconstructCo
 
 def shipped_configs() -> list[str]:
     """Names of the configs of fits that come with jaxfit."""
-    return [name for name in shipped_files() if name != "reconstruct"]
+    return [name for name in shipped_files() if name not in ("ablation", "reconstruct")]
 
 
 def _as_settings(value: Any) -> dict[str, float]:

@@ -14,7 +14,16 @@ import yaml
 
 from jaxfit.errors import InputError
 
-__all__ = ["OWN_FILE", "ConfigKeyError", "config_to_yaml", "read_config", "require", "shipped_files"]
+__all__ = [
+    "OWN_FILE",
+    "ConfigKeyError",
+    "build_config",
+    "config_to_yaml",
+    "plain_config",
+    "read_config",
+    "require",
+    "shipped_files",
+]
 
 Config = TypeVar("Config")
 
@@ -65,9 +74,18 @@ def read_config(kind: type[Config], source: str | Path, base: str) -> Config:
         raise InputError(_origin(origins, error.key, str(source)), error.problem, error.remedy) from None
 
 
+def build_config(kind: type[Config], values: dict[str, Any]) -> Config:
+    """A config from plain values, as `plain_config` gives them.
+
+    Raises:
+        ConfigKeyError: an unknown key, a value of the wrong kind or that makes no sense.
+    """
+    return _build(kind, values, "", "paper")
+
+
 def config_to_yaml(config: Any) -> str:
     """The whole config, defaults included, as a YAML text that reads back."""
-    return yaml.safe_dump(_plain(config), sort_keys=False, allow_unicode=True)
+    return yaml.safe_dump(plain_config(config), sort_keys=False, allow_unicode=True)
 
 
 def _read(source: str, kind: type, seen: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -216,11 +234,12 @@ def _one_of(kinds: tuple[Any, ...], value: Any, where: str, base: str) -> Any:
     raise ConfigKeyError(where, f"`{where}` is {value!r}")
 
 
-def _plain(value: Any) -> Any:
+def plain_config(value: Any) -> Any:
+    """A config, or a part of one, as dicts, lists and plain values."""
     if dataclasses.is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {f.name: plain_config(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: plain_config(v) for k, v in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
+        return [plain_config(v) for v in value]
     return value

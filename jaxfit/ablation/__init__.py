@@ -1,0 +1,1 @@
+"""Ablations: a grid of configs crossed, fitted in batches, measured and reported."""
