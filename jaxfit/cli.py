@@ -173,6 +173,17 @@ def _fitting(add) -> None:
     evaluate.add_argument("--json", action="store_true", help="print JSON instead of tables")
     evaluate.set_defaults(run="fitting.evaluate")
 
+    ablate = add("ablate", help="fit the same birds under a grid of configs, and compare (needs the extra `report`)")
+    ablate.add_argument("observations", type=Path, metavar="OBS.json")
+    ablate.add_argument("--truth", type=Path, required=True, help="COCO file of annotations, or a simulated scene")
+    ablate.add_argument("--grid", default="ablation", help="`ablation` (the paper's 34 runs) or a YAML file")
+    ablate.add_argument("--model", default="murre", help=f"{MODEL} (default murre)")
+    ablate.add_argument("--match", choices=("auto", "ids", "overlap"), default="auto", help="as of `evaluate`")
+    ablate.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder for all of it; one that was interrupted goes on"
+    )
+    ablate.set_defaults(run="ablation.ablate")
+
     overlay = add("overlay", help="draw a result on its video")
     overlay.add_argument("result", type=Path, metavar="DIR")
     overlay.add_argument("--video", type=Path, required=True, help="the video (or folder of frames) that was fitted")

@@ -25,8 +25,8 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     later = {path: value for path, value in values.items() if isinstance(value, str) and value.startswith("=")}
     for path in (*(path for path in values if path not in later), *later):
         value = _get(plain, later[path][1:], path) if path in later else values[path]
-        holder, key = _find(plain, path, path)
-        if isinstance(holder.get(key) if isinstance(holder, dict) else None, dict) and not isinstance(value, dict):
+        holder, key, of_terms = _find(plain, path, path)
+        if of_terms and isinstance(holder.get(key), dict) and not isinstance(value, dict):
             holder, key = holder[key], "weight"  # a term with settings
         holder[key] = value
     return build_config(type(config), plain)
@@ -42,28 +42,30 @@ def get_value(config: Any, path: str) -> Any:
 
 
 def _get(plain: Any, path: str, asked: str) -> Any:
-    holder, key = _find(plain, path, asked)
+    holder, key, of_terms = _find(plain, path, asked)
     if isinstance(holder, dict) and key not in holder:
         raise ConfigKeyError(asked, f"`{asked}` asks for `{path}`, which is not set", _known(holder))
     value = holder[key]
-    return value.get("weight", 1.0) if isinstance(value, dict) else value
+    return value.get("weight", 1.0) if of_terms and isinstance(value, dict) else value
 
 
-def _find(plain: Any, path: str, asked: str) -> tuple[Any, Any]:
-    """What holds the last part of a path, and that part; terms' own names may hold dots."""
-    holder, rest = plain, re.sub(r"\[(\d+)\]", r".\1", path)
+def _find(plain: Any, path: str, asked: str) -> tuple[Any, Any, bool]:
+    """What holds the last part of a path, that part, and whether it names a term; terms' own names may hold dots."""
+    holder: Any = plain
+    rest, of_terms = re.sub(r"\[(\d+)\]", r".\1", path), False
     while True:
+        key: Any
         key, rest = _step(holder, rest)
         if isinstance(holder, list):
             key = _position(holder, key, asked)
         if not rest:
-            return holder, key
+            return holder, key, of_terms
         below = holder[key] if isinstance(holder, list) else holder.get(key)
-        if isinstance(holder, dict) and isinstance(below, int | float) and key != "weight":
-            below = holder[key] = {"weight": below}  # a term's setting beside its weight
+        if of_terms and isinstance(below, int | float):
+            below = holder[key] = {"weight": below}  # a setting comes to stand beside it
         if not isinstance(below, dict | list):
-            raise ConfigKeyError(asked, f"`{asked}` leads nowhere: there is no `{key}`", _known(holder))
-        holder = below
+            raise ConfigKeyError(asked, f"`{path}` leads nowhere: there is no `{key}`", _known(holder))
+        holder, of_terms = below, key in ("terms", "override") and isinstance(below, dict)
 
 
 def _step(holder: Any, rest: str) -> tuple[str, str]:

@@ -15,7 +15,7 @@ from jaxfit.config_file import ConfigKeyError, read_config, require
 from jaxfit.config_paths import get_value, with_values
 from jaxfit.errors import InputError
 
-__all__ = ["CrossConfig", "GridConfig", "Run", "load_grid"]
+__all__ = ["ClaimConfig", "CrossConfig", "Grid", "GridConfig", "Run", "load_grid", "short"]
 
 _logger = logging.getLogger(__name__)
 
@@ -31,13 +31,29 @@ class CrossConfig:
 
 
 @dataclass(frozen=True)
+class ClaimConfig:
+    """Something that a grid can show: runs of one kind are better than runs of another."""
+
+    claim: str
+    """In words."""
+    better: Mapping[str, Any]
+    """Path of a config key → the value, as the grid writes it, of those that should be better."""
+    worse: Mapping[str, Any]
+    """The same of those that they are compared with: runs with equal values of all keys that neither names."""
+    harmless: bool = False
+    """Whether no difference is enough."""
+
+
+@dataclass(frozen=True)
 class GridConfig:
-    """What an ablation runs."""
+    """What an ablation runs, and what it is to show."""
 
     crosses: tuple[CrossConfig, ...]
     """One after the other."""
     config: str = "paper"
     """The config of a fit that every run starts from: a shipped one's name or a YAML file's path."""
+    claims: tuple[ClaimConfig, ...] = ()
+    """What to compare; any number, in words of one's own."""
 
     def __post_init__(self):
         require(len(self.crosses) > 0, "crosses", "is empty", "an ablation needs a cross")
@@ -56,49 +72,78 @@ class Run:
 
     name: str
     """Made from the varied values; a folder's name."""
-    varied: Mapping[str, Any]
-    """The values of all keys that differ between runs of the grid, by their paths."""
+    levels: Mapping[str, Any]
+    """The values of all keys that differ between runs, by their paths, as the grid writes them (`=path` and all)."""
     config: FitConfig
 
+    def value(self, path: str) -> Any:
+        """The value of a key in this run's config."""
+        return get_value(self.config, path)
 
-def load_grid(source: str | Path) -> list[Run]:
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid, crossed."""
+
+    runs: tuple[Run, ...]
+    claims: tuple[ClaimConfig, ...]
+
+
+def load_grid(source: str | Path) -> Grid:
     """Read a grid by the name of the shipped one (`ablation`) or the path of a YAML file, and cross it.
 
     Runs that come out equal are one.
 
     Raises:
-        InputError: an unreadable file, an unknown key, a value that makes no sense, a cross without a run.
+        InputError: an unreadable file, an unknown key, a value that makes no sense, a cross without a run, a claim
+            about a key that does not vary.
     """
     grid = read_config(GridConfig, source, "ablation")
     base = load_config(grid.config)
-    configs: list[FitConfig] = []
-    paths: dict[str, None] = {}
-    for i, each in enumerate(grid.crosses):
-        paths |= dict.fromkeys((*each.set, *each.cross))
-        for values in itertools.product(*each.cross.values()):
-            try:
-                config = with_values(base, {**each.set, **dict(zip(each.cross, values, strict=True))})
-            except ConfigKeyError as error:
-                raise InputError(source, f"crosses[{i}]: {error.problem}", error.remedy) from None
-            if config in configs:
-                _logger.warning("%s: two runs are the same (%s): kept once", source, dict(zip(each.cross, values)))
-            else:
-                configs.append(config)
-    values = {path: [get_value(config, path) for config in configs] for path in paths}
-    varied = {path: each for path, each in values.items() if any(value != each[0] for value in each)}
-    runs = [
-        Run(_name({path: each[r] for path, each in varied.items()}), {p: v[r] for p, v in varied.items()}, config)
-        for r, config in enumerate(configs)
+    levels = [
+        {**each.set, **dict(zip(each.cross, values, strict=True))}
+        for each in grid.crosses
+        for values in itertools.product(*each.cross.values())
     ]
-    return [Run(f"{r + 1:0{len(str(len(runs)))}d}_{run.name}", run.varied, run.config) for r, run in enumerate(runs)]
+    configs: list[FitConfig] = []
+    kept: list[dict[str, Any]] = []
+    for each in levels:
+        try:
+            config = with_values(base, each)
+        except ConfigKeyError as error:
+            raise InputError(source, error.problem, error.remedy) from None
+        if config in configs:
+            _logger.warning("%s: two runs are the same, kept once: %s", source, each)
+        else:
+            configs.append(config)
+            kept.append(each)
+    paths = dict.fromkeys(path for each in kept for path in each)
+    values = {path: [get_value(config, path) for config in configs] for path in paths}
+    varied = [path for path, each in values.items() if any(value != each[0] for value in each)]
+    for i, claim in enumerate(grid.claims):
+        for path in (*claim.better, *claim.worse):
+            if path not in varied:
+                problem = f"`claims[{i}]` is about `{path}`, which does not vary"
+                raise InputError(source, problem, f"these do: {', '.join(varied)}")
+    digits = len(str(len(configs)))
+    runs = tuple(
+        Run(
+            f"{r + 1:0{digits}d}_{_name({path: values[path][r] for path in varied})}",
+            {path: kept[r].get(path, values[path][r]) for path in varied},
+            config,
+        )
+        for r, config in enumerate(configs)
+    )
+    return Grid(runs, grid.claims)
 
 
-def _name(varied: Mapping[str, Any]) -> str:
-    parts = [f"{path.rpartition('.')[2]}={_short(value)}" for path, value in varied.items()]
+def _name(values: Mapping[str, Any]) -> str:
+    parts = [f"{path.rpartition('.')[2]}={short(value)}" for path, value in values.items()]
     return re.sub(r"[^\w.,=+-]", "-", ",".join(parts))[:120] or "only"
 
 
-def _short(value: Any) -> str:
+def short(value: Any) -> str:
+    """A value in few letters: 1e4, true."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value).lower()
     return re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")

@@ -1,0 +1,76 @@
+"""me_p and me_v over the key that a grid sweeps, a line for each setting of the rest."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxfit.ablation.claims import CLAIMED
+from jaxfit.ablation.measure import Result
+from jaxfit.ablation.table import format_cell, heading
+
+__all__ = ["plot", "swept"]
+
+_LABELS = {"me_p": "me_p (share of the bird's longer side)", "me_v": "me_v (the same, a frame)"}
+_STYLES = ("-", "--", "-.", ":")
+_MARKERS = "osD^v<>Pp*"
+
+
+def plot(results: Sequence[Result]) -> bytes:
+    """A PNG with a panel each for me_p and me_v.
+
+    The horizontal axis is the number with the most levels among the varied keys (for the paper's grid λ_vel). Runs
+    that share all other levels are joined by a line; those that stand alone are drawn as a line across. Bars are 95 %
+    intervals over birds.
+    """
+    path = swept(results)
+    lines: dict[tuple[str, ...], list[Result]] = {}
+    for result in results:
+        rest = (f"{heading(p)} {format_cell(p, level)}" for p, level in result.run.levels.items() if p != path)
+        lines.setdefault(tuple(rest), []).append(result)
+    common = set.intersection(*(set(key) for key in lines)) if len(lines) > 1 else set()
+    figure = Figure(figsize=(12, 5.2), layout="constrained")
+    panels = figure.subplots(1, len(CLAIMED))
+    x_of = [_number(result, path) for result in results]
+    for panel, metric in zip(panels, CLAIMED, strict=True):
+        for i, (key, members) in enumerate(lines.items()):
+            label = ", ".join(part for part in key if part not in common) or "all"
+            style = {"color": f"C{i % 10}", "linestyle": _STYLES[i // 10 % 4], "label": label}
+            value = np.array([r.evaluation.overall[metric] for r in members])
+            bounds = np.array([r.evaluation.intervals[metric] for r in members]).T
+            if len(members) == 1:
+                panel.axhline(value[0], linewidth=1, alpha=0.8, **style)
+                continue
+            x = np.array([_number(r, path) for r in members]) * 1.03 ** (i - len(lines) / 2)  # side by side
+            order = np.argsort(x)
+            error = np.abs(bounds - value)[:, order]
+            marker = _MARKERS[i % len(_MARKERS)]
+            panel.errorbar(x[order], value[order], error, marker=marker, markersize=4, elinewidth=0.6, **style)
+        panel.set(xlabel=heading(path) if path else "run", ylabel=_LABELS[metric], title=metric)
+        if path and max(x_of) >= 20 * min((x for x in x_of if x > 0), default=max(x_of) + 1):
+            panel.set_xscale("log")
+        panel.set_yscale("log")
+        panel.grid(True, which="both", alpha=0.2)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=7, frameon=False)
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
+    return out.getvalue()
+
+
+def swept(results: Sequence[Result]) -> str:
+    """Path of the varied key with the most numbers; an empty text where none has two."""
+
+    def numbers(path: str) -> int:
+        levels = {result.run.levels[path] for result in results}
+        return len({level for level in levels if isinstance(level, int | float) and not isinstance(level, bool)})
+
+    best = max(results[0].run.levels, key=numbers, default="")
+    return best if best and numbers(best) > 1 else ""
+
+
+def _number(result: Result, path: str) -> float:
+    return float(result.run.value(path)) if path else float(result.run.name.partition("_")[0])

@@ -1,0 +1,146 @@
+"""The table of an ablation: a row a run, the best first, as text, CSV, Markdown, LaTeX and HTML."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from tabulate import tabulate
+
+from jaxfit.ablation.claims import Verdict
+from jaxfit.ablation.grid import Run, short
+from jaxfit.ablation.measure import Result
+
+__all__ = ["CAPTION", "claims_table", "format_cell", "heading", "ranked", "results_csv", "results_table"]
+
+HEADINGS = {
+    "terms.velocity": "λ_vel",
+    "terms.acceleration": "acceleration",
+    "filter_window": "median filter",
+    "common_size": "common size",
+}
+"""What the paper calls some keys; all others are called by their path."""
+SHOWN: tuple[tuple[str, str, Callable[[float], str]], ...] = (
+    ("me_p", "me_p", lambda v: f"{v:.4f}"),
+    ("me_v", "me_v", lambda v: f"{v:.4f}"),
+    ("mpjpe/length", "MPJPE %", lambda v: f"{100 * v:.2f}"),
+    ("iou", "IoU", lambda v: f"{v:.3f}"),
+    ("pck@0.05", "PCK@0.05", lambda v: f"{v:.3f}"),
+)
+"""Metrics of the table, their headings and how they are written; the first two with their intervals."""
+CAPTION = (
+    "Sorted by me_p. me_p, me_v: RMS error of the projected keypoints' position and frame-to-frame velocity over the "
+    "longer side of the predicted mask's box; in brackets 95 % bootstrap intervals over birds. MPJPE: mean error of "
+    "joints in space, per cent of body length. Poses: birds × frames measured."
+)
+
+
+def heading(path: str) -> str:
+    """What a varied key is called."""
+    return HEADINGS.get(path, path)
+
+
+def format_cell(path: str, level: Any) -> str:
+    """A level as people read it: `yes` and `no`, a dash for a weight of 0 or a filter of one frame."""
+    if isinstance(level, bool):
+        return "yes" if level else "no"
+    if isinstance(level, str) and level.startswith("="):
+        return f"= {heading(level[1:])}"
+    if (level == 0 and path.startswith("terms.")) or (path == "filter_window" and level == 1):
+        return "–"
+    return short(level)
+
+
+def ranked(results: Sequence[Result]) -> list[Result]:
+    """The best first, by me_p; what could not be measured last."""
+    return sorted(results, key=lambda result: (math.isnan(_figure(result, "me_p")), _figure(result, "me_p")))
+
+
+def results_table(results: Sequence[Result], form: str) -> str:
+    """The table in one of tabulate's formats: `simple`, `github`, `latex_booktabs`, `html`, …"""
+    shown = [column for column in SHOWN if any(column[0] in result.evaluation.overall for result in results)]
+    paths = list(results[0].run.levels)
+    head = ["run", *map(heading, paths), *(title for _, title, _ in shown), "poses"]
+    rows = [
+        [
+            result.run.name.partition("_")[0],
+            *(format_cell(path, level) for path, level in result.run.levels.items()),
+            *(_written(result, *column, bounds=i < 2) for i, column in enumerate(shown)),
+            str(result.evaluation.frames),
+        ]
+        for result in ranked(results)
+    ]
+    return _table(head, rows, form)
+
+
+def claims_table(verdicts: Sequence[Verdict], form: str) -> str:
+    """Each claim's verdict, in one of tabulate's formats."""
+    head = ["claim", "metric", "pairs", "agree", "better / worse", "95 % interval", "here"]
+    rows = [
+        [
+            verdict.claim.claim,
+            verdict.metric,
+            str(verdict.pairs),
+            str(verdict.agree),
+            f"{verdict.ratio.value:.3f}",
+            f"{verdict.ratio.low:.3f}–{verdict.ratio.high:.3f}",
+            verdict.holds,
+        ]
+        for verdict in verdicts
+    ]
+    return _table(head, rows, form)
+
+
+def results_csv(results: Sequence[Result]) -> str:
+    """All figures of all runs with their intervals, the varied keys by their paths."""
+    paths = list(results[0].run.levels)
+    metrics = list(dict.fromkeys(name for result in results for name in result.evaluation.overall))
+    text = io.StringIO()
+    out = csv.writer(text, lineterminator="\n")
+    out.writerow(["run", *paths, *(f"{m}{end}" for m in metrics for end in ("", "_low", "_high")), "poses", "missing"])
+    for result in ranked(results):
+        figures = []
+        for metric in metrics:
+            bounds = result.evaluation.intervals.get(metric, (math.nan, math.nan))
+            figures += [_figure(result, metric), *bounds]
+        out.writerow(
+            [
+                result.run.name,
+                *(_plain(result.run, path) for path in paths),
+                *("" if math.isnan(value) else f"{value:.6g}" for value in figures),
+                result.evaluation.frames,
+                result.evaluation.missing,
+            ]
+        )
+    return text.getvalue()
+
+
+def _table(head: list[str], rows: list[list[str]], form: str) -> str:
+    text = tabulate(rows, head, tablefmt=form, disable_numparse=True, colalign=_alignment(rows))
+    return text.replace("λ\\_vel", r"$\lambda_{\mathrm{vel}}$") if form.startswith("latex") else text
+
+
+def _alignment(rows: list[list[str]]) -> list[str]:
+    return ["right" if all(row[i][:1] in "0123456789–" for row in rows) else "left" for i in range(len(rows[0]))]
+
+
+def _written(result: Result, metric: str, _title: str, write: Callable[[float], str], bounds: bool) -> str:
+    value = _figure(result, metric)
+    if math.isnan(value):
+        return "–"
+    interval = result.evaluation.intervals.get(metric)
+    if not bounds or interval is None or math.isnan(interval.low):
+        return write(value)
+    return f"{write(value)} ({write(interval.low)}–{write(interval.high)})"
+
+
+def _figure(result: Result, metric: str) -> float:
+    return result.evaluation.overall.get(metric, math.nan)
+
+
+def _plain(run: Run, path: str) -> Any:
+    value = run.value(path)
+    return str(value).lower() if isinstance(value, bool) else value
