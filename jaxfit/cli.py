@@ -170,7 +170,14 @@ def _fitting(add) -> None:
         default="auto",
         help="whose track of DIR is whose (default auto: by ids, unless a track follows another bird than its id's)",
     )
-    evaluate.add_argument("--json", action="store_true", help="print JSON instead of tables")
+    evaluate.add_argument(
+        "--by",
+        choices=("behaviour", "keypoint"),
+        help="a table of these too; behaviours are those of a simulated scene",
+    )
+    evaluate.add_argument(
+        "--json", action="store_true", help="print JSON instead of tables, behaviours and keypoints included"
+    )
     evaluate.set_defaults(run="fitting.evaluate")
 
     ablate = add("ablate", help="fit the same birds under a grid of configs, and compare (needs the extra `report`)")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.table import Table
@@ -12,11 +13,20 @@ from rich.table import Table
 from jaxfit.quality import track_quality
 
 if TYPE_CHECKING:
-    from jaxfit.evaluation.evaluate import Evaluation
+    from jaxfit.evaluation.figures import Evaluation
     from jaxfit.fitting.solution import Solution
     from jaxfit.observations import Observations
 
-__all__ = ["counted", "evaluation_tables", "plain_json", "right_aligned", "show", "show_facts", "track_table"]
+__all__ = [
+    "breakdown_tables",
+    "counted",
+    "evaluation_tables",
+    "plain_json",
+    "right_aligned",
+    "show",
+    "show_facts",
+    "track_table",
+]
 
 _IN_SPACE = {
     "mpjpe": "MPJPE",
@@ -28,6 +38,7 @@ _IN_SPACE = {
     "size_error": "size %",
 }
 """Figures in space that the table shows, and their headings."""
+_INTERVAL = "from, to: 95 % bootstrap interval over birds (none for one bird)"
 _PERCENT = ("mpjpe/length", "pa_mpjpe/length", "size_error")
 
 
@@ -51,17 +62,22 @@ def right_aligned(*columns: str, **options: Any) -> Table:
 
 def evaluation_tables(result: Evaluation) -> list[Table]:
     """What `evaluate` found, a row for every track: in the picture, and in space where that was measured."""
-    from jaxfit.evaluation.evaluate import COLUMNS
+    from jaxfit.evaluation.figures import COLUMNS
+
+    def frames(row: dict[str, float]) -> str:
+        return f"{row['frames']:.0f}"
 
     tables = [right_aligned("track", "frames", *COLUMNS)]
     for track, row in result.tracks.items():
-        tables[0].add_row(str(track), f"{row['frames']:.0f}", *(_figure(row[name]) for name in COLUMNS))
+        tables[0].add_row(str(track), frames(row), *_in_picture(row, COLUMNS))
     tables[0].add_section()
-    tables[0].add_row("all", str(result.frames), *(_figure(result.overall[name]) for name in COLUMNS))
+    tables[0].add_row("all", str(result.frames), *_in_picture(result.overall, COLUMNS))
+    for name, bounds in _bounds(result):
+        tables[0].add_row(name, "", *_in_picture(bounds, COLUMNS))
     tables[0].caption = (
         "PCK: share of keypoints within 5 or 10 % of the annotated mask's longer side; IoU: mesh against mask; "
         "me_p, me_v: RMS position and velocity error over the mesh mask's longer side; "
-        "all of annotated keypoints, hidden ones included"
+        f"all of annotated keypoints, hidden ones included; {_INTERVAL}"
     )
     if result.points_3d:
         space = right_aligned("track", *_IN_SPACE.values())
@@ -69,12 +85,37 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
             space.add_row(str(track), *_in_space(row))
         space.add_section()
         space.add_row("all", *_in_space(result.overall))
+        for name, bounds in _bounds(result):
+            space.add_row(name, *_in_space(bounds))
         space.caption = (
             f"in space, over {result.points_3d}: mean error in model units and per cent of body length, about the root "
             "and up to one size a track; PA: after aligning every frame; orientation in degrees; acceleration error in "
             "units per frame²; error of the apparent size"
         )
         tables.append(space)
+    return tables
+
+
+def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -> list[Table]:
+    """What `evaluate` found, a row for every behaviour or keypoint."""
+    from jaxfit.evaluation.figures import COLUMNS, COLUMNS_KEYPOINT
+
+    if by == "keypoint":
+        table = right_aligned("keypoint", "frames", *COLUMNS_KEYPOINT)
+        for name, row in result.keypoints.items():
+            table.add_row(name, f"{row['count']:.0f}", *_in_picture(row, COLUMNS_KEYPOINT))
+        tables = [table]
+    else:
+        tables = [right_aligned("behaviour", "birds", "frames", *COLUMNS)]
+        if result.points_3d:
+            tables.append(right_aligned("behaviour", *_IN_SPACE.values(), padding=(0, 0, 0, 1)))
+        for name, row in result.behaviours.items():
+            counts = [f"{row[what]:.0f}" for what in ("birds", "frames")]
+            for table, cells in zip(tables, ([*counts, *_in_picture(row, COLUMNS)], _in_space(row)), strict=False):
+                table.add_row(name, *cells)
+        tables[0].caption = "me_v counts a pair of frames for what the bird does in the earlier one"
+    for table in tables:
+        table.columns[0].justify = "left"
     return tables
 
 
@@ -94,6 +135,18 @@ def track_table(observations: Observations, solution: Solution | None = None) ->
         cells = [str(row.track_id), str(row.frames), f"{row.coverage:.2f}", f"{row.mean_confidence:.2f}", jitter]
         table.add_row(*cells, *([] if status is None else [str(status[row.track_id])]))
     return table
+
+
+def _bounds(result: Evaluation) -> list[tuple[str, dict[str, float]]]:
+    """Both ends of the intervals; nothing where there are none."""
+    if len(result.sums.birds) < 2:
+        return []
+    lows, highs = ({name: interval[end] for name, interval in result.intervals.items()} for end in (0, 1))
+    return [("from", lows), ("to", highs)]
+
+
+def _in_picture(row: dict[str, float], columns: Sequence[str]) -> list[str]:
+    return [_figure(row[name]) for name in columns]
 
 
 def _in_space(row: dict[str, float]) -> list[str]:

@@ -35,6 +35,23 @@ def test_a_scene_measured_against_itself(scene, capsys):
     tables = capsys.readouterr().out
     for heading in ("me_v", "MPJPE", "PA-MPJPE", "orient. °", "size %"):
         assert heading in tables
+    assert [line.split()[1] for line in tables.splitlines() if " from " in line or " to " in line][:2] == ["from", "to"]
+    assert "stand" not in tables
+    assert result["intervals"]["me_p"] == [0, 0]
+    assert sum(row["frames"] for row in result["behaviours"].values()) == result["frames"]
+
+
+def test_figures_by_behaviour_and_keypoint(scene, capsys):
+    command = ["evaluate", str(scene / "truth"), "--truth", str(scene), "--by"]
+    assert main([*command, "keypoint"]) == 0
+    tables = capsys.readouterr().out
+    assert all(name in tables for name in MURRE_KEYPOINTS)
+    assert main([*command, "behaviour"]) == 0
+    assert "stand" in capsys.readouterr().out
+    command[3] = str(scene / "truth.json")
+    refused(capsys, [*command, "behaviour"], "truth.json", "does not say what the birds do", "--by behaviour")
+    command[1] = str(scene / "detections.json")
+    refused(capsys, [*command, "keypoint"], "detections.json", "holds observations")
 
 
 def test_an_overlay_of_the_truth(scene, tmp_path, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxfit.evaluation.metrics_3d import acceleration_error, best_scale, crop_rotation
+from jaxfit.evaluation.metrics_3d import acceleration_errors, best_scale, crop_rotation
 
 
 def test_crop_rotation_by_hand():
@@ -33,13 +33,21 @@ def test_best_scale_by_hand():
     assert math.isnan(best_scale(0 * p, q, [True]))
 
 
+def acceleration_error(*arguments):
+    counted = acceleration_errors(*arguments)
+    counted = counted[np.isfinite(counted)]
+    return counted.mean() if counted.size else math.nan
+
+
 def test_acceleration_by_hand():
-    """One frame of five off by d: three triples see d, 2d, d."""
+    """One frame of five off by d: three triples see d, 2d, d, each at its middle."""
     truth = np.random.default_rng(0).normal(size=(5, 4, 3))
     predicted = truth.copy()
     predicted[2] += [0, 3, 4]
     every = np.ones(5, bool)
     assert acceleration_error(predicted, truth, every, range(5)) == pytest.approx(5 * (1 + 2 + 1) / 3)
+    at = acceleration_errors(predicted, truth, every, range(5))
+    np.testing.assert_allclose(at, np.tile([[np.nan], [5], [10], [5], [np.nan]], 4))
     assert acceleration_error(predicted, truth, every, [0, 1, 2, 3, 7]) == pytest.approx(5 * (1 + 2) / 2)
     assert acceleration_error(truth + np.arange(3), truth, every, range(5)) == pytest.approx(0)
     gap = np.array([True, True, True, False, True])

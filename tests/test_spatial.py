@@ -11,6 +11,7 @@ from helpers import pose_window, skin_by_hand, solution_of, toy_bird
 from scipy.spatial.transform import Rotation
 
 from jaxfit.errors import InputError
+from jaxfit.evaluation.figures import figures
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.model.pose import Pose
 
@@ -91,12 +92,16 @@ def errors(solution, truth=None, **models):
     return SpatialErrors(solution, models.get("bird", BIRD), truth or build(true_poses()), models.get("truth", BIRD))
 
 
+def row_of(errors, where=None):
+    return figures(errors.samples(), where)
+
+
 @pytest.mark.parametrize("factor", [1.0, 0.4, 7.0])
 def test_a_crop_camera_is_undone(factor):
     """Far off the axis, at any size and distance: no error at all."""
     found = errors(in_crop_cameras(true_poses(), factor))
     assert found.points == "joints"
-    row = found.row()
+    row = row_of(found)
     assert tuple(row) == COLUMNS_3D
     for name, bound in zip(COLUMNS_3D, (1e-3, 1e-4, 1e-3, 1e-4, 0.01, 0.01, 2e-3, 1e-4, 1e-4), strict=True):
         assert abs(row[name]) < bound, name
@@ -106,7 +111,7 @@ def test_without_the_correction_the_bird_is_turned():
     """A crop that claims to look along the axis is wrong by the angle of the ray."""
     solution = in_crop_cameras(true_poses())
     middle = np.concatenate([CENTRE - solution.crop[..., 2:] / 2, solution.crop[..., 2:]], axis=-1)
-    row = errors(dataclasses.replace(solution, crop=middle)).row()
+    row = row_of(errors(dataclasses.replace(solution, crop=middle)))
     roots = np.concatenate([root_rest(p) + np.asarray(p.transl) for p in true_poses()])
     angles = np.rad2deg(np.arccos(roots[:, 2] / np.linalg.norm(roots, axis=1)))
     assert angles.mean() > 25
@@ -170,9 +175,9 @@ def test_every_figure_by_hand():
         array[~valid] = np.nan
     found = errors(dataclasses.replace(solution, **holes))
     expected = oracle(predicted, true_poses(), valid)
-    assert found.row() == pytest.approx(expected, rel=2e-4)
+    assert row_of(found) == pytest.approx(expected, rel=2e-4)
     alone = oracle(predicted[1:], true_poses()[1:], valid[1:])
-    assert found.row(slice(1, 2)) == pytest.approx(alone, rel=2e-4)
+    assert row_of(found, np.array([[False], [True]]) & found.measured) == pytest.approx(alone, rel=2e-4)
     np.testing.assert_array_equal(found.measured, valid)
 
 
@@ -193,7 +198,7 @@ def test_tracks_and_frames_are_matched_by_name():
     expected = np.ones((N, T), bool)
     expected[:, 0] = expected[0, 1] = False  # track 5 stands second in the truth
     np.testing.assert_array_equal(found.measured, expected)
-    assert found.row()["mpjpe"] < 1e-3
+    assert row_of(found)["mpjpe"] < 1e-3
     for changes in ({"track_id": np.array([50, 30])}, {"frame_index": np.arange(20, 26)}):
         with pytest.raises(InputError, match="share no track and frame"):
             errors(dataclasses.replace(solution, **changes), other)
@@ -202,10 +207,10 @@ def test_tracks_and_frames_are_matched_by_name():
 def test_nothing_to_measure_is_nan():
     found = errors(build(true_poses(), valid=np.zeros((N, T), bool)))
     assert not found.measured.any()
-    assert all(math.isnan(value) for value in found.row().values())
+    assert all(math.isnan(value) for value in row_of(found).values())
     two = np.zeros((N, T), bool)
     two[0, :2] = two[1, 3:5] = True  # frames 6 and 8 are no neighbours
-    row = errors(build(true_poses(), valid=two)).row()
+    row = row_of(errors(build(true_poses(), valid=two)))
     assert math.isnan(row["acceleration"])
     assert row["mpjpe"] < 1e-3
 
@@ -218,7 +223,7 @@ def test_another_model_is_compared_by_keypoints():
     solution = build(predicted, joint_names=turned)
     found = errors(solution, bird=bird)
     assert found.points == "keypoints"
-    row = found.row()
+    row = row_of(found)
     assert math.isnan(row["orientation_deg"])
     p, q = (np.asarray(s.keypoints_3d, float) for s in (solution, build(true_poses())))
     p, q = p - p.mean(2, keepdims=True), q - q.mean(2, keepdims=True)
@@ -228,7 +233,7 @@ def test_another_model_is_compared_by_keypoints():
     # a model twice as large at rest, at half the scale: the same apparent size
     twice = dataclasses.replace(bird, vertices=2 * bird.vertices, joints=2 * bird.joints)
     half = dataclasses.replace(solution, scale=solution.scale / 2)
-    assert errors(half, bird=twice).row()["size_error"] == pytest.approx(row["size_error"], rel=1e-4)
+    assert row_of(errors(half, bird=twice))["size_error"] == pytest.approx(row["size_error"], rel=1e-4)
 
 
 def test_joints_are_compared_by_name():
@@ -241,7 +246,7 @@ def test_joints_are_compared_by_name():
     moved = {name: getattr(solution, name)[:, :, bones] for name in ("body_pose", "bone_length")}
     found = errors(dataclasses.replace(solution, joint_names=names, **moved), bird=bird)
     assert found.points == "joints"
-    assert found.row()["mpjpe"] < 1e-3
+    assert row_of(found)["mpjpe"] < 1e-3
 
 
 @pytest.mark.parametrize(

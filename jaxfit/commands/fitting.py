@@ -7,10 +7,11 @@ import time
 
 import numpy as np
 
+from jaxfit.errors import InputError
 from jaxfit.formats.coco import read_coco
 from jaxfit.model.files import find_bird
 from jaxfit.progress import terminal
-from jaxfit.tables import counted, evaluation_tables, plain_json, right_aligned, show
+from jaxfit.tables import breakdown_tables, counted, evaluation_tables, plain_json, right_aligned, show
 
 __all__ = ["evaluate", "fit", "overlay"]
 
@@ -50,23 +51,39 @@ def fit(options: argparse.Namespace) -> None:
 def evaluate(options: argparse.Namespace) -> None:
     from jaxfit.evaluation.evaluate import evaluate
     from jaxfit.evaluation.matching import match_tracks
-    from jaxfit.evaluation.truth import read_truth
+    from jaxfit.evaluation.truth import read_behaviours, read_truth
     from jaxfit.fitting.solution import load_solution
     from jaxfit.observation_tables import matching_line
 
     if options.result.is_file():
+        if options.by:
+            raise InputError(options.result, "holds observations, which have no tables --by", "give a folder of poses")
         _evaluate_observations(options)
         return
     solution, bird = load_solution(options.result)
     truth, poses, truth_bird = read_truth(options.truth)
+    behaviours = read_behaviours(options.truth)
+    if options.by == "behaviour" and behaviours is None:
+        remedy = "give the folder of a simulated scene, or leave out --by behaviour"
+        raise InputError(options.truth, "does not say what the birds do", remedy)
     solution, matching = match_tracks(solution, truth, options.match, options.truth)
-    result = evaluate(solution, bird, truth, terminal, options.truth, truth_solution=poses, truth_bird=truth_bird)
+    result = evaluate(
+        solution,
+        bird,
+        truth,
+        terminal,
+        options.truth,
+        truth_solution=poses,
+        truth_bird=truth_bird,
+        behaviours=behaviours,
+    )
     if options.json:
-        counts = {name: getattr(result, name) for name in ("frames", "missing", "unmatched", "frames_3d")}
         named = {"matched_by": matching.by, "follows": matching.follows}
-        print(plain_json({**result.overall, **counts, "tracks": result.tracks, **named}))  # noqa: T201
+        print(plain_json(result.to_dict() | named))  # noqa: T201
         return
     for table in evaluation_tables(result):
+        show(table)
+    for table in breakdown_tables(result, options.by) if options.by else []:
         show(table)
     if matching.by == "overlap":
         show(matching_line(matching))

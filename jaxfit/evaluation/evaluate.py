@@ -1,16 +1,19 @@
-"""How well a result agrees with annotations: a row for every bird, and one for all."""
+"""How well a result agrees with annotations: over all birds, for every bird, behaviour and keypoint."""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+from jaxtyping import Bool
 
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
+from jaxfit.evaluation.bootstrap import BirdSums
+from jaxfit.evaluation.figures import COLUMNS, COLUMNS_KEYPOINT, Evaluation, figures
 from jaxfit.evaluation.matching import match
+from jaxfit.evaluation.samples import correct_keypoints, squared_errors, squared_velocity_errors
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.fitting.posed import PosedBirds
 from jaxfit.fitting.solution import Solution
@@ -23,32 +26,9 @@ __all__ = ["COLUMNS", "COLUMNS_3D", "Evaluation", "evaluate"]
 
 _logger = logging.getLogger(__name__)
 
-COLUMNS = ("pck@0.05", "pck@0.10", "iou", "me_p", "me_v")
 _REMEDY = "give the annotations of the same video"
 _HARDLY = 0.05
 """Median IoU below which a result has nothing to do with its truth, however badly it was fitted."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Metrics of a result; NaN where there is nothing to measure (no mask, no two frames in a row)."""
-
-    overall: dict[str, float]
-    """COLUMNS over all birds: PCK and IoU as means over images, me_p and me_v as RMS over keypoints; with true
-    poses also COLUMNS_3D, which `SpatialErrors` defines."""
-    tracks: dict[int, dict[str, float]]
-    """The same for every track by its id, and the number of its frames as `frames`."""
-    frames: int
-    """Birds × frames measured."""
-    missing: int
-    """Annotated birds × frames that the result has no pose for, also those of tracks that it lacks; they enter no
-    metric."""
-    unmatched: int = 0
-    """Poses × frames of the result whose track or frame the truth lacks; they enter no metric."""
-    frames_3d: int = 0
-    """Birds × frames measured in space."""
-    points_3d: Literal["", "joints", "keypoints"] = ""
-    """What was measured in space; empty without true poses."""
 
 
 def evaluate(
@@ -60,6 +40,7 @@ def evaluate(
     *,
     truth_solution: Solution | None = None,
     truth_bird: Bird | None = None,
+    behaviours: Mapping[int, Sequence[tuple[int, str]]] | None = None,
 ) -> Evaluation:
     """Compare a result with annotations of the same video, matched by track id and frame number.
 
@@ -78,10 +59,12 @@ def evaluate(
         source: what the truth was read from, for messages.
         truth_solution: the true poses, in crops that are the real camera (see `SpatialErrors`).
         truth_bird: their model; None where it is the result's.
+        behaviours: what each true bird does, by its track id: from which frame on, beginning with the first, and
+            what (`read_behaviours`); None where that is not known.
 
     Raises:
-        InputError: other keypoints than the model's, no track and frame in common, pictures of another size, or
-            true poses that are none.
+        InputError: other keypoints than the model's, no track and frame in common, pictures of another size, true
+            poses that are none, or a bird whose behaviour is not told.
     """
     truth = check_keypoints(truth, bird.keypoint_names, source)
     n_truth, t_truth, shared = match(solution, truth.track_id, truth.frame_index)
@@ -98,6 +81,8 @@ def evaluate(
     spatial = None
     if truth_solution is not None:
         spatial = SpatialErrors(solution, bird, truth_solution, truth_bird or bird, source)
+    either = measured if spatial is None else measured | spatial.measured
+    does = np.full(measured.shape, "") if behaviours is None else _behaviours(behaviours, solution, either, source)
     observed = truth.keypoints_px[n_truth, t_truth]
     annotated_points = (truth.confidence[n_truth, t_truth] > 0) & measured[..., None]
     overlap = np.full(measured.shape, np.nan)
@@ -126,32 +111,78 @@ def evaluate(
     if spatial is not None:
         unmatched &= ~spatial.measured
 
-    def row(birds) -> dict[str, float]:
-        predicted, seen, vis = solution.keypoints_2d[birds], observed[birds], annotated_points[birds]
-        covered = overlap[birds][np.isfinite(overlap[birds])]
-        return {
-            "pck@0.05": metrics.pck(predicted, seen, vis, true_side[birds], 0.05),
-            "pck@0.10": metrics.pck(predicted, seen, vis, true_side[birds], 0.10),
-            "iou": float(covered.mean()) if covered.size else float("nan"),
-            "me_p": metrics.me_p(predicted, seen, vis, own_side[birds]),
-            "me_v": metrics.me_v(predicted, seen, vis, own_side[birds], solution.frame_index),
-            **(spatial.row(birds) if spatial else {}),
-        }
-
-    tracks = {
-        int(track): {"frames": float(measured[n].sum()), **row(slice(n, n + 1))}
-        for n, track in enumerate(solution.track_id)
-        if measured[n].any() or (spatial is not None and spatial.measured[n].any())
+    picture = (solution.keypoints_2d, observed, annotated_points)
+    samples = {
+        "pck@0.05": metrics.pck_per_image(*picture, true_side, 0.05)[..., None],
+        "pck@0.10": metrics.pck_per_image(*picture, true_side, 0.10)[..., None],
+        "iou": overlap[..., None],
+        "me_p": squared_errors(*picture, own_side),
+        "me_v": squared_velocity_errors(*picture, own_side, solution.frame_index),
+        **(spatial.samples() if spatial else {}),
     }
+    # an image's share of one keypoint is whether it is correct
+    of_keypoints = samples | {
+        "pck@0.05": correct_keypoints(*picture, true_side, 0.05),
+        "pck@0.10": correct_keypoints(*picture, true_side, 0.10),
+    }
+    rows = np.flatnonzero(either.any(1)).tolist()
+    sums = BirdSums.of(solution.track_id[rows].tolist(), {name: values[rows] for name, values in samples.items()})
+
+    def count(what: np.ndarray) -> float:
+        return float(what.sum())
+
     return Evaluation(
-        row(slice(None)),
-        tracks,
-        int(measured.sum()),
-        int(truth.present.sum() - measured.sum()),
-        int(unmatched.sum()),
-        int(spatial.measured.sum()) if spatial else 0,
-        spatial.points if spatial else "",
+        overall=figures(samples),
+        tracks={
+            int(solution.track_id[n]): {"frames": count(measured[n]), **figures(samples, _only(n, measured.shape))}
+            for n in rows
+        },
+        frames=int(measured.sum()),
+        missing=int(truth.present.sum() - measured.sum()),
+        unmatched=int(unmatched.sum()),
+        frames_3d=int(spatial.measured.sum()) if spatial else 0,
+        points_3d=spatial.points if spatial else "",
+        intervals=sums.intervals(),
+        behaviours={
+            str(name): {
+                "birds": count((either & (does == name)).any(1)),
+                "frames": count(measured & (does == name)),
+                **figures(samples, does == name),
+            }
+            for name in np.unique(does[does != ""])
+        },
+        keypoints={
+            name: {
+                "count": count(annotated_points[..., k]),
+                **figures({column: of_keypoints[column][..., k : k + 1] for column in COLUMNS_KEYPOINT}),
+            }
+            for k, name in enumerate(bird.keypoint_names)
+        },
+        sums=sums,
     )
+
+
+def _only(n: int, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
+    return np.broadcast_to((np.arange(shape[0]) == n)[:, None], shape)
+
+
+def _behaviours(
+    behaviours: Mapping[int, Sequence[tuple[int, str]]],
+    solution: Solution,
+    measured: Bool[np.ndarray, "N T"],
+    source: object,
+) -> np.ndarray:
+    """What each bird does in each frame, (N, T) text; empty where nothing is measured."""
+    does = np.full(measured.shape, "", dtype=object)
+    for n, track in enumerate(solution.track_id.tolist()):
+        if not measured[n].any():
+            continue
+        if track not in behaviours:
+            raise InputError(source, f"does not say what bird {track} does", "give behaviours of all birds, or none")
+        starts, names = zip(*behaviours[track], strict=True)
+        at = np.searchsorted(starts, solution.frame_index, side="right") - 1
+        does[n] = np.where(measured[n], np.array(names, dtype=object)[at], "")
+    return does
 
 
 def _check_sizes(

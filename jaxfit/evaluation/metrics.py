@@ -6,10 +6,12 @@ counts, the result is NaN and no warning.
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import numpy as np
 
+from jaxfit.evaluation.samples import correct_keypoints, distances, points, squared_errors, squared_velocity_errors
 from jaxfit.masks import box_of_mask
 
 __all__ = [
@@ -25,23 +27,9 @@ __all__ = [
 ]
 
 
-def _points(predicted: Any, observed: Any, visible: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    predicted, observed = np.asarray(predicted, np.float64), np.asarray(observed, np.float64)
-    if predicted.shape != observed.shape:
-        raise ValueError(f"predicted and observed must have one shape, not {predicted.shape}, {observed.shape}")
-    visible = np.ones(observed.shape[:-1], bool) if visible is None else np.asarray(visible).astype(bool)
-    if visible.shape != observed.shape[:-1]:
-        raise ValueError(f"visible must have shape {observed.shape[:-1]}, not {visible.shape}")
-    return predicted, observed, visible
-
-
-def _sides(longest_side_px: Any, shape: tuple[int, ...]) -> np.ndarray:
-    sides = np.broadcast_to(np.asarray(longest_side_px, np.float64), shape)
-    return np.where(sides > 0, sides, np.nan)  # an empty mask has no side to divide by
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if values.size else float("nan")
+def _mean(samples: np.ndarray) -> float:
+    counted = samples[np.isfinite(samples)]
+    return float(counted.mean()) if counted.size else float("nan")
 
 
 def pck_per_image(
@@ -66,12 +54,9 @@ def pck_per_image(
     Raises:
         ValueError: shapes that do not agree.
     """
-    predicted, observed, visible = _points(predicted_px, observed_px, visible)
-    allowed = threshold * _sides(longest_side_px, visible.shape[:-1])[..., None]
-    with np.errstate(invalid="ignore"):
-        correct = (np.linalg.norm(predicted - observed, axis=-1) <= allowed) & visible
-    counted = visible.sum(-1)
-    return np.where(counted > 0, correct.sum(-1) / np.maximum(counted, 1), np.nan)
+    correct = correct_keypoints(predicted_px, observed_px, visible, longest_side_px, threshold)
+    counted = np.isfinite(correct).sum(-1)
+    return np.where(counted > 0, np.nansum(correct, -1) / np.maximum(counted, 1), np.nan)
 
 
 def pck(
@@ -107,12 +92,8 @@ def pck(
     """
     if reduction not in ("per_image", "pooled"):
         raise ValueError(f'reduction must be "per_image" or "pooled", not {reduction!r}')
-    shares = pck_per_image(predicted_px, observed_px, visible, longest_side_px, threshold)
-    counted = np.asarray(visible).astype(bool).sum(-1)
-    if reduction == "per_image":
-        return _mean(shares[counted > 0])
-    total = counted.sum()
-    return float(np.where(counted > 0, shares * counted, 0).sum() / total) if total else float("nan")
+    figure = pck_per_image if reduction == "per_image" else correct_keypoints
+    return _mean(figure(predicted_px, observed_px, visible, longest_side_px, threshold))
 
 
 def iou(mask_a: Any, mask_b: Any) -> float:
@@ -166,11 +147,7 @@ def me_p(predicted: Any, observed: Any, visible: Any, longest_side: Any) -> floa
 
     Source: Hägerlind et al. 2024, evaluation.
     """
-    predicted, observed, visible = _points(predicted, observed, visible)
-    sides = _sides(longest_side, visible.shape[:-1])
-    with np.errstate(invalid="ignore"):
-        squared = ((predicted - observed) ** 2).sum(-1) / sides[..., None] ** 2
-    return float(np.sqrt(_mean(squared[visible & np.isfinite(squared)])))
+    return math.sqrt(_mean(squared_errors(predicted, observed, visible, longest_side)))
 
 
 def me_v(predicted: Any, observed: Any, visible: Any, longest_side: Any, frame_index: Any = None) -> float:
@@ -194,19 +171,7 @@ def me_v(predicted: Any, observed: Any, visible: Any, longest_side: Any, frame_i
 
     Source: Hägerlind et al. 2024, evaluation.
     """
-    predicted, observed, visible = _points(predicted, observed, visible)
-    if predicted.ndim < 3:
-        raise ValueError(f"predicted must have shape (…, T, K, 2), not {predicted.shape}")
-    T = predicted.shape[-3]
-    frames = np.arange(T) if frame_index is None else np.asarray(frame_index)
-    if frames.shape != (T,):
-        raise ValueError(f"frame_index must have shape ({T},), not {frames.shape}")
-    both = visible[..., 1:, :] & visible[..., :-1, :] & (np.diff(frames) == 1)[:, None]
-    sides = _sides(longest_side, visible.shape[:-1])[..., :-1]
-    with np.errstate(invalid="ignore"):
-        difference = np.diff(predicted, axis=-3) - np.diff(observed, axis=-3)
-        squared = (difference**2).sum(-1) / sides[..., None] ** 2
-    return float(np.sqrt(_mean(squared[both & np.isfinite(squared)])))
+    return math.sqrt(_mean(squared_velocity_errors(predicted, observed, visible, longest_side, frame_index)))
 
 
 def mpjpe(predicted: Any, truth: Any, visible: Any = None) -> float:
@@ -220,10 +185,7 @@ def mpjpe(predicted: Any, truth: Any, visible: Any = None) -> float:
     Raises:
         ValueError: shapes that do not agree.
     """
-    predicted, truth, visible = _points(predicted, truth, visible)
-    with np.errstate(invalid="ignore"):
-        distance = np.linalg.norm(predicted - truth, axis=-1)
-    return _mean(distance[visible & np.isfinite(distance)])
+    return _mean(distances(predicted, truth, visible))
 
 
 def procrustes_align(predicted: Any, truth: Any, visible: Any = None) -> np.ndarray:
@@ -244,7 +206,7 @@ def procrustes_align(predicted: Any, truth: Any, visible: Any = None) -> np.ndar
 
     Source: Umeyama 1991, equations 40 to 42.
     """
-    predicted, truth, visible = _points(predicted, truth, visible)
+    predicted, truth, visible = points(predicted, truth, visible)
     used = visible & np.isfinite(predicted).all(-1) & np.isfinite(truth).all(-1)
     weight = used[..., None] / np.maximum(used.sum(-1), 1)[..., None, None]
     mean_p = (np.where(used[..., None], predicted, 0) * weight).sum(-2, keepdims=True)

@@ -1,4 +1,4 @@
-"""How close posed birds are to the truth in space. NumPy, exactly defined, one number each.
+"""How close posed birds are to the truth in space. NumPy, exactly defined.
 
 Leading axes (…) are birds, of any number; NaN where there is nothing to measure. Beside these:
 ``metrics.mpjpe`` and ``metrics.pa_mpjpe``.
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["acceleration_error", "best_scale", "crop_rotation"]
+__all__ = ["acceleration_errors", "best_scale", "crop_rotation"]
 
 
 def crop_rotation(centre_px: Any, principal_px: Any, focal_px: float) -> np.ndarray:
@@ -65,10 +65,10 @@ def best_scale(predicted: Any, truth: Any, counted: Any) -> np.ndarray:
     return np.where(squares > 0, np.maximum((p * q).sum((-3, -2, -1)), 0) / np.where(squares > 0, squares, 1), np.nan)
 
 
-def acceleration_error(predicted: Any, truth: Any, counted: Any, frame_index: Any) -> float:
-    """Mean error of the points' acceleration, in their unit per frame².
+def acceleration_errors(predicted: Any, truth: Any, counted: Any, frame_index: Any) -> np.ndarray:
+    """Error of the points' acceleration, in their unit per frame²; NaN where it does not count.
 
-    mean over (t, k) of ‖Δ²p_tk − Δ²q_tk‖,  Δ²x_t = x_t−1 − 2 x_t + x_t+1
+    ‖Δ²p_tk − Δ²q_tk‖ at t, the middle of its three frames,  Δ²x_t = x_t−1 − 2 x_t + x_t+1
 
     Args:
         predicted: (…, T, K, 3) in one frame and unit with the truth.
@@ -76,12 +76,16 @@ def acceleration_error(predicted: Any, truth: Any, counted: Any, frame_index: An
         counted: (…, T) bool; a triple counts where all three frames do.
         frame_index: (T,) numbers of the frames in the video; a triple counts where they follow each other.
 
-    Source: Kanazawa et al. 2019, *Learning 3D Human Dynamics from Video*, acceleration error.
+    Returns:
+        (…, T, K).
+
+    Source: Kanazawa et al. 2019, *Learning 3D Human Dynamics from Video*, acceleration error, of which this is
+    the mean.
     """
-    counted, steps = np.asarray(counted, bool), np.diff(np.asarray(frame_index)) == 1
-    if counted.shape[-1] < 3:
-        return float("nan")
+    predicted, truth, counted = np.asarray(predicted, np.float64), np.asarray(truth, np.float64), np.asarray(counted)
+    errors = np.full(predicted.shape[:-1], np.nan)
+    steps = np.diff(np.asarray(frame_index)) == 1
     triple = counted[..., :-2] & counted[..., 1:-1] & counted[..., 2:] & steps[:-1] & steps[1:]
-    difference = np.diff(np.asarray(predicted, np.float64) - np.asarray(truth, np.float64), 2, axis=-3)
-    error = np.linalg.norm(difference[triple], axis=-1)
-    return float(error.mean()) if error.size else float("nan")
+    difference = np.linalg.norm(np.diff(predicted - truth, 2, axis=-3), axis=-1)
+    errors[..., 1:-1, :] = np.where(triple[..., None], difference, np.nan)
+    return errors

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
 from jaxfit.evaluation.matching import match
-from jaxfit.evaluation.metrics_3d import acceleration_error, best_scale, crop_rotation
+from jaxfit.evaluation.metrics_3d import acceleration_errors, best_scale, crop_rotation
+from jaxfit.evaluation.samples import distances
 from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig, fold_bird, joint_transforms, posed_joints
@@ -114,27 +115,25 @@ class SpatialErrors:
             ratio = _apparent_size(solution, bird) / _apparent_size(truth, truth_bird)[n, t]
         self.size_ratio = ratio * (rest if np.isfinite(rest) else 1.0)
 
-    def row(self, birds: slice = slice(None)) -> dict[str, float]:
-        """COLUMNS_3D over some of the result's tracks, by position."""
-        measured, p, q = self.measured[birds], self.predicted[birds], self.truth[birds]
-        seen = np.broadcast_to(measured[..., None], p.shape[:-1])
-        length = self.body_length[birds][..., None, None]
-        angles, ratio = self.angle_deg[birds][measured], self.size_ratio[birds][measured]
+    def samples(self) -> dict[str, Float[np.ndarray, "N T _"]]:
+        """What every bird, frame and point adds to the means; NaN where nothing is measured."""
+        p, q, length = self.predicted, self.truth, self.body_length[..., None]
+        seen = np.broadcast_to(self.measured[..., None], p.shape[:-1])
+        direct, aligned = distances(p, q, seen), distances(metrics.procrustes_align(p, q, seen), q, seen)
+
+        def of_frames(values: Float[np.ndarray, "N T"]) -> Float[np.ndarray, "N T 1"]:
+            return np.where(self.measured, values, np.nan)[..., None]
+
         return {
-            "mpjpe": metrics.mpjpe(p, q, seen),
-            "mpjpe/length": metrics.mpjpe(p / length, q / length, seen),
-            "pa_mpjpe": metrics.pa_mpjpe(p, q, seen),
-            "pa_mpjpe/length": metrics.pa_mpjpe(p / length, q / length, seen),
-            "orientation_deg": _or_nan(np.mean, angles),
-            "orientation_median_deg": _or_nan(np.median, angles),
-            "acceleration": acceleration_error(p, q, measured, self.frame_index),
-            "size_error": _or_nan(np.mean, np.abs(ratio - 1)),
-            "size_bias": _or_nan(np.mean, ratio - 1),
+            "mpjpe": direct,
+            "mpjpe/length": direct / length,
+            "pa_mpjpe": aligned,
+            "pa_mpjpe/length": aligned / length,
+            "orientation_deg": of_frames(self.angle_deg),
+            "acceleration": acceleration_errors(p, q, self.measured, self.frame_index),
+            "size_error": of_frames(np.abs(self.size_ratio - 1)),
+            "size_bias": of_frames(self.size_ratio - 1),
         }
-
-
-def _or_nan(reduce, values: np.ndarray) -> float:
-    return float(reduce(values)) if values.size else float("nan")
 
 
 def _real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:

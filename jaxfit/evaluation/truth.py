@@ -7,11 +7,12 @@ from pathlib import Path
 from jaxfit.errors import InputError
 from jaxfit.fitting.solution import Solution, load_solution
 from jaxfit.formats.coco import read_coco
-from jaxfit.formats.scene_folder import TRUE_POSES, TRUTH
+from jaxfit.formats.fields import read_json
+from jaxfit.formats.scene_folder import MARKER, TRUE_POSES, TRUTH
 from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
 
-__all__ = ["read_truth"]
+__all__ = ["read_behaviours", "read_truth"]
 
 
 def read_truth(path: str | Path) -> tuple[Observations, Solution | None, Bird | None]:
@@ -37,3 +38,29 @@ def read_truth(path: str | Path) -> tuple[Observations, Solution | None, Bird | 
         remedy = f"give {path / TRUTH} to compare in the image alone"
         raise InputError(path, f"holds no true poses (a folder {TRUE_POSES}/)", remedy)
     return read_coco(path / TRUTH), *load_solution(path / TRUE_POSES)
+
+
+def read_behaviours(path: str | Path) -> dict[int, list[tuple[int, str]]] | None:
+    """Read what each bird of a simulated scene does when.
+
+    Args:
+        path: as for `read_truth`.
+
+    Returns:
+        Track id → from which frame on, and what, in the order of frames and beginning with frame 0; None where
+        behaviours are not told: for a COCO file, or a folder without ``scene.json``.
+
+    Raises:
+        InputError: a ``scene.json`` that cannot be read.
+    """
+    path = Path(path)
+    if not (path / MARKER).is_file():
+        return None
+    behaviours = {}
+    for track, told in read_json(path / MARKER)["behaviour"].entries():
+        acts = [(act["from_frame"].integer(0), act["behaviour"].text()) for act in told]
+        starts = [start for start, _ in acts]
+        if not track.isdecimal() or starts[:1] != [0] or starts != sorted(set(starts)):
+            told.fail("must say for a bird's number from which frame on it does what, in order, from frame 0 on")
+        behaviours[int(track)] = acts
+    return behaviours

@@ -61,6 +61,11 @@ class Field:
         """Whether ``key`` is there and not null."""
         return key in self and self.value[key] is not None
 
+    def entries(self) -> Iterator[tuple[str, Field]]:
+        """The keys and values of an object."""
+        for key in self._expect(dict, "an object"):
+            yield key, self[key]
+
     def __iter__(self) -> Iterator[Field]:
         """The entries of a list."""
         for i, value in enumerate(self._expect(list, "a list")):
