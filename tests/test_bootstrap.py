@@ -1,11 +1,11 @@
-"""Sums for every bird, intervals over birds and paired differences: what a hand computes, and a resampling by loops."""
+"""Sums for every bird, intervals over birds and paired ratios: what a hand computes, and a resampling by loops."""
 
 import math
 
 import numpy as np
 import pytest
 
-from jaxfit.evaluation.bootstrap import BirdSums, Difference, Interval, paired_difference
+from jaxfit.evaluation.bootstrap import BirdSums, Interval, paired_ratio
 
 
 def sums(**metrics):
@@ -80,28 +80,39 @@ def test_the_same_seed_draws_the_same():
     assert sums_of_many(np.arange(40.0)).interval("iou") != sums_of_many(np.arange(40.0)).interval("iou", seed=1)
 
 
-def test_a_paired_difference_by_hand():
-    """Birds far apart, but every one better by the same: no doubt about the difference, much about either."""
-    a = sums(iou=[(0.2, 1), (1.8, 2), (0.5, 1)])
-    b = sums(iou=[(0.1, 1), (1.6, 2), (0.4, 1)])
-    found = paired_difference(a, b, "iou")
-    assert found == pytest.approx((0.1, 0.1, 0.1, 3))
-    assert np.diff(a.interval("iou"))[0] > 0.3
-    third = paired_difference(sums(me_p=[(1.0, 1), (9.0, 2)]), sums(me_p=[(9.0, 1), (81.0, 2)]), "me_p", ratio=True)
-    assert third == pytest.approx((1 / 3, 1 / 3, 1 / 3, 2))
-    assert paired_difference(b, a, "iou").value == pytest.approx(-0.1)
-    assert paired_difference(a, a, "iou") == Difference(0, 0, 0, 3)
+def test_a_paired_ratio_by_hand():
+    """Birds far apart, but every one better by the same factor: no doubt about the ratio, much about either."""
+    a = sums(me_p=[(1.0, 1), (90.0, 2), (4.0, 1)])
+    b = sums(me_p=[(9.0, 1), (810.0, 2), (36.0, 1)])
+    assert paired_ratio([(a, b)], "me_p") == pytest.approx((1 / 3, 1 / 3, 1 / 3, 3))
+    assert np.ptp(a.interval("me_p")) > 3
+    assert paired_ratio([(b, a)], "me_p").value == pytest.approx(3)
+    assert paired_ratio([(a, a)], "me_p") == (1, 1, 1, 3)
+
+
+def test_several_pairs_are_drawn_together():
+    """Geometric mean over pairs; what one pair gains on a bird and the other loses on it leaves no doubt."""
+    even = sums(iou=[(1.0, 1), (1.0, 1), (1.0, 1)])
+    twice = sums(iou=[(2.0, 1), (2.0, 1), (2.0, 1)])
+    eight = sums(iou=[(8.0, 1), (8.0, 1), (8.0, 1)])
+    assert paired_ratio([(twice, even), (eight, even)], "iou") == pytest.approx((4, 4, 4, 3))
+    up, down = sums(iou=[(1.0, 1), (2.0, 1), (4.0, 1)]), sums(iou=[(1.0, 1), (0.5, 1), (0.25, 1)])
+    alone = paired_ratio([(up, even)], "iou")
+    assert alone.high - alone.low > 2
+    found = paired_ratio([(up, even), (even, up)], "iou")
+    assert found == pytest.approx((1, 1, 1, 3))
+    assert paired_ratio([(up, even), (down, even)], "iou").value == pytest.approx(math.sqrt(7 / 3 * 1.75 / 3))
 
 
 def test_birds_are_paired_by_name():
     """In another order, and one that b could not measure."""
     a = BirdSums(("1", "2", "3"), {"iou": (0.9, 0.2, 0.4)}, {"iou": (1, 1, 1)})
-    b = BirdSums(("3", "2", "1"), {"iou": (0.3, 0.0, 0.8)}, {"iou": (1, 0, 1)})
-    assert paired_difference(a, b, "iou") == pytest.approx((0.1, 0.1, 0.1, 2))
-    one = paired_difference(a, BirdSums(("2", "9"), {"iou": (0.1, 0.5)}, {"iou": (1, 1)}), "iou")
-    assert (one.value, one.birds) == (pytest.approx(0.1), 1)
+    b = BirdSums(("3", "2", "1"), {"iou": (0.8, 0.0, 1.8)}, {"iou": (1, 0, 1)})
+    assert paired_ratio([(a, b)], "iou") == pytest.approx((0.5, 0.5, 0.5, 2))
+    one = paired_ratio([(a, BirdSums(("2", "9"), {"iou": (0.1, 0.5)}, {"iou": (1, 1)}))], "iou")
+    assert (one.value, one.birds) == (pytest.approx(2), 1)
     assert np.isnan([one.low, one.high]).all()
-    none = paired_difference(a, BirdSums(("9",), {"iou": (0.5,)}, {"iou": (1,)}), "iou")
+    none = paired_ratio([(a, BirdSums(("9",), {"iou": (0.5,)}, {"iou": (1,)}))], "iou")
     assert none.birds == 0
     assert math.isnan(none.value)
 
@@ -117,6 +128,6 @@ def test_several_results_make_one_flock():
 
 def test_a_metric_that_is_none():
     found = sums(iou=[(0.5, 1), (0.5, 1)])
-    for ask in (found.interval, found.value, lambda name: paired_difference(found, found, name)):
+    for ask in (found.interval, found.value, lambda name: paired_ratio([(found, found)], name)):
         with pytest.raises(ValueError, match="metric must be one of iou, not me_p"):
             ask("me_p")

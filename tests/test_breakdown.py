@@ -9,7 +9,7 @@ import pytest
 from test_evaluate import BIRD, N, T, sides, solution, truth
 
 from jaxfit.errors import InputError
-from jaxfit.evaluation.bootstrap import paired_difference
+from jaxfit.evaluation.bootstrap import paired_ratio
 from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, Evaluation, evaluate
 from jaxfit.evaluation.figures import COLUMNS_KEYPOINT
 from jaxfit.evaluation.truth import read_behaviours
@@ -86,8 +86,8 @@ def test_the_overall_figures_are_those_of_the_sums():
 def test_two_results_of_the_same_birds():
     """The same error added to both birds' images: known in every bird."""
     worse, better = (evaluate(moved(slice(None), 1, by=by), BIRD, truth()).sums for by in ((6, 8), (3, 4)))
-    assert paired_difference(worse, better, "me_p", ratio=True)[:3] == pytest.approx((2, 2, 2), rel=1e-3)
-    assert paired_difference(worse, better, "iou") == pytest.approx((0, 0, 0, 2))
+    assert paired_ratio([(worse, better)], "me_p")[:3] == pytest.approx((2, 2, 2), rel=1e-3)
+    assert paired_ratio([(worse, better)], "iou") == pytest.approx((1, 1, 1, 2))
 
 
 def test_all_of_it_can_be_stored():

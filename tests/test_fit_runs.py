@@ -84,9 +84,7 @@ def test_batches_of_one_window_give_the_same(observed):
 
 def test_a_short_batch_is_filled_up(observed):
     """Three runs of two windows in batches of four: the last is filled with lanes that count nothing."""
-    frames_of_four = 4 * T
-    memory_gb = ONE * frames_of_four / T
-    some = [dataclasses.replace(each, memory_gb=memory_gb) for each in SWEEP]
+    some = [dataclasses.replace(each, memory_gb=0.0066) for each in SWEEP]
     assert batch.frames_per_batch(BIRD, some[0]) // T == 4
     together = fit_runs(prepared(observed), BIRD, some)
     for a, b in zip(together, fit_runs(prepared(observed), BIRD, some[::-1])[::-1], strict=True):

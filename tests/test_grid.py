@@ -45,9 +45,9 @@ def test_the_last_key_changes_fastest_and_runs_are_named(tmp_path):
     runs = load_grid(grid_file(tmp_path, text)).runs
     assert [run.name for run in runs] == [
         "1_filter_window=1,velocity=1",
-        "2_filter_window=1,velocity=1e4",
+        "2_filter_window=1,velocity=10000",
         "3_filter_window=3,velocity=1",
-        "4_filter_window=3,velocity=1e4",
+        "4_filter_window=3,velocity=10000",
     ]
     assert [dict(run.levels) for run in runs][1] == {"filter_window": 1, "terms.velocity": 1e4}
     assert not any(run.config.common_size for run in runs)
@@ -96,7 +96,7 @@ def test_what_is_no_grid(tmp_path, text, words):
 
 
 @pytest.mark.parametrize(
-    ("value", "text"), [(1e4, "1e4"), (1e5, "1e5"), (100.0, "100"), (0.25, "0.25"), (1e-7, "1e-7"), (True, "true")]
+    ("value", "text"), [(1e4, "10000"), (1e6, "1e6"), (100.0, "100"), (0.25, "0.25"), (1e-7, "1e-7"), (True, "true")]
 )
 def test_short_values(value, text):
     assert short(value) == text

@@ -143,7 +143,7 @@ def _name(values: Mapping[str, Any]) -> str:
 
 
 def short(value: Any) -> str:
-    """A value in few letters: 1e4, true."""
+    """A value in few letters: 10000, 1e6, true."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value).lower()
     return re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from jaxfit.ablation.grid import Run
-from jaxfit.config_file import config_to_yaml
+from jaxfit.config import FitConfig
+from jaxfit.config_file import build_config, config_to_yaml
 from jaxfit.errors import InputError
 from jaxfit.fitting.batch import frames_per_batch
 from jaxfit.fitting.fit import fit_runs
@@ -21,6 +23,7 @@ from jaxfit.fitting.prepare import Preparation
 from jaxfit.fitting.solution import write_solution
 from jaxfit.fitting.stages import program
 from jaxfit.fitting.summary import summarise
+from jaxfit.formats.scene_folder import TRUE_POSES, TRUTH
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
 from jaxfit.progress import ProgressTask, silent
@@ -65,21 +68,25 @@ def claim_folder(folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bir
         return
     try:
         held = json.loads(path.read_text(encoding="utf-8"))
-        differs = [name for name in own if held.get(name) != own[name]]
-    except (OSError, ValueError, AttributeError) as error:
+        differs = [name for name in own if name != "runs" and held[name] != own[name]]
+        # by meaning: a later version's config may hold keys that an earlier one did not write
+        as_before = {name: build_config(FitConfig, yaml.safe_load(text)) for name, text in held["runs"].items()}
+    except (OSError, ValueError, KeyError, AttributeError, yaml.YAMLError, InputError) as error:
         raise InputError(path, f"cannot be read: {error}", "choose another --out") from None
+    if as_before != {run.name: run.config for run in runs}:
+        differs.insert(0, "grid")
     if differs:
-        what = ", ".join({"runs": "grid", "format_version": "format"}.get(name, name) for name in differs)
-        raise InputError(folder, f"holds an ablation of another {what}", "choose another --out, or remove that folder")
+        raise InputError(
+            folder, f"holds an ablation of another {', '.join(differs)}", "choose another --out, or remove that folder"
+        )
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a folder."""
+    """SHA-256 of a file, or of the truth in the folder of a simulated scene."""
     digest = hashlib.sha256()
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.is_file():
-            with file.open("rb") as opened:
-                digest.update(hashlib.file_digest(opened, "sha256").digest())
+    for file in [path / TRUTH, *sorted((path / TRUE_POSES).glob("*.npz"))] if path.is_dir() else [path]:
+        with file.open("rb") as opened:
+            digest.update(hashlib.file_digest(opened, "sha256").digest())
     return digest.hexdigest()
 
 

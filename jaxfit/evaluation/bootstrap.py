@@ -1,4 +1,4 @@
-"""Sums for every bird, and how sure the figures are that come of them: intervals over birds, paired differences."""
+"""Sums for every bird, and how sure the figures are that come of them: intervals over birds, paired ratios."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import bootstrap
 
-__all__ = ["BirdSums", "Difference", "Interval", "paired_difference"]
+__all__ = ["BirdSums", "Interval", "Ratio", "paired_ratio"]
 
 LEVEL = 0.95
 """Share of the resampled figures that an interval holds."""
@@ -27,21 +27,21 @@ class Interval(NamedTuple):
     high: float
 
 
-class Difference(NamedTuple):
-    """How far two results of the same birds are apart in one metric."""
+class Ratio(NamedTuple):
+    """How results of the same birds compare in one metric."""
 
     value: float
-    """Over the birds that both measure; NaN where there is none."""
+    """Over the birds that all of them measure; NaN where there is none."""
     low: float
     """Interval over birds; NaN for fewer than two."""
     high: float
     birds: int
-    """How many both measure."""
+    """How many all of them measure."""
 
 
 @dataclass(frozen=True)
 class BirdSums:
-    """What every bird adds to every metric: all that its figures, their intervals and differences are made of.
+    """What every bird adds to every metric: all that its figures, their intervals and ratios are made of.
 
     metric = f(Σ_birds numerator / Σ_birds count),  f = √ for ``me_p`` and ``me_v``, whose numerators are squares
 
@@ -139,37 +139,36 @@ class BirdSums:
         return np.array(self.numerators[metric], float)[at], np.array(self.counts[metric], float)[at]
 
 
-def paired_difference(a: BirdSums, b: BirdSums, metric: str, ratio: bool = False, seed: int = 0) -> Difference:
-    """By how much one result differs from another of the same birds: metric(a) − metric(b), or metric(a) / metric(b).
+def paired_ratio(pairs: Sequence[tuple[BirdSums, BirdSums]], metric: str, seed: int = 0) -> Ratio:
+    """metric(a) / metric(b), the geometric mean over pairs of results (a, b) of the same birds.
 
-    The same birds are drawn for both, so that what makes a bird hard in both cancels; otherwise as
-    ``BirdSums.interval``. Only birds that both measure are taken, by name.
+    The same birds are drawn for all results, so that what makes a bird hard in all of them cancels; otherwise as
+    ``BirdSums.interval``. Only birds that all measure are taken, by name.
 
     Args:
-        a: sums of one result.
-        b: of the other.
+        pairs: sums of the results; one pair or more.
         metric: name.
-        ratio: the ratio instead of the difference.
         seed: of the draw.
 
     Returns:
-        The difference, its interval and the number of birds; with fewer than two the interval is NaN.
+        The ratio, its interval and the number of birds; with fewer than two the interval is NaN.
 
     Raises:
         ValueError: no such metric.
     """
-    in_b = b.measured(metric)
-    birds = [bird for bird in a.measured(metric) if bird in in_b]
-    sums = (*a._sums(metric, birds), *b._sums(metric, birds))
+    results = [result for pair in pairs for result in pair]
+    in_all = set.intersection(*(set(result.measured(metric)) for result in results))
+    birds = [bird for bird in results[0].measured(metric) if bird in in_all]
+    sums = tuple(each for result in results for each in result._sums(metric, birds))
     figure = _figure(metric)
 
-    def apart(numerator_a: Any, count_a: Any, numerator_b: Any, count_b: Any, axis: int = -1) -> Any:
-        of_a, of_b = figure(numerator_a, count_a, axis), figure(numerator_b, count_b, axis)
+    def ratio(*sums: Any, axis: int = -1) -> Any:
         with np.errstate(divide="ignore", invalid="ignore"):
-            return of_a / of_b if ratio else of_a - of_b
+            of = [np.log(figure(n, count, axis)) for n, count in zip(sums[::2], sums[1::2], strict=True)]
+            return np.exp(sum(a - b for a, b in zip(of[::2], of[1::2], strict=True)) / len(pairs))
 
-    value = float(apart(*sums)) if birds else math.nan
-    return Difference(value, *_percentiles(apart, sums, seed), len(birds))
+    value = float(ratio(*sums)) if birds else math.nan
+    return Ratio(value, *_percentiles(ratio, sums, seed), len(birds))
 
 
 def _figure(metric: str) -> Callable[..., Any]:

@@ -50,7 +50,7 @@ class Evaluation:
     """Keypoint → COLUMNS_KEYPOINT of this one alone, over all birds, and in how many frames it is annotated as
     `count`."""
     sums: BirdSums = field(default_factory=lambda: BirdSums((), {}, {}))
-    """What all figures over birds are made of, for `paired_difference` of two results of the same birds."""
+    """What all figures over birds are made of, for `paired_ratio` of results of the same birds."""
 
     def to_dict(self) -> dict[str, Any]:
         """All of it in what JSON knows; the metrics over all birds stand at the top."""
