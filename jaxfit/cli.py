@@ -106,6 +106,7 @@ def _parser() -> argparse.ArgumentParser:
     _fitting(add)
     _simulation(add)
     _training(add)
+    _datasets(add)
     _models(add)
     bench = add("bench", help="measure speed on this machine")
     bench.add_argument("what", choices=("silhouette", "render", "fit"))
@@ -232,6 +233,21 @@ def _training(add) -> None:
     train.add_argument("--seed", type=int, default=0, help="of first weights and of samples (default 0)")
     train.add_argument("--overwrite", action="store_true", help="replace an earlier file of that name")
     train.set_defaults(run="training.train")
+
+
+def _datasets(add) -> None:
+    actions = add("dataset", help="read published data sets").add_subparsers(required=True, metavar="NAME")
+    murre = actions.add_parser("murre", help="common_murre_temporal, whose layout is inferred, as a COCO file")
+    murre.add_argument("folder", type=Path, metavar="DIR", help="folder with annotations.npy and images/")
+    murre.add_argument(
+        "--keypoints",
+        default="none",
+        metavar="NAMES",
+        help="the 20 in order, by comma; `murre` if you know them to be that model's; default none: they are numbered",
+    )
+    murre.add_argument("--out", type=Path, required=True, metavar="OBS.json", help="COCO file to write")
+    murre.add_argument("--overwrite", action="store_true", help="replace an earlier file of that name")
+    murre.set_defaults(run="datasets.murre")
 
 
 def _models(add) -> None:

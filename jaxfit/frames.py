@@ -18,7 +18,7 @@ import numpy as np
 from jaxfit.decoding import Frame, decode, frame_rate, opened
 from jaxfit.errors import InputError
 
-__all__ = ["Frame", "FrameReader", "VideoInfo", "probe_video", "read_frames"]
+__all__ = ["Frame", "FrameReader", "VideoInfo", "image_files", "probe_video", "read_frames"]
 
 _logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ def probe_video(path: str | Path, *, fps: float | None = None) -> VideoInfo:
     """
     path = _existing(path)
     if path.is_dir():
-        files = _image_files(path)
+        files = image_files(path)
         first = next((image for image in map(_read_image, files) if image is not None), None)
         if first is None:
             raise InputError(path, "holds no image that can be read", "the files may be damaged, or no images")
@@ -130,7 +130,7 @@ class FrameReader:
         if not self.path.is_dir():
             yield from decode(self.path, self._wanted, stopped)
             return
-        files, fps = _image_files(self.path), self.info.fps
+        files, fps = image_files(self.path), self.info.fps
         for i in range(len(files))[self._wanted.start : self._wanted.stop : self._wanted.step]:
             picture = _read_image(files[i])
             if picture is None:
@@ -196,7 +196,8 @@ def _existing(path: str | Path) -> Path:
     return path
 
 
-def _image_files(folder: Path) -> list[Path]:
+def image_files(folder: Path) -> list[Path]:
+    """The images of a folder in the order of their names, numbers by value; InputError where there is none."""
     files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     if not files:
         raise InputError(folder, "holds no images", f"their names end in {', '.join(IMAGE_SUFFIXES)}")

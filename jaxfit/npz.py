@@ -1,4 +1,4 @@
-"""Arrays read back from an ``.npz``, whatever may have happened to it."""
+"""Arrays read back from an ``.npz`` or ``.npy``, whatever may have happened to it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxfit.errors import InputError
 
-__all__ = ["load_npz"]
+__all__ = ["load_npy", "load_npz"]
 
 
 def load_npz(path: str | Path, required: Mapping[str, int], version: int | None = None) -> dict[str, np.ndarray]:
@@ -30,26 +30,9 @@ def load_npz(path: str | Path, required: Mapping[str, int], version: int | None 
             missing or of another number of dimensions.
     """
     path = Path(path)
-    if not path.exists():
-        raise InputError(path, "does not exist", "check the path")
-    if path.is_dir():
-        raise InputError(path, "is a folder, not an .npz file", "check the path")
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            raise InputError(path, "holds one bare array, not an .npz", "check the path")
-        with loaded:
-            found = {name: loaded[name] for name in loaded.files}
-    except InputError:
-        raise
-    except PermissionError as error:
-        raise InputError(path, "cannot be read: permission denied", "change its permissions") from error
-    except Exception as error:  # zip, zlib, header and memory errors alike mean: these bytes are no .npz of ours
-        if "allow_pickle" in str(error):
-            problem = "is a pickle or holds Python objects, which jaxfit does not load"
-            raise InputError(path, problem, "save plain arrays with numpy.savez") from error
-        problem = f"is not a readable .npz: {str(error) or type(error).__name__}"
-        raise InputError(path, problem, "it may be truncated: copy or write it again") from error
+    found = _load(path, ".npz")
+    if isinstance(found, np.ndarray):
+        raise InputError(path, "holds one bare array, not an .npz", "check the path")
     if version is not None:
         _check_version(path, found.get("format_version"), version)
     for name, ndim in required.items():
@@ -59,6 +42,40 @@ def load_npz(path: str | Path, required: Mapping[str, int], version: int | None 
             problem = f"{name} has shape {found[name].shape}, expected {ndim} dimensions"
             raise InputError(path, problem, "write the file again")
     return {name: array for name, array in found.items() if isinstance(array, np.ndarray)}
+
+
+def load_npy(path: str | Path) -> np.ndarray:
+    """Read the array of an ``.npy``, running no pickled code.
+
+    Raises:
+        InputError: no such file, not an ``.npy``, truncated, or Python objects inside.
+    """
+    path = Path(path)
+    found = _load(path, ".npy")
+    if not isinstance(found, np.ndarray):
+        raise InputError(path, "is an .npz, not one bare array", "check the path")
+    return found
+
+
+def _load(path: Path, kind: str) -> np.ndarray | dict[str, Any]:
+    if not path.exists():
+        raise InputError(path, "does not exist", "check the path")
+    if path.is_dir():
+        raise InputError(path, f"is a folder, not an {kind} file", "check the path")
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded
+        with loaded:
+            return {name: loaded[name] for name in loaded.files}
+    except PermissionError as error:
+        raise InputError(path, "cannot be read: permission denied", "change its permissions") from error
+    except Exception as error:  # zip, zlib, header and memory errors alike mean: these bytes are no arrays of ours
+        if "allow_pickle" in str(error):
+            problem = "is a pickle or holds Python objects, which jaxfit does not load"
+            raise InputError(path, problem, "save plain arrays with numpy.save or numpy.savez") from error
+        problem = f"is not a readable {kind}: {str(error) or type(error).__name__}"
+        raise InputError(path, problem, "it may be truncated: copy or write it again") from error
 
 
 def _check_version(path: Path, found: Any, newest: int) -> None:

@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -147,7 +148,7 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
     )
 
 
-def write_coco(observations: Observations, path: str | Path) -> None:
+def write_coco(observations: Observations, path: str | Path, info: Mapping[str, str] | None = None) -> None:
     """Write observations as COCO json, the whole file or none.
 
     ``read_coco`` reads the same back, except that tracks come in the order of ``track_id`` and a track that
@@ -156,6 +157,7 @@ def write_coco(observations: Observations, path: str | Path) -> None:
     Args:
         observations: what to write.
         path: the file; an existing one is replaced.
+        info: what the file says of itself, as COCO's ``info``: ``description``, ``license``, …
 
     Raises:
         InputError: the file cannot be written.
@@ -204,7 +206,14 @@ def write_coco(observations: Observations, path: str | Path) -> None:
         figures = quality._asdict()
         track = {"id": figures.pop("track_id"), "category_id": 1}
         tracks.append(track | {key: round(v, 6) if isinstance(v, float) else v for key, v in figures.items()})
-    content = {"images": list(images.values()), "categories": [category], "annotations": annotations, "tracks": tracks}
+    content: dict[str, Any] = {
+        "images": list(images.values()),
+        "categories": [category],
+        "annotations": annotations,
+        "tracks": tracks,
+    }
+    if info:
+        content = {"info": dict(info), **content}
     write_whole(path, json.dumps(content, allow_nan=False).encode())
 
 
