@@ -14,6 +14,7 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.formats.coco import read_coco, write_coco
     from jaxfit.model.bird import Bird
     from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
+    from jaxfit.objective.registry import term
     from jaxfit.observations import Observations
     from jaxfit.perception.config import TrackConfig
     from jaxfit.perception.keypoints import load_keypoint_detector
@@ -54,6 +55,7 @@ __all__ = [
     "save_solution",
     "simulate",
     "stage_scene",
+    "term",
     "track_quality",
     "track_video",
     "write_coco",
@@ -68,6 +70,7 @@ _HOMES = {
     "formats.coco": ("read_coco", "write_coco"),
     "model.bird": ("Bird",),
     "model.files": ("find_bird", "load_bird", "load_murre", "save_bird"),
+    "objective.registry": ("term",),
     "observations": ("Observations",),
     "perception.config": ("TrackConfig",),
     "perception.keypoints": ("load_keypoint_detector",),

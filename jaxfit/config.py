@@ -10,7 +10,7 @@ from typing import Any, Literal
 from jaxfit.config_checks import check_config
 from jaxfit.config_file import OWN_FILE, config_to_yaml, read_config, require, shipped_files
 from jaxfit.errors import InputError
-from jaxfit.objective.objective import term_settings
+from jaxfit.objective.registry import find_term
 from jaxfit.perception.config import TrackConfig
 
 __all__ = [
@@ -119,7 +119,7 @@ class FitConfig:
         """Weight and settings of each of a stage's terms: defaults, `terms`, then the stage's `override`."""
         settings = {}
         for name in stage.terms:
-            values = {"weight": 1.0, **term_settings(name)}
+            values = {"weight": 1.0, **find_term(name).settings}
             for source in (self.terms, stage.override):
                 if name in source:
                     values |= _as_settings(source[name])

@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from jaxfit.config_file import require
-from jaxfit.objective.objective import TERMS, term_settings
+from jaxfit.config_file import ConfigKeyError, require
+from jaxfit.errors import InputError
+from jaxfit.objective.registry import Term, find_term, known_terms
 
 if TYPE_CHECKING:
     from jaxfit.config import FitConfig
@@ -45,9 +46,9 @@ def check_config(config: FitConfig) -> None:
         rate = stage.learning_rate
         require(0 < rate < math.inf, f"{where}.learning_rate", f"is {rate}", "above 0")
         require(0 < stage.blur < math.inf, f"{where}.blur", f"is {stage.blur}", "above 0")
-        require(len(stage.terms) > 0, f"{where}.terms", "is empty", f"known: {', '.join(TERMS)}")
+        require(len(stage.terms) > 0, f"{where}.terms", "is empty", f"known: {', '.join(known_terms())}")
         for name in stage.terms:
-            require(name in TERMS, f"{where}.terms", f"names {name!r}", f"known: {', '.join(TERMS)}")
+            _find(f"{where}.terms", f"names {name!r}", name)
         for key in ("free", "step_scale"):
             for name in getattr(stage, key):
                 known = name in PARAMETERS
@@ -62,14 +63,23 @@ def check_config(config: FitConfig) -> None:
 
 def _check_terms(where: str, terms: Mapping[str, Any]) -> None:
     for name, value in terms.items():
-        require(name in TERMS, f"{where}.{name}", "is not a term", f"known: {', '.join(TERMS)}")
-        known = ("weight", *term_settings(name))
+        term = _find(f"{where}.{name}", "is not a term", name)
+        known = ("weight", *term.settings)
         for key, number in (value if isinstance(value, dict) else {"weight": value}).items():
             place = f"{where}.{name}.{key}"
             require(key in known, place, "is not a setting of this term", f"known: {', '.join(known)}")
             require(_is_number(number), place, f"is {number!r}", "a number, 0 or more")
-            # the robust term divides by it
-            require(key != "sigma_px" or number > 0, place, f"is {number!r}", "above 0")
+            require(key not in term.positive or number > 0, place, f"is {number!r}", "above 0")
+
+
+def _find(where: str, unknown: str, name: str) -> Term:
+    try:
+        return find_term(name)
+    except KeyError:
+        remedy = f"known: {', '.join(known_terms())}, or package.module:function"
+        raise ConfigKeyError(where, f"`{where}` {unknown}", remedy) from None
+    except InputError as error:
+        raise ConfigKeyError(where, f"`{where}`: {error.source} {error.problem}", error.remedy) from error
 
 
 def _is_number(value: Any) -> bool:

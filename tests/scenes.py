@@ -7,14 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from helpers import random_pose, skin_by_hand, toy_bird
+from scipy.fft import dct
+from scipy.spatial.transform import Rotation
+from scipy.special import huber
 
 from jaxfit.camera import Camera
 from jaxfit.model.kinematics import fold_bird
-from jaxfit.objective.objective import TERMS, evaluate_terms, term_settings
+from jaxfit.objective.objective import evaluate_terms
+from jaxfit.objective.registry import find_term, known_terms
 from jaxfit.objective.scene import Evidence, Raster, Scene, priors_of
 from jaxfit.silhouette import Blur
 
 T, SIZE = 3, 32
+TERMS = tuple(known_terms())
 CAMERA = Camera(focal_px=240.0, centre_px=SIZE / 2, size_px=SIZE)
 RASTER = Raster(Blur.for_size(SIZE))
 
@@ -30,6 +35,7 @@ def correlated_bird():
         bone_mean=jnp.asarray(1 + 0.1 * rng.normal(size=7), jnp.float32),
         bone_covariance=jnp.asarray(0.01 * b @ b.T + 0.01 * np.eye(7), jnp.float32),
         shape_variance=jnp.array([0.5, 2.0]),
+        joint_limits=jnp.asarray(np.sort(rng.normal(size=(7, 3, 2)) * 0.1), jnp.float32),
     )
 
 
@@ -55,6 +61,7 @@ def seen(seed=0):
         mask=jnp.asarray(mask),
         has_mask=jnp.ones(T, bool),
         present=jnp.ones(T, bool),
+        corner_px=jnp.asarray(rng.uniform(0, 5, (T, 2)), jnp.float32),
     )
 
 
@@ -73,7 +80,7 @@ def scene(pose, evidence, start=None):
 
 
 def all_settings():
-    return {name: {"weight": 1.0, **term_settings(name)} for name in TERMS}
+    return {name: {"weight": 1.0, **find_term(name).settings} for name in TERMS}
 
 
 @jax.jit
@@ -137,6 +144,12 @@ def mahalanobis(x, mean, covariance):
     return offset @ np.linalg.solve(np.asarray(covariance, np.float64), offset)
 
 
+def angles_between(one, other):
+    """Of the global orientation and of every joint, by scipy."""
+    a, b = (np.concatenate([np.asarray(p.global_orient)[None], np.asarray(p.body_pose)]) for p in (one, other))
+    return (Rotation.from_rotvec(a.astype(float)).inv() * Rotation.from_rotvec(b.astype(float))).magnitude()
+
+
 def oracle(name, pose, start, evidence, seed):
     """Each term by its equation, frame by frame in double precision."""
     total = 0.0
@@ -161,6 +174,31 @@ def oracle(name, pose, start, evidence, seed):
         total = np.sqrt((betas**2).sum())
     elif name == "start_pull":
         total += np.abs(np.asarray(pose.bone_length - start.bone_length)).sum()
+    elif name == "joint_limits":
+        low, high = np.moveaxis(np.asarray(BIRD.joint_limits, np.float64), -1, 0)
+        for theta in np.asarray(pose.body_pose, np.float64):
+            total += (np.where(theta < low, low - theta, 0) ** 2 + np.where(theta > high, theta - high, 0) ** 2).sum()
+    elif name in ("geodesic_velocity", "huber_velocity"):
+        for i in range(T - 1):
+            turned, *bent = angles_between(frame(pose, i), frame(pose, i + 1))
+            if name == "geodesic_velocity":
+                total += 10 * turned + np.sqrt(np.square(bent).sum())
+            else:
+                total += 10 * huber(0.1, turned) + huber(0.1, bent).sum()
+    elif name == "low_pass":
+        for theta in (pose.global_orient, pose.body_pose.reshape(T, -1)):
+            for k, coefficients in enumerate(dct(np.asarray(theta, np.float64), axis=0, norm="ortho")[1:], start=1):
+                total += (coefficients**2).sum() / (1 + (0.15 / (k / (2 * T))) ** 8)
+    elif name == "feet_on_ground":
+        feet = [BIRD.keypoint_names.index(foot) for foot in ("left_foot", "right_foot")]
+        posed = [np.asarray(BIRD.keypoint_weights) @ skin_by_hand(BIRD, frame(pose, t))[0] for t in range(T)]
+        # where the first frame's crop would see them, back in space at their depths
+        corner = np.asarray(evidence.corner_px, np.float64) - CAMERA.centre_px
+        seen_px = [pixels(posed[t][feet]) + corner[t] - np.asarray(evidence.corner_px[0]) for t in range(T)]
+        feet_cam = [np.c_[seen_px[t] * posed[t][feet, 2:] / CAMERA.focal_px, posed[t][feet, 2]] for t in range(T)]
+        for i in range(T - 1):
+            d2 = ((feet_cam[i + 1] - feet_cam[i]) ** 2).sum(-1)
+            total += (0.25 * d2 / (0.25 + d2)).sum()
     elif name in ("velocity", "acceleration"):
         order = 1 if name == "velocity" else 2
         for theta, beta in ((pose.global_orient, 10), (pose.body_pose.reshape(T, -1), 1)):

@@ -16,6 +16,7 @@ from scenes import (
     RASTER,
     RIG,
     SIZE,
+    TERMS,
     T,
     all_settings,
     every_gradient,
@@ -28,9 +29,11 @@ from scenes import (
     without,
 )
 
-from jaxfit.objective.objective import TERMS, compares_masks, evaluate_terms, term_settings, weighted_sum
+from jaxfit.model.rotation import safe_norm
+from jaxfit.objective.objective import evaluate_terms, weighted_sum
+from jaxfit.objective.registry import find_term
 from jaxfit.objective.scene import Priors, Scene, priors_of
-from jaxfit.objective.terms import geman_mcclure, pose_prior, safe_norm
+from jaxfit.objective.terms import geman_mcclure, pose_prior
 
 
 @pytest.mark.parametrize("seed", [0, 10])
@@ -197,11 +200,11 @@ def test_settings_are_traced():
 
 
 def test_settings_of_terms():
-    assert term_settings("keypoints") == {"sigma_px": 50.0}
-    assert term_settings("velocity") == {"beta_global": 10.0, "beta_pose": 1.0}
-    assert term_settings("mask") == {}
+    assert find_term("keypoints").settings == {"sigma_px": 50.0}
+    assert find_term("velocity").settings == {"beta_global": 10.0, "beta_pose": 1.0}
+    assert find_term("mask").settings == {}
     with pytest.raises(KeyError):
-        term_settings("unknown")
+        find_term("unknown")
 
 
 def test_one_size_for_a_window():
@@ -231,5 +234,5 @@ def test_terms_that_draw_the_silhouette_say_so(name):
     """A term that is not marked gets empty masks; one that is marked in vain makes its stage slow."""
     pose = window_pose()
     one = scene(pose, seen())
-    evaluate_terms(one, {name: {"weight": 1.0, **term_settings(name)}})
-    assert compares_masks(name) == ("vertices_screen" in vars(one))
+    evaluate_terms(one, {name: {"weight": 1.0, **find_term(name).settings}})
+    assert find_term(name).compares_masks == ("vertices_screen" in vars(one))

@@ -61,6 +61,7 @@ def case(broken=None):
                 mask=jnp.zeros((T, 0, 0), jnp.uint8),
                 has_mask=jnp.zeros(T, bool),
                 present=jnp.ones(T, bool),
+                corner_px=jnp.zeros((T, 2)),
             )
         )
     rng = np.random.default_rng(0)

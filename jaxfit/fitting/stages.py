@@ -12,7 +12,7 @@ from jaxfit.config import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.fitting.solve import Knobs, Problem
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
-from jaxfit.objective.objective import compares_masks
+from jaxfit.objective.registry import find_term
 from jaxfit.objective.scene import Priors, Raster
 from jaxfit.silhouette import Blur
 
@@ -31,7 +31,7 @@ STEP_SHAPES = {
 
 def needs_mask(stage: StageConfig) -> bool:
     """Whether any of a stage's terms looks at the silhouette."""
-    return any(compares_masks(name) for name in stage.terms)
+    return any(find_term(name).compares_masks for name in stage.terms)
 
 
 def stage_problem(config: FitConfig, stage: StageConfig, rig: Rig, priors: Priors, camera: Camera) -> Problem:

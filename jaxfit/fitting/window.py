@@ -101,6 +101,7 @@ def load_evidence(observations: Observations, windows: Windows, size_px: int) ->
         mask=mask,
         has_mask=has_mask,
         present=windows.present,
+        corner_px=(windows.crop[..., :2] * size_px / windows.crop[..., 2:]).astype(np.float32),
     )
 
 

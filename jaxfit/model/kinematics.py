@@ -47,6 +47,8 @@ class Rig(eqx.Module):
     shape_basis: Float[Array, "S 3 V"]
     faces: Int[Array, "F 3"]
     parents: tuple[int, ...] = eqx.field(static=True)
+    joint_names: tuple[str, ...] = eqx.field(static=True)
+    keypoint_names: tuple[str, ...] = eqx.field(static=True)
 
 
 def fold_bird(bird: Bird) -> Rig:
@@ -68,6 +70,8 @@ def fold_bird(bird: Bird) -> Rig:
         shape_basis=jnp.asarray(basis.transpose(0, 2, 1), jnp.float32),
         faces=jnp.asarray(bird.faces, jnp.int32),
         parents=bird.parents,
+        joint_names=bird.joint_names,
+        keypoint_names=bird.keypoint_names,
     )
 
 

@@ -11,6 +11,7 @@ __all__ = [
     "axis_angle_to_matrix",
     "geodesic_distance",
     "matrix_to_axis_angle",
+    "safe_norm",
     "unwrap_axis_angle",
     "view_grid",
     "viewing_axis_rotations",
@@ -68,10 +69,20 @@ def _matrix_to_quaternion(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 4"]:
 def geodesic_distance(Ra: Float[Array, "*B 3 3"], Rb: Float[Array, "*B 3 3"]) -> Float[Array, "*B"]:
     """The angle between rotations, in radians within [0, π].
 
-    By the chord ‖Ra − Rb‖ = 2√2·sin(θ/2), which keeps its precision at small angles where arccos does not.
+    θ = atan2(½‖Σ_k a_k × b_k‖, 1 − ¼‖Rb − Ra‖²) with a_k and b_k the rows of Ra and Rb: the length is sin θ, the other
+    cos θ. Unlike arccos of the trace, it keeps its precision at small angles and near π, and its gradient is finite
+    everywhere: 0 where the angle has a corner, at 0 and at π.
     """
-    chord = jnp.sqrt(jnp.sum((Ra - Rb) ** 2, axis=(-2, -1)))
-    return 2 * jnp.arcsin(jnp.clip(chord / (2 * jnp.sqrt(2.0)), 0, 1))
+    difference = Rb - Ra  # in place of Rb: the cross product is then exactly 0 for equal rotations
+    sine = safe_norm(jnp.sum(jnp.cross(Ra, difference), axis=-2)) / 2
+    return jnp.arctan2(sine, 1 - jnp.sum(difference**2, axis=(-2, -1)) / 4)
+
+
+def safe_norm(x: Float[Array, "*B D"]) -> Float[Array, "*B"]:
+    """‖x‖₂ over the last axis, with gradient 0 (not NaN) at x = 0."""
+    squared = jnp.sum(x**2, axis=-1)
+    zero = squared == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
 def unwrap_axis_angle(axis_angle: Float[Array, "T 3"]) -> Float[Array, "T 3"]:

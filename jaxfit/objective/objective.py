@@ -2,45 +2,20 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfit.objective import temporal, terms
+from jaxfit.errors import InputError
+from jaxfit.objective.registry import find_term
 from jaxfit.objective.scene import Scene
 
-__all__ = ["TERMS", "compares_masks", "evaluate_terms", "term_settings", "weighted_sum"]
+__all__ = ["evaluate_terms", "weighted_sum"]
 
-Term = Callable[..., Float[Array, ""]]
-
-TERMS: Mapping[str, Term] = {
-    "keypoints": terms.keypoints,
-    "mask": terms.mask,
-    "mask_smooth_l1": terms.mask_smooth_l1,
-    "pose_prior": terms.pose_prior,
-    "bone_prior": terms.bone_prior,
-    "shape_prior": terms.shape_prior,
-    "shape_norm": terms.shape_norm,
-    "start_pull": terms.start_pull,
-    "velocity": temporal.velocity,
-    "acceleration": temporal.acceleration,
-}
-"""Every term by name. To add one: a pure function of the scene, marked where it compares masks, and a line here."""
-
-Settings = Mapping[str, Mapping[str, Float[Array, ""] | float]]
-
-
-def term_settings(name: str) -> dict[str, float]:
-    """A term's own settings and their defaults: its keyword arguments."""
-    parameters = inspect.signature(TERMS[name]).parameters.values()
-    return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
-
-
-def compares_masks(name: str) -> bool:
-    """Whether a term looks at the silhouette, as `terms.compares_masks` marks it."""
-    return getattr(TERMS[name], "compares_masks", False)
+Settings = Mapping[str, Mapping[str, Float[Array | np.ndarray, ""] | float]]
 
 
 def evaluate_terms(scene: Scene, settings: Settings) -> dict[str, Float[Array, ""]]:
@@ -49,10 +24,13 @@ def evaluate_terms(scene: Scene, settings: Settings) -> dict[str, Float[Array, "
     Args:
         scene: one bird in one window.
         settings: for each active term, `weight` and the term's own settings; all may be traced.
+
+    Raises:
+        InputError: a term that returns anything but one real number; it is named.
     """
     return {
-        name: TERMS[name](scene, **{k: v for k, v in values.items() if k != "weight"})
-        for name, values in settings.items()
+        name: _scalar(name, find_term(name).function(scene, **{k: v for k, v in own.items() if k != "weight"}))
+        for name, own in settings.items()
     }
 
 
@@ -62,4 +40,15 @@ def weighted_sum(scene: Scene, settings: Settings) -> Float[Array, ""]:
     Source: Hägerlind et al. 2024, total objective.
     """
     values = evaluate_terms(scene, settings)
-    return sum((settings[name]["weight"] * value for name, value in values.items()), start=jnp.zeros(()))
+    return sum((jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()), start=jnp.zeros(()))
+
+
+def _scalar(name: str, value: Any) -> Float[Array, ""]:
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):
+        array = None
+    if array is not None and array.shape == () and jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    what = type(value).__name__ if array is None else f"{array.dtype} of shape {array.shape}"
+    raise InputError(f"term {name!r}", f"returned {what}, not one real number", "sum it over frames and joints")

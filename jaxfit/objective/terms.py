@@ -12,18 +12,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxfit.model.rotation import safe_norm
+from jaxfit.objective.registry import term
 from jaxfit.objective.scene import Scene
 from jaxfit.silhouette import mask_loss
 
 __all__ = [
     "bone_prior",
-    "compares_masks",
     "geman_mcclure",
     "keypoints",
     "mask",
     "mask_smooth_l1",
     "pose_prior",
-    "safe_norm",
     "shape_norm",
     "shape_prior",
     "start_pull",
@@ -38,6 +38,7 @@ def geman_mcclure(error: Float[Array, "*B"], sigma: Float[Array, ""] | float) ->
     return sigma**2 * squared / (sigma**2 + squared)
 
 
+@term(positive=["sigma_px"])
 def keypoints(scene: Scene, *, sigma_px: Scalar | float = 50.0) -> Scalar:
     """E_kpt = Σ_t Σ_i c_i · (ρ(e_x) + ρ(e_y)), ρ Geman-McClure, e in crop pixels.
 
@@ -48,13 +49,7 @@ def keypoints(scene: Scene, *, sigma_px: Scalar | float = 50.0) -> Scalar:
     return jnp.sum(scene.evidence.confidence * robust)
 
 
-def compares_masks(term):
-    """Marks a term that draws the silhouette: only stages with such a term are given masks."""
-    term.compares_masks = True
-    return term
-
-
-@compares_masks
+@term(compares_masks=True)
 def mask(scene: Scene) -> Scalar:
     """E_msk = Σ_t Σ_pixels |soft silhouette − mask|.
 
@@ -63,7 +58,7 @@ def mask(scene: Scene) -> Scalar:
     return _mask(scene, "l1")
 
 
-@compares_masks
+@term(compares_masks=True)
 def mask_smooth_l1(scene: Scene) -> Scalar:
     """Σ_t Σ_pixels of smooth-L1 (½e² below 1, so ½e² throughout): the silhouette term of AVES.
 
@@ -81,6 +76,7 @@ def _mask(scene: Scene, kind: Literal["l1", "smooth_l1"]) -> Scalar:
     return jnp.sum(jax.vmap(frame)(scene.vertices_screen, scene.evidence.mask, weight))
 
 
+@term
 def pose_prior(scene: Scene) -> Scalar:
     """E_pp = Σ_t (x − μ)ᵀ Σ⁻¹ (x − μ) on the flattened body pose.
 
@@ -92,6 +88,7 @@ def pose_prior(scene: Scene) -> Scalar:
     return jnp.sum(jnp.where(present, distance, 0.0))
 
 
+@term
 def bone_prior(scene: Scene) -> Scalar:
     """(b − μ_b)ᵀ Σ_b⁻¹ (b − μ_b) on the bone lengths.
 
@@ -100,11 +97,13 @@ def bone_prior(scene: Scene) -> Scalar:
     return jnp.sum((scene.priors.bone_whitener @ (scene.pose.bone_length - scene.priors.bone_mean)) ** 2)
 
 
+@term
 def shape_prior(scene: Scene) -> Scalar:
     """Σ (β / sd)²: squared Mahalanobis distance of the shape coefficients."""
     return jnp.sum((scene.pose.betas / scene.priors.shape_sd) ** 2)
 
 
+@term
 def shape_norm(scene: Scene) -> Scalar:
     """‖β‖₂, not squared: a bird keeps the mean shape unless its outline is worth the step.
 
@@ -113,6 +112,7 @@ def shape_norm(scene: Scene) -> Scalar:
     return safe_norm(jnp.asarray(scene.pose.betas))
 
 
+@term
 def start_pull(scene: Scene) -> Scalar:
     """Σ_t ‖θ_p − θ_p,start‖₁ + ‖b − b_start‖₁: keep body pose and bone lengths where the stage began.
 
@@ -121,10 +121,3 @@ def start_pull(scene: Scene) -> Scalar:
     moved = jnp.sum(jnp.abs(scene.pose.body_pose - scene.start.body_pose), axis=(-2, -1))
     stretched = jnp.sum(jnp.abs(scene.pose.bone_length - scene.start.bone_length))
     return jnp.sum(jnp.where(scene.evidence.present, moved, 0.0)) + stretched
-
-
-def safe_norm(x: Float[Array, "*B D"]) -> Float[Array, "*B"]:
-    """‖x‖₂ over the last axis, with gradient 0 (not NaN) at x = 0."""
-    squared = jnp.sum(x**2, axis=-1)
-    zero = squared == 0
-    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
