@@ -262,6 +262,6 @@ def test_the_better_hypothesis_goes_on(observed, after_first):
         only = Lanes(*np.zeros((3, 1), int))
         fitted = fit_batch(BIRD, rig, priors, [settings], CAMERA, evidence, start, only, lambda *_: None)
         assert fitted.pose.global_orient.shape == (1, T, 3)
-        assert not fitted.diverged.any()
+        assert not any(fitted.failure)
         apart = np.linalg.norm(np.asarray(fitted.report.keypoints_px) - keypoints_of([truth]), axis=-1)
         assert apart.mean() < 0.25

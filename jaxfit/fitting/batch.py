@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
 from jaxfit.camera import Camera
 from jaxfit.config import FitConfig
+from jaxfit.fitting.diagnose import name_failures
 from jaxfit.fitting.solve import Knobs, Problem, Report, StageState, advance, begin, report
 from jaxfit.fitting.stages import needs_mask, stage_knobs, stage_problem
 from jaxfit.model.bird import Bird
@@ -33,8 +34,8 @@ class Fitted(NamedTuple):
 
     pose: Pose
     report: Report
-    diverged: Bool[np.ndarray, "L"]
-    """Whether any step was refused because its gradient was not finite, or the end itself is not."""
+    failure: np.ndarray
+    """(L,) text: which terms were the first whose value or gradient was not finite, and when; empty where none was."""
 
 
 def frames_per_batch(bird: Bird, config: FitConfig) -> int:
@@ -77,7 +78,7 @@ def fit_batch(
     """
     starts, hypotheses = start.global_orient.shape[:2]
     pose = jax.tree.map(lambda x: x.reshape(starts * hypotheses, *x.shape[2:]), start)
-    refused = jnp.zeros(starts * hypotheses, int)
+    failure = np.full(starts * hypotheses, "", object)
     before: StageState | None = None
     row = lanes.start  # of each lane in what is computed, hypotheses side by side
     stages = configs[0].stages
@@ -85,24 +86,27 @@ def fit_batch(
         problem = stage_problem(configs[0], stage, rig, priors, camera)
         each = [stage_knobs(config, config.stages[i], bird.keypoint_names) for config in configs]
         first, now = _distinct(row, lanes.config, each)
-        pose, before, refused = _rows((pose, before, refused), row[first], hypotheses)
+        pose, before, failure = _rows((pose, before, failure), row[first], hypotheses)
         row = now
         knobs = _side_by_side([each[k] for k in lanes.config[first]], hypotheses)
         seen = _seen(evidence, lanes.evidence[first], hypotheses, needs_mask(stage))
         state = begin(problem, knobs, pose, seen, before if stage.carry_moments else None)
-        state, new_refused = _run((problem, knobs, seen), state, stage.steps, stage.name, tick)
-        refused = refused + new_refused
+        state, refused = _run((problem, knobs, seen), state, stage.steps, stage.name, tick)
+        broke = np.where(refused > 0, stage.steps + 1 - refused, 0)  # from then on it stood still
+        failure = name_failures(failure, broke, stage.name, problem, knobs, seen, state.pose, state.start)
         last = i == len(stages) - 1
         if hypotheses > 1 and (stage.keep_best or last):
             keep = _best(report(problem, knobs, state.pose, state.start, seen), len(first), hypotheses)
-            state, refused, knobs, seen = jax.tree.map(lambda x, keep=keep: x[keep], (state, refused, knobs, seen))
+            state, failure, knobs, seen = jax.tree.map(lambda x, keep=keep: x[keep], (state, failure, knobs, seen))
             hypotheses = 1
         pose, before = state.pose, state
         if last:
             final = report(problem, knobs, pose, state.start, seen)
-    pose, final, refused = jax.tree.map(lambda x: np.asarray(x)[row], (pose, final, refused))
-    total = sum(value for value in final.loss.values())
-    return Fitted(pose, final, (refused > 0) | ~np.isfinite(total))
+            total = np.asarray(sum(final.loss.values()))
+            broke = np.where(np.isfinite(total), 0, stage.steps)
+            failure = name_failures(failure, broke, stage.name, problem, knobs, seen, pose, state.start)
+    pose, final, failure = jax.tree.map(lambda x: np.asarray(x)[row], (pose, final, failure))
+    return Fitted(pose, final, failure)
 
 
 def _distinct(

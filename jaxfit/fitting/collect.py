@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import jax
 import numpy as np
 
@@ -13,6 +15,8 @@ from jaxfit.model.bird import Bird
 from jaxfit.observations import Observations
 
 __all__ = ["Collector"]
+
+logger = logging.getLogger(__name__)
 
 
 class Collector:
@@ -38,18 +42,23 @@ class Collector:
         self.image_size_px = np.zeros((birds, frames, 2), np.int64)
         self.loss: dict[str, np.ndarray] = {}
         self.status = np.full(birds, "no usable frame", dtype="<U32")
+        self.failures: dict[int, str] = {}
 
     def add(self, w: int, fitted: Fitted, i: int) -> None:
         """Take window `w` from lane `i` of a batch; of a diverged one only the status."""
         n = self.windows.track[w]
-        if fitted.diverged[i]:
+        if fitted.failure[i]:
             self.status[n] = "diverged"
+            track, at = int(self.observations.track_id[n]), self.windows.frame[w][self.windows.present[w]]
+            first, last = self.observations.frame_index[at[[0, -1]]]
+            logger.warning("track %d, frames %d to %d: %s", track, first, last, fitted.failure[i])
+            self.failures.setdefault(track, f"frames {first} to {last}: {fitted.failure[i]}")
         elif self.status[n] != "diverged":
             self.status[n] = "ok"
         for name, value in fitted.report.loss.items():
             self.loss.setdefault(name, np.full(len(self.status), np.nan, np.float32))
             self.loss[name][n] = np.nan_to_num(self.loss[name][n]) + value[i]
-        if fitted.diverged[i]:
+        if fitted.failure[i]:
             return
         present = self.windows.present[w]
         at = self.windows.frame[w][present]
@@ -87,4 +96,5 @@ class Collector:
             joint_names=self.bird.joint_names,
             loss=self.loss,
             status=self.status,
+            failures=self.failures,
         )

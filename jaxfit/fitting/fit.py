@@ -14,6 +14,7 @@ import numpy as np
 from jaxfit.config import FitConfig
 from jaxfit.fitting.batch import Lanes, fit_batch, frames_per_batch
 from jaxfit.fitting.collect import Collector
+from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.prepare import Preparation, camera_of, evidence_key, start_key
 from jaxfit.fitting.solution import Solution
 from jaxfit.fitting.stages import program
@@ -53,7 +54,7 @@ def fit(
 
     Raises:
         InputError: no bird, keypoints that are not the model's, no track with a usable frame, crops that cannot
-            be made.
+            be made, a term that cannot be used.
     """
     return fit_runs(Preparation(observations, bird, start, source), bird, [config], progress)[0]
 
@@ -82,6 +83,7 @@ def fit_runs(
     shaped = prepared.starts_with_shape or any("betas" in stage.free for stage in configs[0].stages)
     used = bird if shaped else _without_shape(bird)
     rig, priors, camera = fold_bird(used), priors_of(used), camera_of(configs[0])
+    check_terms(configs[0], used, rig, priors, camera)
     windows = [prepared.windows(config) for config in configs]
     pairs = np.array([(r, w) for r, each in enumerate(windows) for w in range(len(each))])
     size = min(max(frames_per_batch(bird, configs[0]) // configs[0].window, 1), len(pairs))

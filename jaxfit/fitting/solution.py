@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,8 @@ class Solution:
     """Term → (N,) float64: its weighted share of the final objective, summed over the track's windows."""
     status: np.ndarray
     """(N,) str: how each track's fit ended."""
+    failures: Mapping[int, str] = field(default_factory=dict)
+    """Track → what broke its fit down, where and when; for ``summary.json``, and not read back from there."""
 
     def __post_init__(self):
         arrays = conform(vars(self), LAYOUT)
@@ -117,7 +119,7 @@ class Solution:
     @property
     def pose(self) -> Pose:
         """The poses as the model takes them: every field (N, T, …)."""
-        return Pose(**{field.name: getattr(self, field.name) for field in fields(Pose)})
+        return Pose(**{each.name: getattr(self, each.name) for each in fields(Pose)})
 
 
 def save_solution(

@@ -22,7 +22,7 @@ from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
 from jaxfit.objective.scene import Evidence, Priors, Raster, Scene
 
-__all__ = ["Knobs", "Problem", "Report", "StageState", "advance", "begin", "report"]
+__all__ = ["Knobs", "Problem", "Report", "StageState", "advance", "begin", "lane_scene", "report"]
 
 NEVER = 2**30
 """Non-finite steps in a row that a lane may refuse: a diverging bird stands still and leaves others alone."""
@@ -58,7 +58,8 @@ class StageState(NamedTuple):
     """The solver's state: moments and counters."""
 
 
-def _scene(problem: Problem, knobs: Knobs, pose: Pose, start: Pose, evidence: Evidence) -> Scene:
+def lane_scene(problem: Problem, knobs: Knobs, pose: Pose, start: Pose, evidence: Evidence) -> Scene:
+    """What the terms of one lane see."""
     seen = eqx.tree_at(lambda e: e.confidence, evidence, evidence.confidence * knobs.keypoints_on)
     return Scene(pose, start, seen, problem.rig, problem.priors, problem.camera, problem.raster)
 
@@ -82,7 +83,9 @@ def _fixed(pose: Pose, step_size: Pose) -> Pose:
 
 def _loss(pose: Pose, args: Any) -> tuple[Float[Array, ""], None]:
     problem, knobs, start, evidence = args
-    return weighted_sum(_scene(problem, knobs, _fixed(pose, knobs.step_size), start, evidence), knobs.settings), None
+    return weighted_sum(
+        lane_scene(problem, knobs, _fixed(pose, knobs.step_size), start, evidence), knobs.settings
+    ), None
 
 
 STRUCT = jax.ShapeDtypeStruct((), jnp.float32)
@@ -151,7 +154,7 @@ def report(problem: Problem, knobs: Knobs, pose: Pose, start: Pose, evidence: Ev
     """Evaluate poses as they are (the solver itself only knows the loss before its last step)."""
 
     def one(knobs, pose, start, evidence):
-        scene = _scene(problem, knobs, pose, start, evidence)
+        scene = lane_scene(problem, knobs, pose, start, evidence)
         values = evaluate_terms(scene, knobs.settings)
         weighted = {name: knobs.settings[name]["weight"] * value for name, value in values.items()}
         return Report(weighted, scene.keypoints_cam, scene.keypoints_px)

@@ -19,7 +19,7 @@ LIBRARIES = ("jaxfit", "jax", "jaxlib", "equinox", "optimistix", "optax", "numpy
 
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
-    """What `summary.json` says: counts, status and final objective of every track, timings, versions, model.
+    """What `summary.json` says: counts, every track's status, failure and objective, timings, versions, model.
 
     Args:
         solution: the result.
@@ -32,6 +32,7 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         "poses": int(solution.valid.sum()),
         "status": dict(Counter(str(status) for status in solution.status)),
         "track_status": {int(t): str(s) for t, s in zip(solution.track_id, solution.status, strict=True)},
+        "failures": solution.failures,
         "loss": {name: np.asarray(value).tolist() for name, value in solution.loss.items()},
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "model": {"name": bird.name, "hash": model_hash(bird)},
