@@ -268,3 +268,9 @@ def _models(add) -> None:
         "--posture", help="of the murre: standing, incubating, … (default: standing; other models at rest)"
     )
     view.set_defaults(run="models.model_view")
+
+    priors = add("prior", help="learn a pose prior from results").add_subparsers(required=True, metavar="ACTION")
+    learn = priors.add_parser("learn", help="write a model whose pose prior is learnt from the poses of results")
+    learn.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="folders that fits of one model wrote")
+    learn.add_argument("--out", type=Path, required=True, metavar="P.npz", help="model file to write, for `--model`")
+    learn.set_defaults(run="models.prior_learn")

@@ -6,9 +6,9 @@ import argparse
 
 from jaxfit.errors import InputError
 from jaxfit.model.files import find_bird, save_bird
-from jaxfit.tables import plain_json, show, show_facts
+from jaxfit.tables import counted, plain_json, right_aligned, show, show_facts
 
-__all__ = ["model_import", "model_info", "model_view"]
+__all__ = ["model_import", "model_info", "model_view", "prior_learn"]
 
 
 def model_import(options: argparse.Namespace) -> None:
@@ -37,3 +37,31 @@ def model_view(options: argparse.Namespace) -> None:
         raise InputError("model view: posture", f"{options.posture!r} is none", f"known are {', '.join(POSTURES)}")
     six_views(find_bird(options.file), options.out, options.posture)
     show(f"six views → {options.out}")
+
+
+def prior_learn(options: argparse.Namespace) -> None:
+    import numpy as np
+
+    from jaxfit.fitting.learn import learn_prior
+    from jaxfit.fitting.solution import load_solution
+    from jaxfit.storage import check_writable
+
+    check_writable(options.out)  # before the work, not after it
+    learnt = learn_prior([(folder, *load_solution(folder)) for folder in options.results])
+    counts = {"poses": learnt.poses, "birds": learnt.birds, "effective_poses": learnt.effective_poses}
+    notes = {f"prior_{name}": value for name, value in counts.items()} | {"prior_shrinkage": learnt.shrinkage}
+    save_bird(learnt.bird, options.out, notes)
+    title = "how far each joint's mean moved from the model's, and its standard deviation (mean of three axes)"
+    table = right_aligned("moved °", "spread °", title=title)
+    table.add_column("joint")
+    spread = np.sqrt(np.diag(learnt.bird.pose_covariance).reshape(-1, 3).mean(axis=1))
+    for joint in np.argsort(-learnt.mean_change_rad):
+        figures = np.rad2deg([learnt.mean_change_rad[joint], spread[joint]])
+        table.add_row(*(f"{figure:.1f}" for figure in figures), learnt.bird.joint_names[joint + 1])
+    show(table)
+    left_out = f" ({learnt.diverged} diverged, left out)" if learnt.diverged else ""
+    poses, birds = counted(learnt.poses, "pose"), counted(learnt.birds, "bird")
+    show(f"{poses} of {birds}{left_out}, which tell as much as {learnt.effective_poses:.0f} independent ones")
+    bones = "learnt too" if learnt.bones_learnt else "the model's, as they do not differ here"
+    show(f"correlations shrunk by {100 * learnt.shrinkage:.0f} % (100 % leaves none); bone lengths: {bones}")
+    show(f"{learnt.bird.name} with this prior → {options.out}; fit with `--model {options.out}`")

@@ -8,6 +8,7 @@ them: then the bird is grey and its joints turn freely.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -37,12 +38,13 @@ STATIC_FIELDS = {
 TEXT_FIELDS = ("joint_names", "keypoint_names", "name")
 
 
-def save_bird(bird: Bird, path: Path | str) -> None:
+def save_bird(bird: Bird, path: Path | str, notes: Mapping[str, float] | None = None) -> None:
     """Write a bird to an `.npz` file, whole or not at all; an older file of that name is replaced.
 
     Args:
         bird: the model; its arrays are stored as float32 and int32.
         path: the file, conventionally `<name>.npz`.
+        notes: further numbers for the record, such as what a prior was learnt from; `load_bird` passes over them.
 
     Raises:
         InputError: a field of the bird is wrong, or the file cannot be written.
@@ -55,6 +57,7 @@ def save_bird(bird: Bird, path: Path | str) -> None:
         value = getattr(bird, field)
         array = np.asarray(value, np.str_ if field in TEXT_FIELDS else np.int32)
         arrays[field] = array.reshape(-1, 2) if dimensions == 2 else array
+    arrays |= {name: np.asarray(value) for name, value in (notes or {}).items()}
     write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
 
 
