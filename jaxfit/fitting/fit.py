@@ -99,7 +99,7 @@ def fit_runs(
             tick(0, "starting poses")
             batch = _gather(prepared, used, rig, configs, real, size)
             fitted = fit_batch(used, rig, priors, configs, camera, *batch, tick)
-            for lane, (r, w) in enumerate(real):
+            for lane, (r, w) in enumerate(real.tolist()):
                 collectors[r].add(w, fitted, lane)
     return [collector.finish() for collector in collectors]
 
