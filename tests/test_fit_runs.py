@@ -147,6 +147,7 @@ def test_what_runs_share_is_prepared_once(observed, monkeypatch):
 
 
 def test_a_sweep_compiles_once(observed, caplog):
+    jax.clear_caches()  # other tests fit batches of these shapes
     with caplog.at_level(logging.WARNING), jax.log_compiles():
         values = [(1, 2), (5, 6), (7, 8)]
         for a, b in values:
