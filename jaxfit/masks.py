@@ -23,7 +23,7 @@ def decode_mask(rle: Mapping[str, Any]) -> np.ndarray:
     """The mask that run lengths stand for: (H, W) bool."""
     from pycocotools import mask as coco_mask
 
-    return coco_mask.decode(cast(Any, rle)).astype(bool)
+    return coco_mask.decode(cast(Any, rle)).view(bool)
 
 
 def encode_mask(mask: Any) -> dict[str, Any]:

@@ -106,11 +106,15 @@ def iou(mask_a: Any, mask_b: Any) -> float:
     Raises:
         ValueError: masks of different shapes.
     """
-    mask_a, mask_b = np.asarray(mask_a).astype(bool), np.asarray(mask_b).astype(bool)
+    mask_a, mask_b = np.asarray(mask_a, bool), np.asarray(mask_b, bool)
     if mask_a.shape != mask_b.shape:
         raise ValueError(f"mask_a and mask_b must have one shape, not {mask_a.shape} and {mask_b.shape}")
-    union = np.count_nonzero(mask_a | mask_b)
-    return np.count_nonzero(mask_a & mask_b) / union if union else float("nan")
+    # a bird is small in its picture
+    x, y, width, height = box_of_mask(mask_a) or (0, 0, 0, 0)
+    box = slice(y, y + height), slice(x, x + width)
+    both = np.count_nonzero(mask_a[box] & mask_b[box])
+    union = np.count_nonzero(mask_a[box]) + np.count_nonzero(mask_b) - both
+    return both / union if union else float("nan")
 
 
 def longest_side_of_mask(mask: Any) -> float:
@@ -122,7 +126,7 @@ def longest_side_of_mask(mask: Any) -> float:
     Raises:
         ValueError: ``mask`` has not two dimensions.
     """
-    mask = np.asarray(mask).astype(bool)
+    mask = np.asarray(mask, bool)
     if mask.ndim != 2:
         raise ValueError(f"mask must have shape (H, W), not {mask.shape}")
     box = box_of_mask(mask)
