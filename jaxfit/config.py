@@ -68,15 +68,19 @@ class StageConfig:
     name: str
     """Shown in progress and results."""
     steps: int
-    """Adam steps."""
+    """The solver's steps."""
     terms: tuple[str, ...]
     """Active terms, by name; their weights and settings stand in `terms` of the whole config."""
     free: tuple[str, ...] = ("global_orient", "body_pose", "transl", "scale")
     """Parameters that move: global_orient, body_pose, transl, scale, bone_length, betas."""
+    solver: Literal["adam", "levenberg_marquardt"] = "adam"
+    """`adam`: for any terms. `levenberg_marquardt`: a few steps instead of hundreds, for terms whose curvature is
+    known (keypoints, pose_prior, velocity, acceleration) and fixed bone lengths and shape; 10 to 20 steps will do."""
     learning_rate: float = 0.01
     """Adam's step size, in each parameter's own unit."""
     step_scale: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
-    """Factor on the step size of single parameters; three numbers for `transl` (x, y, z)."""
+    """Factor on the step size of single parameters; three numbers for `transl` (x, y, z). 0 keeps a parameter fixed,
+    whatever the solver."""
     blur: float = 1.0
     """Softness of the silhouette's edge relative to the usual one; below 1 is sharper."""
     keypoints_off: tuple[str, ...] = ()

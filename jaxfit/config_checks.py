@@ -59,6 +59,23 @@ def check_config(config: FitConfig) -> None:
             fits = fits and (len(numbers) == 1 or name == "transl")
             require(fits, f"{where}.step_scale.{name}", f"is {factor!r}", "a number, 0 or more; three for transl")
         _check_terms(f"{where}.override", stage.override)
+        _check_solver(where, config, i)
+
+
+def _check_solver(where: str, config: FitConfig, i: int) -> None:
+    """What stage i asks of its solver."""
+    stage = config.stages[i]
+    if stage.carry_moments:
+        adam = stage.solver == config.stages[max(i - 1, 0)].solver == "adam"
+        require(adam, f"{where}.carry_moments", "is true", "only from one stage of Adam's to the next")
+    if stage.solver == "levenberg_marquardt":
+        for name in stage.terms:
+            problem = f"is levenberg_marquardt, and the curvature of {name!r} is not known"
+            remedy = "adam, or terms with a curvature such as keypoints, pose_prior, velocity, acceleration"
+            require(find_term(name).curvature is not None, f"{where}.solver", problem, remedy)
+        moved = [name for name in stage.free if name in ("bone_length", "betas")]
+        problem = f"is levenberg_marquardt, which does not move {' and '.join(moved)}"
+        require(not moved, f"{where}.solver", problem, "adam, or leave them out of `free`")
 
 
 def _check_terms(where: str, terms: Mapping[str, Any]) -> None:

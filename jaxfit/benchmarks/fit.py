@@ -18,11 +18,12 @@ from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.model.pose import Pose
+from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
 
-__all__ = ["bench_fit", "keypoints_error"]
+__all__ = ["bench_fit", "keypoints_error", "noisy_scene"]
 
 NOISE_PX, OUTLIERS = 2.0, 0.05
 
@@ -47,8 +48,7 @@ def bench_fit(
         quality against truth: `pck@0.05`, `iou`, `me_p`, `me_v`, `pa_mpjpe` (keypoints, model units).
     """
     config = load_config("paper") if config is None else config
-    poses = [smooth_motion(bird, frames, seed + n) for n in range(birds)]
-    observations = detect(bird, poses, NOISE_PX, OUTLIERS, seed)
+    poses, observations = noisy_scene(bird, birds, frames, seed)
     short = dataclasses.replace(config, stages=tuple(dataclasses.replace(stage, steps=1) for stage in config.stages))
     began = time.perf_counter()
     fit(observations, bird, short)
@@ -70,6 +70,12 @@ def bench_fit(
         **{name: quality[name] for name in ("pck@0.05", "iou", "me_p", "me_v")},
         "pa_mpjpe": keypoints_error(solution, bird, poses),
     }
+
+
+def noisy_scene(bird: Bird, birds: int, frames: int, seed: int = 0) -> tuple[list[Pose], Observations]:
+    """Smooth random motion of several birds, one after the other's seed, and what is detected of it."""
+    poses = [smooth_motion(bird, frames, seed + n) for n in range(birds)]
+    return poses, detect(bird, poses, NOISE_PX, OUTLIERS, seed)
 
 
 def keypoints_error(solution: Solution, bird: Bird, truth: list[Pose]) -> float:

@@ -15,7 +15,8 @@ from jaxtyping import Array, Int
 from jaxfit.camera import Camera
 from jaxfit.config import FitConfig
 from jaxfit.fitting.diagnose import name_failures
-from jaxfit.fitting.solve import Knobs, Problem, Report, StageState, advance, begin, report
+from jaxfit.fitting.lane import Knobs, Problem
+from jaxfit.fitting.solve import Report, StageState, advance, begin, report
 from jaxfit.fitting.stages import needs_mask, stage_knobs, stage_problem
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 from jaxfit.camera import Camera
 from jaxfit.config import FitConfig
 from jaxfit.errors import InputError
-from jaxfit.fitting.solve import Knobs, Problem, lane_scene
+from jaxfit.fitting.lane import Knobs, Lane, Problem, lane_scene
 from jaxfit.fitting.stages import needs_mask, stage_knobs, stage_problem
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig
@@ -121,7 +121,7 @@ def _weighted(problem: Problem, name: str) -> Callable[..., Array]:
     """One term's share of the objective, as a function of the pose, knobs, start and evidence of one lane."""
 
     def share(pose: Pose, knobs: Knobs, start: Pose, evidence: Evidence) -> Array:
-        scene = lane_scene(problem, knobs, pose, start, evidence)
+        scene = lane_scene(pose, Lane(problem, knobs, start, evidence))
         return weighted_sum(scene, {name: knobs.settings[name]})
 
     return share

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from jaxfit.camera import Camera
 from jaxfit.config import FitConfig, InitialiseConfig, StageConfig
-from jaxfit.fitting.solve import Knobs, Problem
+from jaxfit.fitting.adam import ADAM
+from jaxfit.fitting.lane import Knobs, Problem, Solver
+from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.registry import find_term
@@ -18,6 +20,8 @@ from jaxfit.silhouette import Blur
 
 __all__ = ["needs_mask", "program", "stage_knobs", "stage_problem"]
 
+SOLVERS: Mapping[str, Solver] = {"adam": ADAM, "levenberg_marquardt": LEVENBERG_MARQUARDT}
+"""By the name that a stage gives as its `solver`."""
 STEP_SHAPES = {
     "global_orient": (3,),
     "body_pose": (1, 3),
@@ -38,7 +42,7 @@ def stage_problem(config: FitConfig, stage: StageConfig, rig: Rig, priors: Prior
     """What the lanes of one stage share."""
     usual = Blur.for_size(camera.size_px)
     raster = Raster(Blur(usual.sigma * stage.blur**2, usual.radius * stage.blur), config.backend)
-    return Problem(rig, priors, camera, raster)
+    return Problem(rig, priors, camera, raster, SOLVERS[stage.solver])
 
 
 def stage_knobs(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[str]) -> Knobs:

@@ -18,6 +18,7 @@ from jaxfit.model.rotation import axis_angle_to_matrix
 
 __all__ = [
     "Rig",
+    "each_frame",
     "fold_bird",
     "joint_transforms",
     "posed_joints",
@@ -132,25 +133,25 @@ def posed_joints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array,
 
 def window_transforms(rig: Rig, pose: Pose) -> Float[Array, "T J 3 4"]:
     """`joint_transforms` of every frame of a window."""
-    return _each_frame(lambda frame: joint_transforms(rig, frame), pose)
+    return each_frame(lambda frame: joint_transforms(rig, frame), pose)
 
 
 def window_keypoints(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T K 3"]:
     """`posed_keypoints` of every frame of a window."""
-    return _each_frame(lambda frame, A: posed_keypoints(rig, A, frame), pose, A)
+    return each_frame(lambda frame, A: posed_keypoints(rig, A, frame), pose, A)
 
 
 def window_joints(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T J 3"]:
     """`posed_joints` of every frame of a window."""
-    return _each_frame(lambda frame, A: posed_joints(rig, A, frame), pose, A)
+    return each_frame(lambda frame, A: posed_joints(rig, A, frame), pose, A)
 
 
 def window_vertices(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T V 3"]:
     """`posed_vertices` of every frame of a window."""
-    return _each_frame(lambda frame, A: posed_vertices(rig, A, frame), pose, A)
+    return each_frame(lambda frame, A: posed_vertices(rig, A, frame), pose, A)
 
 
-def _each_frame(function, pose: Pose, *framewise: Array):
+def each_frame(function, pose: Pose, *framewise: Array):
     """Map a function of one frame's Pose over a window, whose bone lengths, shape and maybe scale are common."""
 
     def one(orient, body, transl, scale, *rest):

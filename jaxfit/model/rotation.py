@@ -11,6 +11,7 @@ __all__ = [
     "axis_angle_to_matrix",
     "geodesic_distance",
     "matrix_to_axis_angle",
+    "right_jacobian",
     "safe_norm",
     "unwrap_axis_angle",
     "view_grid",
@@ -21,15 +22,9 @@ __all__ = [
 def axis_angle_to_matrix(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
     """Rotation matrices of axis-angles in radians (Rodrigues), smooth at zero.
 
-    R = I + a·[r]× + b·[r]×², a = sin θ/θ, b = (1 − cos θ)/θ²; below θ = 1e-2 by their series in θ²,
-    so that values and gradients stay exact to float32 and finite at zero rotation.
+    R = I + a·[r]× + b·[r]×², a = sin θ/θ, b = (1 − cos θ)/θ².
     """
-    theta2 = jnp.sum(axis_angle**2, axis=-1)
-    small = theta2 < 1e-4
-    safe2 = jnp.where(small, 1.0, theta2)
-    theta = jnp.sqrt(safe2)
-    a = jnp.where(small, 1 - theta2 / 6 + theta2**2 / 120, jnp.sin(theta) / theta)
-    b = jnp.where(small, 0.5 - theta2 / 24 + theta2**2 / 720, (1 - jnp.cos(theta)) / safe2)
+    a, b, _ = _rodrigues(axis_angle)
     x, y, z = axis_angle[..., 0], axis_angle[..., 1], axis_angle[..., 2]
     rows = [
         [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
@@ -37,6 +32,36 @@ def axis_angle_to_matrix(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3
         [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
     ]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def right_jacobian(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
+    """How a rotation turns as its axis-angle r changes: R(r + dr) = R(r)·R(Jr(r)·dr) to first order.
+
+    Jr = I − b·[r]× + c·[r]×², b = (1 − cos θ)/θ², c = (θ − sin θ)/θ³.
+
+    Source: Solà et al. 2018, A micro Lie theory for state estimation in robotics, equation 143.
+    """
+    _, b, c = _rodrigues(axis_angle)
+    x, y, z = axis_angle[..., 0], axis_angle[..., 1], axis_angle[..., 2]
+    rows = [
+        [1 - c * (y * y + z * z), c * x * y + b * z, c * x * z - b * y],
+        [c * x * y - b * z, 1 - c * (x * x + z * z), c * y * z + b * x],
+        [c * x * z + b * y, c * y * z - b * x, 1 - c * (x * x + y * y)],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _rodrigues(axis_angle: Float[Array, "*B 3"]) -> tuple[Float[Array, "*B"], Float[Array, "*B"], Float[Array, "*B"]]:
+    """sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³; below θ = 1e-2 by their series in θ², so that values and
+    gradients stay exact to float32 and finite at zero rotation."""
+    theta2 = jnp.sum(axis_angle**2, axis=-1)
+    small = theta2 < 1e-4
+    safe2 = jnp.where(small, 1.0, theta2)
+    theta = jnp.sqrt(safe2)
+    a = jnp.where(small, 1 - theta2 / 6 + theta2**2 / 120, jnp.sin(theta) / theta)
+    b = jnp.where(small, 0.5 - theta2 / 24 + theta2**2 / 720, (1 - jnp.cos(theta)) / safe2)
+    c = jnp.where(small, 1 / 6 - theta2 / 120 + theta2**2 / 5040, (1 - a) / safe2)
+    return a, b, c
 
 
 def matrix_to_axis_angle(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3"]:

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit.errors import InputError
+from jaxfit.objective.curvature import Curvature
 from jaxfit.objective.registry import find_term
 from jaxfit.objective.scene import Scene
 
-__all__ = ["evaluate_terms", "weighted_sum"]
+__all__ = ["evaluate_curvature", "evaluate_terms", "weighted_sum"]
 
 Settings = Mapping[str, Mapping[str, Float[Array | np.ndarray, ""] | float]]
 
@@ -41,6 +42,24 @@ def weighted_sum(scene: Scene, settings: Settings) -> Float[Array, ""]:
     """
     values = evaluate_terms(scene, settings)
     return sum((jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()), start=jnp.zeros(()))
+
+
+def evaluate_curvature(scene: Scene, settings: Settings) -> Curvature:
+    """Σ λ · H_term over the active terms, all of which must have one.
+
+    Args:
+        scene: one bird in one window.
+        settings: as for `evaluate_terms`.
+    """
+    weighted = []
+    for name, own in settings.items():
+        find = find_term(name).curvature
+        assert find is not None, name  # configs are checked for it
+        weighted.append((own["weight"], find(scene, **{k: v for k, v in own.items() if k != "weight"})))
+    return Curvature(
+        lambda d: sum((weight * H.product(d) for weight, H in weighted), start=jnp.zeros_like(d)),
+        sum((weight * H.diagonal for weight, H in weighted), start=jnp.zeros(())),
+    )
 
 
 def _scalar(name: str, value: Any) -> Float[Array, ""]:

@@ -6,13 +6,14 @@ import importlib
 import inspect
 import math
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import Any, TypeVar, overload
 
 import jax
 
 from jaxfit.errors import InputError
+from jaxfit.objective.curvature import Curvature
 
 __all__ = ["ENTRY_POINTS", "Term", "find_term", "known_terms", "term"]
 
@@ -36,6 +37,8 @@ class Term:
     """Settings that must be above 0; the others may be 0."""
     compares_masks: bool
     """Whether it looks at the silhouette: only stages with such a term are given masks."""
+    curvature: Callable[..., Curvature] | None = None
+    """Its curvature, of the same arguments; only then can Levenberg-Marquardt minimise it."""
 
 
 _terms: dict[str, Term] = {}
@@ -46,9 +49,13 @@ _terms: dict[str, Term] = {}
 def term(function: Function, /) -> Function: ...
 @overload
 def term(
-    *, name: str | None = None, positive: Collection[str] = (), compares_masks: bool = False
+    *,
+    name: str | None = None,
+    positive: Collection[str] = (),
+    compares_masks: bool = False,
+    curvature: Callable[..., Curvature] | None = None,
 ) -> Callable[[Function], Function]: ...
-def term(function=None, /, *, name=None, positive=(), compares_masks=False):
+def term(function=None, /, *, name=None, positive=(), compares_masks=False, curvature=None):
     """Register a term of the objective: a pure function of the scene, whose keyword arguments are its settings.
 
     `@term def stillness(scene, *, beta=1.0): …` is from then on what configs of this session call `stillness`. The
@@ -60,6 +67,8 @@ def term(function=None, /, *, name=None, positive=(), compares_masks=False):
         name: what configs call it (default: the function's name).
         positive: its settings that must be above 0.
         compares_masks: whether it looks at `scene.evidence.mask`, which is empty in stages without such a term.
+        curvature: takes what `function` takes and returns a `jaxfit.objective.curvature.Curvature`, for stages whose
+            solver is `levenberg_marquardt`.
 
     Raises:
         InputError: not of a term's form, or a name that another module's term has. A module may register its own
@@ -67,7 +76,7 @@ def term(function=None, /, *, name=None, positive=(), compares_masks=False):
     """
 
     def register(function):
-        own = _read(name or function.__name__, function, positive, compares_masks)
+        own = replace(_read(name or function.__name__, function, positive, compares_masks), curvature=curvature)
         before = _terms.get(own.name)
         if before is not None and before.function.__module__ != function.__module__:
             problem = f"is the name of a term of {before.function.__module__}"

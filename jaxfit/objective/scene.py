@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
@@ -13,6 +14,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 from jaxfit.camera import Camera, project, to_screen
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird, free_limits
+from jaxfit.model.jacobian import window_keypoint_rows
 from jaxfit.model.kinematics import Rig, window_joints, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
@@ -175,6 +177,19 @@ class Scene:
     def keypoints_px(self) -> Float[Array, "T K 2"]:
         """Posed keypoints, crop pixels."""
         return project(self.keypoints_cam, self.camera)
+
+    @cached_property
+    def keypoint_jacobian_px(self) -> tuple[Float[Array, "T rows angles"], Float[Array, "T rows 4"]]:
+        """∂`keypoints_px` of each frame, (T, 2K, …): by the 3J angles, and by translation and scale."""
+        scale = jnp.broadcast_to(self.pose.scale, self.pose.global_orient.shape[:1])
+        points = self.keypoints_cam
+        to_pixels = jax.vmap(jax.vmap(jax.jacfwd(lambda point_cam: project(point_cam, self.camera))))(points)
+        turned = window_keypoint_rows(self._rig, self._transforms, self.pose, to_pixels)
+        unit = (points - self.pose.transl[:, None]) / scale[:, None, None]
+        grown = jnp.sum(to_pixels * unit[..., None, :], axis=-1, keepdims=True)
+        placed = jnp.concatenate([to_pixels, grown], axis=-1)
+        rows = len(points), 2 * points.shape[1]
+        return turned.reshape(*rows, -1), placed.reshape(*rows, -1)
 
     @cached_property
     def vertices_screen(self) -> Float[Array, "T V 3"]:

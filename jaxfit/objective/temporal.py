@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jaxfit.model.rotation import safe_norm
+from jaxfit.objective.curvature import Curvature, Rows, frame_rows
 from jaxfit.objective.registry import term
 from jaxfit.objective.scene import Scene
 from jaxfit.objective.terms import Scalar
@@ -14,7 +15,22 @@ from jaxfit.objective.terms import Scalar
 __all__ = ["acceleration", "complete_runs", "velocity"]
 
 
-@term
+SHORTEST_RAD, AT_REST_RAD = 1e-4, 0.05
+"""A norm has no finite curvature at zero: the length that shorter differences, and equal frames, are taken to have.
+Equal frames may move by a usual step, or a fit that starts from one pose for all frames would hardly begin."""
+
+
+def _velocity_curvature(scene: Scene, *, beta_global: Scalar | float, beta_pose: Scalar | float) -> Curvature:
+    """H of β‖δ‖ ≤ ½β(‖δ‖²/n + n), δ the difference of two frames and n its present norm."""
+    return _differences_curvature(scene, 1, beta_global, beta_pose)
+
+
+def _acceleration_curvature(scene: Scene, *, beta_global: Scalar | float, beta_pose: Scalar | float) -> Curvature:
+    """The same of second differences."""
+    return _differences_curvature(scene, 2, beta_global, beta_pose)
+
+
+@term(curvature=_velocity_curvature)
 def velocity(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
     """E_vel = Σ_k β_k Σ_i ‖θ_k,i+1 − θ_k,i‖₂ over k = global orientation, body pose.
 
@@ -23,7 +39,7 @@ def velocity(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_pose: Sca
     return _differences(scene, 1, beta_global, beta_pose)
 
 
-@term
+@term(curvature=_acceleration_curvature)
 def acceleration(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
     """E_acc = Σ_k β_k Σ_i ‖θ′_k,i+1 − θ′_k,i‖₂ with θ′ the frame-to-frame difference.
 
@@ -40,6 +56,36 @@ def _differences(scene: Scene, order: int, beta_global: Scalar | float, beta_pos
     orient = safe_norm(jnp.diff(scene.pose.global_orient, order, axis=0))
     body = safe_norm(jnp.diff(scene.pose.body_pose.reshape(frames, -1), order, axis=0))
     return jnp.sum(jnp.where(complete, beta_global * orient + beta_pose * body, 0.0))
+
+
+def _differences_curvature(
+    scene: Scene, order: int, beta_global: Scalar | float, beta_pose: Scalar | float
+) -> Curvature:
+    rows = frame_rows(scene.pose)
+    complete = complete_runs(scene.evidence.present, order)
+    orient_pull = beta_global * _coupling(rows[:, :3], order, complete)
+    body_pull = beta_pose * _coupling(rows[:, 3:-4], order, complete)
+
+    def on_rows(orient: Float[Array, "T 3"], body: Float[Array, "T size"]) -> Rows:
+        return jnp.pad(jnp.concatenate([orient, body], axis=1), ((0, 0), (0, 4)))
+
+    def alike(pull: Float[Array, "T T"], like: Float[Array, "T n"]) -> Float[Array, "T n"]:
+        return jnp.broadcast_to(jnp.diagonal(pull)[:, None], like.shape)
+
+    return Curvature(
+        lambda d: on_rows(orient_pull @ d[:, :3], body_pull @ d[:, 3:-4]),
+        on_rows(alike(orient_pull, rows[:, :3]), alike(body_pull, rows[:, 3:-4])),
+    )
+
+
+def _coupling(
+    theta: Float[Array, "T n"], order: int, complete: Bool[Array | np.ndarray, "runs"]
+) -> Float[Array, "T T"]:
+    """Dᵀ·diag(1/‖D·θ‖)·D with D the differences of this order: a band, one for all components of θ."""
+    D = jnp.diff(jnp.eye(len(theta)), order, axis=0)
+    norm = safe_norm(D @ theta)
+    length = jnp.where(norm == 0, AT_REST_RAD, jnp.maximum(norm, SHORTEST_RAD))
+    return D.T @ (jnp.where(complete, 1 / length, 0.0)[:, None] * D)
 
 
 def complete_runs(present: Bool[Array | np.ndarray, "T"], order: int) -> Bool[Array | np.ndarray, "runs"]:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxfit.model.rotation import safe_norm
+from jaxfit.objective.curvature import Curvature, Rows
 from jaxfit.objective.registry import term
 from jaxfit.objective.scene import Scene
 from jaxfit.silhouette import mask_loss
@@ -38,7 +39,23 @@ def geman_mcclure(error: Float[Array, "*B"], sigma: Float[Array, ""] | float) ->
     return sigma**2 * squared / (sigma**2 + squared)
 
 
-@term(positive=["sigma_px"])
+def _keypoints_curvature(scene: Scene, *, sigma_px: Scalar | float) -> Curvature:
+    """H = Jᵀ·diag(w)·J, w = 2c·σ⁴/(σ² + e²)²: Geman-McClure is concave in e², hence below its tangent there."""
+    # XLA would compute the Jacobian again for every use
+    by_angles, by_place = jax.lax.optimization_barrier(scene.keypoint_jacobian_px)
+    error_px = scene.keypoints_px - scene.evidence.keypoints_px
+    weight = 2 * scene.evidence.confidence[..., None] * (sigma_px**2 / (sigma_px**2 + error_px**2)) ** 2
+    weight = weight.reshape(by_angles.shape[:2])
+
+    def product(d: Rows) -> Rows:
+        moved_px = jnp.einsum("tri,ti->tr", by_angles, d[:, :-4]) + jnp.einsum("tri,ti->tr", by_place, d[:, -4:])
+        return jnp.concatenate([jnp.einsum("tri,tr->ti", J, weight * moved_px) for J in (by_angles, by_place)], axis=1)
+
+    diagonal = [jnp.einsum("tri,tr->ti", J**2, weight) for J in (by_angles, by_place)]
+    return Curvature(product, jnp.concatenate(diagonal, axis=1))
+
+
+@term(positive=["sigma_px"], curvature=_keypoints_curvature)
 def keypoints(scene: Scene, *, sigma_px: Scalar | float = 50.0) -> Scalar:
     """E_kpt = Σ_t Σ_i c_i · (ρ(e_x) + ρ(e_y)), ρ Geman-McClure, e in crop pixels.
 
@@ -76,7 +93,19 @@ def _mask(scene: Scene, kind: Literal["l1", "smooth_l1"]) -> Scalar:
     return jnp.sum(jax.vmap(frame)(scene.vertices_screen, scene.evidence.mask, weight))
 
 
-@term
+def _pose_prior_curvature(scene: Scene) -> Curvature:
+    """H = 2·Σ⁻¹ on the body pose of every frame that is there; the term is a square already."""
+    precision = scene.priors.pose_whitener.T @ scene.priors.pose_whitener
+    present, size = scene.evidence.present[:, None], len(precision)
+
+    def on_body(rows: Float[Array, "T size"]) -> Rows:
+        return jnp.pad(2 * jnp.where(present, rows, 0.0), ((0, 0), (3, 4)))
+
+    diagonal = jnp.broadcast_to(jnp.diagonal(precision), (len(present), size))
+    return Curvature(lambda d: on_body(d[:, 3:-4] @ precision), on_body(diagonal))
+
+
+@term(curvature=_pose_prior_curvature)
 def pose_prior(scene: Scene) -> Scalar:
     """E_pp = Σ_t (x − μ)ᵀ Σ⁻¹ (x − μ) on the flattened body pose.
 

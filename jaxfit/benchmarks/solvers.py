@@ -1,0 +1,157 @@
+"""How fast different solvers lower the objective of a stage without masks: loss over time, side by side."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from jaxfit.config import load_config
+from jaxfit.errors import InputError
+from jaxfit.fitting.adam import ADAM
+from jaxfit.fitting.lane import Lane, Solver, lane_loss
+from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
+from jaxfit.fitting.prepare import Preparation, camera_of
+from jaxfit.fitting.solve import advance, begin, report
+from jaxfit.fitting.stages import stage_knobs, stage_problem
+from jaxfit.model.bird import Bird
+from jaxfit.model.kinematics import fold_bird
+from jaxfit.model.pose import Pose
+from jaxfit.objective.scene import priors_of
+from jaxfit.observations import Observations
+from jaxfit.progress import ProgressTask, silent
+from jaxfit.storage import write_whole
+
+__all__ = ["LBFGS", "bench_solvers", "plot_solvers"]
+
+
+def _pose(z: Pose, lane: Lane) -> Pose:
+    """L-BFGS works on the change since the start, in units of Adam's step, so that all parameters are of one scale."""
+    return jax.tree.map(lambda start, step, z: start + step * z, lane.start, lane.knobs.step_size, z)
+
+
+def _loss(z: Pose, lane: Lane) -> tuple[Float[Array, ""], None]:
+    return lane_loss(_pose(z, lane), lane), None
+
+
+def _minimiser() -> optx.OptaxMinimiser:
+    # the default, a zoom line search, takes longer for the same loss
+    search = optax.scale_by_backtracking_linesearch(max_backtracking_steps=15)
+    return optx.OptaxMinimiser(optax.lbfgs(linesearch=search), rtol=0.0, atol=0.0)
+
+
+def _init(pose: Pose, lane: Lane, before: Any) -> Any:
+    z, struct = jax.tree.map(jnp.zeros_like, pose), jax.ShapeDtypeStruct((), jnp.float32)
+    return z, _minimiser().init(_loss, z, lane, {}, struct, None, frozenset())
+
+
+def _step(pose: Pose, lane: Lane, state: Any) -> tuple[Pose, Any]:
+    z, own, _ = _minimiser().step(_loss, state[0], lane, {}, state[1], frozenset())
+    return _pose(z, lane), (z, own)
+
+
+def _outcome(state: Any) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    return state[1].f, jnp.int32(0)
+
+
+LBFGS = Solver(_init, _step, _outcome)
+"""For this comparison only: it does not earn a place among `stages.SOLVERS`."""
+
+RACE = {"adam": (ADAM, 600, 25), "lbfgs": (LBFGS, 400, 25), "levenberg_marquardt": (LEVENBERG_MARQUARDT, 25, 1)}
+"""What runs, how many steps at most, and after how many the loss is looked at."""
+
+
+def bench_solvers(
+    observations: Observations, bird: Bird, limit: int | None = None, progress: ProgressTask = silent
+) -> dict[str, Any]:
+    """Minimise the keypoint stage of the paper's config with each solver, all windows as one batch.
+
+    Compilation and the reports of the loss are not counted.
+
+    Args:
+        observations: what is fitted.
+        bird: the model.
+        limit: at most this many steps of any solver; None for as many as it needs.
+        progress: told of every step.
+
+    Returns:
+        For each solver `steps`, `seconds` and `loss`, its curve: the objective summed over all windows after that many
+        steps. `birds`, `windows`; `adam_s`: Adam's whole stage; for the others `…_s`: seconds until their loss is
+        no higher than Adam's last (None: never), and `…_ratio`: those over Adam's seconds; `…_loss`: the last.
+    """
+    config = load_config("paper")
+    prepared, rig = Preparation(observations, bird, None, "observations"), fold_bird(bird)
+    windows, stage = prepared.windows(config), config.stages[0]
+    rows = np.arange(len(windows))
+    # masks are not looked at
+    evidence = prepared.evidence([(config, rows)])
+    evidence = jax.tree.map(jnp.asarray, replace(evidence, mask=evidence.mask[..., :0, :0]))
+    start = jax.tree.map(lambda x: x[:, 0], prepared.starting_poses(bird, rig, config, rows))
+    one = stage_knobs(config, stage, bird.keypoint_names)
+    knobs = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(rows)), one)
+    usual = stage_problem(config, stage, rig, priors_of(bird), camera_of(config))
+    result: dict[str, Any] = {"birds": len(np.unique(windows.track)), "windows": len(rows)}
+    most = {name: min(steps, limit or steps) for name, (_, steps, _) in RACE.items()}
+    with progress("Minimising", sum(most.values())) as tick:
+        for name, (solver, _, portion) in RACE.items():
+            problem = usual._replace(solver=solver)
+
+            def fresh(problem=problem):
+                return begin(problem, knobs, jax.tree.map(jnp.copy, start), evidence, None)
+
+            def loss_of(state, problem=problem):
+                return float(sum(x.sum() for x in report(problem, knobs, state.pose, start, evidence).loss.values()))
+
+            advance((problem, knobs, evidence, jnp.int32(1)), fresh())  # compiles
+            state, done, seconds = fresh(), 0, 0.0
+            curve = {"steps": [0], "seconds": [0.0], "loss": [loss_of(state)]}
+            while done < most[name]:
+                take = min(portion, most[name] - done)
+                began = time.perf_counter()
+                state, loss, _ = advance((problem, knobs, evidence, jnp.int32(take)), state)
+                jax.block_until_ready(loss)
+                seconds, done = seconds + time.perf_counter() - began, done + take
+                for key, value in zip(curve, (done, seconds, loss_of(state)), strict=True):
+                    curve[key].append(value)
+                tick(take, f"{name}: loss {curve['loss'][-1]:.5g}")
+            result[name] = curve
+    target, adam_s = result["adam"]["loss"][-1], result["adam"]["seconds"][-1]
+    result |= {"adam_s": adam_s, "adam_loss": target}
+    for name in list(RACE)[1:]:
+        result[f"{name}_loss"] = result[name]["loss"][-1]
+        reached = [s for s, loss in zip(result[name]["seconds"], result[name]["loss"], strict=True) if loss <= target]
+        result[f"{name}_s"] = reached[0] if reached else None
+        result[f"{name}_ratio"] = reached[0] / adam_s if reached else None
+    return result
+
+
+def plot_solvers(result: dict[str, Any], path: Path) -> None:
+    """Draw the curves of `bench_solvers` as a PNG: loss above the lowest of all, over seconds.
+
+    Raises:
+        InputError: Matplotlib is not installed (extra `report`).
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InputError("--plot", "needs matplotlib, which is not installed", 'pip install "jaxfit[report]"') from None
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    panel = figure.subplots()
+    for name in RACE:
+        curve = result[name]
+        marker = "o" if len(curve["steps"]) <= 30 else None
+        label = f"{name.replace('_', '-')}, {curve['steps'][-1]} steps"
+        panel.plot(curve["seconds"], curve["loss"], marker=marker, markersize=3, label=label)
+    panel.axhline(result["adam_loss"], color="grey", linewidth=0.8, linestyle=":", label="Adam's last")
+    panel.set(xlabel="seconds", ylabel="objective, all windows", yscale="log", title="Keypoint stage: loss over time")
+    panel.grid(True, which="both", alpha=0.2)
+    panel.legend(frameon=False)
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110, metadata={"Software": None}))
