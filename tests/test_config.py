@@ -76,6 +76,7 @@ def test_stage_settings_override_defaults_then_terms():
 
 
 STAGE = "stages: [{name: a, steps: 1, terms: [keypoints]%s}]\nterms: {}\n"
+LEAST_SQUARES = STAGE.replace("steps: 1", "steps: 1, solver: levenberg_marquardt")
 
 
 @pytest.mark.parametrize(
@@ -129,6 +130,10 @@ STAGE = "stages: [{name: a, steps: 1, terms: [keypoints]%s}]\nterms: {}\n"
         ("base: paper\ninitialise: {smoothness: -1}\n", ["`initialise.smoothness`", "-1"]),
         ((STAGE % "").replace("steps: 1", "steps: 0"), ["`stages[0].steps`", "0"]),
         (STAGE % ", learning_rate: 0", ["`stages[0].learning_rate`", "0"]),
+        (STAGE % ", solver: newton", ["`stages[0].solver`", "newton", "levenberg_marquardt"]),
+        (LEAST_SQUARES.replace("keypoints", "mask") % "", ["`stages[0].solver`", "'mask'", "adam", "velocity"]),
+        (LEAST_SQUARES % ", free: [transl, betas]", ["`stages[0].solver`", "betas", "`free`"]),
+        (LEAST_SQUARES % ", carry_moments: true", ["`stages[0].carry_moments`", "Adam"]),
         (STAGE % ", blur: 0", ["`stages[0].blur`", "0"]),
         ("window: 3\n", ["`stages`", "missing", "base: paper"]),
         ("stages: [{name: a, terms: [mask]}]\nterms: {}\n", ["`stages[0].steps`", "missing"]),

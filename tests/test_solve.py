@@ -36,6 +36,9 @@ CONFIG = FitConfig((FIRST, SECOND), {"pose_prior": 10, "velocity": 5})
 STEP = {"global_orient": 0.02, "body_pose": 0.02, "transl": np.array([0.02, 0.01, 0]), "scale": 0.005}
 
 
+SOLVERS = pytest.mark.parametrize("solver", ["adam", "levenberg_marquardt"])
+
+
 def problem(stage=FIRST, config=CONFIG):
     return stage_problem(config, stage, RIG, PRIORS, CAMERA)
 
@@ -89,8 +92,8 @@ def solve(stages, start, evidence, chunks=(STEPS,)):
     return jax.tree.map(np.asarray, (pose, loss, refused))
 
 
-def total(pose, start, evidence):
-    settings = CONFIG.stage_settings(FIRST)
+def total(pose, start, evidence, stage=FIRST):
+    settings = CONFIG.stage_settings(stage)
     return weighted_sum(Scene(pose, start, evidence, RIG, PRIORS, CAMERA, problem().raster), settings)
 
 
@@ -145,18 +148,22 @@ def test_moments_go_on_or_start_anew(carry):
     assert apart > 1e-3, "the two must differ for this test to tell them apart"
 
 
-def test_steps_may_be_taken_in_any_portions():
+@SOLVERS
+def test_steps_may_be_taken_in_any_portions(solver):
     start, evidence = case()
-    whole, loss, _ = solve([FIRST], start, evidence)
-    parts, loss_of_parts, _ = solve([FIRST], start, evidence, (1, 2, 9, STEPS - 12))
+    stage = dataclasses.replace(FIRST, solver=solver)
+    whole, loss, _ = solve([stage], start, evidence)
+    parts, loss_of_parts, _ = solve([stage], start, evidence, (1, 2, 9, STEPS - 12))
     np.testing.assert_array_equal(loss, loss_of_parts)
     for name in vars(whole):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name), err_msg=name)
 
 
-def test_what_is_fixed_does_not_move():
+@SOLVERS
+def test_what_is_fixed_does_not_move(solver):
     start, evidence = case()
-    pose, _, _ = solve([FIRST, SECOND], start, evidence)
+    first = dataclasses.replace(FIRST, solver=solver)
+    pose, _, _ = solve([first], start, evidence)
     for name in ("bone_length", "betas"):
         np.testing.assert_array_equal(getattr(pose, name), getattr(start, name))
     np.testing.assert_array_equal(pose.transl[..., 2], start.transl[..., 2])
@@ -168,16 +175,18 @@ def test_what_is_fixed_does_not_move():
     ):
         assert (np.abs(moved - still) > 1e-4).mean() > 0.9
     assert pose.scale.shape == (B, 1)  # one size for the window
-    only = dataclasses.replace(FIRST, free=("global_orient",))
+    only = dataclasses.replace(first, free=("global_orient",))
     pose, _, _ = solve([only], start, evidence)
     for name in ("body_pose", "transl", "scale"):
         np.testing.assert_array_equal(getattr(pose, name), getattr(start, name))
 
 
-def test_a_broken_bird_stands_still_and_leaves_the_other_alone():
+@SOLVERS
+def test_a_broken_bird_stands_still_and_leaves_the_other_alone(solver):
     start, healthy = case()
-    pose, _, refused = solve([FIRST, SECOND], start, case(broken=1)[1])
-    expected, _, _ = solve([FIRST, SECOND], start, healthy)
+    stages = [dataclasses.replace(s, solver=solver, carry_moments=solver == "adam") for s in (FIRST, SECOND)]
+    pose, _, refused = solve(stages, start, case(broken=1)[1])
+    expected, _, _ = solve(stages, start, healthy)
     assert refused.tolist() == [0, STEPS]
     for name in vars(pose):
         np.testing.assert_array_equal(getattr(pose, name)[0], getattr(expected, name)[0], err_msg=name)

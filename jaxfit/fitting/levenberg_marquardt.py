@@ -18,7 +18,10 @@ from jaxfit.objective.objective import evaluate_curvature
 __all__ = ["LEVENBERG_MARQUARDT"]
 
 CG_STEPS = 60
-"""Conjugate-gradient steps within each step. With 30 a step costs 0.7 times as much, and twice as many are needed."""
+"""Conjugate-gradient steps within each step, at most. With 30 a step costs 0.7 times as much, and twice as many are
+needed."""
+CG_TOLERANCE = 1e-6
+"""Relative residual at which they end: beyond, single precision underflows to 0/0."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-5, 1e8
 EASE, TIGHTEN = 0.2, 5.0
 """Factors on the damping after a step that lowered the loss, and after one that did not."""
@@ -65,7 +68,7 @@ def _step(pose: Pose, lane: Lane, state: _State) -> tuple[Pose, _State]:
         lambda d: allowed(curvature.product(d)) + state.damping * diagonal * d,
         -allowed(gradient),
         M=lambda d: d / diagonal,
-        tol=0.0,
+        tol=CG_TOLERANCE,
         maxiter=CG_STEPS,
     )
     moved = _moved(pose, change)
