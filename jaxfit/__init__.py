@@ -6,9 +6,13 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # for type checkers and editors
+    from jaxfit.ablation.ablate import ablate
+    from jaxfit.ablation.sweep import sweep
     from jaxfit.config import FitConfig, ReconstructConfig, load_config, load_reconstruct_config
+    from jaxfit.config_paths import with_values
     from jaxfit.errors import InputError
     from jaxfit.evaluation.evaluate import Evaluation, evaluate
+    from jaxfit.evaluation.matching import match_tracks
     from jaxfit.fitting.fit import fit
     from jaxfit.fitting.solution import Solution, load_solution, save_solution
     from jaxfit.formats.coco import read_coco, write_coco
@@ -23,7 +27,8 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.pipeline import Reconstruction, reconstruct
     from jaxfit.quality import track_quality
     from jaxfit.simulation.scene import Scene, simulate, stage_scene
-    from jaxfit.view.overlay import overlay
+    from jaxfit.view.overlay import overlay, overlay_frame
+    from jaxfit.view.sheet import contact_sheet
 
 __version__ = metadata.version("jaxfit")
 
@@ -38,6 +43,8 @@ __all__ = [
     "Scene",
     "Solution",
     "TrackConfig",
+    "ablate",
+    "contact_sheet",
     "evaluate",
     "find_bird",
     "fit",
@@ -48,23 +55,31 @@ __all__ = [
     "load_reconstruct_config",
     "load_segmenter",
     "load_solution",
+    "match_tracks",
     "overlay",
+    "overlay_frame",
     "read_coco",
     "reconstruct",
     "save_bird",
     "save_solution",
     "simulate",
     "stage_scene",
+    "sweep",
     "term",
     "track_quality",
     "track_video",
+    "with_values",
     "write_coco",
 ]
 
 _HOMES = {
+    "ablation.ablate": ("ablate",),
+    "ablation.sweep": ("sweep",),
     "config": ("FitConfig", "ReconstructConfig", "load_config", "load_reconstruct_config"),
+    "config_paths": ("with_values",),
     "errors": ("InputError",),
     "evaluation.evaluate": ("Evaluation", "evaluate"),
+    "evaluation.matching": ("match_tracks",),
     "fitting.fit": ("fit",),
     "fitting.solution": ("Solution", "load_solution", "save_solution"),
     "formats.coco": ("read_coco", "write_coco"),
@@ -79,7 +94,8 @@ _HOMES = {
     "pipeline": ("Reconstruction", "reconstruct"),
     "quality": ("track_quality",),
     "simulation.scene": ("Scene", "simulate", "stage_scene"),
-    "view.overlay": ("overlay",),
+    "view.overlay": ("overlay", "overlay_frame"),
+    "view.sheet": ("contact_sheet",),
 }
 """Module → the public names that it holds, each imported at its first use: together they take seconds."""
 

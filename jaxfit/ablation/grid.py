@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from jaxfit.config_file import ConfigKeyError, read_config, require
 from jaxfit.config_paths import get_value, with_values
 from jaxfit.errors import InputError
 
-__all__ = ["ClaimConfig", "CrossConfig", "Grid", "GridConfig", "Run", "load_grid", "short"]
+__all__ = ["ClaimConfig", "CrossConfig", "Grid", "GridConfig", "Run", "cross", "load_grid", "short"]
 
 _logger = logging.getLogger(__name__)
 
@@ -105,28 +105,38 @@ def load_grid(source: str | Path) -> Grid:
         for each in grid.crosses
         for values in itertools.product(*each.cross.values())
     ]
+    runs = cross(base, levels, source)
+    for i, claim in enumerate(grid.claims):
+        for path in (*claim.better, *claim.worse):
+            if path not in runs[0].levels:
+                problem = f"`claims[{i}]` is about `{path}`, which does not vary"
+                raise InputError(source, problem, f"these do: {', '.join(runs[0].levels)}")
+    return Grid(runs, grid.claims)
+
+
+def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) -> tuple[Run, ...]:
+    """A run for each point, which says by path what differs from the base; runs that come out equal are one.
+
+    Raises:
+        InputError: an unknown key, or a value that makes no sense.
+    """
     configs: list[FitConfig] = []
-    kept: list[dict[str, Any]] = []
-    for each in levels:
+    kept: list[Mapping[str, Any]] = []
+    for point in points:
         try:
-            config = with_values(base, each)
+            config = with_values(base, point)
         except ConfigKeyError as error:
             raise InputError(source, error.problem, error.remedy) from None
         if config in configs:
-            _logger.warning("%s: two runs are the same, kept once: %s", source, each)
+            _logger.warning("%s: two runs are the same, kept once: %s", source, point)
         else:
             configs.append(config)
-            kept.append(each)
-    paths = dict.fromkeys(path for each in kept for path in each)
+            kept.append(point)
+    paths = dict.fromkeys(path for point in kept for path in point)
     values = {path: [get_value(config, path) for config in configs] for path in paths}
     varied = [path for path, each in values.items() if any(value != each[0] for value in each)]
-    for i, claim in enumerate(grid.claims):
-        for path in (*claim.better, *claim.worse):
-            if path not in varied:
-                problem = f"`claims[{i}]` is about `{path}`, which does not vary"
-                raise InputError(source, problem, f"these do: {', '.join(varied)}")
     digits = len(str(len(configs)))
-    runs = tuple(
+    return tuple(
         Run(
             f"{r + 1:0{digits}d}_{_name({path: values[path][r] for path in varied})}",
             {path: kept[r].get(path, values[path][r]) for path in varied},
@@ -134,7 +144,6 @@ def load_grid(source: str | Path) -> Grid:
         )
         for r, config in enumerate(configs)
     )
-    return Grid(runs, grid.claims)
 
 
 def _name(values: Mapping[str, Any]) -> str:

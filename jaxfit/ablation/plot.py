@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from jaxfit.ablation.claims import CLAIMED
 from jaxfit.ablation.measure import Result
@@ -35,6 +36,9 @@ def plot(results: Sequence[Result]) -> bytes:
     figure = Figure(figsize=(12, 5.2), layout="constrained")
     panels = figure.subplots(1, len(CLAIMED))
     x_of = [_number(result, path) for result in results]
+    above = [x for x in x_of if x > 0]
+    logarithmic = bool(path and above) and max(above) >= 20 * min(above)
+    apart = 1.1 if logarithmic else 1.03
     for panel, metric in zip(panels, CLAIMED, strict=True):
         for i, (key, members) in enumerate(lines.items()):
             label = ", ".join(part for part in key if part not in common) or "all"
@@ -44,18 +48,24 @@ def plot(results: Sequence[Result]) -> bytes:
             if len(members) == 1:
                 panel.axhline(value[0], linewidth=1, alpha=0.8, **style)
                 continue
-            x = np.array([_number(r, path) for r in members]) * 1.03 ** (i - len(lines) / 2)  # side by side
+            # side by side
+            x = np.array([_number(r, path) for r in members]) * apart ** (i - (len(lines) - 1) / 2)
             order = np.argsort(x)
             error = np.abs(bounds - value)[:, order]
             marker = _MARKERS[i % len(_MARKERS)]
             panel.errorbar(x[order], value[order], error, marker=marker, markersize=4, elinewidth=0.6, **style)
         panel.set(xlabel=heading(path) if path else "run", ylabel=_LABELS[metric], title=metric)
-        if path and max(x_of) >= 20 * min((x for x in x_of if x > 0), default=max(x_of) + 1):
-            panel.set_xscale("log")
+        if logarithmic:
+            # symlog gives 0, a term that is switched off, a place to the left of the others
+            panel.set_xscale("symlog", linthresh=min(above), linscale=0.5)
         panel.set_yscale("log")
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
+        panel.yaxis.set_major_formatter("{x:g}")
+        panel.yaxis.set_minor_formatter(NullFormatter())
         panel.grid(True, which="both", alpha=0.2)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", fontsize=7, frameon=False)
+    if len(lines) > 1:
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside right center", fontsize=7, frameon=False)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
     return out.getvalue()
