@@ -5,16 +5,17 @@ BIN := $(VENV)/bin
 EXTRAS ?= dev
 export JAXFIT_REFERENCE
 
-.PHONY: install test lint bench demo clean
+.PHONY: install test lint bench demo notebooks clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make install   the package with its native kernels, in $(VENV)"
-	@echo "make test      the test suite (under ten minutes on two cores)"
-	@echo "make lint      formatting, lint and types"
-	@echo "make bench     benchmarks against the committed baseline"
-	@echo "make demo      simulate a short scene, reconstruct it from its footage and show it"
-	@echo "make clean     remove the environment and everything built"
+	@echo "make install    the package with its native kernels, in $(VENV)"
+	@echo "make test       the test suite (under ten minutes on two cores)"
+	@echo "make lint       formatting, lint and types"
+	@echo "make bench      benchmarks against the committed baseline"
+	@echo "make demo       simulate a short scene, reconstruct it from its footage and show it"
+	@echo "make notebooks  run the notebooks and store what they show (six minutes)"
+	@echo "make clean      remove the environment and everything built"
 
 install: $(VENV)/installed
 
@@ -33,8 +34,8 @@ test: install
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
 lint: install
-	$(BIN)/ruff check jaxfit tests
-	$(BIN)/ruff format --check jaxfit tests
+	$(BIN)/ruff check jaxfit tests notebooks
+	$(BIN)/ruff format --check jaxfit tests notebooks
 	$(BIN)/pyright jaxfit
 
 bench: install
@@ -42,6 +43,9 @@ bench: install
 
 demo: install
 	$(BIN)/jaxfit demo
+
+notebooks: install
+	$(BIN)/python tests/notebook_runs.py
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache .ruff_cache .hypothesis
