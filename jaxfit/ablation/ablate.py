@@ -56,6 +56,7 @@ def ablate(
         progress: told of every part.
 
     Raises:
+        ModuleNotFoundError: Matplotlib or tabulate is missing (extra `report`).
         InputError: a file that cannot be read, a grid or config that makes no sense, a truth of other birds, a folder
             that holds something else.
     """
