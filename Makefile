@@ -31,7 +31,7 @@ $(VENV)/installed: pyproject.toml $(wildcard kernels/*)
 	@touch $@
 
 test: install
-	$(BIN)/python -m pytest -n auto --dist loadfile
+	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: install
 	$(BIN)/ruff check jaxfit tests notebooks

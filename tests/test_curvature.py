@@ -75,8 +75,8 @@ def test_keypoint_jacobian():
     def points(rows):
         return scenes.scene(moved(pose, rows), evidence).keypoints_px.reshape(scenes.T, -1)
 
-    expected = jax.jacfwd(points)(jnp.zeros((scenes.T, D)))
-    by_angles, by_place = scenes.scene(pose, evidence).keypoint_jacobian_px
+    expected = jax.jit(jax.jacfwd(points))(jnp.zeros((scenes.T, D)))
+    by_angles, by_place = jax.jit(lambda: scenes.scene(pose, evidence).keypoint_jacobian_px)()
     found = jnp.concatenate([by_angles, by_place], axis=-1)
     for t in range(scenes.T):
         np.testing.assert_allclose(found[t], expected[t, :, t], rtol=1e-3, atol=1e-3 * np.abs(expected).max())

@@ -56,6 +56,17 @@ def assert_equal(a, b):
         np.testing.assert_array_equal(a.loss[term], b.loss[term], err_msg=term)
 
 
+def test_a_sweep_compiles_once(observed, caplog):
+    jax.clear_caches()  # other tests fit batches of these shapes
+    with caplog.at_level(logging.WARNING), jax.log_compiles():
+        values = [(1, 2), (5, 6), (7, 8)]
+        for a, b in values:
+            fit_runs(prepared(observed), BIRD, [config((3, 1), terms__velocity=v) for v in (a, b)])
+    messages = [record.getMessage() for record in caplog.records]
+    compiled = [m for m in messages if m.startswith("Compiling") and "advance" in m.split("with")[0]]
+    assert len(compiled) == 2  # a stage each
+
+
 def test_every_run_is_as_if_alone(observed, swept):
     for each, solution in zip(SWEEP, swept, strict=True):
         alone = fit(observed, BIRD, each)
@@ -144,17 +155,6 @@ def test_what_runs_share_is_prepared_once(observed, monkeypatch):
     fit_runs(shared, BIRD, SWEEP)
     # without and with the filter
     assert counts == {"filter_observations": 2, "cut_windows": 2, "load_evidence": 2, "initial_poses": 2}
-
-
-def test_a_sweep_compiles_once(observed, caplog):
-    jax.clear_caches()  # other tests fit batches of these shapes
-    with caplog.at_level(logging.WARNING), jax.log_compiles():
-        values = [(1, 2), (5, 6), (7, 8)]
-        for a, b in values:
-            fit_runs(prepared(observed), BIRD, [config((3, 1), terms__velocity=v) for v in (a, b)])
-    messages = [record.getMessage() for record in caplog.records]
-    compiled = [m for m in messages if m.startswith("Compiling") and "advance" in m.split("with")[0]]
-    assert len(compiled) == 2  # a stage each
 
 
 def test_other_programs_are_refused(observed):
