@@ -9,6 +9,7 @@ import pytest
 from test_solve import BIRD, FIRST, B, T, case, knobs, problem, solve, total
 
 from jaxfit.config import load_config
+from jaxfit.fitting import levenberg_marquardt
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.lane import Lane, lane_scene
 from jaxfit.fitting.levenberg_marquardt import EASE, FIRST_DAMPING, LEVENBERG_MARQUARDT, TIGHTEN
@@ -69,7 +70,8 @@ def total_of(stage, pose, lane):
     return total(pose, lane.start, lane.evidence, stage)
 
 
-def test_a_step_is_that_of_the_equation():
+def test_a_step_is_that_of_the_equation(monkeypatch):
+    monkeypatch.setattr(levenberg_marquardt, "CG_TOLERANCE", 1e-6)
     stage = dataclasses.replace(NEWTON, free=FEW)
     _, _, lane = lanes(stage)
     state, (pose, after) = first_step(lane, damping=jnp.float32(DAMPING))

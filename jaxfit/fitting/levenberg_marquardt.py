@@ -17,11 +17,9 @@ from jaxfit.objective.objective import evaluate_curvature
 
 __all__ = ["LEVENBERG_MARQUARDT"]
 
-CG_STEPS = 60
-"""Conjugate-gradient steps within each step, at most. With 30 a step costs 0.7 times as much, and twice as many are
-needed."""
-CG_TOLERANCE = 1e-6
-"""Relative residual at which they end: beyond, single precision underflows to 0/0."""
+CG_STEPS, CG_TOLERANCE = 100, 0.01
+"""Conjugate-gradient steps within each step, at most, and the relative residual at which they end: the first steps need
+few, and far below 1e-6 single precision underflows to 0/0."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-5, 1e8
 EASE, TIGHTEN = 0.2, 5.0
 """Factors on the damping after a step that lowered the loss, and after one that did not."""
