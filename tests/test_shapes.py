@@ -62,6 +62,8 @@ crop: {{size_px: 64, focal_px: 541.75}}
 initialise: {{method: so3, turns: 6, directions: 8, hypotheses: 2}}
 terms: {{keypoints: 100, mask: 1, mask_smooth_l1: 1, bone_prior: 1, shape_prior: 1, shape_norm: 1, start_pull: 1}}
 stages:
+  - {{name: least_squares, steps: 2, terms: [keypoints, pose_prior, velocity, acceleration],
+     free: [global_orient, scale], solver: levenberg_marquardt}}
   - {{name: a, steps: 2, terms: [keypoints, pose_prior, bone_prior, shape_prior, velocity],
      free: [global_orient, betas], keep_best: true}}
   - {{name: b, steps: 2, terms: [keypoints, mask, mask_smooth_l1, shape_norm, start_pull, acceleration],

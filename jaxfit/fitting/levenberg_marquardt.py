@@ -49,7 +49,7 @@ def _step(pose: Pose, lane: Lane, state: _State) -> tuple[Pose, _State]:
     Source: Marquardt 1963, An algorithm for least-squares estimation of nonlinear parameters.
     """
     curvature = evaluate_curvature(lane_scene(pose, lane), lane.knobs.settings)
-    free = frame_rows(jax.tree.map(lambda x, size: jnp.broadcast_to(size > 0, x.shape), pose, lane.knobs.step_size))
+    free = frame_rows(jax.tree.map(lambda x, size: jnp.broadcast_to(size, x.shape), pose, lane.knobs.step_size)) > 0
     frames, scales = len(free), pose.scale.shape[0]
 
     def allowed(rows: Rows) -> Rows:
