@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfit.errors import InputError
 
-__all__ = ["check_replaceable", "check_writable", "conform", "new_file", "new_folder", "write_whole"]
+__all__ = ["check_new_file", "check_replaceable", "check_writable", "conform", "new_file", "new_folder", "write_whole"]
 
 # What the operating system may answer to a write, and what the user can do about it.
 _REMEDIES = {
@@ -183,6 +183,14 @@ def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = No
     if marker is not None and not (path / marker).is_file():
         problem = f"holds files, but no {marker}, so it is not a folder of results and is left alone"
         raise InputError(path, problem, "choose another --out")
+
+
+def check_new_file(path: Path, overwrite: bool) -> None:
+    """Raise InputError where a file to write would take the place of something that it may not."""
+    if path.exists() and not path.is_file():
+        raise InputError(path, "is a folder or a device, not a file", "choose another --out")
+    if path.exists() and not overwrite:
+        raise InputError(path, "exists already", "choose another --out or pass --overwrite")
 
 
 def check_writable(path: str | Path) -> None:

@@ -15,7 +15,6 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from jaxfit.config import load_config
-from jaxfit.errors import InputError
 from jaxfit.fitting.adam import ADAM
 from jaxfit.fitting.lane import Lane, Solver, lane_loss
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
@@ -147,15 +146,9 @@ def _total(final: Report) -> float:
 
 
 def plot_solvers(result: dict[str, Any], path: Path) -> None:
-    """Draw the curves of `bench_solvers` as a PNG: loss above the lowest of all, over seconds.
+    """Draw the curves of `bench_solvers` as a PNG: loss over seconds (needs the extra `report`)."""
+    from matplotlib.figure import Figure
 
-    Raises:
-        InputError: Matplotlib is not installed (extra `report`).
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InputError("--plot", "needs matplotlib, which is not installed", 'pip install "jaxfit[report]"') from None
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     panel = figure.subplots()
     for name in RACE:

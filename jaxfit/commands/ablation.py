@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from importlib.util import find_spec
 
-from jaxfit.errors import InputError
+from jaxfit.extras import require_extra
 from jaxfit.model.files import find_bird
 from jaxfit.progress import terminal
 from jaxfit.tables import counted, show
@@ -15,10 +14,7 @@ __all__ = ["ablate"]
 
 
 def ablate(options: argparse.Namespace) -> None:
-    if not all(find_spec(package) for package in ("matplotlib", "tabulate")):
-        raise InputError(
-            "ablate", "needs matplotlib and tabulate, which are not installed", 'pip install "jaxfit[report]"'
-        )
+    require_extra("report", "ablate")
     from jaxfit.ablation.ablate import ablate
     from jaxfit.ablation.report import FILES
     from jaxfit.ablation.table import CAPTION, claims_table, results_table

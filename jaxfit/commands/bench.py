@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from jaxfit.extras import require_extra
 from jaxfit.formats.coco import read_coco
 from jaxfit.model.files import find_bird
 from jaxfit.progress import terminal
@@ -26,7 +27,8 @@ def bench(options: argparse.Namespace) -> None:
         result = bench_render(bird)
     elif options.what == "solvers":
         bird = bird or find_bird("murre")
-        if options.plot:
+        if options.plot:  # before the work, not after it
+            require_extra("report", "--plot")
             check_writable(options.plot)
         given = options.observations
         seen = read_coco(given) if given else noisy_scene(bird, options.birds, options.frames)[1]

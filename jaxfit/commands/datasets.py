@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 
-from jaxfit.errors import InputError
 from jaxfit.progress import terminal
 from jaxfit.tables import counted, show, show_facts
 
@@ -15,10 +14,9 @@ def murre(options: argparse.Namespace) -> None:
     from jaxfit.formats.coco import write_coco
     from jaxfit.formats.common_murre import LICENSE, read_common_murre
     from jaxfit.model.anatomy import MURRE_KEYPOINTS
-    from jaxfit.storage import check_writable
+    from jaxfit.storage import check_new_file, check_writable
 
-    if options.out.exists() and not options.overwrite:
-        raise InputError(options.out, "exists already", "choose another --out or pass --overwrite")
+    check_new_file(options.out, options.overwrite)
     check_writable(options.out)
     chosen = {"none": None, "murre": MURRE_KEYPOINTS}
     names = chosen[options.keypoints] if options.keypoints in chosen else options.keypoints.split(",")

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfit.model.kinematics import Rig, each_frame
+from jaxfit.model.kinematics import Rig, each_frame, unit_joints
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import right_jacobian
 
@@ -34,10 +34,9 @@ def keypoint_rotation_rows(
     keypoint_map = rig.keypoint_map
     if rig.shape_basis.shape[0]:
         keypoint_map = keypoint_map.at[..., :3].add(jnp.tensordot(pose.betas, rig.keypoint_shape_map, axes=1))
-    joints = jnp.sum(A[..., :3] * rig.joints[:, None], axis=-1) + A[..., 3]
     carried = jnp.einsum("kdc,dxc->kxd", keypoint_map, A) @ below
     weight = keypoint_map[..., 3] @ below
-    lever = pose.scale * (carried - weight[:, None] * joints.T)  # (K, 3, J)
+    lever = pose.scale * (carried - weight[:, None] * unit_joints(rig, A).T)  # (K, 3, J)
     (lx, ly, lz), (nx, ny, nz) = jnp.moveaxis(lever[:, :, None], 1, 0), jnp.moveaxis(directions[..., None], 2, 0)
     torque = (ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx)  # each (K, R, J)
     angles = jnp.concatenate([pose.global_orient[None], pose.body_pose])

@@ -24,6 +24,7 @@ __all__ = [
     "posed_joints",
     "posed_keypoints",
     "posed_vertices",
+    "unit_joints",
     "window_joints",
     "window_keypoints",
     "window_transforms",
@@ -127,8 +128,12 @@ def posed_vertices(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Arra
 
 def posed_joints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "J 3"]:
     """Joints in the camera frame, model units."""
-    unit = _matvec(A[..., :3], rig.joints) + A[..., 3]
-    return unit * pose.scale + pose.transl
+    return unit_joints(rig, A) * pose.scale + pose.transl
+
+
+def unit_joints(rig: Rig, A: Float[Array, "J 3 4"]) -> Float[Array, "J 3"]:
+    """Posed joints at scale 1, the camera frame's axes about the root's translation."""
+    return _matvec(A[..., :3], rig.joints) + A[..., 3]
 
 
 def window_transforms(rig: Rig, pose: Pose) -> Float[Array, "T J 3 4"]:

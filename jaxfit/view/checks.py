@@ -10,6 +10,7 @@ from jaxfit.errors import InputError
 from jaxfit.fitting.solution import Solution
 from jaxfit.frames import VideoInfo
 from jaxfit.observations import Observations
+from jaxfit.storage import check_new_file
 
 __all__ = ["check_belongs", "check_outputs", "too_short"]
 
@@ -56,10 +57,7 @@ def check_outputs(outputs: list[Path], video: Path, overwrite: bool) -> None:
             raise InputError(out, "is the video itself, which would be lost", "choose another --out")
         if video.is_dir() and video.resolve() in out.resolve().parents:
             raise InputError(out, f"lies among the video's images in {video}", "choose an --out elsewhere")
-        if out.exists() and not out.is_file():
-            raise InputError(out, "is a folder or a device, not a file", "choose another --out")
-        if out.exists() and not overwrite:
-            raise InputError(out, "exists already", "choose another --out or pass --overwrite")
+        check_new_file(out, overwrite)
 
 
 def too_short(video: Path, solution: Solution, frames: int) -> InputError:
