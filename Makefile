@@ -45,7 +45,7 @@ demo: install
 	$(BIN)/jaxfit demo
 
 notebooks: install
-	$(BIN)/python tests/notebook_runs.py
+	$(BIN)/python tests/support/notebook_runs.py
 
 clean:
 	rm -rf $(VENV) build demo .pytest_cache .ruff_cache .hypothesis

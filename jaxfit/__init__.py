@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.ablation.ablate import ablate
     from jaxfit.ablation.sweep import sweep
-    from jaxfit.config import FitConfig, ReconstructConfig, load_config, load_reconstruct_config
-    from jaxfit.config_paths import with_values
+    from jaxfit.config.paths import with_values
+    from jaxfit.config.perception import TrackConfig
+    from jaxfit.config.schema import FitConfig, ReconstructConfig, load_config, load_reconstruct_config
+    from jaxfit.data.formats.coco import read_coco, write_coco
+    from jaxfit.data.observations import Observations
+    from jaxfit.data.solution import Solution, load_solution, save_solution
+    from jaxfit.data.track_quality import track_quality
     from jaxfit.errors import InputError
     from jaxfit.evaluation.evaluate import Evaluation, evaluate
     from jaxfit.evaluation.matching import match_tracks
     from jaxfit.fitting.fit import fit
-    from jaxfit.fitting.solution import Solution, load_solution, save_solution
-    from jaxfit.formats.coco import read_coco, write_coco
     from jaxfit.model.bird import Bird
     from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
     from jaxfit.objective.registry import term
-    from jaxfit.observations import Observations
-    from jaxfit.perception.config import TrackConfig
     from jaxfit.perception.keypoints import load_keypoint_detector
     from jaxfit.perception.segmentation import load_segmenter
     from jaxfit.perception.track import track_video
     from jaxfit.pipeline import Reconstruction, reconstruct
-    from jaxfit.quality import track_quality
     from jaxfit.simulation.scene import Scene, simulate, stage_scene
     from jaxfit.view.overlay import overlay, overlay_frame
     from jaxfit.view.sheet import contact_sheet
@@ -75,24 +75,24 @@ __all__ = [
 _HOMES = {
     "ablation.ablate": ("ablate",),
     "ablation.sweep": ("sweep",),
-    "config": ("FitConfig", "ReconstructConfig", "load_config", "load_reconstruct_config"),
-    "config_paths": ("with_values",),
+    "config.paths": ("with_values",),
+    "config.perception": ("TrackConfig",),
+    "config.schema": ("FitConfig", "ReconstructConfig", "load_config", "load_reconstruct_config"),
+    "data.formats.coco": ("read_coco", "write_coco"),
+    "data.observations": ("Observations",),
+    "data.solution": ("Solution", "load_solution", "save_solution"),
+    "data.track_quality": ("track_quality",),
     "errors": ("InputError",),
     "evaluation.evaluate": ("Evaluation", "evaluate"),
     "evaluation.matching": ("match_tracks",),
     "fitting.fit": ("fit",),
-    "fitting.solution": ("Solution", "load_solution", "save_solution"),
-    "formats.coco": ("read_coco", "write_coco"),
     "model.bird": ("Bird",),
     "model.files": ("find_bird", "load_bird", "load_murre", "save_bird"),
     "objective.registry": ("term",),
-    "observations": ("Observations",),
-    "perception.config": ("TrackConfig",),
     "perception.keypoints": ("load_keypoint_detector",),
     "perception.segmentation": ("load_segmenter",),
     "perception.track": ("track_video",),
     "pipeline": ("Reconstruction", "reconstruct"),
-    "quality": ("track_quality",),
     "simulation.scene": ("Scene", "simulate", "stage_scene"),
     "view.overlay": ("overlay", "overlay_frame"),
     "view.sheet": ("contact_sheet",),

@@ -9,22 +9,22 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxfit.clock import Clock
-from jaxfit.config import OverlayConfig, ReconstructConfig, config_to_yaml, load_reconstruct_config
+from jaxfit.config.schema import OverlayConfig, ReconstructConfig, config_to_yaml, load_reconstruct_config
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.solution import Solution, write_solution
+from jaxfit.data.track_quality import track_quality
 from jaxfit.errors import InputError
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.solution import Solution, write_solution
 from jaxfit.fitting.summary import summarise
-from jaxfit.formats.coco import write_coco
-from jaxfit.frames import VideoInfo, probe_video
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
-from jaxfit.observations import Observations, check_keypoints
 from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.track import Tracking, find_tracks, network_files, open_keypoint_detector
 from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.quality import track_quality
-from jaxfit.storage import check_replaceable, new_folder
+from jaxfit.storage.files import check_replaceable, new_folder
+from jaxfit.video.reader import VideoInfo, probe_video
 from jaxfit.view.checks import check_outputs
 from jaxfit.view.overlay import overlay
 

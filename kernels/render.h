@@ -5,7 +5,7 @@
 
 namespace jaxfit {
 
-// They fill arrays that the caller has made and checked; jaxfit/render/raster.py is the only one.
+// They fill arrays that the caller has made and checked; jaxfit/raster/zbuffer/operator.py is the only one.
 void add_renderer(nanobind::module_& m);
 
 }  // namespace jaxfit

@@ -1,6 +1,6 @@
 // The z-buffer, compiled once an instruction set (JAXFIT_AVX512, JAXFIT_AVX2, neither).
 //
-// It repeats jaxfit/render/reference.py operation by operation, in double, so that both see the same face at every
+// It repeats jaxfit/raster/zbuffer/reference.py operation by operation, in double, so that both see the same face at every
 // sample; that needs -ffp-contract=off. First every face writes its nearness (1/depth) and its number where it is the
 // nearest so far; then each sample that was written recomputes the weights of its face. Only tiles of columns that a
 // face has reached are cleared and read again: a few birds in a large image cost what they cover.

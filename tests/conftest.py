@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from cli_files import write_inputs
+from support.cli_files import write_inputs
 
 DEFAULT_REFERENCE = Path(__file__).resolve().parents[1] / ".." / "shared"
 

@@ -40,7 +40,7 @@ def test_what_needs_no_library_loads_none(arguments, code, said):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     lines = done.stderr.splitlines()
     loaded = {line.rsplit("|")[-1].strip() for line in lines if line.startswith("import time:")}
-    assert "jaxfit.cli" in loaded
+    assert "jaxfit.cli.main" in loaded
     assert not loaded & {"jax", "numpy", "cv2", "av", "scipy", "yaml"}
     assert done.returncode == code
     assert said in done.stdout + "".join(line for line in lines if not line.startswith("import time:"))
@@ -48,8 +48,8 @@ def test_what_needs_no_library_loads_none(arguments, code, said):
 
 def test_commands_load_what_they_need():
     """No command waits for the video libraries or the objective unless it uses them."""
-    code = "import pkgutil, sys, jaxfit.commands as c\n"
-    code += "for m in pkgutil.iter_modules(c.__path__): __import__(f'jaxfit.commands.{m.name}')\n"
+    code = "import pkgutil, sys, jaxfit.cli as c\n"
+    code += "for m in pkgutil.iter_modules(c.__path__): __import__(f'jaxfit.cli.{m.name}')\n"
     code += "print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "jaxfit.model.files" in loaded

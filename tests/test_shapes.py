@@ -20,7 +20,7 @@ sys.path.insert(0, {tests!r})
 POSE = """
 import jax.numpy as jnp
 import numpy as np
-from helpers import random_pose, toy_bird
+from support.birds import random_pose, toy_bird
 from jaxfit import camera, filtering
 from jaxfit.model import kinematics, rotation
 from jaxfit.model.pose import rest_pose
@@ -41,7 +41,7 @@ assert bird.keypoints.shape == (12, 3)
 """
 
 OBJECTIVE = """
-from scenes import all_settings, every_gradient, scene, seen, window_pose
+from support.terms_by_hand import all_settings, every_gradient, scene, seen, window_pose
 from jaxfit.objective.objective import evaluate_terms
 pose = window_pose()
 evaluate_terms(scene(pose, seen()), all_settings())
@@ -50,8 +50,8 @@ every_gradient(pose, pose, seen(), all_settings())
 
 FIT = """
 from pathlib import Path
-from cli_files import arguments, write_inputs
-from jaxfit.cli import main
+from support.cli_files import arguments, write_inputs
+from jaxfit.cli.main import main
 
 folder = Path({folder!r})
 write_inputs(folder)
@@ -78,7 +78,7 @@ assert main(["model", "info", str(folder / "toy.npz")]) == 0
 
 SCENE = """
 from pathlib import Path
-from jaxfit.cli import main
+from jaxfit.cli.main import main
 
 folder = Path({folder!r})
 scene, out = str(folder / "scene"), str(folder / "o.mp4")

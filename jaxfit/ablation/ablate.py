@@ -10,9 +10,9 @@ from jaxfit.ablation.grid import load_grid
 from jaxfit.ablation.measure import Result, check_shared, measure_grid
 from jaxfit.ablation.report import write_report
 from jaxfit.ablation.runs import claim_folder, fit_grid
+from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.truth import read_truth
 from jaxfit.fitting.prepare import Preparation
-from jaxfit.formats.coco import read_coco
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.progress import ProgressTask, silent

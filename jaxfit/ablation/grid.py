@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from jaxfit.config import FitConfig, load_config
-from jaxfit.config_file import ConfigKeyError, read_config, require
-from jaxfit.config_paths import get_value, with_values
+from jaxfit.config.paths import get_value, with_values
+from jaxfit.config.schema import FitConfig, load_config
+from jaxfit.config.yaml_file import ConfigKeyError, read_config, require
 from jaxfit.errors import InputError
 
 __all__ = ["ClaimConfig", "CrossConfig", "Grid", "GridConfig", "Run", "cross", "load_grid", "short"]

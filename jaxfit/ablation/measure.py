@@ -10,15 +10,15 @@ from typing import Literal
 
 from jaxfit.ablation.grid import Run
 from jaxfit.ablation.runs import run_folder
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import load_solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.figures import Evaluation
 from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.truth import read_behaviours, read_truth
-from jaxfit.fitting.solution import load_solution
-from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.storage import write_whole
+from jaxfit.storage.files import write_whole
 
 __all__ = ["Result", "check_shared", "measure_grid"]
 

@@ -14,7 +14,7 @@ from jaxfit.ablation.claims import Verdict
 from jaxfit.ablation.measure import Result
 from jaxfit.ablation.plot import plot, swept
 from jaxfit.ablation.table import CAPTION, claims_table, heading, results_csv, results_table
-from jaxfit.storage import write_whole
+from jaxfit.storage.files import write_whole
 
 __all__ = ["FILES", "write_report"]
 

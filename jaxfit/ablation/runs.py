@@ -14,20 +14,20 @@ import numpy as np
 import yaml
 
 from jaxfit.ablation.grid import Run
-from jaxfit.config import FitConfig
-from jaxfit.config_file import build_config, config_to_yaml
+from jaxfit.config.schema import FitConfig
+from jaxfit.config.yaml_file import build_config, config_to_yaml
+from jaxfit.data.formats.scene_folder import TRUE_POSES, TRUTH
+from jaxfit.data.solution import write_solution
 from jaxfit.errors import InputError
 from jaxfit.fitting.batch import frames_per_batch
 from jaxfit.fitting.fit import fit_runs
 from jaxfit.fitting.prepare import Preparation
-from jaxfit.fitting.solution import write_solution
 from jaxfit.fitting.stages import program
 from jaxfit.fitting.summary import summarise
-from jaxfit.formats.scene_folder import TRUE_POSES, TRUTH
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.storage import new_folder, write_whole
+from jaxfit.storage.files import new_folder, write_whole
 
 __all__ = ["FRAMES_AT_ONCE", "claim_folder", "fit_grid", "plan_batches", "run_folder"]
 

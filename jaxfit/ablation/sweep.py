@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 from jaxfit.ablation.grid import cross
 from jaxfit.ablation.measure import Result
 from jaxfit.ablation.runs import plan_batches
-from jaxfit.config import FitConfig
+from jaxfit.config.schema import FitConfig
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit_runs
 from jaxfit.fitting.prepare import Preparation
-from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
-from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 
 __all__ = ["Sweep", "sweep"]

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from jaxfit.config import FitConfig, load_config
+from jaxfit.config.schema import FitConfig, load_config
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.metrics import pa_mpjpe
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.model.pose import Pose
-from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion

@@ -4,9 +4,10 @@ import os
 
 import numpy as np
 
-from jaxfit import native, render
 from jaxfit.benchmarks.silhouette import bird_like_mesh, jittered_frames, median_seconds
 from jaxfit.model.bird import Bird
+from jaxfit.raster import kernels as native
+from jaxfit.raster import zbuffer as render
 
 CROP_PX, FRAME_PX, BIRD_PX = 256, (2592, 1520), 350
 

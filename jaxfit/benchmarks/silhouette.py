@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfit import silhouette as raster
+from jaxfit.raster import silhouette as raster
 
 
 def bird_like_mesh() -> tuple[np.ndarray, np.ndarray]:

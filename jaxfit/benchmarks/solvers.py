@@ -14,7 +14,8 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from jaxfit.config import load_config
+from jaxfit.config.schema import load_config
+from jaxfit.data.observations import Observations
 from jaxfit.fitting.adam import ADAM
 from jaxfit.fitting.lane import Lane, Solver, lane_loss
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
@@ -25,9 +26,8 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.pose import Pose
 from jaxfit.objective.scene import priors_of
-from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, Tick, silent
-from jaxfit.storage import write_whole
+from jaxfit.storage.files import write_whole
 
 __all__ = ["LBFGS", "bench_solvers", "plot_solvers"]
 

@@ -12,9 +12,9 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 
+from jaxfit.data.observations import Observations
 from jaxfit.evaluation import metrics
 from jaxfit.evaluation.overlap import Overlap, assign, ignored_region, region
-from jaxfit.observations import Observations
 
 __all__ = ["KeypointRow", "average_precision", "found_keypoints", "matches"]
 

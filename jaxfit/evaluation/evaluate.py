@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Bool
 
+from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.posed import PosedBirds
+from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
 from jaxfit.evaluation.bootstrap import BirdSums
@@ -15,12 +18,9 @@ from jaxfit.evaluation.figures import COLUMNS, COLUMNS_KEYPOINT, Evaluation, fig
 from jaxfit.evaluation.matching import match
 from jaxfit.evaluation.samples import correct_keypoints, squared_errors, squared_velocity_errors
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
-from jaxfit.fitting.posed import PosedBirds
-from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
-from jaxfit.observations import Observations, check_keypoints
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.render import hard_mask
+from jaxfit.raster.zbuffer import hard_mask
 
 __all__ = ["COLUMNS", "COLUMNS_3D", "Evaluation", "evaluate"]
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
+from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
-from jaxfit.fitting.solution import Solution
-from jaxfit.observations import Observations, check_keypoints
 
 __all__ = ["Matching", "follow", "match", "match_tracks"]
 

@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxfit.data.masks import box_of_mask
 from jaxfit.evaluation.samples import correct_keypoints, distances, points, squared_errors, squared_velocity_errors
-from jaxfit.masks import box_of_mask
 
 __all__ = [
     "iou",

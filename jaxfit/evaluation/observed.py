@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
+from jaxfit.data.observations import Observations
 from jaxfit.evaluation.detection import KeypointRow, average_precision, found_keypoints, matches
 from jaxfit.evaluation.overlap import overlap
 from jaxfit.evaluation.tracking import clear, hota, idf1
-from jaxfit.observations import Observations
 
 __all__ = ["ObservationsEvaluation", "evaluate_observations"]
 

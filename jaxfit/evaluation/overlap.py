@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int
 from pycocotools import mask as coco_mask
 from scipy.optimize import linear_sum_assignment
 
+from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
-from jaxfit.observations import Observations
 
 __all__ = ["HIDDEN", "MATCHED", "Overlap", "assign", "ignored_region", "overlap", "region"]
 

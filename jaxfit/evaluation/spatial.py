@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
 from jaxfit.evaluation.matching import match
 from jaxfit.evaluation.metrics_3d import acceleration_errors, best_scale, crop_rotation
 from jaxfit.evaluation.samples import distances
-from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig, fold_bird, joint_transforms, posed_joints
 from jaxfit.model.pose import Pose

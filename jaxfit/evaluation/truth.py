@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.formats.fields import read_json
+from jaxfit.data.formats.scene_folder import MARKER, TRUE_POSES, TRUTH
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution, load_solution
 from jaxfit.errors import InputError
-from jaxfit.fitting.solution import Solution, load_solution
-from jaxfit.formats.coco import read_coco
-from jaxfit.formats.fields import read_json
-from jaxfit.formats.scene_folder import MARKER, TRUE_POSES, TRUTH
 from jaxfit.model.bird import Bird
-from jaxfit.observations import Observations
 
 __all__ = ["read_behaviours", "read_truth"]
 

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxfit.camera import Camera
-from jaxfit.config import FitConfig
+from jaxfit.config.schema import FitConfig
 from jaxfit.fitting.diagnose import name_failures
 from jaxfit.fitting.lane import Knobs, Problem
 from jaxfit.fitting.solve import Report, StageState, advance, begin, report
 from jaxfit.fitting.stages import needs_mask, stage_knobs, stage_problem
 from jaxfit.model.bird import Bird
+from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.scene import Evidence, Priors

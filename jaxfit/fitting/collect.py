@@ -7,12 +7,12 @@ import logging
 import jax
 import numpy as np
 
-from jaxfit.camera import Camera, crop_to_image
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import Fitted
-from jaxfit.fitting.solution import Solution
 from jaxfit.fitting.window import Windows
 from jaxfit.model.bird import Bird
-from jaxfit.observations import Observations
+from jaxfit.model.camera import Camera, crop_to_image
 
 __all__ = ["Collector"]
 

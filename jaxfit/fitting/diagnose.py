@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from jaxfit.camera import Camera
-from jaxfit.config import FitConfig
+from jaxfit.config.schema import FitConfig
 from jaxfit.errors import InputError
 from jaxfit.fitting.lane import Knobs, Lane, Problem, lane_scene
 from jaxfit.fitting.stages import needs_mask, stage_knobs, stage_problem
 from jaxfit.model.bird import Bird
+from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose, rest_pose
 from jaxfit.objective.objective import weighted_sum

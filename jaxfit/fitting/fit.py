@@ -11,19 +11,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfit.config import FitConfig
+from jaxfit.config.schema import FitConfig
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import Lanes, fit_batch, frames_per_batch
 from jaxfit.fitting.collect import Collector
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.prepare import Preparation, camera_of, evidence_key, start_key
-from jaxfit.fitting.solution import Solution
 from jaxfit.fitting.stages import program
 from jaxfit.fitting.start import Start
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig, fold_bird
 from jaxfit.model.pose import Pose
 from jaxfit.objective.scene import Evidence, priors_of
-from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 
 __all__ = ["fit", "fit_runs"]

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfit.camera import Camera
-from jaxfit.config import InitialiseConfig
+from jaxfit.config.schema import InitialiseConfig
 from jaxfit.model.bird import Bird
+from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig, joint_transforms, posed_keypoints
 from jaxfit.model.pose import Pose, rest_pose
 from jaxfit.model.rotation import matrix_to_axis_angle, unwrap_axis_angle, view_grid, viewing_axis_rotations

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfit.camera import Camera
+from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import weighted_sum

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
-from jaxfit.fitting.solution import Solution
 from jaxfit.model.bird import Bird
 
 __all__ = ["LearntPrior", "effective_count", "learn_prior", "oas_shrinkage"]

@@ -10,17 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfit.camera import Camera
-from jaxfit.config import FitConfig
+from jaxfit.config.schema import FitConfig
+from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.errors import InputError
 from jaxfit.fitting.initialise import initial_poses
 from jaxfit.fitting.start import Start
 from jaxfit.fitting.window import Windows, cut_windows, filter_observations, load_evidence, load_keypoints
 from jaxfit.model.bird import Bird
+from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.scene import Evidence
-from jaxfit.observations import Observations, check_keypoints
 
 __all__ = ["Preparation", "camera_of", "evidence_key", "start_key"]
 

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxfit.camera import Camera
-from jaxfit.config import FitConfig, InitialiseConfig, StageConfig
+from jaxfit.config.schema import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.fitting.adam import ADAM
 from jaxfit.fitting.lane import Knobs, Problem, Solver
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
+from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.registry import find_term
 from jaxfit.objective.scene import Priors, Raster
-from jaxfit.silhouette import Blur
+from jaxfit.raster.silhouette import Blur
 
 __all__ = ["needs_mask", "program", "stage_knobs", "stage_problem"]
 

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import LAYOUT
 from jaxfit.errors import InputError
-from jaxfit.fitting.solution import LAYOUT
 from jaxfit.fitting.window import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
-from jaxfit.npz import load_npz
-from jaxfit.observations import Observations
-from jaxfit.storage import conform
+from jaxfit.storage.files import conform
+from jaxfit.storage.npz import load_npz
 
 __all__ = ["Start", "load_start"]
 

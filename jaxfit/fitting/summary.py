@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxfit.fitting.solution import Solution
+from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
 

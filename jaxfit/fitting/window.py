@@ -9,12 +9,12 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit.camera import image_to_crop
-from jaxfit.config import CropConfig, FitConfig
+from jaxfit.config.schema import CropConfig, FitConfig
+from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
-from jaxfit.filtering import weighted_median_filter
+from jaxfit.fitting.filtering import weighted_median_filter
+from jaxfit.model.camera import image_to_crop
 from jaxfit.objective.scene import Evidence
-from jaxfit.observations import Observations
 
 __all__ = ["Windows", "cut_windows", "filter_observations", "load_evidence", "load_keypoints"]
 

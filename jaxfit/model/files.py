@@ -17,8 +17,8 @@ import numpy as np
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird, free_limits, neutral_colours
 from jaxfit.model.checks import ARRAY_FIELDS, check_bird
-from jaxfit.npz import load_npz
-from jaxfit.storage import write_whole
+from jaxfit.storage.files import write_whole
+from jaxfit.storage.npz import load_npz
 
 __all__ = ["FORMAT_VERSION", "MURRE_PATH", "find_bird", "load_bird", "load_murre", "save_bird"]
 

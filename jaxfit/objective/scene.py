@@ -11,14 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from jaxfit.camera import Camera, project, to_screen
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird, free_limits
+from jaxfit.model.camera import Camera, project, to_screen
 from jaxfit.model.jacobian import window_keypoint_rows
 from jaxfit.model.kinematics import Rig, window_joints, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
-from jaxfit.silhouette import Blur
+from jaxfit.raster.silhouette import Blur
 
 __all__ = ["Evidence", "Priors", "Raster", "Scene", "priors_of"]
 

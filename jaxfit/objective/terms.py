@@ -16,7 +16,7 @@ from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.curvature import Curvature, Rows
 from jaxfit.objective.registry import term
 from jaxfit.objective.scene import Scene
-from jaxfit.silhouette import mask_loss
+from jaxfit.raster.silhouette import mask_loss
 
 __all__ = [
     "bone_prior",

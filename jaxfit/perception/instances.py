@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jaxfit.masks import box_of_mask, encode_patch
+from jaxfit.data.masks import box_of_mask, encode_patch
 
 __all__ = ["Instance", "KeypointDetector", "Segmenter", "instance_of"]
 

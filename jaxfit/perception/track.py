@@ -12,18 +12,18 @@ from typing import NamedTuple
 import cv2
 
 from jaxfit.clock import Clock
-from jaxfit.config_file import require
+from jaxfit.config.perception import TrackConfig
+from jaxfit.config.yaml_file import require
+from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
-from jaxfit.frames import FrameReader, read_frames
 from jaxfit.model.anatomy import mirror_pairs, skeleton_pairs
-from jaxfit.observations import Observations
-from jaxfit.perception.config import TrackConfig
 from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.keypoints.detector import BUILTIN_PATH
 from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
 from jaxfit.perception.tracking import Tracker, TrackRecorder, drop_short_tracks, load_tracker, repair_swaps
 from jaxfit.progress import ProgressTask, silent
+from jaxfit.video.reader import FrameReader, read_frames
 
 __all__ = ["Tracking", "find_tracks", "network_files", "open_keypoint_detector", "open_segmenter", "track_video"]
 

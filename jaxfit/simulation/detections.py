@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxfit.camera import Camera, project, to_screen
-from jaxfit.masks import encode_mask
+from jaxfit.data.masks import encode_mask
+from jaxfit.data.observations import Observations
 from jaxfit.model.bird import Bird
+from jaxfit.model.camera import Camera, project, to_screen
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
-from jaxfit.observations import Observations
-from jaxfit.render import hard_mask
+from jaxfit.raster.zbuffer import hard_mask
 
 __all__ = ["detect"]
 

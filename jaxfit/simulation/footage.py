@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfit.model.bird import Bird
-from jaxfit.render import hard_mask, interpolate, vertex_normals
+from jaxfit.raster.zbuffer import hard_mask, interpolate, vertex_normals
 from jaxfit.simulation.flock import Actor
 from jaxfit.simulation.ledge import Light, paint_ledge
 from jaxfit.simulation.motion import smooth_noise

@@ -29,8 +29,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit.masks import box_of_mask, encode_patch
-from jaxfit.observations import Observations
+from jaxfit.data.masks import box_of_mask, encode_patch
+from jaxfit.data.observations import Observations
 
 __all__ = ["detect_noisily"]
 

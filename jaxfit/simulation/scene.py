@@ -9,16 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxfit.camera import Camera
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.formats.scene_folder import DETECTIONS, FOOTAGE, MARKER, TRUE_POSES, TRUTH
+from jaxfit.data.masks import box_of_mask, encode_mask
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution, save_solution
 from jaxfit.errors import InputError
-from jaxfit.fitting.solution import Solution, save_solution
-from jaxfit.formats.coco import write_coco
-from jaxfit.formats.scene_folder import DETECTIONS, FOOTAGE, MARKER, TRUE_POSES, TRUTH
-from jaxfit.masks import box_of_mask, encode_mask
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
+from jaxfit.model.camera import Camera
 from jaxfit.model.describe import model_hash
-from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.simulation.behaviour import BEHAVIOURS
 from jaxfit.simulation.flock import Actor, act
@@ -27,8 +27,8 @@ from jaxfit.simulation.ledge import random_light
 from jaxfit.simulation.noise import detect_noisily
 from jaxfit.simulation.viewpoint import Viewpoint, look_down
 from jaxfit.simulation.visibility import keypoints_of, see
-from jaxfit.storage import new_folder, write_whole
-from jaxfit.video import VideoWriter
+from jaxfit.storage.files import new_folder, write_whole
+from jaxfit.video.writer import VideoWriter
 
 __all__ = ["Scene", "simulate", "stage_scene"]
 

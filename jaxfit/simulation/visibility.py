@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit.model.bird import Bird
-from jaxfit.render import hard_mask, zbuffer
+from jaxfit.raster.zbuffer import hard_mask, zbuffer
 from jaxfit.simulation.viewpoint import Viewpoint
 
 __all__ = ["View", "keypoints_of", "see"]

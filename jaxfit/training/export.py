@@ -14,7 +14,7 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from jaxfit.storage import write_whole
+from jaxfit.storage.files import write_whole
 
 __all__ = ["export_onnx"]
 

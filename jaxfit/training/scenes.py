@@ -21,7 +21,7 @@ from jaxfit.simulation.ledge import random_light
 from jaxfit.simulation.scene import LEDGE_DEPTH
 from jaxfit.simulation.viewpoint import Viewpoint, camera_axes
 from jaxfit.simulation.visibility import keypoints_of, see
-from jaxfit.storage import new_folder
+from jaxfit.storage.files import new_folder
 
 __all__ = ["FRAMES_A_SCENE", "LabelledFrames", "film_scenes", "load_frames"]
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.storage import check_writable
+from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
 from jaxfit.training.export import export_onnx
 from jaxfit.training.loop import Schedule, train

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxfit.render import interpolate
+from jaxfit.raster.zbuffer import interpolate
 from jaxfit.view.marks import DETECTED, FITTED, dot, line, ring, tag, text_width, track_colour
 
 __all__ = ["DrawnBird", "Numbers", "Style", "draw_birds", "draw_keypoints"]

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
-from jaxfit.fitting.solution import Solution
-from jaxfit.frames import VideoInfo
-from jaxfit.observations import Observations
-from jaxfit.storage import check_new_file
+from jaxfit.storage.files import check_new_file
+from jaxfit.video.reader import VideoInfo
 
 __all__ = ["check_belongs", "check_outputs", "too_short"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit.fitting.solution import Solution
-from jaxfit.observations import Observations, check_keypoints
+from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.solution import Solution
 
 __all__ = ["Detected"]
 

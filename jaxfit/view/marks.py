@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfit.storage import write_whole
+from jaxfit.storage.files import write_whole
 
 __all__ = [
     "DETECTED",

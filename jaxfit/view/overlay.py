@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfit.data.observations import Observations
+from jaxfit.data.posed import PosedBirds
+from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
-from jaxfit.fitting.posed import PosedBirds
-from jaxfit.fitting.solution import Solution
-from jaxfit.frames import VideoInfo, probe_video, read_frames
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
-from jaxfit.observations import Observations
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.render import shade
-from jaxfit.storage import write_whole
-from jaxfit.video import VideoWriter
+from jaxfit.raster.zbuffer import shade
+from jaxfit.storage.files import write_whole
+from jaxfit.video.reader import VideoInfo, probe_video, read_frames
+from jaxfit.video.writer import VideoWriter
 from jaxfit.view.birds import DrawnBird, Numbers, Style, draw_birds, draw_keypoints
 from jaxfit.view.checks import check_belongs, check_outputs, too_short
 from jaxfit.view.detected import Detected
@@ -45,7 +45,7 @@ class Overlay(NamedTuple):
     """Width and height of the video, as written."""
     fps: float
     codec: str
-    """Name of `jaxfit.codecs.CODECS`."""
+    """Name of `jaxfit.video.codecs.CODECS`."""
     fallback: bool
     """Whether the codec is another than the one asked for; a warning says so."""
 

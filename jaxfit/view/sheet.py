@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfit.fitting.posed import PosedBirds
-from jaxfit.fitting.solution import Solution
+from jaxfit.data.observations import Observations
+from jaxfit.data.posed import PosedBirds
+from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
-from jaxfit.observations import Observations
-from jaxfit.render import draw, hard_mask, shade
+from jaxfit.raster.zbuffer import draw, hard_mask, shade
 from jaxfit.view.detected import Detected
 from jaxfit.view.marks import DETECTED, FITTED, INK, PAPER, dot, line, ring, tag, text, track_colour, write_png
 

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from scipy.spatial.transform import Rotation
 
-from jaxfit.fitting.solution import Solution
+from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
-from jaxfit.render import draw, shade
+from jaxfit.raster.zbuffer import draw, shade
 from jaxfit.view.marks import PAPER, tag, text, tinted, track_colour
 
 __all__ = ["SideViews", "up_direction"]
@@ -117,8 +117,8 @@ def draw_parallel(
         image: the ground.
         points_px: right of, below and behind the picture's middle, pixels.
         faces, colours: of the mesh; the colours' channels are in the picture's order.
-        samples: as for `jaxfit.render.draw`.
-        light: as for `jaxfit.render.shade`.
+        samples: as for `jaxfit.raster.zbuffer.draw`.
+        light: as for `jaxfit.raster.zbuffer.shade`.
     """
     middle = np.array([image.shape[1] / 2, image.shape[0] / 2, 10 * max(image.shape)])
     lit = shade(points_px, faces, colours, light)

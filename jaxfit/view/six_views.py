@@ -20,7 +20,7 @@ __all__ = ["six_views"]
 
 TILE_PX, MARGIN_PX, TITLE_PX, FOOT_PX, TEXT_PX = 400, 26, 44, 64, 17
 LIGHT = (-0.3, -0.4, -0.85)
-"""As `jaxfit.render.shade` takes it: from the viewer's side, so that above and below are no darker than the flanks."""
+"""Direction of the light, as `raster.zbuffer.shade` takes it: from the viewer, so that all views are equally bright."""
 GREY, DARK = (120, 120, 120), (60, 60, 60)
 
 VIEWS = {  # name → the picture's right and down, in the bird's axes: x right, y forwards, z up

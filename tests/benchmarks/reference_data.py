@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from jaxfit.model.bird import Bird
-from jaxfit.model.sources import import_sources
+from jaxfit.model.importers.sources import import_sources
 
 __all__ = ["reference_bird", "reference_folder"]
 

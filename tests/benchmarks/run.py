@@ -21,10 +21,11 @@ from reference_data import reference_bird, reference_folder
 from rich.console import Console
 from rich.table import Table
 
-from jaxfit import cli, load_config, read_coco
 from jaxfit.benchmarks.fit import bench_fit
 from jaxfit.benchmarks.render import bench_render
 from jaxfit.benchmarks.silhouette import bench_silhouette
+from jaxfit.cli import load_config, read_coco
+from jaxfit.cli import main as cli
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.start import load_start

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jaxfit.data.masks import box_of_mask
 from jaxfit.errors import InputError
-from jaxfit.masks import box_of_mask
 from jaxfit.perception.instances import Instance
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.classes import choose_classes, names_of

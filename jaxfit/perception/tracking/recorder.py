@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit.observations import Observations
+from jaxfit.data.observations import Observations
 from jaxfit.perception.instances import Instance
 
 __all__ = ["TrackRecorder"]

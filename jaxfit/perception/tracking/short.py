@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from jaxfit.observations import Observations
+from jaxfit.data.observations import Observations
 
 __all__ = ["drop_short_tracks"]
 

@@ -23,7 +23,7 @@ from typing import cast
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit.observations import Observations
+from jaxfit.data.observations import Observations
 
 __all__ = ["repair_swaps"]
 

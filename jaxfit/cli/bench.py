@@ -1,0 +1,44 @@
+"""Measure speed on this machine."""
+
+from __future__ import annotations
+
+import argparse
+
+from jaxfit.cli.tables import plain_json, show_facts
+from jaxfit.data.formats.coco import read_coco
+from jaxfit.extras import require_extra
+from jaxfit.model.files import find_bird
+from jaxfit.progress import terminal
+from jaxfit.storage.files import check_writable
+
+__all__ = ["bench"]
+
+
+def bench(options: argparse.Namespace) -> None:
+    from jaxfit.benchmarks.fit import bench_fit, noisy_scene
+    from jaxfit.benchmarks.render import bench_render
+    from jaxfit.benchmarks.silhouette import bench_silhouette
+    from jaxfit.benchmarks.solvers import bench_solvers, plot_solvers
+
+    bird = find_bird(options.model) if options.model else None
+    if options.what == "silhouette":
+        result = bench_silhouette(vertices=bird and bird.vertices, faces=bird and bird.faces)
+    elif options.what == "render":
+        result = bench_render(bird)
+    elif options.what == "solvers":
+        bird = bird or find_bird("murre")
+        if options.plot:  # before the work, not after it
+            require_extra("report", "--plot")
+            check_writable(options.plot)
+        given = options.observations
+        seen = read_coco(given) if given else noisy_scene(bird, options.birds, options.frames)[1]
+        result = bench_solvers(seen, bird, progress=terminal)
+        if options.plot:
+            plot_solvers(result, options.plot)
+    else:
+        result = bench_fit(bird or find_bird("murre"), options.birds, options.frames, progress=terminal)
+    if options.json:
+        print(plain_json(result))  # noqa: T201
+    else:
+        # curves are for the plot and JSON
+        show_facts({key: value for key, value in result.items() if not isinstance(value, dict)})

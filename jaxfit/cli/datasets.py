@@ -1,0 +1,33 @@
+"""Published data sets as observations."""
+
+from __future__ import annotations
+
+import argparse
+
+from jaxfit.cli.tables import counted, show, show_facts
+from jaxfit.progress import terminal
+
+__all__ = ["murre"]
+
+
+def murre(options: argparse.Namespace) -> None:
+    from jaxfit.data.formats.coco import write_coco
+    from jaxfit.data.formats.common_murre import LICENSE, read_common_murre
+    from jaxfit.model.anatomy import MURRE_KEYPOINTS
+    from jaxfit.storage.files import check_new_file, check_writable
+
+    check_new_file(options.out, options.overwrite)
+    check_writable(options.out)
+    chosen = {"none": None, "murre": MURRE_KEYPOINTS}
+    names = chosen[options.keypoints] if options.keypoints in chosen else options.keypoints.split(",")
+    observations, readings = read_common_murre(options.folder, names, terminal)
+    told = "; ".join(f"{question}: {answer}" for question, answer in readings.items())
+    info = {
+        "description": f"common_murre_temporal as jaxfit read it; its layout is inferred, not published. {told}",
+        "license": LICENSE,
+    }
+    write_coco(observations, options.out, info)
+    show("the layout of this data set is inferred, not published; it was read so:")
+    show_facts(readings)
+    birds, frames = counted(observations.num_tracks, "bird"), counted(len(observations.frame_index), "frame")
+    show(f"{birds}, {frames} → {options.out} (licence {LICENSE}: not for commercial use; the video itself is not read)")

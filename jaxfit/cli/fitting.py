@@ -1,0 +1,126 @@
+"""Pose birds, measure how well, draw them."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+
+from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, plain_json, right_aligned, show
+from jaxfit.data.formats.coco import read_coco
+from jaxfit.errors import InputError
+from jaxfit.model.files import find_bird
+from jaxfit.progress import terminal
+
+__all__ = ["evaluate", "fit", "overlay"]
+
+
+def fit(options: argparse.Namespace) -> None:
+    from jaxfit.config.schema import config_to_yaml, load_config
+    from jaxfit.data.solution import save_solution
+    from jaxfit.fitting.fit import fit
+    from jaxfit.fitting.start import load_start
+    from jaxfit.fitting.summary import summarise
+    from jaxfit.storage.files import check_replaceable
+
+    began = time.perf_counter()
+    check_replaceable(options.out, options.overwrite, "poses.npz")  # before the work, not after it
+    config = load_config(options.config)
+    bird = find_bird(options.model)
+    observations = read_coco(options.observations)
+    start = load_start(options.init, observations, bird) if options.init else None
+    read = time.perf_counter()
+    solution = fit(observations, bird, config, start, terminal, source=options.observations)
+    seconds = {"read": read - began, "fit": time.perf_counter() - read}
+    summary = summarise(solution, bird, seconds)
+    save_solution(solution, bird, config_to_yaml(config), summary, options.out, options.overwrite)
+    table = right_aligned("track", "frames", "objective")
+    table.add_column("status")
+    total = np.sum(list(solution.loss.values()), axis=0)
+    for n, track in enumerate(solution.track_id):
+        frames = int(solution.valid[n].sum())
+        table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", str(solution.status[n]))
+    table.title = "objective: final value per frame"
+    show(table)
+    poses, birds = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird")
+    counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
+    show(f"{poses} of {birds} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+
+
+def evaluate(options: argparse.Namespace) -> None:
+    from jaxfit.cli.observation_tables import matching_line
+    from jaxfit.data.solution import load_solution
+    from jaxfit.evaluation.evaluate import evaluate
+    from jaxfit.evaluation.matching import match_tracks
+    from jaxfit.evaluation.truth import read_behaviours, read_truth
+
+    if options.result.is_file():
+        if options.by:
+            raise InputError(options.result, "holds observations, which have no tables --by", "give a folder of poses")
+        _evaluate_observations(options)
+        return
+    solution, bird = load_solution(options.result)
+    truth, poses, truth_bird = read_truth(options.truth)
+    behaviours = read_behaviours(options.truth)
+    if options.by == "behaviour" and behaviours is None:
+        remedy = "give the folder of a simulated scene, or leave out --by behaviour"
+        raise InputError(options.truth, "does not say what the birds do", remedy)
+    solution, matching = match_tracks(solution, truth, options.match, options.truth)
+    result = evaluate(
+        solution,
+        bird,
+        truth,
+        terminal,
+        options.truth,
+        truth_solution=poses,
+        truth_bird=truth_bird,
+        behaviours=behaviours,
+    )
+    if options.json:
+        named = {"matched_by": matching.by, "follows": matching.follows}
+        print(plain_json(result.to_dict() | named))  # noqa: T201
+        return
+    for table in evaluation_tables(result):
+        show(table)
+    for table in breakdown_tables(result, options.by) if options.by else []:
+        show(table)
+    if matching.by == "overlap":
+        show(matching_line(matching))
+    if result.missing:
+        show(f"no figure counts {counted(result.missing, 'annotated bird')} without a pose in this result")
+    if result.unmatched:
+        show(f"no figure counts {counted(result.unmatched, 'pose')} of tracks or frames that the truth lacks")
+
+
+def _evaluate_observations(options: argparse.Namespace) -> None:
+    from dataclasses import asdict
+
+    from jaxfit.cli.observation_tables import observation_tables, uncounted_lines
+    from jaxfit.evaluation.observed import evaluate_observations
+    from jaxfit.evaluation.truth import read_truth
+
+    result = evaluate_observations(read_coco(options.result), read_truth(options.truth)[0], options.truth)
+    if options.json:
+        keypoints = {name: row._asdict() for name, row in result.keypoints.items()}
+        print(plain_json(asdict(result) | {"keypoints": keypoints}))  # noqa: T201
+        return
+    for table in observation_tables(result):
+        show(table)
+    for line in uncounted_lines(result):
+        show(line)
+
+
+def overlay(options: argparse.Namespace) -> None:
+    from jaxfit.data.solution import load_solution
+    from jaxfit.view.overlay import overlay, overlay_frame
+
+    solution, bird = load_solution(options.result)
+    seen = read_coco(options.observations) if options.observations else None
+    drawn = {"observations": seen, "side_views": options.side_views, "overwrite": options.overwrite}
+    if options.frame is not None:
+        overlay_frame(solution, bird, options.video, options.frame, options.out, **drawn)
+        show(f"frame {options.frame} → {options.out}")
+        return
+    overlay(solution, bird, options.video, options.out, codec=options.codec, progress=terminal, **drawn)
+    show(f"overlay → {options.out}, contact sheet → {options.out.with_suffix('.png')}")

@@ -1,0 +1,67 @@
+"""Import, inspect and show bird models."""
+
+from __future__ import annotations
+
+import argparse
+
+from jaxfit.cli.tables import counted, plain_json, right_aligned, show, show_facts
+from jaxfit.errors import InputError
+from jaxfit.model.files import find_bird, save_bird
+
+__all__ = ["model_import", "model_info", "model_view", "prior_learn"]
+
+
+def model_import(options: argparse.Namespace) -> None:
+    from jaxfit.model.importers.sources import import_sources
+
+    bird = import_sources(options.kind, options.sources)
+    save_bird(bird, options.out)
+    show(f"{bird.name}: {bird.vertices.shape[0]} vertices, {bird.num_keypoints} keypoints → {options.out}")
+
+
+def model_info(options: argparse.Namespace) -> None:
+    from jaxfit.model.describe import describe_bird
+
+    facts = describe_bird(find_bird(options.file))
+    if options.json:
+        print(plain_json(facts))  # noqa: T201
+    else:
+        show_facts(facts)
+
+
+def model_view(options: argparse.Namespace) -> None:
+    from jaxfit.model.murre import POSTURES
+    from jaxfit.view.six_views import six_views
+
+    if options.posture and options.posture not in POSTURES:
+        raise InputError("model view: posture", f"{options.posture!r} is none", f"known are {', '.join(POSTURES)}")
+    six_views(find_bird(options.file), options.out, options.posture)
+    show(f"six views → {options.out}")
+
+
+def prior_learn(options: argparse.Namespace) -> None:
+    import numpy as np
+
+    from jaxfit.data.solution import load_solution
+    from jaxfit.fitting.learn import learn_prior
+    from jaxfit.storage.files import check_writable
+
+    check_writable(options.out)  # before the work, not after it
+    learnt = learn_prior([(folder, *load_solution(folder)) for folder in options.results])
+    counts = {"poses": learnt.poses, "birds": learnt.birds, "effective_poses": learnt.effective_poses}
+    notes = {f"prior_{name}": value for name, value in counts.items()} | {"prior_shrinkage": learnt.shrinkage}
+    save_bird(learnt.bird, options.out, notes)
+    title = "how far each joint's mean moved from the model's, and its standard deviation (mean of three axes)"
+    table = right_aligned("moved °", "spread °", title=title)
+    table.add_column("joint")
+    spread = np.sqrt(np.diag(learnt.bird.pose_covariance).reshape(-1, 3).mean(axis=1))
+    for joint in np.argsort(-learnt.mean_change_rad):
+        figures = np.rad2deg([learnt.mean_change_rad[joint], spread[joint]])
+        table.add_row(*(f"{figure:.1f}" for figure in figures), learnt.bird.joint_names[joint + 1])
+    show(table)
+    left_out = f" ({learnt.diverged} diverged, left out)" if learnt.diverged else ""
+    poses, birds = counted(learnt.poses, "pose"), counted(learnt.birds, "bird")
+    show(f"{poses} of {birds}{left_out}, which tell as much as {learnt.effective_poses:.0f} independent ones")
+    bones = "learnt too" if learnt.bones_learnt else "the model's, as they do not differ here"
+    show(f"correlations shrunk by {100 * learnt.shrinkage:.0f} % (100 % leaves none); bone lengths: {bones}")
+    show(f"{learnt.bird.name} with this prior → {options.out}; fit with `--model {options.out}`")

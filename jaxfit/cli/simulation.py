@@ -1,0 +1,49 @@
+"""Simulated scenes, and the demo of everything on one."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from jaxfit.cli.tables import counted, show
+from jaxfit.errors import InputError
+from jaxfit.model.files import find_bird
+from jaxfit.progress import terminal
+
+__all__ = ["demo", "simulate"]
+
+
+def simulate(options: argparse.Namespace) -> None:
+    from jaxfit.simulation.scene import simulate
+
+    began = time.perf_counter()
+    scene = simulate(
+        find_bird("murre"),
+        options.out,
+        birds=options.birds,
+        frames=options.frames,
+        size=_size(options.size),
+        fps=options.fps,
+        seed=options.seed,
+        codec=options.codec,
+        overwrite=options.overwrite,
+        progress=terminal,
+    )
+    boxes, found = int(scene.truth.present.sum()), int(scene.detections.present.sum())
+    show(
+        f"{counted(options.birds, 'bird')} over {counted(options.frames, 'frame')}: {counted(boxes, 'true pose')}, "
+        f"{counted(found, 'detection')}, in {time.perf_counter() - began:.0f} s → {options.out}"
+    )
+
+
+def demo(options: argparse.Namespace) -> None:
+    from jaxfit.cli.demo import run_demo
+
+    run_demo(options.out)
+
+
+def _size(text: str) -> tuple[int, int]:
+    sides = text.lower().replace("×", "x").split("x")
+    if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
+        raise InputError("simulate: size", f"{text!r} is none", "give width and height as in 2592x1520")
+    return int(sides[0]), int(sides[1])

@@ -1,0 +1,221 @@
+"""Observations in COCO json, as used for video instance data.
+
+The file is an object with
+
+- ``images``: ``id``, ``width``, ``height``, ``file_name``, ``frame_index`` (0 for photographs);
+- ``categories``: ``id``, ``keypoints`` (names), optionally ``skeleton`` (pairs counted from 1, as COCO does;
+  from 0 where a 0 occurs);
+- ``annotations``: ``image_id``, ``category_id``, ``track_id``, ``bbox`` [x, y, width, height] and
+  ``keypoints`` [x, y, v, …] in image pixels, optionally ``segmentation`` (run lengths or polygons),
+  ``keypoint_scores`` (K numbers in [0, 1]), ``score`` (of the bird as a whole, in [0, 1]), ``iscrowd``, ``id``.
+
+A written file also has ``tracks``, for people who open the file: ``id``, ``category_id`` and the fields of
+``jaxfit.data.track_quality.TrackQuality``. They follow from the annotations, so the reader ignores ``tracks``.
+
+What a reader has to decide:
+
+- Confidence is the score where ``v > 0`` and 0 where ``v = 0``: COCO puts a keypoint that is not there at
+  (0, 0), whatever its score. Without scores it is 1 where ``v > 0``. An annotation without ``score`` has 1.
+- The first category that has keypoints is the bird. Categories with the same keypoints in the same order,
+  such as several species, are read with it; annotations of all others are left out, and one warning says how
+  many.
+- A file without any annotation is a video without a bird; one whose annotations are all of other categories is
+  refused.
+- A crowd (``iscrowd`` 1) has no mask: its region covers several birds.
+- Several images may share a ``frame_index`` (photographs, several videos); each track keeps its own image.
+- Unknown keys are ignored.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from jaxfit.data.formats.coco_records import (
+    Annotation,
+    Categories,
+    Image,
+    read_annotation,
+    read_categories,
+    read_images,
+)
+from jaxfit.data.formats.fields import Field, read_json
+from jaxfit.data.formats.rle import run_lengths
+from jaxfit.data.observations import Observations, check_keypoints, reorder_keypoints
+from jaxfit.data.track_quality import track_quality
+from jaxfit.storage.files import write_whole
+
+__all__ = ["check_keypoints", "read_coco", "reorder_keypoints", "write_coco"]
+
+_log = logging.getLogger(__name__)
+
+_LARGEST_TABLE = 2**28  # entries of (N, T, K): a GiB of float32
+
+
+def read_coco(path: str | Path) -> Observations:
+    """Read observations from a COCO json; the module says which one.
+
+    Args:
+        path: the file.
+
+    Returns:
+        Observations with tracks in the order of ``track_id`` and frames in that of ``frame_index``,
+        also those without a bird; perhaps no track at all.
+
+    Raises:
+        InputError: a file that cannot be read or whose content contradicts itself, naming file, field and
+            remedy.
+    """
+    root = read_json(Path(path))
+    if not isinstance(root.value, dict):
+        root.fail("must hold an object with images, categories and annotations", "give a COCO json")
+    images = read_images(root["images"])
+    categories = read_categories(root["categories"])
+    found: list[Annotation] = []
+    left_out = 0
+    for annotation in root["annotations"]:
+        category = annotation["category_id"].identifier()
+        if category in categories.others:
+            left_out += 1
+        elif category in categories.birds:
+            found.append(read_annotation(annotation, images, categories.names))
+        else:
+            annotation["category_id"].fail(f"is {category!r}, which no category has", "add the category")
+    if left_out:
+        _log.warning("%s: left out %d annotations of categories without the bird's keypoints", path, left_out)
+        if not found:
+            problem = f"hold no bird ({left_out} of other categories)"
+            root["annotations"].fail(problem, "run detection on footage with a bird in it, or choose another file")
+    return _assemble(root, list(images.values()), categories, found)
+
+
+def _assemble(root: Field, images: list[Image], categories: Categories, found: list[Annotation]) -> Observations:
+    first_image: dict[int, Image] = {}
+    for image in images:
+        first_image.setdefault(image.frame_index, image)
+    frames = sorted(first_image)
+    tracks = sorted({annotation.track_id for annotation in found})
+    N, T, K = len(tracks), len(frames), len(categories.names)
+    if N * T * K > _LARGEST_TABLE:
+        problem = f"hold {N} tracks over {T} frames, too many for one table"
+        root["annotations"].fail(problem, "split the file; for photographs, give every image frame_index 0")
+    row = {track: n for n, track in enumerate(tracks)}
+    column = {frame: t for t, frame in enumerate(frames)}
+
+    keypoints = np.zeros((N, T, K, 4), np.float32)
+    box, score = np.zeros((N, T, 4), np.float32), np.zeros((N, T), np.float32)
+    holder: dict[tuple[int, int], Annotation] = {}
+    for annotation in found:
+        cell = row[annotation.track_id], column[annotation.image.frame_index]
+        if cell in holder:
+            root["annotations"].fail(
+                f"holds track_id {annotation.track_id} twice in frame_index {annotation.image.frame_index}: "
+                f"{holder[cell].label} and {annotation.label}",
+                "remove one, or give it another track_id",
+            )
+        holder[cell] = annotation
+        keypoints[cell] = annotation.keypoints
+        box[cell], score[cell] = annotation.box, annotation.score
+    present = np.zeros((N, T), bool)
+    for cell in holder:
+        present[cell] = True
+    return Observations(
+        track_id=np.array(tracks, np.int64),
+        frame_index=np.array(frames),
+        present=present,
+        keypoints_px=keypoints[..., :2],
+        confidence=keypoints[..., 2],
+        box_px=box,
+        image_size_px=np.array([[first_image[f].width, first_image[f].height] for f in frames]),
+        file_name=np.array([first_image[f].file_name for f in frames]),
+        keypoint_names=categories.names,
+        skeleton=categories.skeleton,
+        masks={cell: a.rle for cell, a in holder.items() if a.rle is not None},
+        amodal_masks={cell: a.amodal_rle for cell, a in holder.items() if a.amodal_rle is not None},
+        occluded=keypoints[..., 3] > 0,
+        score=score,
+        own_images={
+            cell: (a.image.file_name, a.image.width, a.image.height)
+            for cell, a in holder.items()
+            if a.image != first_image[a.image.frame_index]
+        },
+    )
+
+
+def write_coco(observations: Observations, path: str | Path, info: Mapping[str, str] | None = None) -> None:
+    """Write observations as COCO json, the whole file or none.
+
+    ``read_coco`` reads the same back, except that tracks come in the order of ``track_id`` and a track that
+    is present nowhere is gone.
+
+    Args:
+        observations: what to write.
+        path: the file; an existing one is replaced.
+        info: what the file says of itself, as COCO's ``info``: ``description``, ``license``, …
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    images: dict[tuple, dict[str, Any]] = {}
+
+    def image_id(t: int, file_name: str, width: int, height: int) -> int:
+        image = {"id": len(images), "width": width, "height": height, "file_name": file_name}
+        image["frame_index"] = int(observations.frame_index[t])
+        return images.setdefault((t, file_name, width, height), image)["id"]
+
+    for t, (width, height) in enumerate(observations.image_size_px.tolist()):
+        image_id(t, str(observations.file_name[t]), width, height)  # the frame's own image before the others
+    annotations = []
+    scores = cast(np.ndarray, observations.score)
+    for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
+        confidence = observations.confidence[n, t]
+        hidden = cast(np.ndarray, observations.occluded)[n, t]
+        visible = np.where(confidence > 0, np.where(hidden, 1.0, 2.0), 0.0)
+        keypoints = np.concatenate([_shortest(observations.keypoints_px[n, t]), visible[:, None]], axis=-1)
+        annotation = {
+            "id": len(annotations) + 1,
+            "image_id": image_id(t, observations.image_file(n, t), *observations.image_size(n, t)),
+            "category_id": 1,
+            "track_id": int(observations.track_id[n]),
+            "bbox": _shortest(observations.box_px[n, t]).tolist(),
+            "iscrowd": 0,
+            "keypoints": keypoints.reshape(-1).tolist(),
+            "keypoint_scores": _shortest(confidence).tolist(),
+            "num_keypoints": int((confidence > 0).sum()),
+        }
+        if scores[n, t] != 1:
+            annotation["score"] = float(_shortest(scores[n, t]))
+        for key, masks in (("segmentation", observations.masks), ("amodal_segmentation", observations.amodal_masks)):
+            if (n, t) in masks:
+                size, counts = masks[n, t]["size"], masks[n, t]["counts"]
+                counts = counts.decode("ascii") if isinstance(counts, bytes) else counts
+                annotation[key] = {"size": [int(side) for side in size], "counts": counts}
+        if "segmentation" in annotation:
+            annotation["area"] = sum(run_lengths(annotation["segmentation"]["counts"])[1::2])
+        annotations.append(annotation)
+    skeleton = [[a + 1, b + 1] for a, b in observations.skeleton]
+    category = {"id": 1, "name": "bird", "keypoints": list(observations.keypoint_names), "skeleton": skeleton}
+    tracks = []
+    for quality in track_quality(observations):
+        figures = quality._asdict()
+        track = {"id": figures.pop("track_id"), "category_id": 1}
+        tracks.append(track | {key: round(v, 6) if isinstance(v, float) else v for key, v in figures.items()})
+    content: dict[str, Any] = {
+        "images": list(images.values()),
+        "categories": [category],
+        "annotations": annotations,
+        "tracks": tracks,
+    }
+    if info:
+        content = {"info": dict(info), **content}
+    write_whole(path, json.dumps(content, allow_nan=False).encode())
+
+
+def _shortest(values: np.ndarray) -> np.ndarray:
+    """float64 with the fewest digits that read back as the same float32."""
+    return values.astype(str).astype(np.float64)

@@ -1,0 +1,168 @@
+"""The images, categories and annotations of a COCO json, each checked as it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxfit.data.formats.fields import Field
+from jaxfit.data.formats.rle import read_segmentation
+
+__all__ = ["Annotation", "Categories", "Image", "read_annotation", "read_categories", "read_images"]
+
+_LARGEST_SIDE_PX = 16384  # larger masks' run lengths outgrow what pycocotools reserves for them
+_TRACK_REMEDY = "give every annotation its bird's track_id; for photographs, a number of its own"
+_FRAME_REMEDY = "give every image its frame's number in the video; for photographs, 0"
+
+
+@dataclass(frozen=True)
+class Image:
+    """An entry of ``images``; width and height in pixels."""
+
+    frame_index: int
+    width: int
+    height: int
+    file_name: str
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """An entry of ``annotations``: one bird in one image."""
+
+    label: str
+    """What messages call it."""
+    track_id: int
+    image: Image
+    keypoints: np.ndarray
+    """(K, 4): x, y in image pixels, confidence, 1 where something hides the keypoint."""
+    box: list[float]
+    """x, y, width, height in image pixels."""
+    rle: dict[str, Any] | None
+    """The mask's run lengths."""
+    amodal_rle: dict[str, Any] | None
+    """Run lengths of the whole bird, hidden parts included."""
+    score: float
+    """Trust in the bird as a whole."""
+
+
+def read_images(images: Field) -> dict[int | str, Image]:
+    """The images under their ids; InputError where an entry is wrong or an id stands twice."""
+    found: dict[int | str, Image] = {}
+    where: dict[int | str, str] = {}
+    for image in images:
+        name = image["id"].identifier()
+        if name in found:
+            image["id"].fail(f"is {name!r}, as {where[name]} is", "give every image an id of its own")
+        if "frame_index" not in image:
+            image.fail("lacks the key frame_index", _FRAME_REMEDY)
+        where[name] = f"{image.path}.id"
+        found[name] = Image(
+            frame_index=image["frame_index"].integer(0),
+            width=image["width"].integer(1, _LARGEST_SIDE_PX),
+            height=image["height"].integer(1, _LARGEST_SIDE_PX),
+            file_name=image["file_name"].text(),
+        )
+    if not found:
+        images.fail("is empty", "add the images that the annotations stand in")
+    return found
+
+
+@dataclass(frozen=True)
+class Categories:
+    """Which categories are the bird, and its keypoints."""
+
+    names: tuple[str, ...]
+    skeleton: tuple[tuple[int, int], ...]
+    """Pairs counted from 0."""
+    birds: frozenset[int | str]
+    """Ids that mean the bird."""
+    others: frozenset[int | str]
+    """Ids that mean something else."""
+
+
+def read_categories(categories: Field) -> Categories:
+    """The bird's categories; InputError where an entry is wrong or none has keypoints."""
+    names: tuple[str, ...] = ()
+    skeleton: tuple[tuple[int, int], ...] = ()
+    birds: set[int | str] = set()
+    others: set[int | str] = set()
+    for category in categories:
+        name = category["id"].identifier()
+        if name in birds | others:
+            category["id"].fail(f"is {name!r} for the second time", "give every category an id of its own")
+        its_names = tuple(k.text() for k in category["keypoints"]) if category.has("keypoints") else ()
+        if len(set(its_names)) < len(its_names):
+            category["keypoints"].fail("holds a name twice", "give every keypoint a name of its own")
+        if its_names and not names:
+            names = its_names
+            skeleton = _read_skeleton(category, len(names))
+        (birds if names and its_names == names else others).add(name)
+    if not names:
+        categories.fail("hold none with keypoints", "add the keypoints' names to the bird's category")
+    return Categories(names, skeleton, frozenset(birds), frozenset(others))
+
+
+def _read_skeleton(category: Field, num_keypoints: int) -> tuple[tuple[int, int], ...]:
+    if not category.has("skeleton"):
+        return ()
+    pairs = [(edge, edge.numbers(2)) for edge in category["skeleton"]]
+    first = 0 if any(0 in pair for _, pair in pairs) else 1
+    for edge, pair in pairs:
+        if any(k != int(k) or not first <= k < num_keypoints + first for k in pair):
+            problem = f"is {list(pair)}, but the keypoints count from {first} to {num_keypoints - 1 + first}"
+            edge.fail(problem, "correct it or leave skeleton out")
+    return tuple((int(a) - first, int(b) - first) for _, (a, b) in pairs)
+
+
+def read_annotation(annotation: Field, images: Mapping[int | str, Image], names: Sequence[str]) -> Annotation:
+    """One annotation of the bird; InputError where it is wrong."""
+    image_id = annotation["image_id"].identifier()
+    if image_id not in images:
+        annotation["image_id"].fail(f"is {image_id!r}, which no image has", "add the image or remove this")
+    if "track_id" not in annotation:
+        annotation.fail("lacks the key track_id", _TRACK_REMEDY)
+    image = images[image_id]
+    box = annotation["bbox"].positions(4, " (x, y, width, height)")
+    if min(box[2:]) <= 0:
+        problem = f"has width {box[2]} and height {box[3]}, which must be above 0"
+        annotation["bbox"].fail(problem, "give the bird's box, or remove the annotation")
+    rle, amodal_rle = (
+        read_segmentation(annotation[key], image.height, image.width) if annotation.has(key) else None
+        for key in ("segmentation", "amodal_segmentation")
+    )
+    crowd = annotation.has("iscrowd") and annotation["iscrowd"].integer(0, 1)
+    label = f"id {annotation['id'].identifier()!r} ({annotation.path})" if annotation.has("id") else annotation.path
+    return Annotation(
+        label=label,
+        track_id=annotation["track_id"].integer(),
+        image=image,
+        keypoints=_read_keypoints(annotation, len(names)),
+        box=list(box),
+        rle=None if crowd else rle,
+        amodal_rle=None if crowd else amodal_rle,
+        score=annotation["score"].number(0, 1, "scale the scores to 0 to 1") if annotation.has("score") else 1.0,
+    )
+
+
+def _read_keypoints(annotation: Field, num_keypoints: int) -> np.ndarray:
+    why = f" (x, y, v for each of the category's {num_keypoints} keypoints)"
+    values = annotation["keypoints"].positions(3 * num_keypoints, why)
+    keypoints = np.zeros((num_keypoints, 4))
+    keypoints[:, :3] = np.array(values, dtype=np.float64).reshape(-1, 3)
+    visibility = keypoints[:, 2].copy()
+    keypoints[:, 3] = visibility == 1
+    if (visibility < 0).any():
+        annotation["keypoints"].fail(f"has visibility {visibility.min()}", "write 0, 1 or 2")
+    keypoints[:, 2] = 1
+    if annotation.has("keypoint_scores"):
+        scores = annotation["keypoint_scores"].numbers(num_keypoints, ", one for each keypoint")
+        for i, score in enumerate(scores):
+            if not 0 <= score <= 1:
+                problem = f"holds {score} at [{i}], outside 0 to 1"
+                annotation["keypoint_scores"].fail(problem, "scale the scores to 0 to 1")
+        keypoints[:, 2] = scores
+    keypoints[visibility == 0] = 0
+    return keypoints

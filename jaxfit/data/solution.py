@@ -1,0 +1,212 @@
+"""What a fit returns, and the folder of results it is kept in."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxfit.errors import InputError
+from jaxfit.model.bird import Bird
+from jaxfit.model.files import load_bird, save_bird
+from jaxfit.model.pose import Pose
+from jaxfit.storage.files import conform, new_folder, write_whole
+from jaxfit.storage.npz import load_npz
+
+__all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution", "write_solution"]
+
+FORMAT_VERSION = 1
+"""Version of ``poses.npz``; raised where an older reader would misread the file."""
+
+_POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
+
+LAYOUT = {
+    "track_id": ("N", np.int64),
+    "frame_index": ("T", np.int64),
+    "valid": ("N T", np.bool_),
+    "global_orient": ("N T 3", np.float32),
+    "body_pose": ("N T J-1 3", np.float32),
+    "transl": ("N T 3", np.float32),
+    "scale": ("N T", np.float32),
+    "bone_length": ("N T J-1", np.float32),
+    "betas": ("N T S", np.float32),
+    "keypoints_3d": ("N T K 3", np.float32),
+    "keypoints_2d": ("N T K 2", np.float32),
+    "crop": ("N T 3", np.float32),
+    "image_size_px": ("N T 2", np.int64),
+    "keypoint_names": ("K", np.str_),
+    "joint_names": ("J", np.str_),
+    "status": ("N", np.str_),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Poses of N tracks over T frames; J joints, K keypoints, S shape coefficients.
+
+    NumPy arrays, read-only. What stands where ``valid`` is False means nothing, and may be NaN.
+
+    Raises:
+        ValueError: shapes that contradict each other, naming the array.
+    """
+
+    track_id: np.ndarray
+    """(N,) int64."""
+    frame_index: np.ndarray
+    """(T,) int64: the frames' numbers in the video."""
+    valid: np.ndarray
+    """(N, T) bool: this bird was fitted in this frame."""
+    global_orient: np.ndarray
+    """(N, T, 3) float32: axis-angle in radians, camera frame."""
+    body_pose: np.ndarray
+    """(N, T, J−1, 3) float32: axis-angle in radians, relative to the parent joint."""
+    transl: np.ndarray
+    """(N, T, 3) float32: model units, camera frame of the crop."""
+    scale: np.ndarray
+    """(N, T) float32: size relative to the model."""
+    bone_length: np.ndarray
+    """(N, T, J−1) float32: relative to the rest skeleton."""
+    betas: np.ndarray
+    """(N, T, S) float32: shape coefficients."""
+    keypoints_3d: np.ndarray
+    """(N, T, K, 3) float32: model units, camera frame of the crop."""
+    keypoints_2d: np.ndarray
+    """(N, T, K, 2) float32: image pixels."""
+    crop: np.ndarray
+    """(N, T, 3) float32: x0, y0, size of the square crop in image pixels."""
+    image_size_px: np.ndarray
+    """(N, T, 2) int64: width, height of the picture that the bird stands in; 0 where not valid."""
+    focal: float
+    """Focal length in pixels of the crop the fit works on."""
+    keypoint_names: tuple[str, ...]
+    """K names."""
+    joint_names: tuple[str, ...]
+    """J names, the root first."""
+    crop_px: int
+    """Side in pixels of the crop the fit works on; the camera's centre is its middle."""
+    loss: Mapping[str, np.ndarray]
+    """Term → (N,) float64: its weighted share of the final objective, summed over the track's windows."""
+    status: np.ndarray
+    """(N,) str: how each track's fit ended."""
+    failures: Mapping[int, str] = field(default_factory=dict)
+    """Track → what broke its fit down, where and when; for ``summary.json``, and not read back from there."""
+
+    def __post_init__(self):
+        arrays = conform(vars(self), LAYOUT)
+        if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
+            bones = arrays["body_pose"].shape[2]
+            raise ValueError(f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}")
+        loss = {}
+        for term, value in self.loss.items():
+            layout = {"status": LAYOUT["status"], f"loss[{term}]": ("N", np.float64)}
+            loss[str(term)] = conform({"status": self.status, f"loss[{term}]": value}, layout)[f"loss[{term}]"]
+        focal = float(self.focal)
+        if not 0 < focal < math.inf:
+            raise ValueError(f"focal must be above 0 and finite, not {focal}")
+        crop_px = int(self.crop_px)
+        if crop_px < 1:
+            raise ValueError(f"crop_px must be 1 or more, not {crop_px}")
+        for name in ("keypoint_names", "joint_names"):
+            object.__setattr__(self, name, tuple(str(text) for text in arrays.pop(name)))
+        for name, value in (arrays | {"loss": loss, "focal": focal, "crop_px": crop_px}).items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def pose(self) -> Pose:
+        """The poses as the model takes them: every field (N, T, …)."""
+        return Pose(**{each.name: getattr(self, each.name) for each in fields(Pose)})
+
+
+def save_solution(
+    solution: Solution,
+    bird: Bird,
+    config_yaml: str,
+    summary: Mapping[str, Any],
+    folder: str | Path,
+    overwrite: bool = False,
+) -> None:
+    """Write a folder of results, whole or not at all: ``poses.npz``, ``config.yaml``, ``summary.json``, ``model.npz``.
+
+    Args:
+        solution: what to write.
+        bird: the model it was fitted with, kept with it: poses mean nothing without.
+        config_yaml: the configuration as run.
+        summary: metrics, timings, versions; NumPy values are taken, and NaN and infinities become null.
+        folder: where.
+        overwrite: replace an older folder of results, once the new one is complete.
+
+    Raises:
+        InputError: the folder holds results already, or something else, or cannot be written.
+        TypeError: ``summary`` holds what JSON has no form for.
+    """
+    with new_folder(folder, overwrite, marker=_POSES) as part:
+        write_solution(solution, bird, config_yaml, summary, part)
+
+
+def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Mapping[str, Any], folder: Path) -> None:
+    """The files that `save_solution` writes, into a folder that exists: one that is still being made."""
+    summary_json = json.dumps(_plain(summary), indent=2, allow_nan=False)
+    arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in LAYOUT}
+    terms = list(solution.loss)
+    arrays["loss"] = np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
+    arrays["loss_terms"] = np.array(terms, dtype=np.str_)
+    arrays["focal"] = np.asarray(solution.focal, np.float64)
+    arrays["crop_px"] = np.asarray(solution.crop_px, np.int64)
+    arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
+    write_whole(folder / _POSES, lambda file: np.savez_compressed(file, **arrays))
+    write_whole(folder / _CONFIG, config_yaml.encode())
+    write_whole(folder / _SUMMARY, summary_json.encode())
+    save_bird(bird, folder / _MODEL)
+
+
+def _plain(value: Any) -> Any:
+    """``value`` in the types of JSON."""
+    if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
+        value = np.asarray(value).tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
+    """Read the poses of a folder of results, and the model they belong to.
+
+    Args:
+        folder: as ``save_solution`` wrote it.
+
+    Raises:
+        InputError: no such folder, a file that is missing, damaged or of a newer version, or arrays whose
+            shapes contradict each other.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        problem = "is a file, not a folder of results" if folder.exists() else "does not exist"
+        raise InputError(folder, problem, "give the folder that a fit wrote")
+    path = folder / _POSES
+    ndim = {name: len(shape.split()) for name, (shape, _) in LAYOUT.items()}
+    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0, "crop_px": 0}, FORMAT_VERSION)
+    values: dict[str, Any] = {name: arrays[name] for name in LAYOUT}
+    values |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
+    terms, loss = arrays["loss_terms"], arrays["loss"]
+    if loss.shape[1] != len(terms):
+        problem = f"loss has shape {loss.shape}, but there are {len(terms)} loss_terms"
+        raise InputError(path, problem, "run the fit again")
+    try:
+        losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
+        focal, crop_px = float(arrays["focal"]), int(arrays["crop_px"])
+        solution = Solution(**values, loss=losses, focal=focal, crop_px=crop_px)
+    except ValueError as error:
+        raise InputError(path, str(error), "run the fit again") from error
+    bird = load_bird(folder / _MODEL)
+    if (bird.joint_names, bird.keypoint_names) != (solution.joint_names, solution.keypoint_names):
+        raise InputError(folder / _MODEL, f"is another model than that of {_POSES}", "run the fit again")
+    return solution, bird

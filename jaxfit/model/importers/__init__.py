@@ -1,0 +1,1 @@
+"""Published bird models, read from the files that their authors released."""

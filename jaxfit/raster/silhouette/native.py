@@ -1,0 +1,71 @@
+"""The silhouette's calls into the compiled kernels, which `jaxfit.raster.kernels` loads."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from jaxfit.raster.kernels import available_isas, choose_isa, current_isa, kernels_available, require_kernels
+from jaxfit.raster.silhouette.reference import KINDS, Blur
+
+__all__ = [
+    "available_isas",
+    "choose_isa",
+    "current_isa",
+    "kernels_available",
+    "mask_loss",
+    "mask_loss_and_gradient",
+    "silhouette",
+    "silhouette_gradient",
+]
+
+
+def _call(name: str, results, *operands, blur: Blur, **attributes):
+    require_kernels()
+    call = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")
+    return call(*operands, sigma=np.float32(blur.sigma), radius=np.float32(blur.radius), **attributes)
+
+
+def _shape_like(vertices) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(vertices.shape, jnp.float32)
+
+
+def silhouette(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], size: int, blur: Blur):
+    """The image (size, size)."""
+    image = jax.ShapeDtypeStruct((size, size), jnp.float32)
+    return _call("jaxfit_silhouette", image, vertices, faces, blur=blur)
+
+
+def silhouette_gradient(
+    vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], cotangent: Float[Array, "size size"], blur: Blur
+) -> Float[Array, "V 3"]:
+    """The gradient of Σ cotangent · silhouette with respect to the vertices."""
+    return _call("jaxfit_silhouette_gradient", _shape_like(vertices), vertices, faces, cotangent, blur=blur)
+
+
+def mask_loss(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    target: Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"],
+    weight: Float[Array, ""],
+    kind: str,
+    blur: Blur,
+) -> Float[Array, ""]:
+    """The loss, 0 where the weight is 0; otherwise the weight is not applied."""
+    loss = jax.ShapeDtypeStruct((), jnp.float32)
+    operands = (vertices, faces, target, weight)
+    return _call("jaxfit_mask_loss", loss, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))
+
+
+def mask_loss_and_gradient(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    target: Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"],
+    weight: Float[Array, ""],
+    kind: str,
+    blur: Blur,
+) -> tuple[Float[Array, ""], Float[Array, "V 3"]]:
+    """`mask_loss` and its gradient with respect to the vertices, in one pass."""
+    results = (jax.ShapeDtypeStruct((), jnp.float32), _shape_like(vertices))
+    operands = (vertices, faces, target, weight)
+    return _call("jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))

@@ -1,0 +1,211 @@
+"""The differentiable operations: soft silhouette and mask loss of one image; batch them by `vmap`."""
+
+import functools
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
+
+from jaxfit.raster.silhouette import native, reference
+from jaxfit.raster.silhouette.reference import Blur
+
+Backend = Literal["auto", "native", "reference"]
+Kind = Literal["l1", "smooth_l1"]
+Target = Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"]
+
+_BACKENDS = ("auto", "native", "reference")
+
+
+def silhouette(
+    vertices_screen: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    size: int,
+    *,
+    blur: Blur | None = None,
+    backend: Backend = "auto",
+) -> Float[Array, "{size} {size}"]:
+    """Soft silhouette of a triangle mesh in a square image.
+
+    S = 1 − Π_f (1 − sigmoid(−d_f / s)) over every face f that contains the pixel's centre or lies within the blur
+    radius of it; d_f is the squared distance in px² to the face's nearest edge, negative inside.
+
+    Faces with |2·area| ≤ 1e-8 (size/2)² px² or two equal corners, and those with a vertex at a depth of 1e-8 or less,
+    are skipped. If any coordinate of any vertex is NaN or infinite, the whole image and its gradient are NaN.
+    Coordinates beyond ±2²⁰ px are clamped. The kernels leave a pixel once its S is within 1e-5 of 1.
+
+    Args:
+        vertices_screen: x and y in pixels (x right, y down, pixel centres at i + 0.5), and the depth in the camera
+            frame in any unit. The gradient with respect to depth is 0.
+        faces: vertex indices, in any orientation.
+        size: the image's width and height in pixels.
+        blur: softness and radius in pixels, by default `Blur.for_size(size)`.
+        backend: "auto" takes the compiled kernels on the CPU where they were built, the reference elsewhere;
+            "native" insists on the kernels, "reference" on plain JAX.
+
+    Returns:
+        S in [0, 1], row-major: `image[row, column]`.
+
+    Raises:
+        ValueError: an argument's shape, type or value is not as described.
+        RuntimeError: backend="native" without kernels.
+
+    Source: Liu et al., "Soft Rasterizer" (2019), eqs. 1 and 4, as computed by PyTorch3D with no limit on the number
+    of faces a pixel.
+    """
+    _check_mesh(vertices_screen, faces)
+    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not 0 < size <= 2**14:
+        raise ValueError(f"size: expected an integer from 1 to {2**14}, got {size!r}")
+    blur = Blur.for_size(size) if blur is None else blur
+    vertices, faces = _as_operands(vertices_screen, faces)
+    image: Any = _silhouette(vertices, faces, int(size), blur, _choose(backend))
+    return image.astype(vertices_screen.dtype)
+
+
+def mask_loss(
+    vertices_screen: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    target: Target,
+    weight: Float[Array, ""] | float = 1.0,
+    *,
+    kind: Kind = "l1",
+    blur: Blur | None = None,
+    backend: Backend = "auto",
+) -> Float[Array, ""]:
+    """How far a mesh's soft silhouette is from a mask, summed over the pixels.
+
+    L = w · Σ ρ(S − target), with ρ(e) = |e| for "l1"; for "smooth_l1" ρ(e) = e²/2 where |e| < 1, else |e| − 1/2.
+
+    Differentiated with respect to the vertices' x and y and to the weight, in reverse mode; the target is a
+    constant. Loss and gradient come from one pass of the kernel; without differentiation only the loss is computed.
+
+    Args:
+        vertices_screen: as for `silhouette`.
+        faces: as for `silhouette`.
+        target: square; bool or uint8, where anything but 0 is inside, or floats in [0, 1].
+        weight: w. An image of weight 0 costs nothing: its loss and all its gradients, that with respect to the
+            weight included, are 0, even where its vertices are not finite.
+        kind: "l1" or "smooth_l1".
+        blur: as for `silhouette`.
+        backend: as for `silhouette`.
+
+    Returns:
+        The loss in pixels (an area).
+
+    Raises:
+        ValueError: an argument's shape, type or value is not as described.
+        RuntimeError: backend="native" without kernels.
+
+    Source: Hägerlind et al., "Temporally-consistent 3D Reconstruction of Seabirds" (2024), the term E_msk.
+    """
+    _check_mesh(vertices_screen, faces)
+    target = jnp.asarray(target)
+    if target.ndim != 2 or target.shape[0] != target.shape[1] or target.shape[0] == 0:
+        raise ValueError(f"target: expected shape (size, size), got {target.shape}")
+    if jnp.issubdtype(target.dtype, jnp.floating):
+        target = target.astype(jnp.float32)
+    elif target.dtype not in (jnp.bool_, jnp.uint8):
+        raise ValueError(f"target: expected bool, uint8 or floats, got {target.dtype}")
+    if kind not in reference.KINDS:
+        raise ValueError(f"kind: expected one of {reference.KINDS}, got {kind!r}")
+    if jnp.shape(weight) != ():
+        raise ValueError(f"weight: expected a scalar, got shape {jnp.shape(weight)}")
+    blur = Blur.for_size(target.shape[0]) if blur is None else blur
+    vertices, faces = _as_operands(vertices_screen, faces)
+    weight = jnp.asarray(weight, jnp.float32)
+    switch = jax.lax.stop_gradient(weight)
+    loss: Any = _mask_loss(vertices, faces, target, switch, kind, blur, _choose(backend))
+    return (weight * loss).astype(vertices_screen.dtype)
+
+
+def _check_mesh(vertices, faces) -> None:
+    if jnp.ndim(vertices) != 2 or jnp.shape(vertices)[1] != 3:
+        raise ValueError(f"vertices_screen: expected shape (V, 3), got {jnp.shape(vertices)}")
+    if not jnp.issubdtype(jnp.result_type(vertices), jnp.floating):
+        raise ValueError(f"vertices_screen: expected floats, got {jnp.result_type(vertices)}")
+    if jnp.ndim(faces) != 2 or jnp.shape(faces)[1] != 3:
+        raise ValueError(f"faces: expected shape (F, 3), got {jnp.shape(faces)}")
+    if not jnp.issubdtype(jnp.result_type(faces), jnp.integer):
+        raise ValueError(f"faces: expected integers, got {jnp.result_type(faces)}")
+
+
+def _as_operands(vertices, faces):
+    return jnp.asarray(vertices, jnp.float32), jnp.asarray(faces, jnp.int32)
+
+
+def _choose(backend: str) -> str:
+    if backend not in _BACKENDS:
+        raise ValueError(f"backend: expected one of {_BACKENDS}, got {backend!r}")
+    if backend == "auto" and not native.kernels_available():
+        return "reference"
+    return backend
+
+
+def _dispatch(backend: str, native_form, reference_form, *operands):
+    """One form or the other; for "auto" only the one for the platform is in its program."""
+    if backend == "native":
+        return native_form(*operands)
+    if backend == "reference":
+        return reference_form(*operands)
+    return jax.lax.platform_dependent(*operands, cpu=native_form, default=reference_form)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
+def _silhouette(vertices, faces, size, blur, backend) -> Any:
+    return _dispatch(
+        backend,
+        lambda v, f: native.silhouette(v, f, size, blur),
+        lambda v, f: reference.silhouette(v, f, size, blur),
+        vertices,
+        faces,
+    )
+
+
+def _silhouette_forward(vertices, faces, size, blur, backend):
+    return _silhouette(vertices, faces, size, blur, backend), (vertices, faces)
+
+
+def _silhouette_backward(size, blur, backend, residuals, cotangent):
+    def by_autodiff(v, f, c):
+        return jax.vjp(lambda v: reference.silhouette(v, f, size, blur), v)[1](c)[0]
+
+    gradient = _dispatch(
+        backend, lambda v, f, c: native.silhouette_gradient(v, f, c, blur), by_autodiff, *residuals, cotangent
+    )
+    return gradient, None
+
+
+_silhouette.defvjp(_silhouette_forward, _silhouette_backward)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(4, 5, 6))
+def _mask_loss(vertices, faces, target, weight, kind, blur, backend) -> Any:
+    return _dispatch(
+        backend,
+        lambda v, f, t, w: native.mask_loss(v, f, t, w, kind, blur),
+        lambda v, f, t, w: reference.mask_loss(v, f, t, w, kind, blur),
+        vertices,
+        faces,
+        target,
+        weight,
+    )
+
+
+def _mask_loss_forward(vertices, faces, target, weight, kind, blur, backend):
+    return _dispatch(
+        backend,
+        lambda v, f, t, w: native.mask_loss_and_gradient(v, f, t, w, kind, blur),
+        lambda v, f, t, w: jax.value_and_grad(reference.mask_loss)(v, f, t, w, kind, blur),
+        vertices,
+        faces,
+        target,
+        weight,
+    )
+
+
+def _mask_loss_backward(kind, blur, backend, gradient, cotangent):
+    return cotangent * gradient, None, None, None
+
+
+_mask_loss.defvjp(_mask_loss_forward, _mask_loss_backward)

@@ -1,0 +1,217 @@
+"""The z-buffer renderer's operations: NumPy in, NumPy out, nothing differentiable."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
+
+from jaxfit.raster.kernels import kernels_available, require_kernels
+from jaxfit.raster.zbuffer import reference
+
+__all__ = ["Fragments", "draw", "hard_mask", "interpolate", "zbuffer"]
+
+MAX_SIZE, MAX_SAMPLES = 2**14, 8
+
+
+class Fragments(NamedTuple):
+    """What is seen at every pixel's centre."""
+
+    face: Int32[np.ndarray, "*B H W"]
+    """Index of the nearest face, −1 where there is none."""
+
+    barycentric: Float32[np.ndarray, "*B H W 3"]
+    """Perspective-correct weights of that face's vertices, which sum to 1; 0 where there is no face."""
+
+    depth: Float32[np.ndarray, "*B H W"]
+    """In the camera frame, in the vertices' unit; inf where there is no face."""
+
+
+def zbuffer(
+    vertices_screen: Float[Array | np.ndarray, "*B V 3"], faces: Int[Array | np.ndarray, "F 3"], width: int, height: int
+) -> Fragments:
+    """The nearest face at every pixel's centre.
+
+    At a centre inside a face's projection, with screen-space barycentrics λ, 1/depth = Σ λ_i / z_i, and the weights
+    are λ_i · depth / z_i. Edges belong to the face; equal depths go to the face with the lower index. Both sides of a
+    face are seen.
+
+    Faces are not clipped: one with a vertex at a depth of 1e-3 or less, or with a coordinate that is not finite, is
+    skipped, and so is one without area. Coordinates are taken as float32.
+
+    Args:
+        vertices_screen: x and y in pixels (x right, y down, pixel centres at i + 0.5) and depth in the camera frame,
+            in any unit, as `jaxfit.model.camera.to_screen` gives them.
+        faces: vertex indices, in any orientation, the same for the whole batch.
+        width: of the image in pixels, 1 to 16384.
+        height: likewise.
+
+    Raises:
+        ValueError: an argument's shape, type or value is not as described.
+
+    Source: Pineda, "A parallel algorithm for polygon rasterization" (1988); Heckbert & Moreton, "Interpolation for
+    polygon texture mapping and shading" (1991).
+    """
+    vertices, faces, batch = _mesh(vertices_screen, faces)
+    _check_size(width, height)
+    shape = (len(vertices), height, width)
+    face, barycentric, depth = np.empty(shape, np.int32), np.empty((*shape, 3), np.float32), np.empty(shape, np.float32)
+    if kernels_available():
+        require_kernels().zbuffer(vertices, faces, face, barycentric, depth)
+    else:
+        for i, one in enumerate(vertices):
+            face[i], barycentric[i], depth[i] = reference.fragments(one, faces, width, height)
+    return Fragments(*(a.reshape(batch + a.shape[1:]) for a in (face, barycentric, depth)))
+
+
+def hard_mask(
+    vertices_screen: Float[Array | np.ndarray, "V 3"], faces: Int[Array | np.ndarray, "F 3"], width: int, height: int
+) -> Bool[np.ndarray, "{height} {width}"]:
+    """The pixels whose centre lies inside the projection of some face, its edges included.
+
+    It costs what the mesh covers, however large the image.
+
+    Args, skipped faces and errors are those of `zbuffer`, for one mesh.
+    """
+    vertices, faces, batch = _mesh(vertices_screen, faces)
+    if batch:
+        raise ValueError(f"vertices_screen: expected shape (V, 3), got {np.shape(vertices_screen)}")
+    _check_size(width, height)
+    mask = np.zeros((height, width), bool)
+    if kernels_available():
+        require_kernels().hard_mask(vertices, faces, mask[None])
+    else:
+        mask |= reference.raster(vertices[0], faces, width, height, 1)[0] >= 0
+    return mask
+
+
+def interpolate(
+    vertices_screen: Float[Array | np.ndarray, "*B V 3"],
+    faces: Int[Array | np.ndarray, "F 3"],
+    attributes: Float[Array | np.ndarray, "... V C"],
+    width: int,
+    height: int,
+    samples: int = 2,
+) -> tuple[Float32[np.ndarray, "*B H W C"], Float32[np.ndarray, "*B H W"], Int32[np.ndarray, "*B H W"]]:
+    """Vertex attributes over the image, anti-aliased.
+
+    Every pixel has samples² samples on a regular grid, each of which sees the nearest face as in `zbuffer`.
+
+    Args:
+        vertices_screen: as for `zbuffer`.
+        faces: as for `zbuffer`.
+        attributes: any number of channels a vertex, in any unit; leading dimensions may be left out or 1.
+        width: as for `zbuffer`.
+        height: as for `zbuffer`.
+        samples: along a pixel's side, 1 to 8.
+
+    Returns:
+        Values: the attributes, interpolated perspective-correctly and summed over the covered samples, over
+        samples² (premultiplied by the coverage). Coverage: the share of covered samples, 0 to 1. Face: that of
+        the nearest sample, −1 where nothing is covered.
+
+    Raises:
+        ValueError: an argument's shape, type or value is not as described.
+    """
+    vertices, faces, batch = _mesh(vertices_screen, faces)
+    _check_size(width, height)
+    _check_samples(samples)
+    channels = _attributes(attributes, batch, vertices.shape[1])
+    shape = (len(vertices), height, width)
+    values = np.empty((*shape, channels.shape[-1]), np.float32)
+    coverage, face = np.empty(shape, np.float32), np.empty(shape, np.int32)
+    if kernels_available():
+        require_kernels().interpolate(vertices, faces, channels, samples, values, coverage, face)
+    else:
+        for i, one in enumerate(vertices):
+            values[i], coverage[i], face[i] = reference.interpolate(one, faces, channels[i], width, height, samples)
+    values, coverage, face = (a.reshape(batch + a.shape[1:]) for a in (values, coverage, face))
+    return values, coverage, face
+
+
+def draw(
+    image: UInt8[np.ndarray, "H W 3"],
+    vertices_screen: Float[Array | np.ndarray, "V 3"],
+    faces: Int[Array | np.ndarray, "F 3"],
+    colours: Float[Array | np.ndarray, "V 3"],
+    samples: int = 2,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A mesh over an image, anti-aliased: (1 − coverage) · image + 255 · interpolated colours, rounded.
+
+    Several birds are drawn in one call, as one mesh, so that the nearer hides the farther.
+
+    Args:
+        image: left as it is; the order of its channels is that of the colours.
+        vertices_screen: as for `zbuffer`, in this image's pixels.
+        faces: as for `zbuffer`.
+        colours: of the vertices, in [0, 1].
+        samples: as for `interpolate`.
+
+    Returns:
+        A new image.
+
+    Raises:
+        ValueError: an argument's shape, type or value is not as described.
+    """
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+        got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"image: expected uint8 of shape (H, W, 3), got {got}")
+    vertices, faces, batch = _mesh(vertices_screen, faces)
+    if batch:
+        raise ValueError(f"vertices_screen: expected shape (V, 3), got {np.shape(vertices_screen)}")
+    _check_size(image.shape[1], image.shape[0])
+    _check_samples(samples)
+    channels = _attributes(colours, (), vertices.shape[1], "colours")
+    if channels.shape[-1] != 3:
+        raise ValueError(f"colours: expected shape ({vertices.shape[1]}, 3), got {np.shape(colours)}")
+    drawn = np.array(image, order="C")
+    if kernels_available():
+        require_kernels().draw(vertices, faces, channels[0], samples, drawn)
+    else:
+        reference.draw(drawn, vertices[0], faces, channels[0], samples)
+    return drawn
+
+
+def _mesh(vertices_screen: Any, faces: Any) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
+    """Checked and contiguous: float32 vertices (B, V, 3), int32 faces, and the batch's own shape."""
+    vertices, indices = np.asarray(vertices_screen), np.asarray(faces)
+    if vertices.ndim < 2 or vertices.shape[-1] != 3:
+        raise ValueError(f"vertices_screen: expected shape (…, V, 3), got {vertices.shape}")
+    if not np.issubdtype(vertices.dtype, np.floating):
+        raise ValueError(f"vertices_screen: expected floats, got {vertices.dtype}")
+    if indices.ndim != 2 or indices.shape[1] != 3:
+        raise ValueError(f"faces: expected shape (F, 3), got {indices.shape}")
+    if not np.issubdtype(indices.dtype, np.integer):
+        raise ValueError(f"faces: expected integers, got {indices.dtype}")
+    batch, count = vertices.shape[:-2], vertices.shape[-2]
+    if indices.size and not 0 <= indices.min() <= indices.max() < count:
+        raise ValueError(f"faces: expected indices in [0, {count}), got {indices.min()} to {indices.max()}")
+    with np.errstate(over="ignore"):  # too far for float32: infinite, so its faces are skipped
+        vertices = np.ascontiguousarray(vertices, np.float32)
+    return vertices.reshape(math.prod(batch), count, 3), np.ascontiguousarray(indices, np.int32), batch
+
+
+def _attributes(attributes: Any, batch: tuple[int, ...], count: int, name: str = "attributes") -> np.ndarray:
+    """Float32 (B, V, C), contiguous."""
+    found = np.asarray(attributes)
+    if not np.issubdtype(found.dtype, np.floating):
+        raise ValueError(f"{name}: expected floats, got {found.dtype}")
+    wanted = (*batch, count)
+    try:
+        full = np.broadcast_to(found, (*wanted, *found.shape[-1:]))
+    except ValueError:
+        full = None
+    if full is None or found.ndim < 2 or found.shape[-2] != count:
+        raise ValueError(f"{name}: expected shape ({', '.join(map(str, wanted))}, channels), got {found.shape}")
+    return np.ascontiguousarray(full, np.float32).reshape(math.prod(batch), count, found.shape[-1])
+
+
+def _check_size(width: Any, height: Any) -> None:
+    for name, value in (("width", width), ("height", height)):
+        if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 < value <= MAX_SIZE:
+            raise ValueError(f"{name}: expected an integer from 1 to {MAX_SIZE}, got {value!r}")
+
+
+def _check_samples(samples: Any) -> None:
+    if isinstance(samples, bool) or not isinstance(samples, int | np.integer) or not 0 < samples <= MAX_SAMPLES:
+        raise ValueError(f"samples: expected an integer from 1 to {MAX_SAMPLES}, got {samples!r}")

@@ -1,0 +1,92 @@
+"""The z-buffer in NumPy, one face at a time: the definition that the compiled kernel repeats bit by bit.
+
+A sample p sees a face where the three edge functions s·((a − p) × (b − p)) are at least 0, s being the sign of the
+face's area. Of one edge the two faces that share it compute the same number, one with the other sign: no sample on a
+shared edge is lost. In float64 these products are exact for any float32 pixel coordinates below a few thousand.
+"""
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int32, UInt8
+
+NEAR_DEPTH = 1e-3  # a face with a vertex at or before this depth is skipped
+
+
+def raster(
+    vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], width: int, height: int, samples: int
+) -> tuple[Int32[np.ndarray, "R C"], Float[np.ndarray, "R C 3"], Float[np.ndarray, "R C"]]:
+    """The nearest face of every sample, samples² a pixel: its index or −1, barycentrics and 1/depth (−1: nothing)."""
+    rows, columns = height * samples, width * samples
+    face = np.full((rows, columns), -1, np.int32)
+    barycentric = np.zeros((rows, columns, 3))
+    nearness = np.full((rows, columns), -1.0)
+    finite = np.isfinite(vertices).all(-1)
+    drawn = (finite & (vertices[:, 2] > NEAR_DEPTH))[faces].all(-1)
+    for index in np.flatnonzero(drawn):
+        corners = vertices[faces[index]].astype(np.float64)
+        x, y, inverse_depth = corners[:, 0] * samples, corners[:, 1] * samples, 1 / corners[:, 2]
+        area = (x[1] - x[0]) * (y[2] - y[0]) - (y[1] - y[0]) * (x[2] - x[0])
+        left, right = max(np.ceil(x.min() - 0.5), 0), min(np.floor(x.max() - 0.5), columns - 1)
+        top, bottom = max(np.ceil(y.min() - 0.5), 0), min(np.floor(y.max() - 0.5), rows - 1)
+        if area == 0 or left > right or top > bottom:
+            continue
+        box = slice(int(top), int(bottom) + 1), slice(int(left), int(right) + 1)
+        dx = x[:, None, None] - (np.arange(left, right + 1) + 0.5)
+        dy = (y[:, None, None] - (np.arange(top, bottom + 1) + 0.5)[:, None]) * np.sign(area)
+        edge = np.stack([dx[(i + 1) % 3] * dy[(i + 2) % 3] - dy[(i + 1) % 3] * dx[(i + 2) % 3] for i in range(3)])
+        weight = edge * (inverse_depth / abs(area))[:, None, None]
+        total = (weight[0] + weight[1]) + weight[2]
+        near = np.clip(total, inverse_depth.min(), inverse_depth.max())
+        # Rounded, so that faces which meet or coincide tie: the first keeps the sample.
+        better = (edge >= 0).all(0) & (near.astype(np.float32) > nearness[box].astype(np.float32))
+        weight[0, total == 0], total[total == 0] = 1, 1  # rounded away, far outside the image
+        face[box][better] = index
+        nearness[box][better] = near[better]
+        barycentric[box][better] = np.moveaxis(weight * (1 / total), 0, -1)[better]
+    return face, barycentric, nearness
+
+
+def fragments(vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], width: int, height: int):
+    """Face, barycentrics and depth of one image; see `jaxfit.raster.zbuffer.zbuffer`."""
+    face, barycentric, nearness = raster(vertices, faces, width, height, 1)
+    depth = np.where(face >= 0, 1 / nearness, np.inf)
+    return face, barycentric.astype(np.float32), depth.astype(np.float32)
+
+
+def interpolate(
+    vertices: Float32[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    attributes: Float32[np.ndarray, "V C"],
+    width: int,
+    height: int,
+    samples: int,
+) -> tuple[Float[np.ndarray, "H W C"], Float[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
+    """Values, coverage and face of one image; see `jaxfit.raster.zbuffer.interpolate`."""
+    face, barycentric, nearness = raster(vertices, faces, width, height, samples)
+    seen = face >= 0
+    values = np.zeros((*face.shape, attributes.shape[-1]))
+    values[seen] = np.einsum("nk,nkc->nc", barycentric[seen], attributes[faces[face[seen]]].astype(np.float64))
+    values, seen, face, nearness = (_by_pixel(a, samples) for a in (values, seen, face, nearness))
+    nearest = nearness.astype(np.float32).argmax(-1)[..., None]
+    return values.mean(2), seen.mean(2), np.take_along_axis(face, nearest, -1)[..., 0]
+
+
+def draw(
+    image: UInt8[np.ndarray, "H W 3"],
+    vertices: Float32[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    colours: Float32[np.ndarray, "V 3"],
+    samples: int,
+) -> None:
+    """Draws over the image, in place; see `jaxfit.raster.zbuffer.draw`."""
+    values, coverage, _ = interpolate(vertices, faces, colours, image.shape[1], image.shape[0], samples)
+    touched = coverage > 0
+    mixed = (1 - coverage[touched, None]) * image[touched] + 255 * values[touched]
+    # Rounded to float32 first, so that a half is a half however it was summed.
+    image[touched] = np.clip(mixed.astype(np.float32) + np.float32(0.5), 0, 255).astype(np.uint8)
+
+
+def _by_pixel(samples_of: np.ndarray, samples: int) -> np.ndarray:
+    """(H·s, W·s, …) → (H, W, s², …)."""
+    rows, columns = samples_of.shape[:2]
+    split = samples_of.reshape(rows // samples, samples, columns // samples, samples, *samples_of.shape[2:])
+    return np.moveaxis(split, 2, 1).reshape(rows // samples, columns // samples, samples**2, *samples_of.shape[2:])

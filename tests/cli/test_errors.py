@@ -1,0 +1,130 @@
+"""The command line given what it cannot use: one clear line, exit code 2, and nothing written."""
+
+import json
+import os
+import pickle
+
+import numpy as np
+import pytest
+from support.cli_files import arguments, refused
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+def first_annotation(**changes):
+    def change(content):
+        content["annotations"][0] |= changes
+        return content
+
+    return change
+
+
+def keypoints_with(value):
+    def change(content):
+        content["annotations"][0]["keypoints"][0] = value
+        return content
+
+    return change
+
+
+def renamed(content):
+    content["categories"][0]["keypoints"][0] = "beak"
+    return content
+
+
+def one_keypoint_less(content):
+    content["categories"][0]["keypoints"].pop()
+    for annotation in content["annotations"]:
+        annotation["keypoints"] = annotation["keypoints"][:-3]
+        annotation.pop("keypoint_scores", None)
+    content["categories"][0].pop("skeleton", None)
+    return content
+
+
+def doubled(content):
+    content["annotations"].append(content["annotations"][0] | {"id": 999})
+    return content
+
+
+def other_size(content):
+    content["images"][0]["width"] += 7
+    return content
+
+
+def nobody(content):
+    for annotation in content["annotations"]:
+        annotation["keypoint_scores"] = [0.0] * 12
+    return content
+
+
+BAD_OBSERVATIONS = {
+    "malformed": (lambda content: "{'images': []}", ["JSON"]),
+    "truncated": (lambda content: json.dumps(content)[:-200], ["JSON"]),
+    "nan": (keypoints_with(float("nan")), ["annotations[0].keypoints", "nan"]),
+    "infinite": (keypoints_with(float("inf")), ["annotations[0].keypoints", "inf"]),
+    "score": (first_annotation(keypoint_scores=[1.5] * 12), ["keypoint_scores", "1.5"]),
+    "count": (first_annotation(keypoints=[1, 2, 2]), ["keypoints", "3 numbers, not 36"]),
+    "names": (renamed, ["lack bill_tip", "beak"]),
+    "fewer keypoints": (one_keypoint_less, ["lack right_foot"]),
+    "mask size": (other_size, ["segmentation", "size"]),
+    "duplicate": (doubled, ["track_id 4", "twice"]),
+    "no usable frame": (nobody, ["no track has a frame"]),
+}
+
+
+@pytest.mark.parametrize("name", BAD_OBSERVATIONS)
+def test_observations_that_cannot_be_used(inputs, tmp_path, capsys, name):
+    change, words = BAD_OBSERVATIONS[name]
+    content = change(json.loads((inputs / "birds.json").read_text()))
+    path = tmp_path / "bad.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    refused(capsys, arguments(inputs, tmp_path / "out", obs=path), str(path), *words)
+    assert not (tmp_path / "out").exists()
+
+
+class Evil:
+    """Unpickled, it would leave a file behind."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+def test_models_that_cannot_be_used(inputs, tmp_path, capsys):
+    whole = (inputs / "toy.npz").read_bytes()
+    mark = tmp_path / "it ran"
+    with np.load(inputs / "toy.npz") as arrays:
+        kept = dict(arrays)
+    np.savez(tmp_path / "newer.npz", **(kept | {"format_version": np.int32(99)}))
+    np.savez(tmp_path / "objects.npz", **(kept | {"name": np.array([Evil(mark)], dtype=object)}))
+    (tmp_path / "truncated.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "evil.npz").write_bytes(pickle.dumps(Evil(mark)))
+    (tmp_path / "evil.pt").write_bytes(pickle.dumps(Evil(mark)))
+    (tmp_path / "empty.npz").write_bytes(b"")
+    for name, words in (
+        ("newer", ["99", "newer jaxfit"]),
+        ("objects", ["Python objects"]),
+        ("truncated", []),
+        ("evil", []),
+        ("empty", []),
+        ("absent", []),
+    ):
+        path = tmp_path / f"{name}.npz"
+        refused(capsys, arguments(inputs, tmp_path / "out", model=path), str(path), *words)
+        refused(capsys, ["model", "info", str(path)], str(path), *words)
+    refused(capsys, ["model", "import", "aves", str(tmp_path / "evil.pt"), "--out", str(tmp_path / "m.npz")], "evil.pt")
+    assert not mark.exists(), "code from the file was run"
+    assert not (tmp_path / "m.npz").exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_configs_and_starts_that_cannot_be_used(inputs, tmp_path, capsys):
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("base: paper\nwindows: 3\n")
+    refused(capsys, arguments(inputs, tmp_path / "out", config=bad), str(bad), "`windows`", "window")
+    (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04")
+    command = [*arguments(inputs, tmp_path / "out"), "--init", str(tmp_path / "cut.npz")]
+    refused(capsys, command, "cut.npz")
+    assert not (tmp_path / "out").exists()

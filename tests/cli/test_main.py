@@ -1,0 +1,273 @@
+"""The command line from end to end, and one clear line for every input that cannot be used."""
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from support.cli_files import BIRD, T, arguments, refused
+
+from jaxfit.cli import fitting
+from jaxfit.cli import main as cli
+from jaxfit.cli.main import main
+from jaxfit.data.solution import load_solution
+from jaxfit.model.files import load_bird
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+@pytest.fixture(scope="module")
+def fitted(inputs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("results") / "deep" / "out"
+    assert main(arguments(inputs, out)) == 0
+    return out
+
+
+def test_fit_writes_a_whole_result(fitted, inputs, capsys):
+    assert sorted(p.name for p in fitted.iterdir()) == ["config.yaml", "model.npz", "poses.npz", "summary.json"]
+    solution, bird = load_solution(fitted)
+    assert solution.track_id.tolist() == [4, 7, 9]
+    assert solution.status.tolist() == ["ok", "ok", "no usable frame"]
+    assert bird.keypoint_names == BIRD.keypoint_names
+    summary = json.loads((fitted / "summary.json").read_text())
+    assert summary["status"] == {"ok": 2, "no usable frame": 1}
+    assert summary["track_status"]["9"] == "no usable frame"
+    assert (summary["tracks"], summary["poses"], summary["model"]["name"]) == (3, 2 * T, "toy")
+    assert summary["seconds"]["fit"] > 0
+    assert {"jaxfit", "jax", "python"} <= set(summary["versions"])
+    assert "only" in (fitted / "config.yaml").read_text()
+
+
+def test_what_fit_says(inputs, tmp_path, capsys):
+    assert main(arguments(inputs, tmp_path / "out")) == 0
+    said = capsys.readouterr().out
+    assert "no usable frame" in said
+    assert "12 poses of 3 birds (2 ok, 1 no usable frame)" in said
+    assert str(tmp_path / "out") in said.replace("\n", "")
+
+
+def test_the_config_as_run_gives_the_same_again(fitted, inputs, tmp_path):
+    command = arguments(inputs, tmp_path / "again")
+    command[command.index("--config") + 1] = str(fitted / "config.yaml")
+    assert main(command) == 0
+    a, b = load_solution(fitted)[0], load_solution(tmp_path / "again")[0]
+    np.testing.assert_array_equal(a.keypoints_2d, b.keypoints_2d)
+
+
+def test_evaluate(fitted, inputs, tmp_path, capsys):
+    capsys.readouterr()
+    assert main(["evaluate", str(fitted), "--truth", str(inputs / "birds.json"), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert {"pck@0.05", "pck@0.10", "iou", "me_p", "me_v"} <= set(result)
+    assert result["pck@0.05"] == 1
+    assert 0.8 < result["iou"] <= 1
+    assert 0 < result["me_p"] < 0.02
+    assert 0 < result["me_v"] < 0.02
+    assert (result["frames"], result["missing"]) == (2 * T, T)
+    assert set(result["tracks"]) == {"4", "7"}
+    assert main(["evaluate", str(fitted), "--truth", str(inputs / "birds.json")]) == 0
+    table = capsys.readouterr().out
+    assert "pck@0.05" in table
+    assert f"{result['me_p']:.4f}" in table
+    assert f"{T} annotated birds without a pose" in table
+    assert "the truth lacks" not in table
+    content = json.loads((inputs / "birds.json").read_text())
+    content["annotations"] = [a for a in content["annotations"] if a["track_id"] == 4]
+    (tmp_path / "one.json").write_text(json.dumps(content))
+    assert main(["evaluate", str(fitted), "--truth", str(tmp_path / "one.json")]) == 0
+    assert f"{T} poses of tracks or frames that the truth lacks" in capsys.readouterr().out
+
+
+def test_fit_goes_on_from_an_earlier_result(fitted, inputs, tmp_path):
+    command = [*arguments(inputs, tmp_path / "out"), "--init", str(fitted / "poses.npz")]
+    content = (inputs / "birds.json").read_text()
+    kept = json.loads(content)
+    kept["annotations"] = [a for a in kept["annotations"] if a["track_id"] != 9]  # it has no start
+    command[1] = str(tmp_path / "two.json")
+    Path(command[1]).write_text(json.dumps(kept))
+    assert main(command) == 0
+    a, b = load_solution(fitted)[0], load_solution(tmp_path / "out")[0]
+    assert (b.loss["keypoints"] <= a.loss["keypoints"][:2]).all()
+
+
+def test_import_and_info(reference_dir, tmp_path, capsys):
+    for kind, folder, keypoints in (("aves", "aves", 18), ("avian-mesh", "avian_mesh", 12)):
+        out = tmp_path / f"{kind}.npz"
+        assert main(["model", "import", kind, str(reference_dir / "models" / folder), "--out", str(out)]) == 0
+        assert f"{keypoints} keypoints" in capsys.readouterr().out
+        assert load_bird(out).num_keypoints == keypoints
+        assert main(["model", "info", str(out), "--json"]) == 0
+        assert "vertices" in json.loads(capsys.readouterr().out)
+        assert main(["model", "info", str(out)]) == 0
+        assert "vertices" in capsys.readouterr().out
+    refused(capsys, ["model", "info", str(tmp_path / "absent.npz")], "absent.npz")
+    sources = str(reference_dir / "models" / "avian_mesh")
+    refused(capsys, ["model", "import", "aves", sources, "--out", str(tmp_path / "x.npz")], "aves.pt")
+    assert not (tmp_path / "x.npz").exists()
+
+
+def contents(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+def test_results_are_not_overwritten_unasked(fitted, inputs, tmp_path, capsys, monkeypatch):
+    before = contents(fitted)
+
+    def no_work(*_, **__):
+        raise AssertionError("refused before the work, not after it")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("jaxfit.fitting.fit.fit", no_work)
+        refused(capsys, arguments(inputs, fitted), str(fitted), "overwrite")
+        (tmp_path / "thesis").mkdir()
+        (tmp_path / "thesis" / "thesis.tex").write_text("precious")
+        refused(capsys, [*arguments(inputs, tmp_path / "thesis"), "--overwrite"], "thesis")
+    assert contents(fitted) == before
+    assert (tmp_path / "thesis" / "thesis.tex").read_text() == "precious"
+
+
+def test_a_full_disk_loses_nothing(fitted, inputs, tmp_path, capsys, monkeypatch):
+    before = contents(fitted)
+
+    def full(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        refused(capsys, arguments(inputs, tmp_path / "new" / "out"), "No space left", "free some space", alone=False)
+        refused(capsys, [*arguments(inputs, fitted), "--overwrite"], "No space left", alone=False)
+    assert contents(fitted) == before
+    assert not (tmp_path / "new").exists()
+    assert [p.name for p in fitted.parent.iterdir()] == [fitted.name]
+    assert main([*arguments(inputs, fitted), "--overwrite"]) == 0
+
+
+def test_ctrl_c_leaves_nothing_behind(fitted, inputs, tmp_path, capsys, monkeypatch):
+    @contextmanager
+    def impatient(_name, _total):
+        ticks = []
+
+        def tick(_done, _note):
+            ticks.append(None)
+            if len(ticks) == 3:
+                raise KeyboardInterrupt
+
+        yield tick
+
+    monkeypatch.setattr(fitting, "terminal", impatient)
+    before = contents(fitted)
+    refused(capsys, arguments(inputs, tmp_path / "out"), "stopped", code=130, alone=False)
+    refused(capsys, [*arguments(inputs, fitted), "--overwrite"], "stopped", code=130, alone=False)
+    assert [p.name for p in tmp_path.iterdir() if p.name != "cache"] == []
+    assert contents(fitted) == before
+
+
+# shells start background jobs, and so perhaps these tests, with signals ignored
+HEED = "import os, signal, sys; signal.signal(int(sys.argv[1]), signal.SIG_DFL); os.execv(sys.argv[2], sys.argv[2:])"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_process_ends_in_order(number, tmp_path):
+    """A real one, stopped while it works."""
+    script = Path(sys.executable).with_name("jaxfit")
+    command = [sys.executable, "-c", HEED, str(int(number)), script, "simulate", "--frames", "1000", "--out", "scene"]
+
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        patience = time.monotonic() + 120
+        while not list(tmp_path.glob(".scene.*.part")):
+            assert process.poll() is None
+            assert time.monotonic() < patience
+            time.sleep(0.1)
+        process.send_signal(number)
+        said = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, said
+    assert said.endswith("jaxfit: stopped; nothing half-written is left\n")
+    assert not list(tmp_path.glob("*scene*"))
+
+
+def test_an_interrupt_that_compiled_code_turns_into_an_error():
+    code = """
+import os, signal, time
+from jaxfit.cli import main as cli
+
+def main():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        raise TypeError from None
+
+cli.main = main
+cli.run()
+"""
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{code}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; nothing half-written is left\n")
+
+
+def test_an_interrupt_that_the_garbage_collector_loses():
+    code = """
+import gc, os, signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from jaxfit.cli import main as cli
+
+def lose(phase, info):
+    gc.callbacks.remove(lose)
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.01)
+
+def main():
+    gc.callbacks.append(lose)
+    try:
+        gc.collect()
+        time.sleep(60)
+    except KeyboardInterrupt:
+        return cli._stopped()
+
+cli.main = main
+cli.run()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=50)
+    assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; nothing half-written is left\n")
+
+
+def test_results_that_cannot_be_evaluated(fitted, inputs, tmp_path, capsys):
+    truth = str(inputs / "birds.json")
+    refused(capsys, ["evaluate", str(tmp_path / "absent"), "--truth", truth], "absent")
+    refused(capsys, ["evaluate", str(inputs), "--truth", truth], "poses.npz")
+    refused(capsys, ["evaluate", str(fitted), "--truth", str(tmp_path / "no.json")], "no.json")
+    content = json.loads((inputs / "birds.json").read_text())
+    for annotation in content["annotations"]:
+        annotation["track_id"] += 100
+    (tmp_path / "others.json").write_text(json.dumps(content))
+    others = ["--truth", str(tmp_path / "others.json")]
+    refused(capsys, ["evaluate", str(fitted), *others, "--match", "ids"], "shares no bird")
+    assert main(["evaluate", str(fitted), *others]) == 0  # the same birds by other names, in the same places
+    assert "4 → 104" in capsys.readouterr().out
+
+
+def test_compiled_programs_are_kept_for_the_next_run(tmp_path):
+    cli.use_cache()
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "jaxfit")
+
+
+def test_the_installed_command_works_anywhere(inputs, tmp_path):
+    """Shipped configs go by name from any folder; the observations' fault is found after the config's."""
+    script = Path(sys.executable).with_name("jaxfit")
+    (tmp_path / "bad.json").write_text("{")
+    tail = ["--model", str(inputs / "toy.npz"), "--out", "out"]
+    for config, expected in (("paper", "bad.json: "), ("papr", "papr: cannot read this config")):
+        command = [script, "fit", "bad.json", "--config", config, *tail]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 2, done.stderr
+        assert done.stderr.strip().splitlines()[-1].startswith(f"jaxfit: {expected}")
+        assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()

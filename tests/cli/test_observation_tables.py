@@ -1,0 +1,50 @@
+"""`jaxfit evaluate` of observations, and what it says of matched tracks."""
+
+import json
+
+from support.rectangles import birds, steady
+
+from jaxfit.cli import main as cli
+from jaxfit.cli.observation_tables import matching_line
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.evaluation.matching import Matching
+
+LEFT, RIGHT = (0, 0, 30, 20), (60, 0, 30, 20)
+
+
+def files(folder):
+    """Two birds over four frames, one of them found in three; it is hidden in the last frame of the truth."""
+    truth = {1: steady(LEFT, range(4)), 2: steady(RIGHT, range(4))}
+    write_coco(birds(truth, range(4), visible={(1, 3): (0, 0, 2, 2)}), folder / "truth.json")
+    found = {5: steady(LEFT, range(2)), 9: steady(RIGHT, range(4))}
+    write_coco(birds(found, range(4), names=("bill", "crown")), folder / "found.json")
+    return ["evaluate", str(folder / "found.json"), "--truth", str(folder / "truth.json")]
+
+
+def test_tables(tmp_path, capsys):
+    assert cli.main(files(tmp_path)) == 0
+    printed = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in printed.splitlines() if line.startswith("│")]
+    assert rows == [
+        ["4", "7", "6", "0.8515", "0.8515", "1.0000", "0.8571", "1.0000"],  # 86 of 101 recalls
+        ["bill", "6", "1.0000", "1.0000", "6", "1.0000", "1.0000"],
+        ["all", "6", "1.0000", "1.0000", "6", "1.0000", "1.0000"],
+        # 6 matches of 7 birds; association: 4 matches of 4 frames, 2 of 3
+        ["0.8729", "0.8571", "0.8889", "0.8571", "0.9231", "0", "0"],
+    ]
+    assert "no figure counts 1 bird hardly to be seen\n" in printed
+
+
+def test_json(tmp_path, capsys):
+    assert cli.main([*files(tmp_path), "--json"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["counts"]["ignored"] == 1
+    assert figures["keypoints"]["bill"]["visible"] == 6
+    assert figures["tracking"]["switches"] == 0
+    assert figures["detection"]["recall"] == 6 / 7
+
+
+def test_whose_track_is_whose():
+    line = matching_line(Matching("overlap", {3: 1, 8: 2}, [4, 5], [6]))
+    assert "3 → 1, 8 → 2; tracks that follow nobody: 4, 5; birds that no track follows: 6" in line
+    assert matching_line(Matching("overlap", {}, [], [])).endswith(": none")

@@ -1,0 +1,180 @@
+"""The commands around simulated scenes, from end to end."""
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+from support.cli_files import refused
+
+from jaxfit import Observations, load_reconstruct_config, pipeline, read_coco
+from jaxfit.cli import demo
+from jaxfit.cli.main import main
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
+from jaxfit.perception import track
+from jaxfit.perception.instances import instance_of
+from jaxfit.video.reader import probe_video
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+SMALL = ["--birds", "2", "--frames", "5", "--size", "480x280"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "scene"
+    assert main(["simulate", *SMALL, "--out", str(folder)]) == 0
+    return folder
+
+
+def test_a_scene_measured_against_itself(scene, capsys):
+    assert main(["evaluate", str(scene / "truth"), "--truth", str(scene), "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["me_p"] == 0
+    assert result["mpjpe"] < 1e-4
+    assert result["frames_3d"] == 10
+    assert main(["evaluate", str(scene / "truth"), "--truth", str(scene)]) == 0
+    tables = capsys.readouterr().out
+    for heading in ("me_v", "MPJPE", "PA-MPJPE", "orient. °", "size %"):
+        assert heading in tables
+    assert [line.split()[1] for line in tables.splitlines() if " from " in line or " to " in line][:2] == ["from", "to"]
+    assert "stand" not in tables
+    assert result["intervals"]["me_p"] == [0, 0]
+    assert sum(row["frames"] for row in result["behaviours"].values()) == result["frames"]
+
+
+def test_figures_by_behaviour_and_keypoint(scene, capsys):
+    command = ["evaluate", str(scene / "truth"), "--truth", str(scene), "--by"]
+    assert main([*command, "keypoint"]) == 0
+    tables = capsys.readouterr().out
+    assert all(name in tables for name in MURRE_KEYPOINTS)
+    assert main([*command, "behaviour"]) == 0
+    assert "stand" in capsys.readouterr().out
+    command[3] = str(scene / "truth.json")
+    refused(capsys, [*command, "behaviour"], "truth.json", "does not say what the birds do", "--by behaviour")
+    command[1] = str(scene / "detections.json")
+    refused(capsys, [*command, "keypoint"], "detections.json", "holds observations")
+
+
+def test_an_overlay_of_the_truth(scene, tmp_path, capsys):
+    out = tmp_path / "overlay.mp4"
+    command = ["overlay", str(scene / "truth"), "--video", str(scene / "footage.mp4"), "--out", str(out)]
+    assert main([*command, "--side-views", "--observations", str(scene / "detections.json")]) == 0
+    assert probe_video(out).frames == 5
+    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr().out.replace("\n", "")
+    refused(capsys, command, "overlay.mp4", "exists already", "--overwrite")
+    assert main([*command, "--overwrite"]) == 0
+    assert str(out) in said
+    assert str(out.with_suffix(".png")) in said
+
+
+def test_a_frame_of_the_overlay(scene, tmp_path, capsys):
+    out = tmp_path / "frame.png"
+    command = ["overlay", str(scene / "truth"), "--video", str(scene / "footage.mp4"), "--out", str(out), "--frame"]
+    assert main([*command, "3"]) == 0
+    picture = cv2.imread(str(out))
+    assert picture.shape[1] == 480
+    refused(capsys, [*command, "3"], "frame.png", "--overwrite")
+    refused(capsys, [*command, "5", "--overwrite"], "no frame 5")
+    command[command.index(str(out))] = str(tmp_path / "frame.tiff")
+    refused(capsys, [*command, "3"], "frame.tiff", ".png")
+
+
+def test_overlays_that_cannot_be_drawn(scene, tmp_path, capsys):
+    def command(video: Path) -> list[str]:
+        return ["overlay", str(scene / "truth"), "--video", str(video), "--out", str(tmp_path / "o.mp4")]
+
+    refused(capsys, command(tmp_path / "none.mp4"), "none.mp4", alone=False)
+    refused(capsys, command(scene / "truth.json"), "truth.json", alone=False)
+    assert main(["simulate", *SMALL[:2], "--frames", "3", "--size", "480x280", "--out", str(tmp_path / "short")]) == 0
+    refused(capsys, command(tmp_path / "short" / "footage.mp4"), "footage.mp4", alone=False)
+    assert not (tmp_path / "o.mp4").exists()
+
+
+def test_a_scene_is_not_overwritten_unasked(scene, tmp_path, capsys):
+    before = (scene / "truth.json").read_bytes()
+    refused(capsys, ["simulate", *SMALL, "--seed", "8", "--out", str(scene)], "overwrite", alone=False)
+    assert (scene / "truth.json").read_bytes() == before
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "thesis.tex").write_text("precious")
+    refused(capsys, ["simulate", *SMALL, "--out", str(tmp_path / "thesis"), "--overwrite"], "thesis", alone=False)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "word"),
+    [("--birds", "0", "birds"), ("--size", "wide", "size"), ("--size", "12x8", "size"), ("--seed", "-3", "seed")],
+)
+def test_scenes_that_make_no_sense(option, value, word, tmp_path, capsys):
+    refused(capsys, ["simulate", "--out", str(tmp_path / "s"), option, value], word)
+    assert not (tmp_path / "s").exists()
+
+
+def test_the_murre_has_six_sides(tmp_path, capsys):
+    out = tmp_path / "views.png"
+    assert main(["model", "view", "murre", "--posture", "standing", "--out", str(out)]) == 0
+    assert out.read_bytes().startswith(b"\x89PNG")
+    refused(capsys, ["model", "view", "murre", "--posture", "dancing", "--out", str(out)], "dancing", "standing")
+    assert main(["model", "info", "murre"]) == 0
+
+
+def test_the_demo_leaves_other_folders_alone(tmp_path, capsys):
+    (tmp_path / "overlay.mp4").write_text("precious")
+    refused(capsys, ["demo", "--out", str(tmp_path)], "no earlier demo")
+    refused(capsys, ["demo", "--out", str(tmp_path / "overlay.mp4")], "is a file")
+    assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == ["overlay.mp4"]
+
+
+def test_one_bird_is_singular(tmp_path, capsys):
+    size = ["--size", "480x280"]
+    assert main(["simulate", "--birds", "1", "--frames", "2", *size, "--out", str(tmp_path / "one")]) == 0
+    assert "1 bird over 2 frames: " in capsys.readouterr().out
+
+
+class TrueToTheScene:
+    """Stands in for both networks: the truth of a demo's scene, frame after frame."""
+
+    class_names, keypoint_names = ("bird",), MURRE_KEYPOINTS
+
+    def __init__(self, folder):
+        self.truth, self.t = folder / "scene" / "truth.json", -1
+
+    def __call__(self, frame, instances=None):
+        if instances is None:
+            self.truth = self.truth if isinstance(self.truth, Observations) else read_coco(self.truth)
+            self.t += 1
+            masks = {n: self.truth.mask(n, self.t) for n in range(self.truth.num_tracks)}
+            self.found = {n: instance_of(mask, 0.9, "bird") for n, mask in masks.items() if mask is not None}
+            return list(self.found.values())
+        rows = [next(n for n, bird in self.found.items() if bird is instance) for instance in instances]
+        return self.truth.keypoints_px[rows, self.t], self.truth.confidence[rows, self.t]
+
+
+def test_the_demo_leaves_what_it_names(tmp_path, monkeypatch, capsys):
+    (tmp_path / "quick.yaml").write_text(
+        "base: reconstruct\ntrack: {min_track_frames: 2}\nfit:\n  base: paper\n  stages:\n"
+        "    - {name: only, steps: 200, terms: [keypoints, pose_prior], step_scale: {transl: [1, 1, 0]}}\n"
+    )
+
+    def open_one(_):
+        opened.append(TrueToTheScene(tmp_path / "demo"))
+        return opened[-1]
+
+    opened = []
+    monkeypatch.setattr(demo, "load_reconstruct_config", lambda: load_reconstruct_config(tmp_path / "quick.yaml"))
+    monkeypatch.setattr(pipeline, "open_keypoint_detector", open_one)
+    monkeypatch.setattr(track, "open_segmenter", lambda _: opened[-1])
+    monkeypatch.setattr(pipeline, "network_files", lambda _: {})
+    monkeypatch.setattr(demo, "BIRDS", 2)
+    monkeypatch.setattr(demo, "FRAMES", 5)
+    monkeypatch.setattr(demo, "SIZE", (480, 280))
+    for _ in range(2):  # a second demo replaces the first
+        assert main(["demo", "--out", str(tmp_path / "demo")]) == 0
+    said = capsys.readouterr().out.replace("\n", "")
+    for name in ("result/overlay.mp4", "result/overlay.png", "result", "scene", "evaluation.json"):
+        assert (tmp_path / "demo" / name).exists()
+        assert str(tmp_path / "demo" / name) in said
+    assert "PA-MPJPE" in said
+    metrics = json.loads((tmp_path / "demo" / "evaluation.json").read_text())
+    assert metrics["mpjpe"] > 0
+    assert metrics["detection"]["mean_iou"] == 1
+    assert metrics["tracking"]["idf1"] == 1

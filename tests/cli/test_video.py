@@ -1,0 +1,179 @@
+"""`track` and `reconstruct` from end to end, with stand-ins for the networks, and what they refuse."""
+
+import json
+
+import numpy as np
+import pytest
+from support.cli_files import refused
+from support.onnx_graphs import write_constant
+from support.toy_footage import BIRD, BIRDS, FRAMES, QUICK, SIDE, Footage, TrueKeypoints, TrueSegmenter
+
+from jaxfit import load_reconstruct_config, load_solution, pipeline, read_coco
+from jaxfit.cli.main import main
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
+from jaxfit.model.files import save_bird
+from jaxfit.perception import track
+from jaxfit.video.reader import probe_video
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+FOOTAGE = Footage()
+EVERYONE = [(t, n) for t in range(FRAMES) for n in range(BIRDS)]
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("inputs")
+    FOOTAGE.write(folder / "frames")
+    save_bird(BIRD, folder / "toy.npz")
+    (folder / "quick.yaml").write_text(QUICK)
+    (folder / "notes.txt").write_text("no video")
+    return folder
+
+
+@pytest.fixture
+def networks(monkeypatch):
+    """The networks that a config names are stand-ins; returns the birds that they miss."""
+    missed = []
+    monkeypatch.setattr(track, "open_segmenter", lambda *_: TrueSegmenter(FOOTAGE, missed))
+    for module in (track, pipeline):
+        monkeypatch.setattr(module, "open_keypoint_detector", lambda _: TrueKeypoints(FOOTAGE))
+    monkeypatch.setattr(pipeline, "network_files", lambda _: {})
+    return missed
+
+
+def command(inputs, name, out, *more):
+    at = [str(inputs / "frames"), "--config", str(inputs / "quick.yaml"), "--out", str(out)]
+    return [name, *at, *(["--model", str(inputs / "toy.npz")] if name == "reconstruct" else []), *more]
+
+
+@pytest.mark.usefixtures("networks")
+def test_track_writes_what_was_there(inputs, tmp_path, capsys):
+    out = tmp_path / "deep" / "obs.json"
+    assert main(command(inputs, "track", out, "--start", "2", "--stop", "11", "--step", "2")) == 0
+    found = read_coco(out)
+    assert found.frame_index.tolist() == [2, 4, 6, 8, 10]
+    assert found.present.all()
+    columns = (found.keypoints_px[:, 0, 0, 0] // SIDE).astype(int)
+    truth = np.moveaxis(FOOTAGE.keypoints_px, 1, 0)[columns][:, 2:11:2]
+    np.testing.assert_array_equal(found.keypoints_px, truth.astype(np.float32))
+    said = capsys.readouterr().out
+    assert "3 birds over 5 frames" in said.replace("\n", "")
+    for heading in ("coverage", "confidence", "jitter"):
+        assert heading in said
+
+
+@pytest.mark.usefixtures("networks")
+def test_track_replaces_nothing_unasked(inputs, tmp_path, capsys):
+    out = tmp_path / "obs.json"
+    out.write_text("precious")
+    refused(capsys, command(inputs, "track", out), "obs.json", "exists already", "--overwrite")
+    refused(capsys, command(inputs, "track", inputs / "frames" / "o.json"), "among the video's images")
+    assert out.read_text() == "precious"
+    assert main(command(inputs, "track", out, "--overwrite")) == 0
+    assert read_coco(out).num_tracks == BIRDS
+
+
+def test_short_tracks_are_told(inputs, tmp_path, networks, capsys):
+    networks += [(t, 2) for t in range(2, FRAMES)]
+    assert main(command(inputs, "track", tmp_path / "obs.json")) == 0
+    assert "left out: 1 track of fewer than 3 frames: 1 (2)" in capsys.readouterr().out
+
+
+def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
+    """Tracking leaves an empty, valid file and says why; there is nothing to reconstruct."""
+    networks += EVERYONE
+    out = tmp_path / "obs.json"
+    assert main(command(inputs, "track", out)) == 0
+    (message,) = caplog.messages
+    assert "no bird was found in 12 frames" in message
+    assert "min_score" in message
+    content = json.loads(out.read_text())
+    assert (len(content["images"]), content["annotations"]) == (FRAMES, [])
+    assert "0 birds over 12 frames" in capsys.readouterr().out.replace("\n", "")
+    words = "no bird was found in 12 frames", "min_score"
+    refused(capsys, command(inputs, "reconstruct", tmp_path / "result"), *words, alone=False)
+    assert not (tmp_path / "result").exists()
+
+
+def test_a_reconstruction(inputs, tmp_path, networks, capsys):
+    """Every file is there and reads back; a bird that was hardly seen is told."""
+    networks += [(t, 2) for t in range(2, FRAMES)]
+    out = tmp_path / "result"
+    assert main(command(inputs, "reconstruct", out, "--stop", "10", "--classes", "bird,duck")) == 0
+    solution, bird = load_solution(out)
+    found = read_coco(out / "observations.json")
+    assert bird.keypoint_names == BIRD.keypoint_names
+    assert (found.num_tracks, found.num_frames) == (2, 10)
+    assert solution.valid.all()
+    assert solution.track_id.tolist() == found.track_id.tolist()
+    assert probe_video(out / "overlay.mp4").frames == 10
+    assert (out / "overlay.png").read_bytes().startswith(b"\x89PNG")
+    config = load_reconstruct_config(out / "config.yaml")
+    assert config.track.frames.stop == 10
+    assert config.track.segmenter.classes == ("bird", "duck")
+    assert (config.track.min_track_frames, config.fit.window) == (3, 12)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["short_tracks"] == {"1": 2}
+    assert set(summary["seconds"]) == {"load", "track", "fit", "overlay"}
+    assert summary["quality"][str(found.track_id[0])]["coverage"] == 1
+    assert summary["video"]["frames"] == FRAMES
+    assert "onnxruntime" in summary["versions"]
+    said = capsys.readouterr().out
+    assert "left out: 1 track" in said
+    for name in ("overlay.mp4", "overlay.png", "observations.json", "poses.npz"):
+        assert str(out / name) in said.replace("\n", "")
+    again = command(inputs, "reconstruct", out)
+    refused(capsys, again, "holds results already", "--overwrite")
+    assert main(["evaluate", str(out), "--truth", str(out / "observations.json")]) == 0
+
+
+@pytest.mark.usefixtures("networks")
+def test_an_interrupt_leaves_nothing(inputs, tmp_path, monkeypatch, capsys):
+    def stopped(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pipeline, "overlay", stopped)
+    assert main(command(inputs, "reconstruct", tmp_path / "result")) == 130
+    assert "nothing half-written" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == []
+
+
+@pytest.mark.usefixtures("networks")
+def test_the_footage_is_not_replaced(inputs, capsys):
+    refused(capsys, command(inputs, "reconstruct", inputs, "--overwrite"), "holds the video", "another --out")
+    assert (inputs / "frames" / "0.png").is_file()
+
+
+@pytest.mark.usefixtures("networks")
+def test_keypoints_of_another_model(inputs, tmp_path, capsys):
+    wrong = command(inputs, "reconstruct", tmp_path / "result")[:-2]  # the murre, not the toy
+    refused(capsys, wrong, "keypoints lack", "another model")
+    assert not (tmp_path / "result").exists()
+
+
+@pytest.mark.parametrize("name", ["track", "reconstruct"])
+def test_what_cannot_be_tracked(name, inputs, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+
+    def told(*words, video="frames", more=()):
+        refused(capsys, [name, str(inputs / video), "--out", str(out), *map(str, more)], *words)
+
+    told("none.mp4: does not exist", video="none.mp4")
+    told("notes.txt: is no video", video="notes.txt")
+    told("`stop` is 3", more=["--start", 4, "--stop", 3])
+    told("none.yaml", "cannot read", more=["--config", tmp_path / "none.yaml"])
+    (tmp_path / "bad.yaml").write_text("base: reconstruct\ntrack: {segmentor: x}\n")
+    told("bad.yaml", "`track.segmentor`", more=["--config", tmp_path / "bad.yaml"])
+    told("paper", "says how to fit", more=["--config", "paper"])
+    told("notes.txt", "ONNX", more=["--keypoints", inputs / "notes.txt"])
+    keypoints = TrueKeypoints(FOOTAGE)
+    keypoints.keypoint_names = MURRE_KEYPOINTS
+    for module in (track, pipeline):
+        monkeypatch.setattr(module, "open_keypoint_detector", lambda _: keypoints)
+    told("notes.txt", "ONNX", more=["--segmenter", inputs / "notes.txt"])
+    strange = write_constant(tmp_path / "strange.onnx", (1, 3, 8, 8), {"logits": np.zeros(9)})
+    told("strange.onnx: has no layout that is known", "logits (1, 9)", "yolo:", more=["--segmenter", strange])
+    layout = {"output0": np.zeros((116, 84)), "output1": np.zeros((32, 16, 16))}
+    coco = write_constant(tmp_path / "coco.onnx", (1, 3, 64, 64), layout)
+    told("lacks duck", "its classes are person", more=["--segmenter", coco, "--classes", "bird,duck"])
+    assert not out.exists()

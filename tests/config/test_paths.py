@@ -1,0 +1,83 @@
+"""Values of a config by their paths: what is set, what is left alone, and what leads nowhere."""
+
+import dataclasses
+
+import pytest
+
+from jaxfit.config.paths import get_value, with_values
+from jaxfit.config.schema import load_config
+from jaxfit.config.yaml_file import ConfigKeyError
+
+PAPER = load_config("paper")
+
+
+def test_no_value_changes_nothing():
+    assert with_values(PAPER, {}) == PAPER
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "expected"),
+    [
+        ("window", 50, dataclasses.replace(PAPER, window=50)),
+        ("crop.padding", 0.5, dataclasses.replace(PAPER, crop=dataclasses.replace(PAPER.crop, padding=0.5))),
+        ("terms.velocity", 7, dataclasses.replace(PAPER, terms={**PAPER.terms, "velocity": 7})),
+        # a weight leaves a term's settings alone, and a setting its weight
+        (
+            "terms.keypoints",
+            3,
+            dataclasses.replace(PAPER, terms={**PAPER.terms, "keypoints": {"weight": 3, "sigma_px": 50}}),
+        ),
+        (
+            "terms.velocity.beta_global",
+            4.0,
+            dataclasses.replace(PAPER, terms={**PAPER.terms, "velocity": {"weight": 100, "beta_global": 4.0}}),
+        ),
+        # a term that the config does not weigh yet
+        ("terms.bone_prior", 2, dataclasses.replace(PAPER, terms={**PAPER.terms, "bone_prior": 2})),
+    ],
+)
+def test_one_value(path, value, expected):
+    assert with_values(PAPER, {path: value}) == expected
+
+
+@pytest.mark.parametrize("path", ["stages.mask.steps", "stages[1].steps", "stages.1.steps"])
+def test_a_stage_by_name_or_number(path):
+    changed = with_values(PAPER, {path: 9})
+    assert [stage.steps for stage in changed.stages] == [600, 9]
+    assert get_value(changed, path) == 9
+
+
+def test_a_value_may_follow_another_whatever_the_order():
+    for order in (1, -1):
+        values = dict([("terms.acceleration", "=terms.velocity"), ("terms.velocity", 5)][::order])
+        changed = with_values(PAPER, values)
+        assert (changed.terms["velocity"], changed.terms["acceleration"]) == (5, 5)
+
+
+def test_the_value_of_a_term_is_its_weight():
+    assert get_value(PAPER, "terms.keypoints") == 1
+    assert get_value(PAPER, "terms.keypoints.sigma_px") == 50
+    assert get_value(PAPER, "common_size") is True
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"windw": 1}, ("windw", "window")),
+        ({"crop.sze_px": 1}, ("crop.sze_px", "size_px")),
+        ({"window.frames": 1}, ("window.frames",)),
+        ({"nothing.here": 1}, ("nothing.here",)),
+        ({"stages.msk.steps": 1}, ("msk", "keypoints, mask")),
+        ({"stages[2].steps": 1}, ("'2'", "keypoints, mask")),
+        ({"window": "=no.such"}, ("no.such",)),
+        ({"window": "=terms.no_such"}, ("terms.no_such", "not set")),
+        ({"window": 0}, ("window", "1 or more")),
+        ({"terms.no_such": 1}, ("no_such",)),
+        ({"terms.velocity.no_such": 1}, ("no_such",)),
+    ],
+)
+def test_what_leads_nowhere(values, words):
+    with pytest.raises(ConfigKeyError) as refusal:
+        with_values(PAPER, values)
+    for word in words:
+        assert word in str(refusal.value)

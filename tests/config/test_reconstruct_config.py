@@ -1,0 +1,121 @@
+"""The config of a reconstruction: what ships names every knob, parts have bases of their own, mistakes are named."""
+
+import dataclasses
+from importlib import resources
+
+import pytest
+import yaml
+
+from jaxfit.config.perception import TrackConfig
+from jaxfit.config.schema import OverlayConfig, config_to_yaml, load_config, load_reconstruct_config
+from jaxfit.errors import InputError
+
+
+def written(tmp_path, text, name="mine.yaml"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def keys(values, where=""):
+    for key, value in values.items():
+        yield f"{where}{key}"
+        if isinstance(value, dict):
+            yield from keys(value, f"{where}{key}.")
+
+
+def test_the_shipped_file_names_every_knob_at_its_default():
+    shipped = yaml.safe_load((resources.files("jaxfit") / "configs" / "reconstruct.yaml").read_text(encoding="utf-8"))
+    config = load_reconstruct_config()
+    every = {key for key in keys(yaml.safe_load(config_to_yaml(config))) if not key.startswith("fit.")}
+    assert set(keys(shipped)) == every
+    assert (config.track, config.overlay, config.fit) == (TrackConfig(), OverlayConfig(), load_config("paper"))
+    assert not config.track.repair_swaps  # the paper's setting
+
+
+def test_round_trip(tmp_path):
+    text = "base: reconstruct\nfit: aves\ntrack: {frames: {stop: 7}, segmenter: {classes: [bird], tile_px: 640}}\n"
+    config = load_reconstruct_config(written(tmp_path, text))
+    assert load_reconstruct_config(written(tmp_path, config_to_yaml(config), "again.yaml")) == config
+    assert config.track.frames.stop == 7
+    assert config.track.segmenter.classes == ("bird",)
+    assert config.fit == load_config("aves")  # nothing of the paper's shines through
+
+
+@pytest.mark.parametrize(
+    ("text", "of", "changes"),
+    [
+        ("fit: baseline", "baseline", {}),
+        ("fit: {base: baseline, window: 3}", "baseline", {"window": 3}),
+        ("base: reconstruct\nfit: {window: 3}", "paper", {"window": 3}),
+        ("base: reconstruct\nfit: own.yaml", "baseline", {"window": 4}),
+        ("base: middle.yaml\nfit: {common_size: true}", "baseline", {"window": 4, "common_size": True}),
+    ],
+)
+def test_a_fit_has_bases_of_its_own(tmp_path, text, of, changes):
+    written(tmp_path, "base: baseline\nwindow: 4\n", "own.yaml")
+    written(tmp_path, "fit: {base: own.yaml}\n", "middle.yaml")
+    fit = load_reconstruct_config(written(tmp_path, text)).fit
+    assert fit == dataclasses.replace(load_config(of), **changes)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("fits: paper", ["`fits`", "track"]),
+        ("track: {segmentor: x}", ["`track.segmentor`", "segmenter"]),
+        ("track: {segmenter: {path: x}}", ["`track.segmenter.path`", "file"]),
+        ("track: {segmenter: {classes: bird}}", ["`track.segmenter.classes`", "list"]),
+        ("track: {segmenter: {min_score: 2.5}}", ["`track.segmenter.min_score`", "2", "within 0 and 1"]),
+        ("track: {segmenter: {min_score: .nan}}", ["`track.segmenter.min_score`", "nan"]),
+        ("track: {segmenter: {tile_px: 8}}", ["`track.segmenter.tile_px`", "8"]),
+        ("track: {segmenter: {tile_px: wide}}", ["`track.segmenter.tile_px`", "wide", "int"]),
+        ("track: {segmenter: {tile_overlap: 1}}", ["`track.segmenter.tile_overlap`"]),
+        ("track: {keypoints: {batch: 0}}", ["`track.keypoints.batch`", "0"]),
+        ("track: {keypoints: {pad_px: -1}}", ["`track.keypoints.pad_px`", "-1"]),
+        ("track: {tracker: {memory: -1}}", ["`track.tracker.memory`", "-1"]),
+        ("track: {tracker: {min_iou: 3}}", ["`track.tracker.min_iou`", "3"]),
+        ("track: {frames: {start: 9, stop: 9}}", ["`track.frames.stop`", "9"]),
+        ("track: {frames: {step: 0}}", ["`track.frames.step`", "0"]),
+        ("track: {min_track_frames: 0}", ["`track.min_track_frames`", "0"]),
+        ("track: {threads: 0}", ["`track.threads`", "0"]),
+        ("track: 7", ["track", "mapping"]),
+        ("overlay: {max_width_px: 3}", ["`overlay.max_width_px`", "3"]),
+        ("overlay: {codec: gif}", ["`overlay.codec`", "gif", "h264"]),
+        ("fit: {window: 0}", ["`fit.window`", "0"]),
+        ("fit: {terms: {mask: -1}}", ["`fit.terms.mask.weight`", "-1"]),
+        ("fit: {stage: []}", ["`fit.stage`", "stages"]),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_mistakes_are_named(tmp_path, text, names):
+    path = written(tmp_path, f"base: reconstruct\n{text}\n")
+    with pytest.raises(InputError) as caught:
+        load_reconstruct_config(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    for name in names:
+        assert name in message, f"{name!r} is not in {message!r}"
+
+
+def test_mistakes_in_a_file_of_the_fit_name_that_file(tmp_path):
+    fit = written(tmp_path, "base: paper\nwindow: 0\n", "fit.yaml")
+    with pytest.raises(InputError) as caught:
+        load_reconstruct_config(written(tmp_path, "base: reconstruct\nfit: fit.yaml\n"))
+    assert str(caught.value).startswith(f"{fit}: `fit.window` is 0")
+
+
+def test_files_that_do_not_fit():
+    with pytest.raises(InputError, match=r"paper: says how to fit.*fit: paper"):
+        load_reconstruct_config("paper")
+    with pytest.raises(InputError, match=r"reconstruct: unknown key `track`"):
+        load_config("reconstruct")
+
+
+def test_what_is_missing_and_circles(tmp_path):
+    with pytest.raises(InputError, match=r"`fit` is missing.*base: reconstruct"):
+        load_reconstruct_config(written(tmp_path, "track: {threads: 2}\n"))
+    written(tmp_path, "base: below.yaml\n", "below.yaml")
+    with pytest.raises(InputError, match=r"circle"):
+        load_reconstruct_config(written(tmp_path, "fit: below.yaml\n"))

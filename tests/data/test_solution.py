@@ -1,0 +1,209 @@
+"""The folder of results: what is written comes back, and what is damaged is refused by name."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.birds import toy_bird
+
+from jaxfit.data.solution import FORMAT_VERSION, Solution, load_solution, save_solution
+from jaxfit.errors import InputError
+from jaxfit.model.files import save_bird
+
+BIRD = replace(toy_bird(), joint_names=("körper", *toy_bird().joint_names[1:]))
+N, T, J, K, S = 2, 3, BIRD.num_joints, BIRD.num_keypoints, 0
+
+
+def make(**changes):
+    rng = np.random.default_rng(0)
+
+    def some(*shape):
+        return rng.normal(size=(N, T, *shape)).astype(np.float32)
+
+    values = {
+        "track_id": [3, 8],
+        "frame_index": [5, 6, 9],
+        "valid": rng.random((N, T)) < 0.5,
+        "global_orient": some(3),
+        "body_pose": some(J - 1, 3),
+        "transl": some(3),
+        "scale": some(),
+        "bone_length": some(J - 1),
+        "betas": some(S),
+        "keypoints_3d": some(K, 3),
+        "keypoints_2d": some(K, 2),
+        "crop": some(3),
+        "image_size_px": rng.integers(1, 4000, (N, T, 2)),
+        "focal": 2167.0,
+        "crop_px": 256,
+        "keypoint_names": BIRD.keypoint_names,
+        "joint_names": BIRD.joint_names,
+        "loss": {"keypoints": [1.5, math.nan], "mask": np.array([2.5, 3])},
+        "status": ["converged", "no usable frame"],
+    }
+    return Solution(**values | changes)
+
+
+def assert_same(a: Solution, b: Solution):
+    for name, value in vars(a).items():
+        if isinstance(value, np.ndarray):
+            np.testing.assert_array_equal(value, getattr(b, name), err_msg=name)
+            assert value.dtype == getattr(b, name).dtype, name
+    for name in ("focal", "crop_px", "keypoint_names", "joint_names"):
+        assert getattr(a, name) == getattr(b, name), name
+    assert list(a.loss) == list(b.loss)
+    for term in a.loss:
+        np.testing.assert_array_equal(a.loss[term], b.loss[term])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"loss": {}}, {"betas": np.ones((N, T, 7))}, {"global_orient": np.full((N, T, 3), np.nan)}],
+    ids=["plain", "no terms", "shapes", "failed"],
+)
+def test_what_is_saved_is_loaded(tmp_path, changes):
+    save_solution(make(**changes), BIRD, "a: 1\n", {}, tmp_path / "out")
+    solution, bird = load_solution(tmp_path / "out")
+    assert_same(solution, make(**changes))
+    assert bird.joint_names == BIRD.joint_names
+    np.testing.assert_array_equal(bird.vertices, BIRD.vertices)
+
+
+def test_no_birds_at_all(tmp_path):
+    arrays = {name: value[:0] for name, value in vars(make()).items() if getattr(value, "shape", ())[:1] == (N,)}
+    empty = replace(make(), **arrays, loss={"mask": np.zeros(0)})
+    save_solution(empty, BIRD, "", {}, tmp_path / "out")
+    assert_same(load_solution(tmp_path / "out")[0], empty)
+
+
+def test_files_of_the_folder(tmp_path):
+    summary = {
+        "me_p": np.float32(0.5),
+        "me_v": math.nan,
+        "worst": np.array([1, np.inf]),
+        "n": np.int64(3),
+        "nested": {"path": "ü", "ok": True, "none": None, "all": (1, 2)},
+        5: [np.bool_(False)],
+    }
+    save_solution(make(), BIRD, "stages: [ü]\n", summary, tmp_path / "out")
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "config.yaml",
+        "model.npz",
+        "poses.npz",
+        "summary.json",
+    ]
+    assert (tmp_path / "out" / "config.yaml").read_text(encoding="utf-8") == "stages: [ü]\n"
+
+    def refuse(constant):
+        raise AssertionError(f"{constant} is not JSON")
+
+    assert json.loads((tmp_path / "out" / "summary.json").read_text(), parse_constant=refuse) == {
+        "me_p": 0.5,
+        "me_v": None,
+        "worst": [1, None],
+        "n": 3,
+        "nested": {"path": "ü", "ok": True, "none": None, "all": [1, 2]},
+        "5": [False],
+    }
+    with np.load(tmp_path / "out" / "poses.npz", allow_pickle=False) as arrays:
+        assert arrays["loss"].shape == (N, 2)
+        assert arrays["loss_terms"].tolist() == ["keypoints", "mask"]
+        assert arrays["format_version"] == FORMAT_VERSION
+
+
+def test_results_are_protected(tmp_path):
+    out = tmp_path / "out"
+    save_solution(make(), BIRD, "first", {}, out)
+    with pytest.raises(InputError, match="holds results already"):
+        save_solution(make(), BIRD, "second", {}, out)
+    assert (out / "config.yaml").read_text() == "first"
+    save_solution(make(), BIRD, "second", {}, out, overwrite=True)
+    assert (out / "config.yaml").read_text() == "second"
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home" / "thesis.tex").write_text("precious")
+    with pytest.raises(InputError, match=r"no poses\.npz"):
+        save_solution(make(), BIRD, "", {}, tmp_path / "home", overwrite=True)
+    assert (tmp_path / "home" / "thesis.tex").read_text() == "precious"
+
+
+def test_a_summary_that_is_no_json_writes_nothing(tmp_path):
+    with pytest.raises(TypeError):
+        save_solution(make(), BIRD, "", {"path": Path("x")}, tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"valid": np.ones((N, T + 1), bool)}, "valid must have shape .* T is 3 in frame_index"),
+        ({"body_pose": np.ones((N, T, J - 1, 4))}, "body_pose must have shape .* axis 3 should be 3"),
+        ({"bone_length": np.ones((N, T, 3))}, "bone_length must have shape .* J-1 is 7 in body_pose"),
+        ({"joint_names": ("root",)}, "joint_names must be 8"),
+        ({"keypoint_names": ("a",)}, "keypoint_names must have shape .* K is 12 in keypoints_3d"),
+        ({"status": ["ok"]}, "status must have shape .* N is 2"),
+        ({"loss": {"mask": [1.0]}}, r"loss\[mask\] must have shape"),
+        ({"focal": 0}, "focal must be above 0"),
+        ({"crop_px": 0}, "crop_px must be 1 or more"),
+        ({"scale": np.ones((N, T), complex)}, "scale must be of type float32, not complex128"),
+    ],
+)
+def test_contradictions_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        make(**changes)
+
+
+def rewrite(folder, **changes):
+    with np.load(folder / "poses.npz") as arrays:
+        kept = {name: arrays[name] for name in arrays.files}
+    np.savez(folder / "poses.npz", **{k: v for k, v in (kept | changes).items() if v is not None})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format_version": np.int64(FORMAT_VERSION + 1)}, "newer than this jaxfit reads .*needs a newer jaxfit"),
+        ({"format_version": np.array("one")}, "format_version is one"),
+        ({"format_version": None}, "lacks the array format_version"),
+        ({"betas": None}, "lacks the array betas"),
+        ({"scale": np.ones(4)}, r"scale has shape \(4,\), expected 2 dimensions"),
+        ({"scale": np.ones((N, T + 1))}, "scale must have shape .* T is 3 in frame_index"),
+        ({"joint_names": np.array(["a"])}, "joint_names must be 8"),
+        ({"joint_names": np.arange(J)}, "joint_names must be of type str, not int64"),
+        ({"loss_terms": np.array(["a"])}, "loss has shape .* 1 loss_terms"),
+        ({"loss": np.ones((5, 2))}, "loss.* must have shape"),
+        ({"focal": np.array("x")}, "focal|float"),
+        ({"status": np.array([None, {}], dtype=object)}, "holds Python objects"),
+    ],
+)
+def test_damaged_folders_are_refused_by_name(tmp_path, changes, message):
+    save_solution(make(), BIRD, "", {}, tmp_path / "out")
+    rewrite(tmp_path / "out", **changes)
+    with pytest.raises(InputError, match=message) as caught:
+        load_solution(tmp_path / "out")
+    assert str(caught.value).startswith(str(tmp_path / "out" / "poses.npz"))
+
+
+def test_a_model_that_is_not_the_poses_is_refused(tmp_path):
+    save_solution(make(), BIRD, "", {}, tmp_path / "out")
+    save_bird(toy_bird(), tmp_path / "out" / "model.npz")
+    with pytest.raises(InputError, match=r"model\.npz: is another model than that of poses\.npz"):
+        load_solution(tmp_path / "out")
+    (tmp_path / "out" / "model.npz").unlink()
+    with pytest.raises(InputError, match=r"model\.npz"):
+        load_solution(tmp_path / "out")
+
+
+def test_what_is_no_folder_of_results(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        load_solution(tmp_path / "absent")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="is a file, not a folder"):
+        load_solution(tmp_path / "file")
+    with pytest.raises(InputError, match=r"poses\.npz: does not exist"):
+        load_solution(tmp_path)
+    (tmp_path / "poses.npz").write_bytes(b"PK\x03\x04 cut off")
+    with pytest.raises(InputError, match="is not a readable"):
+        load_solution(tmp_path)

@@ -1,0 +1,164 @@
+"""The figures of a result: perfect for the truth, what a hand computes for a known error."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, sides, solution, truth
+
+from jaxfit.data.posed import PosedBirds
+from jaxfit.errors import InputError
+from jaxfit.evaluation.evaluate import COLUMNS, evaluate
+from jaxfit.evaluation.matching import match_tracks
+
+
+def test_the_truth_is_perfect():
+    result = evaluate(solution(), BIRD, truth())
+    assert tuple(result.overall) == COLUMNS
+    for row in (result.overall, *result.tracks.values()):
+        assert row["pck@0.05"] == row["pck@0.10"] == 1
+        assert row["me_p"] == pytest.approx(0, abs=1e-6)
+        assert row["me_v"] == pytest.approx(0, abs=1e-6)
+        assert row["iou"] > 0.999  # but for a pixel whose centre lies on the outline
+    assert list(result.tracks) == [5, 3]
+    assert [row["frames"] for row in result.tracks.values()] == [T, T]
+    assert (result.frames, result.missing) == (N * T, 0)
+
+
+def test_a_known_error():
+    """All keypoints 6, 8 px off: 10 px of each mask's side; steady, so nothing in velocity."""
+    off = solution(keypoints_2d=solution().keypoints_2d + np.float32([6, 8]))
+    result = evaluate(off, BIRD, truth()).overall
+    own = np.array([[PosedBirds(off, BIRD).vertices_screen(n, t)[:, :2] for t in range(T)] for n in range(N)])
+    extent = np.ptp(own, axis=2).max(-1)
+    np.testing.assert_allclose(extent, sides(), atol=2)  # the mesh's mask has the annotated one's size
+    assert result["me_p"] == pytest.approx(np.sqrt((100 / extent**2).mean()), rel=0.02)
+    assert result["me_v"] == pytest.approx(0, abs=1e-6)
+    assert result["pck@0.05"] == (0.05 * sides() >= 10).mean()
+    assert result["pck@0.10"] == (0.10 * sides() >= 10).mean()
+
+
+def test_velocity_counts_neighbouring_frames_alone():
+    """One frame jumps by 10 px: two pairs of 3 see it; frames 12 and 14 are no neighbours."""
+    points = solution().keypoints_2d.copy()
+    points[0, 1] += [6, 8]
+    result = evaluate(solution(keypoints_2d=points), BIRD, truth())
+    assert result.tracks[5]["me_v"] == pytest.approx(np.sqrt((100 / sides()[0, :2] ** 2).mean()), rel=0.02)
+    points = solution().keypoints_2d.copy()
+    points[0, 3] += [6, 8]
+    assert evaluate(solution(keypoints_2d=points), BIRD, truth()).tracks[5]["me_v"] == pytest.approx(0, abs=1e-6)
+
+
+def test_overlap_of_a_shifted_mesh():
+    moved = solution(crop=solution().crop + np.float32([7, 0, 0]))
+    seen, overlap = truth(), []
+    for n in range(N):
+        for t in range(T):
+            mask = seen.mask(n, t)
+            there = np.roll(mask, 7, axis=1)
+            overlap.append((mask & there).sum() / (mask | there).sum())
+    assert evaluate(moved, BIRD, seen).overall["iou"] == pytest.approx(np.mean(overlap), abs=1e-3)
+
+
+def test_poses_that_are_missing():
+    valid = np.ones((N, T), bool)
+    valid[0, 1:3] = valid[1, 0] = False
+    points = solution().keypoints_2d.copy()
+    points[~valid] = np.nan
+    result = evaluate(solution(valid=valid, keypoints_2d=points), BIRD, truth())
+    assert (result.frames, result.missing) == (5, 3)
+    assert result.tracks[5]["frames"] == 2
+    assert result.overall["pck@0.05"] == 1
+    assert math.isnan(result.tracks[5]["me_v"])  # no two frames in a row are left
+
+
+def test_only_what_both_know_is_measured():
+    """Other tracks and frames, in another order."""
+    part = truth().select(tracks=[1, 0], frames=[1, 2])
+    result = evaluate(solution(), BIRD, part)
+    assert (result.frames, result.missing) == (4, 0)
+    assert result.overall["me_p"] == pytest.approx(0, abs=1e-6)
+    one = evaluate(solution(), BIRD, truth().select(tracks=[1]))
+    assert list(one.tracks) == [3]
+
+
+def test_invisible_keypoints_and_absent_masks_do_not_count():
+    seen = truth()
+    points, confidence = seen.keypoints_px.copy(), seen.confidence.copy()
+    points[:, :, 2] += 50
+    confidence[:, :, 2] = 0
+    masks = {at: rle for at, rle in seen.masks.items() if at[0] == 1}
+    result = evaluate(solution(), BIRD, dataclasses.replace(seen.with_keypoints(points, confidence), masks=masks))
+    assert result.overall["pck@0.05"] == 1
+    assert math.isnan(result.tracks[5]["iou"])
+    assert result.overall["iou"] == result.tracks[3]["iou"] > 0.999
+
+
+def test_nothing_in_common():
+    for changes in ({"track_id": np.array([50, 30])}, {"frame_index": np.arange(4)}):
+        with pytest.raises(InputError, match=r"truth\.json: shares no bird with the result: .*annotations"):
+            evaluate(solution(), BIRD, dataclasses.replace(truth(), **changes), source="truth.json")
+    with pytest.raises(InputError, match=r"shares no bird"):
+        evaluate(solution(valid=np.zeros((N, T), bool)), BIRD, truth())
+    renamed = dataclasses.replace(truth(), keypoint_names=("beak", *BIRD.keypoint_names[1:]))
+    with pytest.raises(InputError, match="lack bill_tip"):
+        evaluate(solution(), BIRD, renamed)
+
+
+def test_pictures_of_another_size():
+    larger = dataclasses.replace(truth(), image_size_px=np.full((T, 2), [640, 400]), masks={})
+    with pytest.raises(InputError, match=r"truth: has track 5, frame 10 in a picture of 640×400, but .* 320×280"):
+        evaluate(solution(), BIRD, larger)
+    sizes = np.zeros((N, T, 2), int)
+    sizes[1] = WIDTH, HEIGHT
+    one = truth().select(tracks=[1])
+    assert evaluate(solution(image_size_px=sizes), BIRD, one).frames == T  # of matched birds alone
+
+
+def test_poses_that_the_truth_lacks():
+    valid = np.ones((N, T), bool)
+    valid[1, 0] = False
+    result = evaluate(solution(valid=valid), BIRD, truth().select(tracks=[1]))
+    assert (result.frames, result.missing, result.unmatched) == (T - 1, 1, T)
+    assert evaluate(solution(), BIRD, truth().select(frames=[0, 2])).unmatched == 2 * N
+    assert evaluate(solution(), BIRD, truth()).unmatched == 0
+    confidence = truth().confidence * valid[..., None]
+    away = dataclasses.replace(truth(), present=valid, confidence=confidence, masks={})
+    assert evaluate(solution(), BIRD, away).unmatched == 0  # the truth may annotate a frame in part
+
+
+def test_a_bird_without_a_track_is_missing():
+    result = evaluate(solution(track_id=[5, 99]), BIRD, truth())
+    assert (result.frames, result.missing, result.unmatched) == (T, T, T)
+
+
+def test_tracks_named_by_a_tracker():
+    """The same figures as with the truth's ids, once the tracks are matched."""
+    own, matching = match_tracks(solution(track_id=[3, 8]), truth())
+    assert (matching.by, matching.follows) == ("overlap", {3: 5, 8: 3})
+    assert evaluate(own, BIRD, truth()) == evaluate(solution(), BIRD, truth())
+
+
+def test_the_truth_of_another_video_is_told(caplog):
+    evaluate(solution(), BIRD, truth(), source="t.json")
+    assert not caplog.records
+    elsewhere = solution(crop=solution().crop + np.float32([200, 0, 0]))
+    evaluate(elsewhere, BIRD, truth(), source="t.json")
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    assert "where t.json has one (median IoU 0.00)" in record.message
+
+
+def test_progress_counts_the_birds():
+    from contextlib import contextmanager
+
+    ticks = []
+
+    @contextmanager
+    def watch(name, total):
+        ticks.append(total)
+        yield lambda done, note: ticks.append(-done)
+
+    evaluate(solution(), BIRD, truth(), progress=watch)
+    assert ticks == [N * T] + [-1] * (N * T)

@@ -1,0 +1,85 @@
+"""Reading what a result is measured against: a COCO file, or a scene's folder."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from support.birds import toy_bird
+from support.evaluated import BIRD, solution, truth
+
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.solution import save_solution
+from jaxfit.errors import InputError
+from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, evaluate
+from jaxfit.evaluation.truth import read_truth
+
+
+@pytest.fixture
+def scene(tmp_path):
+    write_coco(truth(), tmp_path / "truth.json")
+    save_solution(solution(crop=one_camera()), BIRD, "", {}, tmp_path / "truth")
+    return tmp_path
+
+
+def one_camera():
+    return np.array(solution().crop)
+
+
+def test_a_coco_file(scene):
+    observations, poses, bird = read_truth(scene / "truth.json")
+    np.testing.assert_array_equal(observations.track_id, [3, 5])
+    assert poses is None
+    assert bird is None
+
+
+def test_a_scene(scene):
+    observations, poses, bird = read_truth(scene)
+    assert observations.num_tracks == 2
+    result = evaluate(solution(), BIRD, observations, truth_solution=poses, truth_bird=bird)
+    assert tuple(result.overall) == (*COLUMNS, *COLUMNS_3D)
+    assert (result.frames, result.frames_3d, result.points_3d) == (8, 8, "joints")
+    for row in (result.overall, *result.tracks.values()):
+        assert row["mpjpe"] == pytest.approx(0, abs=1e-4)
+        assert row["orientation_deg"] == pytest.approx(0, abs=0.05)
+        assert row["size_error"] == pytest.approx(0, abs=1e-6)
+
+
+def test_poses_count_where_nothing_is_annotated(scene):
+    """A bird that the annotations lack has errors in space alone; one model serves for both."""
+    _, poses, _ = read_truth(scene)
+    result = evaluate(solution(), BIRD, truth().select(tracks=[1]), truth_solution=poses)
+    assert (result.frames, result.frames_3d) == (4, 8)
+    assert set(result.tracks) == {3, 5}
+    assert result.tracks[5]["frames"] == 0
+    assert np.isnan(result.tracks[5]["me_p"])
+    assert result.tracks[5]["mpjpe"] == pytest.approx(0, abs=1e-4)
+    one = dataclasses.replace(poses, valid=poses.valid & [[True], [False]])
+    result = evaluate(solution(), BIRD, truth(), truth_solution=one)
+    assert (result.frames, result.frames_3d) == (8, 4)
+    assert np.isnan(result.tracks[3]["mpjpe"])
+
+
+def test_without_true_poses(scene):
+    result = evaluate(solution(), BIRD, truth())
+    assert tuple(result.overall) == COLUMNS
+    assert (result.frames_3d, result.points_3d) == (0, "")
+
+
+def test_a_fit_is_no_truth(scene):
+    moving = one_camera()
+    moving[0, 1, 0] += 3
+    with pytest.raises(InputError, match=r"^scene: its true poses lie in crops that follow the birds"):
+        evaluate(solution(), BIRD, truth(), source="scene", truth_solution=solution(crop=moving), truth_bird=toy_bird())
+
+
+def test_folders_without_truth(scene, tmp_path_factory):
+    with pytest.raises(InputError, match=r"is a folder without truth\.json \(give a COCO file"):
+        read_truth(tmp_path_factory.mktemp("empty"))
+    with pytest.raises(InputError, match="absent"):
+        read_truth(scene / "absent")
+    (scene / "truth" / "poses.npz").unlink()
+    with pytest.raises(InputError, match=r"poses\.npz: does not exist"):
+        read_truth(scene)
+    (scene / "truth").rename(scene / "elsewhere")
+    with pytest.raises(InputError, match=r"holds no true poses .*give .*truth\.json to compare in the image alone"):
+        read_truth(scene)

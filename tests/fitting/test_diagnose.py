@@ -1,0 +1,124 @@
+"""A term that cannot be used is named before the fit; one that breaks a bird down is named with bird and step."""
+
+import importlib
+import json
+import logging
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.cli_files import T, arguments, refused
+
+from jaxfit.cli.main import main
+from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.solution import load_solution
+from jaxfit.fitting.diagnose import name_failures
+from jaxfit.objective import registry
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+MODULE = """
+import jax
+import jax.numpy as jnp
+
+def symmetry(scene, *, power=2.0):
+    "Left and right wing alike."
+    left, right = scene.joint_indices("left_wing", "right_wing")
+    apart = scene.pose.body_pose[:, left - 1] - scene.pose.body_pose[:, right - 1]
+    return jnp.sum(jnp.where(scene.present[:, None], jnp.abs(apart) ** power, 0.0))
+
+def vector(scene):
+    return scene.pose.body_pose[:, 0]
+
+def python_if(scene):
+    if scene.pose.scale[0] > 1:
+        return jnp.sum(scene.pose.scale)
+    return jnp.zeros(())
+
+def no_reverse(scene):
+    return jax.lax.while_loop(lambda x: x < 3, lambda x: x + 1, jnp.sum(scene.pose.scale))
+
+def hoof(scene):
+    return jnp.sum(scene.keypoints_px[:, scene.keypoint_indices("hoof")])
+
+SPLIT_PX = 0.0
+
+def nan_value(scene):
+    left = scene.evidence.keypoints_px[0, 0, 0] < SPLIT_PX
+    return jnp.where(left, jnp.nan, 0.0) * jnp.sum(scene.pose.scale)
+
+def nan_gradient(scene):
+    return jnp.sum(jnp.sqrt(jnp.abs(scene.pose.body_pose - scene.start.body_pose)))
+"""
+
+
+@pytest.fixture(autouse=True)
+def package(tmp_path, monkeypatch):
+    (tmp_path / "own_terms.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(registry, "_terms", dict(registry._terms))
+    yield
+    sys.modules.pop("own_terms", None)
+
+
+def command(inputs, tmp_path, *names, steps=3, weight=1):
+    listed = ", ".join(f"'{name}'" for name in ("keypoints", *names))
+    (tmp_path / "own.yaml").write_text(
+        f"base: {inputs / 'quick.yaml'}\n"
+        f"terms: {{{', '.join(f'{name!r}: {weight}' for name in names)}}}\n"
+        f"stages:\n  - {{name: first, steps: {steps}, terms: [keypoints]}}\n"
+        f"  - {{name: second, steps: {steps}, terms: [{listed}]}}\n"
+    )
+    return arguments(inputs, tmp_path / "out", config=str(tmp_path / "own.yaml"))
+
+
+def test_a_term_by_its_path(inputs, tmp_path):
+    apart = []
+    for weight in (0, 1e4):
+        assert main([*command(inputs, tmp_path, "own_terms:symmetry", steps=30, weight=weight), "--overwrite"]) == 0
+        solution, _ = load_solution(tmp_path / "out")
+        assert set(solution.loss) == {"keypoints", "own_terms:symmetry"}
+        left, right = (solution.joint_names.index(f"{side}_wing") - 1 for side in ("left", "right"))
+        apart.append(np.abs(solution.body_pose[:2, :, left] - solution.body_pose[:2, :, right]).mean())
+    assert apart[1] < 0.3 * apart[0]
+    assert "own_terms:symmetry" in (tmp_path / "out" / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("own_terms:vector", ("float32 of shape (6, 3)", "not one real number")),
+        ("own_terms:python_if", ("own_terms.py:15", "jax.jit")),
+        ("own_terms:no_reverse", ("differentiated", "while_loop")),
+        ("own_terms:hoof", ("no keypoint 'hoof'", "bill_tip")),
+        ("joint_limits", ("no joint limits",)),
+        ("own_terms:absent", ("has no function 'absent'", "own.yaml")),
+        ("absent_terms:symmetry", ("cannot be imported", "own.yaml")),
+        ("nonsense", ("velocity", "package.module:function", "own.yaml")),
+    ],
+)
+def test_terms_that_cannot_be_used(inputs, tmp_path, capsys, name, words):
+    refused(capsys, command(inputs, tmp_path, name, steps=1000), name, *words)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("name", "what"), [("nan_value", "value"), ("nan_gradient", "gradient")])
+def test_what_breaks_a_bird_down_is_named(inputs, tmp_path, caplog, name, what):
+    bill_px = read_coco(inputs / "birds.json").keypoints_px[:2, 0, 0, 0]  # of tracks 4 and 7
+    importlib.import_module("own_terms").SPLIT_PX = bill_px.mean()
+    broken = {"nan_value": {("4", "7")[bill_px.argmin()]}, "nan_gradient": {"4", "7"}}[name]
+    with caplog.at_level(logging.WARNING):
+        assert main(command(inputs, tmp_path, f"own_terms:{name}")) == 0
+    solution, _ = load_solution(tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert set(summary["failures"]) == broken
+    assert {str(track) for track in solution.track_id[solution.status == "diverged"]} == broken
+    for track, said in summary["failures"].items():
+        assert said == f"frames 0 to {T - 1}: the {what} of own_terms:{name} was not finite at step 1 of stage second"
+        assert f"track {track}, {said}" in caplog.text
+
+
+def test_nothing_new_is_computed():
+    told = np.array(["", "known"], object)
+    assert name_failures(told, np.array([0, 3]), "stage", jnp.zeros(())).tolist() == ["", "known"]

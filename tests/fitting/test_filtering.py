@@ -1,0 +1,113 @@
+"""The weighted median filter against a plain loop, hand-computed cases and its properties."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxfit.fitting.filtering import weighted_median_filter
+
+
+def slow_filter(keypoints, confidence, window):
+    """The definition, one frame, keypoint and coordinate at a time."""
+    out = keypoints.copy()
+    T, K = confidence.shape
+    for t in range(T):
+        frames = range(max(0, t - window // 2), min(T, t + window // 2 + 1))
+        for k in range(K):
+            for axis in range(2):
+                pairs = sorted((keypoints[i, k, axis], confidence[i, k]) for i in frames if confidence[i, k] > 0)
+                total = sum(c for _, c in pairs)
+                passed = 0.0
+                for value, c in pairs:
+                    passed += c
+                    if passed >= total / 2:
+                        out[t, k, axis] = value
+                        break
+    return out
+
+
+# one length for each parameter, so that hypothesis does not compile anew for every example
+@pytest.mark.parametrize(("T", "window"), [(1, 5), (3, 5), (7, 3), (8, 5), (4, 1)])
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_agrees_with_the_plain_loop(T, window, data):
+    seed = data.draw(st.integers(0, 2**32 - 1))
+    rng = np.random.default_rng(seed)
+    # few distinct values and confidences in sixteenths: ties, exact halves and missing keypoints all occur
+    keypoints = rng.integers(-4, 5, (T, 3, 2)).astype(np.float32)
+    confidence = (rng.integers(0, 17, (T, 3)) / 16 * (rng.random((T, 3)) < 0.7)).astype(np.float32)
+    filtered = jax.jit(weighted_median_filter, static_argnums=2)(keypoints, confidence, window)
+    np.testing.assert_array_equal(filtered, slow_filter(keypoints, confidence, window))
+
+
+def one(values, confidence, window):
+    keypoints = np.stack([values, -np.asarray(values, float)], -1)[:, None].astype(np.float32)
+    return np.asarray(weighted_median_filter(keypoints, np.asarray(confidence, np.float32)[:, None], window))[:, 0]
+
+
+def test_hand_computed():
+    # the middle frame sees 1, 2, 9 with weights 0.2, 0.3, 0.9: half is 0.7, passed at 9
+    assert one([1, 2, 9], [0.2, 0.3, 0.9], 3)[1, 0] == 9
+    assert one([1, 2, 9], [1, 1, 1], 3)[1, 0] == 2
+    # exactly half passes, so the lower of two equal weights: 1 in x, and −2 in the mirrored y
+    np.testing.assert_array_equal(one([1, 2], [0.3, 0.3], 3), [[1, -2], [1, -2]])
+
+
+def test_exact_half_passes_whatever_the_rounding():
+    # the first three are half of each total, and a little less than half as float32 adds them up
+    for confidence in ([0.1, 0.1, 0.2, 0.3, 0.1], [0.1, 0.1, 0.5, 0.1, 0.6], [0.1, 0.1, 0.7, 0.3, 0.6]):
+        assert one([1, 2, 3, 4, 5], confidence, 5)[2, 0] == 3
+
+
+def test_cut_off_at_the_ends():
+    values = one([10, 20, 30, 40, 50], [1] * 5, 3)
+    np.testing.assert_array_equal(values[:, 0], [10, 20, 30, 40, 40])
+
+
+def test_outlier_is_removed_and_missing_ones_do_not_count():
+    values = [10, 11, 900, 13, 14]
+    assert one(values, [1] * 5, 5)[2, 0] == 13
+    assert one(values, [1, 1, 0, 0, 0], 5)[2, 0] == 10  # a missing frame takes its neighbours' median
+    assert np.isfinite(one([np.nan, 5, 6], [0, 1, 1], 3)).all()
+
+
+def test_input_is_returned_where_nothing_is_near():
+    values = one([7, 8, 9, 10, 11], [0, 0, 0, 0, 1], 3)
+    np.testing.assert_array_equal(values[:, 0], [7, 8, 9, 11, 11])
+
+
+def test_window_of_one_and_constant_signals_change_nothing():
+    rng = np.random.default_rng(0)
+    keypoints, confidence = (
+        rng.normal(size=(9, 4, 2)).astype(np.float32),
+        rng.random((9, 4)).astype(np.float32),
+    )
+    np.testing.assert_array_equal(weighted_median_filter(keypoints, confidence, 1), keypoints)
+    constant = np.broadcast_to(keypoints[:1], keypoints.shape)
+    np.testing.assert_array_equal(weighted_median_filter(constant, confidence, 5), constant)
+
+
+def test_moves_with_the_signal_and_with_the_scale_of_the_confidence():
+    rng = np.random.default_rng(1)
+    keypoints = rng.integers(0, 1000, (12, 3, 2)).astype(np.float32)
+    confidence = rng.integers(0, 9, (12, 3)).astype(np.float32) / 8
+    plain = weighted_median_filter(keypoints, confidence, 5)
+    np.testing.assert_array_equal(weighted_median_filter(keypoints + 64, confidence, 5), plain + 64)
+    np.testing.assert_array_equal(weighted_median_filter(keypoints, confidence / 4, 5), plain)
+    np.testing.assert_array_equal(weighted_median_filter(keypoints[::-1], confidence[::-1], 5), plain[::-1])
+
+
+def test_batches():
+    rng = np.random.default_rng(2)
+    keypoints, confidence = rng.random((2, 6, 3, 2), np.float32), rng.random((2, 6, 3), np.float32)
+    batched = jax.vmap(lambda k, c: weighted_median_filter(k, c, 3))(keypoints, confidence)
+    for k, c, result in zip(keypoints, confidence, batched, strict=True):
+        np.testing.assert_array_equal(weighted_median_filter(k, c, 3), result)
+
+
+@pytest.mark.parametrize("window", [0, 2, -1])
+def test_window_must_be_odd(window):
+    with pytest.raises(ValueError, match="window must be odd and positive"):
+        weighted_median_filter(np.zeros((3, 1, 2)), np.ones((3, 1)), window)

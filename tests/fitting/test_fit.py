@@ -1,0 +1,267 @@
+"""The fit as a whole: known truth comes back, birds do not touch each other, and batches do not matter."""
+
+import dataclasses
+import logging
+from contextlib import contextmanager
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.birds import exp_map, pose_window, toy_bird
+
+from jaxfit.config.schema import config_to_yaml, load_config
+from jaxfit.data.masks import encode_mask
+from jaxfit.data.solution import save_solution
+from jaxfit.errors import InputError
+from jaxfit.evaluation.evaluate import evaluate
+from jaxfit.fitting.batch import Lanes, fit_batch, frames_per_batch
+from jaxfit.fitting.fit import fit
+from jaxfit.fitting.start import load_start
+from jaxfit.fitting.window import cut_windows, load_evidence
+from jaxfit.model.camera import Camera, project
+from jaxfit.model.kinematics import fold_bird
+from jaxfit.model.pose import Pose
+from jaxfit.objective.scene import priors_of
+from jaxfit.simulation.detections import detect
+from jaxfit.simulation.motion import smooth_motion
+
+BIRD = toy_bird(shapes=0)
+T, SIZE = 6, 64
+CAMERA = Camera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
+ONE = 0.002
+"""GB in which one window of six frames fits: most tests share one program a stage."""
+
+
+def config(window=T, steps=(600, 25), memory_gb=ONE, mode="image", **changes):
+    paper = load_config("paper")
+    stages = tuple(dataclasses.replace(s, steps=n) for s, n in zip(paper.stages, steps, strict=True))
+    crop = dataclasses.replace(paper.crop, mode=mode, size_px=SIZE, focal_px=CAMERA.focal_px)
+    terms = {"keypoints": 100, "mask": 1, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0.1}
+    plain = dataclasses.replace(paper, window=window, stages=stages, crop=crop, terms=terms, memory_gb=memory_gb)
+    return dataclasses.replace(plain, filter_window=1, **changes)
+
+
+def truths(frames=T, birds=3):
+    return [smooth_motion(BIRD, frames, seed) for seed in range(birds)]
+
+
+def keypoints_of(poses):
+    return np.stack([np.asarray(project(pose_window(BIRD, pose)[0], CAMERA)) for pose in poses])
+
+
+@pytest.fixture(scope="module")
+def observed():
+    return detect(BIRD, truths(), camera=CAMERA)
+
+
+@pytest.fixture(scope="module")
+def solution(observed):
+    return fit(observed, BIRD, config())
+
+
+def replaced(observations, n, keypoints_px=None, confidence=None):
+    """The same observations, with other keypoints for track `n`."""
+    points, trust = observations.keypoints_px.copy(), observations.confidence.copy()
+    points[n] = points[n] if keypoints_px is None else keypoints_px
+    trust[n] = trust[n] if confidence is None else confidence
+    return observations.with_keypoints(points, trust)
+
+
+ARRAYS = [name for name in Pose.__dataclass_fields__] + ["keypoints_3d", "keypoints_2d", "crop", "valid"]
+
+
+def assert_same(a, b, tracks, exact=True):
+    for name in ARRAYS:
+        got, expected = getattr(a, name)[tracks], getattr(b, name)[tracks]
+        if exact:
+            np.testing.assert_array_equal(got, expected, err_msg=name)
+        else:
+            np.testing.assert_allclose(got, expected, rtol=1e-3, atol=5e-3, err_msg=name)
+
+
+def test_known_truth_comes_back(solution, observed):
+    assert solution.status.tolist() == ["ok"] * 3
+    assert solution.valid.all()
+    apart = np.linalg.norm(solution.keypoints_2d - keypoints_of(truths()), axis=-1)
+    assert apart.max() < 1 * SIZE / 256  # a pixel of the usual crop
+    for n, truth in enumerate(truths()):
+        R, R_true = exp_map(solution.global_orient[n]), exp_map(np.asarray(truth.global_orient))
+        turned = Rotation.from_matrix(R.transpose(0, 2, 1) @ R_true).magnitude()
+        assert np.rad2deg(turned).max() < 12
+        # depth and size go together; the size in the image is what can be known
+        size = solution.scale[n] / solution.transl[n, :, 2]
+        np.testing.assert_allclose(size, float(truth.scale[0]) / 200, rtol=0.03)
+    result = evaluate(solution, BIRD, observed).overall
+    assert result["pck@0.05"] == 1
+    assert result["iou"] > 0.9
+    assert result["me_p"] < 0.005
+
+
+def test_what_the_solution_says_fits_together(solution):
+    for n in range(3):
+        pose = jax.tree.map(lambda values, n=n: values[n], solution.pose)
+        pose = dataclasses.replace(pose, bone_length=solution.bone_length[n, 0], betas=solution.betas[n, 0])
+        keypoints, _ = pose_window(BIRD, pose)
+        np.testing.assert_allclose(solution.keypoints_3d[n], keypoints, atol=1e-3)
+        np.testing.assert_allclose(solution.keypoints_2d[n], project(keypoints, CAMERA), atol=0.02)
+        assert np.ptp(solution.transl[n, :, 2]) == 0  # depth is fixed, for the window as a whole
+        np.testing.assert_array_equal(solution.bone_length[n], np.ones((T, BIRD.num_joints - 1)))
+    assert set(solution.loss) == {"keypoints", "mask", "pose_prior", "velocity", "acceleration"}
+
+
+def test_one_size_a_window(solution, observed):
+    assert (np.ptp(solution.scale, axis=1) == 0).all()
+    keypoints_only = dataclasses.replace(config(common_size=False), stages=config(steps=(30, 1)).stages[:1])
+    each = fit(observed.select(tracks=[0]), BIRD, keypoints_only)
+    assert np.ptp(each.scale[0]) > 1e-4
+
+
+@pytest.mark.parametrize("windows_a_batch", [1, 2])
+def test_a_broken_bird_leaves_the_others_alone(observed, windows_a_batch):
+    settings = config(steps=(20, 2), memory_gb=windows_a_batch * ONE)
+    broken = replaced(observed, 1, np.full((T, BIRD.num_keypoints, 2), 1e30))
+    result = fit(broken, BIRD, settings)
+    assert result.status.tolist() == ["ok", "diverged", "ok"]
+    assert result.valid.all(1).tolist() == [True, False, True]
+    assert not result.valid[1].any()
+    assert np.isnan(result.global_orient[1]).all()
+    assert_same(result, fit(observed, BIRD, settings), [0, 2])
+
+
+def test_a_bird_that_was_hardly_seen(solution, observed):
+    hidden = replaced(observed, 1, confidence=np.zeros((T, BIRD.num_keypoints)))
+    result = fit(hidden, BIRD, config())
+    assert result.status.tolist() == ["ok", "no usable frame", "ok"]
+    assert not result.valid[1].any()
+    assert np.isnan(result.loss["keypoints"][1])
+    assert_same(result, solution, [0, 2])
+    with pytest.raises(InputError, match=r"birds\.json: no track has a frame with 4 confident keypoints"):
+        fit(hidden.select(tracks=[1]), BIRD, config(), source="birds.json")
+
+
+def test_missing_frames_are_left_out(observed):
+    confidence = np.ones((T, BIRD.num_keypoints))
+    confidence[[0, 3]] = 0
+    gaps = replaced(observed, 0, confidence=confidence).select(tracks=[0])
+    result = fit(gaps, BIRD, config())
+    assert result.valid[0].tolist() == [False, True, True, False, True, True]
+    apart = np.linalg.norm(result.keypoints_2d - keypoints_of(truths()[:1]), axis=-1)
+    assert apart[result.valid].max() < SIZE / 256
+    assert np.isnan(result.global_orient[0, [0, 3]]).all()
+
+
+def test_batches_do_not_matter(observed, caplog):
+    """One batch or several, the last of them filled up: the same result, and nothing is compiled again."""
+    settings = [config(steps=(20, 2), memory_gb=gb * ONE) for gb in (1, 2)]
+    assert [frames_per_batch(BIRD, c) // T for c in settings] == [1, 2]
+    for birds in (2, 3):
+        some = observed.select(tracks=slice(birds))
+        apart, together = (fit(some, BIRD, c) for c in settings)
+        assert_same(apart, together, slice(None), exact=False)
+        for term, loss in together.loss.items():
+            np.testing.assert_allclose(apart.loss[term], loss, rtol=2e-3, err_msg=term)
+    with caplog.at_level(logging.WARNING), jax.log_compiles():
+        fit(observed, BIRD, settings[1])
+    compiled = [r.getMessage() for r in caplog.records if r.getMessage().startswith("Compiling")]
+    assert not [m for m in compiled if any(name in m for name in ("advance", "begin", "report", "initial"))]
+
+
+def test_long_tracks_are_fitted_window_by_window():
+    observations = detect(BIRD, truths(2 * T - 2, 1), camera=CAMERA)
+    result = fit(observations, BIRD, config(steps=(30, 2)))
+    assert result.valid.all()
+    parts = [fit(observations.select(frames=f), BIRD, config(steps=(30, 2))) for f in (slice(0, T), slice(T, None))]
+    for name in ("global_orient", "keypoints_2d", "scale"):
+        joined = np.concatenate([getattr(part, name) for part in parts], axis=1)
+        np.testing.assert_array_equal(getattr(result, name), joined, err_msg=name)
+    total = sum(np.asarray(part.loss["keypoints"]) for part in parts)
+    np.testing.assert_allclose(result.loss["keypoints"], total, rtol=1e-6)
+
+
+def in_a_large_image(observations, corner=(210, 90), size=(400, 300)):
+    """The same birds, in an image of `size` where the crop's image lies at `corner`."""
+    masks = {}
+    for at in observations.masks:
+        full = np.zeros(size[::-1], bool)
+        full[corner[1] : corner[1] + SIZE, corner[0] : corner[0] + SIZE] = observations.mask(*at)
+        masks[at] = encode_mask(full)
+    return dataclasses.replace(
+        observations,
+        keypoints_px=observations.keypoints_px + np.float32(corner),
+        box_px=observations.box_px + np.float32([*corner, 0, 0]),
+        image_size_px=np.full((observations.num_frames, 2), size),
+        masks=masks,
+    )
+
+
+def test_boxes_in_a_large_image(observed, tmp_path):
+    """Results are image pixels, the mesh lies where the mask is, and a fit goes on from them."""
+    large = in_a_large_image(observed)
+    result = fit(large, BIRD, config(mode="box"))
+    assert (result.crop[..., 2] != SIZE).all(), "the crop is scaled, or this tests nothing"
+    np.testing.assert_array_equal(result.image_size_px[result.valid], np.tile([400, 300], (result.valid.sum(), 1)))
+    assert not result.image_size_px[~result.valid].any()
+    apart = np.linalg.norm(result.keypoints_2d - keypoints_of(truths()) - np.array([210, 90]), axis=-1)
+    assert apart.max() < 0.5
+    assert evaluate(result, BIRD, large).overall["iou"] > 0.9
+    save_solution(result, BIRD, config_to_yaml(config()), {}, tmp_path / "out")
+    start = load_start(tmp_path / "out" / "poses.npz", large, BIRD)
+    again = fit(large, BIRD, config(mode="box", steps=(1, 1)), start)
+    for name in ("global_orient", "body_pose", "transl", "scale"):
+        np.testing.assert_allclose(getattr(again, name), getattr(result, name), atol=0.05, err_msg=name)
+    shifted = config(mode="box", steps=(1, 1))
+    shifted = dataclasses.replace(shifted, crop=dataclasses.replace(shifted.crop, padding=0.5))
+    with pytest.raises(InputError, match=r"poses\.npz: `crop` of track 0"):
+        fit(large, BIRD, shifted, start)
+
+
+def test_keypoints_in_any_order_but_of_the_model(solution, observed):
+    order = np.random.default_rng(0).permutation(BIRD.num_keypoints)
+    names = tuple(BIRD.keypoint_names[i] for i in order)
+    mixed = dataclasses.replace(
+        observed,
+        keypoint_names=names,
+        keypoints_px=observed.keypoints_px[:, :, order],
+        confidence=observed.confidence[:, :, order],
+    )
+    assert_same(fit(mixed, BIRD, config()), solution, [0, 1, 2])
+    other = dataclasses.replace(observed, keypoint_names=("beak", *BIRD.keypoint_names[1:]))
+    with pytest.raises(InputError, match=r"birds.*lack bill_tip and have beak"):
+        fit(other, BIRD, config(), source="birds")
+
+
+def test_progress_adds_up(observed):
+    seen = []
+
+    @contextmanager
+    def watch(name, total):
+        seen.append((name, total))
+        yield lambda done, note: seen.append((done, note))
+
+    fit(observed, BIRD, config(steps=(5, 2)), progress=watch)
+    assert seen[0] == ("Fitting 3 birds", 21)
+    assert sum(done for done, _ in seen[1:]) == 21
+    assert any(note.startswith("mask: loss ") for _, note in seen[1:])
+
+
+@pytest.mark.parametrize("after_first", [True, False])
+def test_the_better_hypothesis_goes_on(observed, after_first):
+    """One start is right, the other reversed: the right one wins, wherever it stands."""
+    keypoints_only = config(steps=(30, 5))
+    first = dataclasses.replace(keypoints_only.stages[0], keep_best=after_first)
+    second = dataclasses.replace(first, name="on", steps=5, keep_best=False, carry_moments=True)
+    settings = dataclasses.replace(keypoints_only, stages=(first, second))
+    windows = cut_windows(observed, settings)[:1]
+    evidence, truth = load_evidence(observed, windows, SIZE), truths()[0]
+    reversed_R = Rotation.from_rotvec([0, 0, np.pi]) * Rotation.from_rotvec(truth.global_orient)
+    flipped = dataclasses.replace(truth, global_orient=reversed_R.as_rotvec().astype(np.float32))
+    rig, priors = fold_bird(BIRD), priors_of(BIRD)
+    for lanes in ((truth, flipped), (flipped, truth)):
+        start = jax.tree.map(lambda *x: np.stack(x)[None], *lanes)
+        only = Lanes(*np.zeros((3, 1), int))
+        fitted = fit_batch(BIRD, rig, priors, [settings], CAMERA, evidence, start, only, lambda *_: None)
+        assert fitted.pose.global_orient.shape == (1, T, 3)
+        assert not any(fitted.failure)
+        apart = np.linalg.norm(np.asarray(fitted.report.keypoints_px) - keypoints_of([truth]), axis=-1)
+        assert apart.mean() < 0.25

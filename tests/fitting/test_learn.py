@@ -1,0 +1,144 @@
+"""A prior learnt from results: its figures by hand, its honesty about how little it rests on."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.birds import random_pose, solution_of, toy_bird
+
+from jaxfit.cli.main import main
+from jaxfit.data.solution import save_solution
+from jaxfit.errors import InputError
+from jaxfit.fitting.learn import LEAST_SD_RAD, effective_count, learn_prior, oas_shrinkage
+from jaxfit.model.checks import check_bird
+from jaxfit.model.files import load_bird
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+BIRD, T = toy_bird(), 12
+
+
+def posed(seeds, spread=0.3):
+    """A result of one bird a seed, every frame of it drawn anew."""
+    windows = []
+    for seed in seeds:
+        frames = [random_pose(BIRD, 100 * seed + t, spread) for t in range(T)]
+        stacked = jax.tree.map(lambda *x: jnp.stack(x), *frames)
+        windows.append(dataclasses.replace(stacked, bone_length=jnp.ones(7), betas=jnp.zeros(2)))
+    return solution_of(BIRD, windows)
+
+
+def test_oas_by_hand():
+    # S = diag(3, 1), n = 4, D = 2: tr S² = 10, tr² S = 16; (0·10 + 16) / ((4 + 1 − 1)(10 − 8)) = 2 → 1
+    assert oas_shrinkage(np.diag([3.0, 1.0]), 4) == 1
+    # n = 20: 16 / (20 · 2)
+    assert oas_shrinkage(np.diag([3.0, 1.0]), 20) == pytest.approx(0.4)
+    # D = 3, S = diag(4, 1, 1): tr S² = 18, tr² S = 36; (18/3 + 36) / ((n + 1/3)(18 − 12))
+    assert oas_shrinkage(np.diag([4.0, 1.0, 1.0]), 9) == pytest.approx(42 / (28 / 3 * 6))
+    assert oas_shrinkage(np.eye(3), 100) == 1  # nothing to lose
+
+
+def test_oas_is_near_the_best_shrinkage():
+    """Over many samples of known covariance it errs little more than the best fixed shrinkage."""
+    rng, n, D = np.random.default_rng(0), 30, 20
+    truth = 0.5 ** np.abs(np.subtract.outer(np.arange(D), np.arange(D)))
+
+    def error(sample, rho):
+        return (((1 - rho) * sample + rho * np.trace(sample) / D * np.eye(D) - truth) ** 2).sum()
+
+    samples = [np.cov(rng.multivariate_normal(np.zeros(D), truth, n).T, bias=True) for _ in range(400)]
+    best = min(np.mean([error(sample, rho) for sample in samples]) for rho in np.linspace(0, 1, 101))
+    assert np.mean([error(sample, oas_shrinkage(sample, n)) for sample in samples]) < 1.1 * best
+    assert best < 0.6 * np.mean([error(sample, 0) for sample in samples])
+
+
+def test_effective_count_of_autoregressive_poses():
+    rng, r, n = np.random.default_rng(0), 0.8, 4000
+    x = np.zeros((n, 3))
+    for t in range(1, n):
+        x[t] = r * x[t - 1] + rng.normal(size=3)
+    everywhere = np.ones(n, bool)
+    assert effective_count([(x, everywhere)]) == pytest.approx(n * 0.2 / 1.8, rel=0.1)
+    assert effective_count([(rng.normal(size=(n, 3)), everywhere)]) == pytest.approx(n, rel=0.1)
+    # birds that never move are one pose each
+    still = [(np.broadcast_to(rng.normal(size=3), (50, 3)), np.ones(50, bool)) for _ in range(4)]
+    assert effective_count(still) == pytest.approx(4)
+    holes = everywhere & (np.arange(n) % 2 == 0)  # no two valid frames follow each other
+    assert effective_count([(x, holes)]) == n / 2
+
+
+def test_mean_and_covariance():
+    solution = posed([1, 2])
+    valid = solution.valid.copy()
+    valid[0, 3:5] = False
+    body = solution.body_pose.copy()
+    body[0, 3:5] = np.nan
+    solution = dataclasses.replace(solution, valid=valid, body_pose=body)
+    learnt = learn_prior([("a", solution, BIRD)])
+    poses = body[valid].reshape(-1, 21).astype(np.float64)
+    assert (learnt.poses, learnt.birds, learnt.diverged, learnt.bones_learnt) == (2 * T - 2, 2, 0, False)
+    np.testing.assert_allclose(learnt.bird.pose_mean, poses.mean(0), atol=1e-6)
+    sample = np.cov(poses.T, bias=True)
+    covariance = np.asarray(learnt.bird.pose_covariance, np.float64)
+    np.testing.assert_allclose(np.diag(covariance), np.diag(sample) + LEAST_SD_RAD**2, rtol=1e-5)
+    off = ~np.eye(21, dtype=bool)
+    np.testing.assert_allclose(covariance[off], (1 - learnt.shrinkage) * sample[off], atol=1e-6)
+    np.testing.assert_allclose(learnt.mean_change_rad, np.linalg.norm(poses.mean(0).reshape(7, 3), axis=1), rtol=1e-5)
+    assert 0 < learnt.shrinkage <= 1
+    np.testing.assert_array_equal(learnt.bird.bone_mean, BIRD.bone_mean)
+    np.testing.assert_array_equal(learnt.bird.bone_covariance, BIRD.bone_covariance)
+    assert learn_prior([("a", solution, BIRD), ("b", posed([3]), BIRD)]).poses == 3 * T - 2
+
+
+def test_one_still_bird_makes_a_positive_definite_prior():
+    solution = posed([1])
+    still = dataclasses.replace(
+        solution, body_pose=np.broadcast_to(solution.body_pose[:, :1], solution.body_pose.shape)
+    )
+    learnt = learn_prior([("a", still, BIRD)])
+    assert learnt.effective_poses == 1
+    assert learnt.shrinkage == 1
+    assert np.linalg.eigvalsh(np.asarray(learnt.bird.pose_covariance)).min() > 0.9 * LEAST_SD_RAD**2
+    check_bird(learnt.bird, "learnt")
+
+
+def test_bone_lengths_are_learnt_where_they_differ():
+    solution = posed([1, 2, 3])
+    lengths = np.broadcast_to(np.array([0.9, 1.0, 1.2])[:, None, None], (3, T, 7))
+    learnt = learn_prior([("a", dataclasses.replace(solution, bone_length=lengths), BIRD)])
+    assert learnt.bones_learnt
+    np.testing.assert_allclose(learnt.bird.bone_mean, np.full(7, 3.1 / 3), rtol=1e-6)
+    np.testing.assert_allclose(np.diag(learnt.bird.bone_covariance), np.var([0.9, 1.0, 1.2]) + 1e-4, rtol=1e-5)
+    check_bird(learnt.bird, "learnt")
+
+
+def test_what_cannot_be_learnt_from():
+    solution = posed([1, 2])
+    half = dataclasses.replace(solution, status=np.array(["ok", "diverged"]))
+    assert (learn_prior([("a", half, BIRD)]).birds, learn_prior([("a", half, BIRD)]).diverged) == (1, 1)
+    none = dataclasses.replace(solution, status=np.array(["diverged", "diverged"]))
+    with pytest.raises(InputError, match=r"a: holds no pose.*2 diverged"):
+        learn_prior([("a", none, BIRD)])
+    other = dataclasses.replace(BIRD, joint_names=(*BIRD.joint_names[:-1], "hoof"))
+    with pytest.raises(InputError, match="b: is of the model"):
+        learn_prior([("a", solution, BIRD), ("b", solution, other)])
+
+
+def test_the_command(tmp_path, capsys):
+    save_solution(posed([1, 2]), BIRD, "", {}, tmp_path / "one")
+    save_solution(posed([3]), BIRD, "", {}, tmp_path / "two")
+    out = tmp_path / "learnt.npz"
+    assert main(["prior", "learn", str(tmp_path / "one"), str(tmp_path / "two"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    for words in ("36 poses of 3 birds", "left_wing", "independent", f"--model {out}"):
+        assert words in said.replace("\n", "") or words in said
+    learnt = load_bird(out)
+    assert not np.allclose(learnt.pose_mean, BIRD.pose_mean)
+    with np.load(out) as stored:
+        assert (int(stored["prior_poses"]), int(stored["prior_birds"])) == (36, 3)
+        assert 0 < float(stored["prior_shrinkage"]) <= 1
+        assert stored["pose_covariance"].shape == (21, 21)
+    capsys.readouterr()
+    assert main(["prior", "learn", str(tmp_path / "absent"), "--out", str(out)]) == 2
+    assert "absent" in capsys.readouterr().err

@@ -1,0 +1,166 @@
+"""The solver is Adam, step by step: against a plain loop, with some parameters fixed and some birds broken."""
+
+import dataclasses
+import logging
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.stages import BIRD, CAMERA, CONFIG, FIRST, RIG, SECOND, STEPS, B, case, knobs, problem, solve, total
+
+from jaxfit.fitting.solve import advance, begin, report
+from jaxfit.model.camera import project
+from jaxfit.model.kinematics import window_keypoints, window_transforms
+from jaxfit.model.pose import Pose
+
+# what the oracle multiplies Adam's direction by; nothing for what is not free
+STEP = {"global_orient": 0.02, "body_pose": 0.02, "transl": np.array([0.02, 0.01, 0]), "scale": 0.005}
+
+
+SOLVERS = pytest.mark.parametrize("solver", ["adam", "levenberg_marquardt"])
+
+
+@jax.jit
+def loss_and_gradient(pose, evidence):
+    return jax.vmap(jax.value_and_grad(lambda p, e: total(p, p, e)))(pose, evidence)
+
+
+def adam(start, evidence, rates, carry):
+    """Kingma and Ba's algorithm 1, written out; `rates` scales each stage's step."""
+    pose = {name: np.asarray(getattr(start, name), np.float64) for name in vars(start)}
+    losses = []
+    for stage, rate in enumerate(rates):
+        if stage == 0 or not carry:
+            m, v, t = {name: 0.0 for name in STEP}, {name: 0.0 for name in STEP}, 0
+        for _ in range(STEPS):
+            value, gradient = loss_and_gradient(
+                Pose(**{name: jnp.asarray(x, jnp.float32) for name, x in pose.items()}), evidence
+            )
+            t += 1
+            for name, step in STEP.items():
+                g = np.asarray(getattr(gradient, name), np.float64)
+                m[name] = 0.9 * m[name] + 0.1 * g
+                v[name] = 0.999 * v[name] + 0.001 * g**2
+                direction = (m[name] / (1 - 0.9**t)) / (np.sqrt(v[name] / (1 - 0.999**t)) + 1e-8)
+                pose[name] = pose[name] - rate * step * direction
+            losses.append(np.asarray(value))
+    return pose, np.array(losses)
+
+
+def test_a_stage_is_adam():
+    start, evidence = case()
+    pose, loss, refused = solve([FIRST], start, evidence)
+    expected, losses = adam(start, evidence, [1.0], carry=False)
+    np.testing.assert_allclose(loss, losses[-1], rtol=1e-5)
+    assert (losses[-1] < 0.5 * losses[0]).all()
+    for name in STEP:
+        np.testing.assert_allclose(getattr(pose, name), expected[name], atol=2e-5, err_msg=name)
+    assert not refused.any()
+
+
+@pytest.mark.parametrize("carry", [True, False])
+def test_moments_go_on_or_start_anew(carry):
+    start, evidence = case()
+    second = dataclasses.replace(SECOND, carry_moments=carry)
+    pose, loss, _ = solve([FIRST, second], start, evidence)
+    runs = {c: adam(start, evidence, [1.0, 0.5], carry=c) for c in (True, False)}
+    np.testing.assert_allclose(loss, runs[carry][1][-1], rtol=1e-5)
+    for name in STEP:
+        np.testing.assert_allclose(getattr(pose, name), runs[carry][0][name], atol=2e-5, err_msg=name)
+    apart = np.abs(runs[True][0]["body_pose"] - runs[False][0]["body_pose"]).max()
+    assert apart > 1e-3, "the two must differ for this test to tell them apart"
+
+
+@SOLVERS
+def test_steps_may_be_taken_in_any_portions(solver):
+    start, evidence = case()
+    stage = dataclasses.replace(FIRST, solver=solver)
+    whole, loss, _ = solve([stage], start, evidence)
+    parts, loss_of_parts, _ = solve([stage], start, evidence, (1, 2, 9, STEPS - 12))
+    np.testing.assert_array_equal(loss, loss_of_parts)
+    for name in vars(whole):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name), err_msg=name)
+
+
+@SOLVERS
+def test_what_is_fixed_does_not_move(solver):
+    start, evidence = case()
+    first = dataclasses.replace(FIRST, solver=solver)
+    pose, _, _ = solve([first], start, evidence)
+    for name in ("bone_length", "betas"):
+        np.testing.assert_array_equal(getattr(pose, name), getattr(start, name))
+    np.testing.assert_array_equal(pose.transl[..., 2], start.transl[..., 2])
+    for moved, still in (
+        (pose.transl[..., :2], start.transl[..., :2]),
+        (pose.scale, start.scale),
+        (pose.global_orient, start.global_orient),
+        (pose.body_pose, start.body_pose),
+    ):
+        assert (np.abs(moved - still) > 1e-4).mean() > 0.9
+    assert pose.scale.shape == (B, 1)  # one size for the window
+    only = dataclasses.replace(first, free=("global_orient",))
+    pose, _, _ = solve([only], start, evidence)
+    for name in ("body_pose", "transl", "scale"):
+        np.testing.assert_array_equal(getattr(pose, name), getattr(start, name))
+
+
+@SOLVERS
+def test_a_broken_bird_stands_still_and_leaves_the_other_alone(solver):
+    start, healthy = case()
+    stages = [dataclasses.replace(s, solver=solver, carry_moments=solver == "adam") for s in (FIRST, SECOND)]
+    pose, _, refused = solve(stages, start, case(broken=1)[1])
+    expected, _, _ = solve(stages, start, healthy)
+    assert refused.tolist() == [0, STEPS]
+    for name in vars(pose):
+        np.testing.assert_array_equal(getattr(pose, name)[0], getattr(expected, name)[0], err_msg=name)
+        np.testing.assert_array_equal(getattr(pose, name)[1], getattr(start, name)[1], err_msg=name)
+
+
+def test_keypoints_that_are_off():
+    start, evidence = case()
+    stage = dataclasses.replace(FIRST, keypoints_off=("crown", "no such keypoint"))
+    crown = BIRD.keypoint_names.index("crown")
+    moved = eqx.tree_at(lambda e: e.keypoints_px, evidence, evidence.keypoints_px.at[:, :, crown].add(40.0))
+    results = [solve([s], start, e)[0] for s in (stage, FIRST) for e in (evidence, moved)]
+    np.testing.assert_array_equal(results[0].body_pose, results[1].body_pose)
+    assert np.abs(results[2].body_pose - results[3].body_pose).max() > 1e-3
+
+
+def test_the_report_is_weighted_and_of_the_poses_given():
+    start, evidence = case()
+    result = report(problem(), knobs(), start, start, evidence)
+    assert set(result.loss) == set(FIRST.terms)
+    np.testing.assert_allclose(sum(result.loss.values()), loss_and_gradient(start, evidence)[0], rtol=1e-5)
+    prior = (np.asarray(start.body_pose).reshape(B, -1) ** 2).sum(1) / 0.1  # the toy bird's own
+    np.testing.assert_allclose(result.loss["pose_prior"], 10 * prior, rtol=1e-5, atol=1e-5)
+    first = jax.tree.map(lambda x: x[0], start)
+    keypoints = window_keypoints(RIG, window_transforms(RIG, first), first)
+    np.testing.assert_allclose(result.keypoints_cam[0], keypoints, atol=1e-4)
+    np.testing.assert_allclose(result.keypoints_px[0], project(keypoints, CAMERA), atol=1e-2)
+
+
+def test_one_program_for_any_steps_weights_and_rates(caplog):
+    start, evidence = case()
+    solve([FIRST], start, evidence)
+    others = [
+        (dataclasses.replace(FIRST, learning_rate=0.1, step_scale={"transl": (1.0, 1.0, 1.0), "scale": 1.0}), CONFIG),
+        (FIRST, dataclasses.replace(CONFIG, terms={"keypoints": {"sigma_px": 9}, "velocity": 3})),
+        (dataclasses.replace(FIRST, keypoints_off=("crown",)), CONFIG),
+    ]
+    with caplog.at_level(logging.WARNING), jax.log_compiles():
+        for stage, config in others:
+            own = problem(stage, config), knobs(stage, config)
+            state = begin(*own, jax.tree.map(jnp.copy, start), evidence, None)
+            advance((*own, evidence, jnp.int32(3)), state)
+        assert not compiled(caplog, "advance")
+        assert not compiled(caplog, "begin")
+        shorter = jax.tree.map(lambda x: x[:1], (start, evidence))
+        solve([FIRST], *shorter)
+        assert len(compiled(caplog, "advance")) == 1  # so that the count can fail
+
+
+def compiled(caplog, name):
+    messages = [record.getMessage() for record in caplog.records]
+    return [m for m in messages if m.startswith("Compiling") and name in m.split("with")[0]]

@@ -1,0 +1,183 @@
+"""Starting points from files: both layouts are matched to the birds, and what does not fit is refused."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from support.birds import toy_bird
+
+from jaxfit.config.schema import load_config
+from jaxfit.data.observations import Observations
+from jaxfit.errors import InputError
+from jaxfit.fitting.start import load_start
+from jaxfit.fitting.window import cut_windows
+
+BIRD = toy_bird()
+N, T, J = 2, 5, BIRD.num_joints
+CONFIG = dataclasses.replace(load_config("paper"), window=T)
+
+
+def observed(absent=((1, 2),)):
+    rng = np.random.default_rng(0)
+    present = np.ones((N, T), bool)
+    for at in absent:
+        present[at] = False
+    return Observations(
+        track_id=np.array([4, 9]),
+        frame_index=np.array([10, 11, 12, 13, 14]),
+        present=present,
+        keypoints_px=rng.uniform(80, 160, (N, T, BIRD.num_keypoints, 2)),
+        confidence=np.ones((N, T, BIRD.num_keypoints)) * present[..., None],
+        box_px=np.broadcast_to([80.0, 80, 80, 80], (N, T, 4)),
+        image_size_px=np.full((T, 2), 256),
+        file_name=np.array(["a", "b", "c", "d", "e"]),
+        keypoint_names=BIRD.keypoint_names,
+    )
+
+
+def result(seed=1, tracks=(9, 4), frames=(10, 11, 12, 13, 14), **changes):
+    """The arrays of a result's poses.npz, its tracks in another order than the observations'."""
+    rng = np.random.default_rng(seed)
+    lead = (len(tracks), len(frames))
+    arrays = {
+        "track_id": np.array(tracks),
+        "frame_index": np.array(frames),
+        "global_orient": rng.normal(size=(*lead, 3)),
+        "body_pose": rng.normal(size=(*lead, J - 1, 3)),
+        "transl": rng.normal(size=(*lead, 3)),
+        "scale": rng.uniform(1, 2, lead),
+        "bone_length": rng.uniform(0.5, 2, (*lead, J - 1)),
+        "betas": rng.normal(size=(*lead, 2)),
+        "crop": np.broadcast_to(cut_windows(observed(), CONFIG).crop[0, 0], (*lead, 3)),
+    }
+    return {name: np.asarray(value, value.dtype) for name, value in (arrays | changes).items() if value is not None}
+
+
+def rows(count, **changes):
+    """A regressor's rows."""
+    rng = np.random.default_rng(2)
+    arrays = {
+        "init_pose": rng.normal(size=(count, J, 3)),
+        "init_bone_length": rng.uniform(0.5, 2, (count, J - 1)),
+        "init_translation": rng.normal(size=(count, 3)),
+    }
+    return {name: value for name, value in (arrays | changes).items() if value is not None}
+
+
+def saved(tmp_path, arrays, name="start.npz"):
+    np.savez(tmp_path / name, **arrays)
+    return tmp_path / name
+
+
+def poses(start, common_size=False, observations=None):
+    observations = observed() if observations is None else observations
+    windows = cut_windows(observations, CONFIG)
+    start.check_crops(observations, windows)
+    lines = zip(windows.track, windows.frame, windows.present, strict=True)
+    windowed = [start.window_pose(BIRD, int(n), frame, present, common_size) for n, frame, present in lines]
+    return jax.tree.map(np.asarray, windowed)
+
+
+def test_an_earlier_result(tmp_path):
+    arrays = result()
+    start = load_start(saved(tmp_path, arrays), observed(), BIRD)
+    assert start.has_shape
+    first, second = poses(start)
+    np.testing.assert_allclose(first.global_orient, arrays["global_orient"][1], rtol=1e-6)  # track 4 is its second
+    np.testing.assert_allclose(second.body_pose[3], arrays["body_pose"][0, 3], rtol=1e-6)
+    np.testing.assert_allclose(first.transl, arrays["transl"][1], rtol=1e-6)
+    np.testing.assert_allclose(first.scale, arrays["scale"][1], rtol=1e-6)
+    np.testing.assert_allclose(first.bone_length, np.median(arrays["bone_length"][1], 0), rtol=1e-6)
+    np.testing.assert_allclose(first.betas, np.median(arrays["betas"][1], 0), rtol=1e-6)
+    common = poses(start, common_size=True)[0]
+    np.testing.assert_allclose(common.scale, [np.median(arrays["scale"][1])], rtol=1e-6)
+
+
+def test_frames_without_a_start_take_their_neighbours(tmp_path):
+    arrays = result()
+    arrays["global_orient"][1, 0] = np.nan  # track 4 was not fitted there
+    first, second = poses(load_start(saved(tmp_path, arrays), observed(), BIRD))
+    np.testing.assert_allclose(first.global_orient[0], arrays["global_orient"][1, 1], rtol=1e-6)
+    np.testing.assert_allclose(second.transl[2], arrays["transl"][0, 1], rtol=1e-6)  # the bird itself was away
+    fewer = result(frames=(11, 14))
+    first, _ = poses(load_start(saved(tmp_path, fewer), observed(), BIRD))
+    np.testing.assert_allclose(first.transl, fewer["transl"][1, [0, 0, 0, 1, 1]], rtol=1e-6)
+
+
+def test_a_regressors_rows(tmp_path):
+    observations = observed()
+    arrays = rows(N * T - 1)
+    start = load_start(saved(tmp_path, arrays), observations, BIRD)
+    assert not start.has_shape
+    first, second = poses(start)
+    np.testing.assert_allclose(first.global_orient, arrays["init_pose"][:5, 0], rtol=1e-6)
+    np.testing.assert_allclose(second.body_pose[[0, 1, 3, 4]], arrays["init_pose"][5:, 1:], rtol=1e-6)
+    np.testing.assert_allclose(second.transl[[0, 1, 3, 4]], arrays["init_translation"][5:], rtol=1e-6)
+    np.testing.assert_array_equal(first.scale, 1)
+    np.testing.assert_array_equal(first.betas, np.zeros(2))
+    np.testing.assert_allclose(first.bone_length, np.median(arrays["init_bone_length"][:5], 0), rtol=1e-6)
+
+
+def nan_at(array, *at):
+    array[at] = np.nan
+    return array
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (rows(8), "has 8, 8, 8 rows .*9 annotations"),
+        (rows(9, init_translation=np.zeros((4, 3))), "has 9, 9, 4 rows"),
+        (rows(9, init_pose=np.zeros((9, 11, 3)), init_bone_length=np.ones((9, 10))), r"poses of 11 joints \(.* 8"),
+        (rows(9, init_bone_length=np.ones((9, J))), "`init_bone_length`"),
+        (rows(9, init_pose=np.zeros((9, J, 4))), "`init_pose`"),
+        (rows(9, init_pose=np.zeros((9, 3 * J))), "init_pose"),
+        (rows(9, init_pose=nan_at(np.zeros((9, J, 3)), 2, 1)), "NaN or infinite"),
+        (rows(9, init_translation=np.full((9, 3), np.inf)), "NaN or infinite"),
+        (rows(9, init_translation=None), "init_translation"),
+        (result(transl=None), "transl"),
+        (result(body_pose=np.zeros((2, 5, J + 1, 3)), bone_length=np.ones((2, 5, J + 1))), "poses of 10 joints"),
+        (result(betas=np.zeros((2, 5, 9))), "9 shape coefficients .*2"),
+        (result(scale=np.ones((2, 5, 1))), "scale"),
+        (result(transl=np.zeros((2, 4, 3))), "transl"),
+        (result(body_pose=np.zeros((2, 5, J - 1, 4))), "body_pose"),
+        (result(bone_length=np.ones((2, 5, J))), "bone_length"),
+        (result(transl=nan_at(np.zeros((2, 5, 3)), 0, 1)), "transl.*NaN"),
+        (result(body_pose=np.full((2, 5, J - 1, 3), np.inf)), "body_pose.*NaN|NaN.*body_pose"),
+        (result(tracks=(), crop=np.zeros((0, 5, 3))), "no pose for any"),
+        ({"something": np.ones(3)}, "init_pose"),
+    ],
+)
+def test_what_does_not_fit_is_refused(tmp_path, arrays, message):
+    path = saved(tmp_path, arrays)
+    with pytest.raises(InputError, match=message) as caught:
+        load_start(path, observed(), BIRD)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"absent\.npz"):
+        load_start(tmp_path / "absent.npz", observed(), BIRD)
+    whole = saved(tmp_path, result()).read_bytes()
+    for content in (b"", b"text", whole[: len(whole) // 2], whole[:-30], b"\x80\x04c" + whole):
+        (tmp_path / "cut.npz").write_bytes(content)
+        with pytest.raises(InputError, match=r"cut\.npz"):
+            load_start(tmp_path / "cut.npz", observed(), BIRD)
+    np.savez(tmp_path / "objects.npz", init_pose=np.array([{}], dtype=object))
+    with pytest.raises(InputError, match=r"objects\.npz.*Python objects"):
+        load_start(tmp_path / "objects.npz", observed(), BIRD)
+
+
+def test_poses_of_other_crops_are_refused(tmp_path):
+    arrays = result()
+    arrays["crop"] = arrays["crop"] + np.array([30, 0, 0])
+    start = load_start(saved(tmp_path, arrays), observed(), BIRD)
+    with pytest.raises(InputError, match=r"start\.npz: `crop` of track 4 is 30 pixels off"):
+        poses(start)
+
+
+def test_a_bird_without_any_start(tmp_path):
+    start = load_start(saved(tmp_path, result(tracks=(4,))), observed(), BIRD)
+    with pytest.raises(InputError, match="has no pose for track 9"):
+        poses(start)

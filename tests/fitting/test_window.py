@@ -1,0 +1,216 @@
+"""Windows: what is fitted together, cut out how, and that nothing is lost between image and crop."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxfit.config.schema import CropConfig, load_config
+from jaxfit.data.masks import encode_mask
+from jaxfit.data.observations import Observations
+from jaxfit.errors import InputError
+from jaxfit.fitting.filtering import weighted_median_filter
+from jaxfit.fitting.window import cut_mask, cut_windows, filter_observations, load_evidence
+from jaxfit.model.camera import crop_to_image
+
+K, WIDTH, HEIGHT = 5, 400, 300
+
+
+def config(window=4, **changes):
+    return dataclasses.replace(load_config("paper"), window=window, **changes)
+
+
+def walk(numbers, birds=2, seed=0):
+    """Birds that walk to the right, some 4 px a frame number; frame t carries the number `numbers[t]`."""
+    rng = np.random.default_rng(seed)
+    T = len(numbers)
+    centre = np.stack([np.array([60 + 50 * n, 90 + 60 * n]) + np.outer(numbers, [4, 1]) for n in range(birds)])
+    keypoints = centre[:, :, None] + rng.uniform(-18, 18, (birds, T, K, 2))
+    low, high = keypoints.min(2) - 2, keypoints.max(2) + 2
+    masks = {}
+    for n in range(birds):
+        for t in range(T):
+            mask = np.zeros((HEIGHT, WIDTH), bool)
+            (x0, y0), (x1, y1) = low[n, t].astype(int), high[n, t].astype(int)
+            mask[max(y0, 0) : y1, max(x0, 0) : x1] = True
+            masks[n, t] = encode_mask(mask)
+    return Observations(
+        track_id=np.arange(birds) + 7,
+        frame_index=np.array(numbers),
+        present=np.ones((birds, T), bool),
+        keypoints_px=keypoints,
+        confidence=rng.uniform(0.5, 1, (birds, T, K)),
+        box_px=np.concatenate([low, high - low], -1),
+        image_size_px=np.full((T, 2), [WIDTH, HEIGHT]),
+        file_name=np.array([f"{t}.png" for t in numbers]),
+        keypoint_names=tuple("abcde"),
+        masks=masks,
+    )
+
+
+def changed(observations, unseen=(), **changes):
+    """The same without the birds × frames `unseen`."""
+    present, confidence = observations.present.copy(), observations.confidence.copy()
+    for at in unseen:
+        present[at], confidence[at] = False, 0
+    return dataclasses.replace(observations, present=present, confidence=confidence, **changes)
+
+
+def test_tracks_are_cut_into_windows():
+    windows = cut_windows(walk(range(10)), config())
+    assert windows.track.tolist() == [0, 0, 0, 1, 1, 1]
+    assert windows.frame[:3].tolist() == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, -1, -1]]
+    assert windows.present.tolist() == (windows.frame >= 0).tolist()
+    assert len(windows[1:3]) == 2
+    assert windows[np.array([5, 0])].track.tolist() == [1, 0]
+
+
+def test_windows_begin_where_the_bird_does():
+    seen_late = changed(walk(range(10)), [(0, 0), (0, 1), (0, 5), (0, 9), *((1, t) for t in range(10))])
+    windows = cut_windows(seen_late, config())
+    assert windows.track.tolist() == [0, 0]  # the second bird has no usable frame: no window
+    assert windows.frame.tolist() == [[2, 3, 4, 5], [6, 7, 8, -1]]
+    assert windows.present.tolist() == [[True, True, True, False], [True, True, True, False]]
+
+
+def test_too_few_keypoints_are_no_frame():
+    observations = walk(range(4))
+    confidence = observations.confidence.copy()
+    confidence[0, 2, :2] = 0
+    few = dataclasses.replace(observations, confidence=confidence)
+    assert cut_windows(few, config(min_keypoints=4)).present[0].tolist() == [True, True, False, True]
+    assert cut_windows(few, config(min_keypoints=3)).present[0].tolist() == [True] * 4
+
+
+def test_missing_numbers_are_missing_frames():
+    """Frames 0, 1, 4, 5 are not neighbours; frames 0, 2, 4 of a file that has every second are."""
+    windows = cut_windows(walk([0, 1, 4, 5, 15]), config())
+    assert windows.frame[:3].tolist() == [[0, 1, -1, -1], [2, 3, -1, -1], [-1, -1, -1, 4]]
+    assert windows.present[:3].tolist() == (windows.frame[:3] >= 0).tolist()
+    assert cut_windows(walk([10, 12, 14, 18]), config()).frame[:2].tolist() == [[0, 1, 2, -1], [3, -1, -1, -1]]
+    with pytest.raises(InputError, match=r"frame_index runs to 1000000000 .*number the frames"):
+        cut_windows(walk([0, 1, 10**9]), config())
+
+
+def test_the_crop_keeps_its_size_and_follows_the_bird():
+    observations = changed(walk(range(8)), [(0, 2)])
+    windows = cut_windows(observations, config(window=8, crop=CropConfig(padding=0.25)))
+    for n, crop in enumerate(windows.crop):
+        assert len(set(crop[:, 2])) == 1
+        assert (crop == np.round(crop)).all()
+        boxes = observations.box_px[n][windows.present[n]]
+        assert crop[0, 2] == np.ceil(boxes[:, 2:].max() * 1.5)
+        centre = boxes[:, :2] + boxes[:, 2:] / 2
+        apart = crop[windows.present[n], :2] + crop[windows.present[n], 2:] / 2 - centre
+        assert np.abs(apart).max() <= 0.51  # whole pixels
+    assert (
+        windows.crop[0, 2].tolist() in windows.crop[0, [1, 3]].tolist()
+    )  # a missing frame looks where one beside does
+
+
+def test_without_boxes_the_keypoints_make_the_crop():
+    observations = walk(range(4))
+    windows = cut_windows(dataclasses.replace(observations, box_px=np.zeros((2, 4, 4))), config())
+    inside = observations.keypoints_px[windows.track[:, None], windows.frame] - windows.crop[:, :, None, :2]
+    assert (inside > 0).all()
+    assert (inside < windows.crop[:, :, None, 2:]).all()
+
+
+def test_keypoints_go_to_the_crop_and_back():
+    observations = changed(walk([0, 1, 3, 4, 5]), [(1, 0), (0, 3)])
+    windows = cut_windows(observations, config())
+    evidence = load_evidence(observations, windows, 64)
+    assert evidence.keypoints_px.shape == (len(windows), 4, K, 2)
+    back = crop_to_image(evidence.keypoints_px, windows.crop, 64)
+    measured = 0
+    for w, t in zip(*np.nonzero(windows.present), strict=True):
+        n, at = windows.track[w], windows.frame[w, t]
+        np.testing.assert_allclose(back[w, t], observations.keypoints_px[n, at], atol=1e-3)
+        np.testing.assert_array_equal(evidence.confidence[w, t], observations.confidence[n, at])
+        assert (evidence.keypoints_px[w, t] > 0).all()
+        assert (evidence.keypoints_px[w, t] < 64).all()
+        assert evidence.has_mask[w, t]
+        expected = cut_mask(observations.mask(n, at), windows.crop[w, t], 64)
+        np.testing.assert_array_equal(evidence.mask[w, t], expected)
+        measured += 1
+    assert measured == 8
+    absent = ~windows.present
+    assert not evidence.confidence[absent].any()
+    assert not evidence.has_mask[absent].any()
+    assert not evidence.mask[absent].any()
+    assert not evidence.keypoints_px[absent].any()
+    np.testing.assert_array_equal(evidence.present, windows.present)
+
+
+def test_a_bird_without_mask_keeps_its_keypoints():
+    observations = walk(range(4))
+    masks = {at: rle for at, rle in observations.masks.items() if at != (0, 1)}
+    evidence = load_evidence(dataclasses.replace(observations, masks=masks), cut_windows(observations, config()), 64)
+    assert evidence.has_mask[0].tolist() == [True, False, True, True]
+    assert evidence.present[0].all()
+    assert evidence.confidence[0, 1].all()
+
+
+@pytest.mark.parametrize(
+    "crop", [(10, 20, 96), (-13, 5, 64), (350, 250, 100), (0, 0, 32), (37, 41, 75), (500, 400, 80)]
+)
+def test_masks_shrink_by_area(crop):
+    """A crop's pixel counts where the mask covers half of it: by adding up covered areas exactly."""
+    rng = np.random.default_rng(0)
+    mask = np.kron(rng.random((30, 40)) < 0.5, np.ones((10, 10))).astype(bool)  # 300 × 400, blocks of ten
+    x0, y0, size = crop
+    full = np.zeros((size, size))
+    for i in range(size):
+        for j in range(size):
+            y, x = y0 + i, x0 + j
+            full[i, j] = 0 <= y < HEIGHT and 0 <= x < WIDTH and mask[y, x]
+    edges = np.linspace(0, size, 33)
+    pixel = np.arange(size)
+    share = np.clip(np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel), 0, None)
+    covered = share @ full @ share.T / (size / 32) ** 2
+    clear = np.abs(covered - 0.5) > 0.01
+    assert clear.mean() > 0.7
+    cut = cut_mask(mask, np.array(crop, float), 32)
+    assert set(np.unique(cut)) <= {0, 1}
+    np.testing.assert_array_equal(cut[clear], covered[clear] > 0.5)
+
+
+@pytest.mark.parametrize("size", [40, 64, 100])
+def test_masks_stay_under_the_keypoints(size):
+    """A disc cut from the image is the disc at the crop's scale, whether it grows or shrinks."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    crop, centre, radius = np.array([80.0, 60, size]), np.array([80 + 0.55 * size, 60 + 0.4 * size]), 0.25 * size
+    disc = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2
+    cut = cut_mask(disc, crop, 256)
+    y, x = np.mgrid[:256, :256] + 0.5
+    expected = (x - 0.55 * 256) ** 2 + (y - 0.4 * 256) ** 2 < (0.25 * 256) ** 2
+    assert (cut & expected).sum() / (cut | expected).sum() > 0.94
+    inside = np.argwhere(cut) + 0.5
+    np.testing.assert_allclose(inside.mean(0), [0.4 * 256, 0.55 * 256], atol=0.25 * 256 / size)
+
+
+def test_whole_images():
+    observations = dataclasses.replace(walk(range(4)), image_size_px=np.full((4, 2), 400), masks={})
+    crop = cut_windows(observations, config(crop=CropConfig(mode="image"))).crop
+    np.testing.assert_array_equal(crop, np.broadcast_to([0, 0, 400], (2, 4, 3)))
+    with pytest.raises(InputError, match=r"crop.mode: image.*square.*400, 300.*box"):
+        cut_windows(walk(range(4)), config(crop=CropConfig(mode="image")))
+
+
+@pytest.mark.parametrize("numbers", [range(9), [0, 1, 2, 5, 6, 11, 12, 13, 14], [0, 2, 4, 6, 10, 12]])
+def test_the_filter_runs_over_frame_numbers(numbers):
+    """What stands far apart in the video is not smoothed together."""
+    observations = changed(walk(numbers), [(0, 2), (1, 3)])
+    step = 1 if 1 in numbers else 2
+    line = np.arange(max(numbers) // step + 1) * step
+    filtered = filter_observations(observations, 5)
+    for n in range(2):
+        points, weight = np.zeros((len(line), K, 2), np.float32), np.zeros((len(line), K), np.float32)
+        at = np.searchsorted(line, numbers)
+        points[at], weight[at] = observations.keypoints_px[n], observations.confidence[n]
+        expected = np.asarray(weighted_median_filter(points, weight, 5))[at]
+        seen = observations.present[n]
+        np.testing.assert_array_equal(filtered.keypoints_px[n][seen], expected[seen])
+    np.testing.assert_array_equal(filtered.confidence, observations.confidence)
+    assert np.abs(filtered.keypoints_px - observations.keypoints_px).max() > 1
+    assert filter_observations(observations, 1) is observations

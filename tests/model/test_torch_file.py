@@ -1,0 +1,241 @@
+"""Checkpoints are read exactly, and no file can run anything, read outside itself or take all memory."""
+
+import os
+import pickle
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.checkpoints import (
+    integer,
+    integers,
+    legacy,
+    mapping,
+    storage,
+    tensor,
+    text,
+    write_legacy,
+    write_zip,
+)
+
+from jaxfit.errors import InputError
+from jaxfit.model.importers.torch_file import read_tensors
+
+RAW = np.arange(12, dtype="<f4").tobytes()
+FLOATS = {"0": RAW}
+STORED = storage("0", 12)
+
+
+def arrays():
+    rng = np.random.default_rng(0)
+    return {
+        "f": rng.normal(size=(3, 4)).astype("<f4"),
+        "d": rng.normal(size=(2, 2, 2)),
+        "h": rng.normal(size=5).astype("<f2"),
+        "l": np.array([-(2**40), 2**40]),
+        "u": np.arange(3, dtype="u1"),
+        "scalar": np.array(2.5),
+        "empty": np.zeros((0, 3), "<f4"),
+    }
+
+
+@pytest.mark.parametrize("write", [write_legacy, write_zip])
+def test_arrays_come_back_exactly(tmp_path, write):
+    expected = arrays()
+    found = read_tensors(write(tmp_path / "a.pt", expected))
+    assert found.keys() == expected.keys()
+    for name, array in expected.items():
+        assert found[name].dtype == array.dtype, name
+        np.testing.assert_array_equal(found[name], array)
+
+
+def test_views_share_a_storage(tmp_path):
+    entries = {"transposed": tensor(STORED, (4, 3), (1, 4)), "column": tensor(STORED, (3,), (4,), offset=2)}
+    (tmp_path / "a.pt").write_bytes(legacy(mapping(entries), FLOATS))
+    found = read_tensors(tmp_path / "a.pt")
+    whole = np.arange(12).reshape(3, 4)
+    np.testing.assert_array_equal(found["transposed"], whole.T)
+    np.testing.assert_array_equal(found["column"], whole[:, 2])
+    assert not found["column"].flags.writeable
+
+
+def refusal(tmp_path, content: bytes) -> str:
+    path = tmp_path / "hostile.pt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"hostile\.pt") as caught:
+        read_tensors(path)
+    return str(caught.value)
+
+
+class Payload:
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (self.folder,)
+
+
+@pytest.mark.parametrize("protocol", range(6))
+def test_code_in_a_pickle_is_never_run(tmp_path, protocol):
+    canary, control = tmp_path / "canary", tmp_path / "control"
+    pickle.loads(pickle.dumps(Payload(str(control)), protocol))
+    assert control.exists()  # the payload does run where a pickle is trusted
+    payload = pickle.dumps({"V": Payload(str(canary))}, protocol)
+    legacy_message = refusal(tmp_path, legacy(payload, {}))
+    if protocol >= 2:
+        assert "mkdir" in legacy_message
+    assert refusal(tmp_path, payload)  # at the very first pickle
+    with zipfile.ZipFile(tmp_path / "hostile.pt", "w") as archive:
+        archive.writestr("archive/data.pkl", payload)
+    with pytest.raises(InputError):
+        read_tensors(tmp_path / "hostile.pt")
+    assert not canary.exists()
+
+
+BUILD_DICT = b"ccollections\nOrderedDict\n)R}(" + text("__class__") + b"K\x01ub"
+HOSTILE_BODIES = {
+    "eval": (b"cbuiltins\neval\n" + b"(" + text("1") + b"tR.", "builtins.eval"),
+    "stack global": (b"\x80\x04\x8c\x05posix\x8c\x06system\x93.", "posix.system"),
+    "copyreg": (b"ccopyreg\n_reconstructor\n.", "copyreg._reconstructor"),
+    "torch itself": (b"ctorch\nload\n.", "torch.load"),
+    "dotted name": (b"\x80\x04" + text("torch") + text("FloatStorage.__init__") + b"\x93.", "__init__"),
+    "INST": (b"(ios\nsystem\n.", "INST"),
+    "OBJ": (b"(cos\nsystem\no.", "os.system"),
+    "NEWOBJ": (b"ccollections\nOrderedDict\n)\x81.", "NEWOBJ"),
+    "EXT1": (b"\x82\x01.", "EXT1"),
+    "BUILD": (BUILD_DICT + b".", "BUILD"),
+    "BUILD on a tensor": (tensor(STORED, (12,), (1,)) + b"}b.", "BUILD"),
+    "text persistent id": (b"Pstorage\n.", "PERSID"),
+    "ordered dict of something": (b"ccollections\nOrderedDict\n((lt(R.", ""),
+    "ordered dict with a tuple": (b"ccollections\nOrderedDict\n" + integers([1]) + b"R.", "calls something"),
+    "call of a storage type": (b"ctorch\nFloatStorage\n" + integers([2**40]) + b"R.", "calls something"),
+    "call of a text": (text("print") + b")R.", "calls something"),
+    "tensor of text": (
+        mapping({"V": b"ctorch._utils\n_rebuild_tensor_v2\n(" + text("x") * 6 + b"tR"}),
+        "calls",
+    ),
+    "persistent id of numbers": (integers([1, 2, 3, 4, 5]) + b"Q.", "persistent id"),
+    "empty stack": (b"0.", ""),
+    "lone stop": (b".", ""),
+    "unset memo": (b"h\x07.", ""),
+    "no mark": (b"t.", ""),
+    "key that is a tuple": (b"}((I1\nI2\ntI3\nu.", "names"),
+    "unending": (b"\x80\x02" + b"K\x01" * 20, ""),
+    "too long": (b"K\x01" * 200_002 + b".", "longer than"),
+    "text longer than the file": (b"X\xff\xff\xff\x7fabc.", ""),
+    "not UTF-8": (b"X\x01\x00\x00\x00\xff.", ""),
+    "no dictionary": (b"](" + STORED + b"e.", "dictionary"),
+    "bfloat16": (storage("0", 12, "BFloat16") + b".", "torch.BFloat16Storage"),
+    "view of a storage": (mapping({"V": storage("0", 12, tail=integers([1, 0, 2]))}), "view"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE_BODIES)
+def test_hostile_instructions_are_refused(tmp_path, name):
+    body, expected = HOSTILE_BODIES[name]
+    assert expected in refusal(tmp_path, legacy(body, FLOATS))
+
+
+@pytest.mark.parametrize(
+    ("shape", "strides", "offset"),
+    [
+        ((13,), (1,), 0),
+        ((12,), (1,), 1),
+        ((3, 4), (5, 1), 0),
+        ((2,), (2**40,), 0),
+        ((2,), (-1,), 5),
+        ((-1,), (1,), 0),
+        ((3,), (1,), -1),
+        ((0,), (1,), 13),
+        ((2**20, 2**20), (0, 0), 0),
+        ((2**62, 4), (0, 0), 0),
+        ((3,), (1, 1), 0),
+        ((1,) * 9, (1,) * 9, 0),
+    ],
+)
+def test_a_tensor_stays_inside_its_storage(tmp_path, shape, strides, offset):
+    body = mapping({"V": tensor(STORED, shape, strides, offset)})
+    assert "checkpoint" in refusal(tmp_path, legacy(body, FLOATS))
+
+
+def test_the_last_element_may_be_used(tmp_path):
+    (tmp_path / "a.pt").write_bytes(legacy(mapping({"V": tensor(STORED, (3,), (5,), 1)}), FLOATS))
+    np.testing.assert_array_equal(read_tensors(tmp_path / "a.pt")["V"], [1, 6, 11])
+
+
+def test_claimed_counts_must_be_true(tmp_path):
+    body = mapping({"V": tensor(STORED, (12,), (1,))})
+    assert "disagree" in refusal(tmp_path, legacy(body, FLOATS, counts={"0": 11}))
+    assert "disagree" in refusal(tmp_path, legacy(body, FLOATS, counts={"0": -1}))
+    assert "truncated" in refusal(tmp_path, legacy(body, FLOATS)[:-1])
+    assert "not in the file" in refusal(tmp_path, legacy(body, {}))
+    assert "no tensor uses" in refusal(tmp_path, legacy(body, {"0": RAW, "1": RAW}))
+    big = mapping({"V": tensor(storage("0", 2**27), (1,), (1,))})
+    assert "truncated" in refusal(tmp_path, legacy(big, FLOATS, counts={"0": 2**27}))
+    twice = mapping({"V": tensor(STORED, (1,), (1,)), "W": tensor(storage("0", 6, "Double"), (1,), (1,))})
+    assert "two ways" in refusal(tmp_path, legacy(twice, FLOATS))
+    assert "little-endian" in refusal(tmp_path, legacy(body, FLOATS, little=False))
+    assert refusal(tmp_path, b"")
+    assert refusal(tmp_path, b"\x80\x02}." * 5)
+
+
+def test_small_files_cannot_claim_all_memory(tmp_path):
+    bodies = [
+        b"r\xff\xff\xff\x7f.",  # a memo of two thousand million entries
+        b"\x8e" + (2**62).to_bytes(8, "little") + b".",
+        b"\x80\x04\x95" + (2**62).to_bytes(8, "little") + b".",
+        integer(2**40) + b"\x85" * 190_000 + b".",
+    ]
+    tracemalloc.start()
+    for body in bodies:
+        refusal(tmp_path, legacy(body, {}))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**26
+
+
+def test_zip_files_are_checked(tmp_path):
+    path = tmp_path / "hostile.pt"
+    whole = write_zip(path, {"V": np.zeros(1000, "<f4")}).read_bytes()
+    assert "damaged" in refusal(tmp_path, whole[:-40])
+    flipped = bytearray(whole)
+    flipped[whole.index(b"\0" * 1000) + 500] ^= 1
+    assert "damaged" in refusal(tmp_path, bytes(flipped))
+    assert "compressed" in refusal(
+        tmp_path, write_zip(path, {"V": np.zeros(9)}, compression=zipfile.ZIP_DEFLATED).read_bytes()
+    )
+    np.savez(tmp_path / "plain.npz", V=np.zeros(3))
+    assert "data.pkl" in refusal(tmp_path, (tmp_path / "plain.npz").read_bytes())
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a/data.pkl", mapping({"V": tensor(storage("../../etc", 2, tail=b""), (1,), (1,))}))
+    assert "../../etc" in refusal(tmp_path, path.read_bytes())  # a name in the archive, never a path
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a/data.pkl", mapping({"V": tensor(storage("0", 3, tail=b""), (1,), (1,))}))
+        archive.writestr("a/data/0", b"\0" * 8)
+    assert "truncated" in refusal(tmp_path, path.read_bytes())
+
+
+def test_missing_files_and_folders(tmp_path):
+    for path in (tmp_path, tmp_path / "none.pt"):
+        with pytest.raises(InputError, match="no such file"):
+            read_tensors(path)
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data())
+def test_any_damage_is_one_error_or_none(tmp_path_factory, data):
+    """Whatever happens to the bytes: arrays within the file, or an InputError; nothing else."""
+    path = tmp_path_factory.mktemp("fuzz") / "a.pt"
+    write = data.draw(st.sampled_from([write_legacy, write_zip]))
+    content = bytearray(write(path, {"V": np.ones((4, 3), "<f4"), "F": np.array([[0, 1, 2]])}).read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content[: data.draw(st.sampled_from([len(content), len(content) // 2]))])
+    try:
+        found = read_tensors(path)
+    except InputError:
+        return
+    assert sum(array.nbytes for array in found.values()) <= 2 * len(content)

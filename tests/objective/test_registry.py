@@ -1,0 +1,198 @@
+"""Terms are found by name, entry point or path; what is no term is refused with a reason."""
+
+import importlib
+import sys
+from importlib import metadata
+
+import jax
+import jax.numpy as jnp
+import pytest
+from support.terms_by_hand import scene, seen, window_pose
+
+import jaxfit
+from jaxfit.errors import InputError
+from jaxfit.objective import registry, terms
+from jaxfit.objective.objective import evaluate_terms, weighted_sum
+from jaxfit.objective.registry import find_term, known_terms, term
+
+MODULE = """
+import jax.numpy as jnp
+from jaxfit.objective.registry import term
+
+def plain(scene, *, power=2.0):
+    return jnp.sum(jnp.abs(scene.pose.body_pose) ** power)
+
+@term(name="marked", positive=["width"], compares_masks=True)
+def decorated(scene, *, width=1, offset=0.0):
+    return jnp.sum(scene.evidence.mask) / width + offset
+
+number = 3.0
+def no_default(scene, *, x): return 0.0
+def wrong_default(scene, *, x=None): return 0.0
+def flag(scene, *, x=True): return 0.0
+def positional(scene, x=1.0): return 0.0
+def nothing(): return 0.0
+def only(*, scene): return 0.0
+def weighs(scene, *, weight=1.0): return 0.0
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_registry(monkeypatch):
+    """What a test registers goes with it."""
+    monkeypatch.setattr(registry, "_terms", dict(registry._terms))
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    (tmp_path / "own_priors.py").write_text(MODULE)
+    (tmp_path / "broken_priors.py").write_text("raise RuntimeError('no luck')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    for name in ("own_priors", "broken_priors"):
+        sys.modules.pop(name, None)
+
+
+def test_a_term_of_this_session():
+    assert jaxfit.term is term
+
+    @jaxfit.term
+    def stillness(scene, *, beta=2):
+        return beta * jnp.sum(scene.pose.body_pose**2)
+
+    found = find_term("stillness")
+    assert found.function is stillness
+    assert (found.settings, found.positive, found.compares_masks) == ({"beta": 2.0}, frozenset(), False)
+    assert "stillness" in known_terms()
+    pose = window_pose()
+    settings = {"stillness": {"weight": 3.0, "beta": 0.5}}
+    expected = 1.5 * float(jnp.sum(pose.body_pose**2))
+    assert float(weighted_sum(scene(pose, seen()), settings)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_cell_run_twice_is_its_new_self_also_in_compiled_programs():
+    @jax.jit
+    def total(pose):
+        return weighted_sum(scene(pose, seen()), {"again": {"weight": 1.0}})
+
+    for value in (1.0, 2.0):
+
+        @term(name="again")
+        def own(scene):
+            return jnp.float32(value)  # noqa: B023
+
+        assert float(total(window_pose())) == value
+
+
+def test_names_are_taken_once():
+    def velocity(scene):
+        return 0.0
+
+    for taken in ("velocity", "keypoints"):
+        with pytest.raises(InputError, match=rf"'{taken}'.*jaxfit\.objective\."):
+            term(name=taken)(velocity)
+    assert find_term("keypoints").function is terms.keypoints
+    importlib.reload(importlib.import_module("jaxfit.objective.temporal"))  # a module may register its own again
+
+
+def test_by_path(package):
+    found = find_term("own_priors:plain")
+    assert found.settings == {"power": 2.0}
+    assert not found.compares_masks
+    marked = find_term("own_priors:decorated")
+    assert marked.compares_masks
+    assert marked.positive == {"width"}
+    assert find_term("marked").function is marked.function
+    assert "own_priors:plain" not in known_terms()
+    assert "marked" in known_terms()
+    pose = window_pose()
+    value = evaluate_terms(scene(pose, seen()), {"own_priors:plain": {"weight": 1.0, "power": 1.0}})
+    assert float(value["own_priors:plain"]) == pytest.approx(float(jnp.abs(pose.body_pose).sum()), rel=1e-5)
+
+
+def test_a_module_that_is_edited(package):
+    assert find_term("own_priors:plain").settings == {"power": 2.0}
+    (package / "own_priors.py").write_text("def plain(scene, *, changed=7.25):\n    return 0.0\n")
+    importlib.invalidate_caches()
+    importlib.reload(sys.modules["own_priors"])
+    assert find_term("own_priors:plain").settings == {"changed": 7.25}
+
+
+def test_by_entry_point(package, monkeypatch):
+    offered = metadata.EntryPoint("cosy", "own_priors:plain", registry.ENTRY_POINTS)
+    clash = metadata.EntryPoint("velocity", "own_priors:plain", registry.ENTRY_POINTS)
+
+    def entry_points(*, group):
+        return metadata.EntryPoints([offered, clash] if group == "jaxfit.terms" else [])
+
+    monkeypatch.setattr(registry.metadata, "entry_points", entry_points)
+    assert "cosy" in known_terms()
+    assert find_term("cosy").settings == {"power": 2.0}
+    assert find_term("velocity").function.__module__ == "jaxfit.objective.temporal"  # the library's own stays
+    assert known_terms().count("velocity") == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("absent_priors:plain", ("cannot be imported", "absent_priors", "PYTHONPATH")),
+        ("broken_priors:plain", ("cannot be imported", "RuntimeError: no luck")),
+        ("own_priors:absent", ("has no function 'absent'",)),
+        ("own_priors:number", ("is no function", "float")),
+        ("own_priors:no_default", ("'x'", "default is no number")),
+        ("own_priors:wrong_default", ("'x'", "default is no number")),
+        ("own_priors:flag", ("'x'", "default is no number")),
+        ("own_priors:positional", ("'x' beside the scene",)),
+        ("own_priors:nothing", ("takes no scene",)),
+        ("own_priors:only", ("takes no scene",)),
+        ("own_priors:weighs", ("'weight'",)),
+        ("builtins:max", ("takes no scene",)),
+        (":plain", ("cannot be imported",)),
+        ("own_priors:", ("has no function",)),
+    ],
+)
+def test_what_is_no_term(package, path, words):
+    with pytest.raises(InputError) as caught:
+        find_term(path)
+    for word in (repr(path), *words):
+        assert word in str(caught.value)
+
+
+def test_unknown_names():
+    with pytest.raises(KeyError):
+        find_term("unknown")
+    with pytest.raises(InputError, match=r"'width'.*positive"):
+        term(positive=["width"])(lambda scene: 0.0)
+
+
+@pytest.mark.parametrize(
+    ("returned", "said"),
+    [
+        (lambda: jnp.ones(3), r"float32 of shape \(3,\)"),
+        (lambda: jnp.ones(()) > 0, r"bool of shape \(\)"),
+        (lambda: jnp.int32(3), "int32"),
+        (lambda: None, "NoneType"),
+        (lambda: (jnp.ones(()), jnp.ones(())), r"of shape \(2,\)|tuple"),
+    ],
+)
+def test_a_term_is_one_real_number(returned, said):
+    term(name="odd")(lambda scene: returned())
+    with pytest.raises(InputError, match=rf"term 'odd': returned .*{said}"):
+        evaluate_terms(scene(window_pose(), seen()), {"odd": {"weight": 1.0}})
+
+
+def test_a_sweep_over_a_term_of_ones_own_compiles_once():
+    traces = []
+
+    @term(name="counted")
+    def own(scene, *, power=2.0):
+        traces.append(None)
+        return jnp.sum(jnp.abs(scene.pose.body_pose) ** power)
+
+    pose = window_pose()
+    sweep = jax.jit(jax.vmap(lambda w, p: weighted_sum(scene(pose, seen()), {"counted": {"weight": w, "power": p}})))
+    found = sweep(jnp.array([1.0, 2.0, 1.0]), jnp.array([1.0, 1.0, 2.0]))
+    sweep(jnp.array([5.0, 2.0, 1.0]), jnp.array([1.0, 3.0, 2.0]))
+    assert len(traces) == 1
+    size = jnp.abs(pose.body_pose)
+    assert found == pytest.approx([float(size.sum()), 2 * float(size.sum()), float((size**2).sum())], rel=1e-5)

@@ -1,0 +1,238 @@
+"""Every term against its equation in NumPy; settings are traced; what was not seen pulls at nothing."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+from support.birds import pose_window
+from support.terms_by_hand import (
+    BIRD,
+    CAMERA,
+    PRIORS,
+    RASTER,
+    RIG,
+    SIZE,
+    TERMS,
+    T,
+    all_settings,
+    every_gradient,
+    every_term,
+    oracle,
+    scene,
+    seen,
+    soft_silhouettes,
+    window_pose,
+    without,
+)
+
+from jaxfit.model.rotation import safe_norm
+from jaxfit.objective.objective import evaluate_terms, weighted_sum
+from jaxfit.objective.registry import find_term
+from jaxfit.objective.scene import Priors, Scene, priors_of
+from jaxfit.objective.terms import geman_mcclure, pose_prior
+
+
+@pytest.mark.parametrize("seed", [0, 10])
+def test_every_term_is_its_equation(seed):
+    pose, start, evidence = window_pose(seed), window_pose(seed + 50), seen(seed)
+    values = every_term(pose, start, evidence, all_settings())
+    assert set(values) == set(TERMS)
+    for name, value in values.items():
+        expected = oracle(name, pose, start, evidence, seed)
+        assert expected > 0, name
+        assert float(value) == pytest.approx(expected, rel=2e-4), name
+
+
+def test_stored_geman_mcclure_and_mahalanobis(reference_dir):
+    with np.load(reference_dir / "reference" / "lbs.npz") as stored:
+        value = geman_mcclure(jnp.asarray(stored["geman_mcclure/residual"]), 50.0)
+        np.testing.assert_allclose(value, stored["geman_mcclure/value"], rtol=1e-6)
+        poses, expected = stored["pose_prior/body_pose"], stored["pose_prior/squared_mahalanobis"]
+    from jaxfit.model.importers.sources import import_sources
+
+    priors = priors_of(import_sources("avian-mesh", [reference_dir / "models" / "avian_mesh"]))
+    for body_pose, distance in zip(poses, expected, strict=True):
+        pose = dataclasses.replace(window_pose(), body_pose=jnp.asarray(body_pose.reshape(1, -1, 3)))
+        evidence = dataclasses.replace(seen(), present=jnp.ones(1, bool))
+        value = pose_prior(Scene(pose, pose, evidence, RIG, priors, CAMERA, RASTER))
+        assert float(value) == pytest.approx(distance, rel=1e-4)
+
+
+def test_what_was_not_seen_pulls_at_nothing():
+    pose, start = window_pose(), window_pose(50)
+    evidence = without(seen(), 1)
+    results = every_gradient(pose, start, evidence, all_settings())
+    # whatever stands in the absent frame
+    moved = dataclasses.replace(
+        pose,
+        global_orient=pose.global_orient.at[1].set(2.0),
+        body_pose=pose.body_pose.at[1].add(1.0),
+        transl=pose.transl.at[1].add(9.0),
+        scale=pose.scale.at[1].set(3.0),
+    )
+    again = every_term(moved, start, evidence, all_settings())
+    for name, (value, gradient) in results.items():
+        assert float(again[name]) == pytest.approx(float(value), rel=1e-6), name
+        for field in ("global_orient", "body_pose", "transl", "scale"):
+            np.testing.assert_array_equal(getattr(gradient, field)[1], 0, err_msg=f"{name}: {field}")
+    # a keypoint of confidence 0 may stand anywhere
+    faint = dataclasses.replace(seen(), confidence=seen().confidence.at[0, 2].set(0))
+    astray = dataclasses.replace(faint, keypoints_px=faint.keypoints_px.at[0, 2].set(1e4))
+    both = [float(every_term(pose, start, e, all_settings())["keypoints"]) for e in (faint, astray)]
+    assert both[0] == both[1]
+
+
+def test_a_frame_without_mask_is_not_compared():
+    pose, evidence = window_pose(), seen()
+    bare = dataclasses.replace(evidence, has_mask=jnp.array([True, False, True]))
+    value = float(every_term(pose, pose, bare, all_settings())["mask"])
+    e = np.abs(soft_silhouettes(0) - np.asarray(evidence.mask))
+    assert value == pytest.approx(e[[0, 2]].sum(), rel=2e-4)
+
+
+def edges():
+    pose = window_pose()
+    still = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), pose)
+    still = dataclasses.replace(still, bone_length=pose.bone_length, betas=jnp.zeros(2))
+    rest = dataclasses.replace(
+        still,
+        global_orient=jnp.zeros((T, 3)),
+        body_pose=jnp.zeros((T, 7, 3)),
+        bone_length=PRIORS.bone_mean,
+    )
+    at_mean = dataclasses.replace(rest, body_pose=jnp.broadcast_to(BIRD.pose_mean.reshape(7, 3), (T, 7, 3)))
+    empty = dataclasses.replace(seen(), mask=jnp.zeros((T, SIZE, SIZE), jnp.uint8))
+    nothing = functools.reduce(without, range(T), seen())
+    return {
+        "equal frames": (still, seen()),
+        "zero rotation": (rest, seen()),
+        "at the prior's mean": (at_mean, seen()),
+        "empty mask": (pose, empty),
+        "out of the frame": (dataclasses.replace(pose, transl=pose.transl + jnp.array([900.0, 0, 0])), seen()),
+        "behind the camera": (dataclasses.replace(pose, transl=pose.transl * jnp.array([1, 1, -1.0])), seen()),
+        "at the camera": (dataclasses.replace(pose, transl=jnp.zeros((T, 3))), seen()),
+        "of no size": (dataclasses.replace(pose, scale=jnp.zeros(T)), seen()),
+        "nothing seen": (pose, nothing),
+    }
+
+
+@pytest.mark.parametrize("edge", edges())
+def test_finite_at_the_edges(edge):
+    pose, evidence = edges()[edge]
+    for name, (value, gradient) in every_gradient(pose, pose, evidence, all_settings()).items():
+        assert np.isfinite(value), name
+        for leaf in jax.tree.leaves(gradient):
+            assert np.isfinite(leaf).all(), name
+
+
+SMOOTH = [n for n in TERMS if n not in ("mask", "mask_smooth_l1")]  # theirs stand beside the raster core's tests
+
+
+def test_gradients_are_right():
+    """Finite differences of the whole sum; weights bring every term to a similar size."""
+    pose, start, evidence = window_pose(), window_pose(50), seen()
+    values = every_term(pose, start, evidence, all_settings())
+    settings = {name: {**all_settings()[name], "weight": 10.0 / float(values[name])} for name in SMOOTH}
+    settings["start_pull"]["weight"] *= 0.1  # its corners are no matter for finite differences
+
+    @jax.jit
+    def total(orient, body, offset, scale, bones, betas):
+        moved = dataclasses.replace(
+            pose,
+            global_orient=orient,
+            body_pose=body,
+            transl=pose.transl + offset,
+            scale=scale,
+            bone_length=bones,
+            betas=betas,
+        )
+        return weighted_sum(scene(moved, evidence, start), settings)
+
+    at = (pose.global_orient, pose.body_pose, jnp.zeros((T, 3)), pose.scale, pose.bone_length, pose.betas)
+    check_grads(total, at, order=1, modes=["rev"], eps=2e-3, atol=0.05, rtol=0.02)
+
+
+def test_safe_norm():
+    x = jnp.array([[3.0, 4.0], [0.0, 0.0], [1e-20, 0.0]])
+    np.testing.assert_allclose(safe_norm(x)[:2], [5, 0])
+    np.testing.assert_allclose(jax.grad(lambda x: safe_norm(x).sum())(x)[:2], [[0.6, 0.8], [0, 0]], rtol=1e-6)
+    assert np.isfinite(jax.grad(lambda x: safe_norm(x).sum())(x)).all()
+
+
+def test_the_sum_is_weighted():
+    pose, start, evidence = window_pose(), window_pose(50), seen()
+    rng = np.random.default_rng(0)
+    settings = {name: {**values, "weight": float(rng.uniform(0, 9))} for name, values in all_settings().items()}
+    values = every_term(pose, start, evidence, settings)
+    expected = sum(settings[name]["weight"] * float(value) for name, value in values.items())
+    total = jax.jit(lambda settings: weighted_sum(scene(pose, evidence, start), settings))(settings)
+    assert float(total) == pytest.approx(expected, rel=1e-5)
+    assert float(weighted_sum(scene(pose, evidence), {})) == 0
+
+
+def test_settings_are_traced():
+    """Another weight or σ is no new program, and a sweep over them is one vmap."""
+    pose, evidence, traces = window_pose(), seen(), []
+    names = ("keypoints", "pose_prior", "velocity")
+
+    def total(settings):
+        traces.append(None)
+        return weighted_sum(scene(pose, evidence), settings)
+
+    def settings(weight, sigma, beta):
+        own = {"keypoints": {"sigma_px": sigma}, "velocity": {"beta_global": beta, "beta_pose": 1.0}}
+        return {name: {"weight": weight, **own.get(name, {})} for name in names}
+
+    compiled = jax.jit(total)
+    sweep = [(1.0, 50.0, 10.0), (2.0, 50.0, 10.0), (1.0, 5.0, 10.0), (1.0, 50.0, 0.0)]
+    one_by_one = [float(compiled(settings(*jnp.array(values)))) for values in sweep]
+    assert len(traces) == 1
+    assert len(set(one_by_one)) == len(sweep)
+    together = jax.jit(jax.vmap(lambda v: total(settings(*v))))(jnp.array(sweep))
+    np.testing.assert_allclose(together, one_by_one, rtol=1e-5)
+    gradient = jax.jit(jax.grad(lambda v: total(settings(*v))))(jnp.array(sweep[0]))
+    assert np.isfinite(gradient).all()
+    assert (np.abs(gradient) > 0).all()
+
+
+def test_settings_of_terms():
+    assert find_term("keypoints").settings == {"sigma_px": 50.0}
+    assert find_term("velocity").settings == {"beta_global": 10.0, "beta_pose": 1.0}
+    assert find_term("mask").settings == {}
+    with pytest.raises(KeyError):
+        find_term("unknown")
+
+
+def test_one_size_for_a_window():
+    """A common scale acts as the same scale in every frame."""
+    pose, evidence = window_pose(), seen()
+    common = dataclasses.replace(pose, scale=pose.scale[:1])
+    spread = dataclasses.replace(pose, scale=jnp.broadcast_to(pose.scale[:1], (T,)))
+    np.testing.assert_allclose(scene(common, evidence).keypoints_px, scene(spread, evidence).keypoints_px)
+    keypoints, _ = pose_window(BIRD, spread)
+    np.testing.assert_allclose(scene(common, evidence).keypoints_cam, keypoints, atol=1e-5)
+
+
+def test_whitened_priors():
+    """Wᵀ W is the inverse covariance."""
+    assert isinstance(PRIORS, Priors)
+    for whitener, covariance in (
+        (PRIORS.pose_whitener, BIRD.pose_covariance),
+        (PRIORS.bone_whitener, BIRD.bone_covariance),
+    ):
+        W = np.asarray(whitener, np.float64)
+        np.testing.assert_allclose(W @ np.asarray(covariance, np.float64) @ W.T, np.eye(len(W)), atol=1e-4)
+    np.testing.assert_allclose(PRIORS.shape_sd**2, BIRD.shape_variance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_terms_that_draw_the_silhouette_say_so(name):
+    """A term that is not marked gets empty masks; one that is marked in vain makes its stage slow."""
+    pose = window_pose()
+    one = scene(pose, seen())
+    evaluate_terms(one, {name: {"weight": 1.0, **find_term(name).settings}})
+    assert find_term(name).compares_masks == ("vertices_screen" in vars(one))

@@ -1,0 +1,119 @@
+"""The built-in segmenter's layout, on graphs whose maps are known."""
+
+import numpy as np
+import pytest
+from onnx import helper
+from support.onnx_graphs import write_constant, write_graph
+
+from jaxfit.errors import InputError
+from jaxfit.perception.onnx_model import OnnxModel
+from jaxfit.perception.segmentation import load_segmenter
+from jaxfit.perception.segmentation.bottom_up import BottomUp
+
+CELLS_HIGH, CELLS_WIDE, CELL_PX = 48, 64, 2  # an input of 128 x 96
+
+
+def maps_of(*birds):
+    """Foreground, centre and offset of rectangles in cells: (x0, y0, x1, y1), height of the peak."""
+    foreground, centre = np.zeros((2, 1, CELLS_HIGH, CELLS_WIDE), np.float32)
+    offset = np.zeros((2, CELLS_HIGH, CELLS_WIDE), np.float32)
+    rows, columns = np.indices((CELLS_HIGH, CELLS_WIDE))
+    for (x0, y0, x1, y1), peak in birds:
+        box = slice(y0, y1), slice(x0, x1)
+        middle_x, middle_y = (x0 + x1) // 2, (y0 + y1) // 2
+        foreground[0][box], centre[0, middle_y, middle_x] = 1, peak
+        offset[0][box] = (middle_x - columns[box]) * CELL_PX / 32
+        offset[1][box] = (middle_y - rows[box]) * CELL_PX / 32
+    return {"foreground": foreground, "centre": centre, "offset": offset}
+
+
+def write(path, maps, input_shape=(1, 3, 96, 128), **metadata):
+    return write_constant(path, input_shape, maps, {"names": "{0: 'bird'}", **metadata})
+
+
+def test_two_birds_that_touch(tmp_path):
+    # three frame pixels to a pixel of the input, six to a cell
+    path = write(tmp_path / "net.onnx", maps_of(((10, 10, 20, 20), 0.9), ((20, 12, 34, 18), 0.8)))
+    first, second = load_segmenter(path)(np.zeros((288, 384, 3), np.uint8))
+    assert first.label == second.label == "bird"
+    assert (first.score, second.score) == pytest.approx((0.9, 0.8))
+    # alone, an edge lies where the bilinear map passes 0.5: on the border of the cells
+    assert first.box_px.tolist() == [60, 60, 60, 60]
+    assert first.mask[1:-1, 1:-1].all()
+    assert second.box_px.tolist() == [120, 72, 84, 36]
+
+
+def test_cells_belong_to_the_centre_they_point_to_and_not_to_the_nearest(tmp_path):
+    # the long one's left end lies right below the other's centre, and beyond it
+    path = write(tmp_path / "net.onnx", maps_of(((10, 8, 20, 18), 0.9), ((2, 18, 58, 22), 0.8)))
+    first, second = load_segmenter(path)(np.zeros((96, 128, 3), np.uint8))
+    assert first.box_px.tolist() == [20, 16, 20, 20]
+    assert second.box_px.tolist() == [4, 36, 112, 8]
+
+
+def test_a_bird_in_two_pieces_is_one(tmp_path):
+    maps = maps_of(((10, 10, 30, 16), 0.9))
+    maps["foreground"][0, :, 18:22] = 0  # something stands in front of it
+    (bird,) = load_segmenter(write(tmp_path / "net.onnx", maps))(np.zeros((96, 128, 3), np.uint8))
+    assert bird.box_px.tolist() == [20, 20, 40, 12]
+    assert not bird.mask[:, 18:22].any()
+
+
+def test_what_points_nowhere_or_is_hardly_there_belongs_to_nobody(tmp_path):
+    maps = maps_of(((10, 10, 20, 20), 0.9), ((40, 30, 43, 33), 0.9), ((40, 10, 50, 20), 0.3))
+    maps["foreground"][0, 40:46, 2:10] = 1
+    maps["offset"][:, 40:46, 2:10] = 3  # 96 pixels right and below: no centre is near
+    birds = load_segmenter(write(tmp_path / "net.onnx", maps))(np.zeros((96, 128, 3), np.uint8))
+    assert [bird.box_px.tolist() for bird in birds] == [[20, 20, 20, 20]]  # specks and faint peaks are none
+
+
+def test_the_frame_is_seen_as_it_was_learnt(tmp_path):
+    """Averaged over areas, blue-green-red within 0 and 1, in the upper left corner of sides of 32 times something."""
+    nodes = [
+        helper.make_node("AveragePool", ["pictures"], ["cells"], kernel_shape=[2, 2], strides=[2, 2]),
+        helper.make_node("Split", ["cells", "one_each"], ["blue", "green", "red"], axis=1),
+        helper.make_node("Identity", ["blue"], ["foreground"]),
+        helper.make_node("Identity", ["green"], ["centre"]),
+        helper.make_node("Concat", ["red", "red"], ["offset"], axis=1),
+    ]
+    shapes = {"foreground": (1, 1, "h", "w"), "centre": (1, 1, "h", "w"), "offset": (1, 2, "h", "w")}
+    constants = {"one_each": np.array([1, 1, 1])}
+    path = write_graph(
+        tmp_path / "net.onnx",
+        {"pictures": (1, 3, "height", "width")},
+        shapes,
+        nodes,
+        constants,
+        {"longer_side": "96", "names": "['murre']"},
+    )
+    frame = np.zeros((200, 288, 3), np.uint8)
+    frame[60:120, 60:180, 0] = 255  # columns 20 to 60 of 96, rows 20 to 40
+    frame[90, 120, 1] = 255  # a ninth of a pixel, then a quarter of that: below every threshold
+    segmenter = load_segmenter(path)
+    assert segmenter(frame) == []
+    frame[84:90, 114:120, 1] = 255  # one whole cell in the middle, and no offsets: what is too far stays out
+    (bird,) = segmenter(frame)
+    assert bird.label == "murre"
+    assert bird.box_px == pytest.approx([60, 60, 120, 60], abs=1)  # 67 rows stand for 66.7
+    assert bird.mask[1:-1, 1:-1].all()
+
+
+def test_free_sides_are_multiples_of_32(tmp_path):
+    segmenter = BottomUp(OnnxModel(write(tmp_path / "n.onnx", maps_of(), (1, 3, "h", "w"), longer_side="864")))
+    assert segmenter._place((2592, 1520)).input_px == (864, 512)
+    assert segmenter._place((854, 480)).input_px == (864, 512)
+    assert segmenter._place((480, 854)).input_px == (512, 864)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "classes", "said"),
+    [
+        ({"names": "['a', 'b']"}, None, "2 classes"),
+        ({}, ["cat"], "lacks cat"),
+        ({"longer_side": "x"}, None, "longer_side"),
+    ],
+)
+def test_refusals(tmp_path, metadata, classes, said):
+    path = write(tmp_path / "net.onnx", maps_of(), **metadata)
+    with pytest.raises(InputError, match=said):
+        load_segmenter(path, classes=classes)

@@ -1,0 +1,108 @@
+"""A detector's boxes on its grids, and in each the mask of what stands out."""
+
+from functools import partial
+
+import cv2
+import numpy as np
+import pytest
+from onnx import helper
+from support.onnx_graphs import write_graph, write_reading
+
+from jaxfit.perception.onnx_model import OnnxModel
+from jaxfit.perception.segmentation import load_segmenter
+from jaxfit.perception.segmentation.yolox import Yolox
+
+load = partial(load_segmenter, threads=1)  # threads that wait for each other are slow on a busy machine
+FIRST_OF_STRIDE_16, FIRST_OF_STRIDE_32 = 52 * 52, 52 * 52 + 26 * 26
+
+
+def yolox_head(*rows):
+    """Rows of cell, four box values, objectness, class, its probability."""
+    head = np.zeros((1, 3549, 85), np.float32)
+    for cell, box, objectness, label, probability in rows:
+        head[0, cell, :4], head[0, cell, 4], head[0, cell, 5 + label] = box, objectness, probability
+    return head
+
+
+def write_yolox(path, head, read=None):
+    return write_reading(path, (1, 3, 416, 416), {"output": head}, read or {})
+
+
+def write_saliency(path):
+    """What stands out is the input's first channel; a second output says the contrary."""
+    nodes = [
+        helper.make_node("Gather", ["input.1", "zero"], ["1959"], axis=1),
+        helper.make_node("Neg", ["1959"], ["1960"]),
+    ]
+    shape = (1, 1, 320, 320)
+    outputs = {"1959": shape, "1960": shape}
+    return write_graph(path, {"input.1": (1, 3, 320, 320)}, outputs, nodes, {"zero": np.array([0])})
+
+
+# in column 10, row 7 of stride 16: centre (168, 116), size (64, 32) of the input; twice that in a frame of 832 x 416
+BIRD_ROW = (FIRST_OF_STRIDE_16 + 7 * 26 + 10, (0.5, 0.25, np.log(4), np.log(2)), 0.8, 14, 0.9)
+BIRD_BOX = [272, 200, 400, 264]
+
+
+def test_boxes_are_decoded_on_their_grids(tmp_path):
+    rows = [
+        BIRD_ROW,
+        (FIRST_OF_STRIDE_16 + 7 * 26 + 11, (-0.5, 0.25, np.log(4), np.log(2)), 0.7, 14, 0.9),  # the same box, unsurer
+        (3 * 52 + 2, (0.5, 0.5, 0, np.log(2)), 0.5, 14, 1),  # centre (20, 28), size (8, 16)
+        (FIRST_OF_STRIDE_32 + 13, (0, 0, 0, 0), 1, 14, 0.5),  # centre (0, 32), size 32: half of it outside
+        (FIRST_OF_STRIDE_32 + 5, (0, 0, 0, 0), 1, 2, 0.9),  # no bird
+        (FIRST_OF_STRIDE_32 + 7, (0, 0, 0, 0), 0.5, 14, 0.5),  # not sure enough
+    ]
+    found = Yolox(OnnxModel(write_yolox(tmp_path / "d.onnx", yolox_head(*rows)), 1))(np.zeros((416, 832, 3), np.uint8))
+    boxes = [one.box_px for one in found]
+    np.testing.assert_allclose(boxes, [BIRD_BOX, [32, 40, 48, 72], [0, 32, 32, 96]], atol=1e-3)
+    np.testing.assert_allclose([one.score for one in found], [0.72, 0.5, 0.5], atol=1e-6)
+    assert {one.label for one in found} == {"bird"}
+
+
+@pytest.mark.parametrize(("pixel", "value"), [((0, 0, 9, 9), 7), ((0, 2, 9, 9), 3), ((0, 0, 415, 9), 114)])
+def test_the_detector_sees_raw_blue_green_red_over_grey(tmp_path, pixel, value):
+    cell, box, _, label, _ = BIRD_ROW
+    head = yolox_head((cell, box, 0.5, label, 0))
+    path = write_yolox(tmp_path / "d.onnx", head, {"output": {(0, cell, 5 + label): pixel}})
+    (found,) = Yolox(OnnxModel(path, 1))(np.full((416, 832, 3), (7, 5, 3), np.uint8))
+    assert found.score == pytest.approx(value / 2)
+
+
+@pytest.fixture
+def segmenter(tmp_path):
+    detector = write_yolox(tmp_path / "yolox.onnx", yolox_head(BIRD_ROW))
+    return load(f"{detector}+{write_saliency(tmp_path / 'u2netp.onnx')}")
+
+
+def scene(*ellipses):
+    """Red things upon blue: 140 is the brightest, and red needs 0.6 of it to be above a half, normalised."""
+    frame = np.full((416, 832, 3), (140, 0, 75), np.uint8)
+    for centre, axes in ellipses:
+        cv2.ellipse(frame, centre, axes, 0, 0, 360, (0, 0, 140), -1)
+    return frame
+
+
+def test_the_mask_is_what_stands_out_in_the_box(segmenter):
+    frame = scene(((336, 232), (60, 30)))
+    (bird,) = segmenter(frame)
+    truth = frame[..., 2] == 140
+    mask = np.zeros_like(truth)
+    height, width = bird.mask.shape
+    mask[bird.y0 : bird.y0 + height, bird.x0 : bird.x0 + width] = bird.mask
+    assert (mask & truth).sum() / (mask | truth).sum() > 0.97
+    assert (bird.label, pytest.approx(bird.score, abs=1e-6)) == ("bird", 0.72)
+    assert segmenter.class_names == ("bird",)
+
+
+def test_other_things_and_what_leaves_the_box_are_left_out(segmenter):
+    alone = segmenter(scene(((336, 232), (40, 20))))[0]
+    (with_others,) = segmenter(scene(((336, 232), (40, 20)), ((285, 210), (5, 5)), ((420, 232), (12, 12))))
+    np.testing.assert_array_equal(with_others.mask, alone.mask)
+    (cut,) = segmenter(scene(((336, 232), (60, 200))))
+    assert (cut.y0, len(cut.mask)) == (196, 72)  # a twentieth of 64 beyond the box, out to whole pixels
+
+
+def test_without_anything_that_stands_out_there_is_no_instance(segmenter):
+    assert segmenter(scene()) == []
+    assert segmenter(np.zeros((416, 832, 3), np.uint8)) == []

@@ -1,0 +1,87 @@
+"""Agreement with PyTorch3D's soft silhouette, for both backends and every instruction set."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxfit.raster import silhouette as raster
+
+CASES = ("triangle", "triangle_edge_of_frame", "icosphere", "aves_template_a", "aves_template_b", "avian_mesh_a")
+SMALL = CASES[:3]  # the reference takes ten seconds for a bird's loss and gradient, so one bird stands for all
+CENTRE = 128
+
+
+@pytest.fixture(params=["avx512", "avx2", "baseline"])
+def each_isa(request):
+    """Runs the test once an instruction set."""
+    if request.param not in raster.available_isas():
+        pytest.skip(f"no {request.param} kernels here: {raster.available_isas()}")
+    raster.choose_isa(request.param)
+    yield request.param
+    raster.choose_isa("auto")
+
+
+@pytest.fixture(scope="module")
+def data(reference_dir):
+    with np.load(reference_dir / "reference" / "pytorch3d_silhouette.npz") as file:
+        return dict(file)
+
+
+def project(vertices_cam, focal):
+    return jnp.concatenate([focal * vertices_cam[:, :2] / vertices_cam[:, 2:] + CENTRE, vertices_cam[:, 2:]], 1)
+
+
+def relative_error(found, expected):
+    return np.linalg.norm(np.asarray(found, np.float64) - expected) / np.linalg.norm(expected)
+
+
+# Compiled once a mesh size and backend.
+@functools.partial(jax.jit, static_argnames="backend")
+def loss_and_gradient(vertices, faces, target, focal, backend):
+    def loss_of(vertices):
+        return raster.mask_loss(project(vertices, focal), faces, target, backend=backend)
+
+    return jax.value_and_grad(loss_of)(vertices)
+
+
+@functools.partial(jax.jit, static_argnames="backend")
+def image_and_gradient(vertices, faces, target, focal, backend):
+    """The image, and the loss's gradient by way of it: this is the kernel that takes a cotangent image."""
+    image, pull = jax.vjp(
+        lambda v: raster.silhouette(project(v, focal), faces, target.shape[0], backend=backend), vertices
+    )
+    return image, pull(jnp.sign(image - target))[0]
+
+
+def check(data, case, backend):
+    vertices, faces, target, expected, loss, gradient = (
+        data[f"{case}/{name}"] for name in ("vertices", "faces", "target", "silhouette", "loss", "grad_vertices")
+    )
+    found_loss, found_gradient = loss_and_gradient(vertices, faces, target, data["focal"], backend)
+    assert found_loss == pytest.approx(float(loss), rel=1e-5)
+    assert relative_error(found_gradient, gradient) < 1e-4
+    if backend == "native" or case in SMALL:
+        image, by_image = image_and_gradient(vertices, faces, target, data["focal"], backend)
+        assert relative_error(by_image, gradient) < 1e-4
+    else:
+        image = raster.silhouette(project(vertices, data["focal"]), faces, len(target), backend=backend)
+    np.testing.assert_allclose(image, expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_kernels_agree_with_pytorch3d(data, case, each_isa):
+    check(data, case, "native")
+
+
+@pytest.mark.parametrize("case", [*SMALL, "aves_template_a"])
+def test_reference_agrees_with_pytorch3d(data, case):
+    check(data, case, "reference")
+
+
+def test_default_blur_is_that_of_the_data(data):
+    blur = raster.Blur.for_size(256)
+    assert blur.sigma == pytest.approx(float(data["sigma"]) * 128**2)
+    assert blur.radius == pytest.approx(128 * float(data["blur_radius"]) ** 0.5)

@@ -1,0 +1,1 @@
+"""What several tests share: small birds, files, footage and networks."""

@@ -1,0 +1,189 @@
+"""A small bird, and what several tests need of it. Motion and detections come from `jaxfit.simulation`."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from jaxfit.data.solution import Solution
+from jaxfit.model.bird import Bird, free_limits, neutral_colours
+from jaxfit.model.camera import Camera, crop_to_image, project
+from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
+from jaxfit.model.pose import Pose
+
+PARTS = {  # joint: parent, position, centre and half-axes of its ellipsoid (x side, y to the bill, z up)
+    "root": (None, (0, 0, 0), (0, 0, 0), (2.0, 4.0, 1.8)),
+    "neck": ("root", (0, 3, 1), (0, 4.5, 1.8), (1.0, 2.0, 1.0)),
+    "head": ("neck", (0, 6, 2.5), (0, 7.2, 2.8), (0.9, 1.8, 0.9)),
+    "tail": ("root", (0, -3.5, 0), (0, -5.5, 0), (0.9, 2.4, 0.4)),
+    "left_wing": ("root", (1.8, 1.5, 0.8), (2.3, -1.0, 0.6), (0.5, 3.5, 1.2)),
+    "right_wing": ("root", (-1.8, 1.5, 0.8), (-2.3, -1.0, 0.6), (0.5, 3.5, 1.2)),
+    "left_leg": ("root", (0.8, -0.5, -1.4), (0.9, 0.0, -2.8), (0.3, 0.6, 1.5)),
+    "right_leg": ("root", (-0.8, -0.5, -1.4), (-0.9, 0.0, -2.8), (0.3, 0.6, 1.5)),
+}
+KEYPOINTS = {
+    "bill_tip": (0, 9, 2.8),
+    "left_eye": (0.9, 7.5, 3.2),
+    "right_eye": (-0.9, 7.5, 3.2),
+    "crown": (0, 6.8, 3.7),
+    "nape": (0, 4.2, 2.8),
+    "back": (0, 0, 1.8),
+    "breast": (0, 3.0, -1.2),
+    "tail_tip": (0, -7.9, 0),
+    "left_wingtip": (2.4, -4.5, 0.5),
+    "right_wingtip": (-2.4, -4.5, 0.5),
+    "left_foot": (0.9, 0.4, -4.3),
+    "right_foot": (-0.9, 0.4, -4.3),
+}
+
+
+def _pairs(names):
+    return tuple((i, names.index("right" + n[4:])) for i, n in enumerate(names) if n.startswith("left"))
+
+
+def toy_bird(shapes: int = 2) -> Bird:
+    """A bird of eight ellipsoids, each moved by its own joint and a little by its parent's."""
+    names = tuple(PARTS)
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    vertices, faces, weights = [], [], []
+    for j, (parent, _, centre, axes) in enumerate(PARTS.values()):
+        faces.append(sphere.faces + j * len(sphere.vertices))
+        vertices.append(sphere.vertices * axes + centre)
+        w = np.zeros((len(sphere.vertices), len(names)))
+        w[:, j] = 0.9 if parent else 1.0
+        if parent:
+            w[:, names.index(parent)] = 0.1
+        weights.append(w)
+    vertices = np.concatenate(vertices)
+    nearest = [np.argmin(((vertices - np.array(p)) ** 2).sum(1)) for p in KEYPOINTS.values()]
+    bones = len(names) - 1
+    # shape directions: a thicker and a longer bird
+    basis = np.stack([vertices * [0.1, 0, 0.1], vertices * [0, 0.1, 0]])[:shapes]
+    f32 = jnp.float32
+    return Bird(
+        vertices=jnp.asarray(vertices, f32),
+        faces=jnp.asarray(np.concatenate(faces), jnp.int32),
+        joints=jnp.asarray([part[1] for part in PARTS.values()], f32),
+        skin_weights=jnp.asarray(np.concatenate(weights), f32),
+        keypoint_weights=jnp.asarray(np.eye(len(vertices))[nearest], f32),
+        shape_basis=jnp.asarray(basis, f32),
+        shape_variance=jnp.ones(shapes),
+        pose_mean=jnp.zeros(3 * bones),
+        pose_covariance=0.1 * jnp.eye(3 * bones),
+        bone_mean=jnp.ones(bones),
+        bone_covariance=0.01 * jnp.eye(bones),
+        vertex_colours=jnp.asarray(neutral_colours(len(vertices))),
+        joint_limits=jnp.asarray(free_limits(bones)),
+        parents=tuple(-1 if part[0] is None else names.index(part[0]) for part in PARTS.values()),
+        joint_names=names,
+        keypoint_names=tuple(KEYPOINTS),
+        joint_pairs=_pairs(names),
+        keypoint_pairs=_pairs(tuple(KEYPOINTS)),
+        name="toy",
+    )
+
+
+def exp_map(axis_angle):
+    """Rotation matrices by scipy: independent of the library's own."""
+    return Rotation.from_rotvec(axis_angle).as_matrix()
+
+
+def skin_by_hand(bird: Bird, pose: Pose):
+    """One frame posed joint by joint with 4×4 matrices in double precision: (V, 3), and the joints (J, 3).
+
+    Everything is scaled before it is skinned, as avian-mesh's own code does it.
+    """
+    angles = np.concatenate([np.asarray(pose.global_orient)[None], np.asarray(pose.body_pose)])
+    scale, bones = float(np.reshape(pose.scale, -1)[0]), [1.0, *np.asarray(pose.bone_length, np.float64)]
+    rest = np.asarray(bird.vertices, np.float64)
+    for beta, direction in zip(np.asarray(pose.betas), np.asarray(bird.shape_basis, np.float64), strict=True):
+        rest = rest + beta * direction
+    joints = np.asarray(bird.joints, np.float64)
+    chain, vertices, posed = [], np.zeros_like(rest), np.zeros_like(joints)
+    for j, parent in enumerate(bird.parents):
+        local = np.eye(4)
+        local[:3, :3] = exp_map(np.asarray(angles[j], np.float64))
+        local[:3, 3] = scale * bones[j] * (joints[j] - (joints[parent] if j else 0))
+        chain.append(local if j == 0 else chain[parent] @ local)
+        moved = scale * (rest - joints[j]) @ chain[j][:3, :3].T + chain[j][:3, 3]
+        vertices += np.asarray(bird.skin_weights, np.float64)[:, [j]] * moved
+        posed[j] = chain[j][:3, 3]
+    transl = np.asarray(pose.transl, np.float64)
+    return vertices + transl, posed + transl
+
+
+def random_pose(bird: Bird, seed: int, spread: float = 0.5) -> Pose:
+    """A pose of one frame in which nothing is at rest."""
+    rng = np.random.default_rng(seed)
+    bones = bird.num_joints - 1
+
+    def some(*shape):
+        return jnp.asarray(spread * rng.normal(size=shape), jnp.float32)
+
+    return Pose(
+        global_orient=2 * some(3),
+        body_pose=some(bones, 3),
+        transl=some(3) + jnp.array([0, 0, 150.0]),
+        scale=jnp.asarray(rng.uniform(0.7, 1.4), jnp.float32),
+        bone_length=1 + 0.3 * some(bones),
+        betas=some(bird.num_shapes),
+    )
+
+
+def pose_window(bird: Bird, pose: Pose):
+    """Posed keypoints and vertices of a window, camera frame: (T, K, 3) and (T, V, 3)."""
+    rig = fold_bird(bird)
+    A = window_transforms(rig, pose)
+    return np.asarray(window_keypoints(rig, A, pose)), np.asarray(window_vertices(rig, A, pose))
+
+
+def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> Solution:
+    """A result that holds windows of poses, a track each, as the default camera sees them in these crops.
+
+    `crop` is x0, y0, size for all, or (N, 1, 3), (N, T, 3). All is valid, in pictures of the crop's size; whatever
+    else a test wants it replaces.
+    """
+    N, T = len(poses), len(poses[0].global_orient)
+
+    def every_frame(name: str, ndim: int) -> np.ndarray:
+        values = [np.asarray(getattr(pose, name)) for pose in poses]
+        return np.stack([np.broadcast_to(value, (T, *value.shape[value.ndim - ndim :])) for value in values])
+
+    keypoints = np.stack([pose_window(bird, pose)[0] for pose in poses])
+    crop, camera = np.broadcast_to(np.asarray(crop, float), (N, T, 3)), Camera()
+    return Solution(
+        track_id=np.arange(1, N + 1),
+        frame_index=np.arange(T),
+        valid=np.ones((N, T), bool),
+        global_orient=every_frame("global_orient", 1),
+        body_pose=every_frame("body_pose", 2),
+        transl=every_frame("transl", 1),
+        scale=every_frame("scale", 0),
+        bone_length=every_frame("bone_length", 1),
+        betas=every_frame("betas", 1),
+        keypoints_3d=keypoints,
+        keypoints_2d=crop_to_image(np.asarray(project(keypoints, camera)), crop, camera.size_px),
+        crop=crop,
+        image_size_px=np.full((N, T, 2), camera.size_px),
+        keypoint_names=bird.keypoint_names,
+        joint_names=bird.joint_names,
+        status=np.full(N, "ok"),
+        loss={},
+        focal=camera.focal_px,
+        crop_px=camera.size_px,
+    )
+
+
+def filled_mask(vertices_px, faces, size: int) -> np.ndarray:
+    """Hard mask, triangle by triangle: the pixels whose centre lies in any. Independent of the raster core."""
+    canvas = np.zeros((size, size), bool)
+    for a, b, c in np.asarray(vertices_px, np.float64)[np.asarray(faces)]:
+        low = np.clip(np.floor(np.min([a, b, c], axis=0)).astype(int), 0, size)
+        high = np.clip(np.ceil(np.max([a, b, c], axis=0)).astype(int), 0, size)
+        y, x = np.mgrid[low[1] : high[1], low[0] : high[0]] + 0.5
+        sides = [(q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]) for p, q in ((a, b), (b, c), (c, a))]
+        inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
+        canvas[low[1] : high[1], low[0] : high[0]] |= inside
+    return canvas

@@ -1,0 +1,52 @@
+"""Files that the command line takes, for the tests to use and to break."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxfit.cli.main import main
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.model.camera import Camera
+from jaxfit.model.files import save_bird
+from jaxfit.simulation.detections import detect
+from jaxfit.simulation.motion import smooth_motion
+from support.birds import toy_bird
+
+BIRD, T, SIZE = toy_bird(shapes=0), 6, 64
+CONFIG = """
+base: paper
+window: 6
+crop: {mode: image, size_px: 64, focal_px: 541.75}
+terms: {keypoints: 100, pose_prior: 0.1, velocity: 0.1}
+stages:
+  - {name: only, steps: 150, terms: [keypoints, pose_prior, velocity], step_scale: {transl: [1, 1, 0]}}
+"""
+
+
+def write_inputs(folder):
+    """A model, observations of three birds (the last hardly seen) and a config, as files."""
+    save_bird(BIRD, folder / "toy.npz")
+    observed = detect(BIRD, [smooth_motion(BIRD, T, seed) for seed in range(3)], camera=Camera(541.75, 32, SIZE))
+    confidence = observed.confidence.copy()
+    confidence[2, :, 3:] = 0
+    observed = observed.with_keypoints(observed.keypoints_px, confidence)
+    write_coco(dataclasses.replace(observed, track_id=np.array([4, 7, 9])), folder / "birds.json")
+    (folder / "quick.yaml").write_text(CONFIG)
+
+
+def arguments(inputs, out, **changes):
+    given = {"obs": "birds.json", "model": "toy.npz", "config": "quick.yaml"} | changes
+    at = {name: str(inputs / value) for name, value in given.items()}
+    return ["fit", at["obs"], "--model", at["model"], "--config", at["config"], "--out", str(out)]
+
+
+def refused(capsys, command, *words, code=2, alone=True):
+    """The command ends with `code` and one line on stderr that holds all words."""
+    capsys.readouterr()
+    assert main(command) == code
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 or (not alone and lines), "a progress bar may stand before it"
+    assert lines[-1].startswith("jaxfit: ")
+    assert not any("Traceback" in line for line in lines)
+    for word in words:
+        assert word in lines[-1], f"{word!r} is not in {lines[-1]!r}"

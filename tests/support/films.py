@@ -1,0 +1,76 @@
+"""Small videos, and what is damaged in them."""
+
+from fractions import Fraction
+
+import av
+import cv2
+import numpy as np
+
+from jaxfit.video.writer import VideoWriter
+
+SIZE, FPS, COUNT = (64, 48), 12.5, 30
+BITS, CELL_PX = 8, 16
+
+
+def frames(size=SIZE, count=COUNT):
+    """Colour fields that move, smooth enough for 4:2:0, with a patch of pure red, green and blue each."""
+    rng = np.random.default_rng(0)
+    field = cv2.resize(rng.integers(40, 215, (4, 6, 3), dtype=np.uint8), size, interpolation=cv2.INTER_LINEAR)
+    for i in range(count):
+        frame = np.roll(field, i, axis=1)
+        for channel in range(3):
+            frame[8:24, 16 * channel : 16 * channel + 16] = 255 * np.eye(3, dtype=np.uint8)[channel]
+        yield frame
+
+
+def write(path, codec="auto", size=SIZE, count=COUNT):
+    with VideoWriter(path, size, FPS, codec) as writer:
+        for frame in frames(size, count):
+            writer.write(frame)
+    return writer
+
+
+def numbered(i):
+    """A moving texture above black and white cells that hold its number."""
+    field = np.random.default_rng(7).integers(0, 255, (12, 24, 3), dtype=np.uint8)
+    field = cv2.resize(field, (BITS * CELL_PX, 64), interpolation=cv2.INTER_LINEAR)
+    bits = [255 * (i >> bit & 1) for bit in range(BITS)]
+    cells = np.repeat(np.repeat([bits], CELL_PX, axis=0), CELL_PX, axis=1).astype(np.uint8)
+    return np.vstack([np.roll(field, (3 * i, 5 * i), (0, 1)), np.repeat(cells[..., None], 3, axis=2)])
+
+
+def number_in(picture):
+    """What `numbered` wrote into it."""
+    centres = picture[-CELL_PX // 2, CELL_PX // 2 :: CELL_PX].mean(-1)
+    return sum(1 << bit for bit in range(BITS) if centres[bit] > 127)
+
+
+def encode(path, codec="libx264", count=100, gop=20, ticks=None, options=None, b_frames=None):
+    """A video of `numbered` pictures at 25 frames a second, or each at its tick of 1/100 s."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25 if ticks is None else 100, options=options or {})
+        stream.width, stream.height, stream.pix_fmt = BITS * CELL_PX, 64 + CELL_PX, "yuv420p"
+        stream.codec_context.gop_size = gop
+        stream.codec_context.thread_count = 1
+        if b_frames is not None:
+            stream.codec_context.max_b_frames = b_frames
+        for i in range(count):
+            picture = av.VideoFrame.from_ndarray(numbered(i), format="bgr24")
+            picture.pts, picture.time_base = (i, Fraction(1, 25)) if ticks is None else (ticks[i], Fraction(1, 100))
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    return path
+
+
+def packets(path):
+    """Position, size and whether it is a keyframe of every packet, in the order of the file."""
+    with av.open(str(path)) as container:
+        return [(packet.pos, packet.size, packet.is_keyframe) for packet in container.demux(video=0) if packet.size]
+
+
+def overwrite(path, at, length):
+    """Put random bytes over a part of a file."""
+    content = bytearray(path.read_bytes())
+    assert 0 < at < at + length < len(content)
+    content[at : at + length] = np.random.default_rng(1).integers(0, 256, length, dtype=np.uint8).tobytes()
+    path.write_bytes(content)

@@ -1,0 +1,206 @@
+"""Small scenes for the objective's tests, and every term by its equation in NumPy: the oracle."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.fft import dct
+from scipy.spatial.transform import Rotation
+from scipy.special import huber
+
+from jaxfit.model.camera import Camera
+from jaxfit.model.kinematics import fold_bird
+from jaxfit.objective.objective import evaluate_terms
+from jaxfit.objective.registry import find_term, known_terms
+from jaxfit.objective.scene import Evidence, Raster, Scene, priors_of
+from jaxfit.raster.silhouette import Blur
+from support.birds import random_pose, skin_by_hand, toy_bird
+
+T, SIZE = 3, 32
+TERMS = tuple(known_terms())
+CAMERA = Camera(focal_px=240.0, centre_px=SIZE / 2, size_px=SIZE)
+RASTER = Raster(Blur.for_size(SIZE))
+
+
+def correlated_bird():
+    """The toy bird with priors that are not diagonal, so that a transposed whitener shows."""
+    bird, rng = toy_bird(), np.random.default_rng(5)
+    a, b = rng.normal(size=(21, 21)), rng.normal(size=(7, 7))
+    return dataclasses.replace(
+        bird,
+        pose_mean=jnp.asarray(0.2 * rng.normal(size=21), jnp.float32),
+        pose_covariance=jnp.asarray(0.05 * a @ a.T + 0.05 * np.eye(21), jnp.float32),
+        bone_mean=jnp.asarray(1 + 0.1 * rng.normal(size=7), jnp.float32),
+        bone_covariance=jnp.asarray(0.01 * b @ b.T + 0.01 * np.eye(7), jnp.float32),
+        shape_variance=jnp.array([0.5, 2.0]),
+        joint_limits=jnp.asarray(np.sort(rng.normal(size=(7, 3, 2)) * 0.1), jnp.float32),
+    )
+
+
+BIRD = correlated_bird()
+RIG, PRIORS = fold_bird(BIRD), priors_of(BIRD)
+
+
+def window_pose(seed=0, spread=0.2):
+    frames = [random_pose(BIRD, seed + t, spread) for t in range(T)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *frames)
+    transl = 0.2 * (stacked.transl - jnp.array([0, 0, 150.0])) + jnp.array([0, 0, 160.0])
+    first = frames[0]
+    return dataclasses.replace(stacked, transl=transl, bone_length=first.bone_length, betas=first.betas)
+
+
+def seen(seed=0):
+    rng = np.random.default_rng(seed)
+    mask = np.zeros((T, SIZE, SIZE), np.uint8)
+    mask[:, 8:22, 6:25] = 1
+    return Evidence(
+        keypoints_px=jnp.asarray(rng.uniform(0, SIZE, (T, BIRD.num_keypoints, 2)), jnp.float32),
+        confidence=jnp.asarray(rng.uniform(0.1, 1, (T, BIRD.num_keypoints)), jnp.float32),
+        mask=jnp.asarray(mask),
+        has_mask=jnp.ones(T, bool),
+        present=jnp.ones(T, bool),
+        corner_px=jnp.asarray(rng.uniform(0, 5, (T, 2)), jnp.float32),
+    )
+
+
+def without(evidence, t):
+    """The same with frame `t` absent, as the fit's own evidence has it."""
+    return dataclasses.replace(
+        evidence,
+        confidence=evidence.confidence.at[t].set(0),
+        has_mask=evidence.has_mask.at[t].set(False),
+        present=evidence.present.at[t].set(False),
+    )
+
+
+def scene(pose, evidence, start=None):
+    return Scene(pose, pose if start is None else start, evidence, RIG, PRIORS, CAMERA, RASTER)
+
+
+def all_settings():
+    return {name: {"weight": 1.0, **find_term(name).settings} for name in TERMS}
+
+
+@jax.jit
+def every_term(pose, start, evidence, settings):
+    return evaluate_terms(scene(pose, evidence, start), settings)
+
+
+@jax.jit
+def every_gradient(pose, start, evidence, settings):
+    """d term / d pose, for each term by itself, in one program."""
+
+    def terms(pose):
+        values = evaluate_terms(scene(pose, evidence, start), settings)
+        return jnp.stack([values[name] for name in TERMS])
+
+    value, pull = jax.vjp(terms, pose)
+    gradients = jax.vmap(lambda row: pull(row)[0])(jnp.eye(len(TERMS)))
+    return {name: (value[i], jax.tree.map(lambda g, i=i: g[i], gradients)) for i, name in enumerate(TERMS)}
+
+
+def frame(pose, t):
+    return dataclasses.replace(
+        pose,
+        global_orient=pose.global_orient[t],
+        body_pose=pose.body_pose[t],
+        transl=pose.transl[t],
+        scale=pose.scale[t],
+    )
+
+
+def pixels(points):
+    points = np.asarray(points, np.float64)
+    return CAMERA.focal_px * points[..., :2] / points[..., 2:] + CAMERA.centre_px
+
+
+@functools.cache
+def soft_silhouettes(seed):
+    """SoftRas in double precision, face by face: 1 − Π (1 − sigmoid(−d/s)) within the blur radius."""
+    pose, images = window_pose(seed), []
+    at = np.arange(SIZE) + 0.5
+    p = np.stack(np.meshgrid(at, at), -1).reshape(-1, 2)
+    for t in range(T):
+        passed = np.ones(len(p))
+        for corners in pixels(skin_by_hand(BIRD, frame(pose, t))[0])[np.asarray(BIRD.faces)]:
+            squared, sides = [], []
+            for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+                along = np.clip((p - a) @ (b - a) / max((b - a) @ (b - a), 1e-20), 0, 1)
+                squared.append(((p - a - along[:, None] * (b - a)) ** 2).sum(-1))
+                sides.append((b - a)[0] * (p - a)[:, 1] - (b - a)[1] * (p - a)[:, 0])
+            distance, sides = np.min(squared, 0), np.array(sides)
+            inside = (sides >= 0).all(0) | (sides <= 0).all(0)
+            near = inside | (distance < RASTER.blur.radius**2)
+            signed = np.where(inside, -distance, distance)
+            passed *= np.where(near, 1 - 1 / (1 + np.exp(np.minimum(signed / RASTER.blur.sigma, 700))), 1)
+        images.append((1 - passed).reshape(SIZE, SIZE))
+    return np.array(images)
+
+
+def mahalanobis(x, mean, covariance):
+    offset = np.asarray(x, np.float64).reshape(-1) - np.asarray(mean, np.float64)
+    return offset @ np.linalg.solve(np.asarray(covariance, np.float64), offset)
+
+
+def angles_between(one, other):
+    """Of the global orientation and of every joint, by scipy."""
+    a, b = (np.concatenate([np.asarray(p.global_orient)[None], np.asarray(p.body_pose)]) for p in (one, other))
+    return (Rotation.from_rotvec(a.astype(float)).inv() * Rotation.from_rotvec(b.astype(float))).magnitude()
+
+
+def oracle(name, pose, start, evidence, seed):
+    """Each term by its equation, frame by frame in double precision."""
+    total = 0.0
+    for t in range(T):
+        if name == "keypoints":
+            points = np.asarray(BIRD.keypoint_weights) @ skin_by_hand(BIRD, frame(pose, t))[0]
+            e2 = (pixels(points) - np.asarray(evidence.keypoints_px[t])) ** 2
+            total += (np.asarray(evidence.confidence[t])[:, None] * (50**2 * e2 / (50**2 + e2))).sum()
+        elif name in ("mask", "mask_smooth_l1"):
+            e = np.abs(soft_silhouettes(seed)[t] - np.asarray(evidence.mask[t]))
+            total += e.sum() if name == "mask" else (0.5 * e**2).sum()
+        elif name == "pose_prior":
+            total += mahalanobis(pose.body_pose[t], BIRD.pose_mean, BIRD.pose_covariance)
+        elif name == "start_pull":
+            total += np.abs(np.asarray(pose.body_pose[t] - start.body_pose[t])).sum()
+    betas = np.asarray(pose.betas, np.float64)
+    if name == "bone_prior":
+        total = mahalanobis(pose.bone_length, BIRD.bone_mean, BIRD.bone_covariance)
+    elif name == "shape_prior":
+        total = (betas**2 / np.asarray(BIRD.shape_variance)).sum()
+    elif name == "shape_norm":
+        total = np.sqrt((betas**2).sum())
+    elif name == "start_pull":
+        total += np.abs(np.asarray(pose.bone_length - start.bone_length)).sum()
+    elif name == "joint_limits":
+        low, high = np.moveaxis(np.asarray(BIRD.joint_limits, np.float64), -1, 0)
+        for theta in np.asarray(pose.body_pose, np.float64):
+            total += (np.where(theta < low, low - theta, 0) ** 2 + np.where(theta > high, theta - high, 0) ** 2).sum()
+    elif name in ("geodesic_velocity", "huber_velocity"):
+        for i in range(T - 1):
+            turned, *bent = angles_between(frame(pose, i), frame(pose, i + 1))
+            if name == "geodesic_velocity":
+                total += 10 * turned + np.sqrt(np.square(bent).sum())
+            else:
+                total += 10 * huber(0.1, turned) + huber(0.1, bent).sum()
+    elif name == "low_pass":
+        for theta in (pose.global_orient, pose.body_pose.reshape(T, -1)):
+            for k, coefficients in enumerate(dct(np.asarray(theta, np.float64), axis=0, norm="ortho")[1:], start=1):
+                total += (coefficients**2).sum() / (1 + (0.15 / (k / (2 * T))) ** 8)
+    elif name == "feet_on_ground":
+        feet = [BIRD.keypoint_names.index(foot) for foot in ("left_foot", "right_foot")]
+        posed = [np.asarray(BIRD.keypoint_weights) @ skin_by_hand(BIRD, frame(pose, t))[0] for t in range(T)]
+        # where the first frame's crop would see them, back in space at their depths
+        corner = np.asarray(evidence.corner_px, np.float64) - CAMERA.centre_px
+        seen_px = [pixels(posed[t][feet]) + corner[t] - np.asarray(evidence.corner_px[0]) for t in range(T)]
+        feet_cam = [np.c_[seen_px[t] * posed[t][feet, 2:] / CAMERA.focal_px, posed[t][feet, 2]] for t in range(T)]
+        for i in range(T - 1):
+            d2 = ((feet_cam[i + 1] - feet_cam[i]) ** 2).sum(-1)
+            total += (0.25 * d2 / (0.25 + d2)).sum()
+    elif name in ("velocity", "acceleration"):
+        order = 1 if name == "velocity" else 2
+        for theta, beta in ((pose.global_orient, 10), (pose.body_pose.reshape(T, -1), 1)):
+            total += beta * np.linalg.norm(np.diff(np.asarray(theta, np.float64), order, axis=0), axis=1).sum()
+    return total

@@ -1,0 +1,331 @@
+"""Reading videos: a number is always the same picture, damage is told and left out, the thread ends."""
+
+import collections
+import gc
+import logging
+import signal
+import threading
+
+import av
+import cv2
+import numpy as np
+import pytest
+from support.films import COUNT, SIZE, encode, frames, number_in, numbered, overwrite, packets, write
+
+from jaxfit.errors import InputError
+from jaxfit.video import decoding
+from jaxfit.video.reader import _AHEAD, Frame, VideoInfo, _ahead, probe_video, read_frames
+
+KINDS = {
+    "b_frames.mp4": {"options": {"bf": "3", "x264-params": "b-pyramid=normal"}},
+    "open.mp4": {"options": {"x264-params": "open-gop=1:bframes=3:scenecut=0"}},
+    "refresh.mp4": {"options": {"x264-params": "intra-refresh=1"}},
+    "b_frames.mkv": {},
+    "vp9.webm": {"codec": "libvpx-vp9", "options": {"deadline": "realtime", "cpu-used": "8"}},
+    "plain.avi": {"codec": "mpeg4"},
+    "b_frames.avi": {"codec": "mpeg4", "b_frames": 2},
+    "h264.avi": {},
+}
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("films")
+    return {name: encode(folder / name, **kind) for name, kind in KINDS.items()}
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """How many pictures were decoded."""
+    count = []
+
+    class Counting(decoding.Timeline):
+        def show(self, picture):
+            count.append(1)
+            super().show(picture)
+
+    monkeypatch.setattr(decoding, "Timeline", Counting)
+    return count
+
+
+@pytest.fixture
+def told(caplog):
+    """Warnings so far, as text."""
+    caplog.set_level(logging.WARNING, "jaxfit")
+    return lambda: [record.getMessage() for record in caplog.records]
+
+
+def threads():
+    return [thread for thread in threading.enumerate() if thread.name == "frames"]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_number_is_the_same_picture_wherever_reading_begins(films, shown, told, name):
+    reader = read_frames(films[name])
+    every = list(reader)
+    assert [number_in(frame.picture) for frame in every] == [frame.index for frame in every] == list(range(100))
+    np.testing.assert_allclose([frame.time_s for frame in every], np.arange(100) / 25)
+    assert reader.info == VideoInfo(None if name.endswith(("mkv", "webm")) else 100, 25, (128, 80))
+    for start in (1, 19, 20, 21, 58, 77, 81, 99):
+        shown.clear()
+        some = list(read_frames(films[name], start, start + 5, 2))
+        assert [frame.index for frame in some] == list(range(100))[start : start + 5 : 2]
+        for frame in some:
+            np.testing.assert_array_equal(frame.picture, every[frame.index].picture)
+            assert frame.time_s == every[frame.index].time_s
+        if start > 75 and not name.endswith("avi"):  # AVI has no time stamps to seek by
+            assert 0 < len(shown) < 75
+    assert told() == []
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
+def test_a_variable_frame_rate(tmp_path, name):
+    ticks = np.cumsum(np.random.default_rng(3).integers(1, 9, 100)) - 1
+    ticks[50:] += 200
+    encode(tmp_path / name, ticks=ticks.tolist())
+    for start in (0, 49, 50, 83):
+        read = list(read_frames(tmp_path / name, start))
+        assert (
+            [number_in(frame.picture) for frame in read] == [frame.index for frame in read] == list(range(start, 100))
+        )
+        np.testing.assert_allclose([frame.time_s for frame in read], (ticks[start:] - ticks[0]) / 100, atol=1e-3)
+    assert not read_frames(tmp_path / name).damaged
+
+
+@pytest.mark.parametrize("name", ["b_frames.mp4", "open.mp4", "b_frames.mkv", "plain.avi", "b_frames.avi", "h264.avi"])
+@pytest.mark.parametrize("hit", [40, 47, 53])
+def test_a_damaged_packet(tmp_path, films, told, name, hit):
+    """Whatever is given is right to the pixel; what is not is told; from the next keyframe on all is there."""
+    (tmp_path / name).write_bytes(films[name].read_bytes())
+    position, size, _ = packets(films[name])[hit]
+    overwrite(tmp_path / name, position + size // 3, size // 2)
+    whole = {frame.index: frame.picture for frame in read_frames(films[name])}
+    reader = read_frames(tmp_path / name)
+    given = {frame.index: frame.picture for frame in reader}
+    assert sorted([*given, *reader.damaged]) == list(range(100))
+    wrong = [i for i, picture in given.items() if (picture != whole[i]).any()]
+    if name == "h264.avi":  # without time stamps pictures reordered about the damage cannot be told
+        assert set(wrong) <= set(range(hit - 4, hit + 5))
+    else:
+        assert wrong == []
+    assert any(abs(i - hit) <= 4 for i in reader.damaged)
+    assert all(36 <= i < 60 for i in reader.damaged)
+    (warning,) = told()
+    assert f"{name}: damaged and left out: {len(reader.damaged)} frames (" in warning
+    late = read_frames(tmp_path / name, 45, 70, 5)
+    assert sorted([*(frame.index for frame in late), *late.damaged]) == [45, 50, 55, 60, 65]
+    assert late.damaged == [i for i in reader.damaged if i in (45, 50, 55)]
+
+
+@pytest.mark.parametrize("name", ["plain.avi", "b_frames.avi", "h264.avi", "b_frames.mkv", "vp9.webm"])
+def test_lost_packets(tmp_path, films, told, name):
+    """Damage that hides packets from the container: numbers after it are those of the whole file."""
+    (tmp_path / name).write_bytes(films[name].read_bytes())
+    known = packets(films[name])
+    begin = next(i for i in range(36, 60) if known[i][2])
+    overwrite(tmp_path / name, known[begin][0] - 12, known[begin + 8][0] - known[begin][0])
+    reader = read_frames(tmp_path / name)
+    given = list(reader)
+    assert [number_in(frame.picture) for frame in given] == [frame.index for frame in given]
+    assert {*range(begin - 4), *range(60, 100)} <= {frame.index for frame in given}
+    assert set(reader.damaged) >= set(range(begin + 1, begin + 17))
+    assert len(told()) == 1
+
+
+def test_lost_packets_of_uneven_time(tmp_path):
+    """Nobody knows how many they were: the count goes on, time does not lie."""
+    ticks = np.cumsum(np.random.default_rng(3).integers(1, 9, 100)) - 1
+    encode(tmp_path / "a.mkv", ticks=ticks.tolist())
+    known = packets(tmp_path / "a.mkv")
+    overwrite(tmp_path / "a.mkv", known[40][0] - 12, known[48][0] - known[40][0])
+    given = list(read_frames(tmp_path / "a.mkv"))
+    last = given[-1]
+    assert (last.index < 99, number_in(last.picture)) == (True, 99)
+    np.testing.assert_allclose(last.time_s, (ticks[99] - ticks[0]) / 100, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["b_frames.mp4", "plain.avi", "vp9.webm"])
+def test_a_file_cut_short(tmp_path, films, told, name):
+    position, size, _ = packets(films[name])[70]
+    content = films[name].read_bytes()
+    if name.endswith("mp4"):  # its index stands at the end unless asked for otherwise
+        write(tmp_path / "front.mp4", count=100)
+        content = (tmp_path / "front.mp4").read_bytes()
+        position, size, _ = packets(tmp_path / "front.mp4")[70]
+    (tmp_path / name).write_bytes(content[: position + size // 2])
+    reader = read_frames(tmp_path / name)
+    read = [frame.index for frame in reader]
+    assert read == list(range(len(read)))
+    assert 60 < len(read) <= 71
+    assert sum("breaks off after" in text for text in told()) == 1
+
+
+def test_nothing_before_the_frames(tmp_path):
+    write(tmp_path / "a.mp4")
+    whole = (tmp_path / "a.mp4").read_bytes()
+    for size, problem in ((60, "(is|holds) no video"), (whole.find(b"mdat") + 8, "no frame can be decoded")):
+        (tmp_path / "c.mp4").write_bytes(whole[:size])
+        with pytest.raises(InputError, match=rf"c\.mp4: {problem}"):
+            list(read_frames(tmp_path / "c.mp4"))
+    assert not threads()
+
+
+def test_some_frames(tmp_path):
+    write(tmp_path / "a.mp4")
+    every = list(read_frames(tmp_path / "a.mp4"))
+    for start, stop, step in ((5, None, 1), (0, 7, 3), (20, 1000, 4), (40, None, 1), (3, 3, 1), (29, None, 5)):
+        some = list(read_frames(tmp_path / "a.mp4", start, stop, step))
+        assert [frame.index for frame in some] == list(range(COUNT))[start:stop:step]
+        for frame in some:
+            np.testing.assert_array_equal(frame.picture, every[frame.index].picture)
+    for wrong in ((-1, None, 1), (0, -1, 1), (0, None, 0)):
+        with pytest.raises(ValueError, match="step 1 or more"):
+            read_frames(tmp_path / "a.mp4", *wrong)
+    with pytest.raises(ValueError, match="fps must be above 0"):
+        read_frames(tmp_path, fps=0)
+    with pytest.raises(InputError, match="whose frame rate is its own"):
+        read_frames(tmp_path / "a.mp4", fps=25)
+
+
+def test_a_folder_of_images(tmp_path, told):
+    for i, frame in enumerate(frames(count=12)):
+        cv2.imwrite(str(tmp_path / f"frame{i}.png"), frame)  # 10 stands before 2 in plain order
+    (tmp_path / "notes.txt").write_text("none of these")
+    assert probe_video(tmp_path) == VideoInfo(12, None, SIZE)
+    read = list(read_frames(tmp_path, 1, None, 2))
+    assert [frame.index for frame in read] == [1, 3, 5, 7, 9, 11]
+    assert {frame.time_s for frame in read} == {None}
+    for frame, sent in zip(read, list(frames(count=12))[1::2], strict=True):
+        np.testing.assert_array_equal(frame.picture, sent)
+    assert [frame.time_s for frame in read_frames(tmp_path, 4, fps=4)] == [1 + i / 4 for i in range(8)]
+    assert list(read_frames(tmp_path, 50)) == []
+    assert told() == []
+
+
+def test_images_that_cannot_be_read(tmp_path, told):
+    for i, frame in enumerate(frames(count=12)):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), frame)
+    for i, content in ((0, b""), (3, b"no image"), (4, (tmp_path / "4.png").read_bytes()[:40])):
+        (tmp_path / f"{i}.png").write_bytes(content)
+    reader = read_frames(tmp_path, fps=2)
+    assert reader.info == VideoInfo(12, 2, SIZE)
+    assert [(frame.index, frame.time_s) for frame in reader] == [(i, i / 2) for i in (1, 2, *range(5, 12))]
+    assert reader.damaged == [0, 3, 4]
+    assert told() == [f"{tmp_path}: damaged and left out: 3 frames (0, 3–4)"]
+    cv2.imwrite(str(tmp_path / "7.png"), np.zeros((10, 20, 3), np.uint8))
+    with pytest.raises(InputError, match=r"7\.png: is 20×10, but the images before are 64×48"):
+        list(reader)
+    for file in tmp_path.iterdir():
+        file.write_bytes(b"")
+    with pytest.raises(InputError, match="holds no image that can be read"):
+        read_frames(tmp_path)
+
+
+def test_what_is_no_video(tmp_path):
+    with pytest.raises(InputError, match=r"absent\.mp4: does not exist"):
+        read_frames(tmp_path / "absent.mp4")
+    with pytest.raises(InputError, match="holds no images"):
+        read_frames(tmp_path)
+    for name, content in (("a.mp4", b"no video at all\n" * 500), ("b.mp4", b""), ("c.txt", b"some words")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match="is no video that can be read"):
+            read_frames(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["sound.wav", "sound.mp4", "sound.mkv"])
+def test_sound_alone(tmp_path, name):
+    with av.open(str(tmp_path / name), "w") as container:
+        stream = container.add_stream("pcm_s16le" if name.endswith("wav") else "aac", rate=8000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
+        sound.rate = 8000
+        container.mux(stream.encode(sound))
+        container.mux(stream.encode(None))
+    with pytest.raises(InputError, match="holds no video stream"):
+        read_frames(tmp_path / name)
+
+
+def test_a_playlist_opens_no_address(tmp_path):
+    text = "#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\nhttp://127.0.0.1:9/a.ts\n#EXT-X-ENDLIST\n"
+    (tmp_path / "a.m3u8").write_text(text)
+    with pytest.raises(InputError):
+        list(read_frames(tmp_path / "a.m3u8"))
+
+
+def test_the_thread_ends_with_the_reading(films):
+    path = films["b_frames.mp4"]
+
+    def stop_at(index, error=None):
+        for frame in read_frames(path):
+            if frame.index == index:
+                assert len(threads()) <= 1
+                if error is not None:
+                    raise error
+                break
+
+    stop_at(3)
+    assert not threads()
+    with pytest.raises(ZeroDivisionError):
+        stop_at(3, ZeroDivisionError())
+    gc.collect()
+    assert not threads()
+    reader = read_frames(path)
+    for _ in range(2):  # it can be read again
+        assert len(list(reader)) == 100
+    assert not threads()
+
+
+def test_an_interrupt():
+    main, ended = threading.main_thread(), []
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+
+    def source(stopped):
+        try:
+            for i in range(10**6):
+                if i == 10:
+                    signal.pthread_kill(main.ident, signal.SIGINT)
+                yield i
+        finally:
+            ended.append(True)
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            collections.deque(_ahead(source), maxlen=1)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    gc.collect()
+    assert ended
+    assert not threads()
+
+
+def test_no_more_is_made_ahead_than_wanted():
+    made, taken, most = 0, 0, 0
+
+    def source(stopped):
+        nonlocal made, most
+        for i in range(200):
+            made += 1
+            most = max(most, made - taken)
+            yield i
+
+    for i in _ahead(source):
+        assert i == taken
+        taken += 1
+    assert taken == 200
+    assert most <= _AHEAD + 2  # one in the reader's hands, one that waits for its turn
+
+
+def test_errors_of_the_thread_come_out():
+    def source(stopped):
+        yield 1
+        raise InputError("a", "broken")
+
+    items = _ahead(source)
+    assert next(items) == 1
+    with pytest.raises(InputError, match="a: broken"):
+        next(items)
+    assert not threads()
+
+
+def test_numbered_pictures_can_be_told():
+    assert [number_in(numbered(i)) for i in range(256)] == list(range(256))
+    assert Frame(1, numbered(1), None).index == 1

@@ -1,0 +1,250 @@
+"""The overlay shows the birds where they are, in the right order, and refuses a video that is not theirs."""
+
+import contextlib
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.birds import filled_mask, pose_window
+from support.overlays import BIRD, CAMERA, CROPS, FIRST, FPS, GREY, HEIGHT, WIDTH, N, T, film, solution
+
+from jaxfit.data.observations import Observations
+from jaxfit.data.posed import PosedBirds
+from jaxfit.errors import InputError
+from jaxfit.model.camera import project
+from jaxfit.raster.zbuffer import hard_mask
+from jaxfit.simulation.motion import smooth_motion
+from jaxfit.video.reader import probe_video, read_frames
+from jaxfit.view.birds import DrawnBird, Style, draw_birds
+from jaxfit.view.marks import TRACK_COLOURS
+from jaxfit.view.overlay import CHUNK, overlay
+from jaxfit.view.sheet import TILE_PX
+from jaxfit.view.side import SideViews, up_direction
+
+
+def detections(size=(WIDTH, HEIGHT)) -> Observations:
+    """The first bird's bill tip, 20 px left of the fitted one."""
+    points = np.zeros((1, T, BIRD.num_keypoints, 2))
+    points[:, :, 0] = solution().keypoints_2d[:1, :, 0] - [20, 0]
+    confidence = np.zeros((1, T, BIRD.num_keypoints))
+    confidence[:, :, 0] = 1
+    return Observations(
+        track_id=np.array([4]),
+        frame_index=np.arange(FIRST, FIRST + T),
+        present=np.ones((1, T), bool),
+        keypoints_px=points,
+        confidence=confidence,
+        box_px=np.ones((1, T, 4)),
+        image_size_px=np.full((T, 2), size),
+        file_name=np.array([""] * T),
+        keypoint_names=BIRD.keypoint_names,
+    )
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """An overlay with everything, its frames, and the folder it lies in."""
+    folder = tmp_path_factory.mktemp("overlay")
+    film(folder / "film.mp4")
+    ticks = []
+
+    def progress(name, total):
+        return contextlib.nullcontext(lambda done, note: ticks.append((done, total, note)))
+
+    made = overlay(
+        solution(),
+        BIRD,
+        folder / "film.mp4",
+        folder / "out" / "o.mp4",
+        observations=detections(),
+        side_views=True,
+        progress=progress,
+    )
+    return made, [frame.picture.astype(int) for frame in read_frames(made.video)], ticks
+
+
+def masks(t):
+    """Where each bird is in the picture, by the renderer; None where it is away."""
+    posed = PosedBirds(solution(), BIRD)
+    shape = WIDTH, HEIGHT
+    return [
+        hard_mask(posed.vertices_screen(n, t), posed.faces, *shape) if solution().valid[n, t] else None for n in (0, 1)
+    ]
+
+
+def changed(frame):
+    return np.abs(frame[:HEIGHT] - GREY).sum(-1) > 24
+
+
+def test_the_video_is_what_it_says(drawn):
+    made, frames, ticks = drawn
+    info = probe_video(made.video)
+    assert (info.frames, info.fps, info.size_px) == (T, FPS, made.size_px)
+    assert (made.frames, made.fps, made.fallback) == (T, FPS, False)
+    assert len(frames) == T
+    assert made.size_px[0] == WIDTH
+    assert made.size_px[1] > HEIGHT + 100  # the legend and a strip
+    assert [(done, total) for done, total, _ in ticks] == [(1, T)] * T
+    assert ticks[0][2] == f"frame {FIRST}"
+    assert sorted(p.name for p in made.video.parent.iterdir()) == ["o.mp4", "o.png"]
+
+
+def test_birds_are_drawn_where_they_are_and_nowhere_else(drawn):
+    for t, frame in enumerate(drawn[1]):
+        differs, far = changed(frame), np.ones((HEIGHT, WIDTH), bool)
+        for n, mask in enumerate(masks(t)):
+            x0, y0, size = CROPS[n]
+            if mask is None:
+                assert differs[y0 : y0 + size, x0 : x0 + size].sum() == 0
+                continue
+            assert differs[mask].mean() > 0.95
+            near = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) > 0
+            points = solution().keypoints_2d[n, t]
+            low, high = (points.min(0) - 70).astype(int), (points.max(0) + 70).astype(int)  # its number, its rings
+            far[max(low[1], 0) : high[1], max(low[0], 0) : high[0]] = False
+            edge = near & ~(cv2.erode(mask.astype(np.uint8), np.ones((5, 5))) > 0)
+            towards = np.array(TRACK_COLOURS[n]) - GREY
+            like = ((frame[:HEIGHT][edge] - GREY) @ towards) / np.linalg.norm(towards)
+            assert np.percentile(like, 90) > 30  # an outline in the track's colour
+        assert not differs[far].any()
+
+
+def test_detected_keypoints_are_rings(drawn):
+    made, frames, _ = drawn
+    plain = overlay(solution(), BIRD, made.video.parents[1] / "film.mp4", made.video.parent / "plain.mp4")
+    assert plain.size_px[1] < made.size_px[1]
+    for t, frame, _ in read_frames(plain.video):
+        x, y = np.round(detections().keypoints_px[0, t, 0]).astype(int)
+        box = slice(y - 6, y + 6), slice(x - 6, x + 6)
+        assert np.abs(frames[t][box] - frame[box]).sum(-1).max() > 60
+    for file in (plain.video, plain.sheet):
+        file.unlink()
+
+
+def test_side_views_keep_their_places(drawn):
+    side = SideViews(solution(), BIRD, WIDTH, Style.suited(WIDTH, 60).text_px)
+    assert drawn[0].size_px[1] - side.height > HEIGHT
+    strips = np.array(drawn[1])[:, -side.height :]
+    tiles = [strips[:, 30 : side.tile_px - 3, n * side.tile_px + 3 : (n + 1) * side.tile_px - 3] for n in range(N)]
+    ink = [(tile.min(-1) < 150).sum((1, 2)) for tile in tiles]
+    assert (ink[0] > 300).all()
+    assert (np.delete(ink[1], 2) > 300).all()
+    assert ink[1][2] < 30  # away in the third frame
+
+
+def test_the_contact_sheet_has_a_row_a_bird(drawn):
+    sheet = cv2.imread(str(drawn[0].sheet)).astype(int)
+    assert sheet.shape == (N * TILE_PX, 4 * 2 * TILE_PX, 3)
+    tiles = sheet.reshape(N, TILE_PX, 8, TILE_PX, 3).transpose(0, 2, 1, 3, 4)
+    for n in range(N):
+        for pair in range(4):
+            footage, mesh = tiles[n, 2 * pair], tiles[n, 2 * pair + 1]
+            # crops that reach beyond the picture are black there
+            assert (np.abs(footage - GREY).sum(-1) < 30).mean() > 0.3
+            assert 0.03 < (np.abs(mesh - mesh[0, 0]).sum(-1) > 40).mean() < 0.6
+
+
+@pytest.mark.parametrize("one_camera", [True, False])
+def test_which_bird_hides_the_other(one_camera):
+    """One is nearer, the other lower in the picture: depth counts only where it can be compared."""
+    square = np.array([[0, 0], [60, 0], [60, 60], [0, 60]], np.float32)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+
+    def card(n, place, depth):
+        screen = np.column_stack([square + place, np.full(4, depth)]).astype(np.float32)
+        colours = np.tile(np.eye(3, dtype=np.float32)[n], (4, 1))
+        return DrawnBird(n, str(n), screen, colours, square + place, np.zeros((0, 2)))
+
+    near_but_higher, far_but_lower = card(0, [20, 20], 100.0), card(1, [40, 50], 200.0)
+    for birds in ([near_but_higher, far_but_lower], [far_but_lower, near_but_higher]):
+        image = np.zeros((160, 160, 3), np.uint8)
+        draw_birds(image, birds, faces, Style(1, 2, opacity=1.0), one_camera)
+        assert image[65, 60].argmax() == (0 if one_camera else 1)
+        assert image[30, 30].tolist() == [255, 0, 0]
+        assert image[100, 90].tolist() == [0, 255, 0]
+        assert (image[130:] == 0).all()
+
+
+def test_only_every_second_frame_and_a_small_picture(tmp_path):
+    made = overlay(
+        solution(frame_index=tuple(range(0, 2 * T, 2))),
+        BIRD,
+        film(tmp_path / "f.mp4", 2 * T),
+        tmp_path / "o.mp4",
+        max_width=160,
+    )
+    assert (made.frames, made.fps, made.size_px[0]) == (T, FPS / 2, 160)
+    for _, frame, _ in read_frames(made.video):
+        assert np.abs(frame[: HEIGHT // 2].astype(int) - GREY).max() > 60
+
+
+def test_vertices_of_a_window_are_those_of_its_frames():
+    posed = PosedBirds(solution(), BIRD)
+    for n in range(N):
+        whole = posed.vertices_screen_window(n)
+        vertices = pose_window(BIRD, smooth_motion(BIRD, T, n))[1]
+        x0, y0, size = CROPS[n]
+        by_hand = [*np.moveaxis(np.asarray(project(vertices, CAMERA)) * size / 256 + [x0, y0], -1, 0), vertices[..., 2]]
+        np.testing.assert_allclose(whole, np.stack(by_hand, axis=-1), rtol=1e-5, atol=2e-3)
+        np.testing.assert_allclose(posed.vertices_screen(n, 1), whole[1], rtol=1e-6, atol=1e-4)
+        np.testing.assert_array_equal(posed.vertices_screen_window(n, slice(2, 4)).shape, (2, *whole.shape[1:]))
+        filled = filled_mask(whole[0, :, :2], BIRD.faces, WIDTH)[:HEIGHT]
+        assert (filled != masks(0)[n]).sum() <= 3  # pixels whose centre lies on an edge
+
+
+def test_long_results_are_posed_chunk_by_chunk(tmp_path):
+    """Longer than a chunk and no multiple of it: every frame still shows its own pose."""
+    frames, still = CHUNK + 5, solution()
+    names = ("valid", "global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "image_size_px")
+    names += ("keypoints_3d", "keypoints_2d")
+    many = {name: np.repeat(getattr(still, name)[:1, :1], frames, 1) for name in names}
+    crop = np.repeat(still.crop[:1, :1], frames, 1).copy()
+    crop[:, :, 0] += np.arange(frames)  # it walks to the right, a pixel a frame
+    many["keypoints_2d"] = many["keypoints_2d"] + (crop - still.crop[:1, :1])[:, :, None, :2]
+    long = dataclasses.replace(still, **many, crop=crop, track_id=[4], frame_index=np.arange(frames), status=["ok"])
+    made = overlay(long, BIRD, film(tmp_path / "f.mp4", frames), tmp_path / "o.mp4")
+    middles = [np.flatnonzero(changed(frame.astype(int)).sum(0) > 3).mean() for _, frame, _ in read_frames(made.video)]
+    np.testing.assert_allclose(np.diff(middles), 1, atol=6)  # the number may change sides
+    assert middles[-1] - middles[0] == pytest.approx(frames - 1, abs=6)
+
+
+def test_up_is_where_birds_stand():
+    """Birds that face all ways, in a camera that looks down steeply: their feet tell where up is."""
+    look = Rotation.from_euler("x", 130, degrees=True)
+    headings = Rotation.from_rotvec(np.linspace(0, 300, T)[:, None] * [0, 0, 1], degrees=True)
+    points = np.stack([look.apply(headings[t].apply(np.asarray(BIRD.keypoints))) for t in range(T)])
+    standing = dataclasses.replace(solution(), keypoints_3d=np.stack([points, points + 5]))
+    assert np.degrees(np.arccos(up_direction(standing) @ look.apply([0, 0, 1]))) < 3
+
+
+def test_a_video_that_is_not_the_results(tmp_path):
+    def refused(*words, video=None, **given):
+        with pytest.raises(InputError) as error:
+            overlay(
+                given.pop("result", solution()), BIRD, video or film(tmp_path / "f.mp4"), tmp_path / "o.mp4", **given
+            )
+        for word in words:
+            assert word in str(error.value)
+        assert not list(tmp_path.glob("o.*"))
+        assert not list(tmp_path.glob(".o*"))
+
+    last = str(FIRST + T - 1)
+    refused("short.mp4", f"has {T} frames", f"{FIRST} to {last}", video=film(tmp_path / "short.mp4", T))
+    refused("short.webm", f"has {T} frames", last, video=film(tmp_path / "short.webm", T))  # learnt only at the end
+    small = film(tmp_path / "small.mp4", size=(100, 60))
+    refused("small.mp4: is 100×60", "fitted to pictures of 320×200", "give the video", video=small)
+    large = film(tmp_path / "large.mp4", size=(640, 400))  # all keypoints lie in it
+    refused("large.mp4: is 640×400", "fitted to pictures of 320×200", video=large)
+    refused("observations", "640×400", "320×200", observations=detections((640, 400)))
+    refused("none of the result's birds", observations=dataclasses.replace(detections(), track_id=np.array([5])))
+    refused("nothing.mp4", "does not exist", video=tmp_path / "nothing.mp4")
+    (tmp_path / "text.mp4").write_text("no video")
+    refused("text.mp4", "no video", video=tmp_path / "text.mp4")
+    empty = dataclasses.replace(solution(), valid=np.zeros((N, T), bool))
+    refused("no valid pose", result=empty)
+    other = dataclasses.replace(detections(), keypoint_names=("horn", *BIRD.keypoint_names[1:]))
+    refused("horn", observations=other)
+    with pytest.raises(ValueError, match="max_width"):
+        overlay(solution(), BIRD, small, tmp_path / "o.mp4", max_width=3)
