@@ -8,22 +8,22 @@ from contextlib import AbstractContextManager, contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-__all__ = ["ProgressTask", "Tick", "silent", "terminal"]
+__all__ = ["ProgressTask", "ReportProgress", "silent", "terminal"]
 
-Tick = Callable[[float, str], None]
+ReportProgress = Callable[[float, str], None]
 """Called with the amount of work just done and a short note."""
-ProgressTask = Callable[[str, float | None], AbstractContextManager[Tick]]
+ProgressTask = Callable[[str, float | None], AbstractContextManager[ReportProgress]]
 """Opens a task of a given name and total amount of work; None where nobody knows it."""
 
 
 @contextmanager
-def silent(_name: str, _total: float | None) -> Iterator[Tick]:
+def silent(_name: str, _total: float | None) -> Iterator[ReportProgress]:
     """Report nothing."""
     yield lambda _done, _note: None
 
 
 @contextmanager
-def terminal(name: str, total: float | None) -> Iterator[Tick]:
+def terminal(name: str, total: float | None) -> Iterator[ReportProgress]:
     """A bar with elapsed and remaining time on stderr; plain lines where that is not a terminal."""
     console = Console(stderr=True)
     columns = (

@@ -21,8 +21,8 @@ POSE = """
 import jax.numpy as jnp
 import numpy as np
 from support.birds import random_pose, toy_bird
-from jaxfit import camera, filtering
-from jaxfit.model import kinematics, rotation
+from jaxfit.fitting import filtering
+from jaxfit.model import camera, kinematics, rotation
 from jaxfit.model.pose import rest_pose
 
 bird = toy_bird()
@@ -41,10 +41,10 @@ assert bird.keypoints.shape == (12, 3)
 """
 
 OBJECTIVE = """
-from support.terms_by_hand import all_settings, every_gradient, scene, seen, window_pose
+from support.terms_by_hand import all_settings, every_gradient, posed_window, seen, window_pose
 from jaxfit.objective.objective import evaluate_terms
 pose = window_pose()
-evaluate_terms(scene(pose, seen()), all_settings())
+evaluate_terms(posed_window(pose, seen()), all_settings())
 every_gradient(pose, pose, seen(), all_settings())
 """
 
@@ -60,14 +60,14 @@ base: paper
 window: 6
 crop: {{size_px: 64, focal_px: 541.75}}
 initialise: {{method: so3, turns: 6, directions: 8, hypotheses: 2}}
-terms: {{keypoints: 100, mask: 1, mask_smooth_l1: 1, bone_prior: 1, shape_prior: 1, shape_norm: 1, start_pull: 1}}
+terms: {{keypoints: 100, mask: 1, mask_smooth_l1: 1, bone_prior: 1, shape_prior: 1, shape_norm: 1, stage_anchor: 1}}
 stages:
   - {{name: least_squares, steps: 2, terms: [keypoints, pose_prior, velocity, acceleration],
-     free: [global_orient, scale], solver: levenberg_marquardt}}
+     optimised: [global_orient, scale], solver: levenberg_marquardt}}
   - {{name: a, steps: 2, terms: [keypoints, pose_prior, bone_prior, shape_prior, velocity],
-     free: [global_orient, betas], keep_best: true}}
-  - {{name: b, steps: 2, terms: [keypoints, mask, mask_smooth_l1, shape_norm, start_pull, acceleration],
-     free: [body_pose, bone_length, transl, scale], blur: 0.5, carry_moments: true, keypoints_off: [crown]}}
+     optimised: [global_orient, betas], keep_best: true}}
+  - {{name: b, steps: 2, terms: [keypoints, mask, mask_smooth_l1, shape_norm, stage_anchor, acceleration],
+     optimised: [body_pose, bone_length, transl, scale], blur: 0.5, carry_moments: true, keypoints_off: [crown]}}
 ''')
 assert main(arguments(folder, folder / "out", config="full.yaml")) == 0
 again = ["--init", str(folder / "out" / "poses.npz")]

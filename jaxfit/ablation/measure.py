@@ -75,7 +75,7 @@ def measure_grid(
     annotations, poses, truth_bird = read_truth(truth)
     behaviours = read_behaviours(truth)
     results = []
-    with progress("Measuring", len(runs)) as tick:
+    with progress("Measuring", len(runs)) as report_progress:
         for run in runs:
             own = run_folder(folder, run)
             path = own / _EVALUATION
@@ -99,5 +99,5 @@ def measure_grid(
             except (OSError, ValueError, KeyError, TypeError) as error:
                 problem = f"cannot be read: {type(error).__name__}: {error}"
                 raise InputError(own, problem, "remove this folder, and its run is done again") from None
-            tick(1, run.name)
+            report_progress(1, run.name)
     return results

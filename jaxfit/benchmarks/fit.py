@@ -82,4 +82,4 @@ def keypoints_error(solution: Solution, bird: Bird, truth: list[Pose]) -> float:
     """Mean 3D distance of keypoints after aligning every frame (Procrustes), model units."""
     rig = fold_bird(bird)
     true_cam = np.stack([window_keypoints(rig, window_transforms(rig, pose), pose) for pose in truth])
-    return pa_mpjpe(solution.keypoints_3d, true_cam, np.isfinite(solution.keypoints_3d).all(-1))
+    return pa_mpjpe(solution.keypoints_cam, true_cam, np.isfinite(solution.keypoints_cam).all(-1))

@@ -21,12 +21,12 @@ from jaxfit.fitting.lane import Lane, Solver, lane_loss
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.prepare import Preparation, camera_of
 from jaxfit.fitting.solve import Report, advance, begin, report
-from jaxfit.fitting.stages import stage_knobs, stage_problem
+from jaxfit.fitting.stages import stage_hyperparameters, stage_problem
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.pose import Pose
-from jaxfit.objective.scene import priors_of
-from jaxfit.progress import ProgressTask, Tick, silent
+from jaxfit.objective.posed_window import priors_of
+from jaxfit.progress import ProgressTask, ReportProgress, silent
 from jaxfit.storage.files import write_whole
 
 __all__ = ["LBFGS", "bench_solvers", "plot_solvers"]
@@ -34,7 +34,7 @@ __all__ = ["LBFGS", "bench_solvers", "plot_solvers"]
 
 def _pose(z: Pose, lane: Lane) -> Pose:
     """L-BFGS works on the change since the start, in units of Adam's step, so that all parameters are of one scale."""
-    return jax.tree.map(lambda start, step, z: start + step * z, lane.start, lane.knobs.step_size, z)
+    return jax.tree.map(lambda start, step, z: start + step * z, lane.start, lane.hyperparameters.step_size, z)
 
 
 def _loss(z: Pose, lane: Lane) -> tuple[Float[Array, ""], None]:
@@ -96,36 +96,36 @@ def bench_solvers(
     windows, stage = prepared.windows(config), config.stages[0]
     rows = np.arange(len(windows))
     # masks are not looked at
-    evidence = prepared.evidence([(config, rows)])
-    evidence = jax.tree.map(jnp.asarray, replace(evidence, mask=evidence.mask[..., :0, :0]))
+    targets = prepared.targets([(config, rows)])
+    targets = jax.tree.map(jnp.asarray, replace(targets, mask=targets.mask[..., :0, :0]))
     start = jax.tree.map(lambda x: x[:, 0], prepared.starting_poses(bird, rig, config, rows))
-    one = stage_knobs(config, stage, bird.keypoint_names)
-    knobs = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(rows)), one)
+    one = stage_hyperparameters(config, stage, bird.keypoint_names)
+    hyperparameters = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(rows)), one)
     usual = stage_problem(config, stage, rig, priors_of(bird), camera_of(config))
     result: dict[str, Any] = {"birds": len(np.unique(windows.track)), "windows": len(rows)}
     most = {name: min(steps, limit or steps) for name, (_, steps, _) in RACE.items()}
 
-    def run(name: str, tick: Tick) -> tuple[list[int], list[float], list[float]]:
+    def run(name: str, report_progress: ReportProgress) -> tuple[list[int], list[float], list[float]]:
         solver, _, portion = RACE[name]
         problem = usual._replace(solver=solver)
-        state = begin(problem, knobs, jax.tree.map(jnp.copy, start), evidence, None)
-        steps, seconds, loss = [0], [0.0], [_total(report(problem, knobs, start, start, evidence))]
+        state = begin(problem, hyperparameters, jax.tree.map(jnp.copy, start), targets, None)
+        steps, seconds, loss = [0], [0.0], [_total(report(problem, hyperparameters, start, start, targets))]
         while steps[-1] < most[name]:
             take = min(portion, most[name] - steps[-1])
             began = time.perf_counter()
-            state, _, refused = advance((problem, knobs, evidence, jnp.int32(take)), state)
+            state, _, refused = advance((problem, hyperparameters, targets, jnp.int32(take)), state)
             jax.block_until_ready(refused)
             seconds.append(seconds[-1] + time.perf_counter() - began)
             steps.append(steps[-1] + take)
-            loss.append(_total(report(problem, knobs, state.pose, start, evidence)))
-            tick(take, f"{name}: loss {loss[-1]:.5g}")
+            loss.append(_total(report(problem, hyperparameters, state.pose, start, targets)))
+            report_progress(take, f"{name}: loss {loss[-1]:.5g}")
         return steps, seconds, loss
 
     turns: dict[str, list[list[float]]] = {name: [] for name in RACE}
-    with progress("Minimising", (repeats + 1) * sum(most.values())) as tick:
+    with progress("Minimising", (repeats + 1) * sum(most.values())) as report_progress:
         for turn in range(repeats + 1):
             for name in RACE:
-                steps, seconds, loss = run(name, tick)
+                steps, seconds, loss = run(name, report_progress)
                 if turn:  # the first compiles
                     turns[name].append(seconds)
                 result[name] = {"steps": steps, "loss": loss}

@@ -49,7 +49,7 @@ def check_config(config: FitConfig) -> None:
         require(len(stage.terms) > 0, f"{where}.terms", "is empty", f"known: {', '.join(known_terms())}")
         for name in stage.terms:
             _find(f"{where}.terms", f"names {name!r}", name)
-        for key in ("free", "step_scale"):
+        for key in ("optimised", "step_scale"):
             for name in getattr(stage, key):
                 known = name in PARAMETERS
                 require(known, f"{where}.{key}", f"names {name!r}", f"known: {', '.join(PARAMETERS)}")
@@ -73,9 +73,9 @@ def _check_solver(where: str, config: FitConfig, i: int) -> None:
             problem = f"is levenberg_marquardt, and the curvature of {name!r} is not known"
             remedy = "adam, or terms with a curvature such as keypoints, pose_prior, velocity, acceleration"
             require(find_term(name).curvature is not None, f"{where}.solver", problem, remedy)
-        moved = [name for name in stage.free if name in ("bone_length", "betas")]
+        moved = [name for name in stage.optimised if name in ("bone_length", "betas")]
         problem = f"is levenberg_marquardt, which does not move {' and '.join(moved)}"
-        require(not moved, f"{where}.solver", problem, "adam, or leave them out of `free`")
+        require(not moved, f"{where}.solver", problem, "adam, or leave them out of `optimised`")
 
 
 def _check_terms(where: str, terms: Mapping[str, Any]) -> None:

@@ -110,7 +110,7 @@ class TrackConfig:
     tracker: TrackerConfig = TrackerConfig()
     min_track_frames: int = 10
     """Birds seen in fewer frames are left out."""
-    repair_swaps: bool = False
+    repair_left_right_flips: bool = False
     """Exchange left and right keypoints back where a network mixed them up for some frames."""
     threads: int | None = None
     """Cores that the networks use; null takes all."""

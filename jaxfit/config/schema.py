@@ -71,7 +71,7 @@ class StageConfig:
     """The solver's steps."""
     terms: tuple[str, ...]
     """Active terms, by name; their weights and settings stand in `terms` of the whole config."""
-    free: tuple[str, ...] = ("global_orient", "body_pose", "transl", "scale")
+    optimised: tuple[str, ...] = ("global_orient", "body_pose", "transl", "scale")
     """Parameters that move: global_orient, body_pose, transl, scale, bone_length, betas."""
     solver: Literal["adam", "levenberg_marquardt"] = "adam"
     """`adam`: for any terms. `levenberg_marquardt`: a few steps instead of hundreds, for terms whose curvature is

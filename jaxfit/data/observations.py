@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxfit.data.masks import decode_mask
 from jaxfit.errors import InputError
-from jaxfit.storage.files import conform
+from jaxfit.storage.files import validate_arrays
 
 __all__ = ["Observations", "check_keypoints", "reorder_keypoints"]
 
@@ -79,7 +79,7 @@ class Observations:
         occluded = np.zeros(np.shape(self.confidence), bool) if self.occluded is None else self.occluded
         score = np.asarray(self.present, np.float32) if self.score is None else self.score
         values = {**vars(self), "keypoint_names": list(self.keypoint_names), "occluded": occluded, "score": score}
-        arrays = conform(values, _LAYOUT)
+        arrays = validate_arrays(values, _LAYOUT)
         names = tuple(str(name) for name in arrays.pop("keypoint_names"))
         if len(np.unique(arrays["track_id"])) < len(arrays["track_id"]):
             raise ValueError(f"track_id must name each track once, not {arrays['track_id'].tolist()}")

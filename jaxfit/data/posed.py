@@ -56,7 +56,7 @@ class PosedBirds:
         """
         s, crop = self.solution, self.solution.crop[n, frames][:, None]
         size = crop[..., 2:]
-        scale = s.focal * size / s.crop_px / np.maximum(vertices_cam[..., 2:], 1e-3)
+        scale = s.focal_px * size / s.crop_px / np.maximum(vertices_cam[..., 2:], 1e-3)
         xy = vertices_cam[..., :2] * scale + size / 2 + crop[..., :2]
         return np.concatenate([xy, vertices_cam[..., 2:]], axis=-1).astype(np.float32)
 

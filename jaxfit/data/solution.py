@@ -15,7 +15,7 @@ from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.pose import Pose
-from jaxfit.storage.files import conform, new_folder, write_whole
+from jaxfit.storage.files import new_folder, validate_arrays, write_whole
 from jaxfit.storage.npz import load_npz
 
 __all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution", "write_solution"]
@@ -35,8 +35,8 @@ LAYOUT = {
     "scale": ("N T", np.float32),
     "bone_length": ("N T J-1", np.float32),
     "betas": ("N T S", np.float32),
-    "keypoints_3d": ("N T K 3", np.float32),
-    "keypoints_2d": ("N T K 2", np.float32),
+    "keypoints_cam": ("N T K 3", np.float32),
+    "keypoints_px": ("N T K 2", np.float32),
     "crop": ("N T 3", np.float32),
     "image_size_px": ("N T 2", np.int64),
     "keypoint_names": ("K", np.str_),
@@ -73,15 +73,15 @@ class Solution:
     """(N, T, J−1) float32: relative to the rest skeleton."""
     betas: np.ndarray
     """(N, T, S) float32: shape coefficients."""
-    keypoints_3d: np.ndarray
+    keypoints_cam: np.ndarray
     """(N, T, K, 3) float32: model units, camera frame of the crop."""
-    keypoints_2d: np.ndarray
+    keypoints_px: np.ndarray
     """(N, T, K, 2) float32: image pixels."""
     crop: np.ndarray
     """(N, T, 3) float32: x0, y0, size of the square crop in image pixels."""
     image_size_px: np.ndarray
     """(N, T, 2) int64: width, height of the picture that the bird stands in; 0 where not valid."""
-    focal: float
+    focal_px: float
     """Focal length in pixels of the crop the fit works on."""
     keypoint_names: tuple[str, ...]
     """K names."""
@@ -97,23 +97,23 @@ class Solution:
     """Track → what broke its fit down, where and when; for ``summary.json``, and not read back from there."""
 
     def __post_init__(self):
-        arrays = conform(vars(self), LAYOUT)
+        arrays = validate_arrays(vars(self), LAYOUT)
         if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
             bones = arrays["body_pose"].shape[2]
             raise ValueError(f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}")
         loss = {}
         for term, value in self.loss.items():
             layout = {"status": LAYOUT["status"], f"loss[{term}]": ("N", np.float64)}
-            loss[str(term)] = conform({"status": self.status, f"loss[{term}]": value}, layout)[f"loss[{term}]"]
-        focal = float(self.focal)
-        if not 0 < focal < math.inf:
-            raise ValueError(f"focal must be above 0 and finite, not {focal}")
+            loss[str(term)] = validate_arrays({"status": self.status, f"loss[{term}]": value}, layout)[f"loss[{term}]"]
+        focal_px = float(self.focal_px)
+        if not 0 < focal_px < math.inf:
+            raise ValueError(f"focal_px must be above 0 and finite, not {focal_px}")
         crop_px = int(self.crop_px)
         if crop_px < 1:
             raise ValueError(f"crop_px must be 1 or more, not {crop_px}")
         for name in ("keypoint_names", "joint_names"):
             object.__setattr__(self, name, tuple(str(text) for text in arrays.pop(name)))
-        for name, value in (arrays | {"loss": loss, "focal": focal, "crop_px": crop_px}).items():
+        for name, value in (arrays | {"loss": loss, "focal_px": focal_px, "crop_px": crop_px}).items():
             object.__setattr__(self, name, value)
 
     @property
@@ -155,7 +155,7 @@ def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Ma
     terms = list(solution.loss)
     arrays["loss"] = np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
     arrays["loss_terms"] = np.array(terms, dtype=np.str_)
-    arrays["focal"] = np.asarray(solution.focal, np.float64)
+    arrays["focal_px"] = np.asarray(solution.focal_px, np.float64)
     arrays["crop_px"] = np.asarray(solution.crop_px, np.int64)
     arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
     write_whole(folder / _POSES, lambda file: np.savez_compressed(file, **arrays))
@@ -193,7 +193,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         raise InputError(folder, problem, "give the folder that a fit wrote")
     path = folder / _POSES
     ndim = {name: len(shape.split()) for name, (shape, _) in LAYOUT.items()}
-    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal": 0, "crop_px": 0}, FORMAT_VERSION)
+    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal_px": 0, "crop_px": 0}, FORMAT_VERSION)
     values: dict[str, Any] = {name: arrays[name] for name in LAYOUT}
     values |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays["loss_terms"], arrays["loss"]
@@ -202,8 +202,8 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         raise InputError(path, problem, "run the fit again")
     try:
         losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
-        focal, crop_px = float(arrays["focal"]), int(arrays["crop_px"])
-        solution = Solution(**values, loss=losses, focal=focal, crop_px=crop_px)
+        focal_px, crop_px = float(arrays["focal_px"]), int(arrays["crop_px"])
+        solution = Solution(**values, loss=losses, focal_px=focal_px, crop_px=crop_px)
     except ValueError as error:
         raise InputError(path, str(error), "run the fit again") from error
     bird = load_bird(folder / _MODEL)

@@ -89,7 +89,7 @@ def evaluate(
     true_side, own_side = overlap.copy(), overlap.copy()
     posed = PosedBirds(solution, bird)
     faces = np.asarray(posed.faces)
-    with progress("Measuring", int(measured.sum())) as tick:
+    with progress("Measuring", int(measured.sum())) as report_progress:
         for n, t in np.argwhere(measured).tolist():
             at = int(n_truth[n, 0]), int(t_truth[t])
             mask = truth.whole_mask(*at)
@@ -98,7 +98,7 @@ def evaluate(
             true_side[n, t] = truth.box_px[at][2:].max() if mask is None else metrics.longest_side_of_mask(mask)
             if mask is not None:
                 overlap[n, t] = metrics.iou(own, mask)
-            tick(1, "")
+            report_progress(1, "")
 
     overlaps = overlap[np.isfinite(overlap)]
     if overlaps.size and np.median(overlaps) < _HARDLY:
@@ -111,7 +111,7 @@ def evaluate(
     if spatial is not None:
         unmatched &= ~spatial.measured
 
-    picture = (solution.keypoints_2d, observed, annotated_points)
+    picture = (solution.keypoints_px, observed, annotated_points)
     samples = {
         "pck@0.05": metrics.pck_per_image(*picture, true_side, 0.05)[..., None],
         "pck@0.10": metrics.pck_per_image(*picture, true_side, 0.10)[..., None],

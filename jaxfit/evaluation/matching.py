@@ -115,7 +115,7 @@ def follow(solution: Solution, truth: Observations, source: object = "truth") ->
     boxed = annotated.sum(-1) >= _FEWEST
     boxes = _boxes(truth.keypoints_px[:, at_truth], annotated)
     agree = np.zeros((len(solution.track_id), truth.num_tracks), int)
-    for n, points in enumerate(solution.keypoints_2d[:, at_own]):
+    for n, points in enumerate(solution.keypoints_px[:, at_own]):
         both = boxed & solution.valid[n, at_own]
         near = both & (_iou(_boxes(np.broadcast_to(points, (*annotated.shape, 2)), annotated), boxes) >= NEAR)
         agree[n] = np.where(2 * near.sum(1) >= both.sum(1), near.sum(1), 0)

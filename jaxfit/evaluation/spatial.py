@@ -100,7 +100,7 @@ class SpatialErrors:
             root_p, root_q = p[:, :, :1], q[:, :, :1]
         else:
             order = [solution.keypoint_names.index(name) for name in truth.keypoint_names]
-            p, q = solution.keypoints_3d[:, :, order].astype(np.float64), truth.keypoints_3d[n, t].astype(np.float64)
+            p, q = solution.keypoints_cam[:, :, order].astype(np.float64), truth.keypoints_cam[n, t].astype(np.float64)
             root_p, root_q = p.mean(2, keepdims=True), q.mean(2, keepdims=True)
         p, self.truth = (p - root_p) @ np.swapaxes(R, -1, -2), q - root_q
         self.predicted = p * best_scale(p, self.truth, self.measured)[:, None, None, None]
@@ -145,7 +145,7 @@ def _real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:
         problem = "its true poses lie in crops that follow the birds, not in one camera"
         raise InputError(source, problem, f"{_REMEDY}; another fit's result is none")
     x0, y0, size = crops[0]
-    return np.array([x0 + size / 2, y0 + size / 2]), truth.focal * size / truth.crop_px
+    return np.array([x0 + size / 2, y0 + size / 2]), truth.focal_px * size / truth.crop_px
 
 
 def _rest_length(bird: Bird) -> float:
@@ -160,7 +160,7 @@ def _rest_length(bird: Bird) -> float:
 def _apparent_size(solution: Solution, bird: Bird) -> np.ndarray:
     """Image pixels per model unit at the root, (N, T); the root turns about its own rest position."""
     depth = solution.transl[..., 2] + solution.scale * float(np.asarray(bird.joints)[0, 2])
-    return solution.scale * (solution.focal * solution.crop[..., 2] / solution.crop_px) / depth
+    return solution.scale * (solution.focal_px * solution.crop[..., 2] / solution.crop_px) / depth
 
 
 def _joints(solution: Solution, bird: Bird) -> np.ndarray:

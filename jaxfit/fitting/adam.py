@@ -10,7 +10,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from jaxfit.fitting.lane import Knobs, Lane, Solver, lane_loss
+from jaxfit.fitting.lane import Hyperparameters, Lane, Solver, lane_loss
 from jaxfit.model.pose import Pose
 
 __all__ = ["ADAM"]
@@ -19,9 +19,9 @@ NEVER = 2**30
 """Non-finite steps in a row that a lane may refuse: a diverging bird stands still and leaves others alone."""
 
 
-def _minimiser(knobs: Knobs, carried: Any = None) -> optx.OptaxMinimiser:
+def _minimiser(hyperparameters: Hyperparameters, carried: Any = None) -> optx.OptaxMinimiser:
     def scale(updates, _):
-        return jax.tree.map(lambda update, step: -step * update, updates, knobs.step_size)
+        return jax.tree.map(lambda update, step: -step * update, updates, hyperparameters.step_size)
 
     adam = optax.scale_by_adam()
     if carried is not None:
@@ -37,12 +37,12 @@ def _loss(pose: Pose, lane: Lane) -> tuple[Float[Array, ""], None]:
 
 def _init(pose: Pose, lane: Lane, before: Any) -> Any:
     struct = jax.ShapeDtypeStruct((), jnp.float32)
-    minimiser = _minimiser(lane.knobs, None if before is None else before.opt_state.inner_state[0])
+    minimiser = _minimiser(lane.hyperparameters, None if before is None else before.opt_state.inner_state[0])
     return minimiser.init(_loss, pose, lane, {}, struct, None, frozenset())
 
 
 def _step(pose: Pose, lane: Lane, state: Any) -> tuple[Pose, Any]:
-    pose, state, _ = _minimiser(lane.knobs).step(_loss, pose, lane, {}, state, frozenset())
+    pose, state, _ = _minimiser(lane.hyperparameters).step(_loss, pose, lane, {}, state, frozenset())
     return pose, state
 
 

@@ -33,8 +33,8 @@ class Collector:
             "scale": (),
             "bone_length": (joints - 1,),
             "betas": (bird.num_shapes,),
-            "keypoints_3d": (keypoints, 3),
-            "keypoints_2d": (keypoints, 2),
+            "keypoints_cam": (keypoints, 3),
+            "keypoints_px": (keypoints, 2),
             "crop": (3,),
         }
         self.arrays = {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
@@ -73,8 +73,8 @@ class Collector:
             "scale": np.broadcast_to(pose.scale, present.shape)[present],
             "bone_length": pose.bone_length,
             "betas": betas,
-            "keypoints_3d": fitted.report.keypoints_cam[i][present],
-            "keypoints_2d": crop_to_image(fitted.report.keypoints_px[i][present], crop, self.camera.size_px),
+            "keypoints_cam": fitted.report.keypoints_cam[i][present],
+            "keypoints_px": crop_to_image(fitted.report.keypoints_px[i][present], crop, self.camera.size_px),
             "crop": crop,
         }
         for name, value in values.items():
@@ -90,7 +90,7 @@ class Collector:
             valid=self.valid,
             **self.arrays,
             image_size_px=self.image_size_px,
-            focal=self.camera.focal_px,
+            focal_px=self.camera.focal_px,
             crop_px=self.camera.size_px,
             keypoint_names=self.bird.keypoint_names,
             joint_names=self.bird.joint_names,

@@ -13,15 +13,15 @@ from jaxtyping import Array, Bool, Int
 
 from jaxfit.config.schema import FitConfig
 from jaxfit.errors import InputError
-from jaxfit.fitting.lane import Knobs, Lane, Problem, lane_scene
-from jaxfit.fitting.stages import needs_mask, stage_knobs, stage_problem
+from jaxfit.fitting.lane import Hyperparameters, Lane, Problem, lane_window
+from jaxfit.fitting.stages import needs_mask, stage_hyperparameters, stage_problem
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose, rest_pose
 from jaxfit.objective.objective import weighted_sum
+from jaxfit.objective.posed_window import Priors, Targets
 from jaxfit.objective.registry import find_term
-from jaxfit.objective.scene import Evidence, Priors
 
 __all__ = ["check_terms", "name_failures"]
 
@@ -36,8 +36,8 @@ def check_terms(config: FitConfig, bird: Bird, rig: Rig, priors: Priors, camera:
     for stage in config.stages:
         side = camera.size_px if needs_mask(stage) else 0
         problem = stage_problem(config, stage, rig, priors, camera)
-        knobs = stage_knobs(config, stage, bird.keypoint_names)
-        evidence = Evidence(
+        hyperparameters = stage_hyperparameters(config, stage, bird.keypoint_names)
+        targets = Targets(
             keypoints_px=np.zeros((T, K, 2), np.float32),
             confidence=np.zeros((T, K), np.float32),
             mask=np.zeros((T, side, side), np.uint8),
@@ -46,7 +46,7 @@ def check_terms(config: FitConfig, bird: Bird, rig: Rig, priors: Priors, camera:
             corner_px=np.zeros((T, 2), np.float32),
         )
         for name in stage.terms:
-            _trace(name, jax.grad(_weighted(problem, name)), pose, knobs, pose, evidence)
+            _trace(name, jax.grad(_weighted(problem, name)), pose, hyperparameters, pose, targets)
 
 
 def _trace(name: str, function: Callable[..., object], *arguments: object) -> None:
@@ -66,7 +66,7 @@ def _trace(name: str, function: Callable[..., object], *arguments: object) -> No
 
 
 def name_failures(
-    told: np.ndarray, step: Int[np.ndarray, "B"], stage: str, problem: Problem, *lanes: Knobs | Pose | Evidence
+    told: np.ndarray, step: Int[np.ndarray, "B"], stage: str, problem: Problem, *lanes: Hyperparameters | Pose | Targets
 ) -> np.ndarray:
     """Say for each lane that broke down which terms did it.
 
@@ -78,7 +78,7 @@ def name_failures(
         step: at which step of the stage each lane broke down, from 1; 0 where it did not.
         stage: its name.
         problem: of the stage.
-        lanes: knobs, evidence, pose and the pose at which the stage began, of all lanes.
+        lanes: hyperparameters, targets, pose and the pose at which the stage began, of all lanes.
 
     Returns:
         `told`, with the news.
@@ -102,26 +102,27 @@ def name_failures(
 
 @eqx.filter_jit
 def _not_finite(
-    problem: Problem, knobs: Knobs, evidence: Evidence, pose: Pose, start: Pose
+    problem: Problem, hyperparameters: Hyperparameters, targets: Targets, pose: Pose, start: Pose
 ) -> tuple[dict[str, Bool[Array, "B"]], dict[str, Bool[Array, "B"]]]:
     """Of each weighted term of each lane: whether its value is not finite, and whether its gradient is not."""
 
-    def one(knobs, evidence, pose, start):
+    def one(hyperparameters, targets, pose, start):
         found = {
-            name: jax.value_and_grad(_weighted(problem, name))(pose, knobs, start, evidence) for name in knobs.settings
+            name: jax.value_and_grad(_weighted(problem, name))(pose, hyperparameters, start, targets)
+            for name in hyperparameters.settings
         }
         bad = jax.tree.map(lambda x: ~jnp.all(jnp.isfinite(x)), found)
         gradient = {name: jnp.any(jnp.stack(jax.tree.leaves(pull))) for name, (_, pull) in bad.items()}
         return {name: value for name, (value, _) in bad.items()}, gradient
 
-    return jax.vmap(one)(knobs, evidence, pose, start)
+    return jax.vmap(one)(hyperparameters, targets, pose, start)
 
 
 def _weighted(problem: Problem, name: str) -> Callable[..., Array]:
-    """One term's share of the objective, as a function of the pose, knobs, start and evidence of one lane."""
+    """One term's share of the objective, as a function of the pose, hyperparameters, start and targets of one lane."""
 
-    def share(pose: Pose, knobs: Knobs, start: Pose, evidence: Evidence) -> Array:
-        scene = lane_scene(pose, Lane(problem, knobs, start, evidence))
-        return weighted_sum(scene, {name: knobs.settings[name]})
+    def share(pose: Pose, hyperparameters: Hyperparameters, start: Pose, targets: Targets) -> Array:
+        window = lane_window(pose, Lane(problem, hyperparameters, start, targets))
+        return weighted_sum(window, {name: hyperparameters.settings[name]})
 
     return share

@@ -17,13 +17,13 @@ from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import Lanes, fit_batch, frames_per_batch
 from jaxfit.fitting.collect import Collector
 from jaxfit.fitting.diagnose import check_terms
-from jaxfit.fitting.prepare import Preparation, camera_of, evidence_key, start_key
+from jaxfit.fitting.prepare import Preparation, camera_of, start_key, targets_key
 from jaxfit.fitting.stages import program
 from jaxfit.fitting.start import Start
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig, fold_bird
 from jaxfit.model.pose import Pose
-from jaxfit.objective.scene import Evidence, priors_of
+from jaxfit.objective.posed_window import Targets, priors_of
 from jaxfit.progress import ProgressTask, silent
 
 __all__ = ["fit", "fit_runs"]
@@ -80,7 +80,7 @@ def fit_runs(
     if any(program(config) != program(configs[0]) for config in configs):
         raise ValueError("configs must be one program: equal but for weights, settings, step sizes and preparation")
     # shape directions that nothing moves would only cost time
-    shaped = prepared.starts_with_shape or any("betas" in stage.free for stage in configs[0].stages)
+    shaped = prepared.starts_with_shape or any("betas" in stage.optimised for stage in configs[0].stages)
     used = bird if shaped else _without_shape(bird)
     rig, priors, camera = fold_bird(used), priors_of(used), camera_of(configs[0])
     check_terms(configs[0], used, rig, priors, camera)
@@ -93,19 +93,19 @@ def fit_runs(
     what = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
     logger.info("%s, %d windows of %d frames, %d batches", what, len(pairs), configs[0].window, len(batches))
     steps = sum(stage.steps for stage in configs[0].stages)
-    with progress(f"Fitting {what}", steps * len(batches)) as tick:
+    with progress(f"Fitting {what}", steps * len(batches)) as report_progress:
         for first in batches:
             real = pairs[first : first + size]
-            tick(0, "starting poses")
+            report_progress(0, "starting poses")
             batch = _gather(prepared, used, rig, configs, real, size)
-            fitted = fit_batch(used, rig, priors, configs, camera, *batch, tick)
+            fitted = fit_batch(used, rig, priors, configs, camera, *batch, report_progress)
             for lane, (r, w) in enumerate(real.tolist()):
                 collectors[r].add(w, fitted, lane)
     return [collector.finish() for collector in collectors]
 
 
 class _Batch(NamedTuple):
-    evidence: Evidence
+    targets: Targets
     start: Pose
     lanes: Lanes
 
@@ -118,22 +118,22 @@ def _gather(
     Every batch has the same shape, so that one compiled program serves all: a short one is filled up with lanes of
     its own, which start for themselves and so are computed.
     """
-    evidence: dict[tuple, int] = {}  # window → its row
+    targets: dict[tuple, int] = {}  # window → its row
     starts: dict[tuple, int] = {}
     wanted, poses, lanes = [], [], []
     for r in np.unique(pairs[:, 0]):
         config, rows = configs[r], pairs[pairs[:, 0] == r, 1]
-        cut, begin = evidence_key(config), start_key(config)
-        if len(new := _place(evidence, cut, rows)):
+        cut, begin = targets_key(config), start_key(config)
+        if len(new := _place(targets, cut, rows)):
             wanted.append((config, new))
         if len(new := _place(starts, begin, rows)):
             poses.append(prepared.starting_poses(bird, rig, config, new))
-        lanes += [(r, evidence[cut, w], starts[begin, w]) for w in rows]
+        lanes += [(r, targets[cut, w], starts[begin, w]) for w in rows]
     fillers = [(*lanes[i % len(lanes)][:2], len(starts) + i) for i in range(size - len(lanes))]
     filled = np.array([lanes[i % len(lanes)][2] for i in range(size - len(lanes))], int)
     start = jax.tree.map(lambda *x: jnp.concatenate(x), *poses)
     start = jax.tree.map(lambda x: jnp.concatenate([x, x[filled]]), start)
-    return _Batch(prepared.evidence(wanted), start, Lanes(*np.array(lanes + fillers).T))
+    return _Batch(prepared.targets(wanted), start, Lanes(*np.array(lanes + fillers).T))
 
 
 def _place(held: dict[tuple, int], key: tuple, rows: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """One lane of a batch: a window under one config, and what a solver is to it.
 
-What configs may set without another program (`Knobs`) differs from lane to lane, so that a sweep is one batch.
+`Hyperparameters` differ from lane to lane and need no other program, so that a sweep is one batch.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import weighted_sum
-from jaxfit.objective.scene import Evidence, Priors, Raster, Scene
+from jaxfit.objective.posed_window import PosedWindow, Priors, Raster, Targets
 
-__all__ = ["Knobs", "Lane", "Problem", "Solver", "lane_loss", "lane_scene"]
+__all__ = ["Hyperparameters", "Lane", "Problem", "Solver", "lane_loss", "lane_window"]
 
 
 class Problem(NamedTuple):
@@ -33,7 +33,7 @@ class Problem(NamedTuple):
     solver: Solver
 
 
-class Knobs(NamedTuple):
+class Hyperparameters(NamedTuple):
     """What each lane has of its own, all traced; a batch of B lanes puts an axis B in front."""
 
     settings: dict[str, dict[str, Float[Array | np.ndarray, "*B"]]]
@@ -48,10 +48,10 @@ class Lane(NamedTuple):
     """What a solver knows beside the pose."""
 
     problem: Problem
-    knobs: Knobs
+    hyperparameters: Hyperparameters
     start: Pose
     """The pose at which the stage began."""
-    evidence: Evidence
+    targets: Targets
 
 
 class Solver(NamedTuple):
@@ -66,14 +66,16 @@ class Solver(NamedTuple):
     gradient was not finite (from the first such step on the pose stands still)."""
 
 
-def lane_scene(pose: Pose, lane: Lane) -> Scene:
+def lane_window(pose: Pose, lane: Lane) -> PosedWindow:
     """What the terms see."""
-    problem, knobs, start, evidence = lane
-    seen = eqx.tree_at(lambda e: e.confidence, evidence, evidence.confidence * knobs.keypoints_on)
-    return Scene(pose, start, seen, problem.rig, problem.priors, problem.camera, problem.raster)
+    problem, hyperparameters, start, targets = lane
+    seen = eqx.tree_at(lambda e: e.confidence, targets, targets.confidence * hyperparameters.keypoints_on)
+    return PosedWindow(pose, start, seen, problem.rig, problem.priors, problem.camera, problem.raster)
 
 
 def lane_loss(pose: Pose, lane: Lane) -> Float[Array, ""]:
     """The objective; parameters that do not move have no gradient, so that their moments stay zero."""
-    free = jax.tree.map(lambda x, step: jnp.where(step > 0, x, jax.lax.stop_gradient(x)), pose, lane.knobs.step_size)
-    return weighted_sum(lane_scene(free, lane), lane.knobs.settings)
+    free = jax.tree.map(
+        lambda x, step: jnp.where(step > 0, x, jax.lax.stop_gradient(x)), pose, lane.hyperparameters.step_size
+    )
+    return weighted_sum(lane_window(free, lane), lane.hyperparameters.settings)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfit.fitting.lane import Lane, Solver, lane_loss, lane_scene
+from jaxfit.fitting.lane import Lane, Solver, lane_loss, lane_window
 from jaxfit.model.pose import Pose
 from jaxfit.objective.curvature import Rows, frame_rows
 from jaxfit.objective.objective import evaluate_curvature
@@ -48,8 +48,11 @@ def _step(pose: Pose, lane: Lane, state: _State) -> tuple[Pose, _State]:
 
     Source: Marquardt 1963, An algorithm for least-squares estimation of nonlinear parameters.
     """
-    curvature = evaluate_curvature(lane_scene(pose, lane), lane.knobs.settings)
-    free = frame_rows(jax.tree.map(lambda x, size: jnp.broadcast_to(size, x.shape), pose, lane.knobs.step_size)) > 0
+    curvature = evaluate_curvature(lane_window(pose, lane), lane.hyperparameters.settings)
+    free = (
+        frame_rows(jax.tree.map(lambda x, size: jnp.broadcast_to(size, x.shape), pose, lane.hyperparameters.step_size))
+        > 0
+    )
     frames, scales = len(free), pose.scale.shape[0]
 
     def allowed(rows: Rows) -> Rows:

@@ -1,4 +1,4 @@
-"""What comes before the solver: filtered observations, windows, evidence, starting poses. Runs that ask for the same
+"""What comes before the solver: filtered observations, windows, targets, starting poses. Runs that ask for the same
 share it."""
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.errors import InputError
 from jaxfit.fitting.initialise import initial_poses
 from jaxfit.fitting.start import Start
-from jaxfit.fitting.window import Windows, cut_windows, filter_observations, load_evidence, load_keypoints
+from jaxfit.fitting.window import Windows, cut_windows, filter_observations, load_keypoints, load_targets
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
-from jaxfit.objective.scene import Evidence
+from jaxfit.objective.posed_window import Targets
 
-__all__ = ["Preparation", "camera_of", "evidence_key", "start_key"]
+__all__ = ["Preparation", "camera_of", "start_key", "targets_key"]
 
 
 def camera_of(config: FitConfig) -> Camera:
@@ -52,7 +52,7 @@ class Preparation:
         self._filtered: dict[int, Observations] = {}
         self._windows: dict[Any, Windows] = {}
         self._poses: dict[Any, Pose] = {}
-        self._evidence: dict[Any, Evidence] = {}
+        self._targets: dict[Any, Targets] = {}
 
     @property
     def starts_with_shape(self) -> bool:
@@ -72,7 +72,7 @@ class Preparation:
         Raises:
             InputError: no track with a usable frame, or crops that cannot be made.
         """
-        key = evidence_key(config)
+        key = targets_key(config)
         if key not in self._windows:
             windows = cut_windows(self.filtered(config), config)
             if len(windows) == 0:
@@ -86,16 +86,16 @@ class Preparation:
             self._windows[key] = windows
         return self._windows[key]
 
-    def evidence(self, wanted: Sequence[tuple[FitConfig, np.ndarray]]) -> Evidence:
-        """Evidence of some windows of some configs, one after the other; masks are kept until others are asked for."""
+    def targets(self, wanted: Sequence[tuple[FitConfig, np.ndarray]]) -> Targets:
+        """Targets of some windows of some configs, one after the other; masks are kept until others are asked for."""
         held = {}
         for config, rows in wanted:
-            key = (evidence_key(config), rows.tobytes())
-            if key not in self._evidence:
+            key = (targets_key(config), rows.tobytes())
+            if key not in self._targets:
                 size_px = config.crop.size_px
-                self._evidence[key] = load_evidence(self.filtered(config), self.windows(config)[rows], size_px)
-            held[key] = self._evidence[key]
-        self._evidence = held
+                self._targets[key] = load_targets(self.filtered(config), self.windows(config)[rows], size_px)
+            held[key] = self._targets[key]
+        self._targets = held
         each = list(held.values())
         return each[0] if len(each) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *each)
 
@@ -119,11 +119,11 @@ class Preparation:
         return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *poses)
 
 
-def evidence_key(config: FitConfig) -> tuple:
-    """What windows and evidence depend on."""
+def targets_key(config: FitConfig) -> tuple:
+    """What windows and targets depend on."""
     return config.filter_window, config.window, config.min_keypoints, config.crop
 
 
 def start_key(config: FitConfig) -> tuple:
     """What starting poses depend on."""
-    return *evidence_key(config), config.initialise, config.common_size
+    return *targets_key(config), config.initialise, config.common_size

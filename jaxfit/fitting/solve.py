@@ -8,10 +8,10 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float, Int
 
-from jaxfit.fitting.lane import Knobs, Lane, Problem, lane_scene
+from jaxfit.fitting.lane import Hyperparameters, Lane, Problem, lane_window
 from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import evaluate_terms
-from jaxfit.objective.scene import Evidence
+from jaxfit.objective.posed_window import Targets
 
 __all__ = ["Report", "StageState", "advance", "begin", "report"]
 
@@ -27,38 +27,40 @@ class StageState(NamedTuple):
 
 
 @eqx.filter_jit
-def begin(problem: Problem, knobs: Knobs, pose: Pose, evidence: Evidence, before: StageState | None) -> StageState:
+def begin(
+    problem: Problem, hyperparameters: Hyperparameters, pose: Pose, targets: Targets, before: StageState | None
+) -> StageState:
     """Start a stage at `pose`; with `before`, the solver goes on with that stage's moments."""
 
-    def one(knobs, pose, evidence, carried):
-        return problem.solver.init(pose, Lane(problem, knobs, pose, evidence), carried)
+    def one(hyperparameters, pose, targets, carried):
+        return problem.solver.init(pose, Lane(problem, hyperparameters, pose, targets), carried)
 
     carried = None if before is None else before.solver
-    return StageState(pose, pose, jax.vmap(one)(knobs, pose, evidence, carried))
+    return StageState(pose, pose, jax.vmap(one)(hyperparameters, pose, targets, carried))
 
 
 @eqx.filter_jit(donate="all-except-first")
 def advance(
-    fixed: tuple[Problem, Knobs, Evidence, Int[Array, ""]], state: StageState
+    fixed: tuple[Problem, Hyperparameters, Targets, Int[Array, ""]], state: StageState
 ) -> tuple[StageState, Array, Array]:
     """Take some steps.
 
     Args:
-        fixed: the problem, knobs and evidence (B, …) and the number of steps, traced.
+        fixed: the problem, hyperparameters and targets (B, …) and the number of steps, traced.
         state: given up; use the returned one.
 
     Returns:
         The new state, and each lane's `Solver.outcome`: loss (B,) and refused steps (B,).
     """
-    problem, knobs, evidence, steps = fixed
+    problem, hyperparameters, targets, steps = fixed
 
-    def one(knobs: Knobs, state: StageState, evidence: Evidence):
-        lane = Lane(problem, knobs, state.start, evidence)
+    def one(hyperparameters: Hyperparameters, state: StageState, targets: Targets):
+        lane = Lane(problem, hyperparameters, state.start, targets)
         return jax.lax.fori_loop(
             0, steps, lambda _, carry: problem.solver.step(carry[0], lane, carry[1]), (state.pose, state.solver)
         )
 
-    pose, solver_state = jax.vmap(one)(knobs, state, evidence)
+    pose, solver_state = jax.vmap(one)(hyperparameters, state, targets)
     return StageState(pose, state.start, solver_state), *jax.vmap(problem.solver.outcome)(solver_state)
 
 
@@ -73,13 +75,13 @@ class Report(NamedTuple):
 
 
 @eqx.filter_jit
-def report(problem: Problem, knobs: Knobs, pose: Pose, start: Pose, evidence: Evidence) -> Report:
+def report(problem: Problem, hyperparameters: Hyperparameters, pose: Pose, start: Pose, targets: Targets) -> Report:
     """Evaluate poses as they are (Adam itself only knows the loss before its last step)."""
 
-    def one(knobs, pose, start, evidence):
-        scene = lane_scene(pose, Lane(problem, knobs, start, evidence))
-        values = evaluate_terms(scene, knobs.settings)
-        weighted = {name: knobs.settings[name]["weight"] * value for name, value in values.items()}
-        return Report(weighted, scene.keypoints_cam, scene.keypoints_px)
+    def one(hyperparameters, pose, start, targets):
+        window = lane_window(pose, Lane(problem, hyperparameters, start, targets))
+        values = evaluate_terms(window, hyperparameters.settings)
+        weighted = {name: hyperparameters.settings[name]["weight"] * value for name, value in values.items()}
+        return Report(weighted, window.keypoints_cam, window.keypoints_px)
 
-    return jax.vmap(one)(knobs, pose, start, evidence)
+    return jax.vmap(one)(hyperparameters, pose, start, targets)

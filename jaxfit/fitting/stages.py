@@ -9,16 +9,16 @@ import numpy as np
 
 from jaxfit.config.schema import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.fitting.adam import ADAM
-from jaxfit.fitting.lane import Knobs, Problem, Solver
+from jaxfit.fitting.lane import Hyperparameters, Problem, Solver
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig
 from jaxfit.model.pose import Pose
+from jaxfit.objective.posed_window import Priors, Raster
 from jaxfit.objective.registry import find_term
-from jaxfit.objective.scene import Priors, Raster
 from jaxfit.raster.silhouette import Blur
 
-__all__ = ["needs_mask", "program", "stage_knobs", "stage_problem"]
+__all__ = ["needs_mask", "program", "stage_hyperparameters", "stage_problem"]
 
 SOLVERS: Mapping[str, Solver] = {"adam": ADAM, "levenberg_marquardt": LEVENBERG_MARQUARDT}
 """By the name that a stage gives as its `solver`."""
@@ -45,14 +45,16 @@ def stage_problem(config: FitConfig, stage: StageConfig, rig: Rig, priors: Prior
     return Problem(rig, priors, camera, raster, SOLVERS[stage.solver])
 
 
-def stage_knobs(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[str]) -> Knobs:
+def stage_hyperparameters(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[str]) -> Hyperparameters:
     """What one config may set in a stage without another program, as NumPy arrays of one lane."""
 
     def step_size(name: str, shape: tuple[int, ...]) -> np.ndarray:
         scale = np.asarray(stage.step_scale.get(name, 1.0), np.float32)
-        return np.array(np.broadcast_to(stage.learning_rate * scale if name in stage.free else 0.0, shape), np.float32)
+        return np.array(
+            np.broadcast_to(stage.learning_rate * scale if name in stage.optimised else 0.0, shape), np.float32
+        )
 
-    return Knobs(
+    return Hyperparameters(
         settings={
             name: {key: np.array(value, np.float32) for key, value in values.items()}
             for name, values in config.stage_settings(stage).items()
@@ -63,11 +65,11 @@ def stage_knobs(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[
 
 
 def program(config: FitConfig) -> FitConfig:
-    """The config without what its knobs hold and what only prepares the data: equal ones share compiled programs."""
+    """The part of the config that determines the compiled program."""
     stages = tuple(
         replace(
             stage,
-            free=tuple(name for name in stage.free if name == "betas"),  # it decides whether there are any
+            optimised=tuple(name for name in stage.optimised if name == "betas"),  # it decides whether there are any
             learning_rate=1.0,
             step_scale={},
             keypoints_off=(),

@@ -15,7 +15,7 @@ from jaxfit.errors import InputError
 from jaxfit.fitting.window import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
-from jaxfit.storage.files import conform
+from jaxfit.storage.files import validate_arrays
 from jaxfit.storage.npz import load_npz
 
 __all__ = ["Start", "load_start"]
@@ -119,7 +119,7 @@ def load_start(path: str | Path, observations: Observations, bird: Bird) -> Star
 def _from_result(path: str | Path, observations: Observations) -> Start:
     content = load_npz(path, {name: len(shape.split()) for name, (shape, _) in _LAYOUT.items()})
     try:
-        content = conform(content, _LAYOUT)
+        content = validate_arrays(content, _LAYOUT)
     except ValueError as error:
         raise InputError(path, str(error), "give the poses.npz of a fit") from None
     fitted = np.isfinite(content["global_orient"]).all(-1)

@@ -14,9 +14,9 @@ from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.fitting.filtering import weighted_median_filter
 from jaxfit.model.camera import image_to_crop
-from jaxfit.objective.scene import Evidence
+from jaxfit.objective.posed_window import Targets
 
-__all__ = ["Windows", "cut_windows", "filter_observations", "load_evidence", "load_keypoints"]
+__all__ = ["Windows", "cut_windows", "filter_observations", "load_keypoints", "load_targets"]
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     return Windows(track, frame, present, crop)
 
 
-def load_evidence(observations: Observations, windows: Windows, size_px: int) -> Evidence:
+def load_targets(observations: Observations, windows: Windows, size_px: int) -> Targets:
     """Keypoints and masks of some windows in crop pixels (NumPy, with a leading W axis)."""
     keypoints_px, confidence = load_keypoints(observations, windows, size_px)
     mask = np.zeros((*windows.frame.shape, size_px, size_px), np.uint8)
@@ -95,7 +95,7 @@ def load_evidence(observations: Observations, windows: Windows, size_px: int) ->
         if full is not None:
             mask[w, t] = cut_mask(full, windows.crop[w, t], size_px)
             has_mask[w, t] = True
-    return Evidence(
+    return Targets(
         keypoints_px=keypoints_px,
         confidence=confidence,
         mask=mask,

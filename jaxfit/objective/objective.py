@@ -11,51 +11,51 @@ from jaxtyping import Array, Float
 
 from jaxfit.errors import InputError
 from jaxfit.objective.curvature import Curvature
+from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import find_term
-from jaxfit.objective.scene import Scene
 
 __all__ = ["evaluate_curvature", "evaluate_terms", "weighted_sum"]
 
 Settings = Mapping[str, Mapping[str, Float[Array | np.ndarray, ""] | float]]
 
 
-def evaluate_terms(scene: Scene, settings: Settings) -> dict[str, Float[Array, ""]]:
+def evaluate_terms(window: PosedWindow, settings: Settings) -> dict[str, Float[Array, ""]]:
     """Each term of `settings` by itself, unweighted.
 
     Args:
-        scene: one bird in one window.
+        window: one bird in one window.
         settings: for each active term, `weight` and the term's own settings; all may be traced.
 
     Raises:
         InputError: a term that returns anything but one real number; it is named.
     """
     return {
-        name: _scalar(name, find_term(name).function(scene, **{k: v for k, v in own.items() if k != "weight"}))
+        name: _scalar(name, find_term(name).function(window, **{k: v for k, v in own.items() if k != "weight"}))
         for name, own in settings.items()
     }
 
 
-def weighted_sum(scene: Scene, settings: Settings) -> Float[Array, ""]:
+def weighted_sum(window: PosedWindow, settings: Settings) -> Float[Array, ""]:
     """E = Σ λ · E_term over the active terms.
 
     Source: Hägerlind et al. 2024, total objective.
     """
-    values = evaluate_terms(scene, settings)
+    values = evaluate_terms(window, settings)
     return sum((jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()), start=jnp.zeros(()))
 
 
-def evaluate_curvature(scene: Scene, settings: Settings) -> Curvature:
+def evaluate_curvature(window: PosedWindow, settings: Settings) -> Curvature:
     """Σ λ · H_term over the active terms, all of which must have one.
 
     Args:
-        scene: one bird in one window.
+        window: one bird in one window.
         settings: as for `evaluate_terms`.
     """
     weighted = []
     for name, own in settings.items():
         find = find_term(name).curvature
         assert find is not None, name  # configs are checked for it
-        weighted.append((own["weight"], find(scene, **{k: v for k, v in own.items() if k != "weight"})))
+        weighted.append((own["weight"], find(window, **{k: v for k, v in own.items() if k != "weight"})))
     return Curvature(
         lambda d: sum((weight * H.product(d) for weight, H in weighted), start=jnp.zeros_like(d)),
         sum((weight * H.diagonal for weight, H in weighted), start=jnp.zeros(())),

@@ -19,14 +19,14 @@ __all__ = ["ENTRY_POINTS", "Term", "find_term", "known_terms", "term"]
 
 ENTRY_POINTS = "jaxfit.terms"
 """The entry-point group by which an installed package offers terms."""
-FORM = "a term is `def name(scene, *, setting=1.0): …`, with one scene and settings that are numbers"
+FORM = "a term is `def name(window, *, setting=1.0): …`, with one window and settings that are numbers"
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
 class Term:
-    """A pure function of the `Scene`, and what else is to be known of it."""
+    """A pure function of the `PosedWindow`, and what else is to be known of it."""
 
     name: str
     """What configs call it."""
@@ -56,17 +56,17 @@ def term(
     curvature: Callable[..., Curvature] | None = None,
 ) -> Callable[[Function], Function]: ...
 def term(function=None, /, *, name=None, positive=(), compares_masks=False, curvature=None):
-    """Register a term of the objective: a pure function of the scene, whose keyword arguments are its settings.
+    """Register a term of the objective: a pure function of the window, whose keyword arguments are its settings.
 
-    `@term def stillness(scene, *, beta=1.0): …` is from then on what configs of this session call `stillness`. The
+    `@term def stillness(window, *, beta=1.0): …` is from then on what configs of this session call `stillness`. The
     function itself is returned as it is. Weights and settings are traced, so it must be written for
     `jit` and `vmap`: no Python `if` on values.
 
     Args:
-        function: takes the `jaxfit.objective.scene.Scene` and returns a scalar.
+        function: takes the `jaxfit.objective.posed_window.PosedWindow` and returns a scalar.
         name: what configs call it (default: the function's name).
         positive: its settings that must be above 0.
-        compares_masks: whether it looks at `scene.evidence.mask`, which is empty in stages without such a term.
+        compares_masks: whether it looks at `window.targets.mask`, which is empty in stages without such a term.
         curvature: takes what `function` takes and returns a `jaxfit.objective.curvature.Curvature`, for stages whose
             solver is `levenberg_marquardt`.
 
@@ -148,10 +148,10 @@ def _read(name: str, function: Any, positive: Collection[str] = (), compares_mas
     except ValueError:  # some of Python's own do not tell
         parameters = []
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    require(bool(parameters) and parameters[0].kind in positional, "takes no scene")
+    require(bool(parameters) and parameters[0].kind in positional, "takes no window")
     settings = parameters[1:]
     for setting in settings:
-        require(setting.kind is setting.KEYWORD_ONLY, f"takes {setting.name!r} beside the scene, not after a `*`")
+        require(setting.kind is setting.KEYWORD_ONLY, f"takes {setting.name!r} beside the window, not after a `*`")
         default = setting.default
         number = isinstance(default, int | float) and not isinstance(default, bool) and math.isfinite(default)
         require(number, f"has a setting {setting.name!r} whose default is no number")

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxfit.model.rotation import geodesic_distance, safe_norm
+from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.objective.scene import Scene
 from jaxfit.objective.temporal import complete_runs
 from jaxfit.objective.terms import Scalar
 
@@ -24,7 +24,9 @@ BUTTERWORTH_ORDER = 4
 
 
 @term
-def geodesic_velocity(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
+def geodesic_velocity(
+    window: PosedWindow, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0
+) -> Scalar:
     """Σ_i β_g · d(G_i, G_i+1) + β_p · √(Σ_j d(R_j,i, R_j,i+1)²), d the angle between two rotations.
 
     The velocity term with the distance on SO(3) in place of differences of axis-angles: the length of the way from one
@@ -32,14 +34,14 @@ def geodesic_velocity(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_
 
     Source: Huynh 2009, *Metrics for 3D Rotations*, Φ₆; the sums as in Hägerlind et al. 2024, velocity term.
     """
-    turned, bent = _steps(scene)
+    turned, bent = _steps(window)
     moved = beta_global * turned + beta_pose * safe_norm(bent)
-    return jnp.sum(jnp.where(complete_runs(scene.present, 1), moved, 0.0))
+    return jnp.sum(jnp.where(complete_runs(window.present, 1), moved, 0.0))
 
 
 @term(positive=["delta_rad"])
 def huber_velocity(
-    scene: Scene,
+    window: PosedWindow,
     *,
     delta_rad: Scalar | float = 0.1,
     beta_global: Scalar | float = 10.0,
@@ -52,9 +54,9 @@ def huber_velocity(
 
     Source: Huber 1964, *Robust Estimation of a Location Parameter*.
     """
-    turned, bent = _steps(scene)
+    turned, bent = _steps(window)
     moved = beta_global * huber(turned, delta_rad) + beta_pose * jnp.sum(huber(bent, delta_rad), axis=-1)
-    return jnp.sum(jnp.where(complete_runs(scene.present, 1), moved, 0.0))
+    return jnp.sum(jnp.where(complete_runs(window.present, 1), moved, 0.0))
 
 
 def huber(x: Float[Array, "*B"], delta: Scalar | float) -> Float[Array, "*B"]:
@@ -63,15 +65,15 @@ def huber(x: Float[Array, "*B"], delta: Scalar | float) -> Float[Array, "*B"]:
     return near * (x - near / 2)
 
 
-def _steps(scene: Scene) -> tuple[Float[Array, "pairs"], Float[Array, "pairs bones"]]:
+def _steps(window: PosedWindow) -> tuple[Float[Array, "pairs"], Float[Array, "pairs bones"]]:
     """Angles between consecutive frames, radians: of the global orientation, and of each joint."""
-    turned = geodesic_distance(scene.R_camera_root[:-1], scene.R_camera_root[1:])
-    return turned, geodesic_distance(scene.R_parent_child[:-1], scene.R_parent_child[1:])
+    turned = geodesic_distance(window.R_camera_root[:-1], window.R_camera_root[1:])
+    return turned, geodesic_distance(window.R_parent_child[:-1], window.R_parent_child[1:])
 
 
 @term(positive=["cutoff_cycles_per_frame"])
 def low_pass(
-    scene: Scene,
+    window: PosedWindow,
     *,
     cutoff_cycles_per_frame: Scalar | float = 0.15,
     beta_global: Scalar | float = 1.0,
@@ -87,18 +89,18 @@ def low_pass(
     Source: Akhter et al. 2008, *Nonrigid Structure from Motion in Trajectory Space* (the DCT of trajectories);
     Butterworth 1930 (the weights).
     """
-    frames = scene.present.shape[0]
+    frames = window.present.shape[0]
     # log 0 is left out with the mean itself: k = 0
     log_frequency = np.log(np.arange(1, frames) / (2 * frames))
     response = jax.nn.sigmoid(2 * BUTTERWORTH_ORDER * (log_frequency - jnp.log(cutoff_cycles_per_frame)))
-    fill = _between(scene.present)
+    fill = _between(window.present)
 
     def energy(trajectory: Float[Array, "T D"]) -> Scalar:
         coefficients = jax.scipy.fft.dct(fill @ trajectory, axis=0, norm="ortho")[1:]
         return jnp.sum(response[:, None] * coefficients**2)
 
-    body = jnp.asarray(scene.pose.body_pose).reshape(frames, -1)
-    return beta_global * energy(jnp.asarray(scene.pose.global_orient)) + beta_pose * energy(body)
+    body = jnp.asarray(window.pose.body_pose).reshape(frames, -1)
+    return beta_global * energy(jnp.asarray(window.pose.global_orient)) + beta_pose * energy(body)
 
 
 def _between(present: Bool[Array | np.ndarray, "T"]) -> Float[Array, "T T"]:

@@ -8,8 +8,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.curvature import Curvature, Rows, frame_rows
+from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.objective.scene import Scene
 from jaxfit.objective.terms import Scalar
 
 __all__ = ["acceleration", "complete_runs", "velocity"]
@@ -20,49 +20,51 @@ SHORTEST_RAD, AT_REST_RAD = 1e-4, 0.05
 Equal frames may move by a usual step, or a fit that starts from one pose for all frames would hardly begin."""
 
 
-def _velocity_curvature(scene: Scene, *, beta_global: Scalar | float, beta_pose: Scalar | float) -> Curvature:
+def _velocity_curvature(window: PosedWindow, *, beta_global: Scalar | float, beta_pose: Scalar | float) -> Curvature:
     """H of β‖δ‖ ≤ ½β(‖δ‖²/n + n), δ the difference of two frames and n its present norm."""
-    return _differences_curvature(scene, 1, beta_global, beta_pose)
+    return _differences_curvature(window, 1, beta_global, beta_pose)
 
 
-def _acceleration_curvature(scene: Scene, *, beta_global: Scalar | float, beta_pose: Scalar | float) -> Curvature:
+def _acceleration_curvature(
+    window: PosedWindow, *, beta_global: Scalar | float, beta_pose: Scalar | float
+) -> Curvature:
     """The same of second differences."""
-    return _differences_curvature(scene, 2, beta_global, beta_pose)
+    return _differences_curvature(window, 2, beta_global, beta_pose)
 
 
 @term(curvature=_velocity_curvature)
-def velocity(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
+def velocity(window: PosedWindow, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
     """E_vel = Σ_k β_k Σ_i ‖θ_k,i+1 − θ_k,i‖₂ over k = global orientation, body pose.
 
     Source: Hägerlind et al. 2024, velocity term; norms not squared.
     """
-    return _differences(scene, 1, beta_global, beta_pose)
+    return _differences(window, 1, beta_global, beta_pose)
 
 
 @term(curvature=_acceleration_curvature)
-def acceleration(scene: Scene, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
+def acceleration(window: PosedWindow, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0) -> Scalar:
     """E_acc = Σ_k β_k Σ_i ‖θ′_k,i+1 − θ′_k,i‖₂ with θ′ the frame-to-frame difference.
 
     Source: Hägerlind et al. 2024, acceleration term; norms not squared.
     """
-    return _differences(scene, 2, beta_global, beta_pose)
+    return _differences(window, 2, beta_global, beta_pose)
 
 
-def _differences(scene: Scene, order: int, beta_global: Scalar | float, beta_pose: Scalar | float) -> Scalar:
-    frames = scene.pose.global_orient.shape[0]
+def _differences(window: PosedWindow, order: int, beta_global: Scalar | float, beta_pose: Scalar | float) -> Scalar:
+    frames = window.pose.global_orient.shape[0]
     if frames <= order:
         return jnp.zeros(())
-    complete = complete_runs(scene.evidence.present, order)
-    orient = safe_norm(jnp.diff(scene.pose.global_orient, order, axis=0))
-    body = safe_norm(jnp.diff(scene.pose.body_pose.reshape(frames, -1), order, axis=0))
+    complete = complete_runs(window.targets.present, order)
+    orient = safe_norm(jnp.diff(window.pose.global_orient, order, axis=0))
+    body = safe_norm(jnp.diff(window.pose.body_pose.reshape(frames, -1), order, axis=0))
     return jnp.sum(jnp.where(complete, beta_global * orient + beta_pose * body, 0.0))
 
 
 def _differences_curvature(
-    scene: Scene, order: int, beta_global: Scalar | float, beta_pose: Scalar | float
+    window: PosedWindow, order: int, beta_global: Scalar | float, beta_pose: Scalar | float
 ) -> Curvature:
-    rows = frame_rows(scene.pose)
-    complete = complete_runs(scene.evidence.present, order)
+    rows = frame_rows(window.pose)
+    complete = complete_runs(window.targets.present, order)
     orient_pull = beta_global * _coupling(rows[:, :3], order, complete)
     body_pull = beta_pose * _coupling(rows[:, 3:-4], order, complete)
 

@@ -1,6 +1,6 @@
 """The terms of a single frame, and of the bird as a whole; each is summed over its window.
 
-A term is a pure function of the `Scene`; its keyword arguments are its settings. Settings and weights are
+A term is a pure function of the `PosedWindow`; its keyword arguments are its settings. Settings and weights are
 traced, so that a sweep over them is one compiled program.
 """
 
@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.curvature import Curvature, Rows
+from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.objective.scene import Scene
 from jaxfit.raster.silhouette import mask_loss
 
 __all__ = [
@@ -27,7 +27,7 @@ __all__ = [
     "pose_prior",
     "shape_norm",
     "shape_prior",
-    "start_pull",
+    "stage_anchor",
 ]
 
 Scalar = Float[Array, ""]
@@ -39,12 +39,12 @@ def geman_mcclure(error: Float[Array, "*B"], sigma: Float[Array, ""] | float) ->
     return sigma**2 * squared / (sigma**2 + squared)
 
 
-def _keypoints_curvature(scene: Scene, *, sigma_px: Scalar | float) -> Curvature:
+def _keypoints_curvature(window: PosedWindow, *, sigma_px: Scalar | float) -> Curvature:
     """H = Jᵀ·diag(w)·J, w = 2c·σ⁴/(σ² + e²)²: Geman-McClure is concave in e², hence below its tangent there."""
     # XLA would compute the Jacobian again for every use
-    by_angles, by_place = jax.lax.optimization_barrier(scene.keypoint_jacobian_px)
-    error_px = scene.keypoints_px - scene.evidence.keypoints_px
-    weight = 2 * scene.evidence.confidence[..., None] * (sigma_px**2 / (sigma_px**2 + error_px**2)) ** 2
+    by_angles, by_place = jax.lax.optimization_barrier(window.keypoint_jacobian_px)
+    error_px = window.keypoints_px - window.targets.keypoints_px
+    weight = 2 * window.targets.confidence[..., None] * (sigma_px**2 / (sigma_px**2 + error_px**2)) ** 2
     weight = weight.reshape(by_angles.shape[:2])
 
     def product(d: Rows) -> Rows:
@@ -56,47 +56,47 @@ def _keypoints_curvature(scene: Scene, *, sigma_px: Scalar | float) -> Curvature
 
 
 @term(positive=["sigma_px"], curvature=_keypoints_curvature)
-def keypoints(scene: Scene, *, sigma_px: Scalar | float = 50.0) -> Scalar:
+def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Scalar:
     """E_kpt = Σ_t Σ_i c_i · (ρ(e_x) + ρ(e_y)), ρ Geman-McClure, e in crop pixels.
 
     Source: Hägerlind et al. 2024, keypoint term; x and y apart as in Badger et al. 2020.
     """
-    error_px = scene.keypoints_px - scene.evidence.keypoints_px
+    error_px = window.keypoints_px - window.targets.keypoints_px
     robust = jnp.sum(geman_mcclure(error_px, sigma_px), axis=-1)
-    return jnp.sum(scene.evidence.confidence * robust)
+    return jnp.sum(window.targets.confidence * robust)
 
 
 @term(compares_masks=True)
-def mask(scene: Scene) -> Scalar:
+def mask(window: PosedWindow) -> Scalar:
     """E_msk = Σ_t Σ_pixels |soft silhouette − mask|.
 
     Source: Hägerlind et al. 2024, mask term.
     """
-    return _mask(scene, "l1")
+    return _mask(window, "l1")
 
 
 @term(compares_masks=True)
-def mask_smooth_l1(scene: Scene) -> Scalar:
+def mask_smooth_l1(window: PosedWindow) -> Scalar:
     """Σ_t Σ_pixels of smooth-L1 (½e² below 1, so ½e² throughout): the silhouette term of AVES.
 
     Source: Wang et al. 2021, section 4.
     """
-    return _mask(scene, "smooth_l1")
+    return _mask(window, "smooth_l1")
 
 
-def _mask(scene: Scene, kind: Literal["l1", "smooth_l1"]) -> Scalar:
-    weight = scene.evidence.has_mask.astype(jnp.float32)
+def _mask(window: PosedWindow, kind: Literal["l1", "smooth_l1"]) -> Scalar:
+    weight = window.targets.has_mask.astype(jnp.float32)
 
     def frame(vertices_screen, target, weight):
-        return mask_loss(vertices_screen, scene.faces, target, weight, kind=kind, **scene.raster._asdict())
+        return mask_loss(vertices_screen, window.faces, target, weight, kind=kind, **window.raster._asdict())
 
-    return jnp.sum(jax.vmap(frame)(scene.vertices_screen, scene.evidence.mask, weight))
+    return jnp.sum(jax.vmap(frame)(window.vertices_screen, window.targets.mask, weight))
 
 
-def _pose_prior_curvature(scene: Scene) -> Curvature:
+def _pose_prior_curvature(window: PosedWindow) -> Curvature:
     """H = 2·Σ⁻¹ on the body pose of every frame that is there; the term is a square already."""
-    precision = scene.priors.pose_whitener.T @ scene.priors.pose_whitener
-    present, size = scene.evidence.present[:, None], len(precision)
+    precision = window.priors.pose_whitener.T @ window.priors.pose_whitener
+    present, size = window.targets.present[:, None], len(precision)
 
     def on_body(rows: Float[Array, "T size"]) -> Rows:
         return jnp.pad(2 * jnp.where(present, rows, 0.0), ((0, 0), (3, 4)))
@@ -106,47 +106,47 @@ def _pose_prior_curvature(scene: Scene) -> Curvature:
 
 
 @term(curvature=_pose_prior_curvature)
-def pose_prior(scene: Scene) -> Scalar:
+def pose_prior(window: PosedWindow) -> Scalar:
     """E_pp = Σ_t (x − μ)ᵀ Σ⁻¹ (x − μ) on the flattened body pose.
 
     Source: Badger et al. 2020, pose prior.
     """
-    present = scene.evidence.present
-    offset = scene.pose.body_pose.reshape(present.shape[0], -1) - scene.priors.pose_mean
-    distance = jnp.sum((offset @ scene.priors.pose_whitener.T) ** 2, axis=-1)
+    present = window.targets.present
+    offset = window.pose.body_pose.reshape(present.shape[0], -1) - window.priors.pose_mean
+    distance = jnp.sum((offset @ window.priors.pose_whitener.T) ** 2, axis=-1)
     return jnp.sum(jnp.where(present, distance, 0.0))
 
 
 @term
-def bone_prior(scene: Scene) -> Scalar:
+def bone_prior(window: PosedWindow) -> Scalar:
     """(b − μ_b)ᵀ Σ_b⁻¹ (b − μ_b) on the bone lengths.
 
     Source: Badger et al. 2020, bone-length prior.
     """
-    return jnp.sum((scene.priors.bone_whitener @ (scene.pose.bone_length - scene.priors.bone_mean)) ** 2)
+    return jnp.sum((window.priors.bone_whitener @ (window.pose.bone_length - window.priors.bone_mean)) ** 2)
 
 
 @term
-def shape_prior(scene: Scene) -> Scalar:
+def shape_prior(window: PosedWindow) -> Scalar:
     """Σ (β / sd)²: squared Mahalanobis distance of the shape coefficients."""
-    return jnp.sum((scene.pose.betas / scene.priors.shape_sd) ** 2)
+    return jnp.sum((window.pose.betas / window.priors.shape_sd) ** 2)
 
 
 @term
-def shape_norm(scene: Scene) -> Scalar:
+def shape_norm(window: PosedWindow) -> Scalar:
     """‖β‖₂, not squared: a bird keeps the mean shape unless its outline is worth the step.
 
     Source: Wang et al. 2021, shape regularisation.
     """
-    return safe_norm(jnp.asarray(scene.pose.betas))
+    return safe_norm(jnp.asarray(window.pose.betas))
 
 
 @term
-def start_pull(scene: Scene) -> Scalar:
+def stage_anchor(window: PosedWindow) -> Scalar:
     """Σ_t ‖θ_p − θ_p,start‖₁ + ‖b − b_start‖₁: keep body pose and bone lengths where the stage began.
 
     Source: Wang et al. 2021, section 4 (third stage).
     """
-    moved = jnp.sum(jnp.abs(scene.pose.body_pose - scene.start.body_pose), axis=(-2, -1))
-    stretched = jnp.sum(jnp.abs(scene.pose.bone_length - scene.start.bone_length))
-    return jnp.sum(jnp.where(scene.evidence.present, moved, 0.0)) + stretched
+    moved = jnp.sum(jnp.abs(window.pose.body_pose - window.anchor.body_pose), axis=(-2, -1))
+    stretched = jnp.sum(jnp.abs(window.pose.bone_length - window.anchor.bone_length))
+    return jnp.sum(jnp.where(window.targets.present, moved, 0.0)) + stretched

@@ -21,7 +21,7 @@ from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.keypoints.detector import BUILTIN_PATH
 from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
-from jaxfit.perception.tracking import Tracker, TrackRecorder, drop_short_tracks, load_tracker, repair_swaps
+from jaxfit.perception.tracking import Tracker, TrackRecorder, drop_short_tracks, load_tracker, repair_left_right_flips
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.video.reader import FrameReader, read_frames
 
@@ -147,7 +147,7 @@ def find_tracks(
     segmenter = segmenter or open_segmenter(config)
     recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names))
     clock, best, done, began = Clock(), 0.0, 0, time.perf_counter()
-    with _one_opencv_thread(), progress("Tracking", _count(reader, config)) as tick:
+    with _one_opencv_thread(), progress("Tracking", _count(reader, config)) as report_progress:
         for number, picture, _ in clock.each("decode", reader):
             with clock("segment"):
                 instances = segmenter(picture)
@@ -162,14 +162,14 @@ def find_tracks(
                 recorder.add(number, name, size_px, birds, [one for _, one in followed], points_px, confidence)
             best, done = max([best, *(bird.score for bird in instances)]), done + 1
             noun = "bird" if len(birds) == 1 else "birds"
-            tick(1, f"{done / (time.perf_counter() - began):.1f} frames/s, {len(birds)} {noun}")
+            report_progress(1, f"{done / (time.perf_counter() - began):.1f} frames/s, {len(birds)} {noun}")
     if not done:
         raise InputError(source, f"has no frame from {frames.start} on", "begin with an earlier frame")
     with clock("clean up"):
         every = recorder.observations()
         found = drop_short_tracks(every, config.min_track_frames)
-        if config.repair_swaps:
-            found, _ = repair_swaps(found, mirror_pairs(found.keypoint_names))
+        if config.repair_left_right_flips:
+            found, _ = repair_left_right_flips(found, mirror_pairs(found.keypoint_names))
     counts = dict(zip(every.track_id.tolist(), every.present.sum(1).tolist(), strict=True))
     short = {track: count for track, count in counts.items() if track not in found.track_id}
     nothing = None

@@ -85,7 +85,7 @@ def stage_scene(
     points, inside, seen = np.zeros((birds, frames, K, 2)), *np.zeros((2, birds, frames, K), bool)
     boxes, whole, visible = np.zeros((birds, frames, 4), np.float32), {}, {}
     faces = np.asarray(bird.faces)
-    with progress("Staging the scene", frames) as tick:
+    with progress("Staging the scene", frames) as report_progress:
         for t in range(frames):
             seen_now = see(vertices[t], keypoints[t], faces, view)
             points[:, t], inside[:, t], seen[:, t] = seen_now.keypoints_px, seen_now.inside, seen_now.seen
@@ -96,7 +96,7 @@ def stage_scene(
                 whole[n, t], boxes[n, t] = encode_mask(seen_now.whole[n]), box
                 if seen_now.visible[n].any():
                     visible[n, t] = encode_mask(seen_now.visible[n])
-            tick(1, "")
+            report_progress(1, "")
     present = boxes[..., 2] > 0
     labelled = inside & present[..., None]
     truth = Observations(
@@ -151,10 +151,10 @@ def simulate(
         scene = stage_scene(bird, birds, frames, size, fps, seed, progress)
         rng = np.random.default_rng((seed, 4))
         film = Footage(bird, scene.actors, scene.view, LEDGE_DEPTH, random_light(rng), seed)
-        with progress("Filming", frames) as tick, VideoWriter(part / FOOTAGE, size, fps, codec) as video:
+        with progress("Filming", frames) as report_progress, VideoWriter(part / FOOTAGE, size, fps, codec) as video:
             for t in range(frames):
                 video.write(film.frame(t))
-                tick(1, "")
+                report_progress(1, "")
         write_coco(scene.truth, part / TRUTH)
         write_coco(scene.detections, part / DETECTIONS)
         origin = "simulated: these poses are the truth, not a fit"
@@ -204,15 +204,15 @@ def _true_poses(
         scale=np.broadcast_to(stack("scale"), (N, T)),
         bone_length=each_frame("bone_length"),
         betas=each_frame("betas"),
-        keypoints_3d=view.to_camera(keypoints_world),
-        keypoints_2d=points_px,
+        keypoints_cam=view.to_camera(keypoints_world),
+        keypoints_px=points_px,
         crop=np.broadcast_to(view.crop, (N, T, 3)),
         image_size_px=np.where(truth.present[..., None], truth.image_size_px[None], 0),
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
         status=np.full(N, "ok"),
         loss={},
-        focal=view.focal_px * crop_px / float(view.crop[2]),
+        focal_px=view.focal_px * crop_px / float(view.crop[2]),
         crop_px=crop_px,
     )
 

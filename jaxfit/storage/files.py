@@ -15,7 +15,15 @@ import numpy as np
 
 from jaxfit.errors import InputError
 
-__all__ = ["check_new_file", "check_replaceable", "check_writable", "conform", "new_file", "new_folder", "write_whole"]
+__all__ = [
+    "check_new_file",
+    "check_replaceable",
+    "check_writable",
+    "new_file",
+    "new_folder",
+    "validate_arrays",
+    "write_whole",
+]
 
 # What the operating system may answer to a write, and what the user can do about it.
 _REMEDIES = {
@@ -224,7 +232,7 @@ def _take_place(part: Path, path: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def conform(values: Mapping[str, Any], layout: Mapping[str, tuple[str, Any]]) -> dict[str, np.ndarray]:
+def validate_arrays(values: Mapping[str, Any], layout: Mapping[str, tuple[str, Any]]) -> dict[str, np.ndarray]:
     """Arrays of one container, read-only, with their shapes checked against each other.
 
     Args:

@@ -88,7 +88,7 @@ def train(
         optimiser, schedule.learning_rate, schedule.steps, pct_start=0.1, cycle_momentum=False
     )
     recent: list[dict[str, float]] = []
-    with progress(name, schedule.steps) as tick:
+    with progress(name, schedule.steps) as report_progress:
         for sample in loader:
             sample = type(sample)(*(part.to(device) for part in sample))
             picture = sample.picture.contiguous(memory_format=torch.channels_last)
@@ -101,7 +101,7 @@ def train(
             optimiser.step()
             rates.step()
             recent = [*recent[-(schedule.steps // 10) :], {key: float(part.detach()) for key, part in parts.items()}]
-            tick(1, " ".join(f"{key} {np.mean([r[key] for r in recent[-50:]]):.4f}" for key in recent[-1]))
+            report_progress(1, " ".join(f"{key} {np.mean([r[key] for r in recent[-50:]]):.4f}" for key in recent[-1]))
     network.cpu().eval()
     return {key: float(np.mean([values[key] for values in recent])) for key in recent[-1]}
 

@@ -71,13 +71,13 @@ def film_scenes(
         points, seen = np.zeros((S, MOST_BIRDS, K, 2), np.float32), np.zeros((S, MOST_BIRDS, K), np.uint8)
         scale = np.zeros(S, np.float32)
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))  # compiled code does not survive a fork
-        with progress("Filming scenes", len(seeds)) as tick, pool:
+        with progress("Filming scenes", len(seeds)) as report_progress, pool:
             for i, frames in enumerate(pool.map(_film, seeds)):
                 at = slice(i * FRAMES_A_SCENE, (i + 1) * FRAMES_A_SCENE)
                 N = frames.seen.shape[1]
                 pictures[at], owner[at], scale[at] = frames.pictures, frames.owner, frames.pixels_a_unit
                 points[at, :N], seen[at, :N] = frames.keypoints_px, frames.seen
-                tick(1, "")
+                report_progress(1, "")
         pictures.flush()
         owner.flush()
         np.savez(part / _MARKER, keypoints_px=points, seen=seen, pixels_a_unit=scale)

@@ -108,7 +108,7 @@ def overlay(
     tiles = {}
     with (
         VideoWriter(out, drawing.size_px, fps, codec) as writer,
-        progress("overlay", (last - first) // step + 1) as tick,
+        progress("overlay", (last - first) // step + 1) as report_progress,
     ):
         number = None
         for number, picture, _ in read_frames(video, first, last + 1, step):
@@ -116,7 +116,7 @@ def overlay(
             here = t if numbers[t] == number else None
             tiles |= cut_tiles(drawing.posed, picture, [(n, at) for n, at in wanted if at == here])
             writer.write(drawing.frame(picture, number, here, number / (fps * step)))
-            tick(1, f"frame {number}")
+            report_progress(1, f"frame {number}")
         if info.frames is None and number != last:
             raise too_short(video, solution, 0 if number is None else number + 1)
     contact_sheet(solution, bird, observations, out.with_suffix(".png"), footage=tiles)
@@ -189,7 +189,7 @@ class _Drawing:
         # far faster, and as good where every pixel still counts
         self._shrink = cv2.INTER_LINEAR if self.zoom > 0.6 else cv2.INTER_AREA
         self.solution, self.posed = solution, PosedBirds(solution, bird)
-        extent = np.ptp(solution.keypoints_2d[solution.valid], axis=1).max(-1)
+        extent = np.ptp(solution.keypoints_px[solution.valid], axis=1).max(-1)
         self.style = Style.suited(self.picture_px[0], float(np.median(extent)) * self.zoom)
         self._numbers = Numbers(solution.keypoint_names, self.style)
         self._faces = np.asarray(bird.faces)
@@ -230,7 +230,7 @@ class _Drawing:
             name=str(self.solution.track_id[n]),
             screen=self.posed.to_image(cam[None], n, span)[0] * shrink,
             colours=shade(cam, self._faces, self._colours[n]),
-            keypoints_px=self.solution.keypoints_2d[n, t] * self.zoom,
+            keypoints_px=self.solution.keypoints_px[n, t] * self.zoom,
             detected_px=places[confidence > 0] * self.zoom,
         )
 

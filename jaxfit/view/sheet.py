@@ -113,7 +113,7 @@ def contact_sheet(
 def _window(posed: PosedBirds, n: int, t: int) -> Float[np.ndarray, "3"]:
     """x0, y0 and size of the square that a tile shows: the crop, unless the bird is lost in it."""
     crop = posed.solution.crop[n, t]
-    points = posed.solution.keypoints_2d[n, t]
+    points = posed.solution.keypoints_px[n, t]
     low, high = points.min(0), points.max(0)
     size = 1.5 * float((high - low).max())
     return crop if crop[2] < 1.4 * size else np.array([*((low + high - size) / 2), size], np.float32)
@@ -137,7 +137,7 @@ def _evidence(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np
     covered = hard_mask(screen, posed.faces, TILE_PX, TILE_PX).astype(np.uint8)
     contours, _ = cv2.findContours(covered, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(tile, contours, -1, OUTLINE if footage is None else track_colour(n), 1, cv2.LINE_AA)
-    fitted = _to_tile(solution.keypoints_2d[n, t], window)
+    fitted = _to_tile(solution.keypoints_px[n, t], window)
     places, confidence = detected.keypoints(n, t)
     near = _to_tile(places, window)
     rim, fill = (ON_PAPER_DETECTED, ON_PAPER_FITTED) if footage is None else (DETECTED, FITTED)

@@ -32,7 +32,7 @@ def up_direction(solution: Solution) -> Float[np.ndarray, "3"]:
     feet = np.array([any(word in name for word in FOOT_WORDS) for name in names], bool)
     if not feet.any() or feet.all() or not valid.any():
         return np.array([0.0, -1.0, 0.0])
-    points = solution.keypoints_3d[valid].astype(np.float64)
+    points = solution.keypoints_cam[valid].astype(np.float64)
     ways = points[:, ~feet].mean(1) - points[:, feet].mean(1)
     ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
     total = ways.mean(0)
@@ -67,7 +67,7 @@ class SideViews:
         left /= np.maximum(np.linalg.norm(left, axis=-1, keepdims=True), 1e-6)
         down = np.broadcast_to(-up, left.shape)
         self._R_view_cam = np.stack([np.cross(down, -left), down, -left], axis=-2)  # x right, y down, z forward
-        points = np.where(valid[..., None, None], solution.keypoints_3d, 0).astype(np.float64)
+        points = np.where(valid[..., None, None], solution.keypoints_cam, 0).astype(np.float64)
         self._centre_cam = points.mean(2)
         spread = np.einsum("ntij,ntkj->ntki", self._R_view_cam, points - self._centre_cam[:, :, None])
         reach = np.abs(spread[..., :2]).max((2, 3)) / np.where(valid, solution.scale, 1)

@@ -48,7 +48,7 @@ def test_every_run_is_the_fit_of_its_config_in_the_order_of_the_values(observed)
         pair = [jaxfit.with_values(config(), levels[r]) for r in (first, first + 2)]
         alone = fit_runs(Preparation(observed, BIRD, None, "observations"), BIRD, pair)
         for r, expected in zip((first, first + 2), alone, strict=True):
-            np.testing.assert_array_equal(swept.solutions[r].keypoints_2d, expected.keypoints_2d)
+            np.testing.assert_array_equal(swept.solutions[r].keypoints_px, expected.keypoints_px)
             assert swept.results[r].evaluation.overall == jaxfit.evaluate(expected, BIRD, observed).overall
             assert swept.results[r].runs_at_once == 2
     me_p = [result.evaluation.overall["me_p"] for result in swept.results]

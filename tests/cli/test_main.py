@@ -59,7 +59,7 @@ def test_the_config_as_run_gives_the_same_again(fitted, inputs, tmp_path):
     command[command.index("--config") + 1] = str(fitted / "config.yaml")
     assert main(command) == 0
     a, b = load_solution(fitted)[0], load_solution(tmp_path / "again")[0]
-    np.testing.assert_array_equal(a.keypoints_2d, b.keypoints_2d)
+    np.testing.assert_array_equal(a.keypoints_px, b.keypoints_px)
 
 
 def test_evaluate(fitted, inputs, tmp_path, capsys):
@@ -155,12 +155,12 @@ def test_ctrl_c_leaves_nothing_behind(fitted, inputs, tmp_path, capsys, monkeypa
     def impatient(_name, _total):
         ticks = []
 
-        def tick(_done, _note):
+        def report_progress(_done, _note):
             ticks.append(None)
             if len(ticks) == 3:
                 raise KeyboardInterrupt
 
-        yield tick
+        yield report_progress
 
     monkeypatch.setattr(fitting, "terminal", impatient)
     before = contents(fitted)

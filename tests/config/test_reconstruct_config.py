@@ -30,7 +30,7 @@ def test_the_shipped_file_names_every_knob_at_its_default():
     every = {key for key in keys(yaml.safe_load(config_to_yaml(config))) if not key.startswith("fit.")}
     assert set(keys(shipped)) == every
     assert (config.track, config.overlay, config.fit) == (TrackConfig(), OverlayConfig(), load_config("paper"))
-    assert not config.track.repair_swaps  # the paper's setting
+    assert not config.track.repair_left_right_flips  # the paper's setting
 
 
 def test_round_trip(tmp_path):

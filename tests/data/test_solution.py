@@ -33,11 +33,11 @@ def make(**changes):
         "scale": some(),
         "bone_length": some(J - 1),
         "betas": some(S),
-        "keypoints_3d": some(K, 3),
-        "keypoints_2d": some(K, 2),
+        "keypoints_cam": some(K, 3),
+        "keypoints_px": some(K, 2),
         "crop": some(3),
         "image_size_px": rng.integers(1, 4000, (N, T, 2)),
-        "focal": 2167.0,
+        "focal_px": 2167.0,
         "crop_px": 256,
         "keypoint_names": BIRD.keypoint_names,
         "joint_names": BIRD.joint_names,
@@ -52,7 +52,7 @@ def assert_same(a: Solution, b: Solution):
         if isinstance(value, np.ndarray):
             np.testing.assert_array_equal(value, getattr(b, name), err_msg=name)
             assert value.dtype == getattr(b, name).dtype, name
-    for name in ("focal", "crop_px", "keypoint_names", "joint_names"):
+    for name in ("focal_px", "crop_px", "keypoint_names", "joint_names"):
         assert getattr(a, name) == getattr(b, name), name
     assert list(a.loss) == list(b.loss)
     for term in a.loss:
@@ -142,10 +142,10 @@ def test_a_summary_that_is_no_json_writes_nothing(tmp_path):
         ({"body_pose": np.ones((N, T, J - 1, 4))}, "body_pose must have shape .* axis 3 should be 3"),
         ({"bone_length": np.ones((N, T, 3))}, "bone_length must have shape .* J-1 is 7 in body_pose"),
         ({"joint_names": ("root",)}, "joint_names must be 8"),
-        ({"keypoint_names": ("a",)}, "keypoint_names must have shape .* K is 12 in keypoints_3d"),
+        ({"keypoint_names": ("a",)}, "keypoint_names must have shape .* K is 12 in keypoints_cam"),
         ({"status": ["ok"]}, "status must have shape .* N is 2"),
         ({"loss": {"mask": [1.0]}}, r"loss\[mask\] must have shape"),
-        ({"focal": 0}, "focal must be above 0"),
+        ({"focal_px": 0}, "focal must be above 0"),
         ({"crop_px": 0}, "crop_px must be 1 or more"),
         ({"scale": np.ones((N, T), complex)}, "scale must be of type float32, not complex128"),
     ],
@@ -174,7 +174,7 @@ def rewrite(folder, **changes):
         ({"joint_names": np.arange(J)}, "joint_names must be of type str, not int64"),
         ({"loss_terms": np.array(["a"])}, "loss has shape .* 1 loss_terms"),
         ({"loss": np.ones((5, 2))}, "loss.* must have shape"),
-        ({"focal": np.array("x")}, "focal|float"),
+        ({"focal_px": np.array("x")}, "focal|float"),
         ({"status": np.array([None, {}], dtype=object)}, "holds Python objects"),
     ],
 )

@@ -22,9 +22,9 @@ ACTS = {5: [(0, "stand"), (12, "preen")], 3: [(0, "walk"), (11, "stand")]}
 
 def moved(n, t, k=slice(None), by=(6, 8)):
     """The truth, but for some keypoints of one bird and frame: 10 px off."""
-    points = solution().keypoints_2d.copy()
+    points = solution().keypoints_px.copy()
     points[n, t, k] += by
-    return solution(keypoints_2d=points)
+    return solution(keypoints_px=points)
 
 
 def test_behaviours_are_a_partition():

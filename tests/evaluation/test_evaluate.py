@@ -28,7 +28,7 @@ def test_the_truth_is_perfect():
 
 def test_a_known_error():
     """All keypoints 6, 8 px off: 10 px of each mask's side; steady, so nothing in velocity."""
-    off = solution(keypoints_2d=solution().keypoints_2d + np.float32([6, 8]))
+    off = solution(keypoints_px=solution().keypoints_px + np.float32([6, 8]))
     result = evaluate(off, BIRD, truth()).overall
     own = np.array([[PosedBirds(off, BIRD).vertices_screen(n, t)[:, :2] for t in range(T)] for n in range(N)])
     extent = np.ptp(own, axis=2).max(-1)
@@ -41,13 +41,13 @@ def test_a_known_error():
 
 def test_velocity_counts_neighbouring_frames_alone():
     """One frame jumps by 10 px: two pairs of 3 see it; frames 12 and 14 are no neighbours."""
-    points = solution().keypoints_2d.copy()
+    points = solution().keypoints_px.copy()
     points[0, 1] += [6, 8]
-    result = evaluate(solution(keypoints_2d=points), BIRD, truth())
+    result = evaluate(solution(keypoints_px=points), BIRD, truth())
     assert result.tracks[5]["me_v"] == pytest.approx(np.sqrt((100 / sides()[0, :2] ** 2).mean()), rel=0.02)
-    points = solution().keypoints_2d.copy()
+    points = solution().keypoints_px.copy()
     points[0, 3] += [6, 8]
-    assert evaluate(solution(keypoints_2d=points), BIRD, truth()).tracks[5]["me_v"] == pytest.approx(0, abs=1e-6)
+    assert evaluate(solution(keypoints_px=points), BIRD, truth()).tracks[5]["me_v"] == pytest.approx(0, abs=1e-6)
 
 
 def test_overlap_of_a_shifted_mesh():
@@ -64,9 +64,9 @@ def test_overlap_of_a_shifted_mesh():
 def test_poses_that_are_missing():
     valid = np.ones((N, T), bool)
     valid[0, 1:3] = valid[1, 0] = False
-    points = solution().keypoints_2d.copy()
+    points = solution().keypoints_px.copy()
     points[~valid] = np.nan
-    result = evaluate(solution(valid=valid, keypoints_2d=points), BIRD, truth())
+    result = evaluate(solution(valid=valid, keypoints_px=points), BIRD, truth())
     assert (result.frames, result.missing) == (5, 3)
     assert result.tracks[5]["frames"] == 2
     assert result.overall["pck@0.05"] == 1

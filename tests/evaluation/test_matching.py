@@ -34,11 +34,11 @@ def result(tracks, frames=FRAMES):
         scale=np.ones((N, T)),
         bone_length=np.ones((N, T, 0)),
         betas=np.zeros((N, T, 0)),
-        keypoints_3d=np.zeros((N, T, K, 3)),
-        keypoints_2d=np.where(seen.present[..., None, None], seen.keypoints_px, np.nan),
+        keypoints_cam=np.zeros((N, T, K, 3)),
+        keypoints_px=np.where(seen.present[..., None, None], seen.keypoints_px, np.nan),
         crop=np.zeros((N, T, 3)),
         image_size_px=np.full((N, T, 2), [WIDTH, HEIGHT]),
-        focal=100.0,
+        focal_px=100.0,
         keypoint_names=NAMES,
         joint_names=("root",),
         crop_px=64,
@@ -71,7 +71,7 @@ def test_a_tracker_has_ids_of_its_own(ids):
     renamed, matching = match_tracks(own, truth(TWO))
     assert matching == ("overlap", dict(zip(ids, (1, 2), strict=True)), [], [])
     assert renamed.track_id.tolist() == [1, 2]
-    np.testing.assert_array_equal(renamed.keypoints_2d, own.keypoints_2d)
+    np.testing.assert_array_equal(renamed.keypoints_px, own.keypoints_px)
     assert match_tracks(own, truth(TWO), "ids")[1].by == "ids"
 
 

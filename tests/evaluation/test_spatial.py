@@ -170,7 +170,7 @@ def test_every_figure_by_hand():
     valid[0, 1] = valid[1, 5] = False
     predicted = random_poses(1, scale=0.8)
     solution = build(predicted, valid=valid)
-    holes = {name: np.array(getattr(solution, name)) for name in ("transl", "scale", "keypoints_3d", "crop")}
+    holes = {name: np.array(getattr(solution, name)) for name in ("transl", "scale", "keypoints_cam", "crop")}
     for array in holes.values():
         array[~valid] = np.nan
     found = errors(dataclasses.replace(solution, **holes))
@@ -225,7 +225,7 @@ def test_another_model_is_compared_by_keypoints():
     assert found.points == "keypoints"
     row = row_of(found)
     assert math.isnan(row["orientation_deg"])
-    p, q = (np.asarray(s.keypoints_3d, float) for s in (solution, build(true_poses())))
+    p, q = (np.asarray(s.keypoints_cam, float) for s in (solution, build(true_poses())))
     p, q = p - p.mean(2, keepdims=True), q - q.mean(2, keepdims=True)
     scale = (p * q).sum((1, 2, 3)) / (p * p).sum((1, 2, 3))
     expected = np.linalg.norm(scale[:, None, None, None] * p - q, axis=-1).mean()

@@ -22,34 +22,34 @@ MODULE = """
 import jax
 import jax.numpy as jnp
 
-def symmetry(scene, *, power=2.0):
+def symmetry(window, *, power=2.0):
     "Left and right wing alike."
-    left, right = scene.joint_indices("left_wing", "right_wing")
-    apart = scene.pose.body_pose[:, left - 1] - scene.pose.body_pose[:, right - 1]
-    return jnp.sum(jnp.where(scene.present[:, None], jnp.abs(apart) ** power, 0.0))
+    left, right = window.joint_indices("left_wing", "right_wing")
+    apart = window.pose.body_pose[:, left - 1] - window.pose.body_pose[:, right - 1]
+    return jnp.sum(jnp.where(window.present[:, None], jnp.abs(apart) ** power, 0.0))
 
-def vector(scene):
-    return scene.pose.body_pose[:, 0]
+def vector(window):
+    return window.pose.body_pose[:, 0]
 
-def python_if(scene):
-    if scene.pose.scale[0] > 1:
-        return jnp.sum(scene.pose.scale)
+def python_if(window):
+    if window.pose.scale[0] > 1:
+        return jnp.sum(window.pose.scale)
     return jnp.zeros(())
 
-def no_reverse(scene):
-    return jax.lax.while_loop(lambda x: x < 3, lambda x: x + 1, jnp.sum(scene.pose.scale))
+def no_reverse(window):
+    return jax.lax.while_loop(lambda x: x < 3, lambda x: x + 1, jnp.sum(window.pose.scale))
 
-def hoof(scene):
-    return jnp.sum(scene.keypoints_px[:, scene.keypoint_indices("hoof")])
+def hoof(window):
+    return jnp.sum(window.keypoints_px[:, window.keypoint_indices("hoof")])
 
 SPLIT_PX = 0.0
 
-def nan_value(scene):
-    left = scene.evidence.keypoints_px[0, 0, 0] < SPLIT_PX
-    return jnp.where(left, jnp.nan, 0.0) * jnp.sum(scene.pose.scale)
+def nan_value(window):
+    left = window.targets.keypoints_px[0, 0, 0] < SPLIT_PX
+    return jnp.where(left, jnp.nan, 0.0) * jnp.sum(window.pose.scale)
 
-def nan_gradient(scene):
-    return jnp.sum(jnp.sqrt(jnp.abs(scene.pose.body_pose - scene.start.body_pose)))
+def nan_gradient(window):
+    return jnp.sum(jnp.sqrt(jnp.abs(window.pose.body_pose - window.start.body_pose)))
 """
 
 

@@ -18,11 +18,11 @@ from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.batch import Lanes, fit_batch, frames_per_batch
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.start import load_start
-from jaxfit.fitting.window import cut_windows, load_evidence
+from jaxfit.fitting.window import cut_windows, load_targets
 from jaxfit.model.camera import Camera, project
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.pose import Pose
-from jaxfit.objective.scene import priors_of
+from jaxfit.objective.posed_window import priors_of
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
 
@@ -68,7 +68,7 @@ def replaced(observations, n, keypoints_px=None, confidence=None):
     return observations.with_keypoints(points, trust)
 
 
-ARRAYS = [name for name in Pose.__dataclass_fields__] + ["keypoints_3d", "keypoints_2d", "crop", "valid"]
+ARRAYS = [name for name in Pose.__dataclass_fields__] + ["keypoints_cam", "keypoints_px", "crop", "valid"]
 
 
 def assert_same(a, b, tracks, exact=True):
@@ -83,7 +83,7 @@ def assert_same(a, b, tracks, exact=True):
 def test_known_truth_comes_back(solution, observed):
     assert solution.status.tolist() == ["ok"] * 3
     assert solution.valid.all()
-    apart = np.linalg.norm(solution.keypoints_2d - keypoints_of(truths()), axis=-1)
+    apart = np.linalg.norm(solution.keypoints_px - keypoints_of(truths()), axis=-1)
     assert apart.max() < 1 * SIZE / 256  # a pixel of the usual crop
     for n, truth in enumerate(truths()):
         R, R_true = exp_map(solution.global_orient[n]), exp_map(np.asarray(truth.global_orient))
@@ -103,8 +103,8 @@ def test_what_the_solution_says_fits_together(solution):
         pose = jax.tree.map(lambda values, n=n: values[n], solution.pose)
         pose = dataclasses.replace(pose, bone_length=solution.bone_length[n, 0], betas=solution.betas[n, 0])
         keypoints, _ = pose_window(BIRD, pose)
-        np.testing.assert_allclose(solution.keypoints_3d[n], keypoints, atol=1e-3)
-        np.testing.assert_allclose(solution.keypoints_2d[n], project(keypoints, CAMERA), atol=0.02)
+        np.testing.assert_allclose(solution.keypoints_cam[n], keypoints, atol=1e-3)
+        np.testing.assert_allclose(solution.keypoints_px[n], project(keypoints, CAMERA), atol=0.02)
         assert np.ptp(solution.transl[n, :, 2]) == 0  # depth is fixed, for the window as a whole
         np.testing.assert_array_equal(solution.bone_length[n], np.ones((T, BIRD.num_joints - 1)))
     assert set(solution.loss) == {"keypoints", "mask", "pose_prior", "velocity", "acceleration"}
@@ -146,7 +146,7 @@ def test_missing_frames_are_left_out(observed):
     gaps = replaced(observed, 0, confidence=confidence).select(tracks=[0])
     result = fit(gaps, BIRD, config())
     assert result.valid[0].tolist() == [False, True, True, False, True, True]
-    apart = np.linalg.norm(result.keypoints_2d - keypoints_of(truths()[:1]), axis=-1)
+    apart = np.linalg.norm(result.keypoints_px - keypoints_of(truths()[:1]), axis=-1)
     assert apart[result.valid].max() < SIZE / 256
     assert np.isnan(result.global_orient[0, [0, 3]]).all()
 
@@ -172,7 +172,7 @@ def test_long_tracks_are_fitted_window_by_window():
     result = fit(observations, BIRD, config(steps=(30, 2)))
     assert result.valid.all()
     parts = [fit(observations.select(frames=f), BIRD, config(steps=(30, 2))) for f in (slice(0, T), slice(T, None))]
-    for name in ("global_orient", "keypoints_2d", "scale"):
+    for name in ("global_orient", "keypoints_px", "scale"):
         joined = np.concatenate([getattr(part, name) for part in parts], axis=1)
         np.testing.assert_array_equal(getattr(result, name), joined, err_msg=name)
     total = sum(np.asarray(part.loss["keypoints"]) for part in parts)
@@ -202,7 +202,7 @@ def test_boxes_in_a_large_image(observed, tmp_path):
     assert (result.crop[..., 2] != SIZE).all(), "the crop is scaled, or this tests nothing"
     np.testing.assert_array_equal(result.image_size_px[result.valid], np.tile([400, 300], (result.valid.sum(), 1)))
     assert not result.image_size_px[~result.valid].any()
-    apart = np.linalg.norm(result.keypoints_2d - keypoints_of(truths()) - np.array([210, 90]), axis=-1)
+    apart = np.linalg.norm(result.keypoints_px - keypoints_of(truths()) - np.array([210, 90]), axis=-1)
     assert apart.max() < 0.5
     assert evaluate(result, BIRD, large).overall["iou"] > 0.9
     save_solution(result, BIRD, config_to_yaml(config()), {}, tmp_path / "out")
@@ -253,14 +253,14 @@ def test_the_better_hypothesis_goes_on(observed, after_first):
     second = dataclasses.replace(first, name="on", steps=5, keep_best=False, carry_moments=True)
     settings = dataclasses.replace(keypoints_only, stages=(first, second))
     windows = cut_windows(observed, settings)[:1]
-    evidence, truth = load_evidence(observed, windows, SIZE), truths()[0]
+    targets, truth = load_targets(observed, windows, SIZE), truths()[0]
     reversed_R = Rotation.from_rotvec([0, 0, np.pi]) * Rotation.from_rotvec(truth.global_orient)
     flipped = dataclasses.replace(truth, global_orient=reversed_R.as_rotvec().astype(np.float32))
     rig, priors = fold_bird(BIRD), priors_of(BIRD)
     for lanes in ((truth, flipped), (flipped, truth)):
         start = jax.tree.map(lambda *x: np.stack(x)[None], *lanes)
         only = Lanes(*np.zeros((3, 1), int))
-        fitted = fit_batch(BIRD, rig, priors, [settings], CAMERA, evidence, start, only, lambda *_: None)
+        fitted = fit_batch(BIRD, rig, priors, [settings], CAMERA, targets, start, only, lambda *_: None)
         assert fitted.pose.global_orient.shape == (1, T, 3)
         assert not any(fitted.failure)
         apart = np.linalg.norm(np.asarray(fitted.report.keypoints_px) - keypoints_of([truth]), axis=-1)

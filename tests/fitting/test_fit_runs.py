@@ -50,7 +50,7 @@ def swept(observed):
 
 
 def assert_equal(a, b):
-    for name in ("global_orient", "body_pose", "transl", "scale", "keypoints_2d", "valid"):
+    for name in ("global_orient", "body_pose", "transl", "scale", "keypoints_px", "valid"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
     for term in a.loss:
         np.testing.assert_array_equal(a.loss[term], b.loss[term], err_msg=term)
@@ -72,12 +72,12 @@ def test_every_run_is_as_if_alone(observed, swept):
         alone = fit(observed, BIRD, each)
         assert solution.status.tolist() == ["ok"] * BIRDS
         # batches of other sizes round otherwise, and Adam's steps do not shrink
-        np.testing.assert_allclose(solution.keypoints_2d, alone.keypoints_2d, atol=0.05)
+        np.testing.assert_allclose(solution.keypoints_px, alone.keypoints_px, atol=0.05)
         for term, loss in alone.loss.items():
             np.testing.assert_allclose(solution.loss[term], loss, rtol=0.02, err_msg=term)
     # and they are not all the same
-    assert np.abs(swept[0].keypoints_2d - swept[1].keypoints_2d).max() > 0.1
-    assert np.abs(swept[1].keypoints_2d - swept[2].keypoints_2d).max() > 0.1
+    assert np.abs(swept[0].keypoints_px - swept[1].keypoints_px).max() > 0.1
+    assert np.abs(swept[1].keypoints_px - swept[2].keypoints_px).max() > 0.1
 
 
 def test_the_place_in_a_batch_does_not_matter(observed, swept):
@@ -106,9 +106,9 @@ def count_lanes(monkeypatch):
     lanes = []
     begin = batch.begin
 
-    def counting(problem, knobs, pose, *rest):
+    def counting(problem, hyperparameters, pose, *rest):
         lanes.append(pose.global_orient.shape[0])
-        return begin(problem, knobs, pose, *rest)
+        return begin(problem, hyperparameters, pose, *rest)
 
     monkeypatch.setattr(batch, "begin", counting)
     return lanes
@@ -120,8 +120,8 @@ def test_equal_first_stages_are_done_once(observed, monkeypatch):
     shared = fit_runs(prepared(observed), BIRD, sweep)
     assert lanes == [BIRDS, 3 * BIRDS]
     for each, solution in zip(sweep, shared, strict=True):
-        np.testing.assert_allclose(solution.keypoints_2d, fit(observed, BIRD, each).keypoints_2d, atol=0.05)
-    assert np.abs(shared[0].keypoints_2d - shared[2].keypoints_2d).max() > 0.01
+        np.testing.assert_allclose(solution.keypoints_px, fit(observed, BIRD, each).keypoints_px, atol=0.05)
+    assert np.abs(shared[0].keypoints_px - shared[2].keypoints_px).max() > 0.01
 
 
 def test_runs_that_start_alike_but_pull_otherwise_share_nothing(observed, monkeypatch):
@@ -137,12 +137,12 @@ def test_hypotheses_stay_with_their_run(observed, monkeypatch):
     together = fit_runs(prepared(observed), BIRD, sweep)
     assert lanes == [2 * 2 * BIRDS] * 2
     for each, solution in zip(sweep, together, strict=True):
-        np.testing.assert_allclose(solution.keypoints_2d, fit(observed, BIRD, each).keypoints_2d, atol=0.05)
+        np.testing.assert_allclose(solution.keypoints_px, fit(observed, BIRD, each).keypoints_px, atol=0.05)
 
 
 def test_what_runs_share_is_prepared_once(observed, monkeypatch):
     counts = {}
-    for name in ("filter_observations", "cut_windows", "load_evidence", "initial_poses"):
+    for name in ("filter_observations", "cut_windows", "load_targets", "initial_poses"):
         original = getattr(prepare, name)
 
         def counting(*given, name=name, original=original):
@@ -154,7 +154,7 @@ def test_what_runs_share_is_prepared_once(observed, monkeypatch):
     fit_runs(shared, BIRD, SWEEP)
     fit_runs(shared, BIRD, SWEEP)
     # without and with the filter
-    assert counts == {"filter_observations": 2, "cut_windows": 2, "load_evidence": 2, "initial_poses": 2}
+    assert counts == {"filter_observations": 2, "cut_windows": 2, "load_targets": 2, "initial_poses": 2}
 
 
 def test_other_programs_are_refused(observed):

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.stages import BIRD, FIRST, B, T, case, knobs, problem, solve, total
+from support.stages import BIRD, FIRST, B, T, case, hyperparameters, problem, solve, total
 
 from jaxfit.config.schema import load_config
 from jaxfit.fitting import levenberg_marquardt
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.lane import Lane, lane_scene
+from jaxfit.fitting.lane import Lane, lane_window
 from jaxfit.fitting.levenberg_marquardt import EASE, FIRST_DAMPING, LEVENBERG_MARQUARDT, TIGHTEN
 from jaxfit.objective.curvature import frame_rows
 from jaxfit.objective.objective import evaluate_curvature
@@ -30,9 +30,9 @@ DAMPING = 1.0
 
 
 def lanes(stage):
-    start, evidence = case()
-    one = jax.tree.map(lambda x: x[0], (knobs(stage), start, evidence))
-    return start, evidence, Lane(problem(stage), *one)
+    start, targets = case()
+    one = jax.tree.map(lambda x: x[0], (hyperparameters(stage), start, targets))
+    return start, targets, Lane(problem(stage), *one)
 
 
 def first_step(lane, **said):
@@ -46,12 +46,12 @@ def first_step(lane, **said):
 
 
 def dense_step(stage, lane, damping):
-    """(H + μ·diag H)·d = −g with everything written out, over what is free: orientation, x, y and the common size."""
+    """(H + μ·diag H)·d = −g with H written out, over the optimised parameters: orientation, x, y, common size."""
     zero = frame_rows(lane.start)
 
     @jax.jit
     def derivatives():
-        H = evaluate_curvature(lane_scene(lane.start, lane), lane.knobs.settings)
+        H = evaluate_curvature(lane_window(lane.start, lane), lane.hyperparameters.settings)
         units = jnp.eye(zero.size).reshape(-1, *zero.shape)
         return jax.vmap(H.product)(units), jax.grad(lambda pose: total_of(stage, pose, lane))(lane.start)
 
@@ -67,7 +67,7 @@ def dense_step(stage, lane, damping):
 
 
 def total_of(stage, pose, lane):
-    return total(pose, lane.start, lane.evidence, stage)
+    return total(pose, lane.start, lane.targets, stage)
 
 
 def test_a_step_is_that_of_the_equation(monkeypatch):
@@ -96,29 +96,29 @@ def test_a_step_that_raises_the_loss_is_not_taken():
 
 
 def test_few_steps_beat_many_of_adams():
-    start, evidence = case()
+    start, targets = case()
     adam = dataclasses.replace(NEWTON, solver="adam")
-    slow, fast = solve([adam], start, evidence, (300,))[1], solve([NEWTON], start, evidence, (15,))[1]
-    before = solve([NEWTON], start, evidence, (0,))[1]
+    slow, fast = solve([adam], start, targets, (300,))[1], solve([NEWTON], start, targets, (15,))[1]
+    before = solve([NEWTON], start, targets, (0,))[1]
     assert (fast <= slow).all()
     assert (slow < 0.1 * before).all()
 
 
 def test_the_loss_is_that_of_the_poses():
-    start, evidence = case()
-    pose, loss, _ = solve([NEWTON], start, evidence, (7,))
+    start, targets = case()
+    pose, loss, _ = solve([NEWTON], start, targets, (7,))
     for n in range(B):
-        one, at, seen = jax.tree.map(lambda x, n=n: x[n], (pose, start, evidence))
+        one, at, seen = jax.tree.map(lambda x, n=n: x[n], (pose, start, targets))
         np.testing.assert_allclose(loss[n], total(one, at, seen, NEWTON), rtol=1e-5)
 
 
 def test_a_common_size_moves_as_one():
-    start, evidence = case()
-    pose, _, _ = solve([NEWTON], start, evidence, (10,))
+    start, targets = case()
+    pose, _, _ = solve([NEWTON], start, targets, (10,))
     assert pose.scale.shape == (B, 1)
     assert (np.abs(pose.scale - start.scale) > 1e-3).all()
     own = dataclasses.replace(start, scale=jnp.ones((B, T)))
-    pose, loss, _ = solve([NEWTON], own, evidence, (10,))
+    pose, loss, _ = solve([NEWTON], own, targets, (10,))
     assert (np.ptp(pose.scale, axis=1) > 1e-5).all()
     assert np.isfinite(loss).all()
 

@@ -8,7 +8,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.stages import BIRD, CAMERA, CONFIG, FIRST, RIG, SECOND, STEPS, B, case, knobs, problem, solve, total
+from support.stages import (
+    BIRD,
+    CAMERA,
+    CONFIG,
+    FIRST,
+    RIG,
+    SECOND,
+    STEPS,
+    B,
+    case,
+    hyperparameters,
+    problem,
+    solve,
+    total,
+)
 
 from jaxfit.fitting.solve import advance, begin, report
 from jaxfit.model.camera import project
@@ -23,11 +37,11 @@ SOLVERS = pytest.mark.parametrize("solver", ["adam", "levenberg_marquardt"])
 
 
 @jax.jit
-def loss_and_gradient(pose, evidence):
-    return jax.vmap(jax.value_and_grad(lambda p, e: total(p, p, e)))(pose, evidence)
+def loss_and_gradient(pose, targets):
+    return jax.vmap(jax.value_and_grad(lambda p, e: total(p, p, e)))(pose, targets)
 
 
-def adam(start, evidence, rates, carry):
+def adam(start, targets, rates, carry):
     """Kingma and Ba's algorithm 1, written out; `rates` scales each stage's step."""
     pose = {name: np.asarray(getattr(start, name), np.float64) for name in vars(start)}
     losses = []
@@ -36,7 +50,7 @@ def adam(start, evidence, rates, carry):
             m, v, t = {name: 0.0 for name in STEP}, {name: 0.0 for name in STEP}, 0
         for _ in range(STEPS):
             value, gradient = loss_and_gradient(
-                Pose(**{name: jnp.asarray(x, jnp.float32) for name, x in pose.items()}), evidence
+                Pose(**{name: jnp.asarray(x, jnp.float32) for name, x in pose.items()}), targets
             )
             t += 1
             for name, step in STEP.items():
@@ -50,9 +64,9 @@ def adam(start, evidence, rates, carry):
 
 
 def test_a_stage_is_adam():
-    start, evidence = case()
-    pose, loss, refused = solve([FIRST], start, evidence)
-    expected, losses = adam(start, evidence, [1.0], carry=False)
+    start, targets = case()
+    pose, loss, refused = solve([FIRST], start, targets)
+    expected, losses = adam(start, targets, [1.0], carry=False)
     np.testing.assert_allclose(loss, losses[-1], rtol=1e-5)
     assert (losses[-1] < 0.5 * losses[0]).all()
     for name in STEP:
@@ -62,10 +76,10 @@ def test_a_stage_is_adam():
 
 @pytest.mark.parametrize("carry", [True, False])
 def test_moments_go_on_or_start_anew(carry):
-    start, evidence = case()
+    start, targets = case()
     second = dataclasses.replace(SECOND, carry_moments=carry)
-    pose, loss, _ = solve([FIRST, second], start, evidence)
-    runs = {c: adam(start, evidence, [1.0, 0.5], carry=c) for c in (True, False)}
+    pose, loss, _ = solve([FIRST, second], start, targets)
+    runs = {c: adam(start, targets, [1.0, 0.5], carry=c) for c in (True, False)}
     np.testing.assert_allclose(loss, runs[carry][1][-1], rtol=1e-5)
     for name in STEP:
         np.testing.assert_allclose(getattr(pose, name), runs[carry][0][name], atol=2e-5, err_msg=name)
@@ -75,10 +89,10 @@ def test_moments_go_on_or_start_anew(carry):
 
 @SOLVERS
 def test_steps_may_be_taken_in_any_portions(solver):
-    start, evidence = case()
+    start, targets = case()
     stage = dataclasses.replace(FIRST, solver=solver)
-    whole, loss, _ = solve([stage], start, evidence)
-    parts, loss_of_parts, _ = solve([stage], start, evidence, (1, 2, 9, STEPS - 12))
+    whole, loss, _ = solve([stage], start, targets)
+    parts, loss_of_parts, _ = solve([stage], start, targets, (1, 2, 9, STEPS - 12))
     np.testing.assert_array_equal(loss, loss_of_parts)
     for name in vars(whole):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name), err_msg=name)
@@ -86,9 +100,9 @@ def test_steps_may_be_taken_in_any_portions(solver):
 
 @SOLVERS
 def test_what_is_fixed_does_not_move(solver):
-    start, evidence = case()
+    start, targets = case()
     first = dataclasses.replace(FIRST, solver=solver)
-    pose, _, _ = solve([first], start, evidence)
+    pose, _, _ = solve([first], start, targets)
     for name in ("bone_length", "betas"):
         np.testing.assert_array_equal(getattr(pose, name), getattr(start, name))
     np.testing.assert_array_equal(pose.transl[..., 2], start.transl[..., 2])
@@ -100,8 +114,8 @@ def test_what_is_fixed_does_not_move(solver):
     ):
         assert (np.abs(moved - still) > 1e-4).mean() > 0.9
     assert pose.scale.shape == (B, 1)  # one size for the window
-    only = dataclasses.replace(first, free=("global_orient",))
-    pose, _, _ = solve([only], start, evidence)
+    only = dataclasses.replace(first, optimised=("global_orient",))
+    pose, _, _ = solve([only], start, targets)
     for name in ("body_pose", "transl", "scale"):
         np.testing.assert_array_equal(getattr(pose, name), getattr(start, name))
 
@@ -119,20 +133,20 @@ def test_a_broken_bird_stands_still_and_leaves_the_other_alone(solver):
 
 
 def test_keypoints_that_are_off():
-    start, evidence = case()
+    start, targets = case()
     stage = dataclasses.replace(FIRST, keypoints_off=("crown", "no such keypoint"))
     crown = BIRD.keypoint_names.index("crown")
-    moved = eqx.tree_at(lambda e: e.keypoints_px, evidence, evidence.keypoints_px.at[:, :, crown].add(40.0))
-    results = [solve([s], start, e)[0] for s in (stage, FIRST) for e in (evidence, moved)]
+    moved = eqx.tree_at(lambda e: e.keypoints_px, targets, targets.keypoints_px.at[:, :, crown].add(40.0))
+    results = [solve([s], start, e)[0] for s in (stage, FIRST) for e in (targets, moved)]
     np.testing.assert_array_equal(results[0].body_pose, results[1].body_pose)
     assert np.abs(results[2].body_pose - results[3].body_pose).max() > 1e-3
 
 
 def test_the_report_is_weighted_and_of_the_poses_given():
-    start, evidence = case()
-    result = report(problem(), knobs(), start, start, evidence)
+    start, targets = case()
+    result = report(problem(), hyperparameters(), start, start, targets)
     assert set(result.loss) == set(FIRST.terms)
-    np.testing.assert_allclose(sum(result.loss.values()), loss_and_gradient(start, evidence)[0], rtol=1e-5)
+    np.testing.assert_allclose(sum(result.loss.values()), loss_and_gradient(start, targets)[0], rtol=1e-5)
     prior = (np.asarray(start.body_pose).reshape(B, -1) ** 2).sum(1) / 0.1  # the toy bird's own
     np.testing.assert_allclose(result.loss["pose_prior"], 10 * prior, rtol=1e-5, atol=1e-5)
     first = jax.tree.map(lambda x: x[0], start)
@@ -142,8 +156,8 @@ def test_the_report_is_weighted_and_of_the_poses_given():
 
 
 def test_one_program_for_any_steps_weights_and_rates(caplog):
-    start, evidence = case()
-    solve([FIRST], start, evidence)
+    start, targets = case()
+    solve([FIRST], start, targets)
     others = [
         (dataclasses.replace(FIRST, learning_rate=0.1, step_scale={"transl": (1.0, 1.0, 1.0), "scale": 1.0}), CONFIG),
         (FIRST, dataclasses.replace(CONFIG, terms={"keypoints": {"sigma_px": 9}, "velocity": 3})),
@@ -151,12 +165,12 @@ def test_one_program_for_any_steps_weights_and_rates(caplog):
     ]
     with caplog.at_level(logging.WARNING), jax.log_compiles():
         for stage, config in others:
-            own = problem(stage, config), knobs(stage, config)
-            state = begin(*own, jax.tree.map(jnp.copy, start), evidence, None)
-            advance((*own, evidence, jnp.int32(3)), state)
+            own = problem(stage, config), hyperparameters(stage, config)
+            state = begin(*own, jax.tree.map(jnp.copy, start), targets, None)
+            advance((*own, targets, jnp.int32(3)), state)
         assert not compiled(caplog, "advance")
         assert not compiled(caplog, "begin")
-        shorter = jax.tree.map(lambda x: x[:1], (start, evidence))
+        shorter = jax.tree.map(lambda x: x[:1], (start, targets))
         solve([FIRST], *shorter)
         assert len(compiled(caplog, "advance")) == 1  # so that the count can fail
 

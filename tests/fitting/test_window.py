@@ -10,7 +10,7 @@ from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.fitting.filtering import weighted_median_filter
-from jaxfit.fitting.window import cut_mask, cut_windows, filter_observations, load_evidence
+from jaxfit.fitting.window import cut_mask, cut_windows, filter_observations, load_targets
 from jaxfit.model.camera import crop_to_image
 
 K, WIDTH, HEIGHT = 5, 400, 300
@@ -119,36 +119,36 @@ def test_without_boxes_the_keypoints_make_the_crop():
 def test_keypoints_go_to_the_crop_and_back():
     observations = changed(walk([0, 1, 3, 4, 5]), [(1, 0), (0, 3)])
     windows = cut_windows(observations, config())
-    evidence = load_evidence(observations, windows, 64)
-    assert evidence.keypoints_px.shape == (len(windows), 4, K, 2)
-    back = crop_to_image(evidence.keypoints_px, windows.crop, 64)
+    targets = load_targets(observations, windows, 64)
+    assert targets.keypoints_px.shape == (len(windows), 4, K, 2)
+    back = crop_to_image(targets.keypoints_px, windows.crop, 64)
     measured = 0
     for w, t in zip(*np.nonzero(windows.present), strict=True):
         n, at = windows.track[w], windows.frame[w, t]
         np.testing.assert_allclose(back[w, t], observations.keypoints_px[n, at], atol=1e-3)
-        np.testing.assert_array_equal(evidence.confidence[w, t], observations.confidence[n, at])
-        assert (evidence.keypoints_px[w, t] > 0).all()
-        assert (evidence.keypoints_px[w, t] < 64).all()
-        assert evidence.has_mask[w, t]
+        np.testing.assert_array_equal(targets.confidence[w, t], observations.confidence[n, at])
+        assert (targets.keypoints_px[w, t] > 0).all()
+        assert (targets.keypoints_px[w, t] < 64).all()
+        assert targets.has_mask[w, t]
         expected = cut_mask(observations.mask(n, at), windows.crop[w, t], 64)
-        np.testing.assert_array_equal(evidence.mask[w, t], expected)
+        np.testing.assert_array_equal(targets.mask[w, t], expected)
         measured += 1
     assert measured == 8
     absent = ~windows.present
-    assert not evidence.confidence[absent].any()
-    assert not evidence.has_mask[absent].any()
-    assert not evidence.mask[absent].any()
-    assert not evidence.keypoints_px[absent].any()
-    np.testing.assert_array_equal(evidence.present, windows.present)
+    assert not targets.confidence[absent].any()
+    assert not targets.has_mask[absent].any()
+    assert not targets.mask[absent].any()
+    assert not targets.keypoints_px[absent].any()
+    np.testing.assert_array_equal(targets.present, windows.present)
 
 
 def test_a_bird_without_mask_keeps_its_keypoints():
     observations = walk(range(4))
     masks = {at: rle for at, rle in observations.masks.items() if at != (0, 1)}
-    evidence = load_evidence(dataclasses.replace(observations, masks=masks), cut_windows(observations, config()), 64)
-    assert evidence.has_mask[0].tolist() == [True, False, True, True]
-    assert evidence.present[0].all()
-    assert evidence.confidence[0, 1].all()
+    targets = load_targets(dataclasses.replace(observations, masks=masks), cut_windows(observations, config()), 64)
+    assert targets.has_mask[0].tolist() == [True, False, True, True]
+    assert targets.present[0].all()
+    assert targets.confidence[0, 1].all()
 
 
 @pytest.mark.parametrize(

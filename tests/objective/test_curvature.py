@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support import terms_by_hand as scenes
+from support import terms_by_hand
 
 from jaxfit.model.rotation import axis_angle_to_matrix, right_jacobian
 from jaxfit.objective.curvature import frame_rows
@@ -14,7 +14,7 @@ from jaxfit.objective.objective import evaluate_curvature
 from jaxfit.objective.registry import find_term, known_terms
 
 CURVED = [name for name in known_terms() if find_term(name).curvature]
-D = 3 * len(scenes.BIRD.joints) + 4
+D = 3 * len(terms_by_hand.BIRD.joints) + 4
 
 
 def settings(name):
@@ -32,25 +32,28 @@ def moved(pose, rows):
 
 
 @jax.jit
-def along(rows, pose, evidence):
+def along(rows, pose, targets):
     """Each curved term after a change by `rows`, three times over for its weight."""
-    scene = scenes.scene(moved(pose, rows), evidence)
-    return {name: 3.0 * find_term(name).function(scene, **find_term(name).settings) for name in CURVED}
+    window = terms_by_hand.posed_window(moved(pose, rows), targets)
+    return {name: 3.0 * find_term(name).function(window, **find_term(name).settings) for name in CURVED}
 
 
 @jax.jit
-def curvatures(rows, pose, evidence):
+def curvatures(rows, pose, targets):
     """For each term H·rows, H itself, and the diagonal it tells."""
-    scene, units = scenes.scene(pose, evidence), jnp.eye(scenes.T * D).reshape(-1, scenes.T, D)
+    window, units = (
+        terms_by_hand.posed_window(pose, targets),
+        jnp.eye(terms_by_hand.T * D).reshape(-1, terms_by_hand.T, D),
+    )
     found = {}
     for name in CURVED:
-        H = evaluate_curvature(scene, settings(name))
-        found[name] = H.product(rows), jax.vmap(H.product)(units).reshape(scenes.T * D, -1), H.diagonal
+        H = evaluate_curvature(window, settings(name))
+        found[name] = H.product(rows), jax.vmap(H.product)(units).reshape(terms_by_hand.T * D, -1), H.diagonal
     return found
 
 
 def change(seed, size):
-    return jnp.asarray(size * np.random.default_rng(seed).normal(size=(scenes.T, D)), jnp.float32)
+    return jnp.asarray(size * np.random.default_rng(seed).normal(size=(terms_by_hand.T, D)), jnp.float32)
 
 
 def test_the_paper_has_curvature():
@@ -69,30 +72,30 @@ def test_right_jacobian(theta):
 
 
 def test_keypoint_jacobian():
-    pose, evidence = scenes.window_pose(), scenes.seen()
+    pose, targets = terms_by_hand.window_pose(), terms_by_hand.seen()
     assert np.abs(pose.betas).max() > 0.1, "shape must count"
 
     def points(rows):
-        return scenes.scene(moved(pose, rows), evidence).keypoints_px.reshape(scenes.T, -1)
+        return terms_by_hand.posed_window(moved(pose, rows), targets).keypoints_px.reshape(terms_by_hand.T, -1)
 
-    expected = jax.jit(jax.jacfwd(points))(jnp.zeros((scenes.T, D)))
-    by_angles, by_place = jax.jit(lambda: scenes.scene(pose, evidence).keypoint_jacobian_px)()
+    expected = jax.jit(jax.jacfwd(points))(jnp.zeros((terms_by_hand.T, D)))
+    by_angles, by_place = jax.jit(lambda: terms_by_hand.posed_window(pose, targets).keypoint_jacobian_px)()
     found = jnp.concatenate([by_angles, by_place], axis=-1)
-    for t in range(scenes.T):
+    for t in range(terms_by_hand.T):
         np.testing.assert_allclose(found[t], expected[t, :, t], rtol=1e-3, atol=1e-3 * np.abs(expected).max())
 
 
 def test_rows_are_a_pose_frame_by_frame():
-    pose, rows = scenes.window_pose(), change(0, 1.0)
+    pose, rows = terms_by_hand.window_pose(), change(0, 1.0)
     np.testing.assert_allclose(frame_rows(moved(pose, rows)) - frame_rows(pose), rows, atol=3e-5)
     common = dataclasses.replace(pose, scale=jnp.array([1.5]))
-    assert frame_rows(common)[:, -1].tolist() == [1.5] * scenes.T
+    assert frame_rows(common)[:, -1].tolist() == [1.5] * terms_by_hand.T
 
 
 @pytest.mark.parametrize("name", CURVED)
 def test_products_and_diagonal_are_of_one_matrix(name):
     rows = change(1, 1.0)
-    product, H, diagonal = curvatures(rows, scenes.window_pose(), scenes.seen())[name]
+    product, H, diagonal = curvatures(rows, terms_by_hand.window_pose(), terms_by_hand.seen())[name]
     scale = np.abs(H).max()
     np.testing.assert_allclose(product.ravel(), H @ rows.ravel(), atol=1e-4 * scale)
     np.testing.assert_allclose(diagonal.ravel(), np.diagonal(H), atol=1e-5 * scale)
@@ -102,15 +105,15 @@ def test_products_and_diagonal_are_of_one_matrix(name):
 
 @pytest.mark.parametrize("name", ["pose_prior", "velocity", "acceleration"])
 def test_the_quadratic_is_above_the_term(name):
-    pose, evidence = scenes.window_pose(), scenes.seen()
-    still = jnp.zeros((scenes.T, D))
-    value = along(still, pose, evidence)[name]
-    gradient = jax.grad(lambda rows: along(rows, pose, evidence)[name])(still)
+    pose, targets = terms_by_hand.window_pose(), terms_by_hand.seen()
+    still = jnp.zeros((terms_by_hand.T, D))
+    value = along(still, pose, targets)[name]
+    gradient = jax.grad(lambda rows: along(rows, pose, targets)[name])(still)
     for seed, size in enumerate((0.01, 0.1, 0.5, 2.0)):
         rows = change(seed, size)
-        product = curvatures(rows, pose, evidence)[name][0]
+        product = curvatures(rows, pose, targets)[name][0]
         bound = value + jnp.sum(gradient * rows) + 0.5 * jnp.sum(rows * product)
-        after = along(rows, pose, evidence)[name]
+        after = along(rows, pose, targets)[name]
         assert after <= bound * (1 + 1e-5)
         if name == "pose_prior":
             assert after == pytest.approx(float(bound), rel=1e-4)
@@ -118,11 +121,11 @@ def test_the_quadratic_is_above_the_term(name):
 
 def test_keypoints_bound_is_that_of_the_reweighted_errors():
     """H = JᵀWJ, and the weighted squares touch Geman-McClure from above."""
-    pose, evidence = scenes.window_pose(), scenes.seen()
-    scene, sigma = scenes.scene(pose, evidence), 50.0
-    J = np.concatenate(scene.keypoint_jacobian_px, axis=-1)
-    e = np.asarray(scene.keypoints_px - evidence.keypoints_px, np.float64)
-    c = np.asarray(evidence.confidence, np.float64)[..., None]
+    pose, targets = terms_by_hand.window_pose(), terms_by_hand.seen()
+    window, sigma = terms_by_hand.posed_window(pose, targets), 50.0
+    J = np.concatenate(window.keypoint_jacobian_px, axis=-1)
+    e = np.asarray(window.keypoints_px - targets.keypoints_px, np.float64)
+    c = np.asarray(targets.confidence, np.float64)[..., None]
 
     def robust(e):
         return c * sigma**2 * e**2 / (sigma**2 + e**2)
@@ -132,8 +135,8 @@ def test_keypoints_bound_is_that_of_the_reweighted_errors():
     for size in (0.1, 5.0, 100.0):
         other = e + size * rng.normal(size=e.shape)
         assert (robust(other) <= robust(e) + 0.5 * weight * (other**2 - e**2) + 1e-9).all()
-    H = curvatures(change(0, 1.0), pose, evidence)["keypoints"][1].reshape(scenes.T, D, scenes.T, D)
-    for t in range(scenes.T):
+    H = curvatures(change(0, 1.0), pose, targets)["keypoints"][1].reshape(terms_by_hand.T, D, terms_by_hand.T, D)
+    for t in range(terms_by_hand.T):
         expected = 3.0 * J[t].T @ (weight[t].reshape(-1, 1) * J[t])
         np.testing.assert_allclose(H[t, :, t], expected, atol=1e-4 * np.abs(expected).max())
         H = H.at[t, :, t].set(0)
@@ -141,19 +144,21 @@ def test_keypoints_bound_is_that_of_the_reweighted_errors():
 
 
 @pytest.mark.parametrize("name", CURVED)
-@pytest.mark.parametrize("missing", range(scenes.T))
+@pytest.mark.parametrize("missing", range(terms_by_hand.T))
 def test_missing_frames_pull_at_nothing(name, missing):
-    evidence = scenes.without(scenes.seen(), missing)
-    _, H, diagonal = curvatures(change(0, 1.0), scenes.window_pose(), evidence)[name]
-    H = H.reshape(scenes.T, D, scenes.T, D)
+    targets = terms_by_hand.without(terms_by_hand.seen(), missing)
+    _, H, diagonal = curvatures(change(0, 1.0), terms_by_hand.window_pose(), targets)[name]
+    H = H.reshape(terms_by_hand.T, D, terms_by_hand.T, D)
     assert not np.any(H[missing])
     assert not np.any(H[:, :, missing])
     assert not np.any(diagonal[missing])
 
 
 def test_frames_that_are_equal_have_finite_curvature():
-    pose = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), scenes.window_pose())
-    pose = dataclasses.replace(pose, bone_length=scenes.window_pose().bone_length, betas=scenes.window_pose().betas)
-    for name, (_, H, _) in curvatures(change(0, 1.0), pose, scenes.seen()).items():
+    pose = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), terms_by_hand.window_pose())
+    pose = dataclasses.replace(
+        pose, bone_length=terms_by_hand.window_pose().bone_length, betas=terms_by_hand.window_pose().betas
+    )
+    for name, (_, H, _) in curvatures(change(0, 1.0), pose, terms_by_hand.seen()).items():
         assert np.isfinite(H).all(), name
         assert np.abs(H).max() > 0

@@ -7,7 +7,7 @@ from importlib import metadata
 import jax
 import jax.numpy as jnp
 import pytest
-from support.terms_by_hand import scene, seen, window_pose
+from support.terms_by_hand import posed_window, seen, window_pose
 
 import jaxfit
 from jaxfit.errors import InputError
@@ -19,21 +19,21 @@ MODULE = """
 import jax.numpy as jnp
 from jaxfit.objective.registry import term
 
-def plain(scene, *, power=2.0):
-    return jnp.sum(jnp.abs(scene.pose.body_pose) ** power)
+def plain(window, *, power=2.0):
+    return jnp.sum(jnp.abs(window.pose.body_pose) ** power)
 
 @term(name="marked", positive=["width"], compares_masks=True)
-def decorated(scene, *, width=1, offset=0.0):
-    return jnp.sum(scene.evidence.mask) / width + offset
+def decorated(window, *, width=1, offset=0.0):
+    return jnp.sum(window.targets.mask) / width + offset
 
 number = 3.0
-def no_default(scene, *, x): return 0.0
-def wrong_default(scene, *, x=None): return 0.0
-def flag(scene, *, x=True): return 0.0
-def positional(scene, x=1.0): return 0.0
+def no_default(window, *, x): return 0.0
+def wrong_default(window, *, x=None): return 0.0
+def flag(window, *, x=True): return 0.0
+def positional(window, x=1.0): return 0.0
 def nothing(): return 0.0
-def only(*, scene): return 0.0
-def weighs(scene, *, weight=1.0): return 0.0
+def only(*, window): return 0.0
+def weighs(window, *, weight=1.0): return 0.0
 """
 
 
@@ -57,8 +57,8 @@ def test_a_term_of_this_session():
     assert jaxfit.term is term
 
     @jaxfit.term
-    def stillness(scene, *, beta=2):
-        return beta * jnp.sum(scene.pose.body_pose**2)
+    def stillness(window, *, beta=2):
+        return beta * jnp.sum(window.pose.body_pose**2)
 
     found = find_term("stillness")
     assert found.function is stillness
@@ -67,25 +67,25 @@ def test_a_term_of_this_session():
     pose = window_pose()
     settings = {"stillness": {"weight": 3.0, "beta": 0.5}}
     expected = 1.5 * float(jnp.sum(pose.body_pose**2))
-    assert float(weighted_sum(scene(pose, seen()), settings)) == pytest.approx(expected, rel=1e-5)
+    assert float(weighted_sum(posed_window(pose, seen()), settings)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_cell_run_twice_is_its_new_self_also_in_compiled_programs():
     @jax.jit
     def total(pose):
-        return weighted_sum(scene(pose, seen()), {"again": {"weight": 1.0}})
+        return weighted_sum(posed_window(pose, seen()), {"again": {"weight": 1.0}})
 
     for value in (1.0, 2.0):
 
         @term(name="again")
-        def own(scene):
+        def own(window):
             return jnp.float32(value)  # noqa: B023
 
         assert float(total(window_pose())) == value
 
 
 def test_names_are_taken_once():
-    def velocity(scene):
+    def velocity(window):
         return 0.0
 
     for taken in ("velocity", "keypoints"):
@@ -106,13 +106,13 @@ def test_by_path(package):
     assert "own_priors:plain" not in known_terms()
     assert "marked" in known_terms()
     pose = window_pose()
-    value = evaluate_terms(scene(pose, seen()), {"own_priors:plain": {"weight": 1.0, "power": 1.0}})
+    value = evaluate_terms(posed_window(pose, seen()), {"own_priors:plain": {"weight": 1.0, "power": 1.0}})
     assert float(value["own_priors:plain"]) == pytest.approx(float(jnp.abs(pose.body_pose).sum()), rel=1e-5)
 
 
 def test_a_module_that_is_edited(package):
     assert find_term("own_priors:plain").settings == {"power": 2.0}
-    (package / "own_priors.py").write_text("def plain(scene, *, changed=7.25):\n    return 0.0\n")
+    (package / "own_priors.py").write_text("def plain(window, *, changed=7.25):\n    return 0.0\n")
     importlib.invalidate_caches()
     importlib.reload(sys.modules["own_priors"])
     assert find_term("own_priors:plain").settings == {"changed": 7.25}
@@ -142,11 +142,11 @@ def test_by_entry_point(package, monkeypatch):
         ("own_priors:no_default", ("'x'", "default is no number")),
         ("own_priors:wrong_default", ("'x'", "default is no number")),
         ("own_priors:flag", ("'x'", "default is no number")),
-        ("own_priors:positional", ("'x' beside the scene",)),
-        ("own_priors:nothing", ("takes no scene",)),
-        ("own_priors:only", ("takes no scene",)),
+        ("own_priors:positional", ("'x' beside the window",)),
+        ("own_priors:nothing", ("takes no window",)),
+        ("own_priors:only", ("takes no window",)),
         ("own_priors:weighs", ("'weight'",)),
-        ("builtins:max", ("takes no scene",)),
+        ("builtins:max", ("takes no window",)),
         (":plain", ("cannot be imported",)),
         ("own_priors:", ("has no function",)),
     ],
@@ -162,7 +162,7 @@ def test_unknown_names():
     with pytest.raises(KeyError):
         find_term("unknown")
     with pytest.raises(InputError, match=r"'width'.*positive"):
-        term(positive=["width"])(lambda scene: 0.0)
+        term(positive=["width"])(lambda window: 0.0)
 
 
 @pytest.mark.parametrize(
@@ -176,21 +176,23 @@ def test_unknown_names():
     ],
 )
 def test_a_term_is_one_real_number(returned, said):
-    term(name="odd")(lambda scene: returned())
+    term(name="odd")(lambda window: returned())
     with pytest.raises(InputError, match=rf"term 'odd': returned .*{said}"):
-        evaluate_terms(scene(window_pose(), seen()), {"odd": {"weight": 1.0}})
+        evaluate_terms(posed_window(window_pose(), seen()), {"odd": {"weight": 1.0}})
 
 
 def test_a_sweep_over_a_term_of_ones_own_compiles_once():
     traces = []
 
     @term(name="counted")
-    def own(scene, *, power=2.0):
+    def own(window, *, power=2.0):
         traces.append(None)
-        return jnp.sum(jnp.abs(scene.pose.body_pose) ** power)
+        return jnp.sum(jnp.abs(window.pose.body_pose) ** power)
 
     pose = window_pose()
-    sweep = jax.jit(jax.vmap(lambda w, p: weighted_sum(scene(pose, seen()), {"counted": {"weight": w, "power": p}})))
+    sweep = jax.jit(
+        jax.vmap(lambda w, p: weighted_sum(posed_window(pose, seen()), {"counted": {"weight": w, "power": p}}))
+    )
     found = sweep(jnp.array([1.0, 2.0, 1.0]), jnp.array([1.0, 1.0, 2.0]))
     sweep(jnp.array([5.0, 2.0, 1.0]), jnp.array([1.0, 3.0, 2.0]))
     assert len(traces) == 1

@@ -17,7 +17,7 @@ from jaxfit.errors import InputError
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.rotation import axis_angle_to_matrix
 from jaxfit.objective.anatomy import feet_on_ground, joint_limits
-from jaxfit.objective.scene import Scene, priors_of
+from jaxfit.objective.posed_window import PosedWindow, priors_of
 from jaxfit.objective.smoothness import geodesic_velocity, huber, huber_velocity, low_pass
 
 BONES, L = 4, 8
@@ -32,13 +32,13 @@ def window(frames=L, seed=0, missing=(), spread=1.0):
 
 def value(term, orient, body, present, **settings):
     orient, body = jnp.asarray(orient, jnp.float32), jnp.asarray(body, jnp.float32)
-    scene = SimpleNamespace(
+    window = SimpleNamespace(
         pose=SimpleNamespace(global_orient=orient, body_pose=body),
         R_camera_root=axis_angle_to_matrix(orient),
         R_parent_child=axis_angle_to_matrix(body),
         present=jnp.asarray(present),
     )
-    return term(scene, **settings)
+    return term(window, **settings)
 
 
 def angle(a, b):
@@ -188,29 +188,29 @@ LIMITED = toy_bird()
 LIMITED = replace(LIMITED, joint_limits=jnp.broadcast_to(jnp.array([-0.2, 0.5]), (7, 3, 2)))
 
 
-def real_scene(bird, pose, evidence):
-    return Scene(pose, pose, evidence, fold_bird(bird), priors_of(bird), CAMERA, RASTER)
+def real_scene(bird, pose, targets):
+    return PosedWindow(pose, pose, targets, fold_bird(bird), priors_of(bird), CAMERA, RASTER)
 
 
 def test_joint_limits():
-    pose, evidence = window_pose(), seen()
+    pose, targets = window_pose(), seen()
     flat = jnp.zeros_like(pose.body_pose)
     inside = flat.at[0, 0, 0].set(0.5).at[1, 3, 2].set(-0.2)
     outside = inside.at[0, 0, 0].set(0.8).at[1, 3, 2].set(-0.4).at[2, 6, 1].set(2.5)
 
-    def limits(body, evidence=evidence):
+    def limits(body, targets=targets):
         moved = replace(pose, body_pose=body)
-        return joint_limits(real_scene(LIMITED, moved, evidence))
+        return joint_limits(real_scene(LIMITED, moved, targets))
 
     assert float(limits(inside)) == 0
     assert float(limits(outside)) == pytest.approx(0.3**2 + 0.2**2 + 2.0**2, rel=1e-5)
-    absent = replace(evidence, present=jnp.array([True, True, False]))
+    absent = replace(targets, present=jnp.array([True, True, False]))
     assert float(limits(outside, absent)) == pytest.approx(0.3**2 + 0.2**2, rel=1e-5)
     slope = jax.grad(limits)(outside)
     assert float(slope[2, 6, 1]) == pytest.approx(4.0, rel=1e-5)
     assert np.count_nonzero(slope) == 3
     with pytest.raises(InputError, match="no joint limits"):
-        joint_limits(real_scene(toy_bird(), pose, evidence))
+        joint_limits(real_scene(toy_bird(), pose, targets))
 
 
 def test_feet_that_stand_and_feet_that_step():
@@ -220,15 +220,15 @@ def test_feet_that_stand_and_feet_that_step():
     still = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), one)
     still = replace(still, bone_length=one.bone_length, betas=one.betas)
     corner = jnp.array([[0.0, 0.0], [3.0, -1.0], [6.0, 0.0]])
-    evidence = seen()
-    evidence = replace(evidence, corner_px=corner)
-    feet = list(real_scene(bird, still, evidence).keypoint_indices("left_foot", "right_foot"))
-    z = np.asarray(real_scene(bird, still, evidence).keypoints_cam[0, feet, 2])
+    targets = seen()
+    targets = replace(targets, corner_px=corner)
+    feet = list(real_scene(bird, still, targets).keypoint_indices("left_foot", "right_foot"))
+    z = np.asarray(real_scene(bird, still, targets).keypoints_cam[0, feet, 2])
     # what a still bird in the crop slides by in the world, where the crop moves by these pixels
     d = np.hypot([3.0, 3.0], [1.0, 1.0])[:, None] * z / CAMERA.focal_px
     expected = (0.25 * d**2 / (0.25 + d**2)).sum()
-    assert float(feet_on_ground(real_scene(bird, still, evidence))) == pytest.approx(expected, rel=1e-3)
-    fixed = replace(evidence, corner_px=jnp.zeros((3, 2)) + 7.0)
+    assert float(feet_on_ground(real_scene(bird, still, targets))) == pytest.approx(expected, rel=1e-3)
+    fixed = replace(targets, corner_px=jnp.zeros((3, 2)) + 7.0)
     assert float(feet_on_ground(real_scene(bird, still, fixed))) == 0
     far = replace(still, transl=still.transl + jnp.array([[0, 0, 0], [40.0, 0, 0], [80.0, 0, 0]]))
     slope = jax.grad(lambda pose: feet_on_ground(real_scene(bird, pose, fixed)))(far).transl

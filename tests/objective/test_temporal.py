@@ -20,11 +20,11 @@ def window(frames, seed=0, missing=()):
 
 
 def value(term, orient, body, present, **settings):
-    scene = SimpleNamespace(
+    window = SimpleNamespace(
         pose=SimpleNamespace(global_orient=jnp.asarray(orient), body_pose=jnp.asarray(body)),
-        evidence=SimpleNamespace(present=jnp.asarray(present)),
+        targets=SimpleNamespace(present=jnp.asarray(present)),
     )
-    return term(scene, **settings)
+    return term(window, **settings)
 
 
 def by_hand(order, orient, body, present, beta_global=10.0, beta_pose=1.0):

@@ -22,7 +22,7 @@ from support.terms_by_hand import (
     every_gradient,
     every_term,
     oracle,
-    scene,
+    posed_window,
     seen,
     soft_silhouettes,
     window_pose,
@@ -31,18 +31,18 @@ from support.terms_by_hand import (
 
 from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
+from jaxfit.objective.posed_window import PosedWindow, Priors, priors_of
 from jaxfit.objective.registry import find_term
-from jaxfit.objective.scene import Priors, Scene, priors_of
 from jaxfit.objective.terms import geman_mcclure, pose_prior
 
 
 @pytest.mark.parametrize("seed", [0, 10])
 def test_every_term_is_its_equation(seed):
-    pose, start, evidence = window_pose(seed), window_pose(seed + 50), seen(seed)
-    values = every_term(pose, start, evidence, all_settings())
+    pose, start, targets = window_pose(seed), window_pose(seed + 50), seen(seed)
+    values = every_term(pose, start, targets, all_settings())
     assert set(values) == set(TERMS)
     for name, value in values.items():
-        expected = oracle(name, pose, start, evidence, seed)
+        expected = oracle(name, pose, start, targets, seed)
         assert expected > 0, name
         assert float(value) == pytest.approx(expected, rel=2e-4), name
 
@@ -57,15 +57,15 @@ def test_stored_geman_mcclure_and_mahalanobis(reference_dir):
     priors = priors_of(import_sources("avian-mesh", [reference_dir / "models" / "avian_mesh"]))
     for body_pose, distance in zip(poses, expected, strict=True):
         pose = dataclasses.replace(window_pose(), body_pose=jnp.asarray(body_pose.reshape(1, -1, 3)))
-        evidence = dataclasses.replace(seen(), present=jnp.ones(1, bool))
-        value = pose_prior(Scene(pose, pose, evidence, RIG, priors, CAMERA, RASTER))
+        targets = dataclasses.replace(seen(), present=jnp.ones(1, bool))
+        value = pose_prior(PosedWindow(pose, pose, targets, RIG, priors, CAMERA, RASTER))
         assert float(value) == pytest.approx(distance, rel=1e-4)
 
 
 def test_what_was_not_seen_pulls_at_nothing():
     pose, start = window_pose(), window_pose(50)
-    evidence = without(seen(), 1)
-    results = every_gradient(pose, start, evidence, all_settings())
+    targets = without(seen(), 1)
+    results = every_gradient(pose, start, targets, all_settings())
     # whatever stands in the absent frame
     moved = dataclasses.replace(
         pose,
@@ -74,7 +74,7 @@ def test_what_was_not_seen_pulls_at_nothing():
         transl=pose.transl.at[1].add(9.0),
         scale=pose.scale.at[1].set(3.0),
     )
-    again = every_term(moved, start, evidence, all_settings())
+    again = every_term(moved, start, targets, all_settings())
     for name, (value, gradient) in results.items():
         assert float(again[name]) == pytest.approx(float(value), rel=1e-6), name
         for field in ("global_orient", "body_pose", "transl", "scale"):
@@ -87,10 +87,10 @@ def test_what_was_not_seen_pulls_at_nothing():
 
 
 def test_a_frame_without_mask_is_not_compared():
-    pose, evidence = window_pose(), seen()
-    bare = dataclasses.replace(evidence, has_mask=jnp.array([True, False, True]))
+    pose, targets = window_pose(), seen()
+    bare = dataclasses.replace(targets, has_mask=jnp.array([True, False, True]))
     value = float(every_term(pose, pose, bare, all_settings())["mask"])
-    e = np.abs(soft_silhouettes(0) - np.asarray(evidence.mask))
+    e = np.abs(soft_silhouettes(0) - np.asarray(targets.mask))
     assert value == pytest.approx(e[[0, 2]].sum(), rel=2e-4)
 
 
@@ -122,8 +122,8 @@ def edges():
 
 @pytest.mark.parametrize("edge", edges())
 def test_finite_at_the_edges(edge):
-    pose, evidence = edges()[edge]
-    for name, (value, gradient) in every_gradient(pose, pose, evidence, all_settings()).items():
+    pose, targets = edges()[edge]
+    for name, (value, gradient) in every_gradient(pose, pose, targets, all_settings()).items():
         assert np.isfinite(value), name
         for leaf in jax.tree.leaves(gradient):
             assert np.isfinite(leaf).all(), name
@@ -134,10 +134,10 @@ SMOOTH = [n for n in TERMS if n not in ("mask", "mask_smooth_l1")]  # theirs sta
 
 def test_gradients_are_right():
     """Finite differences of the whole sum; weights bring every term to a similar size."""
-    pose, start, evidence = window_pose(), window_pose(50), seen()
-    values = every_term(pose, start, evidence, all_settings())
+    pose, start, targets = window_pose(), window_pose(50), seen()
+    values = every_term(pose, start, targets, all_settings())
     settings = {name: {**all_settings()[name], "weight": 10.0 / float(values[name])} for name in SMOOTH}
-    settings["start_pull"]["weight"] *= 0.1  # its corners are no matter for finite differences
+    settings["stage_anchor"]["weight"] *= 0.1  # its corners are no matter for finite differences
 
     @jax.jit
     def total(orient, body, offset, scale, bones, betas):
@@ -150,7 +150,7 @@ def test_gradients_are_right():
             bone_length=bones,
             betas=betas,
         )
-        return weighted_sum(scene(moved, evidence, start), settings)
+        return weighted_sum(posed_window(moved, targets, start), settings)
 
     at = (pose.global_orient, pose.body_pose, jnp.zeros((T, 3)), pose.scale, pose.bone_length, pose.betas)
     check_grads(total, at, order=1, modes=["rev"], eps=2e-3, atol=0.05, rtol=0.02)
@@ -164,24 +164,24 @@ def test_safe_norm():
 
 
 def test_the_sum_is_weighted():
-    pose, start, evidence = window_pose(), window_pose(50), seen()
+    pose, start, targets = window_pose(), window_pose(50), seen()
     rng = np.random.default_rng(0)
     settings = {name: {**values, "weight": float(rng.uniform(0, 9))} for name, values in all_settings().items()}
-    values = every_term(pose, start, evidence, settings)
+    values = every_term(pose, start, targets, settings)
     expected = sum(settings[name]["weight"] * float(value) for name, value in values.items())
-    total = jax.jit(lambda settings: weighted_sum(scene(pose, evidence, start), settings))(settings)
+    total = jax.jit(lambda settings: weighted_sum(posed_window(pose, targets, start), settings))(settings)
     assert float(total) == pytest.approx(expected, rel=1e-5)
-    assert float(weighted_sum(scene(pose, evidence), {})) == 0
+    assert float(weighted_sum(posed_window(pose, targets), {})) == 0
 
 
 def test_settings_are_traced():
     """Another weight or σ is no new program, and a sweep over them is one vmap."""
-    pose, evidence, traces = window_pose(), seen(), []
+    pose, targets, traces = window_pose(), seen(), []
     names = ("keypoints", "pose_prior", "velocity")
 
     def total(settings):
         traces.append(None)
-        return weighted_sum(scene(pose, evidence), settings)
+        return weighted_sum(posed_window(pose, targets), settings)
 
     def settings(weight, sigma, beta):
         own = {"keypoints": {"sigma_px": sigma}, "velocity": {"beta_global": beta, "beta_pose": 1.0}}
@@ -209,12 +209,12 @@ def test_settings_of_terms():
 
 def test_one_size_for_a_window():
     """A common scale acts as the same scale in every frame."""
-    pose, evidence = window_pose(), seen()
+    pose, targets = window_pose(), seen()
     common = dataclasses.replace(pose, scale=pose.scale[:1])
     spread = dataclasses.replace(pose, scale=jnp.broadcast_to(pose.scale[:1], (T,)))
-    np.testing.assert_allclose(scene(common, evidence).keypoints_px, scene(spread, evidence).keypoints_px)
+    np.testing.assert_allclose(posed_window(common, targets).keypoints_px, posed_window(spread, targets).keypoints_px)
     keypoints, _ = pose_window(BIRD, spread)
-    np.testing.assert_allclose(scene(common, evidence).keypoints_cam, keypoints, atol=1e-5)
+    np.testing.assert_allclose(posed_window(common, targets).keypoints_cam, keypoints, atol=1e-5)
 
 
 def test_whitened_priors():
@@ -233,6 +233,6 @@ def test_whitened_priors():
 def test_terms_that_draw_the_silhouette_say_so(name):
     """A term that is not marked gets empty masks; one that is marked in vain makes its stage slow."""
     pose = window_pose()
-    one = scene(pose, seen())
+    one = posed_window(pose, seen())
     evaluate_terms(one, {name: {"weight": 1.0, **find_term(name).settings}})
     assert find_term(name).compares_masks == ("vertices_screen" in vars(one))

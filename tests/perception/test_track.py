@@ -99,7 +99,7 @@ def test_swaps_are_repaired_if_asked(video):
             return points, confidence
 
     def run(repair):
-        config = TrackConfig(repair_swaps=repair)
+        config = TrackConfig(repair_left_right_flips=repair)
         return track_video(video, config, TrueSegmenter(FOOTAGE), Mixed(FOOTAGE)).keypoints_px
 
     truth = track_video(video, TrackConfig(), TrueSegmenter(FOOTAGE), TrueKeypoints(FOOTAGE)).keypoints_px

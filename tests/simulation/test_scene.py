@@ -60,7 +60,7 @@ def test_the_true_poses_give_the_masks_and_keypoints(scene):
         # the keypoint is a mean of vertices in space, so its projection is nearly the mean of theirs
         np.testing.assert_allclose(points[labelled, :2], scene.truth.keypoints_px[n, t][labelled], atol=0.2)
     np.testing.assert_allclose(
-        scene.poses.keypoints_2d[scene.truth.confidence > 0], scene.truth.keypoints_px[scene.truth.confidence > 0]
+        scene.poses.keypoints_px[scene.truth.confidence > 0], scene.truth.keypoints_px[scene.truth.confidence > 0]
     )
 
 

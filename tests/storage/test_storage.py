@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxfit.errors import InputError
-from jaxfit.storage.files import conform, new_folder, write_whole
+from jaxfit.storage.files import new_folder, validate_arrays, write_whole
 from jaxfit.storage.npz import load_npz
 
 
@@ -276,11 +276,11 @@ def test_what_is_no_file(tmp_path):
 
 def test_conform_names_what_disagrees():
     layout = {"a": ("N 3", np.float32), "b": ("N", np.int64)}
-    arrays = conform({"a": np.ones((2, 3), int), "b": [1, 2]}, layout)
+    arrays = validate_arrays({"a": np.ones((2, 3), int), "b": [1, 2]}, layout)
     assert arrays["a"].dtype == np.float32
     with pytest.raises(ValueError, match=r"b must have shape \(N\), not \(3,\): axis 0 should be 2: N is 2 in a"):
-        conform({"a": np.ones((2, 3)), "b": [1, 2, 3]}, layout)
+        validate_arrays({"a": np.ones((2, 3)), "b": [1, 2, 3]}, layout)
     with pytest.raises(ValueError, match="axis 1 should be 3"):
-        conform({"a": np.ones((2, 4)), "b": [1, 2]}, layout)
+        validate_arrays({"a": np.ones((2, 4)), "b": [1, 2]}, layout)
     with pytest.raises(ValueError, match="b must be of type int64, not float64"):
-        conform({"a": np.ones((2, 3)), "b": [1.0, 2]}, layout)
+        validate_arrays({"a": np.ones((2, 3)), "b": [1.0, 2]}, layout)

@@ -8,11 +8,11 @@ import numpy as np
 
 from jaxfit.config.schema import FitConfig, StageConfig
 from jaxfit.fitting.solve import advance, begin
-from jaxfit.fitting.stages import stage_knobs, stage_problem
+from jaxfit.fitting.stages import stage_hyperparameters, stage_problem
 from jaxfit.model.camera import Camera, project
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.objective.objective import weighted_sum
-from jaxfit.objective.scene import Evidence, Scene, priors_of
+from jaxfit.objective.posed_window import PosedWindow, Targets, priors_of
 from jaxfit.simulation.motion import smooth_motion
 from support.birds import toy_bird
 
@@ -34,8 +34,8 @@ def problem(stage=FIRST, config=CONFIG):
     return stage_problem(config, stage, RIG, PRIORS, CAMERA)
 
 
-def knobs(stage=FIRST, config=CONFIG, lanes=B):
-    return stacked([stage_knobs(config, stage, BIRD.keypoint_names)] * lanes)
+def hyperparameters(stage=FIRST, config=CONFIG, lanes=B):
+    return stacked([stage_hyperparameters(config, stage, BIRD.keypoint_names)] * lanes)
 
 
 def stacked(values):
@@ -43,13 +43,13 @@ def stacked(values):
 
 
 def case(broken=None):
-    """Starts a little off the truth, and evidence; the keypoints of bird `broken` are beyond all numbers."""
+    """Starts a little off the truth, and targets; the keypoints of bird `broken` are beyond all numbers."""
     truths = [smooth_motion(BIRD, T, seed) for seed in range(B)]
-    evidence = []
+    targets = []
     for n, truth in enumerate(truths):
         points = project(window_keypoints(RIG, window_transforms(RIG, truth), truth), CAMERA)
-        evidence.append(
-            Evidence(
+        targets.append(
+            Targets(
                 keypoints_px=jnp.full_like(points, 1e30) if n == broken else points,
                 confidence=jnp.ones(points.shape[:2]),
                 mask=jnp.zeros((T, 0, 0), jnp.uint8),
@@ -67,22 +67,22 @@ def case(broken=None):
         transl=truth.transl + jnp.array([0.5, -0.5, 0]),
         scale=jnp.ones((B, 1)),
     )
-    return start, stacked(evidence)
+    return start, stacked(targets)
 
 
-def solve(stages, start, evidence, chunks=(STEPS,)):
+def solve(stages, start, targets, chunks=(STEPS,)):
     """Run stages as the fit does; final poses, losses before the last step, refused steps."""
     before, pose = None, start
     for stage in stages:
-        own = problem(stage), knobs(stage, lanes=len(evidence.present))
+        own = problem(stage), hyperparameters(stage, lanes=len(targets.present))
         # the solver gives up what it is given: keep the caller's start
-        state = begin(*own, jax.tree.map(jnp.copy, pose), evidence, before if stage.carry_moments else None)
+        state = begin(*own, jax.tree.map(jnp.copy, pose), targets, before if stage.carry_moments else None)
         for steps in chunks:
-            state, loss, refused = advance((*own, evidence, jnp.int32(steps)), state)
+            state, loss, refused = advance((*own, targets, jnp.int32(steps)), state)
         pose, before = state.pose, state
     return jax.tree.map(np.asarray, (pose, loss, refused))
 
 
-def total(pose, start, evidence, stage=FIRST):
+def total(pose, start, targets, stage=FIRST):
     settings = CONFIG.stage_settings(stage)
-    return weighted_sum(Scene(pose, start, evidence, RIG, PRIORS, CAMERA, problem().raster), settings)
+    return weighted_sum(PosedWindow(pose, start, targets, RIG, PRIORS, CAMERA, problem().raster), settings)

@@ -13,8 +13,8 @@ from scipy.special import huber
 from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.objective.objective import evaluate_terms
+from jaxfit.objective.posed_window import PosedWindow, Raster, Targets, priors_of
 from jaxfit.objective.registry import find_term, known_terms
-from jaxfit.objective.scene import Evidence, Raster, Scene, priors_of
 from jaxfit.raster.silhouette import Blur
 from support.birds import random_pose, skin_by_hand, toy_bird
 
@@ -55,7 +55,7 @@ def seen(seed=0):
     rng = np.random.default_rng(seed)
     mask = np.zeros((T, SIZE, SIZE), np.uint8)
     mask[:, 8:22, 6:25] = 1
-    return Evidence(
+    return Targets(
         keypoints_px=jnp.asarray(rng.uniform(0, SIZE, (T, BIRD.num_keypoints, 2)), jnp.float32),
         confidence=jnp.asarray(rng.uniform(0.1, 1, (T, BIRD.num_keypoints)), jnp.float32),
         mask=jnp.asarray(mask),
@@ -65,18 +65,18 @@ def seen(seed=0):
     )
 
 
-def without(evidence, t):
-    """The same with frame `t` absent, as the fit's own evidence has it."""
+def without(targets, t):
+    """The same with frame `t` absent, as the fit's own targets has it."""
     return dataclasses.replace(
-        evidence,
-        confidence=evidence.confidence.at[t].set(0),
-        has_mask=evidence.has_mask.at[t].set(False),
-        present=evidence.present.at[t].set(False),
+        targets,
+        confidence=targets.confidence.at[t].set(0),
+        has_mask=targets.has_mask.at[t].set(False),
+        present=targets.present.at[t].set(False),
     )
 
 
-def scene(pose, evidence, start=None):
-    return Scene(pose, pose if start is None else start, evidence, RIG, PRIORS, CAMERA, RASTER)
+def posed_window(pose, targets, start=None):
+    return PosedWindow(pose, pose if start is None else start, targets, RIG, PRIORS, CAMERA, RASTER)
 
 
 def all_settings():
@@ -84,16 +84,16 @@ def all_settings():
 
 
 @jax.jit
-def every_term(pose, start, evidence, settings):
-    return evaluate_terms(scene(pose, evidence, start), settings)
+def every_term(pose, start, targets, settings):
+    return evaluate_terms(posed_window(pose, targets, start), settings)
 
 
 @jax.jit
-def every_gradient(pose, start, evidence, settings):
+def every_gradient(pose, start, targets, settings):
     """d term / d pose, for each term by itself, in one program."""
 
     def terms(pose):
-        values = evaluate_terms(scene(pose, evidence, start), settings)
+        values = evaluate_terms(posed_window(pose, targets, start), settings)
         return jnp.stack([values[name] for name in TERMS])
 
     value, pull = jax.vjp(terms, pose)
@@ -150,20 +150,20 @@ def angles_between(one, other):
     return (Rotation.from_rotvec(a.astype(float)).inv() * Rotation.from_rotvec(b.astype(float))).magnitude()
 
 
-def oracle(name, pose, start, evidence, seed):
+def oracle(name, pose, start, targets, seed):
     """Each term by its equation, frame by frame in double precision."""
     total = 0.0
     for t in range(T):
         if name == "keypoints":
             points = np.asarray(BIRD.keypoint_weights) @ skin_by_hand(BIRD, frame(pose, t))[0]
-            e2 = (pixels(points) - np.asarray(evidence.keypoints_px[t])) ** 2
-            total += (np.asarray(evidence.confidence[t])[:, None] * (50**2 * e2 / (50**2 + e2))).sum()
+            e2 = (pixels(points) - np.asarray(targets.keypoints_px[t])) ** 2
+            total += (np.asarray(targets.confidence[t])[:, None] * (50**2 * e2 / (50**2 + e2))).sum()
         elif name in ("mask", "mask_smooth_l1"):
-            e = np.abs(soft_silhouettes(seed)[t] - np.asarray(evidence.mask[t]))
+            e = np.abs(soft_silhouettes(seed)[t] - np.asarray(targets.mask[t]))
             total += e.sum() if name == "mask" else (0.5 * e**2).sum()
         elif name == "pose_prior":
             total += mahalanobis(pose.body_pose[t], BIRD.pose_mean, BIRD.pose_covariance)
-        elif name == "start_pull":
+        elif name == "stage_anchor":
             total += np.abs(np.asarray(pose.body_pose[t] - start.body_pose[t])).sum()
     betas = np.asarray(pose.betas, np.float64)
     if name == "bone_prior":
@@ -172,7 +172,7 @@ def oracle(name, pose, start, evidence, seed):
         total = (betas**2 / np.asarray(BIRD.shape_variance)).sum()
     elif name == "shape_norm":
         total = np.sqrt((betas**2).sum())
-    elif name == "start_pull":
+    elif name == "stage_anchor":
         total += np.abs(np.asarray(pose.bone_length - start.bone_length)).sum()
     elif name == "joint_limits":
         low, high = np.moveaxis(np.asarray(BIRD.joint_limits, np.float64), -1, 0)
@@ -193,8 +193,8 @@ def oracle(name, pose, start, evidence, seed):
         feet = [BIRD.keypoint_names.index(foot) for foot in ("left_foot", "right_foot")]
         posed = [np.asarray(BIRD.keypoint_weights) @ skin_by_hand(BIRD, frame(pose, t))[0] for t in range(T)]
         # where the first frame's crop would see them, back in space at their depths
-        corner = np.asarray(evidence.corner_px, np.float64) - CAMERA.centre_px
-        seen_px = [pixels(posed[t][feet]) + corner[t] - np.asarray(evidence.corner_px[0]) for t in range(T)]
+        corner = np.asarray(targets.corner_px, np.float64) - CAMERA.centre_px
+        seen_px = [pixels(posed[t][feet]) + corner[t] - np.asarray(targets.corner_px[0]) for t in range(T)]
         feet_cam = [np.c_[seen_px[t] * posed[t][feet, 2:] / CAMERA.focal_px, posed[t][feet, 2]] for t in range(T)]
         for i in range(T - 1):
             d2 = ((feet_cam[i + 1] - feet_cam[i]) ** 2).sum(-1)

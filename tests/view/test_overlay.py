@@ -27,7 +27,7 @@ from jaxfit.view.side import SideViews, up_direction
 def detections(size=(WIDTH, HEIGHT)) -> Observations:
     """The first bird's bill tip, 20 px left of the fitted one."""
     points = np.zeros((1, T, BIRD.num_keypoints, 2))
-    points[:, :, 0] = solution().keypoints_2d[:1, :, 0] - [20, 0]
+    points[:, :, 0] = solution().keypoints_px[:1, :, 0] - [20, 0]
     confidence = np.zeros((1, T, BIRD.num_keypoints))
     confidence[:, :, 0] = 1
     return Observations(
@@ -101,7 +101,7 @@ def test_birds_are_drawn_where_they_are_and_nowhere_else(drawn):
                 continue
             assert differs[mask].mean() > 0.95
             near = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) > 0
-            points = solution().keypoints_2d[n, t]
+            points = solution().keypoints_px[n, t]
             low, high = (points.min(0) - 70).astype(int), (points.max(0) + 70).astype(int)  # its number, its rings
             far[max(low[1], 0) : high[1], max(low[0], 0) : high[0]] = False
             edge = near & ~(cv2.erode(mask.astype(np.uint8), np.ones((5, 5))) > 0)
@@ -198,11 +198,11 @@ def test_long_results_are_posed_chunk_by_chunk(tmp_path):
     """Longer than a chunk and no multiple of it: every frame still shows its own pose."""
     frames, still = CHUNK + 5, solution()
     names = ("valid", "global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "image_size_px")
-    names += ("keypoints_3d", "keypoints_2d")
+    names += ("keypoints_cam", "keypoints_px")
     many = {name: np.repeat(getattr(still, name)[:1, :1], frames, 1) for name in names}
     crop = np.repeat(still.crop[:1, :1], frames, 1).copy()
     crop[:, :, 0] += np.arange(frames)  # it walks to the right, a pixel a frame
-    many["keypoints_2d"] = many["keypoints_2d"] + (crop - still.crop[:1, :1])[:, :, None, :2]
+    many["keypoints_px"] = many["keypoints_px"] + (crop - still.crop[:1, :1])[:, :, None, :2]
     long = dataclasses.replace(still, **many, crop=crop, track_id=[4], frame_index=np.arange(frames), status=["ok"])
     made = overlay(long, BIRD, film(tmp_path / "f.mp4", frames), tmp_path / "o.mp4")
     middles = [np.flatnonzero(changed(frame.astype(int)).sum(0) > 3).mean() for _, frame, _ in read_frames(made.video)]
@@ -215,7 +215,7 @@ def test_up_is_where_birds_stand():
     look = Rotation.from_euler("x", 130, degrees=True)
     headings = Rotation.from_rotvec(np.linspace(0, 300, T)[:, None] * [0, 0, 1], degrees=True)
     points = np.stack([look.apply(headings[t].apply(np.asarray(BIRD.keypoints))) for t in range(T)])
-    standing = dataclasses.replace(solution(), keypoints_3d=np.stack([points, points + 5]))
+    standing = dataclasses.replace(solution(), keypoints_cam=np.stack([points, points + 5]))
     assert np.degrees(np.arccos(up_direction(standing) @ look.apply([0, 0, 1]))) < 3
 
 

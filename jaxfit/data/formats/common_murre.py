@@ -107,9 +107,9 @@ def _names(names: Sequence[str] | None) -> tuple[str, ...]:
 def _pictures(folder: Path, progress: ProgressTask) -> tuple[list[Path], tuple[int, int]]:
     reader = read_frames(folder)
     files = image_files(folder)
-    with progress("Reading pictures", len(files)) as tick:
+    with progress("Reading pictures", len(files)) as report_progress:
         for _ in reader:
-            tick(1, "")
+            report_progress(1, "")
     if reader.damaged:
         raise InputError(files[reader.damaged[0]], "cannot be read", "copy the picture again")
     return files, reader.info.size_px

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfit.data.observations import Observations
-from jaxfit.perception.tracking import repair_swaps
+from jaxfit.perception.tracking import repair_left_right_flips
 from jaxfit.simulation import noise
 
 PAIRS = ((0, 1), (2, 3), (4, 5))
@@ -61,7 +61,7 @@ def test_runs_of_swaps_are_exchanged_back():
     swapped = np.zeros((2, 60, 3), bool)
     swapped[0, 20:25] = swapped[1, :3, 1] = swapped[1, 30:36, 1] = swapped[1, 44:46, 2] = True
     swapped[0, 22, 0] = False
-    repaired, found = repair_swaps(mixed_up(truth, swapped), PAIRS)
+    repaired, found = repair_left_right_flips(mixed_up(truth, swapped), PAIRS)
     assert_repaired(found, swapped, repaired, truth)
 
 
@@ -74,7 +74,7 @@ def test_gaps_and_outliers_do_not_hide_a_swap():
     points = truth.keypoints_px.copy()
     points[0, [26, 40], 3] += 300
     hidden = without(truth.with_keypoints(points, truth.confidence), gone)
-    repaired, found = repair_swaps(mixed_up(hidden, swapped), PAIRS)
+    repaired, found = repair_left_right_flips(mixed_up(hidden, swapped), PAIRS)
     assert found[0, 21:30].all()
     assert not found[0, :17].any()
     assert not found[0, 30:].any()
@@ -90,11 +90,11 @@ def test_birds_that_turn_quickly_are_left_alone():
         return np.stack([there - back, back, np.deg2rad(50) * t, 0.0 * t])
 
     for seed in range(3):
-        assert not repair_swaps(flock(headings(4), 0.02, seed), PAIRS)[1].any()
+        assert not repair_left_right_flips(flock(headings(4), 0.02, seed), PAIRS)[1].any()
         # with half of all keypoints missing, half a turn in eight
         seen = flock(headings(8), 0.02, seed)
         gone = np.random.default_rng(seed).random(seen.confidence.shape) < 0.5
-        assert repair_swaps(without(seen, gone), PAIRS)[1].mean() < 0.01
+        assert repair_left_right_flips(without(seen, gone), PAIRS)[1].mean() < 0.01
 
 
 def test_the_longer_side_is_right_where_nothing_joins_them():
@@ -104,11 +104,11 @@ def test_the_longer_side_is_right_where_nothing_joins_them():
     gone[:, 20:35] = True
     later = np.zeros((1, 60, 3), bool)
     later[:, 35:] = True
-    assert not repair_swaps(without(mixed_up(truth, later), gone), PAIRS)[1].any()
+    assert not repair_left_right_flips(without(mixed_up(truth, later), gone), PAIRS)[1].any()
     # where they are joined the shorter part follows the longer one
     later[:] = False
     later[:, 48:] = True
-    assert_repaired(repair_swaps(mixed_up(truth, later), PAIRS)[1], later, truth, truth)
+    assert_repaired(repair_left_right_flips(mixed_up(truth, later), PAIRS)[1], later, truth, truth)
 
 
 def test_swaps_of_the_noise_model_are_found_and_nothing_else(monkeypatch):
@@ -124,7 +124,7 @@ def test_swaps_of_the_noise_model_are_found_and_nothing_else(monkeypatch):
 
     def judged(seed):
         detected = noise.detect_noisily(truth, seen, PAIRS, seed)
-        found = repair_swaps(detected, PAIRS)[1]
+        found = repair_left_right_flips(detected, PAIRS)[1]
         points, exact = detected.keypoints_px, truth.keypoints_px
         both = (detected.confidence[:, :, left] > 0) & (detected.confidence[:, :, right] > 0)
         near = 0.15 * SIDE
@@ -147,8 +147,8 @@ def test_swaps_of_the_noise_model_are_found_and_nothing_else(monkeypatch):
 @pytest.mark.parametrize("tracks", [[], [0]])
 def test_nothing_to_repair(tracks):
     seen = flock(np.zeros(5)).select(tracks=np.array(tracks, int))
-    assert repair_swaps(seen, ())[1].shape == (len(tracks), 5, 0)
-    assert not repair_swaps(seen, PAIRS)[1].any()
-    assert repair_swaps(seen.select(frames=[0]), PAIRS)[1].shape == (len(tracks), 1, 3)
+    assert repair_left_right_flips(seen, ())[1].shape == (len(tracks), 5, 0)
+    assert not repair_left_right_flips(seen, PAIRS)[1].any()
+    assert repair_left_right_flips(seen.select(frames=[0]), PAIRS)[1].shape == (len(tracks), 1, 3)
     nothing = seen.with_keypoints(seen.keypoints_px, 0 * seen.confidence)
-    assert not repair_swaps(nothing, PAIRS)[1].any()
+    assert not repair_left_right_flips(nothing, PAIRS)[1].any()

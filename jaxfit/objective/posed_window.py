@@ -20,10 +20,10 @@ from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
 from jaxfit.raster.silhouette import Blur
 
-__all__ = ["Evidence", "Priors", "Raster", "Scene", "priors_of"]
+__all__ = ["PosedWindow", "Priors", "Raster", "Targets", "priors_of"]
 
 
-class Evidence(eqx.Module):
+class Targets(eqx.Module):
     """What was seen of one bird in one window, in crop pixels; batches put further axes in front."""
 
     keypoints_px: Float[Array | np.ndarray, "*T K 2"]
@@ -78,7 +78,7 @@ class Raster(NamedTuple):
     backend: Literal["auto", "native", "reference"] = "auto"
 
 
-class Scene:
+class PosedWindow:
     """One window as the terms see it: T frames of one bird. What no term asks for is never computed.
 
     Camera frame: x right, y down, z forward, of the crop's camera, which follows the bird. Lengths in model units.
@@ -87,8 +87,8 @@ class Scene:
     def __init__(
         self,
         pose: Pose,
-        start: Pose,
-        evidence: Evidence,
+        anchor: Pose,
+        targets: Targets,
         rig: Rig,
         priors: Priors,
         camera: Camera,
@@ -96,9 +96,9 @@ class Scene:
     ):
         self.pose = pose
         """What is optimised: `global_orient` (T, 3), `body_pose` (T, J−1, 3), `transl` (T, 3), `scale`, …"""
-        self.start = start
+        self.anchor = anchor
         """The pose at which the present stage began."""
-        self.evidence = evidence
+        self.targets = targets
         """What was seen: `keypoints_px`, `confidence`, `mask`, `present`, …"""
         self.priors = priors
         self.camera = camera
@@ -108,7 +108,7 @@ class Scene:
     @property
     def present(self) -> Bool[Array | np.ndarray, "T"]:
         """False in frames in which the bird was not seen: their poses mean nothing, and no term counts them."""
-        return self.evidence.present
+        return self.targets.present
 
     @property
     def joint_limits(self) -> Float[Array, "bones 3 2"]:
@@ -170,7 +170,7 @@ class Scene:
         What stands still in the world stands still here, up to the noise of the fit, if the filming camera does too.
         """
         x, z = self.keypoints_cam[..., :2], self.keypoints_cam[..., 2:]
-        shift = jnp.asarray(self.evidence.corner_px - self.evidence.corner_px[:1])
+        shift = jnp.asarray(self.targets.corner_px - self.targets.corner_px[:1])
         return jnp.concatenate([x + shift[:, None] * z / self.camera.focal_px, z], axis=-1)
 
     @cached_property

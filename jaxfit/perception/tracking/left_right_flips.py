@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxfit.data.observations import Observations
 
-__all__ = ["repair_swaps"]
+__all__ = ["repair_left_right_flips"]
 
 REACH = 8
 """Frames over which a bird may be compared with itself."""
@@ -39,7 +39,7 @@ STILL = 0.005
 """Least usual change of the arrow, in longer sides of the box."""
 
 
-def repair_swaps(
+def repair_left_right_flips(
     observations: Observations, keypoint_pairs: Sequence[tuple[int, int]]
 ) -> tuple[Observations, Bool[np.ndarray, "N T P"]]:
     """Exchange the keypoints of left and right in those frames in which the others say so.
