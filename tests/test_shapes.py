@@ -43,8 +43,9 @@ assert bird.keypoints.shape == (12, 3)
 OBJECTIVE = """
 from support.terms_by_hand import all_settings, every_gradient, posed_window, seen, window_pose
 from jaxfit.objective.objective import evaluate_terms
+from jaxfit.objective.registry import find_terms
 pose = window_pose()
-evaluate_terms(posed_window(pose, seen()), all_settings())
+evaluate_terms(posed_window(pose, seen()), find_terms(all_settings()), all_settings())
 every_gradient(pose, pose, seen(), all_settings())
 """
 
@@ -58,7 +59,7 @@ write_inputs(folder)
 (folder / "full.yaml").write_text('''
 base: paper
 window: 6
-crop: {{size_px: 64, focal_px: 541.75}}
+crop: {{size_px: 64}}
 initialise: {{method: so3, turns: 6, directions: 8, hypotheses: 2}}
 terms: {{keypoints: 100, mask: 1, mask_smooth_l1: 1, bone_prior: 1, shape_prior: 1, shape_norm: 1, stage_anchor: 1}}
 stages:

@@ -12,7 +12,7 @@ from jaxfit.ablation.report import write_report
 from jaxfit.ablation.runs import claim_folder, fit_grid
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.truth import read_truth
-from jaxfit.fitting.prepare import Preparation
+from jaxfit.fitting.fit import check_observations
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.progress import ProgressTask, silent
@@ -65,10 +65,10 @@ def ablate(
     observed = read_coco(observations)
     if matching != "overlap":
         check_shared(observed, read_truth(truth)[0], truth)
-    prepared = Preparation(observed, bird, None, observations)
+    check_observations(observed, bird, observations)
     inputs = {"observations": observations, "truth": truth}
     claim_folder(folder, crossed.runs, inputs, bird)
-    fitted = fit_grid(prepared, bird, crossed.runs, folder, progress)
+    fitted = fit_grid(observed, bird, crossed.runs, folder, progress, observations)
     results = measure_grid(crossed.runs, folder, truth, matching, progress)
     verdicts = judge(crossed.claims, results)
     write_report(results, verdicts, folder, inputs, bird.name)

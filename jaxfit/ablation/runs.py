@@ -17,12 +17,12 @@ from jaxfit.ablation.grid import Run
 from jaxfit.config.schema import FitConfig
 from jaxfit.config.yaml_file import build_config, config_to_yaml
 from jaxfit.data.formats.scene_folder import TRUE_POSES, TRUTH
+from jaxfit.data.observations import Observations
 from jaxfit.data.solution import write_solution
 from jaxfit.errors import InputError
 from jaxfit.fitting.batch import frames_per_batch
-from jaxfit.fitting.fit import fit_runs
-from jaxfit.fitting.prepare import Preparation
-from jaxfit.fitting.stages import program
+from jaxfit.fitting.fit import fit_runs, windows_of
+from jaxfit.fitting.stages import compiled_part
 from jaxfit.fitting.summary import summarise
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
@@ -90,16 +90,16 @@ def _digest(path: Path) -> str:
     return digest.hexdigest()
 
 
-def plan_batches(prepared: Preparation, bird: Bird, runs: Sequence[Run]) -> list[list[int]]:
+def plan_batches(observations: Observations, bird: Bird, runs: Sequence[Run], source: object) -> list[list[int]]:
     """Positions of the runs that are fitted together, batch by batch: those of one program, in the grid's order, as
     many as the memory holds and no more than keep the cores busy."""
     groups: dict[Any, list[int]] = {}
     for r, run in enumerate(runs):
-        groups.setdefault(config_to_yaml(program(run.config)), []).append(r)
+        groups.setdefault(config_to_yaml(compiled_part(run.config)), []).append(r)
     batches = []
     for group in groups.values():
         config = runs[group[0]].config
-        frames = len(prepared.windows(config)) * config.window
+        frames = len(windows_of(observations, config, source)) * config.window
         at_once = max(min(frames_per_batch(bird, config), FRAMES_AT_ONCE) // frames, 1)
         parts = np.array_split(group, -(-len(group) // at_once))
         batches += [part.tolist() for part in parts]
@@ -107,7 +107,12 @@ def plan_batches(prepared: Preparation, bird: Bird, runs: Sequence[Run]) -> list
 
 
 def fit_grid(
-    prepared: Preparation, bird: Bird, runs: Sequence[Run], folder: Path, progress: ProgressTask = silent
+    observations: Observations,
+    bird: Bird,
+    runs: Sequence[Run],
+    folder: Path,
+    progress: ProgressTask = silent,
+    source: object = "observations",
 ) -> int:
     """Fit every run that the folder does not hold yet, and store it there.
 
@@ -122,12 +127,12 @@ def fit_grid(
     for part in folder.glob(f".{_READY}*.part"):  # or while they were written
         shutil.rmtree(part)
     fitted = 0
-    for b, batch in enumerate(plan_batches(prepared, bird, runs)):
+    for b, batch in enumerate(plan_batches(observations, bird, runs, source)):
         missing = [r for r in batch if not run_folder(folder, runs[r]).is_dir()]
         if not missing:
             continue
         began = time.perf_counter()
-        solutions = fit_runs(prepared, bird, [runs[r].config for r in batch], progress)
+        solutions = fit_runs(observations, bird, [runs[r].config for r in batch], None, progress, source)
         seconds = {"fit": (time.perf_counter() - began) / len(batch)}
         ready = folder / f"{_READY}{b}"
         with new_folder(ready) as part:

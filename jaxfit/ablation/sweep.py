@@ -15,7 +15,6 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit_runs
-from jaxfit.fitting.prepare import Preparation
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 
@@ -58,11 +57,10 @@ def sweep(
     """
     points = [dict(zip(values, point, strict=True)) for point in itertools.product(*values.values())]
     runs = cross(config, points, "sweep")
-    prepared = Preparation(observations, bird, None, "observations")
     found: dict[int, tuple[Solution, Result]] = {}
-    for batch in plan_batches(prepared, bird, runs):
+    for batch in plan_batches(observations, bird, runs, "observations"):
         began = time.perf_counter()
-        solutions = fit_runs(prepared, bird, [runs[r].config for r in batch], progress)
+        solutions = fit_runs(observations, bird, [runs[r].config for r in batch], progress=progress)
         seconds = (time.perf_counter() - began) / len(batch)
         for r, solution in zip(batch, solutions, strict=True):
             evaluation = evaluate(solution, bird, truth, progress, truth_solution=truth_solution)

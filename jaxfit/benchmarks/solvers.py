@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,28 +16,36 @@ from jaxtyping import Array, Float, Int
 from jaxfit.config.schema import load_config
 from jaxfit.data.observations import Observations
 from jaxfit.fitting.adam import ADAM
-from jaxfit.fitting.lane import Lane, Solver, lane_loss
+from jaxfit.fitting.fit import check_observations, windows_of
+from jaxfit.fitting.initial_pose_search import search_initial_poses
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
-from jaxfit.fitting.prepare import Preparation, camera_of
+from jaxfit.fitting.problem import Problem, Program, Solver, problem_loss
 from jaxfit.fitting.solve import Report, advance, begin, report
-from jaxfit.fitting.stages import stage_hyperparameters, stage_problem
+from jaxfit.fitting.stages import fit_model, stage_hyperparameters, stage_program
+from jaxfit.fitting.windows import load_targets
 from jaxfit.model.bird import Bird
-from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.pose import Pose
-from jaxfit.objective.posed_window import priors_of
 from jaxfit.progress import ProgressTask, ReportProgress, silent
 from jaxfit.storage.files import write_whole
 
 __all__ = ["LBFGS", "bench_solvers", "plot_solvers"]
 
 
-def _pose(z: Pose, lane: Lane) -> Pose:
-    """L-BFGS works on the change since the start, in units of Adam's step, so that all parameters are of one scale."""
-    return jax.tree.map(lambda start, step, z: start + step * z, lane.start, lane.hyperparameters.step_size, z)
+def _pose(z: Pose, problem: Problem) -> Pose:
+    """Return the pose of L-BFGS' variable z: the change since the anchor, in units of Adam's step.
+
+    All parameters are then of one scale.
+    """
+    step_size = problem.hyperparameters.step_size
+    return jax.tree.map(lambda anchor, step, z: anchor + step * z, problem.anchor, step_size, z)
 
 
-def _loss(z: Pose, lane: Lane) -> tuple[Float[Array, ""], None]:
-    return lane_loss(_pose(z, lane), lane), None
+def _loss_of(program: Program):
+    def loss(z: Pose, problem: Problem) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        value = problem_loss(program, problem, _pose(z, problem))
+        return value, value
+
+    return loss
 
 
 def _minimiser() -> optx.OptaxMinimiser:
@@ -47,18 +54,20 @@ def _minimiser() -> optx.OptaxMinimiser:
     return optx.OptaxMinimiser(optax.lbfgs(linesearch=search), rtol=0.0, atol=0.0)
 
 
-def _init(pose: Pose, lane: Lane, before: Any) -> Any:
-    z, struct = jax.tree.map(jnp.zeros_like, pose), jax.ShapeDtypeStruct((), jnp.float32)
-    return z, _minimiser().init(_loss, z, lane, {}, struct, None, frozenset())
+def _init(program: Program, problem: Problem, carried: Any) -> Any:
+    z, scalar = jax.tree.map(jnp.zeros_like, problem.anchor), jax.ShapeDtypeStruct((), jnp.float32)
+    state = _minimiser().init(_loss_of(program), z, problem, {}, scalar, scalar, frozenset())
+    return z, state, jnp.float32(jnp.inf)
 
 
-def _step(pose: Pose, lane: Lane, state: Any) -> tuple[Pose, Any]:
-    z, own, _ = _minimiser().step(_loss, state[0], lane, {}, state[1], frozenset())
-    return _pose(z, lane), (z, own)
+def _step(program: Program, problem: Problem, pose: Pose, state: Any) -> tuple[Pose, Any]:
+    z, state, _ = state
+    z, state, loss = _minimiser().step(_loss_of(program), z, problem, {}, state, frozenset())
+    return _pose(z, problem), (z, state, loss)
 
 
 def _outcome(state: Any) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    return state[1].f, jnp.int32(0)
+    return state[2], jnp.int32(0)
 
 
 LBFGS = Solver(_init, _step, _outcome)
@@ -92,32 +101,42 @@ def bench_solvers(
         no higher than Adam's last (None: never), and `…_ratio`: those over Adam's seconds; `…_loss`: the last.
     """
     config = load_config("paper")
-    prepared, rig = Preparation(observations, bird, None, "observations"), fold_bird(bird)
-    windows, stage = prepared.windows(config), config.stages[0]
-    rows = np.arange(len(windows))
-    # masks are not looked at
-    targets = prepared.targets([(config, rows)])
-    targets = jax.tree.map(jnp.asarray, replace(targets, mask=targets.mask[..., :0, :0]))
-    start = jax.tree.map(lambda x: x[:, 0], prepared.starting_poses(bird, rig, config, rows))
+    stage = config.stages[0]
+    observations = check_observations(observations, bird, "observations")
+    windows, model = windows_of(observations, config, "observations"), fit_model(bird, config)
+    count = len(windows)
+    initial_pose = search_initial_poses(
+        bird,
+        model.rig,
+        jnp.asarray(windows.keypoints_px),
+        jnp.asarray(windows.confidence),
+        config.initialise,
+        model.camera,
+        config.common_size,
+    )
     one = stage_hyperparameters(config, stage, bird.keypoint_names)
-    hyperparameters = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * len(rows)), one)
-    usual = stage_problem(config, stage, rig, priors_of(bird), camera_of(config))
-    result: dict[str, Any] = {"birds": len(np.unique(windows.track)), "windows": len(rows)}
+    problems = Problem(
+        hyperparameters=jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * count), one),
+        anchor=jax.tree.map(lambda x: x[:, 0], initial_pose),
+        targets=jax.tree.map(jnp.asarray, load_targets(windows, mask_px=0)),
+    )
+    program = stage_program(config, stage, model)
+    result: dict[str, Any] = {"birds": len(np.unique(windows.track)), "windows": count}
     most = {name: min(steps, limit or steps) for name, (_, steps, _) in RACE.items()}
 
     def run(name: str, report_progress: ReportProgress) -> tuple[list[int], list[float], list[float]]:
         solver, _, portion = RACE[name]
-        problem = usual._replace(solver=solver)
-        state = begin(problem, hyperparameters, jax.tree.map(jnp.copy, start), targets, None)
-        steps, seconds, loss = [0], [0.0], [_total(report(problem, hyperparameters, start, start, targets))]
+        own = program._replace(solver=solver)
+        state = begin(own, problems, None)
+        steps, seconds, loss = [0], [0.0], [_total(report(own, problems, problems.anchor))]
         while steps[-1] < most[name]:
             take = min(portion, most[name] - steps[-1])
             began = time.perf_counter()
-            state, _, refused = advance((problem, hyperparameters, targets, jnp.int32(take)), state)
-            jax.block_until_ready(refused)
+            state, _, rejected = advance((own, problems, jnp.int32(take)), state)
+            jax.block_until_ready(rejected)
             seconds.append(seconds[-1] + time.perf_counter() - began)
             steps.append(steps[-1] + take)
-            loss.append(_total(report(problem, hyperparameters, state.pose, start, targets)))
+            loss.append(_total(report(own, problems, state.pose)))
             report_progress(take, f"{name}: loss {loss[-1]:.5g}")
         return steps, seconds, loss
 

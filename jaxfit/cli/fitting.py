@@ -20,7 +20,7 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.config.schema import config_to_yaml, load_config
     from jaxfit.data.solution import save_solution
     from jaxfit.fitting.fit import fit
-    from jaxfit.fitting.start import load_start
+    from jaxfit.fitting.initial_pose_file import load_initial_poses
     from jaxfit.fitting.summary import summarise
     from jaxfit.storage.files import check_replaceable
 
@@ -29,9 +29,9 @@ def fit(options: argparse.Namespace) -> None:
     config = load_config(options.config)
     bird = find_bird(options.model)
     observations = read_coco(options.observations)
-    start = load_start(options.init, observations, bird) if options.init else None
+    initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
     read = time.perf_counter()
-    solution = fit(observations, bird, config, start, terminal, source=options.observations)
+    solution = fit(observations, bird, config, initial_poses, terminal, source=options.observations)
     seconds = {"read": read - began, "fit": time.perf_counter() - read}
     summary = summarise(solution, bird, seconds)
     save_solution(solution, bird, config_to_yaml(config), summary, options.out, options.overwrite)

@@ -90,11 +90,13 @@ class Solution:
     crop_px: int
     """Side in pixels of the crop the fit works on; the camera's centre is its middle."""
     loss: Mapping[str, np.ndarray]
-    """Term → (N,) float64: its weighted share of the final objective, summed over the track's windows."""
+    """Term → (N,) float64: its weighted share of the final objective, summed over the track's windows that did not
+    diverge; NaN where there is none."""
     status: np.ndarray
-    """(N,) str: how each track's fit ended."""
-    failures: Mapping[int, str] = field(default_factory=dict)
-    """Track → what broke its fit down, where and when; for ``summary.json``, and not read back from there."""
+    """(N,) str: summary of the track's windows. ``ok``: all fitted; ``partly diverged``: only the poses of the other
+    windows are valid; ``diverged``: no window fitted; ``no usable frame``: no window."""
+    failures: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    """Track → for each of its windows that diverged: frames, term and step. ``summary.json`` holds them."""
 
     def __post_init__(self):
         arrays = validate_arrays(vars(self), LAYOUT)

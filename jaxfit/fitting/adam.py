@@ -1,8 +1,8 @@
-"""Adam: many cheap steps, for any objective. The method's own solver."""
+"""Adam: many cheap steps, for any objective. The solver of the paper."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,44 +10,61 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from jaxfit.fitting.lane import Hyperparameters, Lane, Solver, lane_loss
+from jaxfit.fitting.problem import Hyperparameters, Problem, Program, Solver, problem_loss
 from jaxfit.model.pose import Pose
 
 __all__ = ["ADAM"]
 
-NEVER = 2**30
-"""Non-finite steps in a row that a lane may refuse: a diverging bird stands still and leaves others alone."""
+
+class _State(NamedTuple):
+    minimiser: Any
+    """The state of the optimistix minimiser, with Adam's moments. Nothing here looks inside."""
+    loss: Float[Array, ""]
+    """The loss before the last step."""
+    rejected: Int[Array, ""]
 
 
-def _minimiser(hyperparameters: Hyperparameters, carried: Any = None) -> optx.OptaxMinimiser:
+def _minimiser(hyperparameters: Hyperparameters) -> optx.OptaxMinimiser:
     def scale(updates, _):
         return jax.tree.map(lambda update, step: -step * update, updates, hyperparameters.step_size)
 
-    adam = optax.scale_by_adam()
+    # tolerances of 0: a stage takes exactly its steps, as in the paper
+    return optx.OptaxMinimiser(optax.chain(optax.scale_by_adam(), optax.stateless(scale)), rtol=0.0, atol=0.0)
+
+
+def _init(program: Program, problem: Problem, carried: _State | None) -> _State:
     if carried is not None:
-        adam = optax.GradientTransformation(lambda params: carried, adam.update)
-    chain = optax.chain(adam, optax.stateless(scale))
-    # tolerances of 0: a stage takes exactly its steps, as its source does
-    return optx.OptaxMinimiser(optax.apply_if_finite(chain, NEVER), rtol=0.0, atol=0.0)
+        # step sizes are no part of the minimiser's state, so that the moments continue under those of this stage
+        return carried._replace(rejected=jnp.int32(0))
+    scalar = jax.ShapeDtypeStruct((), jnp.float32)
+    minimiser = _minimiser(problem.hyperparameters)
+    state = minimiser.init(_loss_of(program), problem.anchor, problem, {}, scalar, scalar, frozenset())
+    return _State(state, jnp.float32(jnp.inf), jnp.int32(0))
 
 
-def _loss(pose: Pose, lane: Lane) -> tuple[Float[Array, ""], None]:
-    return lane_loss(pose, lane), None
+def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tuple[Pose, _State]:
+    """Take Adam's step, or reject the step where the loss or its gradient is not finite.
+
+    A rejected step leaves pose and moments as they are: a bird that diverges stands still and leaves others alone.
+    """
+    minimiser = _minimiser(problem.hyperparameters)
+    moved, stepped, loss = minimiser.step(_loss_of(program), pose, problem, {}, state.minimiser, frozenset())
+    # every component of the gradient enters the pose, so that a finite pose means a finite gradient
+    finite = jnp.stack([jnp.isfinite(loss), *(jnp.isfinite(x).all() for x in jax.tree.leaves(moved))]).all()
+    pose, kept = jax.tree.map(lambda a, b: jnp.where(finite, a, b), (moved, stepped), (pose, state.minimiser))
+    return pose, _State(kept, loss, state.rejected + ~finite)
 
 
-def _init(pose: Pose, lane: Lane, before: Any) -> Any:
-    struct = jax.ShapeDtypeStruct((), jnp.float32)
-    minimiser = _minimiser(lane.hyperparameters, None if before is None else before.opt_state.inner_state[0])
-    return minimiser.init(_loss, pose, lane, {}, struct, None, frozenset())
+def _loss_of(program: Program):
+    def loss(pose: Pose, problem: Problem) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        value = problem_loss(program, problem, pose)
+        return value, value  # once to be minimised, once to be returned by `step`
+
+    return loss
 
 
-def _step(pose: Pose, lane: Lane, state: Any) -> tuple[Pose, Any]:
-    pose, state, _ = _minimiser(lane.hyperparameters).step(_loss, pose, lane, {}, state, frozenset())
-    return pose, state
-
-
-def _outcome(state: Any) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    return state.f, state.opt_state.total_notfinite
+def _outcome(state: _State) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    return state.loss, state.rejected
 
 
 ADAM = Solver(_init, _step, _outcome)

@@ -1,8 +1,10 @@
-"""Fitted windows put back where their birds stand in the video."""
+"""From fitted windows to the solution of the whole video."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -10,91 +12,126 @@ import numpy as np
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import Fitted
-from jaxfit.fitting.window import Windows
+from jaxfit.fitting.windows import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera, crop_to_image
+from jaxfit.model.pose import Pose
 
-__all__ = ["Collector"]
+__all__ = ["FittedWindow", "collect_windows", "window_of_batch"]
 
-logger = logging.getLogger(__name__)
+_logger = logging.getLogger(__name__)
 
 
-class Collector:
-    """Gathers the windows of one run."""
+class FittedWindow(NamedTuple):
+    """The result of one window of T frames, as NumPy arrays."""
 
-    def __init__(self, observations: Observations, windows: Windows, bird: Bird, camera: Camera):
-        self.observations, self.windows, self.bird, self.camera = observations, windows, bird, camera
-        birds, frames = observations.num_tracks, observations.num_frames
-        joints, keypoints = bird.num_joints, bird.num_keypoints
-        shapes = {
-            "global_orient": (3,),
-            "body_pose": (joints - 1, 3),
-            "transl": (3,),
-            "scale": (),
-            "bone_length": (joints - 1,),
-            "betas": (bird.num_shapes,),
-            "keypoints_cam": (keypoints, 3),
-            "keypoints_px": (keypoints, 2),
-            "crop": (3,),
-        }
-        self.arrays = {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
-        self.valid = np.zeros((birds, frames), bool)
-        self.image_size_px = np.zeros((birds, frames, 2), np.int64)
-        self.loss: dict[str, np.ndarray] = {}
-        self.status = np.full(birds, "no usable frame", dtype="<U32")
-        self.failures: dict[int, str] = {}
+    pose: Pose
+    loss: dict[str, float]
+    """Each term's weighted share of the objective."""
+    keypoints_cam: np.ndarray
+    """(T, K, 3) camera frame of the crop, model units."""
+    keypoints_px: np.ndarray
+    """(T, K, 2) crop pixels."""
+    failure: str
+    """Why the fit diverged; empty where it did not."""
 
-    def add(self, w: int, fitted: Fitted, i: int) -> None:
-        """Take window `w` from lane `i` of a batch; of a diverged one only the status."""
-        n = self.windows.track[w]
-        if fitted.failure[i]:
-            self.status[n] = "diverged"
-            track, at = int(self.observations.track_id[n]), self.windows.frame[w][self.windows.present[w]]
-            first, last = self.observations.frame_index[at[[0, -1]]]
-            logger.warning("track %d, frames %d to %d: %s", track, first, last, fitted.failure[i])
-            self.failures.setdefault(track, f"frames {first} to {last}: {fitted.failure[i]}")
-        elif self.status[n] != "diverged":
-            self.status[n] = "ok"
-        for name, value in fitted.report.loss.items():
-            self.loss.setdefault(name, np.full(len(self.status), np.nan, np.float32))
-            self.loss[name][n] = np.nan_to_num(self.loss[name][n]) + value[i]
-        if fitted.failure[i]:
-            return
-        present = self.windows.present[w]
-        at = self.windows.frame[w][present]
-        crop = self.windows.crop[w][present].astype(np.float32)
-        pose = jax.tree.map(lambda x: x[i], fitted.pose)
-        betas = np.zeros(self.bird.num_shapes, np.float32)
-        betas[: len(pose.betas)] = pose.betas
-        values = {
-            "global_orient": pose.global_orient[present],
-            "body_pose": pose.body_pose[present],
-            "transl": pose.transl[present],
-            "scale": np.broadcast_to(pose.scale, present.shape)[present],
-            "bone_length": pose.bone_length,
-            "betas": betas,
-            "keypoints_cam": fitted.report.keypoints_cam[i][present],
-            "keypoints_px": crop_to_image(fitted.report.keypoints_px[i][present], crop, self.camera.size_px),
-            "crop": crop,
-        }
-        for name, value in values.items():
-            self.arrays[name][n, at] = value
-        self.valid[n, at] = True
-        self.image_size_px[n, at] = [self.observations.image_size(int(n), int(t)) for t in at]
 
-    def finish(self) -> Solution:
-        """The solution of all windows added."""
-        return Solution(
-            track_id=self.observations.track_id,
-            frame_index=self.observations.frame_index,
-            valid=self.valid,
-            **self.arrays,
-            image_size_px=self.image_size_px,
-            focal_px=self.camera.focal_px,
-            crop_px=self.camera.size_px,
-            keypoint_names=self.bird.keypoint_names,
-            joint_names=self.bird.joint_names,
-            loss=self.loss,
-            status=self.status,
-            failures=self.failures,
-        )
+def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
+    """Return the result of problem `i` of a batch."""
+    pose, report = jax.tree.map(lambda x: x[i], (fitted.pose, fitted.report))
+    loss = {name: float(value) for name, value in report.loss.items()}
+    return FittedWindow(pose, loss, report.keypoints_cam, report.keypoints_px, str(fitted.failure[i]))
+
+
+def collect_windows(
+    observations: Observations, windows: Windows, results: Sequence[FittedWindow], bird: Bird, camera: Camera
+) -> Solution:
+    """Return the solution of one run.
+
+    Every window has a status of its own: only the poses of windows that did not diverge are valid and enter the loss.
+    The status of a track summarises its windows: `ok`, `partly diverged`, `diverged` (all of them) or `no usable frame`
+    (no window).
+
+    Args:
+        observations: the observations that the windows were cut from.
+        windows: W windows.
+        results: the result of each of them.
+        bird: the model.
+        camera: the crop camera.
+    """
+    birds, frames = observations.num_tracks, observations.num_frames
+    bones, keypoints = bird.num_joints - 1, bird.num_keypoints
+    shapes = {
+        "global_orient": (3,),
+        "body_pose": (bones, 3),
+        "transl": (3,),
+        "scale": (),
+        "bone_length": (bones,),
+        "betas": (bird.num_shapes,),
+        "keypoints_cam": (keypoints, 3),
+        "keypoints_px": (keypoints, 2),
+        "crop": (3,),
+    }
+    arrays = {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
+    valid = np.zeros((birds, frames), bool)
+    image_size_px = np.zeros((birds, frames, 2), np.int64)
+    fitted, diverged = np.zeros(birds, int), np.zeros(birds, int)
+    loss = {name: np.full(birds, np.nan) for name in results[0].loss}
+    failures: dict[int, tuple[str, ...]] = {}
+    for w, result in enumerate(results):
+        n, present = int(windows.track[w]), windows.present[w]
+        at = windows.frame[w][present]
+        if result.failure:
+            diverged[n] += 1
+            first, last = observations.frame_index[at[[0, -1]]]
+            track, text = int(windows.track_id[w]), f"frames {first} to {last}: {result.failure}"
+            _logger.warning("track %d, %s", track, text)
+            failures[track] = (*failures.get(track, ()), text)
+            continue
+        for name, value in result.loss.items():
+            loss[name][n] = value + (loss[name][n] if fitted[n] else 0.0)
+        fitted[n] += 1
+        valid[n, at] = True
+        image_size_px[n, at] = [observations.image_size(n, int(t)) for t in at]
+        for name, value in _frame_values(result, windows.crop[w], present, bird, camera).items():
+            arrays[name][n, at] = value
+    return Solution(
+        track_id=observations.track_id,
+        frame_index=observations.frame_index,
+        valid=valid,
+        **arrays,
+        image_size_px=image_size_px,
+        focal_px=camera.focal_px,
+        crop_px=camera.size_px,
+        keypoint_names=bird.keypoint_names,
+        joint_names=bird.joint_names,
+        loss=loss,
+        status=np.array([_status(*counts) for counts in zip(fitted, diverged, strict=True)], "<U32"),
+        failures=failures,
+    )
+
+
+def _frame_values(
+    result: FittedWindow, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: Camera
+) -> dict[str, Any]:
+    """The arrays of a solution at the present frames of one window."""
+    pose, crop = result.pose, crop[present].astype(np.float32)
+    betas = np.zeros(bird.num_shapes, np.float32)  # a fit without shape has none
+    betas[: len(pose.betas)] = pose.betas
+    return {
+        "global_orient": pose.global_orient[present],
+        "body_pose": pose.body_pose[present],
+        "transl": pose.transl[present],
+        "scale": np.broadcast_to(pose.scale, present.shape)[present],
+        "bone_length": pose.bone_length,
+        "betas": betas,
+        "keypoints_cam": result.keypoints_cam[present],
+        "keypoints_px": crop_to_image(result.keypoints_px[present], crop, camera.size_px),
+        "crop": crop,
+    }
+
+
+def _status(fitted: int, diverged: int) -> str:
+    if fitted and diverged:
+        return "partly diverged"
+    return "ok" if fitted else "diverged" if diverged else "no usable frame"

@@ -1,4 +1,4 @@
-"""Terms that cannot be fitted: found by tracing before the fit, and named where a bird's fit broke down."""
+"""Terms that cannot be fitted: detected by tracing before the fit, and named where the fit of a bird diverges."""
 
 from __future__ import annotations
 
@@ -13,30 +13,27 @@ from jaxtyping import Array, Bool, Int
 
 from jaxfit.config.schema import FitConfig
 from jaxfit.errors import InputError
-from jaxfit.fitting.lane import Hyperparameters, Lane, Problem, lane_window
-from jaxfit.fitting.stages import needs_mask, stage_hyperparameters, stage_problem
-from jaxfit.model.bird import Bird
-from jaxfit.model.camera import Camera
-from jaxfit.model.kinematics import Rig
+from jaxfit.fitting.problem import Problem, Program, problem_window
+from jaxfit.fitting.stages import FitModel, needs_mask, stage_hyperparameters, stage_program
 from jaxfit.model.pose import Pose, rest_pose
 from jaxfit.objective.objective import weighted_sum
-from jaxfit.objective.posed_window import Priors, Targets
-from jaxfit.objective.registry import find_term
+from jaxfit.objective.posed_window import Targets
+from jaxfit.objective.registry import Term
 
 __all__ = ["check_terms", "name_failures"]
 
 
-def check_terms(config: FitConfig, bird: Bird, rig: Rig, priors: Priors, camera: Camera) -> None:
+def check_terms(config: FitConfig, model: FitModel) -> None:
     """Trace every term of every stage, and its gradient, without computing anything.
 
     Raises:
-        InputError: a term that returns no scalar, asks for what the model has not, or raises; it is named.
+        InputError: a term that returns no scalar, needs what the model lacks, or raises. The error names the term.
     """
-    T, K, pose = config.window, bird.num_keypoints, rest_pose(bird, config.window, config.common_size)
+    T, K = config.window, model.bird.num_keypoints
+    pose = rest_pose(model.bird, T, config.common_size)
     for stage in config.stages:
-        side = camera.size_px if needs_mask(stage) else 0
-        problem = stage_problem(config, stage, rig, priors, camera)
-        hyperparameters = stage_hyperparameters(config, stage, bird.keypoint_names)
+        side = config.crop.size_px if needs_mask(stage) else 0
+        program = stage_program(config, stage, model)
         targets = Targets(
             keypoints_px=np.zeros((T, K, 2), np.float32),
             confidence=np.zeros((T, K), np.float32),
@@ -45,84 +42,82 @@ def check_terms(config: FitConfig, bird: Bird, rig: Rig, priors: Priors, camera:
             present=np.zeros(T, bool),
             corner_px=np.zeros((T, 2), np.float32),
         )
+        problem = Problem(stage_hyperparameters(config, stage, model.bird.keypoint_names), pose, targets)
         for name in stage.terms:
-            _trace(name, jax.grad(_weighted(problem, name)), pose, hyperparameters, pose, targets)
+            _trace(program.terms[name], jax.grad(_share_of(program, name)), pose, problem)
 
 
-def _trace(name: str, function: Callable[..., object], *arguments: object) -> None:
+def _trace(term: Term, function: Callable[..., object], *arguments: object) -> None:
     try:
         jax.eval_shape(function, *arguments)
     except InputError as error:
         if error.source.startswith("term "):
             raise
-        raise InputError(f"term {name!r}", f"{error.source} {error.problem}", error.remedy) from error
-    except Exception as error:  # whatever somebody's code does
-        file = getattr(getattr(find_term(name).function, "__code__", None), "co_filename", None)
+        raise InputError(f"term {term.name!r}", f"{error.source} {error.problem}", error.remedy) from error
+    except Exception as error:  # a user's term may raise anything
+        file = getattr(getattr(term.function, "__code__", None), "co_filename", None)
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         where = f" at {file}:{lines[-1]}" if lines else ""
-        said = f"{type(error).__name__}: {error}".split("\n")[0].strip()
-        problem = f"cannot be traced or differentiated{where}: {said}"
-        raise InputError(f"term {name!r}", problem, "it must run under jax.jit and jax.grad") from error
+        message = f"{type(error).__name__}: {error}".split("\n")[0].strip()
+        problem = f"cannot be traced or differentiated{where}: {message}"
+        raise InputError(f"term {term.name!r}", problem, "it must run under jax.jit and jax.grad") from error
 
 
 def name_failures(
-    told: np.ndarray, step: Int[np.ndarray, "B"], stage: str, problem: Problem, *lanes: Hyperparameters | Pose | Targets
+    known: np.ndarray, step: Int[np.ndarray, "B"], stage: str, program: Program, problems: Problem, pose: Pose
 ) -> np.ndarray:
-    """Say for each lane that broke down which terms did it.
+    """Name the terms that made problems fail.
 
-    A step whose gradient is not finite is refused and leaves the pose as it is, so that where a lane stands after
-    that is where it broke down: its terms are evaluated there, each by itself.
+    A step whose loss or gradient is not finite is rejected and leaves the pose as it is. The pose after the stage is
+    therefore the pose of the failure: each term is evaluated there by itself.
 
     Args:
-        told: (B,) text of what is known of each lane, empty where nothing is. That stays as it is.
-        step: at which step of the stage each lane broke down, from 1; 0 where it did not.
-        stage: its name.
-        problem: of the stage.
-        lanes: hyperparameters, targets, pose and the pose at which the stage began, of all lanes.
+        known: (B,) text of the failure of each problem so far, empty without failure. A first failure stays.
+        step: the step of the stage at which each problem failed, from 1; 0 without failure.
+        stage: name of the stage.
+        program: what the problems share.
+        problems, pose: of all problems, with leading axis B.
 
     Returns:
-        `told`, with the news.
+        (B,) text: `known`, with the new failures.
     """
-    told = told.copy()
-    new = np.flatnonzero((step > 0) & (told == ""))
+    failure = known.copy()
+    new = np.flatnonzero((step > 0) & (known == ""))
     if not len(new):
-        return told
-    value, gradient = _not_finite(problem, *jax.tree.map(lambda x: x[new], lanes))
-    for i, lane in enumerate(new):
-        worse = [name for name in value if value[name][i]]
-        steep = [name for name in gradient if gradient[name][i] and name not in worse]
-        parts = [f"the value of {', '.join(worse)}"] * bool(worse) + [f"the gradient of {', '.join(steep)}"] * bool(
-            steep
-        )
-        # each may be finite where their sum is not
+        return failure
+    value, gradient = _not_finite(program, *jax.tree.map(lambda x: x[new], (problems, pose)))
+    for i, b in enumerate(new):
+        values = [name for name in value if value[name][i]]
+        gradients = [name for name in gradient if gradient[name][i] and name not in values]
+        parts = [
+            f"the {what} of {', '.join(names)}" for what, names in (("value", values), ("gradient", gradients)) if names
+        ]
+        # every term may be finite where their sum is not
         what = " and ".join(parts) or "the sum of all terms"
-        told[lane] = f"{what} was not finite at step {step[lane]} of stage {stage}"
-    return told
+        failure[b] = f"{what} was not finite at step {step[b]} of stage {stage}"
+    return failure
 
 
 @eqx.filter_jit
 def _not_finite(
-    problem: Problem, hyperparameters: Hyperparameters, targets: Targets, pose: Pose, start: Pose
+    program: Program, problems: Problem, pose: Pose
 ) -> tuple[dict[str, Bool[Array, "B"]], dict[str, Bool[Array, "B"]]]:
-    """Of each weighted term of each lane: whether its value is not finite, and whether its gradient is not."""
+    """Whether the value of each weighted term is not finite, and whether its gradient is not, for each problem."""
 
-    def one(hyperparameters, targets, pose, start):
-        found = {
-            name: jax.value_and_grad(_weighted(problem, name))(pose, hyperparameters, start, targets)
-            for name in hyperparameters.settings
-        }
+    def one(problem: Problem, pose: Pose):
+        found = {name: jax.value_and_grad(_share_of(program, name))(pose, problem) for name in program.terms}
         bad = jax.tree.map(lambda x: ~jnp.all(jnp.isfinite(x)), found)
         gradient = {name: jnp.any(jnp.stack(jax.tree.leaves(pull))) for name, (_, pull) in bad.items()}
         return {name: value for name, (value, _) in bad.items()}, gradient
 
-    return jax.vmap(one)(hyperparameters, targets, pose, start)
+    return jax.vmap(one)(problems, pose)
 
 
-def _weighted(problem: Problem, name: str) -> Callable[..., Array]:
-    """One term's share of the objective, as a function of the pose, hyperparameters, start and targets of one lane."""
+def _share_of(program: Program, name: str) -> Callable[[Pose, Problem], Array]:
+    """One term's share of the objective, as a function of pose and problem."""
 
-    def share(pose: Pose, hyperparameters: Hyperparameters, start: Pose, targets: Targets) -> Array:
-        window = lane_window(pose, Lane(problem, hyperparameters, start, targets))
-        return weighted_sum(window, {name: hyperparameters.settings[name]})
+    def share(pose: Pose, problem: Problem) -> Array:
+        settings = {name: problem.hyperparameters.settings[name]}
+        return weighted_sum(problem_window(program, problem, pose), program.terms, settings)
 
     return share

@@ -71,7 +71,7 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
         for n, status in enumerate(solution.status):
             valid = solution.valid[n]
             diverged += status == "diverged"
-            if status != "diverged" and valid.any():
+            if valid.any():
                 pose = solution.body_pose[n].astype(np.float64)
                 tracks.append((pose.reshape(len(valid), -1), valid))
                 bones.append(solution.bone_length[n, valid].mean(axis=0, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt: a few steps that know the curvature, instead of hundreds that do not."""
+"""Levenberg-Marquardt: a few steps that use the curvature, instead of hundreds that do not."""
 
 from __future__ import annotations
 
@@ -10,60 +10,72 @@ import jax.numpy as jnp
 from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfit.fitting.lane import Lane, Solver, lane_loss, lane_window
+from jaxfit.fitting.problem import BATCH_AXIS, Problem, Program, Solver, problem_loss, problem_window
 from jaxfit.model.pose import Pose
-from jaxfit.objective.curvature import Rows, frame_rows
+from jaxfit.objective.curvature import Curvature, Rows, frame_rows
 from jaxfit.objective.objective import evaluate_curvature
 
 __all__ = ["LEVENBERG_MARQUARDT"]
 
 CG_STEPS, CG_TOLERANCE = 100, 0.01
-"""Conjugate-gradient steps within each step, at most, and the relative residual at which they end: the first steps need
-few, and far below 1e-6 single precision underflows to 0/0."""
+"""Largest number of conjugate-gradient steps within a step, and the relative residual at which they end. The first
+steps need few; far below 1e-6 single precision underflows to 0/0."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-5, 1e8
 EASE, TIGHTEN = 0.2, 5.0
-"""Factors on the damping after a step that lowered the loss, and after one that did not."""
+"""Factors on the damping after a step that lowered the loss, and after a step that did not."""
 
 
 class _State(NamedTuple):
     loss: Float[Array, ""]
     gradient: Pose
+    curvature: Curvature
+    """At the present pose, unless `moved`."""
+    moved: Bool[Array, ""]
+    """Whether the pose changed since the curvature was computed."""
     damping: Float[Array, ""]
-    refused: Int[Array, ""]
+    rejected: Int[Array, ""]
+    """Steps at a pose whose loss or gradient is not finite."""
 
 
-_loss_and_gradient = jax.value_and_grad(lane_loss)
+_loss_and_gradient = jax.value_and_grad(problem_loss, argnums=2)
 
 
-def _init(pose: Pose, lane: Lane, before: Any) -> _State:
-    assert before is None  # configs are checked: no solver has anything for this one
-    return _State(*_loss_and_gradient(pose, lane), jnp.float32(FIRST_DAMPING), jnp.int32(0))
+def _init(program: Program, problem: Problem, carried: Any) -> _State:
+    assert carried is None  # the config was checked: no other solver has anything for this one
+    loss, gradient = _loss_and_gradient(program, problem, problem.anchor)
+    shapes = jax.eval_shape(lambda: _curvature(program, problem, problem.anchor))
+    nothing_yet = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return _State(loss, gradient, nothing_yet, jnp.bool_(True), jnp.float32(FIRST_DAMPING), jnp.int32(0))
 
 
-def _step(pose: Pose, lane: Lane, state: _State) -> tuple[Pose, _State]:
-    """x ← x + d with (H + μ·diag H)·d = −g where that lowers the objective; μ falls then, and else rises.
+def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tuple[Pose, _State]:
+    """x ← x + d with (H + μ·diag H)·d = −g where that lowers the objective; then μ falls, else μ rises.
 
-    H is the curvature of the terms' quadratic bounds. It is never formed: within a frame it is JᵀJ, between frames one
-    band, and conjugate gradients need only its products.
+    H is the curvature of the terms' quadratic bounds. H is never formed: within a frame it is JᵀJ, between frames one
+    band, and conjugate gradients need only its products. After a step that lowered nothing, H is still that of the
+    present pose and is not computed again.
 
     Source: Marquardt 1963, An algorithm for least-squares estimation of nonlinear parameters.
     """
-    curvature = evaluate_curvature(lane_window(pose, lane), lane.hyperparameters.settings)
-    free = (
-        frame_rows(jax.tree.map(lambda x, size: jnp.broadcast_to(size, x.shape), pose, lane.hyperparameters.step_size))
-        > 0
+    # over the whole batch: a condition of each problem by itself would become a selection, which computes both sides
+    curvature = jax.lax.cond(
+        jax.lax.psum(state.moved.astype(jnp.int32), BATCH_AXIS) > 0,
+        lambda: _curvature(program, problem, pose),
+        lambda: state.curvature,
     )
-    frames, scales = len(free), pose.scale.shape[0]
+    step_size = problem.hyperparameters.step_size
+    optimised = frame_rows(jax.tree.map(lambda x, size: jnp.broadcast_to(size, x.shape), pose, step_size)) > 0
+    frames, scales = len(optimised), pose.scale.shape[0]
 
     def allowed(rows: Rows) -> Rows:
         """The part of a change that fixed parameters and a common scale allow."""
-        rows = jnp.where(free, rows, 0.0)
+        rows = jnp.where(optimised, rows, 0.0)
         return rows.at[:, -1].set(rows[:, -1].mean()) if scales < frames else rows
 
     gradient = frame_rows(state.gradient)
-    gradient = gradient.at[:, -1].divide(frames // scales)  # of a common scale each frame has its share
+    gradient = gradient.at[:, -1].divide(frames // scales)  # each frame has its share of a common scale
     diagonal = allowed(curvature.diagonal)
-    # a parameter that nothing pulls at has no gradient either, and stays
+    # a parameter that no term pulls has no gradient either, and stays
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
     change, _ = cg(
         lambda d: allowed(curvature.product(d)) + state.damping * diagonal * d,
@@ -73,7 +85,7 @@ def _step(pose: Pose, lane: Lane, state: _State) -> tuple[Pose, _State]:
         maxiter=CG_STEPS,
     )
     moved = _moved(pose, change)
-    loss, new_gradient = _loss_and_gradient(moved, lane)
+    loss, new_gradient = _loss_and_gradient(program, problem, moved)
     lower = (loss < state.loss) & _finite(new_gradient)
 
     def better(new: Any, old: Any) -> Any:
@@ -82,11 +94,16 @@ def _step(pose: Pose, lane: Lane, state: _State) -> tuple[Pose, _State]:
     damping = jnp.clip(state.damping * jnp.where(lower, EASE, TIGHTEN), LEAST_DAMPING, MOST_DAMPING)
     stuck = ~(jnp.isfinite(state.loss) & _finite(state.gradient))
     loss, gradient = better((loss, new_gradient), (state.loss, state.gradient))
-    return better(moved, pose), _State(loss, gradient, damping, state.refused + stuck)
+    return better(moved, pose), _State(loss, gradient, curvature, lower, damping, state.rejected + stuck)
+
+
+def _curvature(program: Program, problem: Problem, pose: Pose) -> Curvature:
+    window = problem_window(program, problem, pose)
+    return evaluate_curvature(window, program.terms, problem.hyperparameters.settings)
 
 
 def _outcome(state: _State) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    return state.loss, state.refused
+    return state.loss, state.rejected
 
 
 def _moved(pose: Pose, rows: Rows) -> Pose:

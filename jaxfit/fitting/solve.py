@@ -1,4 +1,4 @@
-"""One stage of the fit: a solver's steps on a batch of windows, as one compiled program."""
+"""One stage of the fit: a solver's steps on a batch of problems, as one compiled program."""
 
 from __future__ import annotations
 
@@ -6,82 +6,85 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfit.fitting.lane import Hyperparameters, Lane, Problem, lane_window
+from jaxfit.fitting.problem import BATCH_AXIS, Problem, Program, problem_window
 from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import evaluate_terms
-from jaxfit.objective.posed_window import Targets
 
 __all__ = ["Report", "StageState", "advance", "begin", "report"]
 
 
 class StageState(NamedTuple):
-    """Where a batch of B windows stands."""
+    """The progress of a batch of B problems in one stage."""
 
     pose: Pose
-    start: Pose
-    """The poses at which the stage began."""
     solver: Any
-    """The solver's own state."""
+    """The state of the solver, for each problem."""
 
 
 @eqx.filter_jit
-def begin(
-    problem: Problem, hyperparameters: Hyperparameters, pose: Pose, targets: Targets, before: StageState | None
-) -> StageState:
-    """Start a stage at `pose`; with `before`, the solver goes on with that stage's moments."""
+def begin(program: Program, problems: Problem, carried: Any) -> StageState:
+    """Return the state at the beginning of a stage, at the anchor poses.
 
-    def one(hyperparameters, pose, targets, carried):
-        return problem.solver.init(pose, Lane(problem, hyperparameters, pose, targets), carried)
+    Args:
+        program: what the problems share.
+        problems: with leading axis B.
+        carried: solver state at the end of the stage before, whose moments continue; None: fresh moments.
+    """
 
-    carried = None if before is None else before.solver
-    return StageState(pose, pose, jax.vmap(one)(hyperparameters, pose, targets, carried))
+    def one(problem: Problem, carried: Any) -> Any:
+        return program.solver.init(program, problem, carried)
+
+    solver = jax.vmap(one, axis_name=BATCH_AXIS)(problems, carried)
+    # copies: `advance` reuses the memory of its state
+    return StageState(*jax.tree.map(jnp.copy, (problems.anchor, solver)))
 
 
 @eqx.filter_jit(donate="all-except-first")
 def advance(
-    fixed: tuple[Problem, Hyperparameters, Targets, Int[Array, ""]], state: StageState
-) -> tuple[StageState, Array, Array]:
+    fixed: tuple[Program, Problem, Int[Array, ""]], state: StageState
+) -> tuple[StageState, Float[Array, "B"], Int[Array, "B"]]:
     """Take some steps.
 
     Args:
-        fixed: the problem, hyperparameters and targets (B, …) and the number of steps, traced.
-        state: given up; use the returned one.
+        fixed: the program, the problems (B, …) and the number of steps, which is traced.
+        state: its memory is reused; use the returned state instead.
 
     Returns:
-        The new state, and each lane's `Solver.outcome`: loss (B,) and refused steps (B,).
+        The new state, and `Solver.outcome` of each problem: loss (B,) and rejected steps (B,).
     """
-    problem, hyperparameters, targets, steps = fixed
+    program, problems, steps = fixed
 
-    def one(hyperparameters: Hyperparameters, state: StageState, targets: Targets):
-        lane = Lane(problem, hyperparameters, state.start, targets)
-        return jax.lax.fori_loop(
-            0, steps, lambda _, carry: problem.solver.step(carry[0], lane, carry[1]), (state.pose, state.solver)
-        )
+    def one(problem: Problem, state: StageState) -> StageState:
+        def step(_, state: StageState) -> StageState:
+            return StageState(*program.solver.step(program, problem, *state))
 
-    pose, solver_state = jax.vmap(one)(hyperparameters, state, targets)
-    return StageState(pose, state.start, solver_state), *jax.vmap(problem.solver.outcome)(solver_state)
+        return jax.lax.fori_loop(0, steps, step, state)
+
+    state = jax.vmap(one, axis_name=BATCH_AXIS)(problems, state)
+    return state, *jax.vmap(program.solver.outcome)(state.solver)
 
 
 class Report(NamedTuple):
-    """What a batch of poses amounts to."""
+    """The objective and the keypoints at a batch of poses."""
 
     loss: dict[str, Float[Array, "B"]]
-    """Each term's weighted share of the objective, at these poses."""
+    """Each term's weighted share of the objective."""
     keypoints_cam: Float[Array, "B T K 3"]
     keypoints_px: Float[Array, "B T K 2"]
     """Crop pixels."""
 
 
 @eqx.filter_jit
-def report(problem: Problem, hyperparameters: Hyperparameters, pose: Pose, start: Pose, targets: Targets) -> Report:
-    """Evaluate poses as they are (Adam itself only knows the loss before its last step)."""
+def report(program: Program, problems: Problem, pose: Pose) -> Report:
+    """Evaluate a batch of poses (a solver's state only knows the loss before its last step)."""
 
-    def one(hyperparameters, pose, start, targets):
-        window = lane_window(pose, Lane(problem, hyperparameters, start, targets))
-        values = evaluate_terms(window, hyperparameters.settings)
-        weighted = {name: hyperparameters.settings[name]["weight"] * value for name, value in values.items()}
+    def one(problem: Problem, pose: Pose) -> Report:
+        window, settings = problem_window(program, problem, pose), problem.hyperparameters.settings
+        values = evaluate_terms(window, program.terms, settings)
+        weighted = {name: jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()}
         return Report(weighted, window.keypoints_cam, window.keypoints_px)
 
-    return jax.vmap(one)(hyperparameters, pose, start, targets)
+    return jax.vmap(one)(problems, pose)

@@ -1,27 +1,37 @@
-"""Stages as data, turned into what the solver takes."""
+"""Stages of a config, turned into programs and hyperparameters for the solvers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxfit.config.schema import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.fitting.adam import ADAM
-from jaxfit.fitting.lane import Hyperparameters, Problem, Solver
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
-from jaxfit.model.camera import Camera
-from jaxfit.model.kinematics import Rig
+from jaxfit.fitting.problem import Hyperparameters, Program, Solver
+from jaxfit.model.bird import Bird
+from jaxfit.model.camera import CROP_PX, Camera
+from jaxfit.model.kinematics import Rig, fold_bird
 from jaxfit.model.pose import Pose
-from jaxfit.objective.posed_window import Priors, Raster
-from jaxfit.objective.registry import find_term
+from jaxfit.objective.posed_window import Priors, Raster, priors_of
+from jaxfit.objective.registry import find_terms
 from jaxfit.raster.silhouette import Blur
 
-__all__ = ["needs_mask", "program", "stage_hyperparameters", "stage_problem"]
+__all__ = [
+    "FitModel",
+    "compiled_part",
+    "crop_camera",
+    "fit_model",
+    "needs_mask",
+    "stage_hyperparameters",
+    "stage_program",
+]
 
 SOLVERS: Mapping[str, Solver] = {"adam": ADAM, "levenberg_marquardt": LEVENBERG_MARQUARDT}
-"""By the name that a stage gives as its `solver`."""
+"""By the name in a stage's `solver`."""
 STEP_SHAPES = {
     "global_orient": (3,),
     "body_pose": (1, 3),
@@ -30,29 +40,48 @@ STEP_SHAPES = {
     "bone_length": (1,),
     "betas": (1,),
 }
-"""Step sizes are those of one frame, the same for all bones and shape coefficients."""
+"""Step sizes are the same for all frames, bones and shape coefficients."""
+
+
+class FitModel(NamedTuple):
+    """A bird and the crop camera, as all stages of a fit use them."""
+
+    bird: Bird
+    rig: Rig
+    priors: Priors
+    camera: Camera
+
+
+def fit_model(bird: Bird, config: FitConfig) -> FitModel:
+    """Fold a bird for a fit."""
+    return FitModel(bird, fold_bird(bird), priors_of(bird), crop_camera(config))
+
+
+def crop_camera(config: FitConfig) -> Camera:
+    """Return the crop camera, in crop pixels."""
+    return Camera(config.crop.focal_px, CROP_PX / 2, CROP_PX)
 
 
 def needs_mask(stage: StageConfig) -> bool:
-    """Whether any of a stage's terms looks at the silhouette."""
-    return any(find_term(name).compares_masks for name in stage.terms)
+    """Whether any term of a stage compares masks."""
+    return any(term.compares_masks for term in find_terms(stage.terms).values())
 
 
-def stage_problem(config: FitConfig, stage: StageConfig, rig: Rig, priors: Priors, camera: Camera) -> Problem:
-    """What the lanes of one stage share."""
-    usual = Blur.for_size(camera.size_px)
-    raster = Raster(Blur(usual.sigma * stage.blur**2, usual.radius * stage.blur), config.backend)
-    return Problem(rig, priors, camera, raster, SOLVERS[stage.solver])
+def stage_program(config: FitConfig, stage: StageConfig, model: FitModel) -> Program:
+    """Return what the problems of one stage share. The terms are looked up here, before anything is compiled."""
+    usual = Blur.for_size(config.crop.size_px)
+    blur = Blur(usual.sigma * stage.blur**2, usual.radius * stage.blur)
+    raster = Raster(blur, config.crop.size_px, config.backend)
+    return Program(model.rig, model.priors, model.camera, raster, find_terms(stage.terms), SOLVERS[stage.solver])
 
 
 def stage_hyperparameters(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[str]) -> Hyperparameters:
-    """What one config may set in a stage without another program, as NumPy arrays of one lane."""
+    """Return the hyperparameters of one stage of one config, as NumPy arrays of a single problem."""
 
     def step_size(name: str, shape: tuple[int, ...]) -> np.ndarray:
         scale = np.asarray(stage.step_scale.get(name, 1.0), np.float32)
-        return np.array(
-            np.broadcast_to(stage.learning_rate * scale if name in stage.optimised else 0.0, shape), np.float32
-        )
+        size = stage.learning_rate * scale if name in stage.optimised else 0.0
+        return np.array(np.broadcast_to(size, shape), np.float32)
 
     return Hyperparameters(
         settings={
@@ -64,12 +93,16 @@ def stage_hyperparameters(config: FitConfig, stage: StageConfig, keypoint_names:
     )
 
 
-def program(config: FitConfig) -> FitConfig:
-    """The part of the config that determines the compiled program."""
+def compiled_part(config: FitConfig) -> FitConfig:
+    """Return the part of the config that determines the compiled program.
+
+    Configs with an equal part differ only in hyperparameters and in the preparation of the data. They share one
+    compiled program.
+    """
     stages = tuple(
         replace(
             stage,
-            optimised=tuple(name for name in stage.optimised if name == "betas"),  # it decides whether there are any
+            optimised=tuple(name for name in stage.optimised if name == "betas"),  # decides whether there are any
             learning_rate=1.0,
             step_scale={},
             keypoints_off=(),

@@ -8,7 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = ["Camera", "crop_to_image", "image_to_crop", "project", "to_screen"]
+__all__ = ["CROP_PX", "Camera", "crop_to_image", "image_to_crop", "project", "to_screen"]
+
+CROP_PX = 256
+"""Side of every crop in crop pixels. All pixel quantities of a fit are in this unit, whatever the silhouette's size."""
 
 
 class Camera(NamedTuple):
@@ -19,7 +22,7 @@ class Camera(NamedTuple):
 
     focal_px: float = 2167.0
     centre_px: float = 128.0
-    size_px: int = 256
+    size_px: int = CROP_PX
 
 
 def project(points_cam: Float[Array, "*B 3"], camera: Camera) -> Float[Array, "*B 2"]:
@@ -43,14 +46,14 @@ def to_screen(points_cam: Float[Array, "*B 3"], camera: Camera) -> Float[Array, 
 
 
 def crop_to_image(
-    points_px: Float[Array | np.ndarray, "*B 2"], crop: Float[Array | np.ndarray, "*C 3"], size_px: int = 256
+    points_px: Float[Array | np.ndarray, "*B 2"], crop: Float[Array | np.ndarray, "*C 3"], size_px: int = CROP_PX
 ) -> Float[Array | np.ndarray, "*B 2"]:
     """Crop pixels → image pixels; `crop` is (x0, y0, size) in image pixels, one per leading index."""
     return points_px * (crop[..., None, 2:] / size_px) + crop[..., None, :2]
 
 
 def image_to_crop(
-    points_px: Float[Array | np.ndarray, "*B 2"], crop: Float[Array | np.ndarray, "*C 3"], size_px: int = 256
+    points_px: Float[Array | np.ndarray, "*B 2"], crop: Float[Array | np.ndarray, "*C 3"], size_px: int = CROP_PX
 ) -> Float[Array | np.ndarray, "*B 2"]:
     """Image pixels → crop pixels; the inverse of `crop_to_image`."""
     return (points_px - crop[..., None, :2]) * (size_px / crop[..., None, 2:])

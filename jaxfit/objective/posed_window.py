@@ -30,14 +30,13 @@ class Targets(eqx.Module):
     confidence: Float[Array | np.ndarray, "*T K"]
     """In [0, 1]; 0 where the keypoint was not seen."""
     mask: UInt8[Array | np.ndarray, "*T H W"]
-    """0 or 1."""
+    """0 or 1; of the silhouette's size, or empty in a stage that compares no masks."""
     has_mask: Bool[Array | np.ndarray, "*T"]
     """False where the frame has no mask; such a frame's silhouette is not compared."""
     present: Bool[Array | np.ndarray, "*T"]
     """False where the bird was not seen at all; such a frame contributes nothing to any term."""
     corner_px: Float[Array | np.ndarray, "*T 2"]
-    """Upper left corner of the crop in the image, in pixels of the crop's own size: the crop follows the bird, and
-    this tells where to."""
+    """Upper left corner of the crop in the image, in crop pixels. The crop follows the bird."""
 
 
 class Priors(NamedTuple):
@@ -75,6 +74,9 @@ class Raster(NamedTuple):
     """How silhouettes are drawn; static, part of the compiled program."""
 
     blur: Blur
+    """In pixels of the silhouette."""
+    size_px: int
+    """Side of silhouettes and masks, which show the whole crop."""
     backend: Literal["auto", "native", "reference"] = "auto"
 
 
@@ -193,8 +195,10 @@ class PosedWindow:
 
     @cached_property
     def vertices_screen(self) -> Float[Array, "T V 3"]:
-        """Posed vertices as (x_px, y_px, z_cam) in the crop, for the raster core."""
-        return to_screen(window_vertices(self._rig, self._transforms, self.pose), self.camera)
+        """Posed vertices as (x, y) in pixels of the silhouette and depth z in the camera frame, for the raster core."""
+        screen = to_screen(window_vertices(self._rig, self._transforms, self.pose), self.camera)
+        ratio = self.raster.size_px / self.camera.size_px
+        return screen if ratio == 1 else screen * jnp.array([ratio, ratio, 1.0])
 
     @property
     def faces(self):

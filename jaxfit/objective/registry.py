@@ -5,17 +5,15 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import Any, TypeVar, overload
 
-import jax
-
 from jaxfit.errors import InputError
 from jaxfit.objective.curvature import Curvature
 
-__all__ = ["ENTRY_POINTS", "Term", "find_term", "known_terms", "term"]
+__all__ = ["ENTRY_POINTS", "Term", "find_term", "find_terms", "known_terms", "term"]
 
 ENTRY_POINTS = "jaxfit.terms"
 """The entry-point group by which an installed package offers terms."""
@@ -24,7 +22,7 @@ FORM = "a term is `def name(window, *, setting=1.0): …`, with one window and s
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Term:
     """A pure function of the `PosedWindow`, and what else is to be known of it."""
 
@@ -81,7 +79,7 @@ def term(function=None, /, *, name=None, positive=(), compares_masks=False, curv
         if before is not None and before.function.__module__ != function.__module__:
             problem = f"is the name of a term of {before.function.__module__}"
             raise InputError(f"term {own.name!r}", problem, "choose another name")
-        _keep(own.name, own)
+        _terms[own.name] = own
         return function
 
     return register if function is None else register(function)
@@ -107,8 +105,13 @@ def find_term(name: str) -> Term:
     function = _import(name, path)
     registered = next((known for known in _terms.values() if known.function is function), None)
     found = registered or _read(name, function)
-    _keep(name, found)
+    _terms[name] = found
     return found
+
+
+def find_terms(names: Iterable[str]) -> dict[str, Term]:
+    """Return terms by their names, as `find_term` finds each of them."""
+    return {name: find_term(name) for name in names}
 
 
 def known_terms() -> list[str]:
@@ -160,10 +163,3 @@ def _read(name: str, function: Any, positive: Collection[str] = (), compares_mas
     require(not unknown, f"has no setting {', '.join(map(repr, unknown))} that could be positive")
     defaults = {setting.name: float(setting.default) for setting in settings}
     return Term(name, function, defaults, frozenset(positive), compares_masks)
-
-
-def _keep(name: str, found: Term) -> None:
-    if name in _terms and _terms[name].function is not found.function:
-        # programs compiled with the earlier function go by the same name
-        jax.clear_caches()
-    _terms[name] = found

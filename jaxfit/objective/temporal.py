@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float
 
 from jaxfit.model.rotation import safe_norm
@@ -68,16 +69,21 @@ def _differences_curvature(
     orient_pull = beta_global * _coupling(rows[:, :3], order, complete)
     body_pull = beta_pose * _coupling(rows[:, 3:-4], order, complete)
 
-    def on_rows(orient: Float[Array, "T 3"], body: Float[Array, "T size"]) -> Rows:
-        return jnp.pad(jnp.concatenate([orient, body], axis=1), ((0, 0), (0, 4)))
-
     def alike(pull: Float[Array, "T T"], like: Float[Array, "T n"]) -> Float[Array, "T n"]:
         return jnp.broadcast_to(jnp.diagonal(pull)[:, None], like.shape)
 
     return Curvature(
-        lambda d: on_rows(orient_pull @ d[:, :3], body_pull @ d[:, 3:-4]),
-        on_rows(alike(orient_pull, rows[:, :3]), alike(body_pull, rows[:, 3:-4])),
+        Partial(_differences_product, orient_pull, body_pull),
+        _angle_rows(alike(orient_pull, rows[:, :3]), alike(body_pull, rows[:, 3:-4])),
     )
+
+
+def _differences_product(orient_pull: Float[Array, "T T"], body_pull: Float[Array, "T T"], d: Rows) -> Rows:
+    return _angle_rows(orient_pull @ d[:, :3], body_pull @ d[:, 3:-4])
+
+
+def _angle_rows(orient: Float[Array, "T 3"], body: Float[Array, "T size"]) -> Rows:
+    return jnp.pad(jnp.concatenate([orient, body], axis=1), ((0, 0), (0, 4)))
 
 
 def _coupling(

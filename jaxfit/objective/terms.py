@@ -10,7 +10,8 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.tree_util import Partial
+from jaxtyping import Array, Bool, Float
 
 from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.curvature import Curvature, Rows
@@ -46,13 +47,18 @@ def _keypoints_curvature(window: PosedWindow, *, sigma_px: Scalar | float) -> Cu
     error_px = window.keypoints_px - window.targets.keypoints_px
     weight = 2 * window.targets.confidence[..., None] * (sigma_px**2 / (sigma_px**2 + error_px**2)) ** 2
     weight = weight.reshape(by_angles.shape[:2])
-
-    def product(d: Rows) -> Rows:
-        moved_px = jnp.einsum("tri,ti->tr", by_angles, d[:, :-4]) + jnp.einsum("tri,ti->tr", by_place, d[:, -4:])
-        return jnp.concatenate([jnp.einsum("tri,tr->ti", J, weight * moved_px) for J in (by_angles, by_place)], axis=1)
-
     diagonal = [jnp.einsum("tri,tr->ti", J**2, weight) for J in (by_angles, by_place)]
-    return Curvature(product, jnp.concatenate(diagonal, axis=1))
+    return Curvature(Partial(_keypoints_product, by_angles, by_place, weight), jnp.concatenate(diagonal, axis=1))
+
+
+def _keypoints_product(
+    by_angles: Float[Array, "T rows angles"],
+    by_place: Float[Array, "T rows 4"],
+    weight: Float[Array, "T rows"],
+    d: Rows,
+) -> Rows:
+    moved_px = jnp.einsum("tri,ti->tr", by_angles, d[:, :-4]) + jnp.einsum("tri,ti->tr", by_place, d[:, -4:])
+    return jnp.concatenate([jnp.einsum("tri,tr->ti", J, weight * moved_px) for J in (by_angles, by_place)], axis=1)
 
 
 @term(positive=["sigma_px"], curvature=_keypoints_curvature)
@@ -68,7 +74,7 @@ def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Scalar
 
 @term(compares_masks=True)
 def mask(window: PosedWindow) -> Scalar:
-    """E_msk = Σ_t Σ_pixels |soft silhouette − mask|.
+    """E_msk = Σ_t Σ_pixels |soft silhouette − mask|, over the pixels of a 256-pixel crop.
 
     Source: Hägerlind et al. 2024, mask term.
     """
@@ -85,10 +91,12 @@ def mask_smooth_l1(window: PosedWindow) -> Scalar:
 
 
 def _mask(window: PosedWindow, kind: Literal["l1", "smooth_l1"]) -> Scalar:
-    weight = window.targets.has_mask.astype(jnp.float32)
+    # a sum over crop pixels, whatever the size of the silhouette
+    weight = window.targets.has_mask.astype(jnp.float32) * (window.camera.size_px / window.raster.size_px) ** 2
+    raster = {"blur": window.raster.blur, "backend": window.raster.backend}
 
     def frame(vertices_screen, target, weight):
-        return mask_loss(vertices_screen, window.faces, target, weight, kind=kind, **window.raster._asdict())
+        return mask_loss(vertices_screen, window.faces, target, weight, kind=kind, **raster)
 
     return jnp.sum(jax.vmap(frame)(window.vertices_screen, window.targets.mask, weight))
 
@@ -96,13 +104,17 @@ def _mask(window: PosedWindow, kind: Literal["l1", "smooth_l1"]) -> Scalar:
 def _pose_prior_curvature(window: PosedWindow) -> Curvature:
     """H = 2·Σ⁻¹ on the body pose of every frame that is there; the term is a square already."""
     precision = window.priors.pose_whitener.T @ window.priors.pose_whitener
-    present, size = window.targets.present[:, None], len(precision)
+    present = jnp.asarray(window.present)
+    diagonal = jnp.broadcast_to(jnp.diagonal(precision), (len(present), len(precision)))
+    return Curvature(Partial(_pose_prior_product, precision, present), _body_rows(present, diagonal))
 
-    def on_body(rows: Float[Array, "T size"]) -> Rows:
-        return jnp.pad(2 * jnp.where(present, rows, 0.0), ((0, 0), (3, 4)))
 
-    diagonal = jnp.broadcast_to(jnp.diagonal(precision), (len(present), size))
-    return Curvature(lambda d: on_body(d[:, 3:-4] @ precision), on_body(diagonal))
+def _pose_prior_product(precision: Float[Array, "D D"], present: Bool[Array, "T"], d: Rows) -> Rows:
+    return _body_rows(present, d[:, 3:-4] @ precision)
+
+
+def _body_rows(present: Bool[Array, "T"], rows: Float[Array, "T D"]) -> Rows:
+    return jnp.pad(2 * jnp.where(present[:, None], rows, 0.0), ((0, 0), (3, 4)))
 
 
 @term(curvature=_pose_prior_curvature)

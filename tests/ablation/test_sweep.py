@@ -16,7 +16,6 @@ from jaxfit.errors import InputError
 from jaxfit.evaluation.bootstrap import Interval
 from jaxfit.evaluation.figures import Evaluation
 from jaxfit.fitting.fit import fit_runs
-from jaxfit.fitting.prepare import Preparation
 from jaxfit.model.camera import Camera
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
@@ -33,8 +32,8 @@ def observed():
 def config():
     paper = jaxfit.load_config("paper")
     stages = (dataclasses.replace(paper.stages[0], steps=12),)
-    crop = dataclasses.replace(paper.crop, mode="image", size_px=SIZE, focal_px=CAMERA.focal_px)
-    terms = {"keypoints": 10, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0}
+    crop = dataclasses.replace(paper.crop, mode="image", size_px=SIZE)
+    terms = {"keypoints": 0.625, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0}
     return dataclasses.replace(paper, window=T, stages=stages, crop=crop, terms=terms)
 
 
@@ -46,7 +45,7 @@ def test_every_run_is_the_fit_of_its_config_in_the_order_of_the_values(observed)
     assert [dict(result.run.levels) for result in swept.results] == levels
     for first in (0, 1):
         pair = [jaxfit.with_values(config(), levels[r]) for r in (first, first + 2)]
-        alone = fit_runs(Preparation(observed, BIRD, None, "observations"), BIRD, pair)
+        alone = fit_runs(observed, BIRD, pair)
         for r, expected in zip((first, first + 2), alone, strict=True):
             np.testing.assert_array_equal(swept.solutions[r].keypoints_px, expected.keypoints_px)
             assert swept.results[r].evaluation.overall == jaxfit.evaluate(expected, BIRD, observed).overall

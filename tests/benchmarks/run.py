@@ -28,7 +28,7 @@ from jaxfit.cli import load_config, read_coco
 from jaxfit.cli import main as cli
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.start import load_start
+from jaxfit.fitting.initial_pose_file import load_initial_poses
 from jaxfit.model.bird import Bird
 from jaxfit.progress import terminal
 
@@ -77,7 +77,7 @@ def photographs(bird: Bird, reference: Path) -> Iterator[Metric]:
         config, rows, seconds = load_config(name), [], 0.0
         for path in sorted((reference / "cub").glob("*.json")):
             observations = read_coco(path)
-            start = load_start(path.with_suffix(".init.npz"), observations, bird) if name == "aves" else None
+            start = load_initial_poses(path.with_suffix(".init.npz"), observations, bird) if name == "aves" else None
             one_step = tuple(dataclasses.replace(stage, steps=1) for stage in config.stages)
             fit(observations, bird, dataclasses.replace(config, stages=one_step), start)  # compiles
             began = time.perf_counter()

@@ -13,7 +13,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.track_quality import track_quality
 from jaxfit.errors import InputError
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.window import filter_observations
+from jaxfit.fitting.windows import filter_observations
 from jaxfit.perception.instances import instance_of
 from jaxfit.perception.tracking import TrackRecorder, drop_short_tracks
 

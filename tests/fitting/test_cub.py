@@ -8,7 +8,7 @@ from jaxfit.config.schema import load_config
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.start import load_start
+from jaxfit.fitting.initial_pose_file import load_initial_poses
 from jaxfit.model.importers.sources import import_sources
 
 SPECIES = "106.Horned_Puffin"
@@ -34,7 +34,7 @@ def measured(photographs, config, start=None):
 
 def test_from_the_stored_starting_points(photographs, reference_dir):
     bird, observations, reached = photographs
-    start = load_start(reference_dir / "cub" / f"{SPECIES}.init.npz", observations, bird)
+    start = load_initial_poses(reference_dir / "cub" / f"{SPECIES}.init.npz", observations, bird)
     result = measured(photographs, "aves", start)
     assert result["pck@0.05"] >= reached["pck05"] - 0.01
     assert result["pck@0.10"] >= reached["pck10"] - 0.01

@@ -4,16 +4,17 @@ import importlib
 import json
 import logging
 import sys
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.cli_files import T, arguments, refused
+from support.cli_files import SIZE, T, arguments, refused
 
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.solution import load_solution
 from jaxfit.fitting.diagnose import name_failures
+from jaxfit.model.camera import CROP_PX
 from jaxfit.objective import registry
 
 pytestmark = pytest.mark.usefixtures("own_cache")
@@ -48,8 +49,13 @@ def nan_value(window):
     left = window.targets.keypoints_px[0, 0, 0] < SPLIT_PX
     return jnp.where(left, jnp.nan, 0.0) * jnp.sum(window.pose.scale)
 
+def nan_value_later(window):
+    "Not finite as soon as the bird has moved, with a gradient of zero."
+    moved = jnp.abs(window.pose.transl - window.anchor.transl).max() > 0.005
+    return jnp.where(moved, jnp.nan, 0.0)
+
 def nan_gradient(window):
-    return jnp.sum(jnp.sqrt(jnp.abs(window.pose.body_pose - window.start.body_pose)))
+    return jnp.sum(jnp.sqrt(jnp.abs(window.pose.body_pose - window.anchor.body_pose)))
 """
 
 
@@ -106,7 +112,7 @@ def test_terms_that_cannot_be_used(inputs, tmp_path, capsys, name, words):
 @pytest.mark.parametrize(("name", "what"), [("nan_value", "value"), ("nan_gradient", "gradient")])
 def test_what_breaks_a_bird_down_is_named(inputs, tmp_path, caplog, name, what):
     bill_px = read_coco(inputs / "birds.json").keypoints_px[:2, 0, 0, 0]  # of tracks 4 and 7
-    importlib.import_module("own_terms").SPLIT_PX = bill_px.mean()
+    importlib.import_module("own_terms").SPLIT_PX = bill_px.mean() * CROP_PX / SIZE
     broken = {"nan_value": {("4", "7")[bill_px.argmin()]}, "nan_gradient": {"4", "7"}}[name]
     with caplog.at_level(logging.WARNING):
         assert main(command(inputs, tmp_path, f"own_terms:{name}")) == 0
@@ -115,10 +121,20 @@ def test_what_breaks_a_bird_down_is_named(inputs, tmp_path, caplog, name, what):
     assert set(summary["failures"]) == broken
     assert {str(track) for track in solution.track_id[solution.status == "diverged"]} == broken
     for track, said in summary["failures"].items():
-        assert said == f"frames 0 to {T - 1}: the {what} of own_terms:{name} was not finite at step 1 of stage second"
-        assert f"track {track}, {said}" in caplog.text
+        failure = f"frames 0 to {T - 1}: the {what} of own_terms:{name} was not finite at step 1 of stage second"
+        assert said == [failure]
+        assert f"track {track}, {failure}" in caplog.text
 
 
-def test_nothing_new_is_computed():
-    told = np.array(["", "known"], object)
-    assert name_failures(told, np.array([0, 3]), "stage", jnp.zeros(())).tolist() == ["", "known"]
+def test_a_value_that_stops_being_finite_is_dated(inputs, tmp_path):
+    """Adam's first step moves every translation by 0.01, so that the value at the second step is not finite."""
+    assert main(command(inputs, tmp_path, "own_terms:nan_value_later", steps=20)) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    expected = "the value of own_terms:nan_value_later was not finite at step 2 of stage second"
+    assert [said[0].split(": ", 1)[1] for said in summary["failures"].values()] == [expected] * 2
+
+
+def test_a_first_failure_stays():
+    known = np.array(["", "known"], object)
+    nothing: Any = None  # nothing is evaluated
+    assert name_failures(known, np.array([0, 3]), "stage", nothing, nothing, nothing).tolist() == ["", "known"]

@@ -15,14 +15,16 @@ from jaxfit.data.masks import encode_mask
 from jaxfit.data.solution import save_solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import evaluate
-from jaxfit.fitting.batch import Lanes, fit_batch, frames_per_batch
+from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.start import load_start
-from jaxfit.fitting.window import cut_windows, load_targets
-from jaxfit.model.camera import Camera, project
-from jaxfit.model.kinematics import fold_bird
+from jaxfit.fitting.initial_pose_file import load_initial_poses
+from jaxfit.fitting.learn import learn_prior
+from jaxfit.fitting.problem import Problem
+from jaxfit.fitting.solve import report
+from jaxfit.fitting.stages import fit_model, stage_hyperparameters, stage_program
+from jaxfit.fitting.windows import cut_windows, load_targets
+from jaxfit.model.camera import CROP_PX, Camera, project
 from jaxfit.model.pose import Pose
-from jaxfit.objective.posed_window import priors_of
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
 
@@ -36,8 +38,8 @@ ONE = 0.002
 def config(window=T, steps=(600, 25), memory_gb=ONE, mode="image", **changes):
     paper = load_config("paper")
     stages = tuple(dataclasses.replace(s, steps=n) for s, n in zip(paper.stages, steps, strict=True))
-    crop = dataclasses.replace(paper.crop, mode=mode, size_px=SIZE, focal_px=CAMERA.focal_px)
-    terms = {"keypoints": 100, "mask": 1, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0.1}
+    crop = dataclasses.replace(paper.crop, mode=mode, size_px=SIZE)
+    terms = {"keypoints": 6.25, "mask": 0.0625, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0.1}
     plain = dataclasses.replace(paper, window=window, stages=stages, crop=crop, terms=terms, memory_gb=memory_gb)
     return dataclasses.replace(plain, filter_window=1, **changes)
 
@@ -129,6 +131,49 @@ def test_a_broken_bird_leaves_the_others_alone(observed, windows_a_batch):
     assert_same(result, fit(observed, BIRD, settings), [0, 2])
 
 
+@pytest.mark.parametrize("first_diverges", [True, False])
+def test_one_diverged_window_leaves_the_other_windows_of_the_track_alone(first_diverges):
+    """Only the poses of the other windows are valid, and the loss is theirs, in whatever order the windows come."""
+    observations, settings = detect(BIRD, truths(2 * T, 2), camera=CAMERA), config(steps=(20, 2))
+    points = observations.keypoints_px.copy()
+    bad, good = (slice(T), slice(T, None)) if first_diverges else (slice(T, None), slice(T))
+    points[0, bad] = 1e30
+    result = fit(observations.with_keypoints(points, observations.confidence), BIRD, settings)
+    healthy = fit(observations.select(frames=good), BIRD, settings)
+    assert result.status.tolist() == ["partly diverged", "ok"]
+    assert result.valid[0, good].all()
+    assert not result.valid[0, bad].any()
+    np.testing.assert_array_equal(result.body_pose[0, good], healthy.body_pose[0])
+    assert np.isnan(result.body_pose[0, bad]).all()
+    for term, loss in healthy.loss.items():
+        assert result.loss[term][0] == pytest.approx(loss[0], rel=1e-5)
+    (failure,) = result.failures[0]
+    assert failure.startswith(f"frames {0 if first_diverges else T} to {T - 1 if first_diverges else 2 * T - 1}: ")
+    learnt = learn_prior([("result", result, BIRD)])
+    assert (learnt.poses, learnt.birds, learnt.diverged) == (3 * T, 2, 0)
+    assert evaluate(result, BIRD, observations).frames == 3 * T
+
+
+def test_the_size_of_the_silhouette_does_not_change_the_objective(observed):
+    """Pixel quantities are those of a 256-pixel crop, also where silhouettes and masks are smaller."""
+    model, poses = {}, jax.tree.map(lambda *x: np.stack(x), *truths())
+    moved = dataclasses.replace(poses, transl=poses.transl + np.array([1.0, -0.5, 0], np.float32))
+    large = in_a_large_image(observed)
+    for size_px in (64, 128, 256):
+        settings = config(mode="box", steps=(1, 1))
+        settings = dataclasses.replace(settings, crop=dataclasses.replace(settings.crop, size_px=size_px))
+        fitted, stage = fit_model(BIRD, settings), settings.stages[1]
+        one = stage_hyperparameters(settings, stage, BIRD.keypoint_names)
+        windows = cut_windows(large, settings)
+        problems = Problem(jax.tree.map(lambda x: np.stack([x] * 3), one), moved, load_targets(windows, size_px))
+        model[size_px] = report(stage_program(settings, stage, fitted), problems, moved).loss
+    for term in ("keypoints", "pose_prior", "velocity", "acceleration"):
+        np.testing.assert_allclose(model[64][term], model[256][term], rtol=1e-5, err_msg=term)
+    # the outline of a smaller silhouette is coarser
+    np.testing.assert_allclose(model[128]["mask"], model[256]["mask"], rtol=0.02)
+    np.testing.assert_allclose(model[64]["mask"], model[256]["mask"], rtol=0.08)
+
+
 def test_a_bird_that_was_hardly_seen(solution, observed):
     hidden = replaced(observed, 1, confidence=np.zeros((T, BIRD.num_keypoints)))
     result = fit(hidden, BIRD, config())
@@ -206,7 +251,7 @@ def test_boxes_in_a_large_image(observed, tmp_path):
     assert apart.max() < 0.5
     assert evaluate(result, BIRD, large).overall["iou"] > 0.9
     save_solution(result, BIRD, config_to_yaml(config()), {}, tmp_path / "out")
-    start = load_start(tmp_path / "out" / "poses.npz", large, BIRD)
+    start = load_initial_poses(tmp_path / "out" / "poses.npz", large, BIRD)
     again = fit(large, BIRD, config(mode="box", steps=(1, 1)), start)
     for name in ("global_orient", "body_pose", "transl", "scale"):
         np.testing.assert_allclose(getattr(again, name), getattr(result, name), atol=0.05, err_msg=name)
@@ -253,15 +298,14 @@ def test_the_better_hypothesis_goes_on(observed, after_first):
     second = dataclasses.replace(first, name="on", steps=5, keep_best=False, carry_moments=True)
     settings = dataclasses.replace(keypoints_only, stages=(first, second))
     windows = cut_windows(observed, settings)[:1]
-    targets, truth = load_targets(observed, windows, SIZE), truths()[0]
+    targets, truth = load_targets(windows, SIZE), truths()[0]
     reversed_R = Rotation.from_rotvec([0, 0, np.pi]) * Rotation.from_rotvec(truth.global_orient)
     flipped = dataclasses.replace(truth, global_orient=reversed_R.as_rotvec().astype(np.float32))
-    rig, priors = fold_bird(BIRD), priors_of(BIRD)
-    for lanes in ((truth, flipped), (flipped, truth)):
-        start = jax.tree.map(lambda *x: np.stack(x)[None], *lanes)
-        only = Lanes(*np.zeros((3, 1), int))
-        fitted = fit_batch(BIRD, rig, priors, [settings], CAMERA, targets, start, only, lambda *_: None)
+    for hypotheses in ((truth, flipped), (flipped, truth)):
+        initial_pose = jax.tree.map(lambda *x: np.stack(x)[None], *hypotheses)
+        batch = Batch(targets, initial_pose, *np.zeros((3, 1), int))
+        fitted = fit_batch(fit_model(BIRD, settings), [settings], batch, lambda *_: None)
         assert fitted.pose.global_orient.shape == (1, T, 3)
         assert not any(fitted.failure)
-        apart = np.linalg.norm(np.asarray(fitted.report.keypoints_px) - keypoints_of([truth]), axis=-1)
+        apart = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of([truth]), axis=-1)
         assert apart.mean() < 0.25

@@ -10,9 +10,9 @@ from support.birds import toy_bird
 
 from jaxfit.config.paths import with_values
 from jaxfit.config.schema import load_config
-from jaxfit.fitting import batch, prepare
+from jaxfit.fitting import batch
+from jaxfit.fitting import fit as fit_module
 from jaxfit.fitting.fit import fit, fit_runs
-from jaxfit.fitting.prepare import Preparation
 from jaxfit.model.camera import Camera
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
@@ -26,13 +26,13 @@ ONE = 0.002
 def config(steps=(12, 2), **values):
     paper = load_config("paper")
     stages = tuple(dataclasses.replace(s, steps=n) for s, n in zip(paper.stages, steps, strict=True))
-    crop = dataclasses.replace(paper.crop, mode="image", size_px=SIZE, focal_px=CAMERA.focal_px)
-    terms = {"keypoints": 10, "mask": 1, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0.1}
+    crop = dataclasses.replace(paper.crop, mode="image", size_px=SIZE)
+    terms = {"keypoints": 0.625, "mask": 0.0625, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0.1}
     base = dataclasses.replace(paper, window=T, stages=stages, crop=crop, terms=terms, filter_window=1)
     return with_values(base, {path.replace("__", "."): value for path, value in values.items()})
 
 
-SWEEP = [config(terms__velocity=0.1), config(terms__velocity=3), config(terms__velocity=3, filter_window=3)]
+SWEEP = [config(terms__velocity=0.1), config(terms__velocity=10), config(terms__velocity=10, filter_window=3)]
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +40,9 @@ def observed():
     return detect(BIRD, [smooth_motion(BIRD, T, seed) for seed in range(BIRDS)], 1.0, 0.05, 0, camera=CAMERA)
 
 
-def prepared(observed):
-    return Preparation(observed, BIRD, None, "observations")
-
-
 @pytest.fixture(scope="module")
 def swept(observed):
-    return fit_runs(prepared(observed), BIRD, SWEEP)
+    return fit_runs(observed, BIRD, SWEEP)
 
 
 def assert_equal(a, b):
@@ -61,7 +57,7 @@ def test_a_sweep_compiles_once(observed, caplog):
     with caplog.at_level(logging.WARNING), jax.log_compiles():
         values = [(1, 2), (5, 6), (7, 8)]
         for a, b in values:
-            fit_runs(prepared(observed), BIRD, [config((3, 1), terms__velocity=v) for v in (a, b)])
+            fit_runs(observed, BIRD, [config((3, 1), terms__velocity=v) for v in (a, b)])
     messages = [record.getMessage() for record in caplog.records]
     compiled = [m for m in messages if m.startswith("Compiling") and "advance" in m.split("with")[0]]
     assert len(compiled) == 2  # a stage each
@@ -81,83 +77,81 @@ def test_every_run_is_as_if_alone(observed, swept):
 
 
 def test_the_place_in_a_batch_does_not_matter(observed, swept):
-    turned = fit_runs(prepared(observed), BIRD, SWEEP[::-1])[::-1]
+    turned = fit_runs(observed, BIRD, SWEEP[::-1])[::-1]
     for a, b in zip(swept, turned, strict=True):
         assert_equal(a, b)
 
 
 def test_batches_of_one_window_give_the_same(observed):
     small = [dataclasses.replace(each, memory_gb=ONE) for each in SWEEP]
-    together = fit_runs(prepared(observed), BIRD, small)
+    together = fit_runs(observed, BIRD, small)
     for each, solution in zip(small, together, strict=True):
         assert_equal(solution, fit(observed, BIRD, each))
 
 
 def test_a_short_batch_is_filled_up(observed):
-    """Three runs of two windows in batches of four: the last is filled with lanes that count nothing."""
+    """Three runs of two windows in batches of four: the last is filled with counts that count nothing."""
     some = [dataclasses.replace(each, memory_gb=0.0066) for each in SWEEP]
     assert batch.frames_per_batch(BIRD, some[0]) // T == 4
-    together = fit_runs(prepared(observed), BIRD, some)
-    for a, b in zip(together, fit_runs(prepared(observed), BIRD, some[::-1])[::-1], strict=True):
+    together = fit_runs(observed, BIRD, some)
+    for a, b in zip(together, fit_runs(observed, BIRD, some[::-1])[::-1], strict=True):
         assert_equal(a, b)
 
 
-def count_lanes(monkeypatch):
-    lanes = []
+def count_problems(monkeypatch):
+    counts = []
     begin = batch.begin
 
-    def counting(problem, hyperparameters, pose, *rest):
-        lanes.append(pose.global_orient.shape[0])
-        return begin(problem, hyperparameters, pose, *rest)
+    def counting(program, problems, *rest):
+        counts.append(problems.anchor.global_orient.shape[0])
+        return begin(program, problems, *rest)
 
     monkeypatch.setattr(batch, "begin", counting)
-    return lanes
+    return counts
 
 
 def test_equal_first_stages_are_done_once(observed, monkeypatch):
-    lanes = count_lanes(monkeypatch)
-    sweep = [config(stages__mask__override={"mask": weight}) for weight in (0.5, 1, 2)]
-    shared = fit_runs(prepared(observed), BIRD, sweep)
-    assert lanes == [BIRDS, 3 * BIRDS]
+    counts = count_problems(monkeypatch)
+    sweep = [config(stages__mask__override={"mask": weight / 16}) for weight in (0.5, 1, 2)]
+    shared = fit_runs(observed, BIRD, sweep)
+    assert counts == [BIRDS, 3 * BIRDS]
     for each, solution in zip(sweep, shared, strict=True):
         np.testing.assert_allclose(solution.keypoints_px, fit(observed, BIRD, each).keypoints_px, atol=0.05)
     assert np.abs(shared[0].keypoints_px - shared[2].keypoints_px).max() > 0.01
 
 
 def test_runs_that_start_alike_but_pull_otherwise_share_nothing(observed, monkeypatch):
-    lanes = count_lanes(monkeypatch)
-    fit_runs(prepared(observed), BIRD, SWEEP[:2])
-    assert lanes == [2 * BIRDS, 2 * BIRDS]
+    counts = count_problems(monkeypatch)
+    fit_runs(observed, BIRD, SWEEP[:2])
+    assert counts == [2 * BIRDS, 2 * BIRDS]
 
 
 def test_hypotheses_stay_with_their_run(observed, monkeypatch):
     two = {"initialise": dataclasses.replace(SWEEP[0].initialise, hypotheses=2)}
     sweep = [dataclasses.replace(each, **two) for each in SWEEP[:2]]
-    lanes = count_lanes(monkeypatch)
-    together = fit_runs(prepared(observed), BIRD, sweep)
-    assert lanes == [2 * 2 * BIRDS] * 2
+    counts = count_problems(monkeypatch)
+    together = fit_runs(observed, BIRD, sweep)
+    assert counts == [2 * 2 * BIRDS] * 2
     for each, solution in zip(sweep, together, strict=True):
         np.testing.assert_allclose(solution.keypoints_px, fit(observed, BIRD, each).keypoints_px, atol=0.05)
 
 
 def test_what_runs_share_is_prepared_once(observed, monkeypatch):
     counts = {}
-    for name in ("filter_observations", "cut_windows", "load_targets", "initial_poses"):
-        original = getattr(prepare, name)
+    for name in ("cut_windows", "load_targets", "search_initial_poses"):
+        original = getattr(fit_module, name)
 
         def counting(*given, name=name, original=original):
             counts[name] = counts.get(name, 0) + 1
             return original(*given)
 
-        monkeypatch.setattr(prepare, name, counting)
-    shared = prepared(observed)
-    fit_runs(shared, BIRD, SWEEP)
-    fit_runs(shared, BIRD, SWEEP)
+        monkeypatch.setattr(fit_module, name, counting)
+    fit_runs(observed, BIRD, SWEEP)
     # without and with the filter
-    assert counts == {"filter_observations": 2, "cut_windows": 2, "load_targets": 2, "initial_poses": 2}
+    assert counts == {"cut_windows": 2, "load_targets": 2, "search_initial_poses": 2}
 
 
 def test_other_programs_are_refused(observed):
     for other in (config(common_size=False), config(window=3), config((12, 3))):
-        with pytest.raises(ValueError, match="one program"):
-            fit_runs(prepared(observed), BIRD, [SWEEP[0], other])
+        with pytest.raises(ValueError, match="one compiled program"):
+            fit_runs(observed, BIRD, [SWEEP[0], other])

@@ -115,9 +115,10 @@ def test_bone_lengths_are_learnt_where_they_differ():
 
 def test_what_cannot_be_learnt_from():
     solution = posed([1, 2])
-    half = dataclasses.replace(solution, status=np.array(["ok", "diverged"]))
+    first = np.array([True, False])[:, None] & solution.valid
+    half = dataclasses.replace(solution, status=np.array(["ok", "diverged"]), valid=first)
     assert (learn_prior([("a", half, BIRD)]).birds, learn_prior([("a", half, BIRD)]).diverged) == (1, 1)
-    none = dataclasses.replace(solution, status=np.array(["diverged", "diverged"]))
+    none = dataclasses.replace(half, status=np.array(["diverged", "diverged"]), valid=np.zeros_like(first))
     with pytest.raises(InputError, match=r"a: holds no pose.*2 diverged"):
         learn_prior([("a", none, BIRD)])
     other = dataclasses.replace(BIRD, joint_names=(*BIRD.joint_names[:-1], "hoof"))

@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.stages import BIRD, FIRST, B, T, case, hyperparameters, problem, solve, total
+from support.stages import BIRD, FIRST, B, T, case, problems, program, solve, total
 
 from jaxfit.config.schema import load_config
 from jaxfit.fitting import levenberg_marquardt
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.lane import Lane, lane_window
 from jaxfit.fitting.levenberg_marquardt import EASE, FIRST_DAMPING, LEVENBERG_MARQUARDT, TIGHTEN
+from jaxfit.fitting.problem import BATCH_AXIS, problem_window
 from jaxfit.objective.curvature import frame_rows
 from jaxfit.objective.objective import evaluate_curvature
 from jaxfit.simulation.detections import detect
@@ -29,31 +29,38 @@ DAMPING = 1.0
 """With less, the first step of this case leads too far and is not taken."""
 
 
-def lanes(stage):
-    start, targets = case()
-    one = jax.tree.map(lambda x: x[0], (hyperparameters(stage), start, targets))
-    return start, targets, Lane(problem(stage), *one)
+def first_problem(stage):
+    """The problem of the first bird."""
+    return jax.tree.map(lambda x: x[0], problems(*case(), stage))
 
 
-def first_step(lane, **said):
-    """The state before it, and what `step` returns; `said` changes that state."""
+def take_steps(stage, problem, count=1, **changes):
+    """The state before the first step, and pose and state after each step; `changes` are made to the first state."""
+    own = program(stage)
 
-    def run():
-        state = LEVENBERG_MARQUARDT.init(lane.start, lane, None)._replace(**said)
-        return state, LEVENBERG_MARQUARDT.step(lane.start, lane, state)
+    def run(problem):
+        pose, state = problem.anchor, LEVENBERG_MARQUARDT.init(own, problem, None)._replace(**changes)
+        states = [(pose, state)]
+        for _ in range(count):
+            states.append(LEVENBERG_MARQUARDT.step(own, problem, *states[-1]))
+        return states
 
-    return jax.jit(run)()
+    batch = jax.tree.map(lambda x: jnp.asarray(x)[None], problem)
+    states = jax.jit(jax.vmap(run, axis_name=BATCH_AXIS))(batch)
+    (_, before), *after = jax.tree.map(lambda x: x[0], states)
+    return before, after
 
 
-def dense_step(stage, lane, damping):
+def dense_step(stage, problem, damping):
     """(H + μ·diag H)·d = −g with H written out, over the optimised parameters: orientation, x, y, common size."""
-    zero = frame_rows(lane.start)
+    own, anchor = program(stage), problem.anchor
+    zero = frame_rows(anchor)
 
     @jax.jit
     def derivatives():
-        H = evaluate_curvature(lane_window(lane.start, lane), lane.hyperparameters.settings)
+        H = evaluate_curvature(problem_window(own, problem, anchor), own.terms, problem.hyperparameters.settings)
         units = jnp.eye(zero.size).reshape(-1, *zero.shape)
-        return jax.vmap(H.product)(units), jax.grad(lambda pose: total_of(stage, pose, lane))(lane.start)
+        return jax.vmap(H.product)(units), jax.grad(lambda pose: total_of(stage, pose, problem))(anchor)
 
     product, gradient = derivatives()
     dense, g = np.asarray(product, np.float64).reshape(zero.size, -1), np.array(frame_rows(gradient), np.float64)
@@ -66,33 +73,55 @@ def dense_step(stage, lane, damping):
     return (basis @ d).reshape(zero.shape)
 
 
-def total_of(stage, pose, lane):
-    return total(pose, lane.start, lane.targets, stage)
+def total_of(stage, pose, problem):
+    return total(pose, problem.anchor, problem.targets, stage)
 
 
 def test_a_step_is_that_of_the_equation(monkeypatch):
     monkeypatch.setattr(levenberg_marquardt, "CG_TOLERANCE", 1e-6)
-    stage = dataclasses.replace(NEWTON, free=FEW)
-    _, _, lane = lanes(stage)
-    state, (pose, after) = first_step(lane, damping=jnp.float32(DAMPING))
-    expected = dense_step(stage, lane, DAMPING)
-    found = np.asarray(frame_rows(pose) - frame_rows(lane.start))
+    stage = dataclasses.replace(NEWTON, optimised=FEW)
+    problem = first_problem(stage)
+    before, [(pose, after)] = take_steps(stage, problem, damping=jnp.float32(DAMPING))
+    expected = dense_step(stage, problem, DAMPING)
+    found = np.asarray(frame_rows(pose) - frame_rows(problem.anchor))
     assert np.abs(expected).max() > 0.05
     np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
-    assert after.loss < state.loss
+    assert after.loss < before.loss
     assert after.damping == pytest.approx(DAMPING * EASE)
-    np.testing.assert_allclose(after.loss, total_of(stage, pose, lane), rtol=1e-5)
+    np.testing.assert_allclose(after.loss, total_of(stage, pose, problem), rtol=1e-5)
 
 
 def test_a_step_that_raises_the_loss_is_not_taken():
-    """A damping far too small, and a loss that is said to be low already."""
-    _, _, lane = lanes(NEWTON)
-    _, (pose, after) = first_step(lane, loss=jnp.float32(0.0))
+    """The recorded loss is lower than any that a step can reach."""
+    problem = first_problem(NEWTON)
+    _, [(pose, after)] = take_steps(NEWTON, problem, loss=jnp.float32(0.0))
     for name in vars(pose):
-        np.testing.assert_array_equal(getattr(pose, name), getattr(lane.start, name), err_msg=name)
+        np.testing.assert_array_equal(getattr(pose, name), getattr(problem.anchor, name), err_msg=name)
     assert after.loss == 0
     assert after.damping == pytest.approx(FIRST_DAMPING * TIGHTEN)
-    assert after.refused == 0
+    assert after.rejected == 0
+    assert not after.moved
+
+
+def test_the_curvature_is_computed_once_for_each_pose(monkeypatch):
+    """After a step that was not taken, the pose is the same, and so is its curvature."""
+    computed = []
+    evaluate = levenberg_marquardt.evaluate_curvature
+
+    def counting(window, *rest):
+        jax.debug.callback(lambda _: computed.append(None), window.pose.scale)
+        return evaluate(window, *rest)
+
+    monkeypatch.setattr(levenberg_marquardt, "evaluate_curvature", counting)
+    problem = first_problem(NEWTON)
+    _, steps = take_steps(NEWTON, problem, 3, loss=jnp.float32(0.0))
+    jax.effects_barrier()
+    assert [bool(state.moved) for _, state in steps] == [False] * 3
+    assert len(computed) == 1
+    computed.clear()
+    _, steps = take_steps(NEWTON, problem, 3, damping=jnp.float32(DAMPING))
+    jax.effects_barrier()
+    assert len(computed) == 1 + sum(bool(state.moved) for _, state in steps[:2]) > 1
 
 
 def test_few_steps_beat_many_of_adams():

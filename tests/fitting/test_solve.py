@@ -13,13 +13,13 @@ from support.stages import (
     CAMERA,
     CONFIG,
     FIRST,
-    RIG,
+    MODEL,
     SECOND,
     STEPS,
     B,
     case,
-    hyperparameters,
-    problem,
+    problems,
+    program,
     solve,
     total,
 )
@@ -65,13 +65,13 @@ def adam(start, targets, rates, carry):
 
 def test_a_stage_is_adam():
     start, targets = case()
-    pose, loss, refused = solve([FIRST], start, targets)
+    pose, loss, rejected = solve([FIRST], start, targets)
     expected, losses = adam(start, targets, [1.0], carry=False)
     np.testing.assert_allclose(loss, losses[-1], rtol=1e-5)
     assert (losses[-1] < 0.5 * losses[0]).all()
     for name in STEP:
         np.testing.assert_allclose(getattr(pose, name), expected[name], atol=2e-5, err_msg=name)
-    assert not refused.any()
+    assert not rejected.any()
 
 
 @pytest.mark.parametrize("carry", [True, False])
@@ -124,9 +124,9 @@ def test_what_is_fixed_does_not_move(solver):
 def test_a_broken_bird_stands_still_and_leaves_the_other_alone(solver):
     start, healthy = case()
     stages = [dataclasses.replace(s, solver=solver, carry_moments=solver == "adam") for s in (FIRST, SECOND)]
-    pose, _, refused = solve(stages, start, case(broken=1)[1])
+    pose, _, rejected = solve(stages, start, case(broken=1)[1])
     expected, _, _ = solve(stages, start, healthy)
-    assert refused.tolist() == [0, STEPS]
+    assert rejected.tolist() == [0, STEPS]
     for name in vars(pose):
         np.testing.assert_array_equal(getattr(pose, name)[0], getattr(expected, name)[0], err_msg=name)
         np.testing.assert_array_equal(getattr(pose, name)[1], getattr(start, name)[1], err_msg=name)
@@ -144,13 +144,13 @@ def test_keypoints_that_are_off():
 
 def test_the_report_is_weighted_and_of_the_poses_given():
     start, targets = case()
-    result = report(problem(), hyperparameters(), start, start, targets)
+    result = report(program(), problems(start, targets), start)
     assert set(result.loss) == set(FIRST.terms)
     np.testing.assert_allclose(sum(result.loss.values()), loss_and_gradient(start, targets)[0], rtol=1e-5)
     prior = (np.asarray(start.body_pose).reshape(B, -1) ** 2).sum(1) / 0.1  # the toy bird's own
     np.testing.assert_allclose(result.loss["pose_prior"], 10 * prior, rtol=1e-5, atol=1e-5)
     first = jax.tree.map(lambda x: x[0], start)
-    keypoints = window_keypoints(RIG, window_transforms(RIG, first), first)
+    keypoints = window_keypoints(MODEL.rig, window_transforms(MODEL.rig, first), first)
     np.testing.assert_allclose(result.keypoints_cam[0], keypoints, atol=1e-4)
     np.testing.assert_allclose(result.keypoints_px[0], project(keypoints, CAMERA), atol=1e-2)
 
@@ -165,9 +165,8 @@ def test_one_program_for_any_steps_weights_and_rates(caplog):
     ]
     with caplog.at_level(logging.WARNING), jax.log_compiles():
         for stage, config in others:
-            own = problem(stage, config), hyperparameters(stage, config)
-            state = begin(*own, jax.tree.map(jnp.copy, start), targets, None)
-            advance((*own, targets, jnp.int32(3)), state)
+            own = program(stage, config), problems(start, targets, stage, config)
+            advance((*own, jnp.int32(3)), begin(*own, None))
         assert not compiled(caplog, "advance")
         assert not compiled(caplog, "begin")
         shorter = jax.tree.map(lambda x: x[:1], (start, targets))

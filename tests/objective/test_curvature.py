@@ -11,7 +11,7 @@ from support import terms_by_hand
 from jaxfit.model.rotation import axis_angle_to_matrix, right_jacobian
 from jaxfit.objective.curvature import frame_rows
 from jaxfit.objective.objective import evaluate_curvature
-from jaxfit.objective.registry import find_term, known_terms
+from jaxfit.objective.registry import find_term, find_terms, known_terms
 
 CURVED = [name for name in known_terms() if find_term(name).curvature]
 D = 3 * len(terms_by_hand.BIRD.joints) + 4
@@ -47,7 +47,7 @@ def curvatures(rows, pose, targets):
     )
     found = {}
     for name in CURVED:
-        H = evaluate_curvature(window, settings(name))
+        H = evaluate_curvature(window, find_terms([name]), settings(name))
         found[name] = H.product(rows), jax.vmap(H.product)(units).reshape(terms_by_hand.T * D, -1), H.diagonal
     return found
 

@@ -4,6 +4,7 @@ import importlib
 import sys
 from importlib import metadata
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
@@ -13,7 +14,7 @@ import jaxfit
 from jaxfit.errors import InputError
 from jaxfit.objective import registry, terms
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
-from jaxfit.objective.registry import find_term, known_terms, term
+from jaxfit.objective.registry import find_term, find_terms, known_terms, term
 
 MODULE = """
 import jax.numpy as jnp
@@ -67,21 +68,29 @@ def test_a_term_of_this_session():
     pose = window_pose()
     settings = {"stillness": {"weight": 3.0, "beta": 0.5}}
     expected = 1.5 * float(jnp.sum(pose.body_pose**2))
-    assert float(weighted_sum(posed_window(pose, seen()), settings)) == pytest.approx(expected, rel=1e-5)
+    total = weighted_sum(posed_window(pose, seen()), find_terms(settings), settings)
+    assert float(total) == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_cell_run_twice_is_its_new_self_also_in_compiled_programs():
-    @jax.jit
-    def total(pose):
-        return weighted_sum(posed_window(pose, seen()), {"again": {"weight": 1.0}})
+def test_a_term_that_is_registered_again_is_compiled_again_and_nothing_else_is():
+    traces = []
 
+    @eqx.filter_jit
+    def total(pose, terms):
+        traces.append(None)
+        return weighted_sum(posed_window(pose, seen()), terms, {name: {"weight": 1.0} for name in terms})
+
+    pose = window_pose()
+    total(pose, find_terms(["pose_prior"]))
     for value in (1.0, 2.0):
 
         @term(name="again")
         def own(window):
             return jnp.float32(value)  # noqa: B023
 
-        assert float(total(window_pose())) == value
+        assert float(total(pose, find_terms(["again"]))) == value
+    total(pose, find_terms(["pose_prior"]))
+    assert len(traces) == 3  # pose_prior once, `again` twice
 
 
 def test_names_are_taken_once():
@@ -106,7 +115,8 @@ def test_by_path(package):
     assert "own_priors:plain" not in known_terms()
     assert "marked" in known_terms()
     pose = window_pose()
-    value = evaluate_terms(posed_window(pose, seen()), {"own_priors:plain": {"weight": 1.0, "power": 1.0}})
+    settings = {"own_priors:plain": {"weight": 1.0, "power": 1.0}}
+    value = evaluate_terms(posed_window(pose, seen()), find_terms(settings), settings)
     assert float(value["own_priors:plain"]) == pytest.approx(float(jnp.abs(pose.body_pose).sum()), rel=1e-5)
 
 
@@ -178,7 +188,7 @@ def test_unknown_names():
 def test_a_term_is_one_real_number(returned, said):
     term(name="odd")(lambda window: returned())
     with pytest.raises(InputError, match=rf"term 'odd': returned .*{said}"):
-        evaluate_terms(posed_window(window_pose(), seen()), {"odd": {"weight": 1.0}})
+        evaluate_terms(posed_window(window_pose(), seen()), find_terms(["odd"]), {"odd": {"weight": 1.0}})
 
 
 def test_a_sweep_over_a_term_of_ones_own_compiles_once():
@@ -189,10 +199,12 @@ def test_a_sweep_over_a_term_of_ones_own_compiles_once():
         traces.append(None)
         return jnp.sum(jnp.abs(window.pose.body_pose) ** power)
 
-    pose = window_pose()
-    sweep = jax.jit(
-        jax.vmap(lambda w, p: weighted_sum(posed_window(pose, seen()), {"counted": {"weight": w, "power": p}}))
-    )
+    pose, counted = window_pose(), find_terms(["counted"])
+
+    def objective(weight, power):
+        return weighted_sum(posed_window(pose, seen()), counted, {"counted": {"weight": weight, "power": power}})
+
+    sweep = jax.jit(jax.vmap(objective))
     found = sweep(jnp.array([1.0, 2.0, 1.0]), jnp.array([1.0, 1.0, 2.0]))
     sweep(jnp.array([5.0, 2.0, 1.0]), jnp.array([1.0, 3.0, 2.0]))
     assert len(traces) == 1

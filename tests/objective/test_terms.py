@@ -32,7 +32,7 @@ from support.terms_by_hand import (
 from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
 from jaxfit.objective.posed_window import PosedWindow, Priors, priors_of
-from jaxfit.objective.registry import find_term
+from jaxfit.objective.registry import find_term, find_terms
 from jaxfit.objective.terms import geman_mcclure, pose_prior
 
 
@@ -150,7 +150,7 @@ def test_gradients_are_right():
             bone_length=bones,
             betas=betas,
         )
-        return weighted_sum(posed_window(moved, targets, start), settings)
+        return weighted_sum(posed_window(moved, targets, start), find_terms(settings), settings)
 
     at = (pose.global_orient, pose.body_pose, jnp.zeros((T, 3)), pose.scale, pose.bone_length, pose.betas)
     check_grads(total, at, order=1, modes=["rev"], eps=2e-3, atol=0.05, rtol=0.02)
@@ -169,9 +169,10 @@ def test_the_sum_is_weighted():
     settings = {name: {**values, "weight": float(rng.uniform(0, 9))} for name, values in all_settings().items()}
     values = every_term(pose, start, targets, settings)
     expected = sum(settings[name]["weight"] * float(value) for name, value in values.items())
-    total = jax.jit(lambda settings: weighted_sum(posed_window(pose, targets, start), settings))(settings)
+    terms = find_terms(settings)
+    total = jax.jit(lambda settings: weighted_sum(posed_window(pose, targets, start), terms, settings))(settings)
     assert float(total) == pytest.approx(expected, rel=1e-5)
-    assert float(weighted_sum(posed_window(pose, targets), {})) == 0
+    assert float(weighted_sum(posed_window(pose, targets), {}, {})) == 0
 
 
 def test_settings_are_traced():
@@ -181,7 +182,7 @@ def test_settings_are_traced():
 
     def total(settings):
         traces.append(None)
-        return weighted_sum(posed_window(pose, targets), settings)
+        return weighted_sum(posed_window(pose, targets), find_terms(settings), settings)
 
     def settings(weight, sigma, beta):
         own = {"keypoints": {"sigma_px": sigma}, "velocity": {"beta_global": beta, "beta_pose": 1.0}}
@@ -234,5 +235,5 @@ def test_terms_that_draw_the_silhouette_say_so(name):
     """A term that is not marked gets empty masks; one that is marked in vain makes its stage slow."""
     pose = window_pose()
     one = posed_window(pose, seen())
-    evaluate_terms(one, {name: {"weight": 1.0, **find_term(name).settings}})
+    evaluate_terms(one, find_terms([name]), {name: {"weight": 1.0, **find_term(name).settings}})
     assert find_term(name).compares_masks == ("vertices_screen" in vars(one))

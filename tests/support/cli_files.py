@@ -16,8 +16,8 @@ BIRD, T, SIZE = toy_bird(shapes=0), 6, 64
 CONFIG = """
 base: paper
 window: 6
-crop: {mode: image, size_px: 64, focal_px: 541.75}
-terms: {keypoints: 100, pose_prior: 0.1, velocity: 0.1}
+crop: {mode: image, size_px: 64}
+terms: {keypoints: 6.25, pose_prior: 0.1, velocity: 0.1}
 stages:
   - {name: only, steps: 150, terms: [keypoints, pose_prior, velocity], step_scale: {transl: [1, 1, 0]}}
 """

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfit.config.schema import FitConfig, StageConfig
+from jaxfit.fitting.problem import Problem
 from jaxfit.fitting.solve import advance, begin
-from jaxfit.fitting.stages import stage_hyperparameters, stage_problem
+from jaxfit.fitting.stages import FitModel, stage_hyperparameters, stage_program
 from jaxfit.model.camera import Camera, project
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.objective.objective import weighted_sum
@@ -18,7 +19,7 @@ from support.birds import toy_bird
 
 B, T, STEPS = 2, 4, 25
 BIRD, CAMERA = toy_bird(), Camera()
-RIG, PRIORS = fold_bird(BIRD), priors_of(BIRD)
+MODEL = FitModel(BIRD, fold_bird(BIRD), priors_of(BIRD), CAMERA)
 FIRST = StageConfig(
     "first",
     STEPS,
@@ -30,12 +31,14 @@ SECOND = dataclasses.replace(FIRST, name="second", learning_rate=0.01, carry_mom
 CONFIG = FitConfig((FIRST, SECOND), {"pose_prior": 10, "velocity": 5})
 
 
-def problem(stage=FIRST, config=CONFIG):
-    return stage_problem(config, stage, RIG, PRIORS, CAMERA)
+def program(stage=FIRST, config=CONFIG):
+    return stage_program(config, stage, MODEL)
 
 
-def hyperparameters(stage=FIRST, config=CONFIG, lanes=B):
-    return stacked([stage_hyperparameters(config, stage, BIRD.keypoint_names)] * lanes)
+def problems(anchor, targets, stage=FIRST, config=CONFIG):
+    """The problems of all birds, at these poses."""
+    one = stage_hyperparameters(config, stage, BIRD.keypoint_names)
+    return Problem(stacked([one] * len(targets.present)), anchor, targets)
 
 
 def stacked(values):
@@ -43,11 +46,11 @@ def stacked(values):
 
 
 def case(broken=None):
-    """Starts a little off the truth, and targets; the keypoints of bird `broken` are beyond all numbers."""
+    """Poses a little off the truth, and targets; the keypoints of bird `broken` exceed the range of float32."""
     truths = [smooth_motion(BIRD, T, seed) for seed in range(B)]
     targets = []
     for n, truth in enumerate(truths):
-        points = project(window_keypoints(RIG, window_transforms(RIG, truth), truth), CAMERA)
+        points = project(window_keypoints(MODEL.rig, window_transforms(MODEL.rig, truth), truth), CAMERA)
         targets.append(
             Targets(
                 keypoints_px=jnp.full_like(points, 1e30) if n == broken else points,
@@ -71,18 +74,19 @@ def case(broken=None):
 
 
 def solve(stages, start, targets, chunks=(STEPS,)):
-    """Run stages as the fit does; final poses, losses before the last step, refused steps."""
-    before, pose = None, start
+    """Run stages as the fit does; final poses, losses before the last step, rejected steps."""
+    pose, solver = start, None
     for stage in stages:
-        own = problem(stage), hyperparameters(stage, lanes=len(targets.present))
-        # the solver gives up what it is given: keep the caller's start
-        state = begin(*own, jax.tree.map(jnp.copy, pose), targets, before if stage.carry_moments else None)
+        own = program(stage), problems(pose, targets, stage)
+        state = begin(*own, solver if stage.carry_moments else None)
         for steps in chunks:
-            state, loss, refused = advance((*own, targets, jnp.int32(steps)), state)
-        pose, before = state.pose, state
-    return jax.tree.map(np.asarray, (pose, loss, refused))
+            state, loss, rejected = advance((*own, jnp.int32(steps)), state)
+        pose, solver = state
+    return jax.tree.map(np.asarray, (pose, loss, rejected))
 
 
 def total(pose, start, targets, stage=FIRST):
-    settings = CONFIG.stage_settings(stage)
-    return weighted_sum(PosedWindow(pose, start, targets, RIG, PRIORS, CAMERA, problem().raster), settings)
+    """The objective of one bird."""
+    own = program(stage)
+    window = PosedWindow(pose, start, targets, own.rig, own.priors, own.camera, own.raster)
+    return weighted_sum(window, own.terms, CONFIG.stage_settings(stage))

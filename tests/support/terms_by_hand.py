@@ -14,14 +14,14 @@ from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.objective.objective import evaluate_terms
 from jaxfit.objective.posed_window import PosedWindow, Raster, Targets, priors_of
-from jaxfit.objective.registry import find_term, known_terms
+from jaxfit.objective.registry import find_term, find_terms, known_terms
 from jaxfit.raster.silhouette import Blur
 from support.birds import random_pose, skin_by_hand, toy_bird
 
 T, SIZE = 3, 32
 TERMS = tuple(known_terms())
 CAMERA = Camera(focal_px=240.0, centre_px=SIZE / 2, size_px=SIZE)
-RASTER = Raster(Blur.for_size(SIZE))
+RASTER = Raster(Blur.for_size(SIZE), SIZE)
 
 
 def correlated_bird():
@@ -85,7 +85,7 @@ def all_settings():
 
 @jax.jit
 def every_term(pose, start, targets, settings):
-    return evaluate_terms(posed_window(pose, targets, start), settings)
+    return evaluate_terms(posed_window(pose, targets, start), find_terms(settings), settings)
 
 
 @jax.jit
@@ -93,7 +93,7 @@ def every_gradient(pose, start, targets, settings):
     """d term / d pose, for each term by itself, in one program."""
 
     def terms(pose):
-        values = evaluate_terms(posed_window(pose, targets, start), settings)
+        values = evaluate_terms(posed_window(pose, targets, start), find_terms(settings), settings)
         return jnp.stack([values[name] for name in TERMS])
 
     value, pull = jax.vjp(terms, pose)

@@ -10,8 +10,8 @@ from support.birds import toy_bird
 from jaxfit.config.schema import load_config
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
-from jaxfit.fitting.start import load_start
-from jaxfit.fitting.window import cut_windows
+from jaxfit.fitting.initial_pose_file import load_initial_poses
+from jaxfit.fitting.windows import cut_windows
 
 BIRD = toy_bird()
 N, T, J = 2, 5, BIRD.num_joints
@@ -73,15 +73,14 @@ def saved(tmp_path, arrays, name="start.npz"):
 def poses(start, common_size=False, observations=None):
     observations = observed() if observations is None else observations
     windows = cut_windows(observations, CONFIG)
-    start.check_crops(observations, windows)
-    lines = zip(windows.track, windows.frame, windows.present, strict=True)
-    windowed = [start.window_pose(BIRD, int(n), frame, present, common_size) for n, frame, present in lines]
-    return jax.tree.map(np.asarray, windowed)
+    start.check_crops(windows)
+    windowed = start.window_poses(BIRD, windows, common_size)
+    return [jax.tree.map(lambda x, w=w: np.asarray(x)[w, 0], windowed) for w in range(len(windows))]
 
 
 def test_an_earlier_result(tmp_path):
     arrays = result()
-    start = load_start(saved(tmp_path, arrays), observed(), BIRD)
+    start = load_initial_poses(saved(tmp_path, arrays), observed(), BIRD)
     assert start.has_shape
     first, second = poses(start)
     np.testing.assert_allclose(first.global_orient, arrays["global_orient"][1], rtol=1e-6)  # track 4 is its second
@@ -97,18 +96,18 @@ def test_an_earlier_result(tmp_path):
 def test_frames_without_a_start_take_their_neighbours(tmp_path):
     arrays = result()
     arrays["global_orient"][1, 0] = np.nan  # track 4 was not fitted there
-    first, second = poses(load_start(saved(tmp_path, arrays), observed(), BIRD))
+    first, second = poses(load_initial_poses(saved(tmp_path, arrays), observed(), BIRD))
     np.testing.assert_allclose(first.global_orient[0], arrays["global_orient"][1, 1], rtol=1e-6)
     np.testing.assert_allclose(second.transl[2], arrays["transl"][0, 1], rtol=1e-6)  # the bird itself was away
     fewer = result(frames=(11, 14))
-    first, _ = poses(load_start(saved(tmp_path, fewer), observed(), BIRD))
+    first, _ = poses(load_initial_poses(saved(tmp_path, fewer), observed(), BIRD))
     np.testing.assert_allclose(first.transl, fewer["transl"][1, [0, 0, 0, 1, 1]], rtol=1e-6)
 
 
 def test_a_regressors_rows(tmp_path):
     observations = observed()
     arrays = rows(N * T - 1)
-    start = load_start(saved(tmp_path, arrays), observations, BIRD)
+    start = load_initial_poses(saved(tmp_path, arrays), observations, BIRD)
     assert not start.has_shape
     first, second = poses(start)
     np.testing.assert_allclose(first.global_orient, arrays["init_pose"][:5, 0], rtol=1e-6)
@@ -152,32 +151,32 @@ def nan_at(array, *at):
 def test_what_does_not_fit_is_refused(tmp_path, arrays, message):
     path = saved(tmp_path, arrays)
     with pytest.raises(InputError, match=message) as caught:
-        load_start(path, observed(), BIRD)
+        load_initial_poses(path, observed(), BIRD)
     assert str(caught.value).startswith(f"{path}: ")
 
 
 def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"absent\.npz"):
-        load_start(tmp_path / "absent.npz", observed(), BIRD)
+        load_initial_poses(tmp_path / "absent.npz", observed(), BIRD)
     whole = saved(tmp_path, result()).read_bytes()
     for content in (b"", b"text", whole[: len(whole) // 2], whole[:-30], b"\x80\x04c" + whole):
         (tmp_path / "cut.npz").write_bytes(content)
         with pytest.raises(InputError, match=r"cut\.npz"):
-            load_start(tmp_path / "cut.npz", observed(), BIRD)
+            load_initial_poses(tmp_path / "cut.npz", observed(), BIRD)
     np.savez(tmp_path / "objects.npz", init_pose=np.array([{}], dtype=object))
     with pytest.raises(InputError, match=r"objects\.npz.*Python objects"):
-        load_start(tmp_path / "objects.npz", observed(), BIRD)
+        load_initial_poses(tmp_path / "objects.npz", observed(), BIRD)
 
 
 def test_poses_of_other_crops_are_refused(tmp_path):
     arrays = result()
     arrays["crop"] = arrays["crop"] + np.array([30, 0, 0])
-    start = load_start(saved(tmp_path, arrays), observed(), BIRD)
-    with pytest.raises(InputError, match=r"start\.npz: `crop` of track 4 is 30 pixels off"):
+    start = load_initial_poses(saved(tmp_path, arrays), observed(), BIRD)
+    with pytest.raises(InputError, match=r"start\.npz: `crop` of track 4 differs by 30 pixels"):
         poses(start)
 
 
 def test_a_bird_without_any_start(tmp_path):
-    start = load_start(saved(tmp_path, result(tracks=(4,))), observed(), BIRD)
+    start = load_initial_poses(saved(tmp_path, result(tracks=(4,))), observed(), BIRD)
     with pytest.raises(InputError, match="has no pose for track 9"):
         poses(start)

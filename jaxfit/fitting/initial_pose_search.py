@@ -24,7 +24,7 @@ from jaxfit.model.kinematics import Rig, joint_transforms, posed_keypoints
 from jaxfit.model.pose import Pose, rest_pose
 from jaxfit.model.rotation import matrix_to_axis_angle, unwrap_axis_angle, view_grid, viewing_axis_rotations
 
-__all__ = ["candidate_orientations", "choose_sequence", "initial_poses", "match_candidates"]
+__all__ = ["candidate_orientations", "choose_sequence", "match_candidates", "search_initial_poses"]
 
 SIGMA_PX = 30.0
 """Scale of the robust match: mean-pose keypoints lie this far off on a posed bird of 200 pixels."""
@@ -135,7 +135,7 @@ def _orientations(
 
 
 @partial(jax.jit, static_argnames=("config", "camera", "common_size"))
-def initial_poses(
+def search_initial_poses(
     bird: Bird,
     rig: Rig,
     keypoints_px: Float[Array, "W T K 2"],
@@ -161,14 +161,16 @@ def initial_poses(
     """
     frames = keypoints_px.shape[1]
     rest = rest_pose(bird)
-    model_keypoints = posed_keypoints(rig, joint_transforms(rig, rest), rest)
+    model_keypoints, root = posed_keypoints(rig, joint_transforms(rig, rest), rest), rig.joints[0]
     candidates = jnp.asarray(candidate_orientations(config), jnp.float32)
 
     def start(R, scale_px, keypoints_px, confidence) -> tuple[Array, Array, Array]:
         window_scale_px = jnp.median(scale_px)
         depth = camera.focal_px / window_scale_px
         scale = jnp.ones(1) if common_size else jnp.clip(scale_px / window_scale_px, 0.5, 2.0)
-        rotated = jnp.einsum("tij,kj->tki", R, model_keypoints) * scale[:, None, None]
+        # the bird turns about its root joint, as in `joint_transforms`
+        turned = jnp.einsum("tij,kj->tki", R, model_keypoints - root) + root
+        rotated = turned * scale[:, None, None]
         # the shift that brings the confident keypoints' mean onto the observed mean, at that depth
         weight = confidence[..., None] / jnp.maximum(jnp.sum(confidence, axis=1), 1e-6)[:, None, None]
         offset_px = jnp.sum(weight * (keypoints_px - camera.centre_px), axis=1)

@@ -1,5 +1,6 @@
 """Starts: planted orientations are found, and a window's frames are chosen together."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -12,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from support.birds import exp_map, toy_bird
 
 from jaxfit.config.schema import InitialiseConfig
-from jaxfit.fitting.initialise import (
+from jaxfit.fitting.initial_pose_search import (
     BLOCKED_RADIUS,
     candidate_orientations,
     choose_sequence,
-    initial_poses,
     match_candidates,
+    search_initial_poses,
 )
 from jaxfit.model.camera import Camera, project
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
@@ -44,7 +45,7 @@ def start(keypoints_px, config, confidence=None, common_size=True):
     keypoints_px = np.asarray(keypoints_px, np.float32)
     confidence = np.ones(keypoints_px.shape[:2]) if confidence is None else confidence
     one = (jnp.asarray(keypoints_px)[None], jnp.asarray(confidence, jnp.float32)[None])
-    return jax.tree.map(lambda x: np.asarray(x)[0], initial_poses(BIRD, RIG, *one, config, CAMERA, common_size))
+    return jax.tree.map(lambda x: np.asarray(x)[0], search_initial_poses(BIRD, RIG, *one, config, CAMERA, common_size))
 
 
 def turns(rng, frames):
@@ -115,6 +116,19 @@ def test_the_start_lies_on_the_keypoints(common_size):
     np.testing.assert_allclose(pose.transl[0, :, 2], 150, rtol=0.03)
     if not common_size:
         np.testing.assert_allclose(pose.scale[0], sizes, rtol=0.03)
+
+
+def test_the_bird_turns_about_its_root():
+    """A model whose root is far from the origin starts on its keypoints all the same."""
+    shift = jnp.array([4.0, -7.0, 3.0])
+    far = dataclasses.replace(BIRD, vertices=BIRD.vertices + shift, joints=BIRD.joints + shift)
+    points = pictured(np.broadcast_to(FROM_ABOVE, (6, 3, 3)), depth=150.0).astype(np.float32)
+    one = (jnp.asarray(points)[None], jnp.ones((1, 6, BIRD.num_keypoints)))
+    near, away = (search_initial_poses(b, fold_bird(b), *one, ABOVE, CAMERA, True) for b in (BIRD, far))
+    rig, window = fold_bird(far), jax.tree.map(lambda x: x[0, 0], away)
+    posed = np.asarray(project(window_keypoints(rig, window_transforms(rig, window), window), CAMERA))
+    np.testing.assert_allclose(posed.mean(1), points.mean(1), atol=3)
+    np.testing.assert_allclose(away.global_orient, near.global_orient, atol=1e-5)
 
 
 def cost_of(path, cost, R, smoothness):
@@ -194,7 +208,7 @@ def test_windows_are_searched_by_themselves():
     rng = np.random.default_rng(5)
     points = np.stack([pictured(turns(rng, 6)) for _ in range(3)]).astype(np.float32)
     ones = jnp.ones(points.shape[:3])
-    together = initial_poses(BIRD, RIG, jnp.asarray(points), ones, ABOVE, CAMERA, True)
+    together = search_initial_poses(BIRD, RIG, jnp.asarray(points), ones, ABOVE, CAMERA, True)
     for w in range(3):
         np.testing.assert_allclose(together.global_orient[w], start(points[w], ABOVE).global_orient, atol=1e-5)
         np.testing.assert_allclose(together.transl[w], start(points[w], ABOVE).transl, rtol=1e-4, atol=1e-4)

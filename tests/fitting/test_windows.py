@@ -9,15 +9,16 @@ from jaxfit.config.schema import CropConfig, load_config
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
+from jaxfit.fitting.crops import cut_mask
 from jaxfit.fitting.filtering import weighted_median_filter
-from jaxfit.fitting.window import cut_mask, cut_windows, filter_observations, load_targets
-from jaxfit.model.camera import crop_to_image
+from jaxfit.fitting.windows import cut_windows, filter_observations, load_targets
+from jaxfit.model.camera import CROP_PX, crop_to_image
 
 K, WIDTH, HEIGHT = 5, 400, 300
 
 
 def config(window=4, **changes):
-    return dataclasses.replace(load_config("paper"), window=window, **changes)
+    return dataclasses.replace(load_config("paper"), window=window, filter_window=1, **changes)
 
 
 def walk(numbers, birds=2, seed=0):
@@ -119,16 +120,16 @@ def test_without_boxes_the_keypoints_make_the_crop():
 def test_keypoints_go_to_the_crop_and_back():
     observations = changed(walk([0, 1, 3, 4, 5]), [(1, 0), (0, 3)])
     windows = cut_windows(observations, config())
-    targets = load_targets(observations, windows, 64)
+    targets = load_targets(windows, 64)
     assert targets.keypoints_px.shape == (len(windows), 4, K, 2)
-    back = crop_to_image(targets.keypoints_px, windows.crop, 64)
+    back = crop_to_image(targets.keypoints_px, windows.crop)
     measured = 0
     for w, t in zip(*np.nonzero(windows.present), strict=True):
         n, at = windows.track[w], windows.frame[w, t]
         np.testing.assert_allclose(back[w, t], observations.keypoints_px[n, at], atol=1e-3)
         np.testing.assert_array_equal(targets.confidence[w, t], observations.confidence[n, at])
         assert (targets.keypoints_px[w, t] > 0).all()
-        assert (targets.keypoints_px[w, t] < 64).all()
+        assert (targets.keypoints_px[w, t] < CROP_PX).all()
         assert targets.has_mask[w, t]
         expected = cut_mask(observations.mask(n, at), windows.crop[w, t], 64)
         np.testing.assert_array_equal(targets.mask[w, t], expected)
@@ -145,7 +146,7 @@ def test_keypoints_go_to_the_crop_and_back():
 def test_a_bird_without_mask_keeps_its_keypoints():
     observations = walk(range(4))
     masks = {at: rle for at, rle in observations.masks.items() if at != (0, 1)}
-    targets = load_targets(dataclasses.replace(observations, masks=masks), cut_windows(observations, config()), 64)
+    targets = load_targets(cut_windows(dataclasses.replace(observations, masks=masks), config()), 64)
     assert targets.has_mask[0].tolist() == [True, False, True, True]
     assert targets.present[0].all()
     assert targets.confidence[0, 1].all()

@@ -1,10 +1,11 @@
-"""Starting points from a file: a pose regressor's, or an earlier result's."""
+"""Initial poses from a file: from a pose regressor, or from an earlier result."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,23 +13,24 @@ from jaxtyping import Bool, Float, Int
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import LAYOUT
 from jaxfit.errors import InputError
-from jaxfit.fitting.window import Windows
+from jaxfit.fitting.windows import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
 from jaxfit.storage.files import validate_arrays
 from jaxfit.storage.npz import load_npz
 
-__all__ = ["Start", "load_start"]
+__all__ = ["InitialPoses", "load_initial_poses"]
 
 _FIELDS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "crop")
 _LAYOUT = {name: LAYOUT[name] for name in ("track_id", "frame_index", *_FIELDS)}
 
 
 @dataclass(frozen=True)
-class Start:
-    """Starting poses of the birds of one observations file, crop camera frame; NaN where there is none."""
+class InitialPoses:
+    """Initial poses of the birds of one observations file, in the crop's camera frame; NaN where there is none."""
 
     source: str
+    """Name of the file, for error messages."""
     global_orient: Float[np.ndarray, "N T 3"]
     body_pose: Float[np.ndarray, "N T bones 3"]
     transl: Float[np.ndarray, "N T 3"]
@@ -36,45 +38,50 @@ class Start:
     bone_length: Float[np.ndarray, "N T bones"]
     betas: Float[np.ndarray, "N T S"]
     crop: Float[np.ndarray, "N T 3"] | None = None
-    """Crops that the poses belong to, where the file tells."""
+    """The crops of the poses, (x0, y0, size) in image pixels; None where the file does not contain them."""
 
     @property
     def has_shape(self) -> bool:
         """Whether any shape coefficient is not zero."""
         return bool(np.any(np.nan_to_num(self.betas)))
 
-    def check_crops(self, observations: Observations, windows: Windows) -> None:
-        """Check that every window has a start, in the crop that the window uses.
+    def check_crops(self, windows: Windows) -> None:
+        """Check that every window has an initial pose, in the crop of the window.
 
         Raises:
-            InputError: a window without any starting pose, or poses of other crops.
+            InputError: a window without any initial pose, or poses in other crops.
         """
-        for w in range(len(windows)):
-            n, at = windows.track[w], windows.frame[w][windows.present[w]]
+        for n, track, frame, present, crop in zip(
+            windows.track, windows.track_id, windows.frame, windows.present, windows.crop, strict=True
+        ):
+            at = frame[present]
             have = np.isfinite(self.global_orient[n, at]).all(-1)
             if not have.any():
-                raise InputError(self.source, f"has no pose for track {observations.track_id[n]}", "add one")
+                raise InputError(self.source, f"has no pose for track {track}", "add one")
             if self.crop is not None:
-                apart = np.abs(self.crop[n, at] - windows.crop[w][windows.present[w]])[have].max()
+                apart = np.abs(self.crop[n, at] - crop[present])[have].max()
                 if apart > 1:
                     raise InputError(
                         self.source,
-                        f"`crop` of track {observations.track_id[n]} is {apart:.0f} pixels off this config's",
+                        f"`crop` of track {track} differs by {apart:.0f} pixels from the crop of this config",
                         "use the window and crop settings that made the file",
                     )
 
-    def window_pose(
-        self,
-        bird: Bird,
-        n: int,
-        frame: Int[np.ndarray, "T"],
-        present: Bool[np.ndarray, "T"],
-        common_size: bool,
+    def window_poses(self, bird: Bird, windows: Windows, common_size: bool) -> Pose:
+        """Return the initial poses of W windows, with leading axes W, 1 (one hypothesis)."""
+        poses = [
+            self._window_pose(bird, n, frame, present, common_size)
+            for n, frame, present in zip(windows.track.tolist(), windows.frame, windows.present, strict=True)
+        ]
+        return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *poses)
+
+    def _window_pose(
+        self, bird: Bird, n: int, frame: Int[np.ndarray, "T"], present: Bool[np.ndarray, "T"], common_size: bool
     ) -> Pose:
-        """The start of one window; a frame without one takes its nearest neighbour's."""
-        at = np.maximum(frame, 0)
-        have = np.flatnonzero(present & np.isfinite(self.global_orient[n, at]).all(-1))
-        at = at[have[np.abs(np.arange(len(frame))[:, None] - have).argmin(1)]]
+        """The initial pose of one window. A frame without a pose takes that of its nearest neighbour."""
+        known = present & np.isfinite(self.global_orient[n, frame]).all(-1)
+        have = np.flatnonzero(known)
+        at = frame[have[np.abs(np.arange(len(frame))[:, None] - have).argmin(1)]]
         scale = self.scale[n, at]
         betas = np.median(self.betas[n, at], axis=0)[: bird.num_shapes]
         return Pose(
@@ -87,8 +94,8 @@ class Start:
         )
 
 
-def load_start(path: str | Path, observations: Observations, bird: Bird) -> Start:
-    """Read starting poses for the birds of `observations`.
+def load_initial_poses(path: str | Path, observations: Observations, bird: Bird) -> InitialPoses:
+    """Read initial poses for the birds of `observations`.
 
     Two layouts are known: the arrays of a result's `poses.npz` (matched by `track_id` and `frame_index`), and
     a regressor's rows `init_pose` (N, J, 3), `init_bone_length` (N, J−1), `init_translation` (N, 3), one
@@ -104,19 +111,19 @@ def load_start(path: str | Path, observations: Observations, bird: Bird) -> Star
         names = {"init_pose"}  # load_npz tells what is wrong
     except Exception:  # zipfile's own errors
         names = {"init_pose"}
-    start = _from_result(path, observations) if "global_orient" in names else _from_rows(path, observations)
-    joints = start.body_pose.shape[2] + 1
+    poses = _from_result(path, observations) if "global_orient" in names else _from_rows(path, observations)
+    joints = poses.body_pose.shape[2] + 1
     if joints != bird.num_joints:
         raise InputError(path, f"has poses of {joints} joints", f"this bird has {bird.num_joints}")
-    if start.betas.shape[2] not in (0, bird.num_shapes):
-        raise InputError(path, f"has {start.betas.shape[2]} shape coefficients", f"this bird has {bird.num_shapes}")
-    if start.betas.shape[2] == 0:
-        empty = np.zeros((*start.betas.shape[:2], bird.num_shapes), np.float32)
-        start = replace(start, betas=empty)
-    return start
+    if poses.betas.shape[2] not in (0, bird.num_shapes):
+        raise InputError(path, f"has {poses.betas.shape[2]} shape coefficients", f"this bird has {bird.num_shapes}")
+    if poses.betas.shape[2] == 0:
+        empty = np.zeros((*poses.betas.shape[:2], bird.num_shapes), np.float32)
+        poses = replace(poses, betas=empty)
+    return poses
 
 
-def _from_result(path: str | Path, observations: Observations) -> Start:
+def _from_result(path: str | Path, observations: Observations) -> InitialPoses:
     content = load_npz(path, {name: len(shape.split()) for name, (shape, _) in _LAYOUT.items()})
     try:
         content = validate_arrays(content, _LAYOUT)
@@ -135,10 +142,10 @@ def _from_result(path: str | Path, observations: Observations) -> Start:
     for name in _FIELDS:
         picked[name] = content[name][rows][:, columns]
         picked[name][missing] = np.nan
-    return Start(str(path), **picked)
+    return InitialPoses(str(path), **picked)
 
 
-def _from_rows(path: str | Path, observations: Observations) -> Start:
+def _from_rows(path: str | Path, observations: Observations) -> InitialPoses:
     content = load_npz(path, {"init_pose": 3, "init_bone_length": 2, "init_translation": 2})
     pose, bone, transl = content["init_pose"], content["init_bone_length"], content["init_translation"]
     rows = int(observations.present.sum())
@@ -158,7 +165,7 @@ def _from_rows(path: str | Path, observations: Observations) -> Start:
         full[observations.present] = values
         return full
 
-    return Start(
+    return InitialPoses(
         str(path),
         global_orient=spread(pose[:, 0]),
         body_pose=spread(pose[:, 1:]),

@@ -1,0 +1,80 @@
+"""Crops: the squares that are cut from the images around each bird."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxfit.config.schema import CropConfig
+from jaxfit.data.observations import Observations
+from jaxfit.errors import InputError
+
+__all__ = ["crop_squares", "cut_mask"]
+
+LEAST_SIZE_PX = 16.0
+"""No crop is smaller than this, image pixels."""
+
+
+def crop_squares(
+    observations: Observations,
+    track: Int[np.ndarray, "W"],
+    frame: Int[np.ndarray, "W T"],
+    present: Bool[np.ndarray, "W T"],
+    config: CropConfig,
+) -> Float[np.ndarray, "W T 3"]:
+    """Return (x0, y0, size) in image pixels for every frame of some windows: whole numbers, one size for each window.
+
+    Raises:
+        InputError: `mode: image` with images that are not square or not of one size.
+    """
+    crop = np.zeros((*frame.shape, 3))
+    for w, n in enumerate(track.tolist()):
+        make = _whole_image if config.mode == "image" else _around_the_bird
+        crop[w] = make(observations, n, frame[w], present[w], config)
+    return crop
+
+
+def _whole_image(observations: Observations, n: int, frame, present, config: CropConfig) -> Float[np.ndarray, "3"]:
+    sizes = {observations.image_size(n, int(t)) for t in frame[present]}
+    if len(sizes) > 1 or any(width != height for width, height in sizes):
+        raise InputError(
+            "crop.mode: image",
+            f"needs square images of one size, not {sorted(sizes)} (width, height)",
+            "use crop.mode: box",
+        )
+    return np.array([0.0, 0.0, sizes.pop()[0]])
+
+
+def _around_the_bird(
+    observations: Observations, n: int, frame, present, config: CropConfig
+) -> Float[np.ndarray, "T 3"]:
+    corner = np.zeros((len(frame), 4))
+    for i in np.flatnonzero(present):
+        box, confident = observations.box_px[n, frame[i]], observations.confidence[n, frame[i]] > 0
+        points = observations.keypoints_px[n, frame[i]][confident]
+        if min(box[2:]) > 0:  # the box is the bird; single keypoints may be far off
+            corner[i] = [*box[:2], *(box[:2] + box[2:])]
+        else:
+            corner[i] = [*points.min(0), *points.max(0)]
+    longest = (corner[:, 2:] - corner[:, :2]).max()
+    size = max(np.ceil(longest * (1 + 2 * config.padding)), LEAST_SIZE_PX)
+    centre = (corner[:, :2] + corner[:, 2:]) / 2
+    nearest = np.abs(np.arange(len(frame))[:, None] - np.flatnonzero(present)).argmin(1)
+    centre = centre[np.flatnonzero(present)[nearest]]  # a missing frame takes the crop of its nearest neighbour
+    return np.concatenate([np.round(centre - size / 2), np.full((len(frame), 1), size)], axis=1)
+
+
+def cut_mask(mask: Bool[np.ndarray, "H W"], crop: Float[np.ndarray, "3"], mask_px: int) -> np.ndarray:
+    """Return a mask's crop as (mask_px, mask_px) of 0 and 1: a pixel is 1 where at least half of it is covered."""
+    x0, y0, size = (int(v) for v in crop)
+    cut = np.zeros((size, size), np.uint8)
+    rows, columns = mask.shape
+    top, left, bottom, right = max(y0, 0), max(x0, 0), min(y0 + size, rows), min(x0 + size, columns)
+    if top < bottom and left < right:
+        cut[top - y0 : bottom - y0, left - x0 : right - x0] = mask[top:bottom, left:right]
+    if size == mask_px:
+        return cut
+    method = cv2.INTER_AREA if size > mask_px else cv2.INTER_LINEAR
+    covered = cv2.resize(cut * np.uint8(255), (mask_px, mask_px), interpolation=method)
+    return (covered >= 128).astype(np.uint8)

@@ -1,0 +1,150 @@
+"""Windows: the frames of one bird that are fitted together, with their keypoints and masks in crop pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxfit.config.schema import FitConfig
+from jaxfit.data.masks import decode_mask
+from jaxfit.data.observations import Observations
+from jaxfit.errors import InputError
+from jaxfit.fitting.crops import crop_squares, cut_mask
+from jaxfit.fitting.filtering import weighted_median_filter
+from jaxfit.model.camera import CROP_PX, image_to_crop
+from jaxfit.objective.posed_window import Targets
+
+__all__ = ["Windows", "cut_windows", "filter_observations", "load_targets", "windows_key"]
+
+
+@dataclass(frozen=True)
+class Windows:
+    """W windows of T frames, each of one track, with K keypoints."""
+
+    track: Int[np.ndarray, "W"]
+    """Position of the window's track in the observations."""
+    track_id: Int[np.ndarray, "W"]
+    """Number of the same track."""
+    frame: Int[np.ndarray, "W T"]
+    """Position of each frame in the observations; −1 where the video has no such frame (a gap, or past its end)."""
+    present: Bool[np.ndarray, "W T"]
+    """Whether the bird has enough confident keypoints in that frame to be fitted."""
+    crop: Float[np.ndarray, "W T 3"]
+    """(x0, y0, size) in image pixels; whole numbers, one size for each window."""
+    keypoints_px: Float[np.ndarray, "W T K 2"]
+    """Crop pixels; 0 where the confidence is 0."""
+    confidence: Float[np.ndarray, "W T K"]
+    """In [0, 1]; 0 where a keypoint is missing."""
+    mask_rle: np.ndarray
+    """(W, T) objects: run lengths of the bird's mask in its image, or None. `load_targets` decodes them."""
+
+    def __len__(self) -> int:
+        return len(self.track)
+
+    def __getitem__(self, rows: slice | np.ndarray) -> Windows:
+        return Windows(**{name: array[rows] for name, array in vars(self).items()})
+
+
+def windows_key(config: FitConfig) -> tuple:
+    """Return the part of the config that determines the windows and their targets."""
+    return config.filter_window, config.window, config.min_keypoints, config.crop
+
+
+def cut_windows(observations: Observations, config: FitConfig) -> Windows:
+    """Cut every track into consecutive windows of `config.window` frames, from its first usable frame on.
+
+    Keypoints are filtered first. Frames are consecutive by their numbers: where the file skips numbers, the window has
+    missing frames, so that no term takes distant frames for neighbours. Tracks without a usable frame get no window.
+    """
+    observations = filter_observations(observations, config.filter_window)
+    usable = observations.usable(config.min_keypoints)
+    line = _timeline(observations)
+    tracks, frames = [], []
+    for n in range(observations.num_tracks):
+        at = np.flatnonzero((line >= 0) & usable[n, np.maximum(line, 0)])
+        if len(at) == 0:
+            continue
+        for first in range(at[0], at[-1] + 1, config.window):
+            window = np.full(config.window, -1)
+            piece = line[first : min(first + config.window, at[-1] + 1)]
+            window[: len(piece)] = piece
+            if ((window >= 0) & usable[n, np.maximum(window, 0)]).any():
+                tracks.append(n)
+                frames.append(window)
+    track = np.array(tracks, int)
+    frame = np.array(frames, int).reshape(len(tracks), config.window)
+    rows, columns = track[:, None], np.maximum(frame, 0)
+    present = (frame >= 0) & usable[rows, columns]
+    crop = crop_squares(observations, track, frame, present, config.crop)
+    confidence = (observations.confidence[rows, columns] * present[..., None]).astype(np.float32)
+    keypoints_px = image_to_crop(observations.keypoints_px[rows, columns], crop)
+    mask_rle = np.full(frame.shape, None, object)
+    for w, t in zip(*np.nonzero(present), strict=True):
+        mask_rle[w, t] = observations.masks.get((int(track[w]), int(frame[w, t])))
+    return Windows(
+        track=track,
+        track_id=observations.track_id[track],
+        frame=frame,
+        present=present,
+        crop=crop,
+        keypoints_px=np.where(confidence[..., None] > 0, keypoints_px, 0).astype(np.float32),
+        confidence=confidence,
+        mask_rle=mask_rle,
+    )
+
+
+def filter_observations(observations: Observations, window: int) -> Observations:
+    """Smooth every track with the weighted median filter, over frame numbers (a gap stays a gap)."""
+    if window == 1 or observations.num_frames == 1:
+        return observations
+    line = _timeline(observations)
+    at = np.maximum(line, 0)
+    known = line >= 0
+    confidence = np.where(known[None, :, None], observations.confidence[:, at], 0)
+    smooth = jax.vmap(weighted_median_filter, (0, 0, None))
+    filtered = np.asarray(smooth(observations.keypoints_px[:, at], confidence, window))
+    return observations.with_keypoints(filtered[:, known], observations.confidence)
+
+
+def load_targets(windows: Windows, mask_px: int) -> Targets:
+    """Return the targets of some windows as NumPy arrays with a leading axis W. Masks are decoded here.
+
+    Args:
+        windows: the windows; their masks are all in memory afterwards.
+        mask_px: side of the masks; 0: no masks.
+    """
+    mask = np.zeros((*windows.frame.shape, mask_px, mask_px), np.uint8)
+    has_mask = windows.mask_rle != np.array(None)
+    if mask_px == 0:
+        has_mask = np.zeros_like(has_mask)
+    for w, t in zip(*np.nonzero(has_mask), strict=True):
+        full = decode_mask(cast(Any, windows.mask_rle[w, t]))
+        mask[w, t] = cut_mask(full, windows.crop[w, t], mask_px)
+    return Targets(
+        keypoints_px=windows.keypoints_px,
+        confidence=windows.confidence,
+        mask=mask,
+        has_mask=has_mask,
+        present=windows.present,
+        corner_px=(windows.crop[..., :2] * CROP_PX / windows.crop[..., 2:]).astype(np.float32),
+    )
+
+
+def _timeline(observations: Observations) -> Int[np.ndarray, "L"]:
+    """Position of every frame number from first to last, in the file's own step; −1 where it has none."""
+    numbers = observations.frame_index
+    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    if len(numbers) and (numbers[-1] - numbers[0]) // step > 100 * len(numbers):
+        raise InputError(
+            "observations",
+            f"frame_index runs to {numbers[-1]} but holds {len(numbers)} frames",
+            "number the frames consecutively",
+        )
+    at = (numbers - numbers[0]) // step if len(numbers) else np.zeros(0, int)
+    line = np.full(int(at[-1]) + 1 if len(at) else 0, -1)
+    line[at] = np.arange(len(at))
+    return line
