@@ -102,16 +102,15 @@ def imports(path):
 
 def test_the_tree_of_the_document_is_the_tree_of_the_package():
     documented, present = paths_in_document(), paths_on_disk()
-    where = DOCUMENT.relative_to(ROOT)
-    wrong = [
-        f"{where}:{documented[path].line}: remove {path}, which does not exist" for path in documented.keys() - present
-    ]
-    for path in set(present) - documented.keys():
-        folder = path.rstrip("/").rpartition("/")[0] + "/"
-        line = f":{documented[folder].line}" if folder in documented else ""
-        wrong.append(f"{where}{line}: add {path} below {folder}")
-    wrong += [f"{where}:{entry.line}: describe {path}" for path, entry in documented.items() if not entry.description]
-    assert not wrong, "\n".join([*sorted(wrong), "or run: python tests/test_architecture.py"])
+    wrong = [(entry.line, f"remove {path}") for path, entry in documented.items() if path not in present]
+    wrong += [(entry.line, f"describe {path}") for path, entry in documented.items() if not entry.description]
+    line = 0
+    for path in present:
+        if path not in documented:
+            wrong.append((line, f"add {path} after this line"))
+        line = documented[path].line if path in documented else line
+    messages = [f"docs/architecture.md:{line}: {what}" for line, what in sorted(wrong)]
+    assert not wrong, "\n".join([*messages, "or run: python tests/test_architecture.py"])
 
 
 def test_paths_in_the_text_of_the_document_exist():
@@ -122,7 +121,8 @@ def test_paths_in_the_text_of_the_document_exist():
 
 def test_the_document_names_the_floor_of_every_package():
     present = {path.split("/")[0].removesuffix(".py") for path in paths_on_disk()} - {"__init__"}
-    assert floors().keys() == present
+    lacking, removed = present - floors().keys(), floors().keys() - present
+    assert not lacking | removed, f'docs/architecture.md, "Floors": add {lacking or "none"}, remove {removed or "none"}'
 
 
 def test_modules_import_from_lower_floors_only():
