@@ -6,6 +6,7 @@ tree keeps the descriptions; a new module gets the first line of its docstring, 
 
 import ast
 import re
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -135,6 +136,15 @@ def test_modules_import_from_lower_floors_only():
             if other != own and floor[other] >= floor[own]:
                 wrong.append(f"{path.relative_to(ROOT)}:{line}: {own} (floor {floor[own]}) imports {name}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_no_modules_import_each_other():
+    graph = {module_name(path): {name for name, _ in imports(path)} for path in MODULES}
+    del graph["jaxfit"]  # names the home of every public name; no module imports it back
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        raise AssertionError("a circle of imports: " + " → ".join(reversed(error.args[1]))) from None
 
 
 def test_modules_are_short_and_few_at_the_root():
