@@ -1,4 +1,4 @@
-"""Executes the notebooks; as a program, in place, so that what is stored shows what they give (`make notebooks`)."""
+"""Run the notebooks. As a program (`make notebooks`): run them in place and store their outputs."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ def read(path: Path) -> NotebookNode:
     return nbformat.read(path, as_version=4)
 
 
-def parameters(notebook: NotebookNode) -> NotebookNode:
-    """The cell of values to choose, as papermill marks it."""
+def parameters_cell(notebook: NotebookNode) -> NotebookNode:
+    """Return the cell of parameters, which has papermill's tag."""
     (cell,) = (cell for cell in notebook.cells if "parameters" in cell.metadata.get("tags", []))
     return cell
 
 
-def choose(notebook: NotebookNode, values: Mapping[str, Any]) -> NotebookNode:
-    """With other values after those of the parameters' cell."""
-    cell = parameters(notebook)
+def set_parameters(notebook: NotebookNode, values: Mapping[str, Any]) -> NotebookNode:
+    """Append assignments of other values to the cell of parameters."""
+    cell = parameters_cell(notebook)
     cell.source = "\n".join([cell.source, *(f"{name} = {value!r}" for name, value in values.items())])
     return notebook
 
 
-def execute(notebook: NotebookNode, folder: Path, go_on: bool = False) -> NotebookNode:
-    """Run all cells in a folder; `go_on` leaves errors among the outputs.
+def execute(notebook: NotebookNode, folder: Path, allow_errors: bool = False) -> NotebookNode:
+    """Run all cells in a folder; with `allow_errors`, errors become outputs.
 
     Raises:
-        CellExecutionError: a cell failed.
+        CellExecutionError: a cell failed and `allow_errors` is False.
     """
-    profile = folder / ".ipython"  # nothing of the user's, and nothing left there
+    profile = folder / ".ipython"  # a fresh profile: the user's profile is neither read nor changed
     profile.mkdir(exist_ok=True)
     client = NotebookClient(
         notebook,
@@ -48,22 +48,24 @@ def execute(notebook: NotebookNode, folder: Path, go_on: bool = False) -> Notebo
         timeout=900,
         startup_timeout=300,
         record_timing=False,
-        allow_errors=go_on,
+        allow_errors=allow_errors,
         resources={"metadata": {"path": str(folder)}},
     )
     return client.execute(env={**os.environ, "IPYTHONDIR": str(profile)})
 
 
 def execute_together(notebooks: list[NotebookNode], folder: Path) -> None:
-    """Run notebooks one after the other in one process, each without the names of those before, errors among the
-    outputs: they share what importing and compiling takes."""
+    """Run notebooks one after the other in one process; errors become outputs.
+
+    The notebooks share imports and compiled programs, which saves time. Names are reset before every notebook.
+    """
     v4 = nbformat.v4
-    cells = [cell for each in notebooks for cell in (v4.new_code_cell("%reset -f"), *each.cells)]
-    execute(v4.new_notebook(cells=cells), folder, go_on=True)
+    cells = [cell for notebook in notebooks for cell in (v4.new_code_cell("%reset -f"), *notebook.cells)]
+    execute(v4.new_notebook(cells=cells), folder, allow_errors=True)
 
 
-def clean(notebook: NotebookNode) -> NotebookNode:
-    """Without what differs from run to run and from machine to machine."""
+def without_run_metadata(notebook: NotebookNode) -> NotebookNode:
+    """Remove the metadata that differ between runs and between machines."""
     notebook.metadata = NotebookNode(
         kernelspec={"display_name": "Python 3", "language": "python", "name": "python3"},
         language_info={"name": "python"},
@@ -76,7 +78,7 @@ def clean(notebook: NotebookNode) -> NotebookNode:
 def main(names: list[str]) -> None:
     for path in [FOLDER / Path(name).name for name in names] or NOTEBOOKS:
         with tempfile.TemporaryDirectory() as folder:
-            notebook = clean(execute(read(path), Path(folder)))
+            notebook = without_run_metadata(execute(read(path), Path(folder)))
         path.write_text(nbformat.writes(notebook) + "\n", encoding="utf-8")
 
 

@@ -1,0 +1,86 @@
+"""The documents: their links lead somewhere, their commands parse, their configs are valid, the README is short."""
+
+import argparse
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import jaxfit
+from jaxfit.cli.main import main
+
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+MODEL_CARD = ROOT / "jaxfit" / "perception" / "networks" / "README.md"
+DOCUMENTS = [README, MODEL_CARD, *sorted((ROOT / "docs").glob("*.md"))]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+documents = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+
+
+class Parsed(BaseException):
+    """The parser accepted a command."""
+
+
+def anchors(path):
+    """Return the anchors of a Markdown file's headings, as GitHub makes them."""
+    text = BLOCK.sub("", path.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def commands(text):
+    """Return the `jaxfit` commands of a document: lines of code blocks, and code in sentences that has options."""
+    lines = [line for _, block in BLOCK.findall(text) for line in block.splitlines()]
+    lines += re.findall(r"`(jaxfit [^`]* --[^`]+)`", BLOCK.sub("", text).replace("\n", " "))
+    found = [re.fullmatch(r"(?:\w+=\S+ )?(jaxfit .+)", line) for line in lines]
+    return [shlex.split(match[1], comments=True)[1:] for match in found if match]
+
+
+@documents
+def test_links_lead_to_files_and_headings(path):
+    links = re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8"))
+    broken = []
+    for link in links:
+        file, _, anchor = link.partition("#")
+        target = (path.parent / file).resolve() if file else path
+        if "://" not in link and (not target.exists() or (anchor and anchor not in anchors(target))):
+            broken.append(link)
+    assert not broken
+
+
+@documents
+def test_commands_parse(path, monkeypatch):
+    parse = argparse.ArgumentParser.parse_args
+
+    def parse_and_stop(*arguments, **options):
+        parse(*arguments, **options)
+        raise Parsed
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_and_stop)
+    for arguments in commands(path.read_text(encoding="utf-8")):
+        with pytest.raises(Parsed):  # SystemExit where the parser rejects the command
+            main(arguments)
+
+
+def test_configs_are_valid(tmp_path):
+    text = (ROOT / "docs" / "configs.md").read_text(encoding="utf-8")
+    configs = [block for language, block in BLOCK.findall(text) if language == "yaml" and block.startswith("base:")]
+    assert configs
+    for config in configs:
+        (tmp_path / "mine.yaml").write_text(config, encoding="utf-8")
+        load = jaxfit.load_reconstruct_config if config.startswith("base: reconstruct") else jaxfit.load_config
+        load(tmp_path / "mine.yaml")
+
+
+def test_every_command_stands_in_the_readme(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    known = re.findall(r"^    (\w+) ", capsys.readouterr().out, re.MULTILINE)
+    assert len(known) > 5
+    text = README.read_text(encoding="utf-8")
+    assert not [name for name in known if f"jaxfit {name}" not in text]
+
+
+def test_the_readme_is_short():
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
