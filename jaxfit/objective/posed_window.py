@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxfit.errors import InputError
-from jaxfit.model.bird import Bird, free_limits
+from jaxfit.model.bird import Bird, unlimited_joints
 from jaxfit.model.camera import Camera, project, to_screen
 from jaxfit.model.jacobian import window_keypoint_rows
 from jaxfit.model.kinematics import Rig, window_joints, window_keypoints, window_transforms, window_vertices
@@ -55,7 +55,7 @@ class Priors(NamedTuple):
 
 def priors_of(bird: Bird) -> Priors:
     """Whiten a bird's priors (in float64, once)."""
-    unlimited = np.array_equal(bird.joint_limits, free_limits(bird.num_joints - 1))
+    unlimited = np.array_equal(bird.joint_limits, unlimited_joints(bird.num_joints - 1))
 
     def whitener(covariance):
         cholesky = np.linalg.cholesky(np.asarray(covariance, np.float64))

@@ -16,7 +16,7 @@ from support.terms_by_hand import CAMERA, RASTER, seen, window_pose
 from jaxfit.errors import InputError
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.rotation import axis_angle_to_matrix
-from jaxfit.objective.anatomy import feet_on_ground, joint_limits
+from jaxfit.objective.plausibility import feet_on_ground, joint_limits
 from jaxfit.objective.posed_window import PosedWindow, priors_of
 from jaxfit.objective.smoothness import geodesic_velocity, huber, huber_velocity, low_pass
 

@@ -52,9 +52,9 @@ def test_stored_geman_mcclure_and_mahalanobis(reference_dir):
         value = geman_mcclure(jnp.asarray(stored["geman_mcclure/residual"]), 50.0)
         np.testing.assert_allclose(value, stored["geman_mcclure/value"], rtol=1e-6)
         poses, expected = stored["pose_prior/body_pose"], stored["pose_prior/squared_mahalanobis"]
-    from jaxfit.model.importers.sources import import_sources
+    from jaxfit.model.importers.import_model import import_model
 
-    priors = priors_of(import_sources("avian-mesh", [reference_dir / "models" / "avian_mesh"]))
+    priors = priors_of(import_model("avian-mesh", [reference_dir / "models" / "avian_mesh"]))
     for body_pose, distance in zip(poses, expected, strict=True):
         pose = dataclasses.replace(window_pose(), body_pose=jnp.asarray(body_pose.reshape(1, -1, 3)))
         targets = dataclasses.replace(seen(), present=jnp.ones(1, bool))
