@@ -31,9 +31,9 @@ def test_projection_by_hand():
 @pytest.mark.parametrize("depth", [0.0, -0.0, 1e-12, -1e-3, -5.0, -1e6])
 def test_projection_at_and_behind_the_camera_is_finite(depth):
     point = jnp.array([0.5, -2.0, depth])
-    value, pull = jax.vjp(lambda p: project(p, Camera()), point)
+    value, pullback = jax.vjp(lambda p: project(p, Camera()), point)
     assert np.isfinite(value).all()
-    assert np.isfinite(pull(jnp.ones(2))[0]).all()
+    assert np.isfinite(pullback(jnp.ones(2))[0]).all()
     # a point on the right stays on the right: the projection does not mirror points behind the camera
     assert value[0] > 128 > value[1]
 

@@ -124,13 +124,13 @@ def test_gradients(rest):
     start = rest_pose(BIRD) if rest else random_pose(BIRD, 1, 0.3)
     # a small translation, because large coordinates hide the small steps of finite differences
     start = dataclasses.replace(start, transl=jnp.array([0.1, 0.2, 0.3]))
-    pull = jnp.asarray(np.random.default_rng(0).normal(size=(BIRD.num_keypoints, 3)), jnp.float32)
-    push = jnp.asarray(np.random.default_rng(1).normal(size=BIRD.vertices.shape) / 50, jnp.float32)
+    keypoint_weights = jnp.asarray(np.random.default_rng(0).normal(size=(BIRD.num_keypoints, 3)), jnp.float32)
+    vertex_weights = jnp.asarray(np.random.default_rng(1).normal(size=BIRD.vertices.shape) / 50, jnp.float32)
 
     @jax.jit
     def value(pose):
         vertices, keypoints, _ = posed(RIG, pose)
-        return jnp.sum(pull * keypoints) + jnp.sum(push * vertices)
+        return jnp.sum(keypoint_weights * keypoints) + jnp.sum(vertex_weights * vertices)
 
     check_grads(value, (start,), order=1, modes=["rev"], eps=1e-2, atol=0.02, rtol=0.02)
     gradient = jax.grad(value)(start)

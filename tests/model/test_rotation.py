@@ -62,12 +62,12 @@ def test_gradients_are_finite_and_right(theta):
 @example(np.array([0, 0, 1], np.float32), 0.0)
 def test_axis_angle_of_a_matrix(axis, theta):
     R = Rotation.from_rotvec(theta * axis.astype(np.float64)).as_matrix()
-    found = np.asarray(to_axis_angle(jnp.asarray(R, jnp.float32)))
-    assert np.isfinite(found).all()
-    assert np.linalg.norm(found) <= np.pi + 1e-6
-    assert Rotation.from_rotvec(found).inv().as_matrix() @ R == pytest.approx(np.eye(3), abs=2e-6)
+    result = np.asarray(to_axis_angle(jnp.asarray(R, jnp.float32)))
+    assert np.isfinite(result).all()
+    assert np.linalg.norm(result) <= np.pi + 1e-6
+    assert Rotation.from_rotvec(result).inv().as_matrix() @ R == pytest.approx(np.eye(3), abs=2e-6)
     if theta < 3:  # near π both signs of the axis are the same rotation
-        np.testing.assert_allclose(found, theta * axis, atol=5e-6)
+        np.testing.assert_allclose(result, theta * axis, atol=5e-6)
 
 
 @settings(max_examples=50, deadline=None)

@@ -45,21 +45,21 @@ def arrays():
 @pytest.mark.parametrize("write", [write_legacy, write_zip])
 def test_arrays_come_back_exactly(tmp_path, write):
     expected = arrays()
-    found = read_tensors(write(tmp_path / "a.pt", expected))
-    assert found.keys() == expected.keys()
+    tensors = read_tensors(write(tmp_path / "a.pt", expected))
+    assert tensors.keys() == expected.keys()
     for name, array in expected.items():
-        assert found[name].dtype == array.dtype, name
-        np.testing.assert_array_equal(found[name], array)
+        assert tensors[name].dtype == array.dtype, name
+        np.testing.assert_array_equal(tensors[name], array)
 
 
 def test_views_share_a_storage(tmp_path):
     entries = {"transposed": tensor(STORED, (4, 3), (1, 4)), "column": tensor(STORED, (3,), (4,), offset=2)}
     (tmp_path / "a.pt").write_bytes(legacy(mapping(entries), FLOATS))
-    found = read_tensors(tmp_path / "a.pt")
+    tensors = read_tensors(tmp_path / "a.pt")
     whole = np.arange(12).reshape(3, 4)
-    np.testing.assert_array_equal(found["transposed"], whole.T)
-    np.testing.assert_array_equal(found["column"], whole[:, 2])
-    assert not found["column"].flags.writeable
+    np.testing.assert_array_equal(tensors["transposed"], whole.T)
+    np.testing.assert_array_equal(tensors["column"], whole[:, 2])
+    assert not tensors["column"].flags.writeable
 
 
 def read_error(tmp_path, content: bytes) -> str:
@@ -235,7 +235,7 @@ def test_damaged_bytes_give_arrays_or_an_input_error(tmp_path_factory, data):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     path.write_bytes(content[: data.draw(st.sampled_from([len(content), len(content) // 2]))])
     try:
-        found = read_tensors(path)
+        tensors = read_tensors(path)
     except InputError:
         return
-    assert sum(array.nbytes for array in found.values()) <= 2 * len(content)
+    assert sum(array.nbytes for array in tensors.values()) <= 2 * len(content)

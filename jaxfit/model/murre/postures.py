@@ -102,6 +102,7 @@ def _leg_bends(pitch: float, ankle: tuple[float, float]) -> tuple[float, float, 
 
 
 STAND, STEP = (-2.9, -8.5), 2.0
+"""Ankle position of a standing bird relative to the root (forwards, upwards), and half a step, centimetres."""
 UPRIGHT = {
     "lower_body": (-10, 0, 0),
     "tail": (-20, 0, 0),
