@@ -41,11 +41,11 @@ assert bird.keypoints.shape == (12, 3)
 """
 
 OBJECTIVE = """
-from support.terms_by_hand import all_settings, every_gradient, posed_window, seen, window_pose
+from support.terms_by_hand import all_settings, every_gradient, posed_window, random_targets, window_pose
 from jaxfit.objective.objective import evaluate_terms
 pose = window_pose()
-evaluate_terms(posed_window(pose, seen()), all_settings())
-every_gradient(pose, pose, seen(), all_settings())
+evaluate_terms(posed_window(pose, random_targets()), all_settings())
+every_gradient(pose, pose, random_targets(), all_settings())
 """
 
 FIT = """

@@ -1,4 +1,4 @@
-"""The objective: short pure terms and their weighted sum. Importing it registers the library's own terms."""
+"""The objective: short pure terms and their weighted sum. The import of this package registers jaxfit's own terms."""
 
 from jaxfit.objective import plausibility, smoothness, temporal, terms
 

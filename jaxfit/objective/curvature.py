@@ -1,8 +1,8 @@
-"""What a Gauss-Newton step needs of a term beside its gradient: the curvature of a quadratic that bounds it.
+"""The curvature of a term: the matrix H that a Gauss-Newton step needs beside the gradient.
 
-At the present pose a term E is bounded by E + g·d + ½ d·H·d for a change d, with E's own gradient g (exactly where its
-residuals are linear in the pose, else to first order). Robust errors and unsquared norms thus become weighted squares:
-iteratively reweighted least squares.
+At the current pose, the quadratic E + g·d + ½ d·H·d is an upper bound of a term E for a change d of the pose, where g
+is the gradient of E. The bound is exact if the residuals are linear in the pose, and holds to first order otherwise.
+Robust errors and unsquared norms become weighted squares: this is iteratively reweighted least squares.
 """
 
 from __future__ import annotations
@@ -18,19 +18,24 @@ from jaxfit.model.pose import Pose
 __all__ = ["Curvature", "Rows", "frame_rows"]
 
 Rows = Float[Array, "T D"]
-"""A change of pose, or a gradient, by frame: global orientation (3), body pose (3(J−1)), translation (3), scale (1)."""
+"""A change of the pose, or a gradient, one row per frame: global orientation (3), body pose (3(J−1)), translation (3),
+scale (1)."""
 
 
 class Curvature(NamedTuple):
-    """A positive semi-definite H on rows of frames."""
+    """A positive semi-definite matrix H on rows of frames."""
 
     product: Callable[[Rows], Rows]
-    """d ↦ H·d."""
+    """The function d ↦ H·d."""
     diagonal: Rows
+    """Diagonal of H."""
 
 
 def frame_rows(pose: Pose) -> Rows:
-    """A window's pose as one row a frame, without what is the window's own; a common scale stands in every row."""
+    """Return the pose of a window as one row per frame, without bone lengths and shape.
+
+    A scale that all frames share is repeated in every row.
+    """
     frames = pose.global_orient.shape[0]
     scale = jnp.broadcast_to(pose.scale, (frames,))
     return jnp.concatenate(

@@ -20,14 +20,14 @@ Settings = Mapping[str, Mapping[str, Float[Array | np.ndarray, ""] | float]]
 
 
 def evaluate_terms(window: PosedWindow, settings: Settings) -> dict[str, Float[Array, ""]]:
-    """Each term of `settings` by itself, unweighted.
+    """Return the unweighted value of each term of `settings`.
 
     Args:
         window: one bird in one window.
-        settings: for each active term, `weight` and the term's own settings; all may be traced.
+        settings: for each active term, `weight` and the settings of the term; all values may be traced.
 
     Raises:
-        InputError: a term that returns anything but one real number; it is named.
+        InputError: a term does not return one real number; the message names the term.
     """
     return {
         name: _scalar(name, find_term(name).function(window, **{k: v for k, v in own.items() if k != "weight"}))
@@ -36,7 +36,7 @@ def evaluate_terms(window: PosedWindow, settings: Settings) -> dict[str, Float[A
 
 
 def weighted_sum(window: PosedWindow, settings: Settings) -> Float[Array, ""]:
-    """E = Σ λ · E_term over the active terms.
+    """Return the objective E = Σ λ · E_term over the active terms.
 
     Source: Hägerlind et al. 2024, total objective.
     """
@@ -45,7 +45,7 @@ def weighted_sum(window: PosedWindow, settings: Settings) -> Float[Array, ""]:
 
 
 def evaluate_curvature(window: PosedWindow, settings: Settings) -> Curvature:
-    """Σ λ · H_term over the active terms, all of which must have one.
+    """Return the curvature Σ λ · H_term of the objective; every active term must have a curvature.
 
     Args:
         window: one bird in one window.
@@ -54,7 +54,7 @@ def evaluate_curvature(window: PosedWindow, settings: Settings) -> Curvature:
     weighted = []
     for name, own in settings.items():
         find = find_term(name).curvature
-        assert find is not None, name  # configs are checked for it
+        assert find is not None, name  # the check of the config has rejected terms without curvature
         weighted.append((own["weight"], find(window, **{k: v for k, v in own.items() if k != "weight"})))
     return Curvature(
         lambda d: sum((weight * H.product(d) for weight, H in weighted), start=jnp.zeros_like(d)),
