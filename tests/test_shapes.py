@@ -41,12 +41,12 @@ assert bird.keypoints.shape == (12, 3)
 """
 
 OBJECTIVE = """
-from support.terms_by_hand import all_settings, every_gradient, posed_window, seen, window_pose
+from support.terms_by_hand import all_settings, every_gradient, posed_window, random_targets, window_pose
 from jaxfit.objective.objective import evaluate_terms
 from jaxfit.objective.registry import find_terms
 pose = window_pose()
-evaluate_terms(posed_window(pose, seen()), find_terms(all_settings()), all_settings())
-every_gradient(pose, pose, seen(), all_settings())
+evaluate_terms(posed_window(pose, random_targets()), find_terms(all_settings()), all_settings())
+every_gradient(pose, pose, random_targets(), all_settings())
 """
 
 FIT = """

@@ -12,9 +12,9 @@ __all__ = ["model_import", "model_info", "model_view", "prior_learn"]
 
 
 def model_import(options: argparse.Namespace) -> None:
-    from jaxfit.model.importers.sources import import_sources
+    from jaxfit.model.importers.import_model import import_model
 
-    bird = import_sources(options.kind, options.sources)
+    bird = import_model(options.kind, options.sources)
     save_bird(bird, options.out)
     show(f"{bird.name}: {bird.vertices.shape[0]} vertices, {bird.num_keypoints} keypoints → {options.out}")
 

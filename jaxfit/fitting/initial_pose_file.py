@@ -16,7 +16,7 @@ from jaxfit.errors import InputError
 from jaxfit.fitting.windows import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
-from jaxfit.storage.files import validate_arrays
+from jaxfit.storage.arrays import validate_arrays
 from jaxfit.storage.npz import load_npz
 
 __all__ = ["InitialPoses", "load_initial_poses"]

@@ -175,7 +175,8 @@ def search_initial_poses(
         weight = confidence[..., None] / jnp.maximum(jnp.sum(confidence, axis=1), 1e-6)[:, None, None]
         offset_px = jnp.sum(weight * (keypoints_px - camera.centre_px), axis=1)
         xy = offset_px * depth / camera.focal_px - jnp.sum(weight * rotated, axis=1)[:, :2]
-        transl = jnp.concatenate([xy, jnp.full((frames, 1), depth)], axis=-1)
+        z = jnp.broadcast_to(depth - scale * root[2], (frames,))  # the root joint at this depth
+        transl = jnp.concatenate([xy, z[:, None]], axis=-1)
         return unwrap_axis_angle(matrix_to_axis_angle(R)), transl, scale
 
     def window(seen: tuple[Array, Array]) -> tuple[Array, Array, Array]:

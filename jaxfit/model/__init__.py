@@ -1,1 +1,1 @@
-"""What a bird is: mesh, joint tree, priors, pose and kinematics."""
+"""Bird models: mesh, joint tree, priors, pose, camera and kinematics."""

@@ -1,13 +1,14 @@
-"""What the joints and keypoints of the published bird models are called.
+"""Names and pairs of the joints and keypoints of the bird models.
 
-Both models share one skeleton. In rest pose the bird looks along +y with +z up, so its left side is −x.
-A joint is named by the place it turns about, in a bird's terms: the thigh lies inside the body, the joint
-that shows half-way down the leg and bends backwards is the ankle, and `foot` is where the toes begin.
-The folded wings cross over the back, which puts `left_wingtip` a little to the right of the midline.
+The published models (avian-mesh, AVES) and the murre share one skeleton. In the rest pose the bird looks along +y
+and +z points up, so the left side of the bird is −x. A joint has the name of its place in the anatomy of a bird: the
+thigh lies inside the body, the visible joint half-way down the leg that bends backwards is the ankle, and the toes
+begin at `foot`. The folded wings cross over the back, so `left_wingtip` of the published models lies a little to the
+right of the midline.
 
-Source: the keypoints' order is Badger et al. 2020 (marcbadger/avian-mesh, `utils/constants.py`) and
-Wang et al. 2021 (the parts of CUB-200-2011, feet, shins and tail split as that work annotates them); the
-joints' names are ours.
+Source: the order of the keypoints is that of Badger et al. 2020 (marcbadger/avian-mesh, `utils/constants.py`) and of
+Wang et al. 2021 (the parts of CUB-200-2011; feet, shins and tail are split as in the annotations of that work). The
+names of the joints are ours.
 """
 
 from __future__ import annotations
@@ -35,11 +36,11 @@ JOINT_NAMES = (
     "left_knee",
     "left_ankle",
     "left_foot",
-    "left_wing_root",  # at the midline; moves no vertex of its own, but the whole wing
+    "left_wing_root",  # at the midline; moves the whole wing, but has no vertices of its own
     "left_shoulder",
     "left_elbow",
     "left_wrist",
-    "neck_root",  # likewise for neck and head
+    "neck_root",  # moves neck and head, but has no vertices of its own
     "neck",
     "head",
     "jaw",  # the lower bill
@@ -90,8 +91,8 @@ AVES_KEYPOINTS = (
 )
 
 MURRE_KEYPOINTS = (*AVES_KEYPOINTS, "left_wrist", "right_wrist")
-"""The murre's 20. Hägerlind et al. label 20 points, AVES' 18 and two that they do not name; that these are the
-wrists (carpal joints: the bend of the wing, at the breast side of the folded one) is our choice."""
+"""The 20 keypoints of the murre. Hägerlind et al. label 20 points: the 18 of AVES and two points without names. We
+choose the wrists for these two (carpal joints: the bend of the wing, at the breast side of a folded wing)."""
 
 MURRE_SKELETON = (
     ("bill_tip", "bill_base"),
@@ -116,11 +117,11 @@ MURRE_SKELETON = (
     ("left_shin", "left_foot"),
     ("right_shin", "right_foot"),
 )
-"""Pairs of the murre's keypoints that a picture joins by lines."""
+"""Pairs of murre keypoints that drawings connect by lines."""
 
 
 def mirror_pairs(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """(left, right) indices of the names that differ only in `left_` and `right_`."""
+    """Return (left, right) indices of the names that differ only in the prefix `left_` or `right_`."""
     index = {name: i for i, name in enumerate(names)}
     pairs = []
     for i, name in enumerate(names):
@@ -130,7 +131,7 @@ def mirror_pairs(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
 
 
 def other_side(name: str) -> str:
-    """`right_foot` for `left_foot` and the reverse; a name without a side is its own."""
+    """Return `right_foot` for `left_foot` and the reverse; return a name without a side unchanged."""
     for side, other in (("left_", "right_"), ("right_", "left_")):
         if name.startswith(side):
             return other + name.removeprefix(side)
@@ -138,6 +139,6 @@ def other_side(name: str) -> str:
 
 
 def skeleton_pairs(keypoint_names: Sequence[str]) -> tuple[tuple[int, int], ...]:
-    """Indices of the keypoints that `MURRE_SKELETON` joins, of those that a model has."""
+    """Return the index pairs of `MURRE_SKELETON`; pairs with a keypoint that the model lacks are skipped."""
     index = {name: k for k, name in enumerate(keypoint_names)}
     return tuple((index[a], index[b]) for a, b in MURRE_SKELETON if a in index and b in index)

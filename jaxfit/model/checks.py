@@ -1,4 +1,4 @@
-"""Whether the numbers of a bird make sense, field by field, before anything is computed with them."""
+"""Check that the fields of a bird are valid and agree with each other."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxfit.model.bird import Bird
 __all__ = ["ARRAY_FIELDS", "MAX_INFLUENCES", "check_bird"]
 
 MAX_INFLUENCES = 8
-"""Most joints that may move one vertex."""
+"""Maximum number of joints that move one vertex."""
 SUM_TOLERANCE = 1e-3
 
 ARRAY_FIELDS = {
@@ -35,14 +35,14 @@ D = 3B angles."""
 
 
 def check_bird(bird: Bird, source: object) -> Bird:
-    """The bird itself, if every field agrees with every other.
+    """Return the bird unchanged, if all fields are valid and agree with each other.
 
     Args:
         bird: the model.
-        source: file or object named in the error.
+        source: file or object that an error names.
 
     Raises:
-        InputError: names the first field that is wrong, what it should be and what it is.
+        InputError: a field is wrong; the message names the first wrong field, its value and the expected value.
     """
     _Checker(bird, source).run()
     return bird
@@ -64,7 +64,7 @@ class _Checker:
         self.require("faces", faces.min() >= 0 and faces.max() <= last, f"an index outside 0…{last}")
         self.check_weights("skin_weights")
         most = int((self.arrays["skin_weights"] != 0).sum(axis=1).max())
-        self.require("skin_weights", most <= MAX_INFLUENCES, f"{most} joints move one vertex, at most 8 may")
+        self.require("skin_weights", most <= MAX_INFLUENCES, f"{most} joints move one vertex, the maximum is 8")
         self.check_weights("keypoint_weights")
         self.require("shape_variance", bool((self.arrays["shape_variance"] > 0).all()), "must be positive")
         for field in ("pose_covariance", "bone_covariance"):
@@ -83,13 +83,13 @@ class _Checker:
             array = self.arrays[field]
             self.require(field, array.ndim == len(axes.split()), f"shape {array.shape}, expected ({axes})")
             for axis, size in zip(axes.split(), array.shape, strict=True):
-                # the first array with an axis sets its size, the others follow
+                # the first array with an axis defines the size of this axis
                 expected = sizes.setdefault(axis, size)
                 problem = f"shape {array.shape}, expected ({axes}) with {axis} = {expected}"
                 self.require(field, size == expected, problem)
                 self.require(field, size > 0 or axis == "S", f"shape {array.shape} has no entries")
             kind = "iu" if field == "faces" else "f"
-            self.require(field, array.dtype.kind in kind, f"holds {array.dtype} numbers")
+            self.require(field, array.dtype.kind in kind, f"has values of type {array.dtype}")
             self.require(field, np.isfinite(array).all(), "holds NaN or infinite numbers")
 
     def check_tree(self) -> None:
@@ -105,21 +105,21 @@ class _Checker:
         count = len(self.bird.parents) if field == "joint_names" else len(self.arrays["keypoint_weights"])
         self.require(field, len(names) == count, f"{len(names)} names for {count}")
         self.require(field, all(names), "an empty name")
-        twice = {name for name in names if list(names).count(name) > 1}
-        self.require(field, not twice, f"names used twice: {', '.join(sorted(twice))}")
+        repeated = {name for name in names if list(names).count(name) > 1}
+        self.require(field, not repeated, f"names used twice: {', '.join(sorted(repeated))}")
 
     def check_pairs(self, field: str, count: int) -> None:
         used = [index for pair in getattr(self.bird, field) for index in pair]
         self.require(field, all(0 <= index < count for index in used), f"an index outside 0…{count - 1}")
-        self.require(field, len(used) == len(set(used)), "an index stands in two pairs, or in one pair twice")
+        self.require(field, len(used) == len(set(used)), "an index is in two pairs, or in one pair twice")
 
     def check_weights(self, field: str) -> None:
         weights = self.arrays[field]
         self.require(field, (weights >= 0).all(), "negative weights")
         sums = weights.sum(axis=1)
         row = int(np.abs(sums - 1).argmax())
-        one = abs(sums[row] - 1) <= SUM_TOLERANCE
-        self.require(field, one, f"row {row} sums to {sums[row]:.4g}, not to 1")
+        sums_to_one = abs(sums[row] - 1) <= SUM_TOLERANCE
+        self.require(field, sums_to_one, f"row {row} sums to {sums[row]:.4g}, not to 1")
 
     def check_covariance(self, field: str) -> None:
         matrix = self.arrays[field].astype(np.float64)
@@ -127,21 +127,22 @@ class _Checker:
         self.require(field, size > 0, "is zero")
         self.require(field, np.abs(matrix - matrix.T).max() <= 1e-5 * size, "is not symmetric")
         smallest = float(np.linalg.eigvalsh((matrix + matrix.T) / 2)[0])
-        # rounding to float32 may push an eigenvalue of 0 a little below it
+        # rounding to float32 may make an eigenvalue of 0 slightly negative
         problem = f"is not positive semidefinite (eigenvalue {smallest:.3g})"
         self.require(field, smallest >= -1e-5 * size, problem)
 
     def check_colours(self) -> None:
         colours = self.arrays["vertex_colours"]
-        least, greatest = float(colours.min()), float(colours.max())
-        problem = f"from {least:.4g} to {greatest:.4g}, sRGB lies in [0, 1]"
-        self.require("vertex_colours", least >= 0 and greatest <= 1, problem)
+        lowest, highest = float(colours.min()), float(colours.max())
+        problem = f"values from {lowest:.4g} to {highest:.4g}, sRGB values lie in [0, 1]"
+        self.require("vertex_colours", lowest >= 0 and highest <= 1, problem)
 
     def check_limits(self) -> None:
         limits = self.arrays["joint_limits"]
         crossed = np.argwhere(limits[..., 0] > limits[..., 1])
         joint = self.bird.joint_names[crossed[0, 0] + 1] if len(crossed) else ""
-        self.require("joint_limits", not joint, f"the least angle of {joint} exceeds the greatest")
-        far = float(np.abs(limits).max())
-        # no rotation needs a component beyond a full turn
-        self.require("joint_limits", far <= 2 * np.pi + SUM_TOLERANCE, f"{far:.4g} radians is beyond a full turn")
+        self.require("joint_limits", not joint, f"the minimum angle of {joint} exceeds the maximum")
+        largest = float(np.abs(limits).max())
+        # an axis-angle component beyond a full turn is never necessary
+        valid = largest <= 2 * np.pi + SUM_TOLERANCE
+        self.require("joint_limits", valid, f"{largest:.4g} radians is beyond a full turn")

@@ -1,4 +1,4 @@
-"""What a bird is made of, in numbers a person can check, and the fingerprint results are recorded with."""
+"""Facts about a bird model for people to check, and the hash that identifies the model in results."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ __all__ = ["describe_bird", "model_hash"]
 
 
 def model_hash(bird: Bird) -> str:
-    """SHA-256 (hexadecimal) of everything that a result can depend on.
+    """Return the SHA-256 hash (hexadecimal) of all parts of a bird that a fit depends on.
 
-    It covers arrays (as little-endian float32 and int32), tree, names of joints and keypoints, and pairs. It
-    does not cover `bird.name` and `vertex_colours`, which change no fit, nor how or when the file was written.
+    The hash covers the arrays (as little-endian float32 and int32), the joint tree, the names of joints and
+    keypoints, and the pairs. The hash does not cover `bird.name` and `vertex_colours`, because a fit does not depend
+    on them, and it does not depend on the file from which the bird was read.
     """
     digest = hashlib.sha256(b"jaxfit bird 1\n")
     for field in ARRAY_FIELDS:
@@ -33,17 +34,17 @@ def model_hash(bird: Bird) -> str:
 
 
 def describe_bird(bird: Bird) -> dict[str, Any]:
-    """Facts about a model, ready to be printed or written as JSON.
+    """Return facts about a model, as values that JSON can hold.
 
     Returns:
         `name`, `model_hash`; counts (`vertices`, `faces`, `joints`, `keypoints`, `shapes`); `joint_names`,
         `keypoint_names`, `parents` by name (None for the root), `joint_pairs` and `keypoint_pairs` as
         [left, right] names; `minimum`, `maximum`, `extents` (x, y, z, model units); `watertight`,
-        `boundary_edges` (edges of one face only), `volume` (cubed model units; None if not watertight);
-        `max_influences` (joints that move one vertex); `pose_prior_variance`, `bone_prior_variance` and
-        `shape_variance`: smallest and largest eigenvalue (rad², 1, 1; None without shapes).
+        `boundary_edges` (edges that belong to one face only), `volume` (cubed model units; None if not watertight);
+        `max_influences` (maximum number of joints that move one vertex); `pose_prior_variance`,
+        `bone_prior_variance` and `shape_variance`: smallest and largest eigenvalue (rad², 1, 1; None without shapes).
     """
-    import trimesh  # here: few need this function, and it takes half a second
+    import trimesh  # imported here because the import takes half a second and few callers need it
 
     vertices, faces = np.asarray(bird.vertices), np.asarray(bird.faces)
     minimum, maximum = vertices.min(axis=0), vertices.max(axis=0)
@@ -73,12 +74,12 @@ def describe_bird(bird: Bird) -> dict[str, Any]:
         "boundary_edges": int((shared == 1).sum()),
         "volume": float(mesh.volume) if watertight else None,
         "max_influences": int((np.asarray(bird.skin_weights) != 0).sum(axis=1).max()),
-        "pose_prior_variance": _spread(bird.pose_covariance),
-        "bone_prior_variance": _spread(bird.bone_covariance),
+        "pose_prior_variance": _eigenvalue_range(bird.pose_covariance),
+        "bone_prior_variance": _eigenvalue_range(bird.bone_covariance),
         "shape_variance": [float(variance.min()), float(variance.max())] if variance.size else None,
     }
 
 
-def _spread(covariance: Any) -> list[float]:
+def _eigenvalue_range(covariance: Any) -> list[float]:
     eigenvalues = np.linalg.eigvalsh(np.asarray(covariance, np.float64))
     return [float(eigenvalues[0]), float(eigenvalues[-1])]

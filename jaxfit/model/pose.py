@@ -1,4 +1,4 @@
-"""What moves a bird: the pose of every frame of a window, as one pytree."""
+"""The pose parameters of a bird in one frame or in all frames of a window, as one pytree."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ __all__ = ["Pose", "rest_pose"]
 
 
 class Pose(eqx.Module):
-    """The pose of one bird in one frame; a window holds the same fields with a leading T.
+    """The pose of one bird in one frame; in a window, the fields have a leading frame axis T.
 
-    Rotations are axis-angle in radians, each joint relative to its parent; lengths are in model units,
-    camera frame. In a window, `bone_length` and `betas` stay without a frame axis: a bird keeps its
-    skeleton and its shape. `scale` has one entry per frame, or one for the window ("common size"). Batches
-    put further axes W in front of every field. There are J−1 bones.
+    Rotations are axis-angle in radians, each joint relative to its parent. Translations are in model units, camera
+    frame. In a window, `bone_length` and `betas` have no frame axis, because skeleton and shape of a bird do not
+    change. `scale` has one entry per frame, or one entry for the window ("common size"). In a batch, every field has
+    further leading axes W. There are J−1 bones.
     """
 
     global_orient: Float[Array | np.ndarray, "*T 3"]
-    """Rotation model → camera, about the root joint."""
+    """Rotation model → camera, about the rest position of the root joint."""
     body_pose: Float[Array | np.ndarray, "*T bones 3"]
-    """Rotation of every other joint against its parent."""
+    """Rotation of every joint except the root relative to its parent."""
     transl: Float[Array | np.ndarray, "*T 3"]
-    """Position of the root joint's rest origin in the camera frame."""
+    """Translation in the camera frame: the posed root joint is at scale · (rest position of the root) + transl."""
     scale: Float[Array | np.ndarray, "*#T"]
     """Size relative to the model's rest size."""
     bone_length: Float[Array | np.ndarray, "*W bones"]
@@ -36,12 +36,12 @@ class Pose(eqx.Module):
 
 
 def rest_pose(bird: Bird, frames: int | None = None, common_size: bool = False) -> Pose:
-    """The bird at its prior's mean pose and bone lengths, unrotated at the origin, scale 1.
+    """Return the mean pose and mean bone lengths of the prior, without rotation and translation, at scale 1.
 
     Args:
         bird: the model.
         frames: length T of a window; None gives one frame without a leading axis.
-        common_size: one scale for the whole window instead of one a frame.
+        common_size: one scale for the window instead of one scale per frame.
     """
     lead = () if frames is None else (frames,)
     joints = bird.num_joints

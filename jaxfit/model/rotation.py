@@ -1,4 +1,4 @@
-"""Rotations: axis-angle, matrices, quaternions, the distance between them, and grids over SO(3)."""
+"""Rotations: axis-angles, matrices, quaternions, distances between rotations, and grids over SO(3)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = [
 
 
 def axis_angle_to_matrix(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
-    """Rotation matrices of axis-angles in radians (Rodrigues), smooth at zero.
+    """Return the rotation matrices of axis-angles in radians (Rodrigues), differentiable at zero rotation.
 
     R = I + a·[r]× + b·[r]×², a = sin θ/θ, b = (1 − cos θ)/θ².
     """
@@ -35,7 +35,7 @@ def axis_angle_to_matrix(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3
 
 
 def right_jacobian(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
-    """How a rotation turns as its axis-angle r changes: R(r + dr) = R(r)·R(Jr(r)·dr) to first order.
+    """Return the right Jacobian Jr of axis-angles r, with R(r + dr) = R(r)·R(Jr(r)·dr) to first order.
 
     Jr = I − b·[r]× + c·[r]×², b = (1 − cos θ)/θ², c = (θ − sin θ)/θ³.
 
@@ -52,8 +52,11 @@ def right_jacobian(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
 
 
 def _rodrigues(axis_angle: Float[Array, "*B 3"]) -> tuple[Float[Array, "*B"], Float[Array, "*B"], Float[Array, "*B"]]:
-    """sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³; below θ = 1e-2 by their series in θ², so that values and
-    gradients stay exact to float32 and finite at zero rotation."""
+    """Return sin θ/θ, (1 − cos θ)/θ² and (θ − sin θ)/θ³.
+
+    Below θ = 1e-2, the values come from their series in θ²: values and gradients are then exact to float32 and
+    finite at zero rotation.
+    """
     theta2 = jnp.sum(axis_angle**2, axis=-1)
     small = theta2 < 1e-4
     safe2 = jnp.where(small, 1.0, theta2)
@@ -65,7 +68,7 @@ def _rodrigues(axis_angle: Float[Array, "*B 3"]) -> tuple[Float[Array, "*B"], Fl
 
 
 def matrix_to_axis_angle(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3"]:
-    """Axis-angles in radians, θ in [0, π], of rotation matrices (through unit quaternions)."""
+    """Return the axis-angles in radians, θ in [0, π], of rotation matrices (through unit quaternions)."""
     quaternion = _matrix_to_quaternion(R)
     w, xyz = quaternion[..., :1], quaternion[..., 1:]
     sine = jnp.linalg.norm(xyz, axis=-1, keepdims=True)
@@ -74,7 +77,7 @@ def matrix_to_axis_angle(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3"]:
 
 
 def _matrix_to_quaternion(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 4"]:
-    """Unit quaternions (w ≥ 0), from whichever of the four components is largest: stable everywhere."""
+    """Return unit quaternions (w ≥ 0), computed from the largest component, which is stable for all rotations."""
     m = [[R[..., i, j] for j in range(3)] for i in range(3)]
     candidates = jnp.stack(
         [
@@ -92,37 +95,37 @@ def _matrix_to_quaternion(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 4"]:
 
 
 def geodesic_distance(Ra: Float[Array, "*B 3 3"], Rb: Float[Array, "*B 3 3"]) -> Float[Array, "*B"]:
-    """The angle between rotations, in radians within [0, π].
+    """Return the angle between rotations, in radians within [0, π].
 
-    θ = atan2(½‖Σ_k a_k × b_k‖, 1 − ¼‖Rb − Ra‖²) with a_k and b_k the rows of Ra and Rb: the length is sin θ, the other
-    cos θ. Unlike arccos of the trace, it keeps its precision at small angles and near π, and its gradient is finite
-    everywhere: 0 where the angle has a corner, at 0 and at π.
+    θ = atan2(½‖Σ_k a_k × b_k‖, 1 − ¼‖Rb − Ra‖²) with a_k and b_k the rows of Ra and Rb. The first argument is sin θ,
+    the second is cos θ. In contrast to the arccos of the trace, this formula is precise at small angles and near π,
+    and its gradient is finite everywhere: 0 at θ = 0 and θ = π, where the angle is not differentiable.
     """
-    difference = Rb - Ra  # in place of Rb: the cross product is then exactly 0 for equal rotations
+    difference = Rb - Ra  # used instead of Rb, so that the cross product of equal rotations is exactly 0
     sine = safe_norm(jnp.sum(jnp.cross(Ra, difference), axis=-2)) / 2
     return jnp.arctan2(sine, 1 - jnp.sum(difference**2, axis=(-2, -1)) / 4)
 
 
 def safe_norm(x: Float[Array, "*B D"]) -> Float[Array, "*B"]:
-    """‖x‖₂ over the last axis, with gradient 0 (not NaN) at x = 0."""
+    """Return ‖x‖₂ over the last axis, with gradient 0 (not NaN) at x = 0."""
     squared = jnp.sum(x**2, axis=-1)
     zero = squared == 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
 def unwrap_axis_angle(axis_angle: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
-    """The same rotations, each in the representative r + 2πk·r/‖r‖ nearest to its predecessor's.
+    """Return the same rotations as axis-angles r + 2πk·r/‖r‖, with k such that each is nearest to the previous frame's.
 
-    Axis-angle is many-to-one; without this, a bird that turns through θ = π jumps by 2π between frames
-    and the velocity term pulls at a motion that is not there.
+    Many axis-angles describe one rotation. Without unwrapping, the axis-angle of a bird that turns through θ = π jumps
+    by 2π between two frames, and the velocity term penalises a motion that does not exist.
     """
 
     def step(previous, current):
         theta = jnp.linalg.norm(current)
         axis = current / jnp.maximum(theta, 1e-9)
-        # nearest point of the line of representatives: (θ + 2πk)·axis closest to the predecessor
+        # choose k so that (θ + 2πk)·axis is closest to the previous axis-angle
         k = jnp.round((jnp.dot(previous, axis) - theta) / (2 * jnp.pi))
-        # no rotation has no axis: it is a whole number of turns about the predecessor's
+        # a zero rotation has no axis: use a whole number of turns about the previous axis
         length = jnp.linalg.norm(previous)
         turns = 2 * jnp.pi * jnp.round(length / (2 * jnp.pi)) * previous / jnp.maximum(length, 1e-9)
         nearest = jnp.where(theta < 1e-6, turns, current + 2 * jnp.pi * k * axis)
@@ -133,7 +136,7 @@ def unwrap_axis_angle(axis_angle: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
 
 
 def viewing_axis_rotations(count: int) -> Float[np.ndarray, "C 3 3"]:
-    """`count` rotations about the camera's z axis in equal steps (the paper's 30 steps of 12°)."""
+    """Return `count` rotations about the camera's z axis in equal steps (Hägerlind et al. 2024: 30 steps of 12°)."""
     angles = 2 * np.pi * np.arange(count) / count
     rotations = np.zeros((count, 3, 3))
     rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(angles)
@@ -143,11 +146,11 @@ def viewing_axis_rotations(count: int) -> Float[np.ndarray, "C 3 3"]:
 
 
 def view_grid(directions: int, turns: int) -> Float[np.ndarray, "C 3 3"]:
-    """A near-uniform grid over SO(3): a Fibonacci sphere of viewing directions × turns about the view axis.
+    """Return a near-uniform grid over SO(3): a Fibonacci sphere of viewing directions × turns about the view axis.
 
     Args:
-        directions: directions from which the bird is seen.
-        turns: equal turns about the camera's z axis for each direction.
+        directions: number of directions from which the camera sees the bird.
+        turns: number of equal turns about the camera's z axis for each direction.
 
     Returns:
         directions · turns rotation matrices, model → camera.

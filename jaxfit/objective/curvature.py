@@ -1,8 +1,8 @@
-"""The curvature of a term: what a Gauss-Newton step needs besides the gradient.
+"""The curvature of a term: the matrix H that a Gauss-Newton step needs beside the gradient.
 
-At the present pose a term E is bounded by E + g·d + ½ d·H·d for a change d of the pose, with E's own gradient g. The
-bound is exact where the residuals are linear in the pose, and of first order elsewhere. Robust errors and unsquared
-norms become weighted squares: iteratively reweighted least squares.
+At the current pose, the quadratic E + g·d + ½ d·H·d is an upper bound of a term E for a change d of the pose, where g
+is the gradient of E. The bound is exact if the residuals are linear in the pose, and holds to first order otherwise.
+Robust errors and unsquared norms become weighted squares: this is iteratively reweighted least squares.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from jaxfit.model.pose import Pose
 __all__ = ["Curvature", "Rows", "frame_rows", "weighted_curvature"]
 
 Rows = Float[Array, "T D"]
-"""A change of pose, or a gradient, by frame: global orientation (3), body pose (3(J−1)), translation (3), scale (1)."""
+"""A change of the pose, or a gradient, one row per frame: global orientation (3), body pose (3(J−1)), translation (3),
+scale (1)."""
 
 
 class Curvature(NamedTuple):
@@ -28,6 +29,7 @@ class Curvature(NamedTuple):
     product: Partial
     """d ↦ H·d: a `jax.tree_util.Partial` of a function at the top level of a module, and the arrays that it needs."""
     diagonal: Rows
+    """Diagonal of H."""
 
 
 def weighted_curvature(weights: Sequence[Float[Array, ""]], curvatures: Sequence[Curvature]) -> Curvature:
@@ -41,9 +43,9 @@ def _weighted_product(weights: list[Float[Array, ""]], products: list[Partial], 
 
 
 def frame_rows(pose: Pose) -> Rows:
-    """Return a window's pose as one row for each frame, without bone lengths and shape.
+    """Return the pose of a window as one row per frame, without bone lengths and shape.
 
-    A common scale is repeated in every row.
+    A scale that all frames share is repeated in every row.
     """
     frames = pose.global_orient.shape[0]
     scale = jnp.broadcast_to(pose.scale, (frames,))

@@ -1,4 +1,4 @@
-"""What a term sees: one bird in one window, its observations, its priors, and everything posed from them."""
+"""The posed window: one bird in one window, with targets, priors and posed geometry, as the terms receive it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxfit.errors import InputError
-from jaxfit.model.bird import Bird, free_limits
+from jaxfit.model.bird import Bird, unlimited_joints
 from jaxfit.model.camera import Camera, project, to_screen
 from jaxfit.model.jacobian import window_keypoint_rows
 from jaxfit.model.kinematics import Rig, window_joints, window_keypoints, window_transforms, window_vertices
@@ -24,24 +24,29 @@ __all__ = ["PosedWindow", "Priors", "Raster", "Targets", "priors_of"]
 
 
 class Targets(eqx.Module):
-    """What was seen of one bird in one window, in crop pixels; batches put further axes in front."""
+    """The observations of one bird in one window, in crop pixels; a batch has further leading axes."""
 
     keypoints_px: Float[Array | np.ndarray, "*T K 2"]
+    """Observed keypoints, crop pixels."""
     confidence: Float[Array | np.ndarray, "*T K"]
-    """In [0, 1]; 0 where the keypoint was not seen."""
+    """Confidence of each keypoint in [0, 1]; 0 where the keypoint was not observed."""
     mask: UInt8[Array | np.ndarray, "*T H W"]
     """0 or 1; of the silhouette's size, or empty in a stage that compares no masks."""
     has_mask: Bool[Array | np.ndarray, "*T"]
-    """False where the frame has no mask; such a frame's silhouette is not compared."""
+    """False where the frame has no mask; the mask terms skip such frames."""
     present: Bool[Array | np.ndarray, "*T"]
-    """False where the bird was not seen at all; such a frame contributes nothing to any term."""
+    """False where the bird was not observed; all terms skip such frames."""
     corner_px: Float[Array | np.ndarray, "*T 2"]
-    """Upper left corner of the crop in the image, in crop pixels. The crop follows the bird."""
+    """Upper left corner of the crop in the image, in crop pixels. The crop follows the bird, so the corner differs
+    between frames."""
 
 
 class Priors(NamedTuple):
-    """What a bird is known to be like. Gaussian priors are a mean and a whitening matrix W, with ‖W(x − μ)‖² the
-    squared Mahalanobis distance: the square root keeps float32 accurate where the inverse covariance does not."""
+    """Priors of a bird model.
+
+    A Gaussian prior is a mean μ and a whitening matrix W: ‖W(x − μ)‖² is the squared Mahalanobis distance. In float32,
+    the whitening matrix is accurate where the inverse covariance is not.
+    """
 
     pose_mean: Float[Array, "D"]
     pose_whitener: Float[Array, "D D"]
@@ -49,12 +54,12 @@ class Priors(NamedTuple):
     bone_whitener: Float[Array, "bones bones"]
     shape_sd: Float[Array, "S"]
     joint_limits: Float[Array, "bones 3 2"] | None
-    """As the bird's; None of a model that knows none."""
+    """Joint limits of the bird; None for a model without limits."""
 
 
 def priors_of(bird: Bird) -> Priors:
-    """Whiten a bird's priors (in float64, once)."""
-    unlimited = np.array_equal(bird.joint_limits, free_limits(bird.num_joints - 1))
+    """Return the priors of a bird with whitening matrices, which are computed in float64."""
+    unlimited = np.array_equal(bird.joint_limits, unlimited_joints(bird.num_joints - 1))
 
     def whitener(covariance):
         cholesky = np.linalg.cholesky(np.asarray(covariance, np.float64))
@@ -71,7 +76,7 @@ def priors_of(bird: Bird) -> Priors:
 
 
 class Raster(NamedTuple):
-    """How silhouettes are drawn; static, part of the compiled program."""
+    """Settings of the silhouette renderer; static, so they are part of the compiled program."""
 
     blur: Blur
     """In pixels of the silhouette."""
@@ -81,9 +86,9 @@ class Raster(NamedTuple):
 
 
 class PosedWindow:
-    """One window as the terms see it: T frames of one bird. What no term asks for is never computed.
+    """One window as the terms receive it: T frames of one bird. Posed quantities are computed on first access.
 
-    Camera frame: x right, y down, z forward, of the crop's camera, which follows the bird. Lengths in model units.
+    Camera frame: x right, y down, z forward, of the crop camera, which follows the bird. Lengths are in model units.
     """
 
     def __init__(
@@ -97,11 +102,11 @@ class PosedWindow:
         raster: Raster,
     ):
         self.pose = pose
-        """What is optimised: `global_orient` (T, 3), `body_pose` (T, J−1, 3), `transl` (T, 3), `scale`, …"""
+        """The optimised pose: `global_orient` (T, 3), `body_pose` (T, J−1, 3), `transl` (T, 3), `scale`, …"""
         self.anchor = anchor
-        """The pose at which the present stage began."""
+        """The pose at the start of the current stage."""
         self.targets = targets
-        """What was seen: `keypoints_px`, `confidence`, `mask`, `present`, …"""
+        """The observations: `keypoints_px`, `confidence`, `mask`, `present`, …"""
         self.priors = priors
         self.camera = camera
         self.raster = raster
@@ -109,23 +114,24 @@ class PosedWindow:
 
     @property
     def present(self) -> Bool[Array | np.ndarray, "T"]:
-        """False in frames in which the bird was not seen: their poses mean nothing, and no term counts them."""
+        """False in frames without an observation of the bird; poses of these frames are meaningless, and terms must
+        skip them."""
         return self.targets.present
 
     @property
     def joint_limits(self) -> Float[Array, "bones 3 2"]:
-        """Least and greatest of each component of the body pose, radians.
+        """Minimum and maximum of each component of the body pose, radians.
 
         Raises:
-            InputError: the model holds none.
+            InputError: the model has no joint limits.
         """
         if self.priors.joint_limits is None:
-            remedy = "leave out the terms that ask for them, or use a model that has some, as the murre"
+            remedy = "remove the terms that need joint limits, or use a model with joint limits, such as the murre"
             raise InputError("the model", "has no joint limits", remedy)
         return self.priors.joint_limits
 
     def joint_indices(self, *names: str) -> tuple[int, ...]:
-        """Where joints stand among all joints, the root first; a `body_pose` has no root, and is one less.
+        """Return the indices of joints among all joints, root first; subtract 1 for the indices in `body_pose`.
 
         Raises:
             InputError: the model has no such joint.
@@ -133,7 +139,7 @@ class PosedWindow:
         return _indices("joint", names, self._rig.joint_names)
 
     def keypoint_indices(self, *names: str) -> tuple[int, ...]:
-        """Where keypoints stand among all keypoints.
+        """Return the indices of keypoints among all keypoints.
 
         Raises:
             InputError: the model has no such keypoint.
@@ -147,7 +153,7 @@ class PosedWindow:
 
     @cached_property
     def R_parent_child(self) -> Float[Array, "T bones 3 3"]:  # noqa: N802
-        """Body pose: rotation of every other joint against its parent."""
+        """Body pose: rotation of every joint except the root relative to its parent."""
         return axis_angle_to_matrix(jnp.asarray(self.pose.body_pose))
 
     @cached_property
@@ -166,10 +172,10 @@ class PosedWindow:
 
     @cached_property
     def keypoints_static_cam(self) -> Float[Array, "T K 3"]:
-        """Posed keypoints in the camera frame of the window's first frame: of a crop that does not follow the bird.
+        """Posed keypoints in the camera frame of the window's first frame, that is, in a crop that does not move.
 
-        A crop whose corner lies further by (u, v) pixels sees a point at depth z by (u, v) · z / focal further back.
-        What stands still in the world stands still here, up to the noise of the fit, if the filming camera does too.
+        x_static = x_cam + (corner − corner of the first frame) · z / focal length, for x and y. If the filming camera
+        is at rest, a point at rest in the world has a constant position here, up to the noise of the fit.
         """
         x, z = self.keypoints_cam[..., :2], self.keypoints_cam[..., 2:]
         shift = jnp.asarray(self.targets.corner_px - self.targets.corner_px[:1])
@@ -182,16 +188,17 @@ class PosedWindow:
 
     @cached_property
     def keypoint_jacobian_px(self) -> tuple[Float[Array, "T rows angles"], Float[Array, "T rows 4"]]:
-        """∂`keypoints_px` of each frame, (T, 2K, …): by the 3J angles, and by translation and scale."""
+        """Derivatives of `keypoints_px` of each frame, (T, 2K, …): with respect to the 3J angles, and with respect to
+        translation and scale."""
         scale = jnp.broadcast_to(self.pose.scale, self.pose.global_orient.shape[:1])
         points = self.keypoints_cam
-        to_pixels = jax.vmap(jax.vmap(jax.jacfwd(lambda point_cam: project(point_cam, self.camera))))(points)
-        turned = window_keypoint_rows(self._rig, self._transforms, self.pose, to_pixels)
+        by_point = jax.vmap(jax.vmap(jax.jacfwd(lambda point_cam: project(point_cam, self.camera))))(points)
+        by_angles = window_keypoint_rows(self._rig, self._transforms, self.pose, by_point)
         unit = (points - self.pose.transl[:, None]) / scale[:, None, None]
-        grown = jnp.sum(to_pixels * unit[..., None, :], axis=-1, keepdims=True)
-        placed = jnp.concatenate([to_pixels, grown], axis=-1)
+        by_scale = jnp.sum(by_point * unit[..., None, :], axis=-1, keepdims=True)
+        by_place = jnp.concatenate([by_point, by_scale], axis=-1)
         rows = len(points), 2 * points.shape[1]
-        return turned.reshape(*rows, -1), placed.reshape(*rows, -1)
+        return by_angles.reshape(*rows, -1), by_place.reshape(*rows, -1)
 
     @cached_property
     def vertices_screen(self) -> Float[Array, "T V 3"]:
@@ -202,7 +209,7 @@ class PosedWindow:
 
     @property
     def faces(self):
-        """Vertex indices of each triangle, (F, 3)."""
+        """Vertex indices of the triangles, (F, 3)."""
         return self._rig.faces
 
 

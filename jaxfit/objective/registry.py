@@ -1,4 +1,4 @@
-"""Which terms there are: the library's own, those of other packages, and those of a notebook, found in one way."""
+"""Registry of the terms of the objective: jaxfit's own terms, terms of other packages, and terms of a notebook."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jaxfit.objective.curvature import Curvature
 __all__ = ["ENTRY_POINTS", "Term", "find_term", "find_terms", "known_terms", "term"]
 
 ENTRY_POINTS = "jaxfit.terms"
-"""The entry-point group by which an installed package offers terms."""
+"""The entry-point group with which an installed package provides terms."""
 FORM = "a term is `def name(window, *, setting=1.0): …`, with one window and settings that are numbers"
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -24,23 +24,24 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A pure function of the `PosedWindow`, and what else is to be known of it."""
+    """A term of the objective: a pure function of the `PosedWindow`, and its properties."""
 
     name: str
-    """What configs call it."""
+    """Name of the term in configs."""
     function: Callable[..., Any]
+    """The function (window, *, settings) → scalar."""
     settings: dict[str, float]
-    """Its keyword arguments and their defaults."""
+    """Keyword arguments of the function and their defaults."""
     positive: frozenset[str]
-    """Settings that must be above 0; the others may be 0."""
+    """Settings that must be above 0; the other settings may be 0."""
     compares_masks: bool
-    """Whether it looks at the silhouette: only stages with such a term are given masks."""
+    """Whether the term uses masks: only stages with such a term receive masks."""
     curvature: Callable[..., Curvature] | None = None
-    """Its curvature, of the same arguments; only then can Levenberg-Marquardt minimise it."""
+    """The curvature, a function of the same arguments; Levenberg-Marquardt requires a curvature."""
 
 
 _terms: dict[str, Term] = {}
-"""By name: what was registered, and by its path what was imported."""
+"""Registered terms by name, and imported terms by path."""
 
 
 @overload
@@ -54,23 +55,23 @@ def term(
     curvature: Callable[..., Curvature] | None = None,
 ) -> Callable[[Function], Function]: ...
 def term(function=None, /, *, name=None, positive=(), compares_masks=False, curvature=None):
-    """Register a term of the objective: a pure function of the window, whose keyword arguments are its settings.
+    """Register a term of the objective: a pure function of the window, with the settings as keyword arguments.
 
-    `@term def stillness(window, *, beta=1.0): …` is from then on what configs of this session call `stillness`. The
-    function itself is returned as it is. Weights and settings are traced, so it must be written for
-    `jit` and `vmap`: no Python `if` on values.
+    After `@term def stillness(window, *, beta=1.0): …`, the configs of this session can use the term `stillness`. The
+    decorator returns the function unchanged. Weights and settings are traced, so the function must work under `jit`
+    and `vmap`: no Python `if` on values.
 
     Args:
-        function: takes the `jaxfit.objective.posed_window.PosedWindow` and returns a scalar.
-        name: what configs call it (default: the function's name).
-        positive: its settings that must be above 0.
-        compares_masks: whether it looks at `window.targets.mask`, which is empty in stages without such a term.
-        curvature: takes what `function` takes and returns a `jaxfit.objective.curvature.Curvature`, for stages whose
-            solver is `levenberg_marquardt`.
+        function: takes a `jaxfit.objective.posed_window.PosedWindow` and returns a scalar.
+        name: name of the term in configs (default: the name of the function).
+        positive: settings that must be above 0.
+        compares_masks: whether the function uses `window.targets.mask`, which is empty in stages without such a term.
+        curvature: takes the arguments of `function` and returns a `jaxfit.objective.curvature.Curvature`; stages with
+            the solver `levenberg_marquardt` require a curvature.
 
     Raises:
-        InputError: not of a term's form, or a name that another module's term has. A module may register its own
-            names anew, as a notebook does when its cell runs again.
+        InputError: the function does not have the form of a term, or a term of another module has this name. A module
+            may register its own names again, as a notebook does when a cell runs a second time.
     """
 
     def register(function):
@@ -86,13 +87,15 @@ def term(function=None, /, *, name=None, positive=(), compares_masks=False, curv
 
 
 def find_term(name: str) -> Term:
-    """A term by its registered name, by an entry point of the group `jaxfit.terms`, or by `package.module:function`.
+    """Return a term by its registered name, by an entry point of the group `jaxfit.terms`, or by its path.
 
-    A function found by its path needs no decorator, unless it compares masks or has settings that must be above 0.
+    The path is `package.module:function`. Such a function needs the decorator only if the term uses masks, has a
+    curvature, or has settings that must be above 0.
 
     Raises:
         KeyError: no term has this name.
-        InputError: its module cannot be imported, or holds no such function, or it is not of a term's form.
+        InputError: the module cannot be imported or has no such function, or the function does not have the form of a
+            term.
     """
     if name in _terms and ":" not in name:
         return _terms[name]
@@ -115,20 +118,21 @@ def find_terms(names: Iterable[str]) -> dict[str, Term]:
 
 
 def known_terms() -> list[str]:
-    """Names of all terms registered or offered by installed packages, but not of those found by their path."""
+    """Return the names of all terms that are registered or provided by installed packages; paths are not included."""
     return [name for name in dict.fromkeys([*_terms, *_offered()]) if ":" not in name]
 
 
 def _offered() -> dict[str, str]:
+    """Return name → path of the terms that installed packages provide."""
     return {point.name: point.value for point in metadata.entry_points(group=ENTRY_POINTS)}
 
 
 def _import(name: str, path: str) -> Any:
-    """What stands at `package.module:function`."""
+    """Import the object at `package.module:function`."""
     module_name, _, attribute = path.partition(":")
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:  # whatever somebody's module does when it is run
+    except Exception as error:  # a foreign module may raise any exception
         problem = f"cannot be imported from {module_name!r}: {type(error).__name__}: {error}"
         remedy = "write `package.module:function`, with its folder installed or in PYTHONPATH"
         raise InputError(f"term {name!r}", problem, remedy) from error
@@ -139,7 +143,7 @@ def _import(name: str, path: str) -> Any:
 
 
 def _read(name: str, function: Any, positive: Collection[str] = (), compares_masks: bool = False) -> Term:
-    """A term, once its function is of the right form."""
+    """Return a term after a check that its function has the right form."""
 
     def require(holds: bool, problem: str) -> None:
         if not holds:
@@ -148,7 +152,7 @@ def _read(name: str, function: Any, positive: Collection[str] = (), compares_mas
     require(callable(function), f"is no function, but of type {type(function).__name__}")
     try:
         parameters = list(inspect.signature(function).parameters.values())
-    except ValueError:  # some of Python's own do not tell
+    except ValueError:  # some built-in functions have no signature
         parameters = []
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     require(bool(parameters) and parameters[0].kind in positional, "takes no window")

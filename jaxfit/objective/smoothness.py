@@ -1,7 +1,7 @@
-"""Smooth motion beyond the paper's terms: on the rotations themselves, robustly, and by frequency.
+"""Further terms for smooth motion: geodesic velocity, robust velocity, and a penalty on high frequencies.
 
-They know nothing of 2π: the first two compare rotations, not their axis-angles. As elsewhere, a missing frame adds
-nothing, and a window of one frame does not move.
+The two velocity terms compare rotations, not axis-angles, so a jump of an axis-angle by 2π has no effect. Missing
+frames contribute 0 to all terms, and windows of one frame have the value 0.
 """
 
 from __future__ import annotations
@@ -27,16 +27,20 @@ BUTTERWORTH_ORDER = 4
 def geodesic_velocity(
     window: PosedWindow, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0
 ) -> Scalar:
-    """Σ_i β_g · d(G_i, G_i+1) + β_p · √(Σ_j d(R_j,i, R_j,i+1)²), d the angle between two rotations.
+    """Penalise the geodesic distance between the poses of consecutive frames.
 
-    The velocity term with the distance on SO(3) in place of differences of axis-angles: the length of the way from one
-    pose to the next on SO(3) × … × SO(3). It agrees with `velocity` to first order near rest.
+    E = Σ_i β_g · d(G_i, G_i+1) + β_p · √(Σ_j d(R_j,i, R_j,i+1)²), with d the angle between two rotations, G the global
+    orientation and R_j the rotation of joint j.
+
+    This is the velocity term with the distance on SO(3) instead of differences of axis-angles: the second part is the
+    geodesic distance of the body poses on SO(3) × … × SO(3). Near zero rotation, the term agrees with `velocity` to
+    first order.
 
     Source: Huynh 2009, *Metrics for 3D Rotations*, Φ₆; the sums as in Hägerlind et al. 2024, velocity term.
     """
-    turned, bent = _steps(window)
-    moved = beta_global * turned + beta_pose * safe_norm(bent)
-    return jnp.sum(jnp.where(complete_runs(window.present, 1), moved, 0.0))
+    orient, joints = _angles_between_frames(window)
+    cost = beta_global * orient + beta_pose * safe_norm(joints)
+    return jnp.sum(jnp.where(complete_runs(window.present, 1), cost, 0.0))
 
 
 @term(positive=["delta_rad"])
@@ -47,28 +51,30 @@ def huber_velocity(
     beta_global: Scalar | float = 10.0,
     beta_pose: Scalar | float = 1.0,
 ) -> Scalar:
-    """Σ_i β_g · h(d(G_i, G_i+1)) + β_p · Σ_j h(d(R_j,i, R_j,i+1)), h Huber's loss with δ in radians a frame.
+    """Penalise the rotation of every joint between consecutive frames by Huber's loss.
 
-    Every joint for itself: slow trembling is pulled in proportion to its size, while a joint that turns faster than δ,
-    as in a wingbeat, is pulled by no more than δ.
+    E = Σ_i β_g · h(d(G_i, G_i+1)) + β_p · Σ_j h(d(R_j,i, R_j,i+1)), with h Huber's loss and δ in radians per frame.
+
+    Each joint has its own loss. The gradient of slow jitter is proportional to its size; the gradient of a joint that
+    rotates faster than δ, as in a wingbeat, is limited to δ.
 
     Source: Huber 1964, *Robust Estimation of a Location Parameter*.
     """
-    turned, bent = _steps(window)
-    moved = beta_global * huber(turned, delta_rad) + beta_pose * jnp.sum(huber(bent, delta_rad), axis=-1)
-    return jnp.sum(jnp.where(complete_runs(window.present, 1), moved, 0.0))
+    orient, joints = _angles_between_frames(window)
+    cost = beta_global * huber(orient, delta_rad) + beta_pose * jnp.sum(huber(joints, delta_rad), axis=-1)
+    return jnp.sum(jnp.where(complete_runs(window.present, 1), cost, 0.0))
 
 
 def huber(x: Float[Array, "*B"], delta: Scalar | float) -> Float[Array, "*B"]:
-    """Huber's loss of x ≥ 0: x²/2 up to δ, then δ (x − δ/2)."""
-    near = jnp.minimum(x, delta)
-    return near * (x - near / 2)
+    """Return Huber's loss of x ≥ 0: x²/2 for x ≤ δ, else δ (x − δ/2)."""
+    clipped = jnp.minimum(x, delta)
+    return clipped * (x - clipped / 2)
 
 
-def _steps(window: PosedWindow) -> tuple[Float[Array, "pairs"], Float[Array, "pairs bones"]]:
-    """Angles between consecutive frames, radians: of the global orientation, and of each joint."""
-    turned = geodesic_distance(window.R_camera_root[:-1], window.R_camera_root[1:])
-    return turned, geodesic_distance(window.R_parent_child[:-1], window.R_parent_child[1:])
+def _angles_between_frames(window: PosedWindow) -> tuple[Float[Array, "pairs"], Float[Array, "pairs bones"]]:
+    """Return the angles between consecutive frames of the global orientation and of each joint, radians."""
+    orient = geodesic_distance(window.R_camera_root[:-1], window.R_camera_root[1:])
+    return orient, geodesic_distance(window.R_parent_child[:-1], window.R_parent_child[1:])
 
 
 @term(positive=["cutoff_cycles_per_frame"])
@@ -79,21 +85,22 @@ def low_pass(
     beta_global: Scalar | float = 1.0,
     beta_pose: Scalar | float = 1.0,
 ) -> Scalar:
-    """Σ_k w_k (β_g ‖ĝ_k‖² + β_p ‖θ̂_k‖²): energy of the motion that is faster than a cut-off, rad².
+    """Penalise the energy of motion above a cut-off frequency, rad².
 
-    ĝ_k and θ̂_k are the orthonormal DCT-II over the window of global orientation and body pose (axis-angles), of
-    frequency f_k = k/2T cycles a frame, and w_k = 1/(1 + (f_c/f_k)⁸) is the response of a Butterworth high-pass filter
-    of order 4: 0 for the mean pose, ½ at the cut-off, smooth in it. Frames that are missing are filled along straight
-    lines between their neighbours, and beyond the first and last by these: a gap counts as slow motion.
+    E = Σ_k w_k (β_g ‖ĝ_k‖² + β_p ‖θ̂_k‖²), where ĝ_k and θ̂_k are the coefficients of the orthonormal DCT-II over the
+    window of the global orientation and the body pose (axis-angles), with frequency f_k = k/2T cycles per frame. The
+    weight w_k = 1/(1 + (f_c/f_k)⁸) is the response of a Butterworth high-pass filter of order 4: 0 for the mean pose,
+    ½ at the cut-off f_c, differentiable in f_c. Missing frames are interpolated linearly between their neighbours;
+    frames before the first and after the last present frame take the value of that frame.
 
     Source: Akhter et al. 2008, *Nonrigid Structure from Motion in Trajectory Space* (the DCT of trajectories);
     Butterworth 1930 (the weights).
     """
     frames = window.present.shape[0]
-    # log 0 is left out with the mean itself: k = 0
+    # k = 0, the mean pose, has weight 0 and is excluded, because log 0 is not finite
     log_frequency = np.log(np.arange(1, frames) / (2 * frames))
     response = jax.nn.sigmoid(2 * BUTTERWORTH_ORDER * (log_frequency - jnp.log(cutoff_cycles_per_frame)))
-    fill = _between(window.present)
+    fill = _interpolation(window.present)
 
     def energy(trajectory: Float[Array, "T D"]) -> Scalar:
         coefficients = jax.scipy.fft.dct(fill @ trajectory, axis=0, norm="ortho")[1:]
@@ -103,14 +110,14 @@ def low_pass(
     return beta_global * energy(jnp.asarray(window.pose.global_orient)) + beta_pose * energy(body)
 
 
-def _between(present: Bool[Array | np.ndarray, "T"]) -> Float[Array, "T T"]:
-    """The matrix that keeps present frames and puts the others between them; 0 where no frame is present."""
+def _interpolation(present: Bool[Array | np.ndarray, "T"]) -> Float[Array, "T T"]:
+    """Return the matrix that interpolates missing frames linearly from present frames; 0 if no frame is present."""
     frames = present.shape[0]
     at = jnp.arange(frames)
     before = jax.lax.cummax(jnp.where(present, at, -1))
     after = jax.lax.cummin(jnp.where(present, at, frames), reverse=True)
-    # outside of all present frames both ends are the nearest one
+    # before the first and after the last present frame, both ends are the nearest present frame
     first, last = jnp.where(before < 0, after, before), jnp.where(after == frames, before, after)
     share = (at - first) / jnp.maximum(last - first, 1)
-    # an index that no frame has is a row of zeros
+    # one_hot gives a row of zeros for an index outside the window
     return (1 - share)[:, None] * jax.nn.one_hot(first, frames) + share[:, None] * jax.nn.one_hot(last, frames)

@@ -1,7 +1,7 @@
-"""The terms of a single frame, and of the bird as a whole; each is summed over its window.
+"""Terms of single frames (summed over the window) and terms of the bird as a whole.
 
 A term is a pure function of the `PosedWindow`; its keyword arguments are its settings. Settings and weights are
-traced, so that a sweep over them is one compiled program.
+traced, so a sweep over them needs one compiled program.
 """
 
 from __future__ import annotations
@@ -35,14 +35,17 @@ Scalar = Float[Array, ""]
 
 
 def geman_mcclure(error: Float[Array, "*B"], sigma: Float[Array, ""] | float) -> Float[Array, "*B"]:
-    """Geman-McClure: σ²e² / (σ² + e²), quadratic near zero and bounded by σ²."""
+    """Return the Geman-McClure error σ²e² / (σ² + e²), which is quadratic near zero and bounded by σ²."""
     squared = error**2
     return sigma**2 * squared / (sigma**2 + squared)
 
 
 def _keypoints_curvature(window: PosedWindow, *, sigma_px: Scalar | float) -> Curvature:
-    """H = Jᵀ·diag(w)·J, w = 2c·σ⁴/(σ² + e²)²: Geman-McClure is concave in e², hence below its tangent there."""
-    # XLA would compute the Jacobian again for every use
+    """Return H = Jᵀ·diag(w)·J with w = 2c·σ⁴/(σ² + e²)².
+
+    This H gives an upper bound, because Geman-McClure is concave in e² and therefore lies below its tangent in e².
+    """
+    # without the barrier, XLA computes the Jacobian again for every use
     by_angles, by_place = jax.lax.optimization_barrier(window.keypoint_jacobian_px)
     error_px = window.keypoints_px - window.targets.keypoints_px
     weight = 2 * window.targets.confidence[..., None] * (sigma_px**2 / (sigma_px**2 + error_px**2)) ** 2
@@ -63,9 +66,11 @@ def _keypoints_product(
 
 @term(positive=["sigma_px"], curvature=_keypoints_curvature)
 def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Scalar:
-    """E_kpt = Σ_t Σ_i c_i · (ρ(e_x) + ρ(e_y)), ρ Geman-McClure, e in crop pixels.
+    """Compare projected and observed keypoints: E_kpt = Σ_t Σ_i c_i · (ρ(e_x) + ρ(e_y)), ρ Geman-McClure.
 
-    Source: Hägerlind et al. 2024, keypoint term; x and y apart as in Badger et al. 2020.
+    The error e is in crop pixels, as is its scale σ = `sigma_px`; c is the confidence of the keypoint.
+
+    Source: Hägerlind et al. 2024, keypoint term; x and y separately as in Badger et al. 2020.
     """
     error_px = window.keypoints_px - window.targets.keypoints_px
     robust = jnp.sum(geman_mcclure(error_px, sigma_px), axis=-1)
@@ -74,7 +79,9 @@ def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Scalar
 
 @term(compares_masks=True)
 def mask(window: PosedWindow) -> Scalar:
-    """E_msk = Σ_t Σ_pixels |soft silhouette − mask|, over the pixels of a 256-pixel crop.
+    """Compare silhouette and mask by the L1 norm: E_msk = Σ_t Σ_pixels |soft silhouette − mask|.
+
+    The sum is over crop pixels, whatever the size of the silhouette.
 
     Source: Hägerlind et al. 2024, mask term.
     """
@@ -83,7 +90,9 @@ def mask(window: PosedWindow) -> Scalar:
 
 @term(compares_masks=True)
 def mask_smooth_l1(window: PosedWindow) -> Scalar:
-    """Σ_t Σ_pixels of smooth-L1 (½e² below 1, so ½e² throughout): the silhouette term of AVES.
+    """Compare silhouette and mask by smooth-L1, as AVES does: Σ_t Σ_pixels ½e², e = soft silhouette − mask.
+
+    Smooth-L1 is ½e² for |e| ≤ 1, and |e| ≤ 1 holds for all pixels.
 
     Source: Wang et al. 2021, section 4.
     """
@@ -102,7 +111,7 @@ def _mask(window: PosedWindow, kind: Literal["l1", "smooth_l1"]) -> Scalar:
 
 
 def _pose_prior_curvature(window: PosedWindow) -> Curvature:
-    """H = 2·Σ⁻¹ on the body pose of every frame that is there; the term is a square already."""
+    """Return H = 2·Σ⁻¹ on the body pose of every present frame; the bound is exact, because the term is quadratic."""
     precision = window.priors.pose_whitener.T @ window.priors.pose_whitener
     present = jnp.asarray(window.present)
     diagonal = jnp.broadcast_to(jnp.diagonal(precision), (len(present), len(precision)))
@@ -119,7 +128,7 @@ def _body_rows(present: Bool[Array, "T"], rows: Float[Array, "T D"]) -> Rows:
 
 @term(curvature=_pose_prior_curvature)
 def pose_prior(window: PosedWindow) -> Scalar:
-    """E_pp = Σ_t (x − μ)ᵀ Σ⁻¹ (x − μ) on the flattened body pose.
+    """Penalise improbable body poses: E_pp = Σ_t (x − μ)ᵀ Σ⁻¹ (x − μ), with x the flattened body pose.
 
     Source: Badger et al. 2020, pose prior.
     """
@@ -131,7 +140,7 @@ def pose_prior(window: PosedWindow) -> Scalar:
 
 @term
 def bone_prior(window: PosedWindow) -> Scalar:
-    """(b − μ_b)ᵀ Σ_b⁻¹ (b − μ_b) on the bone lengths.
+    """Penalise improbable bone lengths b: E = (b − μ_b)ᵀ Σ_b⁻¹ (b − μ_b).
 
     Source: Badger et al. 2020, bone-length prior.
     """
@@ -140,13 +149,15 @@ def bone_prior(window: PosedWindow) -> Scalar:
 
 @term
 def shape_prior(window: PosedWindow) -> Scalar:
-    """Σ (β / sd)²: squared Mahalanobis distance of the shape coefficients."""
+    """Penalise improbable shapes by the squared Mahalanobis distance of the shape coefficients: E = Σ (β / sd)²."""
     return jnp.sum((window.pose.betas / window.priors.shape_sd) ** 2)
 
 
 @term
 def shape_norm(window: PosedWindow) -> Scalar:
-    """‖β‖₂, not squared: a bird keeps the mean shape unless its outline is worth the step.
+    """Penalise the norm of the shape coefficients, E = ‖β‖₂.
+
+    The norm is not squared, so a bird keeps the mean shape unless the other terms gain more than the norm costs.
 
     Source: Wang et al. 2021, shape regularisation.
     """
@@ -155,7 +166,9 @@ def shape_norm(window: PosedWindow) -> Scalar:
 
 @term
 def stage_anchor(window: PosedWindow) -> Scalar:
-    """Σ_t ‖θ_p − θ_p,start‖₁ + ‖b − b_start‖₁: keep body pose and bone lengths where the stage began.
+    """Keep body pose θ_p and bone lengths b close to their values at the start of the stage.
+
+    E = Σ_t ‖θ_p − θ_p,anchor‖₁ + ‖b − b_anchor‖₁, with `window.anchor` the pose at the start of the stage.
 
     Source: Wang et al. 2021, section 4 (third stage).
     """

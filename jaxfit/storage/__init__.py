@@ -1,1 +1,1 @@
-"""Files that are written whole or not at all, and arrays that are read back safely."""
+"""Storage: files and folders written atomically, safe reading of arrays, and validation of array layouts."""

@@ -1,4 +1,4 @@
-"""Files and folders written whole or not at all, and arrays whose layout is checked."""
+"""Write files and folders atomically: a file or folder appears complete, or does not appear."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
-
-import numpy as np
 
 from jaxfit.errors import InputError
 
@@ -21,31 +19,30 @@ __all__ = [
     "check_writable",
     "new_file",
     "new_folder",
-    "validate_arrays",
     "write_whole",
 ]
 
-# What the operating system may answer to a write, and what the user can do about it.
+# Errors of the operating system for a write, and the action that the user can take.
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another place",
     errno.EDQUOT: "free some of your quota or choose another place",
-    errno.EFBIG: "choose a file system that takes files of this size",
-    errno.EROFS: "choose a place that can be written to",
-    errno.EACCES: "change its permissions or choose a place that you can write to",
-    errno.EPERM: "change its permissions or choose a place that you can write to",
+    errno.EFBIG: "choose a file system that supports files of this size",
+    errno.EROFS: "choose a place with write access",
+    errno.EACCES: "change its permissions or choose a place with write access",
+    errno.EPERM: "change its permissions or choose a place with write access",
     errno.EBUSY: "it is a mount point or in use: choose a folder inside it",
     errno.EIO: "check the disk or choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ENOENT: "choose another place",
     errno.ENOTDIR: "a part of its path is a file: choose another place",
     errno.EEXIST: "a part of its path is a file: choose another place",
-    errno.ENOTEMPTY: "something else wrote there meanwhile: choose another place",
+    errno.ENOTEMPTY: "another program has written there in the meantime: choose another place",
 }
 
 
 @contextmanager
 def _write_errors(path: Path) -> Iterator[None]:
-    """Turns what the operating system refuses into one InputError that names ``path``."""
+    """Convert errors of the operating system in the body to an InputError that names ``path``."""
     try:
         yield
     except OSError as error:
@@ -57,7 +54,7 @@ def _write_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _parents(path: Path) -> Iterator[None]:
-    """Makes the folders above ``path``; those it made are removed again where the body fails."""
+    """Create the missing folders above ``path``; if the body fails, remove these folders again."""
     missing = [parent for parent in path.parents if not parent.exists()]
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,20 +63,20 @@ def _parents(path: Path) -> Iterator[None]:
         for parent in missing:
             try:
                 parent.rmdir()
-            except OSError:  # not made after all, or in use by someone else meanwhile
+            except OSError:  # the folder was not created, or another program uses the folder
                 break
         raise
 
 
 def _temporary(path: Path, suffix: str) -> Path:
-    # a sibling, so that the rename stays within one file system
+    # in the same folder, so that the rename stays within one file system
     return path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}{suffix}")
 
 
 def _sync(path: Path) -> None:
-    """Asks for ``path`` (a file or a folder's list of names) to be on the disk before going on."""
+    """Wait until ``path`` (a file, or the list of names of a folder) is on the disk."""
     if path.is_dir():
-        # not every system opens folders, and not every file system syncs them
+        # some systems cannot open folders, and some file systems cannot sync folders
         with suppress(OSError):
             _sync_descriptor(os.open(path, os.O_RDONLY))
     else:
@@ -94,11 +91,11 @@ def _sync_descriptor(descriptor: int) -> None:
 
 
 def write_whole(path: str | Path, content: bytes | Callable[[BinaryIO], Any]) -> None:
-    """Write one file, whole or not at all, as ``new_file`` does.
+    """Write one file atomically, as ``new_file`` does.
 
     Args:
-        path: the file; an existing one is replaced.
-        content: its bytes, or a function that writes them to the binary file it is given.
+        path: the file; an existing file is replaced.
+        content: the bytes, or a function that writes the bytes to an open binary file.
 
     Raises:
         InputError: as ``new_file``.
@@ -112,20 +109,20 @@ def write_whole(path: str | Path, content: bytes | Callable[[BinaryIO], Any]) ->
 
 @contextmanager
 def new_file(path: str | Path) -> Iterator[Path]:
-    """A file that appears whole or not at all.
+    """Write a file atomically, as a context manager.
 
-    ``with new_file("out.mp4") as part:`` gives the name of a temporary sibling, which the body makes. When
-    the body ends, it goes onto the disk and only then to its name, so that a reader never sees half a file
-    and an older file of that name survives a failure. Missing folders above are made.
+    ``with new_file("out.mp4") as part:`` yields a temporary path in the same folder, and the body writes this file.
+    At the end of the body, the file is synced to the disk and then renamed to ``path``. A reader therefore never sees
+    an incomplete file, and an existing file of that name survives a failure. Missing folders above are created.
 
     Args:
-        path: the file; an existing one is replaced.
+        path: the file; an existing file is replaced.
 
     Raises:
-        InputError: ``path`` is a folder or a device, or the system refuses the write (disk full, quota,
+        InputError: ``path`` is a folder or a device, or the system rejects the write (disk full, quota,
             read-only, permissions).
     """
-    path = Path(path).resolve()  # through a symbolic link, which should stay one
+    path = Path(path).resolve()  # a symbolic link stays a link, and its target is replaced
     if path.exists() and not path.is_file():
         raise InputError(path, "is a folder or a device, not a file", "choose another name")
     part = _temporary(path, ".part")
@@ -141,21 +138,22 @@ def new_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = None) -> Iterator[Path]:
-    """A folder that appears whole or not at all.
+    """Write a folder atomically, as a context manager.
 
-    ``with new_folder("out") as folder:`` gives a temporary sibling to write into; it takes its name when the
-    body ends, and is removed when the body fails. An older folder is replaced only after the new one is
-    complete. (A power cut between the two renames leaves the older one under ``.out.<hex>.old``.)
+    ``with new_folder("out") as folder:`` yields a temporary folder beside ``path``. At the end of the body, the
+    temporary folder is renamed to ``path``; if the body fails, the temporary folder is removed. An existing folder is
+    replaced only after the new folder is complete. (A power failure between the two renames leaves the existing folder
+    under ``.out.<hex>.old``.)
 
     Args:
-        path: the folder; missing folders above are made.
-        overwrite: replace a folder that holds something.
-        marker: name of a file that every folder of this kind holds. A folder without it is not replaced even
-            with ``overwrite``: it would be somebody's home.
+        path: the folder; missing folders above are created.
+        overwrite: replace a folder that is not empty.
+        marker: name of a file that every folder of this kind contains. A folder without this file is not replaced,
+            even with ``overwrite``, because the folder may be a home directory.
 
     Raises:
-        InputError: the folder holds results already, is no folder, lacks the ``marker``, is the current folder or
-            one above it, or the system refuses the write (disk full, quota, read-only, permissions).
+        InputError: the folder is not empty, is not a folder, lacks the ``marker``, is the current folder or a folder
+            above it, or the system rejects the write (disk full, quota, read-only, permissions).
     """
     path = Path(path).resolve()
     check_replaceable(path, overwrite, marker)
@@ -166,17 +164,17 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
             yield part
             for entry in [*part.rglob("*"), part]:
                 _sync(entry)
-            check_replaceable(path, overwrite, marker)  # once more: the body may have taken hours
-            _take_place(part, path)
+            check_replaceable(path, overwrite, marker)  # again, because the body may have taken hours
+            _replace_folder(part, path)
         finally:
             shutil.rmtree(part, ignore_errors=True)
         _sync(path.parent)
 
 
 def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = None) -> None:
-    """Raise `new_folder`'s InputError where it would refuse ``path``: before long work rather than after it."""
+    """Raise the InputError that `new_folder` would raise for ``path``; call this function before long work."""
     path = Path(path).resolve()
-    if _holds_current(path):  # renamed over, it would leave the shell in a folder that is gone
+    if _contains_current(path):  # a replacement would leave the shell in a removed folder
         raise InputError(path, "is the folder you are in, or one above it", "name a folder inside it")
     check_writable(path)
     if not path.exists():
@@ -189,12 +187,12 @@ def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = No
     if not overwrite:
         raise InputError(path, "holds results already", "choose another --out or pass --overwrite")
     if marker is not None and not (path / marker).is_file():
-        problem = f"holds files, but no {marker}, so it is not a folder of results and is left alone"
+        problem = f"holds files, but no {marker}, so it is not a folder of results and is not replaced"
         raise InputError(path, problem, "choose another --out")
 
 
 def check_new_file(path: Path, overwrite: bool) -> None:
-    """Raise InputError where a file to write would take the place of something that it may not."""
+    """Raise InputError if ``path`` exists and a new file must not replace it."""
     if path.exists() and not path.is_file():
         raise InputError(path, "is a folder or a device, not a file", "choose another --out")
     if path.exists() and not overwrite:
@@ -202,23 +200,24 @@ def check_new_file(path: Path, overwrite: bool) -> None:
 
 
 def check_writable(path: str | Path) -> None:
-    """Raise InputError where nothing can be made beside a file or folder to write: before long work."""
+    """Raise InputError if the folder of ``path`` is not writable; call this function before long work."""
     path = Path(path).resolve()
-    with _write_errors(path):  # permissions alone do not tell: try
+    with _write_errors(path):  # permissions alone are not sufficient information, so try a write
         probe = _temporary(next(parent for parent in path.parents if parent.exists()) / path.name, ".probe")
         probe.mkdir()
         probe.rmdir()
 
 
-def _holds_current(path: Path) -> bool:
+def _contains_current(path: Path) -> bool:
     try:
-        here = Path.cwd().resolve()
-    except FileNotFoundError:  # somebody removed it
+        current = Path.cwd().resolve()
+    except FileNotFoundError:  # the current folder was removed
         return False
-    return path == here or path in here.parents
+    return path == current or path in current.parents
 
 
-def _take_place(part: Path, path: Path) -> None:
+def _replace_folder(part: Path, path: Path) -> None:
+    """Rename `part` to `path`; if this fails, restore the existing folder."""
     if not path.exists():
         part.rename(path)
         return
@@ -230,40 +229,3 @@ def _take_place(part: Path, path: Path) -> None:
         old.rename(path)
         raise
     shutil.rmtree(old, ignore_errors=True)
-
-
-def validate_arrays(values: Mapping[str, Any], layout: Mapping[str, tuple[str, Any]]) -> dict[str, np.ndarray]:
-    """Arrays of one container, read-only, with their shapes checked against each other.
-
-    Args:
-        values: name → array-like.
-        layout: name → (shape, dtype). A shape is words such as ``"N T 3"``: a number is that size, and a word
-            means one size wherever it stands.
-
-    Returns:
-        Name → a read-only copy with that dtype.
-
-    Raises:
-        ValueError: an array of another kind or shape, naming it, what was expected and what came.
-    """
-    sizes: dict[str, tuple[int, str]] = {}
-    arrays = {}
-    for name, (shape, dtype) in layout.items():
-        array, dtype = np.array(values[name]), np.dtype(dtype)
-        # an empty list has no kind of its own
-        if array.size and array.dtype.kind not in {"f": "fiu", "i": "iu"}.get(dtype.kind, dtype.kind):
-            raise ValueError(f"{name} must be of type {dtype.name}, not {array.dtype}")
-        words = shape.split()
-        if array.ndim != len(words):
-            raise ValueError(f"{name} must have shape ({', '.join(words)}), not {array.shape}")
-        for axis, (word, size) in enumerate(zip(words, array.shape, strict=True)):
-            expected, origin = (int(word), "") if word.isdigit() else sizes.setdefault(word, (size, name))
-            if size != expected:
-                why = f": {word} is {expected} in {origin}" if origin else ""
-                raise ValueError(
-                    f"{name} must have shape ({', '.join(words)}), not {array.shape}: "
-                    f"axis {axis} should be {expected}{why}"
-                )
-        arrays[name] = array if dtype.kind == "U" else array.astype(dtype)
-        arrays[name].flags.writeable = False
-    return arrays

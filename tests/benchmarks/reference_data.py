@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from jaxfit.model.bird import Bird
-from jaxfit.model.importers.sources import import_sources
+from jaxfit.model.importers.import_model import import_model
 
 __all__ = ["reference_bird", "reference_folder"]
 
@@ -20,4 +20,4 @@ def reference_folder() -> Path | None:
 def reference_bird() -> Bird | None:
     """The AVES model of the reference data, if that is there."""
     folder = reference_folder()
-    return None if folder is None else import_sources("aves", [folder / "models" / "aves"])
+    return None if folder is None else import_model("aves", [folder / "models" / "aves"])

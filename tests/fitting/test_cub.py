@@ -9,14 +9,14 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.initial_pose_file import load_initial_poses
-from jaxfit.model.importers.sources import import_sources
+from jaxfit.model.importers.import_model import import_model
 
 SPECIES = "106.Horned_Puffin"
 
 
 @pytest.fixture(scope="module")
 def photographs(reference_dir):
-    bird = import_sources("aves", [reference_dir / "models" / "aves"])
+    bird = import_model("aves", [reference_dir / "models" / "aves"])
     reached = json.loads((reference_dir / "reference" / "aves_fit.json").read_text())["species"][SPECIES]
     observations = read_coco(reference_dir / "cub" / f"{SPECIES}.json")
     assert observations.num_tracks == reached["n"]

@@ -124,11 +124,12 @@ def test_the_bird_turns_about_its_root():
     far = dataclasses.replace(BIRD, vertices=BIRD.vertices + shift, joints=BIRD.joints + shift)
     points = pictured(np.broadcast_to(FROM_ABOVE, (6, 3, 3)), depth=150.0).astype(np.float32)
     one = (jnp.asarray(points)[None], jnp.ones((1, 6, BIRD.num_keypoints)))
-    near, away = (search_initial_poses(b, fold_bird(b), *one, ABOVE, CAMERA, True) for b in (BIRD, far))
-    rig, window = fold_bird(far), jax.tree.map(lambda x: x[0, 0], away)
-    posed = np.asarray(project(window_keypoints(rig, window_transforms(rig, window), window), CAMERA))
-    np.testing.assert_allclose(posed.mean(1), points.mean(1), atol=3)
-    np.testing.assert_allclose(away.global_orient, near.global_orient, atol=1e-5)
+    posed = []
+    for bird in (BIRD, far):
+        rig = fold_bird(bird)
+        window = jax.tree.map(lambda x: x[0, 0], search_initial_poses(bird, rig, *one, ABOVE, CAMERA, True))
+        posed.append(project(window_keypoints(rig, window_transforms(rig, window), window), CAMERA))
+    np.testing.assert_allclose(posed[1], posed[0], atol=0.01)
 
 
 def cost_of(path, cost, R, smoothness):

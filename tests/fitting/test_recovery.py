@@ -10,7 +10,7 @@ from jaxfit.config.schema import load_config
 from jaxfit.evaluation.metrics import me_p, me_v, mpjpe, pa_mpjpe
 from jaxfit.fitting.fit import fit
 from jaxfit.model.camera import Camera, project
-from jaxfit.model.importers.sources import import_sources
+from jaxfit.model.importers.import_model import import_model
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
 
@@ -22,7 +22,7 @@ MASK_STEPS = 20
 @pytest.fixture(scope="module")
 def figures(reference_dir):
     """Errors against the noise-free truth of both configs: {config: {metric: value}}."""
-    bird = import_sources("aves", [reference_dir / "models" / "aves"])
+    bird = import_model("aves", [reference_dir / "models" / "aves"])
     poses = [smooth_motion(bird, FRAMES, seed) for seed in range(BIRDS)]
     observed = detect(bird, poses, noise_px=2.0, outliers=0.05, seed=0)
     posed = [pose_window(bird, pose) for pose in poses]

@@ -1,4 +1,4 @@
-"""Projection agrees with stored numbers, survives the camera plane, and crops undo themselves."""
+"""Projection agrees with stored numbers and is finite at the camera; the crop conversions are inverse."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def test_stored_projection(reference_dir):
     assert camera == Camera()  # the defaults are the reference's camera
 
 
-def test_by_hand():
+def test_projection_by_hand():
     camera = Camera(focal_px=100, centre_px=32, size_px=64)
     points = np.array([[0, 0, 5], [1, 0, 5], [0, -2, 10], [0.3, 0.4, 2]], np.float32)
     expected = [[32, 32], [52, 32], [32, 12], [47, 52]]
@@ -29,12 +29,12 @@ def test_by_hand():
 
 
 @pytest.mark.parametrize("depth", [0.0, -0.0, 1e-12, -1e-3, -5.0, -1e6])
-def test_at_and_behind_the_camera(depth):
+def test_projection_at_and_behind_the_camera_is_finite(depth):
     point = jnp.array([0.5, -2.0, depth])
-    value, pull = jax.vjp(lambda p: project(p, Camera()), point)
+    value, pullback = jax.vjp(lambda p: project(p, Camera()), point)
     assert np.isfinite(value).all()
-    assert np.isfinite(pull(jnp.ones(2))[0]).all()
-    # what lies to the right stays to the right, rather than coming back mirrored
+    assert np.isfinite(pullback(jnp.ones(2))[0]).all()
+    # a point on the right stays on the right: the projection does not mirror points behind the camera
     assert value[0] > 128 > value[1]
 
 

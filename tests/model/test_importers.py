@@ -1,4 +1,4 @@
-"""Importing takes every field over as it is, finds its files, and names what is wrong with them."""
+"""Importers copy every field unchanged, find the files of a model, and report wrong files and fields."""
 
 import json
 
@@ -8,8 +8,9 @@ from support.checkpoints import write_legacy, write_zip
 
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, mirror_pairs
-from jaxfit.model.importers.published import import_aves, import_avian_mesh
-from jaxfit.model.importers.sources import import_sources
+from jaxfit.model.importers.aves import import_aves
+from jaxfit.model.importers.avian_mesh import import_avian_mesh
+from jaxfit.model.importers.import_model import import_model
 
 PARENTS = [-1, 0, 1, 0, 3, 3, 5, 6, 7, 3, 9, 10, 11, 3, 13, 14, 15, 3, 17, 18, 19, 3, 21, 22, 23]
 
@@ -28,6 +29,7 @@ def mesh(keypoints: int) -> dict[str, np.ndarray]:
 
 
 def prior(pose: str, bone: str) -> dict[str, np.ndarray]:
+    """The four arrays of a prior, with these prefixes in their names."""
     means = {pose + "m": np.linspace(-0.1, 0.1, 72), bone + "m": np.linspace(0.9, 1.1, 24)}
     covariances = {pose + "cov": 0.01 * np.eye(72), bone + "cov": 0.02 * np.eye(24)}
     return {name: array.astype(np.float32) for name, array in (means | covariances).items()}
@@ -110,12 +112,12 @@ def test_a_prior_is_required(avian_mesh_files):
         ({"kintree_table": [[-1, *range(1, 25)], list(range(25))]}, "parents: the parent of joint 1"),
     ],
 )
-def test_a_wrong_mesh_is_named(avian_mesh_files, change, expected):
+def test_error_names_the_wrong_field_of_a_mesh(avian_mesh_files, change, expected):
     path = write_mesh(avian_mesh_files[0], **change)
     with pytest.raises(InputError, match=rf"bird_eccv\.json: {expected}"):
         import_avian_mesh(*avian_mesh_files)
     with pytest.raises(InputError):
-        import_sources("avian-mesh", [path, avian_mesh_files[1]])
+        import_model("avian-mesh", [path, avian_mesh_files[1]])
 
 
 @pytest.mark.parametrize(
@@ -147,27 +149,27 @@ def test_damaged_json(avian_mesh_files, content, expected):
         ({"V": np.full((4, 3), np.nan, "<f4")}, "vertices: holds NaN"),
     ],
 )
-def test_a_wrong_aves_file_is_named(tmp_path, change, expected):
+def test_error_names_the_wrong_field_of_aves(tmp_path, change, expected):
     with pytest.raises(InputError, match=rf"aves\.pt: {expected}"):
         import_aves(write_aves(tmp_path / "aves.pt", **change))
 
 
-def test_sources_in_any_order_or_in_a_folder(tmp_path, avian_mesh_files):
+def test_files_in_any_order_or_in_a_folder(tmp_path, avian_mesh_files):
     mesh_path, prior_path = avian_mesh_files
     write_aves(tmp_path / "aves.pt")
     (tmp_path / "notes.json").write_text("{}")
     (tmp_path / "other.pt").write_bytes(b"something else")
     for sources in ([prior_path, mesh_path], [tmp_path], [str(mesh_path), tmp_path]):
-        assert import_sources("avian-mesh", sources).num_keypoints == 12
+        assert import_model("avian-mesh", sources).num_keypoints == 12
     for sources in ([tmp_path], [tmp_path / "aves.pt"], [prior_path, tmp_path / "aves.pt"]):
-        assert import_sources("aves", sources).num_keypoints == 18
+        assert import_model("aves", sources).num_keypoints == 18
     mesh_path.unlink()
     renamed = write_mesh(tmp_path / "mesh of mine.json")
-    assert import_sources("avian-mesh", [tmp_path]).num_keypoints == 12
-    assert import_sources("avian-mesh", [renamed, prior_path]).num_keypoints == 12
+    assert import_model("avian-mesh", [tmp_path]).num_keypoints == 12
+    assert import_model("avian-mesh", [renamed, prior_path]).num_keypoints == 12
 
 
-def test_sources_that_do_not_fit(tmp_path, avian_mesh_files):
+def test_files_that_do_not_belong_to_the_model(tmp_path, avian_mesh_files):
     mesh_path, prior_path = avian_mesh_files
     aves_path = write_aves(tmp_path / "aves.pt")
     empty = tmp_path / "empty"
@@ -186,12 +188,12 @@ def test_sources_that_do_not_fit(tmp_path, avian_mesh_files):
     ):
         (tmp_path / "notes.txt").write_text("notes")
         with pytest.raises(InputError, match=expected):
-            import_sources(kind, sources)
+            import_model(kind, sources)
     aves_path.write_bytes(aves_path.read_bytes()[:-5])
     with pytest.raises(InputError, match=r"aves\.pt: .*truncated"):
-        import_sources("aves", [tmp_path])
+        import_model("aves", [tmp_path])
     with pytest.raises(ValueError, match="kind must be one of avian-mesh, aves, not 'crow'"):
-        import_sources("crow", [])
+        import_model("crow", [])
 
 
 def test_mirror_pairs():

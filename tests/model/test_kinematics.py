@@ -1,4 +1,4 @@
-"""Posing agrees with the authors' numbers and with a loop of 4×4 matrices, and follows the laws of motion."""
+"""Kinematics agrees with the authors' numbers and with a loop over 4×4 matrices, and moves as a rigid body."""
 
 import dataclasses
 
@@ -9,14 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
-from support.birds import exp_map, random_pose, skin_by_hand, toy_bird
+from support.birds import PUBLISHED_CASES, exp_map, published_poses, random_pose, skin_by_hand, toy_bird
 
-from jaxfit.model.importers.sources import import_sources
+from jaxfit.model.importers.import_model import import_model
 from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_joints, posed_keypoints, posed_vertices
-from jaxfit.model.pose import Pose, rest_pose
+from jaxfit.model.pose import rest_pose
 
-AT = np.float32([0.5, -1.0, 2.0])  # a root that is not the origin, or turning about either would be the same
-BIRD = dataclasses.replace(toy_bird(), vertices=toy_bird().vertices + AT, joints=toy_bird().joints + AT)
+# the root is not at the origin, so that rotations about the root and about the origin differ
+ROOT = np.float32([0.5, -1.0, 2.0])
+BIRD = dataclasses.replace(toy_bird(), vertices=toy_bird().vertices + ROOT, joints=toy_bird().joints + ROOT)
 RIG = fold_bird(BIRD)
 
 
@@ -26,26 +27,14 @@ def posed(rig, pose):
     return posed_vertices(rig, A, pose), posed_keypoints(rig, A, pose), posed_joints(rig, A, pose)
 
 
-@pytest.mark.parametrize(("model", "scale"), [("avian_mesh", 1.0), ("avian_mesh", 1.3), ("aves", 1.0)])
+@pytest.mark.parametrize(("model", "scale"), PUBLISHED_CASES)
 def test_agrees_with_the_authors_numbers(reference_dir, model, scale):
-    bird = import_sources(model.replace("_", "-"), [reference_dir / "models" / model])
+    bird = import_model(model.replace("_", "-"), [reference_dir / "models" / model])
     rig, size = fold_bird(bird), np.ptp(np.asarray(bird.vertices), axis=0).max()
-    prefix = f"{model}/scale_{scale}/"
-    with np.load(reference_dir / "reference" / "lbs.npz") as stored:
-        case = {name.removeprefix(prefix): stored[name] for name in stored.files if name.startswith(prefix)}
-    assert len(case["vertices"]) == 3
-    for i in range(3):
-        pose = Pose(
-            global_orient=jnp.asarray(case["global_orient"][i]),
-            body_pose=jnp.asarray(case["body_pose"][i].reshape(-1, 3)),
-            transl=jnp.zeros(3),
-            scale=jnp.float32(scale),
-            bone_length=jnp.asarray(case["bone_length"][i]),
-            betas=jnp.asarray(case["beta"][i]) if "beta" in case else jnp.zeros(0),
-        )
+    for pose, expected_vertices, expected_keypoints in published_poses(reference_dir, model, scale):
         vertices, keypoints, _ = posed(rig, pose)
-        assert np.abs(vertices - case["vertices"][i]).max() < 1e-4 * size
-        assert np.abs(keypoints - case["keypoints"][i]).max() < 1e-4 * size
+        assert np.abs(vertices - expected_vertices).max() < 1e-4 * size
+        assert np.abs(keypoints - expected_keypoints).max() < 1e-4 * size
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -59,7 +48,7 @@ def test_agrees_with_a_loop_of_matrices(seed):
 
 
 def test_keypoints_of_several_vertices():
-    """Folded keypoints are the weighted means of the posed vertices, with shape too."""
+    """The keypoints of a rig are the weighted means of the posed vertices, also with non-zero shape coefficients."""
     rng = np.random.default_rng(0)
     weights = rng.dirichlet(np.full(len(BIRD.vertices), 0.01), size=BIRD.num_keypoints)
     bird = dataclasses.replace(BIRD, keypoint_weights=jnp.asarray(weights, jnp.float32))
@@ -68,7 +57,7 @@ def test_keypoints_of_several_vertices():
     np.testing.assert_allclose(keypoints, weights @ skin_by_hand(bird, pose)[0], atol=1e-4)
 
 
-def test_every_shape_direction_counts():
+def test_every_shape_direction_changes_the_mesh():
     pose = random_pose(BIRD, 3)
     flat = dataclasses.replace(pose, betas=jnp.zeros(2))
     for i in range(2):
@@ -77,7 +66,7 @@ def test_every_shape_direction_counts():
             assert np.abs(moved - still).max() > 0.1
 
 
-def test_rest_is_rest():
+def test_rest_pose_gives_the_rest_mesh():
     vertices, keypoints, joints = posed(RIG, rest_pose(BIRD))
     np.testing.assert_allclose(vertices, BIRD.vertices, atol=1e-6)
     np.testing.assert_allclose(keypoints, BIRD.keypoints, atol=1e-6)
@@ -101,7 +90,7 @@ angles = st.tuples(*[st.floats(-3, 3, width=32)] * 3)
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), angles, angles, st.floats(0.25, 4, width=32))
 def test_moves_as_a_rigid_body(seed, turn, shift, factor):
-    """Turned about its root, shifted and scaled, the bird is the same bird: p ↦ s·R·(p − root) + root′."""
+    """Rotation about the root, translation and scale move all points alike: p ↦ s·R·(p − root) + root′."""
     from scipy.spatial.transform import Rotation
 
     pose, root = random_pose(BIRD, seed), np.asarray(BIRD.joints)[0]
@@ -119,28 +108,29 @@ def test_moves_as_a_rigid_body(seed, turn, shift, factor):
         np.testing.assert_allclose(after, expected, atol=1e-3)
 
 
-def test_bone_lengths_stretch_their_own_bone():
+def test_bone_length_moves_its_bone_and_the_descendants():
     pose = rest_pose(BIRD)
     neck = BIRD.joint_names.index("neck")
     longer = dataclasses.replace(pose, bone_length=pose.bone_length.at[neck - 1].set(2.0))
     joints = np.asarray(posed(RIG, longer)[2])
     moved = np.asarray(BIRD.joints)[neck] - np.asarray(BIRD.joints)[0]
     expected = np.asarray(BIRD.joints).copy()
-    expected[[neck, BIRD.joint_names.index("head")]] += moved  # the head rides on the neck
+    expected[[neck, BIRD.joint_names.index("head")]] += moved  # the head is a child of the neck
     np.testing.assert_allclose(joints, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("rest", [True, False], ids=["rest", "posed"])
 def test_gradients(rest):
     start = rest_pose(BIRD) if rest else random_pose(BIRD, 1, 0.3)
-    start = dataclasses.replace(start, transl=jnp.array([0.1, 0.2, 0.3]))  # large numbers hide small steps
-    pull = jnp.asarray(np.random.default_rng(0).normal(size=(BIRD.num_keypoints, 3)), jnp.float32)
-    push = jnp.asarray(np.random.default_rng(1).normal(size=BIRD.vertices.shape) / 50, jnp.float32)
+    # a small translation, because large coordinates hide the small steps of finite differences
+    start = dataclasses.replace(start, transl=jnp.array([0.1, 0.2, 0.3]))
+    keypoint_weights = jnp.asarray(np.random.default_rng(0).normal(size=(BIRD.num_keypoints, 3)), jnp.float32)
+    vertex_weights = jnp.asarray(np.random.default_rng(1).normal(size=BIRD.vertices.shape) / 50, jnp.float32)
 
     @jax.jit
     def value(pose):
         vertices, keypoints, _ = posed(RIG, pose)
-        return jnp.sum(pull * keypoints) + jnp.sum(push * vertices)
+        return jnp.sum(keypoint_weights * keypoints) + jnp.sum(vertex_weights * vertices)
 
     check_grads(value, (start,), order=1, modes=["rev"], eps=1e-2, atol=0.02, rtol=0.02)
     gradient = jax.grad(value)(start)

@@ -1,4 +1,4 @@
-"""A bird survives its file, and a wrong file is one clear error."""
+"""Saved birds load unchanged, wrong files give one clear error, and the hash identifies a model."""
 
 import dataclasses
 import pickle
@@ -49,16 +49,16 @@ def tiny_bird(shapes: int = 2, **changes) -> Bird:
 
 
 def saved(tmp_path: Path, **changes) -> Path:
-    """A file of the tiny bird with some entries replaced, or left out where None."""
+    """A file of the tiny bird with some entries replaced, or removed where the value is None."""
     path = tmp_path / "bird.npz"
     save_bird(tiny_bird(), path)
-    with np.load(path) as found:
-        content = {name: found[name] for name in found.files} | changes
+    with np.load(path) as stored:
+        content = {name: stored[name] for name in stored.files} | changes
     np.savez(path, **{name: array for name, array in content.items() if array is not None})
     return path
 
 
-def refusal(path: Path) -> str:
+def load_error(path: Path) -> str:
     with pytest.raises(InputError) as caught:
         load_bird(path)
     assert str(caught.value).startswith(str(path))
@@ -66,7 +66,7 @@ def refusal(path: Path) -> str:
 
 
 @pytest.mark.parametrize("bird", [tiny_bird(), tiny_bird(shapes=0, joint_pairs=(), keypoint_pairs=())])
-def test_a_bird_survives_its_file(tmp_path, bird):
+def test_a_saved_bird_loads_unchanged(tmp_path, bird):
     path = tmp_path / "folder" / "a bird.npz"
     save_bird(bird, path)
     loaded = load_bird(path)
@@ -84,11 +84,11 @@ def test_a_bird_survives_its_file(tmp_path, bird):
 
 def test_the_file_holds_no_objects(tmp_path):
     save_bird(tiny_bird(), tmp_path / "bird.npz")
-    with np.load(tmp_path / "bird.npz", allow_pickle=False) as found:
-        assert {"format_version", *ARRAY_FIELDS, *STATIC} == set(found.files)
-        assert found["format_version"] == 1
-        assert found["joint_names"].dtype.kind == "U"
-        assert all(found[name].dtype.kind in "ifU" for name in found.files)
+    with np.load(tmp_path / "bird.npz", allow_pickle=False) as stored:
+        assert {"format_version", *ARRAY_FIELDS, *STATIC} == set(stored.files)
+        assert stored["format_version"] == 1
+        assert stored["joint_names"].dtype.kind == "U"
+        assert all(stored[name].dtype.kind in "ifU" for name in stored.files)
 
 
 def test_a_failed_save_leaves_the_older_file(tmp_path):
@@ -126,7 +126,7 @@ BROKEN = {
     "vertex_colours": (np.full((4, 3), 1.1), "[0, 1]"),
     "vertex_colours negative": (np.full((4, 3), -0.1), "[0, 1]"),
     "vertex_colours count": (np.zeros((5, 3)), "V = 4"),
-    "joint_limits": (np.tile([1.0, -1.0], (3, 3, 1)), "least angle of body"),
+    "joint_limits": (np.tile([1.0, -1.0], (3, 3, 1)), "minimum angle of body"),
     "joint_limits far": (np.tile([-7.0, 7.0], (3, 3, 1)), "full turn"),
     "joint_limits shape": (np.zeros((3, 3, 3)), "2 = 2"),
     "parents": ((-1, 0, 3, 1), "parent of joint 2"),
@@ -172,16 +172,16 @@ def test_at_most_eight_joints_move_a_vertex():
 
 
 def test_missing_files_folders_and_other_formats(tmp_path):
-    assert "exist" in refusal(tmp_path / "none.npz")
-    assert "folder" in refusal(tmp_path)
+    assert "exist" in load_error(tmp_path / "none.npz")
+    assert "folder" in load_error(tmp_path)
     path = saved(tmp_path)
     whole = path.read_bytes()
     for content in (b"", b"hello", whole[: len(whole) // 2], whole[:-10], b"PK\x03\x04"):
         path.write_bytes(content)
-        assert "npz" in refusal(path)
+        assert "npz" in load_error(path)
     with path.open("wb") as file:
         np.save(file, np.zeros(3))
-    assert "npz" in refusal(path)
+    assert "npz" in load_error(path)
 
 
 class Canary:
@@ -195,9 +195,9 @@ class Canary:
 def test_objects_are_never_loaded(tmp_path):
     canary = tmp_path / "canary"
     path = saved(tmp_path, joints=np.array([Canary(canary)], dtype=object))
-    assert "objects" in refusal(path).lower()
+    assert "objects" in load_error(path).lower()
     path.write_bytes(pickle.dumps(Canary(canary)))
-    refusal(path)
+    load_error(path)
     assert not canary.exists()
     pickle.loads(path.read_bytes())
     assert canary.exists()  # the object would have acted, had it been loaded
@@ -208,7 +208,7 @@ REQUIRED = [field for field in ARRAY_FIELDS if field not in OPTIONAL_FIELDS]
 
 @pytest.mark.parametrize("field", ["format_version", *REQUIRED, *STATIC])
 def test_every_field_must_be_there(tmp_path, field):
-    assert field in refusal(saved(tmp_path, **{field: None}))
+    assert field in load_error(saved(tmp_path, **{field: None}))
 
 
 def test_colours_and_limits_may_be_missing(tmp_path):
@@ -218,32 +218,32 @@ def test_colours_and_limits_may_be_missing(tmp_path):
 
 
 @pytest.mark.parametrize("field", ["format_version", *ARRAY_FIELDS, *STATIC])
-def test_every_field_must_have_its_kind(tmp_path, field):
-    assert field in refusal(saved(tmp_path, **{field: np.zeros((1, 2, 3, 4))}))
-    assert field in refusal(saved(tmp_path, **{field: np.array([b"abc"])}))
+def test_every_field_must_have_its_dimensions_and_type(tmp_path, field):
+    assert field in load_error(saved(tmp_path, **{field: np.zeros((1, 2, 3, 4))}))
+    assert field in load_error(saved(tmp_path, **{field: np.array([b"abc"])}))
 
 
-def test_a_bird_is_found_by_its_name_or_its_path(tmp_path):
+def test_a_bird_loads_by_name_or_by_path(tmp_path):
     assert find_bird("murre").name == "murre"
     assert find_bird(saved(tmp_path)).name == "tiny guillemot"
 
 
 def test_versions(tmp_path):
-    message = refusal(saved(tmp_path, format_version=np.array(2)))
+    message = load_error(saved(tmp_path, format_version=np.array(2)))
     assert "needs a newer jaxfit" in message
-    assert "format_version" in refusal(saved(tmp_path, format_version=np.array(0)))
-    load_bird(saved(tmp_path, added_later=np.zeros(3)))  # the same version with more in it can be read
+    assert "format_version" in load_error(saved(tmp_path, format_version=np.array(0)))
+    load_bird(saved(tmp_path, added_later=np.zeros(3)))  # further arrays in a file of the same version are ignored
 
 
-def test_numbers_that_do_not_fit_are_not_wrapped(tmp_path):
+def test_numbers_beyond_32_bits_are_rejected(tmp_path):
     faces = np.array([[0, 1, 2**32 + 2]])  # would be vertex 2 after wrapping to 32 bits
-    assert "faces" in refusal(saved(tmp_path, faces=faces))
-    assert "faces" in refusal(saved(tmp_path, faces=np.array([[0, 1, 2**64 - 1]], dtype=np.uint64)))
-    assert "vertices" in refusal(saved(tmp_path, vertices=np.full((4, 3), 1e300)))
-    assert "joint_pairs" in refusal(saved(tmp_path, joint_pairs=np.array([[2, 3, 1]])))
+    assert "faces" in load_error(saved(tmp_path, faces=faces))
+    assert "faces" in load_error(saved(tmp_path, faces=np.array([[0, 1, 2**64 - 1]], dtype=np.uint64)))
+    assert "vertices" in load_error(saved(tmp_path, vertices=np.full((4, 3), 1e300)))
+    assert "joint_pairs" in load_error(saved(tmp_path, joint_pairs=np.array([[2, 3, 1]])))
 
 
-def test_the_hash_is_the_content(tmp_path):
+def test_the_hash_depends_on_the_content_only(tmp_path):
     bird, path = tiny_bird(), tmp_path / "bird.npz"
     save_bird(bird, path)
     known = model_hash(bird)

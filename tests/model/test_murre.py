@@ -1,4 +1,4 @@
-"""The built-in murre is a sound mesh of the right size, symmetric, and moves as a murre does."""
+"""The built-in murre is a closed symmetric mesh with the measurements, postures and colours of a murre."""
 
 from itertools import pairwise
 
@@ -30,7 +30,7 @@ SWAP = [JOINT_NAMES.index(other_side(name)) for name in JOINT_NAMES]
 
 
 def mirror_vertices() -> np.ndarray:
-    """The vertex at every vertex's mirror image."""
+    """Index of the mirror image of every vertex."""
     distance = np.linalg.norm(VERTICES[:, None] * FLIP - VERTICES[None], axis=-1)
     assert distance.min(axis=1).max() < 1e-6
     return distance.argmin(axis=1)
@@ -54,15 +54,16 @@ def posed_cm(body_pose, pitch_rad=0.0, betas=None):
     """Vertices and keypoints in centimetres."""
     pose = pose_of(body_pose, pitch_rad, betas)
     A = joint_transforms(RIG, pose)
-    found = posed_vertices(RIG, A, pose), posed_keypoints(RIG, A, pose)
-    return tuple(np.asarray(points, np.float64) * CM_PER_UNIT for points in found)
+    posed = posed_vertices(RIG, A, pose), posed_keypoints(RIG, A, pose)
+    return tuple(np.asarray(points, np.float64) * CM_PER_UNIT for points in posed)
 
 
 def vertices_of(*joints: str, least: float = 0.9) -> np.ndarray:
+    """Whether the skinning weights of these joints together exceed `least`, for each vertex."""
     return WEIGHTS[:, [JOINT_NAMES.index(joint) for joint in joints]].sum(axis=1) > least
 
 
-def apart(a, b) -> float:
+def distance(a, b) -> float:
     return float(np.linalg.norm(a - b))
 
 
@@ -82,13 +83,13 @@ def test_the_mesh_is_one_closed_surface():
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
     assert mesh.body_count == 1
-    assert mesh.volume > 0  # faces look outwards
+    assert mesh.volume > 0  # the face normals point outwards
     assert 1500 <= len(FACES) <= 3000
     assert mesh.area_faces.min() > 1e-7
     assert 1.0 <= mesh.volume * CM_PER_UNIT**3 / 1000 <= 2.0  # litres: a plumed bird of one kilogram
 
 
-def test_everything_is_symmetric():
+def test_the_model_is_symmetric():
     np.testing.assert_array_equal(MIRROR[MIRROR], np.arange(len(MIRROR)))
     turned = {tuple(np.roll(face, -np.argmin(face))) for face in MIRROR[FACES][:, ::-1]}
     assert turned == {tuple(np.roll(face, -np.argmin(face))) for face in FACES}
@@ -102,28 +103,28 @@ def test_everything_is_symmetric():
     )
 
 
-def test_few_joints_move_a_vertex():
+def test_at_most_four_joints_move_a_vertex():
     assert (WEIGHTS > 0).sum(axis=1).max() <= 4
     used = {name for name, most in zip(JOINT_NAMES, WEIGHTS.max(axis=0), strict=True) if most > 0}
     assert set(JOINT_NAMES) - used == {"root", "left_hip", "right_hip"}
 
 
-def test_the_murre_measures_what_murres_measure():
+def test_the_murre_has_the_measurements_of_its_species():
     spine = [JOINTS[name] for name in ("tail", "upper_body", "neck_root", "neck", "head")]
     spine = [KEYPOINTS["tail_tip"], *spine, KEYPOINTS["bill_base"], KEYPOINTS["bill_tip"]]
     spread, _ = posed_cm(spread_pose())
     trunk = VERTICES[vertices_of("upper_body", "lower_body", "chest", least=0.99)] * CM_PER_UNIT
     neck = VERTICES[vertices_of("neck", least=0.9)]
     measured = {
-        "total_length": sum(apart(a, b) for a, b in pairwise(spine)),
+        "total_length": sum(distance(a, b) for a, b in pairwise(spine)),
         "wingspan": np.ptp(spread[:, 0]),
-        "wing": apart(JOINTS["left_wrist"], KEYPOINTS["left_wingtip"]),
-        "bill": apart(KEYPOINTS["bill_base"], KEYPOINTS["bill_tip"]),
-        "tarsus": apart(JOINTS["left_ankle"], JOINTS["left_foot"]),
-        "tail": apart(KEYPOINTS["tail_base"], KEYPOINTS["tail_tip"]),
+        "wing": distance(JOINTS["left_wrist"], KEYPOINTS["left_wingtip"]),
+        "bill": distance(KEYPOINTS["bill_base"], KEYPOINTS["bill_tip"]),
+        "tarsus": distance(JOINTS["left_ankle"], JOINTS["left_foot"]),
+        "tail": distance(KEYPOINTS["tail_base"], KEYPOINTS["tail_tip"]),
         "middle_toe": VERTICES[vertices_of("left_foot"), 1].max() * CM_PER_UNIT - JOINTS["left_foot"][1],
-        "humerus": apart(JOINTS["left_shoulder"], JOINTS["left_elbow"]),
-        "forearm": apart(JOINTS["left_elbow"], JOINTS["left_wrist"]),
+        "humerus": distance(JOINTS["left_shoulder"], JOINTS["left_elbow"]),
+        "forearm": distance(JOINTS["left_elbow"], JOINTS["left_wrist"]),
         "body_width": np.ptp(trunk[:, 0]),
         "body_depth": np.ptp(trunk[np.abs(trunk[:, 1]) < 1.0, 2]),
         "neck_width": np.ptp(neck[:, 0]) * CM_PER_UNIT,
@@ -137,7 +138,7 @@ def test_the_murre_measures_what_murres_measure():
 
 
 def spread_pose() -> np.ndarray:
-    """Both wings spread level."""
+    """Body pose with both wings spread horizontally."""
     pose = np.zeros((24, 3))
     for name, R in spread_rotations().items():
         angle = np.arccos((np.trace(R) - 1) / 2)
@@ -148,7 +149,7 @@ def spread_pose() -> np.ndarray:
     return pose
 
 
-def test_keypoints_lie_where_they_are_named():
+def test_keypoints_lie_at_their_places():
     for name, point in KEYPOINTS.items():
         assert np.linalg.norm(VERTICES * CM_PER_UNIT - point, axis=1).min() < 1.0, name
         side = np.sign(point[0]) if abs(point[0]) > 1e-5 else 0
@@ -157,7 +158,7 @@ def test_keypoints_lie_where_they_are_named():
     assert np.all(np.diff([KEYPOINTS[name][1] for name in forwards]) > 0)
     assert KEYPOINTS["throat"][2] < KEYPOINTS["left_eye"][2] < KEYPOINTS["crown"][2]
     assert KEYPOINTS["left_foot"][2] < KEYPOINTS["left_shin"][2] < KEYPOINTS["breast"][2] < KEYPOINTS["back"][2]
-    assert apart(KEYPOINTS["left_wrist"], JOINTS["left_wrist"]) < 2.0
+    assert distance(KEYPOINTS["left_wrist"], JOINTS["left_wrist"]) < 2.0
     np.testing.assert_allclose(np.asarray(BIRD.keypoint_weights).sum(axis=1), 1, atol=1e-6)
     assert {name for pair in MURRE_SKELETON for name in pair} == set(MURRE_KEYPOINTS)
     assert len(skeleton_pairs(MURRE_KEYPOINTS)) == len(MURRE_SKELETON)
@@ -169,13 +170,13 @@ def test_postures_lie_within_the_limits_and_near_the_prior(name):
     body_pose = POSTURES[name].body_pose
     low, high = np.moveaxis(np.asarray(BIRD.joint_limits), -1, 0)
     assert np.all((low + 0.2 < body_pose) & (body_pose < high - 0.2))
-    apart = body_pose.ravel() - np.asarray(BIRD.pose_mean, np.float64)
-    distance = np.sqrt(apart @ np.linalg.solve(np.asarray(BIRD.pose_covariance, np.float64), apart))
-    assert distance < 7.5  # a pose drawn from the prior lies near √72 = 8.5
+    offset = body_pose.ravel() - np.asarray(BIRD.pose_mean, np.float64)
+    mahalanobis = np.sqrt(offset @ np.linalg.solve(np.asarray(BIRD.pose_covariance, np.float64), offset))
+    assert mahalanobis < 7.5  # a pose drawn from the prior lies near √72 = 8.5
 
 
 @pytest.mark.parametrize("name", [n for n in POSTURES if not n.startswith("wings_") or n == "wings_half"])
-def test_on_the_ledge_the_feet_lie_flat_and_nothing_is_lower(name):
+def test_on_the_ground_the_feet_lie_flat_and_are_the_lowest_part(name):
     vertices, _ = posed_cm(*POSTURES[name])
     ground = vertices[:, 2].min()
     for side in ("left", "right"):
@@ -190,24 +191,24 @@ def test_on_the_ledge_the_feet_lie_flat_and_nothing_is_lower(name):
 
 
 @pytest.mark.parametrize("name", POSTURES)
-def test_no_posture_tears_the_mesh(name):
+def test_no_posture_overstretches_the_mesh(name):
     vertices, _ = posed_cm(*POSTURES[name])
     length = np.linalg.norm(vertices[EDGES[:, 0]] - vertices[EDGES[:, 1]], axis=1)
     rest = np.linalg.norm(VERTICES[EDGES[:, 0]] - VERTICES[EDGES[:, 1]], axis=1) * CM_PER_UNIT
     assert length.max() < 6.5  # the longest edge at rest is about 4 cm
-    # A folded wing is a narrow fan, so its innermost edges lengthen many times; elsewhere skin stretches as skin does.
+    # The folded wing is a narrow fan, so its innermost edges lengthen many times; other edges stretch as skin does.
     body = ~vertices_of("left_shoulder", "left_elbow", "left_wrist", least=0.01)
     body &= ~vertices_of("right_shoulder", "right_elbow", "right_wrist", least=0.01)
     assert (length / rest)[body[EDGES].all(axis=1)].max() < 3.5
     volume = trimesh.Trimesh(vertices, FACES, process=False).volume
     assert 1400 < volume < 2000
     if name.startswith("wings_"):
-        # no wing is turned inside out: hardly any of its upper side looks down in the wing's own frame
+        # no wing is turned inside out: nearly the whole upper side points up in the frame of the wing
         assert inverted_share(vertices) < 0.02
 
 
 def inverted_share(vertices) -> float:
-    """Share of the wings' area whose outside has turned in: the face looks to the sheet's other side."""
+    """Share of the area of the left wing whose face normals point to the other side of the wing."""
     wing = vertices_of("left_shoulder", "left_elbow", "left_wrist", least=0.5)
     faces = FACES[wing[FACES].all(axis=1)]
     joint = WEIGHTS[faces].mean(axis=1).argmax(axis=1)
@@ -219,7 +220,7 @@ def inverted_share(vertices) -> float:
     share = 0.0
     for j in np.unique(joint):
         which = joint == j
-        # the rotation that carries this joint's faces best: Kabsch on their normals
+        # the best rotation of the faces of this joint: Kabsch on their normals
         u, _, vt = np.linalg.svd(after[which].T @ before[which])
         R = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
         flipped = np.einsum("fc,fc->f", before[which] @ R.T, after[which]) < 0
@@ -236,7 +237,7 @@ def test_left_and_right_postures_are_mirror_images():
         np.testing.assert_allclose(mirrored_pose(POSTURES[name].body_pose), POSTURES[name].body_pose, atol=1e-12)
 
 
-def test_postures_look_as_they_are_called():
+def test_postures_have_the_shape_of_their_names():
     posed = {name: dict(zip(MURRE_KEYPOINTS, posed_cm(*posture)[1], strict=True)) for name, posture in POSTURES.items()}
     bill = {name: points["bill_tip"] for name, points in posed.items()}
     height = {name: points["bill_tip"][2] - points["left_foot"][2] for name, points in posed.items()}
@@ -254,7 +255,7 @@ def test_postures_look_as_they_are_called():
         assert abs(tip[0]) > 24
 
 
-def test_the_prior_is_sound_and_symmetric():
+def test_the_prior_is_positive_definite_and_symmetric():
     covariance = np.asarray(BIRD.pose_covariance, np.float64)
     assert np.linalg.eigvalsh(covariance)[0] > 1e-4
     mean = np.asarray(BIRD.pose_mean, np.float64).reshape(24, 3)
@@ -269,7 +270,7 @@ def test_the_prior_is_sound_and_symmetric():
     np.testing.assert_array_equal(BIRD.bone_mean, 1)
 
 
-def test_shapes_change_what_they_name():
+def test_each_shape_direction_changes_its_part():
     rest, _ = posed_cm(np.zeros((24, 3)))
     grown = {
         name: posed_cm(np.zeros((24, 3)), betas=np.eye(BIRD.num_shapes)[i])[0]
@@ -283,7 +284,7 @@ def test_shapes_change_what_they_name():
     assert trimesh.Trimesh(grown["neck"], FACES).volume > trimesh.Trimesh(rest, FACES).volume
 
 
-def test_the_plumage_is_a_murre_s():
+def test_dark_and_white_plumage_lie_at_their_places():
     colours = np.asarray(BIRD.vertex_colours)
     lightness = colours.mean(axis=1)
     keypoints = np.asarray(BIRD.keypoint_weights) @ lightness

@@ -1,4 +1,4 @@
-"""Rotations agree with scipy's, keep finite gradients, and the grids of views leave no hole."""
+"""Rotations agree with scipy, gradients are finite, and the view grid covers SO(3)."""
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ def angle_between(Ra, Rb):
 @example(np.array([0.00999, 0, 0], np.float32))
 @example(np.array([0, 0.01001, 0], np.float32))
 @example(np.array([0, 0, np.pi], np.float32))
-def test_matrices_are_scipys(axis_angle):
+def test_matrices_agree_with_scipy(axis_angle):
     R = np.asarray(to_matrix(axis_angle), np.float64)
     np.testing.assert_allclose(R, Rotation.from_rotvec(axis_angle).as_matrix(), atol=2e-6)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=3e-6)
@@ -62,12 +62,12 @@ def test_gradients_are_finite_and_right(theta):
 @example(np.array([0, 0, 1], np.float32), 0.0)
 def test_axis_angle_of_a_matrix(axis, theta):
     R = Rotation.from_rotvec(theta * axis.astype(np.float64)).as_matrix()
-    found = np.asarray(to_axis_angle(jnp.asarray(R, jnp.float32)))
-    assert np.isfinite(found).all()
-    assert np.linalg.norm(found) <= np.pi + 1e-6
-    assert Rotation.from_rotvec(found).inv().as_matrix() @ R == pytest.approx(np.eye(3), abs=2e-6)
+    result = np.asarray(to_axis_angle(jnp.asarray(R, jnp.float32)))
+    assert np.isfinite(result).all()
+    assert np.linalg.norm(result) <= np.pi + 1e-6
+    assert Rotation.from_rotvec(result).inv().as_matrix() @ R == pytest.approx(np.eye(3), abs=2e-6)
     if theta < 3:  # near π both signs of the axis are the same rotation
-        np.testing.assert_allclose(found, theta * axis, atol=5e-6)
+        np.testing.assert_allclose(result, theta * axis, atol=5e-6)
 
 
 @settings(max_examples=50, deadline=None)
@@ -77,7 +77,7 @@ def test_geodesic_distance(base, axis, theta):
     Ra = Rotation.from_rotvec(base).as_matrix()
     Rb = Ra @ Rotation.from_rotvec(theta * axis.astype(np.float64)).as_matrix()
     distance = geodesic_distance(jnp.asarray(Ra, jnp.float32), jnp.asarray(Rb, jnp.float32))
-    # the chord is flat at π: half a float32's digits remain there
+    # near π the distance is insensitive to the angle: only half of the digits of float32 remain
     assert float(distance) == pytest.approx(theta, abs=1e-6 + (2e-5 if theta > 2.5 else 2e-6))
 
 
@@ -88,18 +88,18 @@ def spins():
     above = Rotation.from_matrix(viewing_axis_rotations(50)) * Rotation.from_rotvec([np.pi, 0, 0])
     past_pi = Rotation.from_rotvec(np.linspace(2, 4.3, 50)[:, None] * [0, 0, 1])
     whole_turn = Rotation.from_rotvec(np.linspace(0, 2 * np.pi, 49)[:, None] * [0, 0, 1])
-    whole_turn = Rotation.concatenate([whole_turn, Rotation.identity(1)])  # no rotation has no axis to go on about
+    whole_turn = Rotation.concatenate([whole_turn, Rotation.identity(1)])  # the identity has no axis
     return {
         "about a fixed axis": spun,
-        "to where it began": whole_turn,
-        "seen from above": above,  # every one of them a half turn, of either sign
+        "a whole turn": whole_turn,
+        "seen from above": above,  # all rotations are half turns, with an axis of either sign
         "seen from above, leaning": Rotation.from_rotvec(wobble) * above,
         "through π, leaning": past_pi * Rotation.from_rotvec(wobble),
     }
 
 
 @pytest.mark.parametrize("name", spins())
-def test_unwrapped_spins_do_not_jump(name):
+def test_unwrapped_rotations_do_not_jump(name):
     R = spins()[name].as_matrix()
     wrapped = np.asarray(to_axis_angle(jnp.asarray(R, jnp.float32)))
     unwrapped = np.asarray(jax.jit(unwrap_axis_angle)(wrapped))
@@ -110,13 +110,13 @@ def test_unwrapped_spins_do_not_jump(name):
 
 
 def test_unwrapping_is_needed():
-    """The spin past π jumps by almost 2π before unwrapping, so that the test above can fail."""
+    """Before unwrapping, the rotation past π jumps by almost 2π: the previous test can fail."""
     R = spins()["through π, leaning"].as_matrix()
     wrapped = np.asarray(to_axis_angle(jnp.asarray(R, jnp.float32)))
     assert np.linalg.norm(np.diff(wrapped, axis=0), axis=1).max() > 5
 
 
-def test_steps_about_the_viewing_axis():
+def test_rotations_about_the_viewing_axis():
     R = viewing_axis_rotations(30)
     assert R.shape == (30, 3, 3)
     np.testing.assert_allclose(R[0], np.eye(3))
@@ -126,10 +126,11 @@ def test_steps_about_the_viewing_axis():
 
 
 @pytest.mark.parametrize(("directions", "turns"), [(100, 24), (40, 12)])
-def test_the_grid_of_views_has_no_hole(directions, turns):
-    """Nearest view of any rotation: at most a direction's cell plus half a turn away.
+def test_the_view_grid_covers_so3(directions, turns):
+    """The nearest grid point of any rotation is at most the radius of a direction's cell plus half a turn away.
 
-    With cells of 4π/directions, a square lattice covers within √(cell/2); a spiral is at most half as far again.
+    For cells of area 4π/directions, the covering radius of a square lattice is √(cell/2); the covering radius of the
+    spiral is at most 1.5 times as large.
     """
     grid = view_grid(directions, turns)
     assert grid.shape == (directions * turns, 3, 3)
@@ -142,4 +143,4 @@ def test_the_grid_of_views_has_no_hole(directions, turns):
     assert nearest.max() < bound
     between = np.arccos(np.clip((np.einsum("aij,gij->ag", grid, grid) - 1) / 2, -1, 1))
     np.fill_diagonal(between, np.inf)
-    assert between.min() > 0.5 * np.pi / turns, "two views that are nearly one are a waste"
+    assert between.min() > 0.5 * np.pi / turns, "two views are nearly equal"

@@ -1,4 +1,4 @@
-"""Checkpoints are read exactly, and no file can run anything, read outside itself or take all memory."""
+"""Checkpoints are read exactly; no file can run code, read outside its content, or exhaust the memory."""
 
 import os
 import pickle
@@ -45,24 +45,24 @@ def arrays():
 @pytest.mark.parametrize("write", [write_legacy, write_zip])
 def test_arrays_come_back_exactly(tmp_path, write):
     expected = arrays()
-    found = read_tensors(write(tmp_path / "a.pt", expected))
-    assert found.keys() == expected.keys()
+    tensors = read_tensors(write(tmp_path / "a.pt", expected))
+    assert tensors.keys() == expected.keys()
     for name, array in expected.items():
-        assert found[name].dtype == array.dtype, name
-        np.testing.assert_array_equal(found[name], array)
+        assert tensors[name].dtype == array.dtype, name
+        np.testing.assert_array_equal(tensors[name], array)
 
 
 def test_views_share_a_storage(tmp_path):
     entries = {"transposed": tensor(STORED, (4, 3), (1, 4)), "column": tensor(STORED, (3,), (4,), offset=2)}
     (tmp_path / "a.pt").write_bytes(legacy(mapping(entries), FLOATS))
-    found = read_tensors(tmp_path / "a.pt")
+    tensors = read_tensors(tmp_path / "a.pt")
     whole = np.arange(12).reshape(3, 4)
-    np.testing.assert_array_equal(found["transposed"], whole.T)
-    np.testing.assert_array_equal(found["column"], whole[:, 2])
-    assert not found["column"].flags.writeable
+    np.testing.assert_array_equal(tensors["transposed"], whole.T)
+    np.testing.assert_array_equal(tensors["column"], whole[:, 2])
+    assert not tensors["column"].flags.writeable
 
 
-def refusal(tmp_path, content: bytes) -> str:
+def read_error(tmp_path, content: bytes) -> str:
     path = tmp_path / "hostile.pt"
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"hostile\.pt") as caught:
@@ -84,10 +84,10 @@ def test_code_in_a_pickle_is_never_run(tmp_path, protocol):
     pickle.loads(pickle.dumps(Payload(str(control)), protocol))
     assert control.exists()  # the payload does run where a pickle is trusted
     payload = pickle.dumps({"V": Payload(str(canary))}, protocol)
-    legacy_message = refusal(tmp_path, legacy(payload, {}))
+    legacy_message = read_error(tmp_path, legacy(payload, {}))
     if protocol >= 2:
         assert "mkdir" in legacy_message
-    assert refusal(tmp_path, payload)  # at the very first pickle
+    assert read_error(tmp_path, payload)  # at the very first pickle
     with zipfile.ZipFile(tmp_path / "hostile.pt", "w") as archive:
         archive.writestr("archive/data.pkl", payload)
     with pytest.raises(InputError):
@@ -134,9 +134,9 @@ HOSTILE_BODIES = {
 
 
 @pytest.mark.parametrize("name", HOSTILE_BODIES)
-def test_hostile_instructions_are_refused(tmp_path, name):
+def test_hostile_opcodes_are_rejected(tmp_path, name):
     body, expected = HOSTILE_BODIES[name]
-    assert expected in refusal(tmp_path, legacy(body, FLOATS))
+    assert expected in read_error(tmp_path, legacy(body, FLOATS))
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_hostile_instructions_are_refused(tmp_path, name):
 )
 def test_a_tensor_stays_inside_its_storage(tmp_path, shape, strides, offset):
     body = mapping({"V": tensor(STORED, shape, strides, offset)})
-    assert "checkpoint" in refusal(tmp_path, legacy(body, FLOATS))
+    assert "checkpoint" in read_error(tmp_path, legacy(body, FLOATS))
 
 
 def test_the_last_element_may_be_used(tmp_path):
@@ -166,32 +166,32 @@ def test_the_last_element_may_be_used(tmp_path):
     np.testing.assert_array_equal(read_tensors(tmp_path / "a.pt")["V"], [1, 6, 11])
 
 
-def test_claimed_counts_must_be_true(tmp_path):
+def test_stated_sizes_must_agree_with_the_content(tmp_path):
     body = mapping({"V": tensor(STORED, (12,), (1,))})
-    assert "disagree" in refusal(tmp_path, legacy(body, FLOATS, counts={"0": 11}))
-    assert "disagree" in refusal(tmp_path, legacy(body, FLOATS, counts={"0": -1}))
-    assert "truncated" in refusal(tmp_path, legacy(body, FLOATS)[:-1])
-    assert "not in the file" in refusal(tmp_path, legacy(body, {}))
-    assert "no tensor uses" in refusal(tmp_path, legacy(body, {"0": RAW, "1": RAW}))
+    assert "disagree" in read_error(tmp_path, legacy(body, FLOATS, counts={"0": 11}))
+    assert "disagree" in read_error(tmp_path, legacy(body, FLOATS, counts={"0": -1}))
+    assert "truncated" in read_error(tmp_path, legacy(body, FLOATS)[:-1])
+    assert "not in the file" in read_error(tmp_path, legacy(body, {}))
+    assert "no tensor uses" in read_error(tmp_path, legacy(body, {"0": RAW, "1": RAW}))
     big = mapping({"V": tensor(storage("0", 2**27), (1,), (1,))})
-    assert "truncated" in refusal(tmp_path, legacy(big, FLOATS, counts={"0": 2**27}))
+    assert "truncated" in read_error(tmp_path, legacy(big, FLOATS, counts={"0": 2**27}))
     twice = mapping({"V": tensor(STORED, (1,), (1,)), "W": tensor(storage("0", 6, "Double"), (1,), (1,))})
-    assert "two ways" in refusal(tmp_path, legacy(twice, FLOATS))
-    assert "little-endian" in refusal(tmp_path, legacy(body, FLOATS, little=False))
-    assert refusal(tmp_path, b"")
-    assert refusal(tmp_path, b"\x80\x02}." * 5)
+    assert "two ways" in read_error(tmp_path, legacy(twice, FLOATS))
+    assert "little-endian" in read_error(tmp_path, legacy(body, FLOATS, little=False))
+    assert read_error(tmp_path, b"")
+    assert read_error(tmp_path, b"\x80\x02}." * 5)
 
 
-def test_small_files_cannot_claim_all_memory(tmp_path):
+def test_small_files_cannot_exhaust_the_memory(tmp_path):
     bodies = [
-        b"r\xff\xff\xff\x7f.",  # a memo of two thousand million entries
+        b"r\xff\xff\xff\x7f.",  # a memo of 2³¹ entries
         b"\x8e" + (2**62).to_bytes(8, "little") + b".",
         b"\x80\x04\x95" + (2**62).to_bytes(8, "little") + b".",
         integer(2**40) + b"\x85" * 190_000 + b".",
     ]
     tracemalloc.start()
     for body in bodies:
-        refusal(tmp_path, legacy(body, {}))
+        read_error(tmp_path, legacy(body, {}))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**26
@@ -200,22 +200,22 @@ def test_small_files_cannot_claim_all_memory(tmp_path):
 def test_zip_files_are_checked(tmp_path):
     path = tmp_path / "hostile.pt"
     whole = write_zip(path, {"V": np.zeros(1000, "<f4")}).read_bytes()
-    assert "damaged" in refusal(tmp_path, whole[:-40])
+    assert "damaged" in read_error(tmp_path, whole[:-40])
     flipped = bytearray(whole)
     flipped[whole.index(b"\0" * 1000) + 500] ^= 1
-    assert "damaged" in refusal(tmp_path, bytes(flipped))
-    assert "compressed" in refusal(
+    assert "damaged" in read_error(tmp_path, bytes(flipped))
+    assert "compressed" in read_error(
         tmp_path, write_zip(path, {"V": np.zeros(9)}, compression=zipfile.ZIP_DEFLATED).read_bytes()
     )
     np.savez(tmp_path / "plain.npz", V=np.zeros(3))
-    assert "data.pkl" in refusal(tmp_path, (tmp_path / "plain.npz").read_bytes())
+    assert "data.pkl" in read_error(tmp_path, (tmp_path / "plain.npz").read_bytes())
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a/data.pkl", mapping({"V": tensor(storage("../../etc", 2, tail=b""), (1,), (1,))}))
-    assert "../../etc" in refusal(tmp_path, path.read_bytes())  # a name in the archive, never a path
+    assert "../../etc" in read_error(tmp_path, path.read_bytes())  # a name in the archive is not used as a path
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a/data.pkl", mapping({"V": tensor(storage("0", 3, tail=b""), (1,), (1,))}))
         archive.writestr("a/data/0", b"\0" * 8)
-    assert "truncated" in refusal(tmp_path, path.read_bytes())
+    assert "truncated" in read_error(tmp_path, path.read_bytes())
 
 
 def test_missing_files_and_folders(tmp_path):
@@ -226,8 +226,8 @@ def test_missing_files_and_folders(tmp_path):
 
 @settings(max_examples=300, deadline=None)
 @given(data=st.data())
-def test_any_damage_is_one_error_or_none(tmp_path_factory, data):
-    """Whatever happens to the bytes: arrays within the file, or an InputError; nothing else."""
+def test_damaged_bytes_give_arrays_or_an_input_error(tmp_path_factory, data):
+    """For any damage, the reader returns arrays no larger than the file or raises InputError."""
     path = tmp_path_factory.mktemp("fuzz") / "a.pt"
     write = data.draw(st.sampled_from([write_legacy, write_zip]))
     content = bytearray(write(path, {"V": np.ones((4, 3), "<f4"), "F": np.array([[0, 1, 2]])}).read_bytes())
@@ -235,7 +235,7 @@ def test_any_damage_is_one_error_or_none(tmp_path_factory, data):
         content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
     path.write_bytes(content[: data.draw(st.sampled_from([len(content), len(content) // 2]))])
     try:
-        found = read_tensors(path)
+        tensors = read_tensors(path)
     except InputError:
         return
-    assert sum(array.nbytes for array in found.values()) <= 2 * len(content)
+    assert sum(array.nbytes for array in tensors.values()) <= 2 * len(content)

@@ -1,4 +1,4 @@
-"""Curvature bounds each term, and the derivatives that it is made of are those that JAX finds."""
+"""The quadratic of a curvature bounds its term, and its derivatives agree with automatic differentiation."""
 
 import dataclasses
 
@@ -33,30 +33,28 @@ def moved(pose, rows):
 
 @jax.jit
 def along(rows, pose, targets):
-    """Each curved term after a change by `rows`, three times over for its weight."""
+    """Each term with curvature after a change of the pose by `rows`, times 3 for its weight."""
     window = terms_by_hand.posed_window(moved(pose, rows), targets)
     return {name: 3.0 * find_term(name).function(window, **find_term(name).settings) for name in CURVED}
 
 
 @jax.jit
 def curvatures(rows, pose, targets):
-    """For each term H·rows, H itself, and the diagonal it tells."""
-    window, units = (
-        terms_by_hand.posed_window(pose, targets),
-        jnp.eye(terms_by_hand.T * D).reshape(-1, terms_by_hand.T, D),
-    )
-    found = {}
+    """For each term: H·rows, the matrix H, and the diagonal that the curvature returns."""
+    window = terms_by_hand.posed_window(pose, targets)
+    units = jnp.eye(terms_by_hand.T * D).reshape(-1, terms_by_hand.T, D)
+    results = {}
     for name in CURVED:
         H = evaluate_curvature(window, find_terms([name]), settings(name))
-        found[name] = H.product(rows), jax.vmap(H.product)(units).reshape(terms_by_hand.T * D, -1), H.diagonal
-    return found
+        results[name] = H.product(rows), jax.vmap(H.product)(units).reshape(terms_by_hand.T * D, -1), H.diagonal
+    return results
 
 
 def change(seed, size):
     return jnp.asarray(size * np.random.default_rng(seed).normal(size=(terms_by_hand.T, D)), jnp.float32)
 
 
-def test_the_paper_has_curvature():
+def test_the_terms_of_the_paper_without_masks_have_curvature():
     assert {"keypoints", "pose_prior", "velocity", "acceleration"} <= set(CURVED)
 
 
@@ -67,25 +65,25 @@ def test_right_jacobian(theta):
     dR = np.asarray(jax.jacfwd(axis_angle_to_matrix)(jnp.asarray(r)), np.float64)
     for k in range(3):
         spin = R.T @ dR[..., k]  # skew-symmetric
-        found = [spin[2, 1], spin[0, 2], spin[1, 0]]
-        np.testing.assert_allclose(right_jacobian(jnp.asarray(r))[:, k], found, atol=2e-5)
+        actual = [spin[2, 1], spin[0, 2], spin[1, 0]]
+        np.testing.assert_allclose(right_jacobian(jnp.asarray(r))[:, k], actual, atol=2e-5)
 
 
 def test_keypoint_jacobian():
-    pose, targets = terms_by_hand.window_pose(), terms_by_hand.seen()
-    assert np.abs(pose.betas).max() > 0.1, "shape must count"
+    pose, targets = terms_by_hand.window_pose(), terms_by_hand.random_targets()
+    assert np.abs(pose.betas).max() > 0.1, "the test needs a shape other than the mean"
 
     def points(rows):
         return terms_by_hand.posed_window(moved(pose, rows), targets).keypoints_px.reshape(terms_by_hand.T, -1)
 
     expected = jax.jit(jax.jacfwd(points))(jnp.zeros((terms_by_hand.T, D)))
     by_angles, by_place = jax.jit(lambda: terms_by_hand.posed_window(pose, targets).keypoint_jacobian_px)()
-    found = jnp.concatenate([by_angles, by_place], axis=-1)
+    actual = jnp.concatenate([by_angles, by_place], axis=-1)
     for t in range(terms_by_hand.T):
-        np.testing.assert_allclose(found[t], expected[t, :, t], rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+        np.testing.assert_allclose(actual[t], expected[t, :, t], rtol=1e-3, atol=1e-3 * np.abs(expected).max())
 
 
-def test_rows_are_a_pose_frame_by_frame():
+def test_frame_rows():
     pose, rows = terms_by_hand.window_pose(), change(0, 1.0)
     np.testing.assert_allclose(frame_rows(moved(pose, rows)) - frame_rows(pose), rows, atol=3e-5)
     common = dataclasses.replace(pose, scale=jnp.array([1.5]))
@@ -93,9 +91,9 @@ def test_rows_are_a_pose_frame_by_frame():
 
 
 @pytest.mark.parametrize("name", CURVED)
-def test_products_and_diagonal_are_of_one_matrix(name):
+def test_product_and_diagonal_belong_to_one_positive_semidefinite_matrix(name):
     rows = change(1, 1.0)
-    product, H, diagonal = curvatures(rows, terms_by_hand.window_pose(), terms_by_hand.seen())[name]
+    product, H, diagonal = curvatures(rows, terms_by_hand.window_pose(), terms_by_hand.random_targets())[name]
     scale = np.abs(H).max()
     np.testing.assert_allclose(product.ravel(), H @ rows.ravel(), atol=1e-4 * scale)
     np.testing.assert_allclose(diagonal.ravel(), np.diagonal(H), atol=1e-5 * scale)
@@ -105,7 +103,7 @@ def test_products_and_diagonal_are_of_one_matrix(name):
 
 @pytest.mark.parametrize("name", ["pose_prior", "velocity", "acceleration"])
 def test_the_quadratic_is_above_the_term(name):
-    pose, targets = terms_by_hand.window_pose(), terms_by_hand.seen()
+    pose, targets = terms_by_hand.window_pose(), terms_by_hand.random_targets()
     still = jnp.zeros((terms_by_hand.T, D))
     value = along(still, pose, targets)[name]
     gradient = jax.grad(lambda rows: along(rows, pose, targets)[name])(still)
@@ -119,9 +117,9 @@ def test_the_quadratic_is_above_the_term(name):
             assert after == pytest.approx(float(bound), rel=1e-4)
 
 
-def test_keypoints_bound_is_that_of_the_reweighted_errors():
-    """H = JᵀWJ, and the weighted squares touch Geman-McClure from above."""
-    pose, targets = terms_by_hand.window_pose(), terms_by_hand.seen()
+def test_keypoint_curvature_is_reweighted_least_squares():
+    """H = JᵀWJ, and the weighted squares are an upper bound of Geman-McClure."""
+    pose, targets = terms_by_hand.window_pose(), terms_by_hand.random_targets()
     window, sigma = terms_by_hand.posed_window(pose, targets), 50.0
     J = np.concatenate(window.keypoint_jacobian_px, axis=-1)
     e = np.asarray(window.keypoints_px - targets.keypoints_px, np.float64)
@@ -140,13 +138,13 @@ def test_keypoints_bound_is_that_of_the_reweighted_errors():
         expected = 3.0 * J[t].T @ (weight[t].reshape(-1, 1) * J[t])
         np.testing.assert_allclose(H[t, :, t], expected, atol=1e-4 * np.abs(expected).max())
         H = H.at[t, :, t].set(0)
-    assert not np.any(H), "frames have nothing to do with each other here"
+    assert not np.any(H), "the keypoint term does not couple frames"
 
 
 @pytest.mark.parametrize("name", CURVED)
 @pytest.mark.parametrize("missing", range(terms_by_hand.T))
-def test_missing_frames_pull_at_nothing(name, missing):
-    targets = terms_by_hand.without(terms_by_hand.seen(), missing)
+def test_missing_frames_have_no_curvature(name, missing):
+    targets = terms_by_hand.without_frame(terms_by_hand.random_targets(), missing)
     _, H, diagonal = curvatures(change(0, 1.0), terms_by_hand.window_pose(), targets)[name]
     H = H.reshape(terms_by_hand.T, D, terms_by_hand.T, D)
     assert not np.any(H[missing])
@@ -154,11 +152,11 @@ def test_missing_frames_pull_at_nothing(name, missing):
     assert not np.any(diagonal[missing])
 
 
-def test_frames_that_are_equal_have_finite_curvature():
+def test_equal_frames_have_finite_curvature():
     pose = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), terms_by_hand.window_pose())
     pose = dataclasses.replace(
         pose, bone_length=terms_by_hand.window_pose().bone_length, betas=terms_by_hand.window_pose().betas
     )
-    for name, (_, H, _) in curvatures(change(0, 1.0), pose, terms_by_hand.seen()).items():
+    for name, (_, H, _) in curvatures(change(0, 1.0), pose, terms_by_hand.random_targets()).items():
         assert np.isfinite(H).all(), name
         assert np.abs(H).max() > 0

@@ -1,4 +1,4 @@
-"""Terms are found by name, entry point or path; what is no term is refused with a reason."""
+"""find_term returns terms by name, entry point or path, and rejects other functions with a reason."""
 
 import importlib
 import sys
@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
-from support.terms_by_hand import posed_window, seen, window_pose
+from support.terms_by_hand import posed_window, random_targets, window_pose
 
 import jaxfit
 from jaxfit.errors import InputError
@@ -40,7 +40,7 @@ def weighs(window, *, weight=1.0): return 0.0
 
 @pytest.fixture(autouse=True)
 def own_registry(monkeypatch):
-    """What a test registers goes with it."""
+    """Terms that a test registers are removed after the test."""
     monkeypatch.setattr(registry, "_terms", dict(registry._terms))
 
 
@@ -68,7 +68,7 @@ def test_a_term_of_this_session():
     pose = window_pose()
     settings = {"stillness": {"weight": 3.0, "beta": 0.5}}
     expected = 1.5 * float(jnp.sum(pose.body_pose**2))
-    total = weighted_sum(posed_window(pose, seen()), find_terms(settings), settings)
+    total = weighted_sum(posed_window(pose, random_targets()), find_terms(settings), settings)
     assert float(total) == pytest.approx(expected, rel=1e-5)
 
 
@@ -78,7 +78,7 @@ def test_a_term_that_is_registered_again_is_compiled_again_and_nothing_else_is()
     @eqx.filter_jit
     def total(pose, terms):
         traces.append(None)
-        return weighted_sum(posed_window(pose, seen()), terms, {name: {"weight": 1.0} for name in terms})
+        return weighted_sum(posed_window(pose, random_targets()), terms, {name: {"weight": 1.0} for name in terms})
 
     pose = window_pose()
     total(pose, find_terms(["pose_prior"]))
@@ -93,7 +93,7 @@ def test_a_term_that_is_registered_again_is_compiled_again_and_nothing_else_is()
     assert len(traces) == 3  # pose_prior once, `again` twice
 
 
-def test_names_are_taken_once():
+def test_another_module_cannot_use_the_name_of_a_term():
     def velocity(window):
         return 0.0
 
@@ -116,11 +116,11 @@ def test_by_path(package):
     assert "marked" in known_terms()
     pose = window_pose()
     settings = {"own_priors:plain": {"weight": 1.0, "power": 1.0}}
-    value = evaluate_terms(posed_window(pose, seen()), find_terms(settings), settings)
+    value = evaluate_terms(posed_window(pose, random_targets()), find_terms(settings), settings)
     assert float(value["own_priors:plain"]) == pytest.approx(float(jnp.abs(pose.body_pose).sum()), rel=1e-5)
 
 
-def test_a_module_that_is_edited(package):
+def test_a_reloaded_module_replaces_its_terms(package):
     assert find_term("own_priors:plain").settings == {"power": 2.0}
     (package / "own_priors.py").write_text("def plain(window, *, changed=7.25):\n    return 0.0\n")
     importlib.invalidate_caches()
@@ -138,7 +138,7 @@ def test_by_entry_point(package, monkeypatch):
     monkeypatch.setattr(registry.metadata, "entry_points", entry_points)
     assert "cosy" in known_terms()
     assert find_term("cosy").settings == {"power": 2.0}
-    assert find_term("velocity").function.__module__ == "jaxfit.objective.temporal"  # the library's own stays
+    assert find_term("velocity").function.__module__ == "jaxfit.objective.temporal"  # jaxfit's own term has priority
     assert known_terms().count("velocity") == 1
 
 
@@ -161,7 +161,7 @@ def test_by_entry_point(package, monkeypatch):
         ("own_priors:", ("has no function",)),
     ],
 )
-def test_what_is_no_term(package, path, words):
+def test_objects_that_are_not_terms_are_rejected(package, path, words):
     with pytest.raises(InputError) as caught:
         find_term(path)
     for word in (repr(path), *words):
@@ -188,10 +188,10 @@ def test_unknown_names():
 def test_a_term_is_one_real_number(returned, said):
     term(name="odd")(lambda window: returned())
     with pytest.raises(InputError, match=rf"term 'odd': returned .*{said}"):
-        evaluate_terms(posed_window(window_pose(), seen()), find_terms(["odd"]), {"odd": {"weight": 1.0}})
+        evaluate_terms(posed_window(window_pose(), random_targets()), find_terms(["odd"]), {"odd": {"weight": 1.0}})
 
 
-def test_a_sweep_over_a_term_of_ones_own_compiles_once():
+def test_a_sweep_over_a_custom_term_compiles_once():
     traces = []
 
     @term(name="counted")
@@ -202,7 +202,9 @@ def test_a_sweep_over_a_term_of_ones_own_compiles_once():
     pose, counted = window_pose(), find_terms(["counted"])
 
     def objective(weight, power):
-        return weighted_sum(posed_window(pose, seen()), counted, {"counted": {"weight": weight, "power": power}})
+        return weighted_sum(
+            posed_window(pose, random_targets()), counted, {"counted": {"weight": weight, "power": power}}
+        )
 
     sweep = jax.jit(jax.vmap(objective))
     found = sweep(jnp.array([1.0, 2.0, 1.0]), jnp.array([1.0, 1.0, 2.0]))

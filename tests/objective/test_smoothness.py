@@ -1,7 +1,6 @@
-"""Terms beyond the paper: against scipy, at their corners, and where frames are missing."""
+"""Terms for smooth and plausible motion: against scipy, at non-differentiable points, and with missing frames."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -11,34 +10,15 @@ from jax.test_util import check_grads
 from scipy.fft import dct
 from scipy.spatial.transform import Rotation
 from support.birds import toy_bird
-from support.terms_by_hand import CAMERA, RASTER, seen, window_pose
+from support.terms_by_hand import CAMERA, RASTER, random_motion, random_targets, term_value, window_pose
 
 from jaxfit.errors import InputError
 from jaxfit.model.kinematics import fold_bird
-from jaxfit.model.rotation import axis_angle_to_matrix
-from jaxfit.objective.anatomy import feet_on_ground, joint_limits
+from jaxfit.objective.plausibility import feet_on_ground, joint_limits
 from jaxfit.objective.posed_window import PosedWindow, priors_of
 from jaxfit.objective.smoothness import geodesic_velocity, huber, huber_velocity, low_pass
 
 BONES, L = 4, 8
-
-
-def window(frames=L, seed=0, missing=(), spread=1.0):
-    rng = np.random.default_rng(seed)
-    present = np.ones(frames, bool)
-    present[list(missing)] = False
-    return spread * rng.normal(size=(frames, 3)), spread * rng.normal(size=(frames, BONES, 3)), present
-
-
-def value(term, orient, body, present, **settings):
-    orient, body = jnp.asarray(orient, jnp.float32), jnp.asarray(body, jnp.float32)
-    window = SimpleNamespace(
-        pose=SimpleNamespace(global_orient=orient, body_pose=body),
-        R_camera_root=axis_angle_to_matrix(orient),
-        R_parent_child=axis_angle_to_matrix(body),
-        present=jnp.asarray(present),
-    )
-    return term(window, **settings)
 
 
 def angle(a, b):
@@ -51,23 +31,24 @@ def huber_by_hand(x, delta):
 
 def by_hand(term, orient, body, present, beta_global, beta_pose, **settings):
     if term is low_pass:
-        return beta_global * fast(orient, present, **settings) + beta_pose * fast(
-            body.reshape(len(body), -1), present, **settings
+        flat = body.reshape(len(body), -1)
+        return beta_global * fast_energy(orient, present, **settings) + beta_pose * fast_energy(
+            flat, present, **settings
         )
     total = 0.0
     for i in range(len(orient) - 1):
         if present[i] and present[i + 1]:
-            turned, bent = angle(orient[i], orient[i + 1]), angle(body[i], body[i + 1])
+            root, joints = angle(orient[i], orient[i + 1]), angle(body[i], body[i + 1])
             if term is geodesic_velocity:
-                total += beta_global * turned + beta_pose * np.sqrt((bent**2).sum())
+                total += beta_global * root + beta_pose * np.sqrt((joints**2).sum())
             else:
                 delta = settings["delta_rad"]
-                total += beta_global * huber_by_hand(turned, delta) + beta_pose * huber_by_hand(bent, delta).sum()
+                total += beta_global * huber_by_hand(root, delta) + beta_pose * huber_by_hand(joints, delta).sum()
     return total
 
 
-def fast(x, present, cutoff_cycles_per_frame):
-    """Energy above the cut-off of a trajectory whose gaps are filled by numpy."""
+def fast_energy(x, present, cutoff_cycles_per_frame):
+    """Energy above the cut-off frequency, with missing frames interpolated by NumPy."""
     at = np.flatnonzero(present)
     if not len(at):
         return 0.0
@@ -86,25 +67,25 @@ CASES = [
 @pytest.mark.parametrize(("term", "own"), CASES)
 @pytest.mark.parametrize("missing", [(), (0,), (3,), (2, 3, 7), range(L), range(1, L)])
 def test_by_hand(term, own, missing):
-    case = window(missing=missing)
+    case = random_motion(L, missing=missing)
     own = own | {"beta_global": 3.0, "beta_pose": 0.5}
     expected = by_hand(term, *case, **own)
-    assert float(value(term, *case, **own)) == pytest.approx(expected, rel=2e-5, abs=1e-6)
+    assert float(term_value(term, *case, **own)) == pytest.approx(expected, rel=2e-5, abs=1e-6)
 
 
 @pytest.mark.parametrize(("term", "own"), CASES)
-def test_one_frame_does_not_move(term, own):
-    assert float(value(term, *window(1), **own)) == 0
-    assert float(value(term, *window(2), **own)) > 0
+def test_a_window_of_one_frame_has_the_value_zero(term, own):
+    assert float(term_value(term, *random_motion(1), **own)) == 0
+    assert float(term_value(term, *random_motion(2), **own)) > 0
 
 
 @pytest.mark.parametrize(("term", "own"), CASES)
-def test_a_missing_frame_may_hold_anything(term, own):
-    orient, body, present = window(missing=(3, 4))
-    expected = float(value(term, orient, body, present, **own))
+def test_the_pose_of_a_missing_frame_has_no_effect(term, own):
+    orient, body, present = random_motion(L, missing=(3, 4))
+    expected = float(term_value(term, orient, body, present, **own))
     orient[3], body[4] = 1e3, -1e3
-    assert float(value(term, orient, body, present, **own)) == expected
-    gradient = jax.grad(lambda body: value(term, orient, body, present, **own))(jnp.asarray(body, jnp.float32))
+    assert float(term_value(term, orient, body, present, **own)) == expected
+    gradient = jax.grad(lambda body: term_value(term, orient, body, present, **own))(jnp.asarray(body, jnp.float32))
     np.testing.assert_array_equal(gradient[3:5], 0)
     assert np.abs(gradient[:3]).max() > 0
 
@@ -123,7 +104,7 @@ CORNERS = {
 def test_gradients_are_finite_at_corners(term, own, corner):
     orient = jnp.asarray(CORNERS[corner], jnp.float32)
     body = jnp.broadcast_to(orient[:, None], (L, BONES, 3))
-    gradients = jax.grad(lambda *pose: value(term, *pose, np.ones(L, bool), **own), (0, 1))(orient, body)
+    gradients = jax.grad(lambda *pose: term_value(term, *pose, np.ones(L, bool), **own), (0, 1))(orient, body)
     for gradient in gradients:
         assert np.isfinite(gradient).all()
         if corner in ("equal frames", "zero rotation"):
@@ -132,75 +113,78 @@ def test_gradients_are_finite_at_corners(term, own, corner):
 
 @pytest.mark.parametrize(("term", "own"), CASES)
 def test_gradients_are_right(term, own):
-    orient, body, present = window(missing=(2,), spread=0.4)
+    orient, body, present = random_motion(L, missing=(2,), spread=0.4)
     own = {name: jnp.float32(setting) for name, setting in own.items()}
 
     def total(orient, body, own):
-        return value(term, orient, body, present, **own) / 10
+        return term_value(term, orient, body, present, **own) / 10
 
     at = (jnp.asarray(orient, jnp.float32), jnp.asarray(body, jnp.float32), own)
     check_grads(total, at, order=1, modes=["rev"], eps=1e-3, atol=0.02, rtol=0.02)
 
 
-def test_geodesic_velocity_does_not_see_how_a_rotation_is_written():
-    """A full turn more is the same rotation; the paper's velocity sees a jump of 2π."""
-    orient, body, present = window(spread=0.3)
+def test_velocity_on_rotations_ignores_full_turns_of_the_axis_angle():
+    """Axis-angles that differ by a full turn are the same rotation; `velocity` would count a jump of 2π."""
+    orient, body, present = random_motion(L, spread=0.3)
     again = orient.copy()
     again[4:] += 2 * np.pi * orient[4:] / np.linalg.norm(orient[4:], axis=1, keepdims=True)
     for term, own in ((geodesic_velocity, {}), (huber_velocity, {})):
-        before, after = (float(value(term, o, body, present, **own)) for o in (orient, again))
+        before, after = (float(term_value(term, o, body, present, **own)) for o in (orient, again))
         assert after == pytest.approx(before, rel=1e-4)
 
 
-def test_huber_lets_a_wingbeat_be():
-    """The pull on one joint grows with its speed up to δ, whatever the other joints do."""
+def test_huber_limits_the_gradient_of_fast_joints():
+    """The gradient of one joint grows with its speed up to δ, independently of the other joints."""
 
-    def pull(speed, others):
+    def gradient(speed, others):
         body = np.zeros((2, BONES, 3))
         body[1, 0, 0], body[1, 1:, 1] = speed, others
-        slope = jax.grad(lambda body: value(huber_velocity, np.zeros((2, 3)), body, np.ones(2, bool), delta_rad=0.1))
+        slope = jax.grad(
+            lambda body: term_value(huber_velocity, np.zeros((2, 3)), body, np.ones(2, bool), delta_rad=0.1)
+        )
         return float(slope(jnp.asarray(body, jnp.float32))[1, 0, 0])
 
     for others in (0.0, 0.5):
-        assert pull(0.02, others) == pytest.approx(0.02, rel=1e-3)
-        assert pull(0.4, others) == pytest.approx(0.1, rel=1e-3)
-        assert pull(1.5, others) == pytest.approx(0.1, rel=1e-3)
+        assert gradient(0.02, others) == pytest.approx(0.02, rel=1e-3)
+        assert gradient(0.4, others) == pytest.approx(0.1, rel=1e-3)
+        assert gradient(1.5, others) == pytest.approx(0.1, rel=1e-3)
     np.testing.assert_allclose(huber(jnp.array([0.0, 1.0, 3.0]), 1.0), [0, 0.5, 2.5])
 
 
-def test_low_pass_parts_slow_from_fast():
+def test_low_pass_separates_slow_from_fast_motion():
     t = np.arange(60) + 0.5
     body = np.zeros((60, BONES, 3))
 
     def energy(cycles_per_frame):
         orient = np.cos(2 * np.pi * cycles_per_frame * t)[:, None] * [0.1, 0, 0]
-        return float(value(low_pass, orient, body, np.ones(60, bool), cutoff_cycles_per_frame=0.15))
+        return float(term_value(low_pass, orient, body, np.ones(60, bool), cutoff_cycles_per_frame=0.15))
 
     whole = 60 * 0.1**2 / 2
     assert energy(0.05) < 1e-3 * whole
     assert energy(0.15) == pytest.approx(whole / 2, rel=1e-3)
     assert energy(0.4) == pytest.approx(whole, rel=1e-2)
     still = np.full((60, 3), 2.0)
-    assert float(value(low_pass, still, body, np.ones(60, bool))) < 1e-9
+    assert float(term_value(low_pass, still, body, np.ones(60, bool))) < 1e-9
 
 
 LIMITED = toy_bird()
 LIMITED = replace(LIMITED, joint_limits=jnp.broadcast_to(jnp.array([-0.2, 0.5]), (7, 3, 2)))
 
 
-def real_scene(bird, pose, targets):
+def make_window(bird, pose, targets):
+    """A posed window with the priors of `bird`, whose anchor is the pose itself."""
     return PosedWindow(pose, pose, targets, fold_bird(bird), priors_of(bird), CAMERA, RASTER)
 
 
 def test_joint_limits():
-    pose, targets = window_pose(), seen()
+    pose, targets = window_pose(), random_targets()
     flat = jnp.zeros_like(pose.body_pose)
     inside = flat.at[0, 0, 0].set(0.5).at[1, 3, 2].set(-0.2)
     outside = inside.at[0, 0, 0].set(0.8).at[1, 3, 2].set(-0.4).at[2, 6, 1].set(2.5)
 
     def limits(body, targets=targets):
         moved = replace(pose, body_pose=body)
-        return joint_limits(real_scene(LIMITED, moved, targets))
+        return joint_limits(make_window(LIMITED, moved, targets))
 
     assert float(limits(inside)) == 0
     assert float(limits(outside)) == pytest.approx(0.3**2 + 0.2**2 + 2.0**2, rel=1e-5)
@@ -210,30 +194,30 @@ def test_joint_limits():
     assert float(slope[2, 6, 1]) == pytest.approx(4.0, rel=1e-5)
     assert np.count_nonzero(slope) == 3
     with pytest.raises(InputError, match="no joint limits"):
-        joint_limits(real_scene(toy_bird(), pose, targets))
+        joint_limits(make_window(toy_bird(), pose, targets))
 
 
-def test_feet_that_stand_and_feet_that_step():
-    """The same bird in a crop that moves: standing where the image shows it standing, sliding where it does not."""
+def test_feet_on_ground():
+    """A constant pose in a moving crop slides in the world; a constant pose in a static crop stands."""
     bird = toy_bird()
     one = window_pose()
     still = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), one)
     still = replace(still, bone_length=one.bone_length, betas=one.betas)
     corner = jnp.array([[0.0, 0.0], [3.0, -1.0], [6.0, 0.0]])
-    targets = seen()
+    targets = random_targets()
     targets = replace(targets, corner_px=corner)
-    feet = list(real_scene(bird, still, targets).keypoint_indices("left_foot", "right_foot"))
-    z = np.asarray(real_scene(bird, still, targets).keypoints_cam[0, feet, 2])
-    # what a still bird in the crop slides by in the world, where the crop moves by these pixels
+    feet = list(make_window(bird, still, targets).keypoint_indices("left_foot", "right_foot"))
+    z = np.asarray(make_window(bird, still, targets).keypoints_cam[0, feet, 2])
+    # displacement in the world of a bird at rest in the crop, if the crop moves by these pixels
     d = np.hypot([3.0, 3.0], [1.0, 1.0])[:, None] * z / CAMERA.focal_px
     expected = (0.25 * d**2 / (0.25 + d**2)).sum()
-    assert float(feet_on_ground(real_scene(bird, still, targets))) == pytest.approx(expected, rel=1e-3)
+    assert float(feet_on_ground(make_window(bird, still, targets))) == pytest.approx(expected, rel=1e-3)
     fixed = replace(targets, corner_px=jnp.zeros((3, 2)) + 7.0)
-    assert float(feet_on_ground(real_scene(bird, still, fixed))) == 0
+    assert float(feet_on_ground(make_window(bird, still, fixed))) == 0
     far = replace(still, transl=still.transl + jnp.array([[0, 0, 0], [40.0, 0, 0], [80.0, 0, 0]]))
-    slope = jax.grad(lambda pose: feet_on_ground(real_scene(bird, pose, fixed)))(far).transl
-    assert np.abs(slope).max() < 1e-4, "a long step is let go"
+    slope = jax.grad(lambda pose: feet_on_ground(make_window(bird, pose, fixed)))(far).transl
+    assert np.abs(slope).max() < 1e-4, "long steps must have hardly any gradient"
     names = tuple("foot" if "foot" in name else name for name in bird.keypoint_names)
     footless = replace(bird, keypoint_names=names)
     with pytest.raises(InputError, match=r"no keypoint 'left_foot'.*bill_tip"):
-        feet_on_ground(real_scene(footless, still, fixed))
+        feet_on_ground(make_window(footless, still, fixed))

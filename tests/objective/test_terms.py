@@ -1,4 +1,4 @@
-"""Every term against its equation in NumPy; settings are traced; what was not seen pulls at nothing."""
+"""Every term agrees with its equation in NumPy; settings are traced; missing observations have no effect."""
 
 import dataclasses
 import functools
@@ -23,10 +23,10 @@ from support.terms_by_hand import (
     every_term,
     oracle,
     posed_window,
-    seen,
+    random_targets,
     soft_silhouettes,
     window_pose,
-    without,
+    without_frame,
 )
 
 from jaxfit.model.rotation import safe_norm
@@ -37,8 +37,8 @@ from jaxfit.objective.terms import geman_mcclure, pose_prior
 
 
 @pytest.mark.parametrize("seed", [0, 10])
-def test_every_term_is_its_equation(seed):
-    pose, start, targets = window_pose(seed), window_pose(seed + 50), seen(seed)
+def test_every_term_agrees_with_its_equation(seed):
+    pose, start, targets = window_pose(seed), window_pose(seed + 50), random_targets(seed)
     values = every_term(pose, start, targets, all_settings())
     assert set(values) == set(TERMS)
     for name, value in values.items():
@@ -52,21 +52,21 @@ def test_stored_geman_mcclure_and_mahalanobis(reference_dir):
         value = geman_mcclure(jnp.asarray(stored["geman_mcclure/residual"]), 50.0)
         np.testing.assert_allclose(value, stored["geman_mcclure/value"], rtol=1e-6)
         poses, expected = stored["pose_prior/body_pose"], stored["pose_prior/squared_mahalanobis"]
-    from jaxfit.model.importers.sources import import_sources
+    from jaxfit.model.importers.import_model import import_model
 
-    priors = priors_of(import_sources("avian-mesh", [reference_dir / "models" / "avian_mesh"]))
+    priors = priors_of(import_model("avian-mesh", [reference_dir / "models" / "avian_mesh"]))
     for body_pose, distance in zip(poses, expected, strict=True):
         pose = dataclasses.replace(window_pose(), body_pose=jnp.asarray(body_pose.reshape(1, -1, 3)))
-        targets = dataclasses.replace(seen(), present=jnp.ones(1, bool))
+        targets = dataclasses.replace(random_targets(), present=jnp.ones(1, bool))
         value = pose_prior(PosedWindow(pose, pose, targets, RIG, priors, CAMERA, RASTER))
         assert float(value) == pytest.approx(distance, rel=1e-4)
 
 
-def test_what_was_not_seen_pulls_at_nothing():
+def test_missing_observations_have_no_effect():
     pose, start = window_pose(), window_pose(50)
-    targets = without(seen(), 1)
+    targets = without_frame(random_targets(), 1)
     results = every_gradient(pose, start, targets, all_settings())
-    # whatever stands in the absent frame
+    # the pose of the missing frame has no effect
     moved = dataclasses.replace(
         pose,
         global_orient=pose.global_orient.at[1].set(2.0),
@@ -79,15 +79,15 @@ def test_what_was_not_seen_pulls_at_nothing():
         assert float(again[name]) == pytest.approx(float(value), rel=1e-6), name
         for field in ("global_orient", "body_pose", "transl", "scale"):
             np.testing.assert_array_equal(getattr(gradient, field)[1], 0, err_msg=f"{name}: {field}")
-    # a keypoint of confidence 0 may stand anywhere
-    faint = dataclasses.replace(seen(), confidence=seen().confidence.at[0, 2].set(0))
+    # the position of a keypoint with confidence 0 has no effect
+    faint = dataclasses.replace(random_targets(), confidence=random_targets().confidence.at[0, 2].set(0))
     astray = dataclasses.replace(faint, keypoints_px=faint.keypoints_px.at[0, 2].set(1e4))
     both = [float(every_term(pose, start, e, all_settings())["keypoints"]) for e in (faint, astray)]
     assert both[0] == both[1]
 
 
-def test_a_frame_without_mask_is_not_compared():
-    pose, targets = window_pose(), seen()
+def test_mask_terms_skip_frames_without_mask():
+    pose, targets = window_pose(), random_targets()
     bare = dataclasses.replace(targets, has_mask=jnp.array([True, False, True]))
     value = float(every_term(pose, pose, bare, all_settings())["mask"])
     e = np.abs(soft_silhouettes(0) - np.asarray(targets.mask))
@@ -95,7 +95,7 @@ def test_a_frame_without_mask_is_not_compared():
 
 
 def edges():
-    pose = window_pose()
+    pose, targets = window_pose(), random_targets()
     still = jax.tree.map(lambda x: jnp.broadcast_to(x[:1], x.shape), pose)
     still = dataclasses.replace(still, bone_length=pose.bone_length, betas=jnp.zeros(2))
     rest = dataclasses.replace(
@@ -105,18 +105,18 @@ def edges():
         bone_length=PRIORS.bone_mean,
     )
     at_mean = dataclasses.replace(rest, body_pose=jnp.broadcast_to(BIRD.pose_mean.reshape(7, 3), (T, 7, 3)))
-    empty = dataclasses.replace(seen(), mask=jnp.zeros((T, SIZE, SIZE), jnp.uint8))
-    nothing = functools.reduce(without, range(T), seen())
+    empty = dataclasses.replace(targets, mask=jnp.zeros((T, SIZE, SIZE), jnp.uint8))
+    none_present = functools.reduce(without_frame, range(T), targets)
     return {
-        "equal frames": (still, seen()),
-        "zero rotation": (rest, seen()),
-        "at the prior's mean": (at_mean, seen()),
+        "equal frames": (still, targets),
+        "zero rotation": (rest, targets),
+        "at the prior's mean": (at_mean, targets),
         "empty mask": (pose, empty),
-        "out of the frame": (dataclasses.replace(pose, transl=pose.transl + jnp.array([900.0, 0, 0])), seen()),
-        "behind the camera": (dataclasses.replace(pose, transl=pose.transl * jnp.array([1, 1, -1.0])), seen()),
-        "at the camera": (dataclasses.replace(pose, transl=jnp.zeros((T, 3))), seen()),
-        "of no size": (dataclasses.replace(pose, scale=jnp.zeros(T)), seen()),
-        "nothing seen": (pose, nothing),
+        "out of the frame": (dataclasses.replace(pose, transl=pose.transl + jnp.array([900.0, 0, 0])), targets),
+        "behind the camera": (dataclasses.replace(pose, transl=pose.transl * jnp.array([1, 1, -1.0])), targets),
+        "at the camera": (dataclasses.replace(pose, transl=jnp.zeros((T, 3))), targets),
+        "scale 0": (dataclasses.replace(pose, scale=jnp.zeros(T)), targets),
+        "no observations": (pose, none_present),
     }
 
 
@@ -129,15 +129,15 @@ def test_finite_at_the_edges(edge):
             assert np.isfinite(leaf).all(), name
 
 
-SMOOTH = [n for n in TERMS if n not in ("mask", "mask_smooth_l1")]  # theirs stand beside the raster core's tests
+SMOOTH = [n for n in TERMS if n not in ("mask", "mask_smooth_l1")]  # tests/raster checks the gradients of masks
 
 
 def test_gradients_are_right():
     """Finite differences of the whole sum; weights bring every term to a similar size."""
-    pose, start, targets = window_pose(), window_pose(50), seen()
+    pose, start, targets = window_pose(), window_pose(50), random_targets()
     values = every_term(pose, start, targets, all_settings())
     settings = {name: {**all_settings()[name], "weight": 10.0 / float(values[name])} for name in SMOOTH}
-    settings["stage_anchor"]["weight"] *= 0.1  # its corners are no matter for finite differences
+    settings["stage_anchor"]["weight"] *= 0.1  # finite differences are wrong where an absolute value has its corner
 
     @jax.jit
     def total(orient, body, offset, scale, bones, betas):
@@ -164,7 +164,7 @@ def test_safe_norm():
 
 
 def test_the_sum_is_weighted():
-    pose, start, targets = window_pose(), window_pose(50), seen()
+    pose, start, targets = window_pose(), window_pose(50), random_targets()
     rng = np.random.default_rng(0)
     settings = {name: {**values, "weight": float(rng.uniform(0, 9))} for name, values in all_settings().items()}
     values = every_term(pose, start, targets, settings)
@@ -176,8 +176,8 @@ def test_the_sum_is_weighted():
 
 
 def test_settings_are_traced():
-    """Another weight or σ is no new program, and a sweep over them is one vmap."""
-    pose, targets, traces = window_pose(), seen(), []
+    """Another weight or σ needs no new program, and a sweep over weights and σ is one vmap."""
+    pose, targets, traces = window_pose(), random_targets(), []
     names = ("keypoints", "pose_prior", "velocity")
 
     def total(settings):
@@ -208,9 +208,9 @@ def test_settings_of_terms():
         find_term("unknown")
 
 
-def test_one_size_for_a_window():
-    """A common scale acts as the same scale in every frame."""
-    pose, targets = window_pose(), seen()
+def test_common_size():
+    """A common scale has the effect of the same scale in every frame."""
+    pose, targets = window_pose(), random_targets()
     common = dataclasses.replace(pose, scale=pose.scale[:1])
     spread = dataclasses.replace(pose, scale=jnp.broadcast_to(pose.scale[:1], (T,)))
     np.testing.assert_allclose(posed_window(common, targets).keypoints_px, posed_window(spread, targets).keypoints_px)
@@ -231,9 +231,9 @@ def test_whitened_priors():
 
 
 @pytest.mark.parametrize("name", TERMS)
-def test_terms_that_draw_the_silhouette_say_so(name):
-    """A term that is not marked gets empty masks; one that is marked in vain makes its stage slow."""
+def test_compares_masks_is_set_for_terms_that_draw_silhouettes(name):
+    """A term without the mark receives empty masks; an unnecessary mark makes a stage slow."""
     pose = window_pose()
-    one = posed_window(pose, seen())
+    one = posed_window(pose, random_targets())
     evaluate_terms(one, find_terms([name]), {name: {"weight": 1.0, **find_term(name).settings}})
     assert find_term(name).compares_masks == ("vertices_screen" in vars(one))

@@ -1,6 +1,7 @@
-"""A small bird, and what several tests need of it. Motion and detections come from `jaxfit.simulation`."""
+"""A small bird, its poses and results, and oracles for posing and masks. Simulated motion is in `jaxfit.simulation`."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from jaxfit.data.solution import Solution
-from jaxfit.model.bird import Bird, free_limits, neutral_colours
+from jaxfit.model.bird import Bird, neutral_colours, unlimited_joints
 from jaxfit.model.camera import Camera, crop_to_image, project
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
@@ -75,7 +76,7 @@ def toy_bird(shapes: int = 2) -> Bird:
         bone_mean=jnp.ones(bones),
         bone_covariance=0.01 * jnp.eye(bones),
         vertex_colours=jnp.asarray(neutral_colours(len(vertices))),
-        joint_limits=jnp.asarray(free_limits(bones)),
+        joint_limits=jnp.asarray(unlimited_joints(bones)),
         parents=tuple(-1 if part[0] is None else names.index(part[0]) for part in PARTS.values()),
         joint_names=names,
         keypoint_names=tuple(KEYPOINTS),
@@ -86,14 +87,14 @@ def toy_bird(shapes: int = 2) -> Bird:
 
 
 def exp_map(axis_angle):
-    """Rotation matrices by scipy: independent of the library's own."""
+    """Rotation matrices by scipy, independent of the library."""
     return Rotation.from_rotvec(axis_angle).as_matrix()
 
 
 def skin_by_hand(bird: Bird, pose: Pose):
-    """One frame posed joint by joint with 4×4 matrices in double precision: (V, 3), and the joints (J, 3).
+    """Pose one frame joint by joint with 4×4 matrices in double precision; vertices (V, 3) and joints (J, 3).
 
-    Everything is scaled before it is skinned, as avian-mesh's own code does it.
+    Vertices and joint offsets are scaled before skinning, as in the code of avian-mesh.
     """
     angles = np.concatenate([np.asarray(pose.global_orient)[None], np.asarray(pose.body_pose)])
     scale, bones = float(np.reshape(pose.scale, -1)[0]), [1.0, *np.asarray(pose.bone_length, np.float64)]
@@ -114,8 +115,32 @@ def skin_by_hand(bird: Bird, pose: Pose):
     return vertices + transl, posed + transl
 
 
+PUBLISHED_CASES = [("avian_mesh", 1.0), ("avian_mesh", 1.3), ("aves", 1.0)]
+"""Models and scales of `published_poses`."""
+
+
+def published_poses(reference_dir: Path, model: str, scale: float) -> list[tuple[Pose, np.ndarray, np.ndarray]]:
+    """Three poses, each with the vertices and keypoints that the code of the model's authors gives."""
+    prefix = f"{model}/scale_{scale}/"
+    with np.load(reference_dir / "reference" / "lbs.npz") as stored:
+        case = {name.removeprefix(prefix): stored[name] for name in stored.files if name.startswith(prefix)}
+    assert len(case["vertices"]) == 3
+    poses = [
+        Pose(
+            global_orient=jnp.asarray(case["global_orient"][i]),
+            body_pose=jnp.asarray(case["body_pose"][i].reshape(-1, 3)),
+            transl=jnp.zeros(3),
+            scale=jnp.float32(scale),
+            bone_length=jnp.asarray(case["bone_length"][i]),
+            betas=jnp.asarray(case["beta"][i]) if "beta" in case else jnp.zeros(0),
+        )
+        for i in range(3)
+    ]
+    return list(zip(poses, case["vertices"], case["keypoints"], strict=True))
+
+
 def random_pose(bird: Bird, seed: int, spread: float = 0.5) -> Pose:
-    """A pose of one frame in which nothing is at rest."""
+    """A pose of one frame in which every parameter differs from rest."""
     rng = np.random.default_rng(seed)
     bones = bird.num_joints - 1
 
@@ -140,10 +165,10 @@ def pose_window(bird: Bird, pose: Pose):
 
 
 def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> Solution:
-    """A result that holds windows of poses, a track each, as the default camera sees them in these crops.
+    """A result with one track per window of poses, projected by the default camera in the given crops.
 
-    `crop` is x0, y0, size for all, or (N, 1, 3), (N, T, 3). All is valid, in pictures of the crop's size; whatever
-    else a test wants it replaces.
+    `crop` is (x0, y0, size) for all frames, or an array (N, 1, 3) or (N, T, 3). All frames are valid, and the images
+    have the size of the crop camera. Tests replace other fields as required.
     """
     N, T = len(poses), len(poses[0].global_orient)
 
@@ -177,7 +202,7 @@ def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> So
 
 
 def filled_mask(vertices_px, faces, size: int) -> np.ndarray:
-    """Hard mask, triangle by triangle: the pixels whose centre lies in any. Independent of the raster core."""
+    """Hard mask of a mesh: pixels whose centre lies in any triangle. Independent of the raster core."""
     canvas = np.zeros((size, size), bool)
     for a, b, c in np.asarray(vertices_px, np.float64)[np.asarray(faces)]:
         low = np.clip(np.floor(np.min([a, b, c], axis=0)).astype(int), 0, size)

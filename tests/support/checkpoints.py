@@ -1,4 +1,4 @@
-"""PyTorch checkpoints written opcode by opcode, so that tests need no PyTorch and can lie in every field."""
+"""Write PyTorch checkpoints opcode by opcode: tests need no PyTorch and can put wrong values into every field."""
 
 import pickle
 import struct
@@ -39,7 +39,7 @@ def mapping(entries: dict[str, bytes]) -> bytes:
 
 
 def legacy(body: bytes, storages: dict[str, bytes], counts=None, little: bool = True) -> bytes:
-    """A whole legacy file; `storages` are raw float32 by key, `counts` overrides what they claim."""
+    """A complete legacy file; `storages` are raw float32 bytes by key, `counts` overrides their stated sizes."""
     head = [MAGIC, 1001, {"protocol_version": 1001, "little_endian": little, "type_sizes": {"int": 4}}]
     content = b"".join(pickle.dumps(part, 2) for part in head) + body + pickle.dumps(list(storages), 2)
     for key, raw in storages.items():

@@ -1,7 +1,8 @@
-"""Small scenes for the objective's tests, and every term by its equation in NumPy: the oracle."""
+"""Small windows for the tests of the objective, and an oracle: every term by its equation in NumPy."""
 
 import dataclasses
 import functools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from scipy.special import huber
 
 from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import fold_bird
+from jaxfit.model.rotation import axis_angle_to_matrix
 from jaxfit.objective.objective import evaluate_terms
 from jaxfit.objective.posed_window import PosedWindow, Raster, Targets, priors_of
 from jaxfit.objective.registry import find_term, find_terms, known_terms
@@ -25,7 +27,7 @@ RASTER = Raster(Blur.for_size(SIZE), SIZE)
 
 
 def correlated_bird():
-    """The toy bird with priors that are not diagonal, so that a transposed whitener shows."""
+    """The toy bird with priors that are not diagonal, so that the tests detect a transposed whitening matrix."""
     bird, rng = toy_bird(), np.random.default_rng(5)
     a, b = rng.normal(size=(21, 21)), rng.normal(size=(7, 7))
     return dataclasses.replace(
@@ -44,6 +46,7 @@ RIG, PRIORS = fold_bird(BIRD), priors_of(BIRD)
 
 
 def window_pose(seed=0, spread=0.2):
+    """A window of T frames with different poses."""
     frames = [random_pose(BIRD, seed + t, spread) for t in range(T)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *frames)
     transl = 0.2 * (stacked.transl - jnp.array([0, 0, 150.0])) + jnp.array([0, 0, 160.0])
@@ -51,7 +54,8 @@ def window_pose(seed=0, spread=0.2):
     return dataclasses.replace(stacked, transl=transl, bone_length=first.bone_length, betas=first.betas)
 
 
-def seen(seed=0):
+def random_targets(seed=0):
+    """Random targets of T frames, all with keypoints and mask."""
     rng = np.random.default_rng(seed)
     mask = np.zeros((T, SIZE, SIZE), np.uint8)
     mask[:, 8:22, 6:25] = 1
@@ -65,8 +69,8 @@ def seen(seed=0):
     )
 
 
-def without(targets, t):
-    """The same with frame `t` absent, as the fit's own targets has it."""
+def without_frame(targets, t):
+    """The same targets with frame `t` missing, as in the targets of a fit."""
     return dataclasses.replace(
         targets,
         confidence=targets.confidence.at[t].set(0),
@@ -75,8 +79,28 @@ def without(targets, t):
     )
 
 
-def posed_window(pose, targets, start=None):
-    return PosedWindow(pose, pose if start is None else start, targets, RIG, PRIORS, CAMERA, RASTER)
+def posed_window(pose, targets, anchor=None):
+    return PosedWindow(pose, pose if anchor is None else anchor, targets, RIG, PRIORS, CAMERA, RASTER)
+
+
+def random_motion(frames, seed=0, missing=(), spread=1.0, bones=4):
+    """Random global orientation (T, 3) and body pose (T, bones, 3), radians; False for the missing frames (T,)."""
+    rng = np.random.default_rng(seed)
+    present = np.ones(frames, bool)
+    present[list(missing)] = False
+    return spread * rng.normal(size=(frames, 3)), spread * rng.normal(size=(frames, bones, 3)), present
+
+
+def term_value(term, orient, body, present, **settings):
+    """A temporal term of a motion, in a window that has only rotations."""
+    orient, body = jnp.asarray(orient, jnp.float32), jnp.asarray(body, jnp.float32)
+    window = SimpleNamespace(
+        pose=SimpleNamespace(global_orient=orient, body_pose=body),
+        R_camera_root=axis_angle_to_matrix(orient),
+        R_parent_child=axis_angle_to_matrix(body),
+        present=jnp.asarray(present),
+    )
+    return term(window, **settings)
 
 
 def all_settings():
@@ -84,20 +108,20 @@ def all_settings():
 
 
 @jax.jit
-def every_term(pose, start, targets, settings):
-    return evaluate_terms(posed_window(pose, targets, start), find_terms(settings), settings)
+def every_term(pose, anchor, targets, settings):
+    return evaluate_terms(posed_window(pose, targets, anchor), find_terms(settings), settings)
 
 
 @jax.jit
-def every_gradient(pose, start, targets, settings):
-    """d term / d pose, for each term by itself, in one program."""
+def every_gradient(pose, anchor, targets, settings):
+    """Value and derivative with respect to the pose of each term, in one program."""
 
     def terms(pose):
-        values = evaluate_terms(posed_window(pose, targets, start), find_terms(settings), settings)
+        values = evaluate_terms(posed_window(pose, targets, anchor), find_terms(settings), settings)
         return jnp.stack([values[name] for name in TERMS])
 
-    value, pull = jax.vjp(terms, pose)
-    gradients = jax.vmap(lambda row: pull(row)[0])(jnp.eye(len(TERMS)))
+    value, pullback = jax.vjp(terms, pose)
+    gradients = jax.vmap(lambda row: pullback(row)[0])(jnp.eye(len(TERMS)))
     return {name: (value[i], jax.tree.map(lambda g, i=i: g[i], gradients)) for i, name in enumerate(TERMS)}
 
 
@@ -145,13 +169,13 @@ def mahalanobis(x, mean, covariance):
 
 
 def angles_between(one, other):
-    """Of the global orientation and of every joint, by scipy."""
+    """Angles between the global orientations and between the joint rotations of two frames, by scipy."""
     a, b = (np.concatenate([np.asarray(p.global_orient)[None], np.asarray(p.body_pose)]) for p in (one, other))
     return (Rotation.from_rotvec(a.astype(float)).inv() * Rotation.from_rotvec(b.astype(float))).magnitude()
 
 
-def oracle(name, pose, start, targets, seed):
-    """Each term by its equation, frame by frame in double precision."""
+def oracle(name, pose, anchor, targets, seed):
+    """A term by its equation, frame by frame in double precision."""
     total = 0.0
     for t in range(T):
         if name == "keypoints":
@@ -164,7 +188,7 @@ def oracle(name, pose, start, targets, seed):
         elif name == "pose_prior":
             total += mahalanobis(pose.body_pose[t], BIRD.pose_mean, BIRD.pose_covariance)
         elif name == "stage_anchor":
-            total += np.abs(np.asarray(pose.body_pose[t] - start.body_pose[t])).sum()
+            total += np.abs(np.asarray(pose.body_pose[t] - anchor.body_pose[t])).sum()
     betas = np.asarray(pose.betas, np.float64)
     if name == "bone_prior":
         total = mahalanobis(pose.bone_length, BIRD.bone_mean, BIRD.bone_covariance)
@@ -173,7 +197,7 @@ def oracle(name, pose, start, targets, seed):
     elif name == "shape_norm":
         total = np.sqrt((betas**2).sum())
     elif name == "stage_anchor":
-        total += np.abs(np.asarray(pose.bone_length - start.bone_length)).sum()
+        total += np.abs(np.asarray(pose.bone_length - anchor.bone_length)).sum()
     elif name == "joint_limits":
         low, high = np.moveaxis(np.asarray(BIRD.joint_limits, np.float64), -1, 0)
         for theta in np.asarray(pose.body_pose, np.float64):
@@ -192,10 +216,10 @@ def oracle(name, pose, start, targets, seed):
     elif name == "feet_on_ground":
         feet = [BIRD.keypoint_names.index(foot) for foot in ("left_foot", "right_foot")]
         posed = [np.asarray(BIRD.keypoint_weights) @ skin_by_hand(BIRD, frame(pose, t))[0] for t in range(T)]
-        # where the first frame's crop would see them, back in space at their depths
+        # pixels in the crop of the first frame, then back-projection to the depth of the feet
         corner = np.asarray(targets.corner_px, np.float64) - CAMERA.centre_px
-        seen_px = [pixels(posed[t][feet]) + corner[t] - np.asarray(targets.corner_px[0]) for t in range(T)]
-        feet_cam = [np.c_[seen_px[t] * posed[t][feet, 2:] / CAMERA.focal_px, posed[t][feet, 2]] for t in range(T)]
+        feet_px = [pixels(posed[t][feet]) + corner[t] - np.asarray(targets.corner_px[0]) for t in range(T)]
+        feet_cam = [np.c_[feet_px[t] * posed[t][feet, 2:] / CAMERA.focal_px, posed[t][feet, 2]] for t in range(T)]
         for i in range(T - 1):
             d2 = ((feet_cam[i + 1] - feet_cam[i]) ** 2).sum(-1)
             total += (0.25 * d2 / (0.25 + d2)).sum()

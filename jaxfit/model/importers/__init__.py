@@ -1,1 +1,1 @@
-"""Published bird models, read from the files that their authors released."""
+"""Importers of published bird models: they read the files that the authors released, without PyTorch."""

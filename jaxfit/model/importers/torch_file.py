@@ -1,6 +1,7 @@
-"""Tensors out of PyTorch checkpoints, without PyTorch and without running anything the file says.
+"""Read tensors from PyTorch checkpoints without PyTorch and without running code from the file.
 
-Both layouts are read: the legacy one (before PyTorch 1.6: five pickles, then raw storages) and the zip.
+The reader knows both layouts: the legacy layout (before PyTorch 1.6: five pickles, then raw storages) and zip.
+
 Source: PyTorch, `torch/serialization.py` (layout of both formats).
 """
 
@@ -23,21 +24,21 @@ __all__ = ["read_tensors"]
 LEGACY_MAGIC = 0x1950A86A20F9469CFC6C
 LEGACY_PROTOCOL = 1001
 MALFORMED = (ValueError, TypeError, LookupError, ArithmeticError, EOFError, MemoryError, struct.error)
-"""What a damaged stream makes the parsers raise."""
+"""Exceptions that the parsers raise for a damaged stream."""
 
 
 def read_tensors(path: Path | str) -> dict[str, np.ndarray]:
-    """The named tensors at the top level of a PyTorch checkpoint.
+    """Return the named tensors at the top level of a PyTorch checkpoint.
 
     Args:
         path: a `.pt` or `.pth` file, legacy or zip.
 
     Returns:
-        Name → read-only array in the file's own dtype and shape; entries that are no tensors are left out.
+        Name → read-only array with the dtype and shape of the file. Entries that are not tensors are skipped.
 
     Raises:
-        InputError: the file is missing, truncated, too large, not a checkpoint, refers to a name other
-            than a tensor's, or claims sizes that it does not hold.
+        InputError: the file is missing, truncated, too large or not a checkpoint; its pickle refers to a name
+            that tensors do not need; or its stated sizes exceed its content.
     """
     path = Path(path)
     try:
@@ -58,7 +59,7 @@ def read_tensors(path: Path | str) -> dict[str, np.ndarray]:
 
 
 def _read_legacy(content: bytes, path: Path) -> dict[str, np.ndarray]:
-    """Magic number, protocol, system facts, the object, the storage keys; then the storages."""
+    """Read the legacy layout: magic number, protocol, system facts, object, storage keys, then the storages."""
     stream = io.BytesIO(content)
     if content[:1] != b"\x80" or run_pickle(stream, path)[0] != LEGACY_MAGIC:
         raise InputError(path, "not a PyTorch checkpoint", "expected a .pt or .pth file of tensors")
@@ -70,29 +71,29 @@ def _read_legacy(content: bytes, path: Path) -> dict[str, np.ndarray]:
     root, storages = run_pickle(stream, path)
     keys = run_pickle(stream, path)[0]
     if not isinstance(keys, list) or not all(type(key) is str for key in keys):
-        raise InputError(path, "its list of storage keys is damaged", REMEDY)
+        raise InputError(path, "the list of storage keys is damaged", REMEDY)
     flat: dict[str, np.ndarray] = {}
     for key in keys:
         storage, head = storages.get(key), stream.read(8)
         if storage is None or key in flat:
-            raise InputError(path, "lists a storage that no tensor uses, or one twice", REMEDY)
+            raise InputError(path, "lists a storage that no tensor uses, or lists a storage twice", REMEDY)
         if len(head) != 8 or struct.unpack("<q", head)[0] != storage.numel:
-            raise InputError(path, f"storage {key}: count and tensor disagree, or file truncated", REMEDY)
+            raise InputError(path, f"storage {key}: count and tensor disagree, or the file is truncated", REMEDY)
         flat[key] = _storage_array(storage, content, stream.tell(), path)
         stream.seek(flat[key].nbytes, io.SEEK_CUR)
     return _tensors(root, flat, path)
 
 
 def _read_zip(content: bytes, path: Path) -> dict[str, np.ndarray]:
-    """`<name>/data.pkl` holds the object and `<name>/data/<key>` each storage, uncompressed."""
+    """Read the zip layout: `<name>/data.pkl` is the object, `<name>/data/<key>` a storage, all uncompressed."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             names = archive.namelist()
             pickles = [name for name in names if name == "data.pkl" or name.endswith("/data.pkl")]
             if len(pickles) != 1:
-                raise InputError(path, "a zip file, but no PyTorch checkpoint (no data.pkl)", REMEDY)
+                raise InputError(path, "a zip file, but not a PyTorch checkpoint (no data.pkl)", REMEDY)
             folder = pickles[0].removesuffix("data.pkl")
-            remaining = [len(content)]  # entries may overlap: together they must not outgrow the file
+            remaining = [len(content)]  # entries may overlap, so their total size must not exceed the file
 
             def entry(name: str) -> bytes:
                 info = archive.getinfo(name)
@@ -113,6 +114,7 @@ def _read_zip(content: bytes, path: Path) -> dict[str, np.ndarray]:
 
 
 def _storage_array(storage: Storage, content: bytes, start: int, path: Path) -> np.ndarray:
+    """Return a storage as a flat array of its numbers, which begin at byte `start` of `content`."""
     size = storage.numel * np.dtype(storage.dtype).itemsize
     if start + size > len(content):
         raise InputError(path, f"storage {storage.key}: truncated, {size} bytes expected", REMEDY)
@@ -120,15 +122,15 @@ def _storage_array(storage: Storage, content: bytes, start: int, path: Path) -> 
 
 
 def _tensors(root: Any, flat: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
-    """The root's tensors as read-only views; bounds were checked when they were parsed."""
+    """Return the tensors of the root object as read-only views; `run_pickle` has checked their bounds."""
     if not isinstance(root, dict):
-        raise InputError(path, "holds no dictionary of tensors", REMEDY)
+        raise InputError(path, "does not contain a dictionary of tensors", REMEDY)
     tensors = {}
     for name, value in root.items():
         if not isinstance(value, Tensor) or type(name) is not str:
             continue
         if value.storage.key not in flat:
-            raise InputError(path, f"{name}: its numbers are not in the file", REMEDY)
+            raise InputError(path, f"{name}: the numbers of this tensor are not in the file", REMEDY)
         array = flat[value.storage.key][value.offset :]
         strides = tuple(array.itemsize * stride for stride in value.strides)
         tensors[name] = np.lib.stride_tricks.as_strided(array, value.shape, strides, writeable=False)

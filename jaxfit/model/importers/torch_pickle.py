@@ -1,9 +1,9 @@
-"""The pickle inside a PyTorch checkpoint, read without running anything it says.
+"""Read the pickle of a PyTorch checkpoint without running its code.
 
-A pickle is a program. `pickle.Unpickler` with a filter on names still runs that program: it calls, sets
-attributes, hashes and allocates as told. Here the opcodes are only *parsed* (`pickletools.genops`) and a
-small interpreter knows the two dozen that tensors need. Nothing it meets can be called: three names are
-understood (a tensor, a storage type, an ordered dict), everything else is refused by name.
+A pickle is a program. `pickle.Unpickler` with a filter on names still runs this program: calls, attribute changes,
+hashing and memory allocation remain possible. This module only *parses* the opcodes (`pickletools.genops`), and a
+small interpreter handles the opcodes that tensors need. The interpreter calls no object of the file. It knows three
+names: a tensor, a storage type and an ordered dict. Every other name is rejected with a message that contains it.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxfit.errors import InputError
 __all__ = ["MAX_FILE_BYTES", "REMEDY", "Storage", "Tensor", "run_pickle"]
 
 MAX_FILE_BYTES = 256 * 2**20
-"""A bird model holds 2 MB; far beyond that it is some other checkpoint."""
+"""A bird model has about 2 MB; a much larger file is another kind of checkpoint."""
 MAX_OPCODES = 200_000
 MAX_DIMENSIONS = 8
 
@@ -41,14 +41,14 @@ REMEDY = "use the file as its authors published it"
 
 
 class _Name(NamedTuple):
-    """A name that the pickle refers to; never an object that could be called."""
+    """A name that the pickle refers to; a plain value, which cannot be called."""
 
     kind: str
     dtype: str = ""
 
 
 class Storage(NamedTuple):
-    """A flat run of numbers kept elsewhere in the file."""
+    """A flat sequence of numbers that is stored elsewhere in the file."""
 
     key: str
     dtype: str
@@ -56,7 +56,7 @@ class Storage(NamedTuple):
 
 
 class Tensor(NamedTuple):
-    """A view into a storage, within its bounds; offset and strides count elements."""
+    """A view into a storage, inside the bounds of the storage; offset and strides count elements."""
 
     storage: Storage
     offset: int
@@ -71,16 +71,16 @@ def run_pickle(stream: io.BytesIO, path: Path) -> tuple[Any, dict[str, Storage]]
     """Interpret one pickle.
 
     Args:
-        stream: stands at the pickle's start, and after it at its end.
-        path: the file named in an error.
+        stream: positioned at the start of the pickle; on return, at its end.
+        path: the file that an error names.
 
     Returns:
-        What it builds, of dicts, lists, tuples, numbers, text, `Storage` and `Tensor`; and, by key, the
-        storages it refers to.
+        The object that the pickle builds (dicts, lists, tuples, numbers, text, `Storage` and `Tensor`), and the
+        storages that the object refers to, by key.
 
     Raises:
-        InputError: it needs an instruction or a name that tensors do not need.
-        ValueError, LookupError, TypeError: it is malformed.
+        InputError: the pickle uses an opcode or a name that tensors do not need.
+        ValueError, LookupError, TypeError: the pickle is malformed.
     """
     stack: list[Any] = []
     marks: list[int] = []
@@ -96,7 +96,7 @@ def run_pickle(stream: io.BytesIO, path: Path) -> tuple[Any, dict[str, Storage]]
     for count, (opcode, arg, _) in enumerate(pickletools.genops(stream)):
         name = opcode.name
         if count > MAX_OPCODES:
-            raise InputError(path, f"its pickle is longer than {MAX_OPCODES} instructions", REMEDY)
+            raise InputError(path, f"the pickle is longer than {MAX_OPCODES} opcodes", REMEDY)
         if name in ("PROTO", "FRAME"):
             pass
         elif name == "STOP":
@@ -110,7 +110,7 @@ def run_pickle(stream: io.BytesIO, path: Path) -> tuple[Any, dict[str, Storage]]
         elif name in FIXED_TUPLES:
             start = len(stack) - FIXED_TUPLES[name]
             if start < 0:
-                raise ValueError("tuple of missing items")
+                raise ValueError("a tuple has fewer items than expected")
             stack[start:] = [tuple(stack[start:])]
         elif name == "TUPLE":
             stack.append(tuple(since_mark()))
@@ -118,41 +118,41 @@ def run_pickle(stream: io.BytesIO, path: Path) -> tuple[Any, dict[str, Storage]]
             stack.append({} if name == "EMPTY_DICT" else [])
         elif name in ("APPEND", "APPENDS"):
             items = since_mark() if name == "APPENDS" else [stack.pop()]
-            _typed(stack[-1], list).extend(items)
+            _require_type(stack[-1], list).extend(items)
         elif name in ("SETITEM", "SETITEMS"):
             items = since_mark() if name == "SETITEMS" else [stack.pop(-2), stack.pop()]
-            _set_items(_typed(stack[-1], dict), items)
+            _set_items(_require_type(stack[-1], dict), items)
         elif name in ("BINPUT", "LONG_BINPUT", "PUT", "MEMOIZE"):
             memo[len(memo) if arg is None else arg] = stack[-1]
         elif name in ("BINGET", "LONG_BINGET", "GET"):
-            stack.append(memo[_typed(arg, int)])
+            stack.append(memo[_require_type(arg, int)])
         elif name == "GLOBAL":
-            module, _, attribute = _typed(arg, str).partition(" ")
+            module, _, attribute = _require_type(arg, str).partition(" ")
             stack.append(_global(module, attribute, path))
         elif name == "STACK_GLOBAL":
             attribute, module = stack.pop(), stack.pop()
-            stack.append(_global(_typed(module, str), _typed(attribute, str), path))
+            stack.append(_global(_require_type(module, str), _require_type(attribute, str), path))
         elif name == "BINPERSID":
-            stack.append(_persistent(_typed(stack.pop(), tuple), storages, path))
+            stack.append(_persistent(_require_type(stack.pop(), tuple), storages, path))
         elif name == "REDUCE":
             arguments, function = stack.pop(), stack.pop()
-            stack.append(_reduce(function, _typed(arguments, tuple), path))
+            stack.append(_reduce(function, _require_type(arguments, tuple), path))
         else:
-            raise InputError(path, f"its pickle uses {name}, which tensors do not need", REMEDY)
-    raise ValueError("pickle without an end")
+            raise InputError(path, f"the pickle uses {name}, which tensors do not need", REMEDY)
+    raise ValueError("the pickle has no end")
 
 
-def _typed(value: Any, kind: type) -> Any:
+def _require_type(value: Any, kind: type) -> Any:
     if not isinstance(value, kind):
         raise ValueError(f"a {kind.__name__} was expected, not a {type(value).__name__}")
     return value
 
 
 def _set_items(target: dict, items: list[Any]) -> None:
-    # Only plain keys: hashing nested tuples that share their parts takes exponential time.
+    # Keys must be text or integers: hashing nested tuples that share parts takes exponential time.
     keys, values = items[::2], items[1::2]
     if len(keys) != len(values) or not all(type(key) in (str, int) for key in keys):
-        raise ValueError("dictionary keys must be names")
+        raise ValueError("dictionary keys must be names or integers")
     target.update(zip(keys, values, strict=True))
 
 
@@ -164,44 +164,45 @@ def _global(module: str, attribute: str, path: Path) -> _Name:
     if module == "torch" and attribute in STORAGE_DTYPES:
         return _Name("storage", STORAGE_DTYPES[attribute])
     shown = f"{module}.{attribute}"[:100]
-    raise InputError(path, f"refers to {shown!r}, which is no tensor; nothing of it was run", REMEDY)
+    raise InputError(path, f"refers to {shown!r}, which is not a tensor; no code was run", REMEDY)
 
 
-def _count(value: Any) -> int:
+def _require_size(value: Any) -> int:
     if type(value) is not int or not 0 <= value <= MAX_FILE_BYTES:
-        raise ValueError("a size, offset or stride out of range")
+        raise ValueError("a size, offset or stride is out of range")
     return value
 
 
 def _persistent(parts: tuple, storages: dict[str, Storage], path: Path) -> Storage:
-    """('storage', type, key, location, numel[, view]); location is a device and means nothing here."""
+    """Return the storage of a persistent id ('storage', type, key, location, numel[, view]); location is ignored."""
     if len(parts) not in (5, 6) or type(parts[0]) is not str or parts[0] != "storage":
-        raise ValueError("a persistent id that is no storage")
+        raise ValueError("a persistent id is not a storage")
     kind, key = parts[1], parts[2]
     if not isinstance(kind, _Name) or kind.kind != "storage" or type(key) is not str or len(key) > 64:
-        raise ValueError("a storage without type or key")
+        raise ValueError("a storage has no type or no key")
     if len(parts) == 6 and parts[5] is not None:
         raise InputError(path, f"storage {key}: a view into another storage", "save it with a newer PyTorch")
-    storage = Storage(key, kind.dtype, _count(parts[4]))
+    storage = Storage(key, kind.dtype, _require_size(parts[4]))
     if storages.setdefault(key, storage) != storage:
         raise ValueError(f"storage {key} is described in two ways")
     return storage
 
 
 def _reduce(function: Any, arguments: tuple, path: Path) -> Any:
+    """Return the empty dict or the `Tensor` that a call in the pickle would build; reject all other calls."""
     if function is _DICT and not arguments:
         return {}
     if function is not _TENSOR or len(arguments) not in (6, 7) or not isinstance(arguments[0], Storage):
-        raise InputError(path, "calls something other than the making of a tensor", REMEDY)
+        raise InputError(path, "calls something other than the construction of a tensor", REMEDY)
     storage, offset, shape, strides = arguments[:4]
-    shape = tuple(_count(size) for size in _typed(shape, tuple))
-    strides = tuple(_count(stride) for stride in _typed(strides, tuple))
-    offset = _count(offset)
+    shape = tuple(_require_size(size) for size in _require_type(shape, tuple))
+    strides = tuple(_require_size(stride) for stride in _require_type(strides, tuple))
+    offset = _require_size(offset)
     if len(shape) != len(strides) or len(shape) > MAX_DIMENSIONS:
         raise ValueError(f"a tensor of {len(shape)} dimensions with {len(strides)} strides")
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
     elements = math.prod(shape)
-    # An expanded tensor (stride 0) may outgrow its storage: a few bytes could ask for all memory.
+    # An expanded tensor (stride 0) may be larger than its storage: a few bytes could then require all memory.
     if elements > storage.numel or (elements and last >= storage.numel) or offset > storage.numel:
         raise ValueError(f"a tensor of shape {shape} reaches outside its storage of {storage.numel}")
     return Tensor(storage, offset, shape, strides)

@@ -1,8 +1,9 @@
 """The bird that comes with jaxfit: a common guillemot (common murre), *Uria aalge*, in breeding plumage.
 
-Everything is made here from measurements: `measurements` (what is known of the species), `skeleton` (joints, and how
-the wing unfolds), `surface`, `wing` and `leg` (the mesh), `skinning`, `plumage`, `variation` (shape and bones),
-`postures`, `prior`. `build` puts them together and writes `murre.npz`, which is what `load_murre` reads.
+This package designs the model from measurements: `measurements` (sizes of the species), `skeleton` (joints, and the
+unfolding of the wing), `surface`, `wing` and `leg` (the mesh), `skinning`, `plumage` (colours and keypoints),
+`variation` (shape and bone lengths), `postures`, `prior`. `build` combines these parts and writes `murre.npz`, the
+file that `load_murre` reads.
 """
 
 from jaxfit.model.files import load_murre

@@ -1,4 +1,4 @@
-"""Put the murre together: `python -m jaxfit.model.murre.build` writes `jaxfit/model/murre.npz`."""
+"""Build the murre: `python -m jaxfit.model.murre.build` writes `jaxfit/model/murre.npz`."""
 
 from __future__ import annotations
 
@@ -20,32 +20,32 @@ __all__ = ["build_murre"]
 
 
 def build_murre() -> Bird:
-    """The murre from nothing but the numbers in this package; the same on every machine up to rounding."""
+    """Build the murre from the numbers in this package; the result is equal on all machines up to rounding."""
     half = make_half()
     mesh = mirrored(half)
     left = half_weights(half)
-    side = np.where(mesh.right[:, None], [-1.0, 1.0, 1.0], 1.0)
-    shapes = half_shapes(half, left)[:, mesh.half] * side
+    mirror = np.where(mesh.right[:, None], [-1.0, 1.0, 1.0], 1.0)
+    shapes = half_shapes(half, left)[:, mesh.half] * mirror
     pose_mean, pose_covariance = pose_prior()
     bone_mean, bone_covariance = bone_prior()
 
-    def real(array):
+    def float32(array):
         return jnp.asarray(np.asarray(array, np.float32))
 
     bird = Bird(
-        vertices=real(mesh.vertices / CM_PER_UNIT),
+        vertices=float32(mesh.vertices / CM_PER_UNIT),
         faces=jnp.asarray(mesh.faces.astype(np.int32)),
-        joints=real(joint_positions() / CM_PER_UNIT),
-        skin_weights=real(mirrored_weights(mesh, left)),
-        keypoint_weights=real(keypoint_weights(half, mesh)),
-        shape_basis=real(shapes / CM_PER_UNIT),
-        shape_variance=real(np.ones(len(SHAPES))),
-        pose_mean=real(pose_mean),
-        pose_covariance=real(pose_covariance),
-        bone_mean=real(bone_mean),
-        bone_covariance=real(bone_covariance),
-        vertex_colours=real(half_colours(half)[mesh.half]),
-        joint_limits=real(joint_limits()),
+        joints=float32(joint_positions() / CM_PER_UNIT),
+        skin_weights=float32(mirrored_weights(mesh, left)),
+        keypoint_weights=float32(keypoint_weights(half, mesh)),
+        shape_basis=float32(shapes / CM_PER_UNIT),
+        shape_variance=float32(np.ones(len(SHAPES))),
+        pose_mean=float32(pose_mean),
+        pose_covariance=float32(pose_covariance),
+        bone_mean=float32(bone_mean),
+        bone_covariance=float32(bone_covariance),
+        vertex_colours=float32(half_colours(half)[mesh.half]),
+        joint_limits=float32(joint_limits()),
         parents=PARENTS,
         joint_names=JOINT_NAMES,
         keypoint_names=MURRE_KEYPOINTS,

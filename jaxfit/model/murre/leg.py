@@ -1,4 +1,4 @@
-"""The left leg: feathered stump, tarsus, and three toes in one web."""
+"""The left leg of the murre: feathered thigh and tibia, tarsus, and three webbed toes."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ from jaxtyping import Float
 
 from jaxfit.model.murre.skeleton import MIDDLE_AND_LEFT
 
-__all__ = ["LEG_SHARES", "leg_rings"]
+__all__ = ["LEG_PARTS", "leg_rings"]
 
-ROUND = np.radians(np.arange(0, 360, 45))
-LEG_SHARES = ("thigh", "tibia", "tibia", "ankle", "tarsus", "tarsus", "foot", "toes", "toes")
-"""What each ring of the leg belongs to."""
+RING_ANGLES = np.radians(np.arange(0, 360, 45))
+LEG_PARTS = ("thigh", "tibia", "tibia", "ankle", "tarsus", "tarsus", "foot", "toes", "toes")
+"""Part of the leg that each ring belongs to, from the body to the toes."""
 TOES = {0: (1.75, 3.9), 1: (0.95, 3.75), 2: (0.0, 5.0), 3: (-1.0, 4.1), 4: (-2.0, 4.5)}
-"""Ends of the inner, middle and outer toe (0, 2, 4) and of the webs between: sideways and forwards of the root."""
+"""Ends of the inner, middle and outer toe (0, 2, 4) and of the webs between the toes: offsets from the foot joint in
+centimetres, sideways (to the inner side) and forwards."""
 
 
 def leg_rings() -> Float[np.ndarray, "L 8 3"]:
-    """Rings from the body to the toes; a ring begins on the inner side and runs by the front to the outer side."""
+    """Return the rings of the leg from the body to the toes, in centimetres.
+
+    The points of a ring begin on the inner side of the leg and run over the front to the outer side.
+    """
     knee, ankle, foot = (np.asarray(MIDDLE_AND_LEFT[f"left_{name}"]) for name in ("knee", "ankle", "foot"))
     tibia, tarsus = ankle - knee, foot - ankle
     toes = np.array([0.0, 1.0, 0.0])
@@ -47,7 +51,9 @@ def leg_rings() -> Float[np.ndarray, "L 8 3"]:
 
 
 def _ring(centre, along, side: float, front: float) -> np.ndarray:
+    """Return an ellipse around `centre`, normal to `along`, with half-axes `side` (along x) and `front`."""
     along = along / np.linalg.norm(along)
     forwards = np.array([0.0, -along[2], along[1]])
     forwards /= np.linalg.norm(forwards)
-    return centre + side * np.cos(ROUND)[:, None] * [1, 0, 0] + front * np.sin(ROUND)[:, None] * forwards
+    cosine, sine = np.cos(RING_ANGLES)[:, None], np.sin(RING_ANGLES)[:, None]
+    return centre + side * cosine * [1, 0, 0] + front * sine * forwards

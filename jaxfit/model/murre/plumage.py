@@ -1,4 +1,4 @@
-"""Colours of the breeding plumage, vertex by vertex, and where the keypoints sit."""
+"""Vertex colours of the murre's breeding plumage, and the vertices of its keypoints."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ BROWN, HEAD = (0.235, 0.180, 0.155), (0.200, 0.150, 0.130)
 WHITE, UNDERWING, DUSKY = (0.94, 0.94, 0.92), (0.86, 0.85, 0.83), (0.50, 0.47, 0.45)
 BLACK = (0.03, 0.03, 0.03)
 BILL, LEG, PRIMARIES = (0.11, 0.11, 0.12), (0.24, 0.23, 0.22), (0.170, 0.135, 0.120)
-LAST_BROWN = 4
-"""Last brown column of the loft, from the back; below it the flank is white."""
+LAST_BROWN_COLUMN = 4
+"""Last brown column of the body mesh, counted from the back; the flank below this column is white."""
 EYE = (int(np.argmin(np.abs(RINGS - 15.1))), 4)
 """Ring and column of the left eye."""
-SHOULDER = {BIB_RINGS[0] - 3: 5, BIB_RINGS[0] - 2: 6, BIB_RINGS[0] - 1: 7, BIB_RINGS[0]: 8}
-"""The same just behind the bib, whose brown runs down the sides of the neck to the bend of the wing."""
-BAR = (0.10, 0.46)
-"""Part of the span whose trailing edge, the tips of the secondaries, is white."""
+LAST_BROWN_AT_SHOULDER = {BIB_RINGS[0] - 3: 5, BIB_RINGS[0] - 2: 6, BIB_RINGS[0] - 1: 7, BIB_RINGS[0]: 8}
+"""Last brown column of the rings behind the bib: the brown of the bib runs down the sides of the neck to the bend of
+the wing."""
+WHITE_BAR = (0.10, 0.46)
+"""Part of the span where the trailing edge (the tips of the secondaries) is white."""
 
 
 def half_colours(half: Half) -> Float[np.ndarray, "H 3"]:
-    """sRGB of every vertex of the left half."""
+    """Return the sRGB colours of the vertices of the left half."""
     colours = np.empty((len(half.vertices), 3))
     points = half.wing_index.shape[1]
     for vertex, (part, (ring, place)) in enumerate(zip(half.part, half.place, strict=True)):
@@ -49,7 +50,7 @@ def _body_colour(ring: int, column: int):
         return BLACK
     if row > 11:
         return HEAD
-    if ring >= BIB_RINGS[1] or row < 2.9 or column <= SHOULDER.get(ring, LAST_BROWN):
+    if ring >= BIB_RINGS[1] or row < 2.9 or column <= LAST_BROWN_AT_SHOULDER.get(ring, LAST_BROWN_COLUMN):
         return BROWN
     return WHITE
 
@@ -59,15 +60,18 @@ def _wing_colour(span: float, chord: float, below: bool):
         if chord < 0.1:
             return BROWN
         return UNDERWING if chord < 0.6 and span < 0.75 else DUSKY
-    if BAR[0] < span < BAR[1] and chord > 0.9:
+    if WHITE_BAR[0] < span < WHITE_BAR[1] and chord > 0.9:
         return WHITE
     return PRIMARIES if span > 0.6 else BROWN
 
 
 def keypoint_weights(half: Half, mesh: Mesh) -> Float[np.ndarray, "K V"]:
-    """Each keypoint as the mean of a few vertices at its place."""
+    """Return the weights that place each keypoint at the mean of a few vertices."""
     body, wing, leg = half.body_index, half.wing_index, half.leg_index
-    rows = lambda row: int(np.argmin(np.abs(RINGS - row)))  # noqa: E731
+
+    def ring_at(row: float) -> int:
+        return int(np.argmin(np.abs(RINGS - row)))
+
     points = wing.shape[1]
     wrist = 1 + int(np.argmin(np.abs(SPAN - 0.42)))
     left = {
@@ -78,15 +82,15 @@ def keypoint_weights(half: Half, mesh: Mesh) -> Float[np.ndarray, "K V"]:
         "wrist": wing[wrist, [0, 1, points - 1]],
     }
     middle = {
-        "forehead": body[rows(16.5), 0],
-        "crown": body[rows(15.1), 0],
-        "nape": body[rows(12.7), 0],
+        "forehead": body[ring_at(16.5), 0],
+        "crown": body[ring_at(15.1), 0],
+        "nape": body[ring_at(12.7), 0],
         "back": body[12, 0],
-        "throat": body[rows(13.9), -1],
-        "breast": body[rows(8.55), -1],
-        "bill_base": body[rows(17.0), 0],
+        "throat": body[ring_at(13.9), -1],
+        "breast": body[ring_at(8.55), -1],
+        "bill_base": body[ring_at(17.0), 0],
         "bill_tip": body[-1],
-        "tail_base": body[rows(3), 0],
+        "tail_base": body[ring_at(3), 0],
         "tail_tip": body[0, [0, -1]],
     }
     weights = np.zeros((len(MURRE_KEYPOINTS), len(mesh.vertices)))

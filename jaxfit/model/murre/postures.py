@@ -1,7 +1,7 @@
-"""How a murre holds itself: named body poses, each with the pitch that it is held at.
+"""Named postures of the murre: body poses, each with a pitch of the whole bird.
 
-The legs are placed by a plane two-bone solution (hip, knee) so that the tarsi, on which murres rest, and the toes lie
-flat on level ground when the bird is turned about +x by the posture's pitch.
+A two-bone inverse kinematics in the sagittal plane (hip, knee) places the legs. With the pitch of the posture about
++x, the tarsi (on which murres rest) and the toes lie flat on level ground.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ SIDES = ("left", "right")
 
 
 class Posture(NamedTuple):
-    """A body pose and how it is held."""
+    """A body pose and the pitch of the bird."""
 
     body_pose: Float[np.ndarray, "bones 3"]
-    """Axis-angle of every joint but the root, radians."""
+    """Axis-angle of every joint except the root, radians."""
     pitch_rad: float
-    """Turn of the whole bird about +x (bill upwards) against level; the rest pose has 0."""
+    """Rotation of the whole bird about +x (bill upwards), radians; 0 is the rest pose."""
 
 
 def mirrored_pose(body_pose: Float[np.ndarray, "*B bones 3"]) -> Float[np.ndarray, "*B bones 3"]:
-    """The mirror image of a body pose: sides exchanged, turns about y and z reversed."""
+    """Return the mirror image of a body pose: sides exchanged, rotations about y and z reversed."""
     swap = [JOINT_NAMES.index(other_side(name)) - 1 for name in JOINT_NAMES[1:]]
     return body_pose[..., swap, :] * np.array([1.0, -1.0, -1.0])
 
@@ -43,15 +43,15 @@ def _posture(
     /,
     **turns: tuple[float, float, float],
 ) -> Posture:
-    """A posture from degrees.
+    """Return a posture; angles are in degrees.
 
     Args:
-        pitch: in degrees.
-        ankles: where the ankles are, forwards of and above the root, in centimetres with the bird pitched; both or each
-            side's. None: the legs trail, as in flight.
-        spread: how far the wings are unfolded, 0 to 1.
-        flap: how far the wings are raised, in degrees.
-        turns: axis-angle of joints by name, in degrees; of the left side for both sides.
+        pitch: rotation of the whole bird about +x, degrees.
+        ankles: position of the ankles relative to the root (forwards, upwards), in centimetres, with the bird pitched;
+            one position for both sides, or one position per side. None: the legs trail behind, as in flight.
+        spread: share of the unfolding of the wings, 0 (folded) to 1 (spread).
+        flap: elevation of the wings, degrees.
+        turns: axis-angles that are added to joints, by name, degrees; the values of left joints apply to both sides.
     """
     pose = {name: np.zeros(3) for name in JOINT_NAMES}
     for name, R in spread_rotations().items():
@@ -65,7 +65,7 @@ def _posture(
         pose[joint.replace("left_", "right_")] = pose[joint] * [1, -1, -1]
     for side in SIDES:
         if ankles is None:
-            bends = TRAILING
+            bends = TRAILING_LEG
         else:
             bends = _leg_bends(np.radians(pitch), ankles[side] if isinstance(ankles, dict) else ankles)
         for joint, bend in zip(("hip", "knee", "ankle", "foot"), bends, strict=True):
@@ -74,31 +74,35 @@ def _posture(
 
 
 ROOT_SHARE = 0.5
-"""Share of a raised wing's turn that its root takes; the shoulder takes the rest."""
-TRAILING = np.radians([0.0, -25.0, -95.0, -20.0])
-"""Bends of the leg's joints in flight: feet stretched out behind."""
+"""Share of the wing elevation that the wing root takes; the shoulder takes the rest."""
+TRAILING_LEG = np.radians([0.0, -25.0, -95.0, -20.0])
+"""Rotations of hip, knee, ankle and foot about x in flight: the feet point backwards."""
 
 
 def _leg_bends(pitch: float, ankle: tuple[float, float]) -> tuple[float, float, float, float]:
-    """Turns about x of hip, knee, ankle and foot that put the ankle there, tarsus and toes level."""
+    """Return the rotations of hip, knee, ankle and foot about x that reach `ankle`, with level tarsus and toes.
+
+    Positions in the plane (y, z) are complex numbers y + iz.
+    """
     hip, knee, at_ankle, foot = (
         complex(*MIDDLE_AND_LEFT[f"left_{name}"][1:]) for name in ("hip", "knee", "ankle", "foot")
     )
     thigh, tibia = knee - hip, at_ankle - knee
     target = complex(*ankle) * np.exp(-1j * pitch) - hip
     distance = np.clip(abs(target), abs(abs(tibia) - abs(thigh)) + 0.05, abs(tibia) + abs(thigh) - 0.05)
-    # the knee keeps to the side of the line hip–ankle that it has at rest: in front
+    # as in the rest pose, the knee stays in front of the line from hip to ankle
     cosine = (distance**2 - abs(thigh) ** 2 - abs(tibia) ** 2) / (2 * abs(thigh) * abs(tibia))
     rest = np.angle(tibia / thigh)
     bend = np.sign(rest) * np.arccos(np.clip(cosine, -1, 1)) - rest
     reached = thigh + tibia * np.exp(1j * bend)
     swing = np.angle(target / reached)
     tarsus = np.angle(foot - at_ankle)
-    # rest slopes: tarsus as the skeleton has it, toes level
+    # in the rest pose the tarsus has the slope of the skeleton and the toes are level
     return float(swing), float(bend), float(-tarsus - pitch - swing - bend), float(tarsus)
 
 
 STAND, STEP = (-2.9, -8.5), 2.0
+"""Ankle position of a standing bird relative to the root (forwards, upwards), and half a step, centimetres."""
 UPRIGHT = {
     "lower_body": (-10, 0, 0),
     "tail": (-20, 0, 0),
@@ -106,7 +110,7 @@ UPRIGHT = {
     "neck": (-13, 0, 0),
     "head": (-24, 0, 0),
 }
-"""How back, neck and head go with standing."""
+"""Rotations of back, neck and head of a standing bird, degrees."""
 
 POSTURES: dict[str, Posture] = {
     "standing": _posture(50, STAND, **UPRIGHT),

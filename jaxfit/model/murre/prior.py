@@ -1,8 +1,8 @@
-"""The murre's pose prior and joint limits: designed from the postures, not learnt from birds.
+"""Pose prior and joint limits of the murre: designed from the postures, not learnt from birds.
 
-Poses are drawn between pairs of postures, with a little independent noise at every joint, each with its mirror image.
-Their mean and covariance are the Gaussian prior. It prefers what murres on a ledge do, standing above all, and leaves
-the wings room along the way in which they unfold.
+The prior is the mean and covariance of poses between pairs of postures and of their mirror images, with a little
+independent noise at every joint. The prior prefers the postures of murres on a ledge, most of all standing, and has a
+large variance along the unfolding of the wings.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ SHARES = {
     "walking_left": 0.06, "walking_right": 0.06, "jab": 0.05, "wings_half": 0.03, "wings_up": 0.02, "wings_down": 0.02,
     "flapping_up": 0.015, "flapping_down": 0.015,
 }  # fmt: skip
-"""How often a bird is near each posture."""
+"""Share of the time that a bird spends near each posture."""
 NOISE = {"neck_root": 0.12, "neck": 0.15, "head": 0.18, "hip": 0.10, "knee": 0.12, "ankle": 0.15, "foot": 0.15}
 OTHER_NOISE = 0.06
-"""Standard deviation of the independent noise of each component, radians."""
+"""Standard deviation of the independent noise of the joints that `NOISE` and `RIGID` do not name, radians."""
 RIGID = {"jaw": 0.03, "chest": 0.02}
 MARGIN = 0.35
-"""Radians by which the limits lie outside of every posture."""
+"""Minimum distance of the joint limits from the outermost posture, radians."""
 
 
 def pose_prior() -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
-    """Mean and covariance of the flattened body pose.
+    """Return mean and covariance of the flattened body pose, radians and rad².
 
-    For poses a + s (b − a) with a and b drawn by `SHARES` and s evenly from [0, 1], the moments are known exactly:
-    E = Σ p_a x_a and Cov = (2/3) Σ p_a (x_a − E)(x_a − E)ᵀ, since E[(1 − s)² + s²] = 2/3. Nothing is sampled, so the
-    prior is the same on every machine.
+    For poses a + s (b − a), with a and b drawn with the probabilities `SHARES` and s uniform in [0, 1], the moments
+    have a closed form: E = Σ p_a x_a and Cov = (2/3) Σ p_a (x_a − E)(x_a − E)ᵀ, because E[(1 − s)² + s²] = 2/3. The
+    prior needs no sampling, so it is equal on all machines.
     """
     names = list(SHARES)
     poses = np.stack([POSTURES[name].body_pose for name in names])
@@ -42,19 +42,22 @@ def pose_prior() -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"]]:
     poses = np.concatenate([poses, mirrored_pose(poses)]).reshape(2 * len(names), -1)
     share = np.concatenate([share, share]) / (2 * share.sum())
     mean = share @ poses
-    apart = poses - mean
+    offset = poses - mean
     noise = np.repeat(joint_noise(), 3)
-    return mean, (2 / 3) * np.einsum("a,ai,aj->ij", share, apart, apart) + np.diag(noise**2)
+    return mean, (2 / 3) * np.einsum("a,ai,aj->ij", share, offset, offset) + np.diag(noise**2)
 
 
 def joint_noise() -> Float[np.ndarray, "B"]:
-    """Standard deviation of each joint's own noise, radians."""
+    """Return the standard deviation of the independent noise of each joint, radians."""
     known = NOISE | RIGID
     return np.array([known.get(n.removeprefix("left_").removeprefix("right_"), OTHER_NOISE) for n in JOINT_NAMES[1:]])
 
 
 def joint_limits() -> Float[np.ndarray, "B 3 2"]:
-    """Least and greatest of each component over rest and all postures and their mirror images, with a margin."""
+    """Return minimum and maximum of each component over the rest pose, all postures and their mirror images.
+
+    The limits include a margin: `MARGIN`, or three standard deviations of the joint noise, whichever is larger.
+    """
     poses = np.stack([np.zeros((len(JOINT_NAMES) - 1, 3)), *(posture.body_pose for posture in POSTURES.values())])
     poses = np.concatenate([poses, mirrored_pose(poses)])
     margin = np.maximum(MARGIN, 3 * joint_noise())[:, None]

@@ -1,8 +1,8 @@
-"""Where the murre's joints lie, and how its wing unfolds.
+"""Joint positions of the murre, and the unfolding of its wing.
 
-Joints, names and axes are those of the published models (`jaxfit.model.anatomy`), so that a body pose means the same
-bend of the same joint: at rest the bird is nearly horizontal, wings folded, legs below, the root at the origin between
-the knees. Positions here are centimetres, left side only.
+Joints, names and axes are those of the published models (`jaxfit.model.anatomy`), so a body pose has the same meaning
+for all models. In the rest pose the bird is nearly horizontal, the wings are folded, the legs point down, and the root
+is at the origin between the knees. Positions in this module are in centimetres, left side only.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from jaxfit.model.anatomy import JOINT_NAMES
 __all__ = ["CM_PER_UNIT", "PARENTS", "WING_BONES", "Frame", "joint_positions", "spread_rotations", "spread_transforms"]
 
 CM_PER_UNIT = 2.0
-"""One model unit. The murre is then some 20 units long, as the published birds are, so that learning rates, priors and
-weights that were tuned on them carry over."""
+"""Length of one model unit. The murre is then about 20 units long, as the published birds are, so learning rates,
+priors and weights that were tuned on the published birds remain valid."""
 
 PARENTS = (-1, 0, 1, 0, 3, 3, 5, 6, 7, 3, 9, 10, 11, 3, 13, 14, 15, 3, 17, 18, 19, 3, 21, 22, 23)
 """Parent of each joint, in the order of `JOINT_NAMES`."""
@@ -46,13 +46,13 @@ MIDDLE_AND_LEFT = {
 
 
 class Frame(NamedTuple):
-    """How a bone of the wing lies: the way it points, and the way the wing's upper side looks there."""
+    """Orientation of a wing bone: the direction of the bone, and the normal of the upper side of the wing."""
 
     along: tuple[float, float, float]
     above: tuple[float, float, float]
 
     def matrix(self) -> Float[np.ndarray, "3 3"]:
-        """Columns: along the bone, across the wing, out of its upper side (right-handed, orthonormal)."""
+        """Return the axes as columns: along the bone, across the wing, out of the upper side (orthonormal)."""
         along = np.asarray(self.along) / np.linalg.norm(self.along)
         above = np.asarray(self.above) - np.dot(self.above, along) * along
         above /= np.linalg.norm(above)
@@ -63,16 +63,17 @@ WING_BONES = ("left_shoulder", "left_elbow", "left_wrist")
 WING_TIP = (-1.6, -12.7, 3.4)
 """Tip of the longest primary of the folded wing."""
 FOLDED_ABOVE = ((-0.85, 0.0, 0.5), (-0.95, 0.1, 0.25), (-0.97, 0.0, 0.25))
+"""Normals of the upper side at humerus, forearm and hand of the folded wing."""
 SPREAD = (
     Frame((-0.93, -0.30, 0.06), (0.0, 0.0, 1.0)),
     Frame((-0.93, 0.36, 0.02), (0.0, 0.0, 1.0)),
     Frame((-0.92, -0.38, -0.02), (0.0, 0.0, 1.0)),
 )
-"""Humerus, forearm and hand of the spread wing."""
+"""Orientation of humerus, forearm and hand of the spread wing."""
 
 
 def joint_positions() -> Float[np.ndarray, "J 3"]:
-    """Rest positions of all joints in centimetres."""
+    """Return the rest positions of all joints in centimetres."""
     mirror = np.array([-1.0, 1.0, 1.0])
     return np.stack(
         [
@@ -85,7 +86,7 @@ def joint_positions() -> Float[np.ndarray, "J 3"]:
 
 
 def spread_rotations() -> dict[str, Float[np.ndarray, "3 3"]]:
-    """Rotation, folded → spread, of each of the left wing's bones against its parent."""
+    """Return the rotation folded → spread of each bone of the left wing, relative to its parent."""
     ends = [np.asarray(MIDDLE_AND_LEFT[name]) for name in WING_BONES] + [np.asarray(WING_TIP)]
     local, above = {}, np.eye(3)
     for i, name in enumerate(WING_BONES):
@@ -97,13 +98,17 @@ def spread_rotations() -> dict[str, Float[np.ndarray, "3 3"]]:
 
 
 def spread_transforms(share: float = 1.0) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """(R, t) of each of the left wing's bones, unfolded by a share of the way, in centimetres: x ↦ R x + t."""
-    R, position, placed = np.eye(3), np.asarray(MIDDLE_AND_LEFT["left_shoulder"]), {}
-    local, before = spread_rotations(), position
+    """Return (R, t) for each bone of the left wing, x ↦ R x + t in centimetres, for a partly unfolded wing.
+
+    Args:
+        share: share of the unfolding, 0 (folded) to 1 (spread).
+    """
+    R, position, transforms = np.eye(3), np.asarray(MIDDLE_AND_LEFT["left_shoulder"]), {}
+    local, parent = spread_rotations(), position
     for name in WING_BONES:
         joint = np.asarray(MIDDLE_AND_LEFT[name])
-        position = position + R @ (joint - before)
+        position = position + R @ (joint - parent)
         R = R @ Rotation.from_rotvec(share * Rotation.from_matrix(local[name]).as_rotvec()).as_matrix()
-        placed[name] = (R, position - R @ joint)
-        before = joint
-    return placed
+        transforms[name] = (R, position - R @ joint)
+        parent = joint
+    return transforms

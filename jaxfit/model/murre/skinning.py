@@ -1,8 +1,8 @@
-"""Which joints move which vertex of the left half, and by how much.
+"""Skinning weights of the murre.
 
-Body and leg: smooth steps from joint to joint. Wing: the weights are solved for, so that linear blend skinning carries
-the folded sheet into the spread one (`wing`): a feather's tip then follows a mean of hand, forearm and upper arm, as a
-feather does that fans, instead of one bone.
+The weights of body and leg are smooth steps from joint to joint. The weights of the wing solve a least-squares problem:
+linear blend skinning shall transform the folded wing into the spread wing (`wing`). The tip of a feather then follows
+a mean of hand, forearm and upper arm, as the feathers of a fan do, instead of one bone.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.optimize import nnls
 
 from jaxfit.model.anatomy import JOINT_NAMES, other_side
-from jaxfit.model.murre.leg import LEG_SHARES
+from jaxfit.model.murre.leg import LEG_PARTS
 from jaxfit.model.murre.skeleton import spread_transforms
 from jaxfit.model.murre.surface import ANGLES, RINGS, Half, Mesh
 from jaxfit.model.murre.wing import SPAN, spread_sheet
@@ -26,7 +26,8 @@ SPINE = (
     ("neck_root", "neck", 9.1, 10.8),
     ("neck", "head", 11.2, 13.2),
 )
-"""Joints from the tail to the head, and where, in rows of `surface.SECTIONS`, one hands over to the next."""
+"""(joint, next joint, start, end) from the tail to the head: the weight changes from the joint to the next joint
+between `start` and `end`, in rows of `surface.SECTIONS`."""
 WING = ("left_wing_root", "left_shoulder", "left_elbow", "left_wrist")
 LEG = {
     "thigh": {"body": 0.4, "left_knee": 0.6},
@@ -37,35 +38,35 @@ LEG = {
     "toes": {"left_foot": 1.0},
 }
 HINGE = {"upper_body": 0.45, "left_wing_root": 0.2, "left_shoulder": 0.35}
-"""Weights of the wing's first ring."""
+"""Weights of the first ring of the wing."""
 MAX_JOINTS = 4
 SMOOTH, NEAR = 2.0, 0.5
-"""How strongly neighbours on the wing share their weights, and how strongly those keep to a plain guess: both in
-centimetres of misfit for a whole weight."""
+"""Penalties of the wing weights: on differences between neighbouring vertices, and on differences from the initial
+guess; both in centimetres of position error per unit of weight."""
 
 
 def half_weights(half: Half) -> Float[np.ndarray, "H J"]:
-    """Weights of every vertex of the left half; rows sum to 1 and hold at most four that are not 0."""
+    """Return the skinning weights of the left half; rows sum to 1 and have at most four non-zero entries."""
     weights = np.zeros((len(half.vertices), len(JOINT_NAMES)))
     for vertex in np.flatnonzero(half.part == 0):
         ring, column = half.place[vertex]
         for name, share in body_weights(float(RINGS[ring]), float(ANGLES[column])).items():
             weights[vertex, JOINT_NAMES.index(name)] = share
-    stump = weights[half.leg_index[0]].mean(axis=0)
-    for ring, name in enumerate(LEG_SHARES, start=1):
+    at_body = weights[half.leg_index[0]].mean(axis=0)
+    for ring, name in enumerate(LEG_PARTS, start=1):
         for joint, share in LEG[name].items():
-            row = stump if joint == "body" else np.eye(len(JOINT_NAMES))[JOINT_NAMES.index(joint)]
+            row = at_body if joint == "body" else np.eye(len(JOINT_NAMES))[JOINT_NAMES.index(joint)]
             weights[half.leg_index[ring]] += share * row
     columns = [JOINT_NAMES.index(name) for name in WING]
     weights[half.wing_index[1:].ravel()[:, None], columns] = wing_weights(half).reshape(-1, len(WING))
     weights[half.wing_index[1]] = 0.0
     for name, share in HINGE.items():
         weights[half.wing_index[1], JOINT_NAMES.index(name)] = share
-    return _few(weights)
+    return _keep_largest(weights)
 
 
 def body_weights(row: float, angle: float) -> dict[str, float]:
-    """Weights of a point of the loft."""
+    """Return the weights of a point of the body, by its row of `surface.SECTIONS` and its angle from the back."""
     weights = {SPINE[0][0]: 1.0}
     for before, after, start, end in SPINE:
         share = smooth_step(row, start, end)
@@ -81,10 +82,10 @@ def body_weights(row: float, angle: float) -> dict[str, float]:
 
 
 def wing_weights(half: Half) -> Float[np.ndarray, "U P 4"]:
-    """Weights of the wing's vertices on `WING` that turn the folded wing into the spread one.
+    """Return the weights on the joints `WING` that transform the folded wing into the spread wing.
 
-    Σ_j w_j (R_j x + t_j) = y for every vertex, folded at x and spread at y, in the least-squares sense, with w ≥ 0,
-    Σ_j w_j = 1, w near a plain guess, and w smooth over the sheet.
+    Least-squares solution of Σ_j w_j (R_j x + t_j) = y for every vertex, with folded position x and spread position
+    y, subject to w ≥ 0 and Σ_j w_j = 1. Penalties keep w close to an initial guess and smooth over the wing.
     """
     folded = half.vertices[half.wing_index[1:]]
     upper, lower = spread_sheet()
@@ -93,15 +94,15 @@ def wing_weights(half: Half) -> Float[np.ndarray, "U P 4"]:
     images = np.stack(moved, axis=-1)  # (U, P, 3, 4)
     stations, points, joints = len(SPAN), folded.shape[1], len(WING)
     index = np.arange(stations * points * joints).reshape(stations, points, joints)
-    rows, columns, values, wanted = [], [], [], []
+    rows, columns, values, right_side = [], [], [], []
 
     def equation(at, coefficients, value) -> None:
-        rows.append(np.full(len(at), len(wanted)))
+        rows.append(np.full(len(at), len(right_side)))
         columns.append(at)
         values.append(coefficients)
-        wanted.append(value)
+        right_side.append(value)
 
-    guess = _guess()
+    guess = _initial_guess()
     for u in range(stations):
         for p in range(points):
             for d in range(3):
@@ -113,20 +114,21 @@ def wing_weights(half: Half) -> Float[np.ndarray, "U P 4"]:
                     if other[0] < stations:
                         at = np.array([index[u, p, j], index[other[0], other[1] % points, j]])
                         equation(at, np.array([SMOOTH, -SMOOTH]), 0.0)
-    matrix = np.zeros((len(wanted), index.size))
+    matrix = np.zeros((len(right_side), index.size))
     np.add.at(matrix, (np.concatenate(rows), np.concatenate(columns)), np.concatenate(values))
-    solved = nnls(matrix.T @ matrix, matrix.T @ np.array(wanted), maxiter=20 * index.size)[0]
+    solved = nnls(matrix.T @ matrix, matrix.T @ np.array(right_side), maxiter=20 * index.size)[0]
     weights = solved.reshape(stations, points, joints)
     return weights / weights.sum(axis=-1, keepdims=True)
 
 
-def _guess() -> Float[np.ndarray, "U 4"]:
+def _initial_guess() -> Float[np.ndarray, "U 4"]:
+    """Return weights on `WING` that change by smooth steps along the span."""
     hand, fore, arm = smooth_step(SPAN, 0.36, 0.50), smooth_step(SPAN, 0.16, 0.30), smooth_step(SPAN, 0.0, 0.13)
     return np.stack([1 - arm, arm * (1 - fore), fore * (1 - hand), hand], axis=-1)
 
 
 def mirrored_weights(mesh: Mesh, left: Float[np.ndarray, "H J"]) -> Float[np.ndarray, "V J"]:
-    """Weights of both halves; a vertex in the middle of the bird is moved by both sides alike."""
+    """Return the weights of the whole mesh; a vertex on the midline has equal weights for both sides."""
     swap = [JOINT_NAMES.index(other_side(name)) for name in JOINT_NAMES]
     weights = left[mesh.half]
     weights[mesh.right] = weights[mesh.right][:, swap]
@@ -135,14 +137,14 @@ def mirrored_weights(mesh: Mesh, left: Float[np.ndarray, "H J"]) -> Float[np.nda
     return weights
 
 
-def _few(weights: np.ndarray) -> np.ndarray:
-    """Keep the largest few weights of every row, and none too small to matter."""
-    least = np.sort(weights, axis=1)[:, [-MAX_JOINTS]]
-    weights = np.where((weights >= least) & (weights > 0.004), weights, 0.0)
+def _keep_largest(weights: np.ndarray) -> np.ndarray:
+    """Keep the `MAX_JOINTS` largest weights of every row that are above 0.004, and normalise the rows."""
+    smallest = np.sort(weights, axis=1)[:, [-MAX_JOINTS]]
+    weights = np.where((weights >= smallest) & (weights > 0.004), weights, 0.0)
     return weights / weights.sum(axis=1, keepdims=True)
 
 
 def smooth_step(x, start: float, end: float):
-    """0 before `start`, 1 after `end`, smooth between."""
+    """Return 0 below `start`, 1 above `end`, and the cubic 3t² − 2t³ between them."""
     t = np.clip((x - start) / (end - start), 0.0, 1.0)
     return t * t * (3 - 2 * t)

@@ -1,7 +1,7 @@
-"""The murre's mesh: a loft from tail to bill with two slits for the wings and two holes for the legs.
+"""The mesh of the murre: a lofted body from tail to bill, with slits for the wings and holes for the legs.
 
-Only the left half is made; its mirror image is joined to it along the middle, so the mesh is symmetric by construction.
-Centimetres, in the axes of `jaxfit.model.anatomy`.
+The code builds the left half and joins its mirror image along the midline, so the mesh is symmetric by construction.
+Lengths are in centimetres, in the axes of `jaxfit.model.anatomy`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from jaxfit.model.murre.wing import wing_rings
 
 __all__ = ["ANGLES", "Half", "Mesh", "body_rings", "make_half", "mirrored"]
 
-# One section a row: y and z of its centre, the slope of the spine there in degrees, half the width, and the height
-# above and below the centre.
+# One cross-section per row: y and z of the centre, slope of the spine in degrees, half width, and height above and
+# below the centre.
 SECTIONS = np.array(
     [
         (-15.3, 1.55, 2, 0.95, 0.12, 0.12),  # tail tip
@@ -46,58 +46,62 @@ SECTIONS = np.array(
     ]
 )
 SLIT = slice(10, 17)
-"""Rings along which the wing is joined on, from its hindmost to its foremost."""
+"""Rings at which the wing is attached, from back to front."""
 RINGS = np.array([
     0, 1, 1.6, 2.3, 3, 3.5, 4.0, 4.5, 5.0, 5.4,
     *np.interp(np.linspace(-1.2, 7.4, 7), SECTIONS[5:9, 0], np.arange(5.0, 9.0)),
     8.55, 9.0, 9.12, 9.7, 10.4, 11.2, 12, 12.7, 13.3, 13.9, 14.5, 15.1, 15.8, 16.5, 17, 17.25, 18, 19, 20,
 ])  # fmt: skip
-"""Where rings are cut, in rows of `SECTIONS`."""
+"""Positions of the rings of vertices, in (fractional) rows of `SECTIONS`."""
 ANGLES = np.radians([0, 19, 37, 53, 69, 74, 91, 109, 127, 145, 163, 180])
-"""Around a ring from the middle of the back to the middle of the belly."""
+"""Angles of the vertices of a ring, from the middle of the back to the middle of the belly."""
 SLIT_COLUMNS = (3, 4)
 BIB_RINGS = (18, 19)
-"""Two rings close together, along which the brown of the foreneck ends."""
+"""Two rings close together, between which the brown of the foreneck ends."""
 BIB = {17: 0.45, 18: 1.0, 19: 1.0, 20: 0.75, 21: 0.4, 22: 0.15}
 BIB_REACH = np.interp(np.degrees(ANGLES), [0, 75, 100, 125, 150, 180], [-0.3, -0.3, -0.15, 0.15, 0.42, 0.5])
-"""Those rings run higher on the foreneck than at the sides: how far along the spine each column is moved, and the share
-of it that each ring takes."""
+"""The bib rings lie further forward on the foreneck than at the sides: `BIB_REACH` is the shift of each column along
+the spine in rows of `SECTIONS`, `BIB` the share of this shift for each ring."""
 LEG_RINGS, LEG_COLUMNS = (7, 8, 9), (7, 8, 9)
 
 
 class Half(NamedTuple):
-    """The left half of the mesh. Parts: 0 body, 1 wing, 2 leg; `place` says where in its part a vertex lies."""
+    """The left half of the mesh.
+
+    `part` is 0 for the body, 1 for the wing, 2 for the leg; `place` is the position of a vertex in its part.
+    """
 
     vertices: Float[np.ndarray, "H 3"]
     faces: Int[np.ndarray, "G 3"]
     part: Int[np.ndarray, "H"]
     place: Int[np.ndarray, "H 2"]
-    """Body: ring from the tail, column from the back. Wing and leg: ring from the body, point round it."""
+    """Body: ring counted from the tail, column counted from the back. Wing and leg: ring counted from the body, and
+    point of the ring."""
     body_index: Int[np.ndarray, "R C"]
     wing_index: Int[np.ndarray, "U P"]
     leg_index: Int[np.ndarray, "L P"]
 
 
 class Mesh(NamedTuple):
-    """Both halves."""
+    """The whole mesh."""
 
     vertices: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
     half: Int[np.ndarray, "V"]
-    """The vertex of the left half that each vertex is, or is the mirror image of."""
+    """Index in the left half: of the vertex itself, or of the vertex whose mirror image it is."""
     right: np.ndarray
-    """Whether a vertex is a mirror image."""
+    """Whether the vertex is a mirror image."""
     mirror: Int[np.ndarray, "V"]
-    """The other side's vertex; a vertex in the middle is its own."""
+    """Index of the mirror image of the vertex; for a vertex on the midline, its own index."""
 
 
 def sections_at(rows: Float[np.ndarray, "*R"]) -> Float[np.ndarray, "*R 6"]:
-    """`SECTIONS` between its rows; the section's numbers stand last."""
+    """Interpolate `SECTIONS` between its rows; the last axis has the six numbers of a section."""
     return PchipInterpolator(np.arange(len(SECTIONS)), SECTIONS)(rows)
 
 
 def body_rings() -> Float[np.ndarray, "R C 3"]:
-    """Points of the loft's left half, from the tail's ring to the bill's, from the back to the belly."""
+    """Return the points of the left half of the body: rings from tail to bill, columns from back to belly."""
     rows = np.repeat(RINGS[:, None], len(ANGLES), axis=1)
     for ring, share in BIB.items():
         rows[ring] += share * BIB_REACH
@@ -105,12 +109,12 @@ def body_rings() -> Float[np.ndarray, "R C 3"]:
     slope = np.radians(slope)
     side, up = np.sin(ANGLES), np.cos(ANGLES)
     height = np.where(up >= 0, above, below) * up
-    side = np.where(np.abs(side) < 1e-9, 0.0, side)  # the middle lies at exactly x = 0
+    side = np.where(np.abs(side) < 1e-9, 0.0, side)  # points on the midline have exactly x = 0
     return np.stack([-width * side, y - np.sin(slope) * height, z + np.cos(slope) * height], axis=-1)
 
 
 def make_half() -> Half:
-    """The left half: loft, wing and leg, with shared vertices where they join."""
+    """Build the left half: body, wing and leg, with shared vertices where the parts join."""
     rings = body_rings()
     rows, columns = rings.shape[:2]
     inside_leg = (LEG_RINGS[1], LEG_COLUMNS[1])
@@ -151,7 +155,7 @@ def make_half() -> Half:
 
 
 def mirrored(half: Half) -> Mesh:
-    """The whole mesh: the half, and its mirror image with the faces turned round."""
+    """Return the whole mesh: the left half, and its mirror image with reversed face orientation."""
     count = len(half.vertices)
     middle = half.vertices[:, 0] == 0
     copies = np.flatnonzero(~middle)
@@ -169,7 +173,7 @@ def _quad(faces: list, a: int, b: int, c: int, d: int) -> None:
 
 
 def _extrude(faces: list, loop: list, rings, add, part: int) -> list:
-    """Join rings of points on to a loop of vertices; all run the same way round."""
+    """Connect rings of points to a loop of vertices by faces; loop and rings have the same direction."""
     index = [list(loop)]
     for j, ring in enumerate(rings, start=1):
         index.append([add(point, part, (j, p)) for p, point in enumerate(ring)])
@@ -180,7 +184,7 @@ def _extrude(faces: list, loop: list, rings, add, part: int) -> list:
 
 
 def _zip(faces: list, loop, flip: bool = False, pointed: bool = False) -> None:
-    """Close a flat loop by rungs across it; a pointed one ends in single points instead of rungs."""
+    """Close a flat loop with faces between opposite points; a pointed loop has one end point at either end."""
     loop = list(loop)
     n = len(loop)
     rungs = [(loop[p], loop[-p if pointed else n - 1 - p]) for p in range(n // 2 + pointed)]

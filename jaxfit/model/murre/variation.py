@@ -1,7 +1,7 @@
-"""How one murre differs from another: shape directions and bone lengths.
+"""Variation between murres: shape directions and the prior of bone lengths.
 
-Designed from the ranges in `measurements`, not learnt: one unit of a coefficient is one standard deviation, a quarter
-of the range from the least to the greatest measurement.
+The directions are designed from the ranges in `measurements`, not learnt. One unit of a shape coefficient is one
+standard deviation, which is a quarter of the range from the lowest to the highest measurement.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ __all__ = ["SHAPES", "bone_prior", "half_shapes"]
 
 SHAPES = ("girth", "neck thickness", "bill length", "wing length", "tail length")
 PIVOT = (0.0, 0.0, 2.8)
-"""What the girth grows away from."""
-BONE_DEVIATION, SIDES_AGREE = 0.05, 0.9
+"""Centre from which the girth direction expands the trunk, centimetres."""
+BONE_DEVIATION, SIDE_CORRELATION = 0.05, 0.9
+"""Standard deviation of relative bone lengths, and correlation between the two sides of a bird."""
 
 
 def relative_deviation(name: str) -> float:
-    """Standard deviation of a measurement relative to its value."""
+    """Return the standard deviation of a measurement, relative to the value of the model."""
     low, high, used, _ = MEASUREMENTS[name]
     return (high - low) / 4 / used
 
 
 def half_shapes(half: Half, weights: Float[np.ndarray, "H J"]) -> Float[np.ndarray, "S H 3"]:
-    """Displacement in centimetres of every vertex of the left half by one unit of each direction."""
+    """Return the vertex displacements of the left half for one unit of each shape direction, in centimetres."""
     v, basis = half.vertices, np.zeros((len(SHAPES), *half.vertices.shape))
     trunk = smooth_step(v[:, 1], -13.0, -5.0) * (1 - smooth_step(v[:, 1], 7.0, 11.0)) * (half.part < 2)
     basis[0] = relative_deviation("body_width") * trunk[:, None] * (v - PIVOT) * [1, 0, 1]
@@ -60,9 +61,9 @@ def half_shapes(half: Half, weights: Float[np.ndarray, "H J"]) -> Float[np.ndarr
 
 
 def bone_prior() -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B B"]]:
-    """Mean and covariance of relative bone lengths: about 1, both sides of a bird nearly equal."""
+    """Return mean (1) and covariance of the relative bone lengths; the two sides of a bird are strongly correlated."""
     bones = len(JOINT_NAMES) - 1
     correlation = np.eye(bones)
     for left, right in mirror_pairs(JOINT_NAMES):
-        correlation[left - 1, right - 1] = correlation[right - 1, left - 1] = SIDES_AGREE
+        correlation[left - 1, right - 1] = correlation[right - 1, left - 1] = SIDE_CORRELATION
     return np.ones(bones), BONE_DEVIATION**2 * correlation

@@ -1,8 +1,9 @@
-"""The left wing: the same sheet of feathers folded on the flank and spread, point by point.
+"""The left wing of the murre: one sheet of points, folded on the flank and spread.
 
-A wing is no stack of layers here but one sheet that fans: folded, the wrist lies at the breast, the leading edge runs
-down to it and back along the flank, and the tips of the secondaries lie along the back; spread, the same points form a
-long narrow wing. `skinning` finds the weights that carry the one into the other.
+The wing is one sheet, not a stack of feathers. In the folded wing, the wrist lies at the breast, the leading edge runs
+down to the wrist and then back along the flank, and the tips of the secondaries lie along the back. In the spread wing,
+the same points form a long narrow wing. `skinning` computes the weights that transform the folded wing into the spread
+wing.
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from scipy.interpolate import PchipInterpolator
 __all__ = ["CHORD", "SPAN", "folded_sheet", "spread_sheet", "wing_rings"]
 
 CHORD = np.array([0.0, 0.17, 0.34, 0.53, 0.75, 0.88, 1.0])
-"""Stations from the leading to the trailing edge, as many as the slit has rings."""
+"""Positions of the points from the leading edge (0) to the trailing edge (1), one point for each ring of the slit."""
 SPAN = np.array([0.06, 0.13, 0.20, 0.27, 0.34, 0.41, 0.48, 0.55, 0.63, 0.71, 0.79, 0.87, 0.94, 1.0])
-"""Stations from the body to the tip; the wrist is at 0.42."""
+"""Positions of the rings from the body (0) to the tip (1); the wrist is at 0.42."""
 
-# Folded: at a station, y and the arc from the slit down the flank (cm) of the leading and the trailing edge.
+# Folded wing, one span position per row: span, then y and arc length from the slit down the flank (cm), first of the
+# leading edge, then of the trailing edge.
 FOLDED = np.array(
     [
         (0.00, 7.4, 0.0, -1.2, 0.0),
@@ -31,7 +33,7 @@ FOLDED = np.array(
         (1.00, -12.0, 1.4, -12.7, 0.7),
     ]
 )
-# Spread: x and y of the leading and the trailing edge.
+# Spread wing, one span position per row: span, then x and y of the leading edge and of the trailing edge (cm).
 SPREAD = np.array(
     [
         (0.00, -4.5, 7.4, -5.0, -1.2),
@@ -44,7 +46,7 @@ SPREAD = np.array(
         (1.00, -34.6, -1.4, -34.3, -2.5),
     ]
 )
-# What the folded wing lies on: y, z of the centre, half the width, height above and below.
+# Body surface under the folded wing: y, z of the centre, half width, height above and below the centre (cm).
 BED = np.array(
     [
         (-15.0, 2.2, 1.7, 1.0, 1.0),
@@ -59,11 +61,11 @@ BED = np.array(
 )
 SLIT_ANGLE = np.radians(61)
 HINGE = (0.42, 0.04)
-"""How far the upper and the lower side of the hinge stand out of the body, in centimetres."""
+"""Distance of the upper and the lower side of the first ring from the body, in centimetres."""
 
 
 def _on_flank(y, arc, off) -> np.ndarray:
-    """A point of the folded wing: y, arc down from the slit, distance off the body."""
+    """Return points of the folded wing from y, arc length below the slit, and distance from the body."""
     z, width, above, below = PchipInterpolator(BED[:, 0], BED[:, 1:])(np.clip(y, -15, 9)).T
     angle = SLIT_ANGLE + arc / np.maximum(width, 3.0)
     height = np.where(np.cos(angle) >= 0, above, below) * np.cos(angle)
@@ -77,14 +79,14 @@ def _edges(table, span):
 
 
 def _thickness(span, chord):
-    """Of the sheet in centimetres: an arm with feathers behind it, thinner towards the tip."""
+    """Return the thickness of the wing in centimetres: thick at the arm, thin at the feathers and the tip."""
     arm = np.interp(span, [0, 0.12, 0.42, 0.7, 1.0], [1.1, 0.85, 0.55, 0.32, 0.15])
     profile = np.interp(chord, [0, 0.1, 0.3, 0.6, 1.0], [0.45, 0.9, 1.0, 0.5, 0.2])
     return np.maximum(arm * profile, 0.12)
 
 
 def folded_sheet() -> tuple[Float[np.ndarray, "U C 3"], Float[np.ndarray, "U C 3"]]:
-    """Upper (outer) and lower (inner) side of the folded wing."""
+    """Return the upper (outer) and the lower (inner) side of the folded wing, in centimetres."""
     front_y, front_arc, back_y, back_arc = (column[:, None] for column in _edges(FOLDED, SPAN).T)
     y = front_y + CHORD * (back_y - front_y)
     arc = front_arc + CHORD * (back_arc - front_arc)
@@ -98,7 +100,7 @@ def folded_sheet() -> tuple[Float[np.ndarray, "U C 3"], Float[np.ndarray, "U C 3
 
 
 def spread_sheet() -> tuple[Float[np.ndarray, "U C 3"], Float[np.ndarray, "U C 3"]]:
-    """Upper and lower side of the spread wing."""
+    """Return the upper and the lower side of the spread wing, in centimetres."""
     front_x, front_y, back_x, back_y = (column[:, None] for column in _edges(SPREAD, SPAN).T)
     x = front_x + CHORD * (back_x - front_x)
     y = front_y + CHORD * (back_y - front_y)
@@ -112,15 +114,19 @@ def spread_sheet() -> tuple[Float[np.ndarray, "U C 3"], Float[np.ndarray, "U C 3
 
 
 def wing_rings(slit: Float[np.ndarray, "P 3"]) -> Float[np.ndarray, "U P 3"]:
-    """The folded wing as rings from body to tip: the upper side from the front back, then the lower side forwards.
+    """Return the folded wing as rings from body to tip, in centimetres.
 
-    The first ring is the hinge: the slit's own outline, drawn a little together and out of the body, so that it can
-    turn half-way with the wing in either direction.
+    A ring runs along the upper side from front to back, then along the lower side from back to front. The first ring
+    is the hinge: the outline of the slit, slightly contracted and moved out of the body, so that the hinge can turn
+    half-way with the wing in both directions.
+
+    Args:
+        slit: vertices of the slit of the body, in the same order.
     """
     upper, lower = folded_sheet()
     rings = np.concatenate([upper, lower[:, ::-1]], axis=1)
-    across = (slit + slit[::-1]) / 2  # the middle between upper and lower side
+    middle = (slit + slit[::-1]) / 2  # between upper and lower side
     outwards = np.array([-np.sin(SLIT_ANGLE), 0.0, np.cos(SLIT_ANGLE)])
-    out = np.repeat(HINGE, len(slit) // 2)
-    rings[0] = slit + 0.3 * (across - slit) + out[:, None] * outwards
+    distance = np.repeat(HINGE, len(slit) // 2)
+    rings[0] = slit + 0.3 * (middle - slit) + distance[:, None] * outwards
     return rings

@@ -1,18 +1,15 @@
-"""Files and folders appear whole or not at all, and damaged arrays give one clear error."""
+"""Files and folders are written atomically."""
 
 import errno
-import io
 import os
 import subprocess
-import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from jaxfit.errors import InputError
-from jaxfit.storage.files import new_folder, validate_arrays, write_whole
-from jaxfit.storage.npz import load_npz
+from jaxfit.storage.files import new_folder, write_whole
 
 
 def names(folder):
@@ -40,7 +37,7 @@ def test_writes_a_file_and_the_folders_above(tmp_path):
     assert names(path.parent) == ["file.bin"]
 
 
-def test_a_symbolic_link_stays_one(tmp_path):
+def test_writing_through_a_symbolic_link_keeps_the_link(tmp_path):
     (tmp_path / "real").write_bytes(b"old")
     (tmp_path / "link").symlink_to(tmp_path / "real")
     write_whole(tmp_path / "link", b"new")
@@ -48,7 +45,7 @@ def test_a_symbolic_link_stays_one(tmp_path):
     assert (tmp_path / "real").read_bytes() == b"new"
 
 
-def test_a_folder_or_device_is_no_file(tmp_path):
+def test_a_folder_or_device_is_not_replaced_by_a_file(tmp_path):
     for path in (tmp_path, Path("/dev/null")):
         with pytest.raises(InputError, match="is a folder or a device"):
             write_whole(path, b"")
@@ -56,7 +53,7 @@ def test_a_folder_or_device_is_no_file(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES])
-def test_a_refused_write_leaves_everything_as_it_was(tmp_path, monkeypatch, number):
+def test_a_rejected_write_changes_nothing(tmp_path, monkeypatch, number):
     path = tmp_path / "file"
     path.write_bytes(b"old")
     monkeypatch.setattr(os, "fsync", fail_with(number))
@@ -70,7 +67,7 @@ def test_a_refused_write_leaves_everything_as_it_was(tmp_path, monkeypatch, numb
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_the_systems_own_full_disk(tmp_path):
+def test_a_full_device(tmp_path):
     def content(file):
         file.write(b"half")
         with open("/dev/full", "wb", buffering=0) as full:  # noqa: PTH123
@@ -109,7 +106,7 @@ def test_a_disk_that_fills_up(tiny_disk):
     assert (tiny_disk / "results" / "poses.npz").read_bytes() == b"old"
 
 
-def test_any_other_error_passes_through_and_leaves_nothing(tmp_path):
+def test_other_errors_are_not_converted_and_leave_no_files(tmp_path):
     def content(file):
         file.write(b"half")
         raise KeyError("a mistake in the program")
@@ -126,7 +123,7 @@ def test_any_other_error_passes_through_and_leaves_nothing(tmp_path):
     assert names(tmp_path) == []
 
 
-def test_a_folder_appears_at_the_end(tmp_path):
+def test_a_folder_appears_after_the_body(tmp_path):
     out = tmp_path / "results" / "cliff"
     with new_folder(out) as folder:
         (folder / "sub").mkdir()
@@ -136,48 +133,48 @@ def test_a_folder_appears_at_the_end(tmp_path):
     assert names(out.parent) == ["cliff"]
 
 
-def test_results_are_not_overwritten_unasked(tmp_path):
+def test_results_are_overwritten_only_on_request(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
-    with new_folder(out) as folder:  # an empty folder is nothing to protect
+    with new_folder(out) as folder:  # an empty folder may be replaced
         (folder / "poses.npz").write_bytes(b"1")
     with pytest.raises(InputError, match=r"out: holds results already \(choose another --out or pass --overwrite\)"):
         new_folder(out).__enter__()
     with new_folder(out, overwrite=True, marker="poses.npz") as folder:
         (folder / "new").write_bytes(b"2")
-        assert names(out) == ["poses.npz"]  # the old one stands until the new one is complete
+        assert names(out) == ["poses.npz"]  # the old folder remains until the new folder is complete
     assert names(out) == ["new"]
     with pytest.raises(InputError, match=r"holds files, but no poses\.npz"):
         new_folder(out, overwrite=True, marker="poses.npz").__enter__()
     assert names(tmp_path) == ["out"]
 
 
-def test_results_that_appear_meanwhile_are_kept(tmp_path):
+def test_results_that_another_program_writes_meanwhile_are_kept(tmp_path):
     out = tmp_path / "out"
 
-    def overtaken(folder):
+    def write_second(folder):
         (folder / "file").write_bytes(b"second")
         out.mkdir()
         (out / "file").write_bytes(b"first")
 
     with pytest.raises(InputError, match="holds results already"):
-        fill(out, overtaken)
+        fill(out, write_second)
     assert (out / "file").read_bytes() == b"first"
     assert names(tmp_path) == ["out"]
 
 
-def test_a_failed_exchange_puts_the_old_folder_back(tmp_path, monkeypatch):
+def test_a_failed_replacement_restores_the_old_folder(tmp_path, monkeypatch):
     out = tmp_path / "out"
     with new_folder(out) as folder:
         (folder / "file").write_bytes(b"old")
     rename = Path.rename
 
-    def refuse_new(self, target):
+    def fail_for_new_folder(self, target):
         if self.name.endswith(".part"):
             fail_with(errno.EIO)()
         return rename(self, target)
 
-    monkeypatch.setattr(Path, "rename", refuse_new)
+    monkeypatch.setattr(Path, "rename", fail_for_new_folder)
     with pytest.raises(InputError, match="Input/output error"):
         fill(out, lambda folder: (folder / "file").write_bytes(b"new"), overwrite=True)
     assert (out / "file").read_bytes() == b"old"
@@ -185,7 +182,7 @@ def test_a_failed_exchange_puts_the_old_folder_back(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_the_current_folder_stays(tmp_path, monkeypatch, overwrite):
+def test_the_current_folder_is_not_replaced(tmp_path, monkeypatch, overwrite):
     here = tmp_path / "above" / "here"
     here.mkdir(parents=True)
     monkeypatch.chdir(here)
@@ -198,7 +195,7 @@ def test_the_current_folder_stays(tmp_path, monkeypatch, overwrite):
     assert names(here) == ["inside"]
 
 
-def test_a_file_stands_in_the_way(tmp_path):
+def test_a_file_at_the_place_of_a_folder(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(InputError, match="is a file, not a folder"):
         new_folder(tmp_path / "file", overwrite=True).__enter__()
@@ -206,81 +203,3 @@ def test_a_file_stands_in_the_way(tmp_path):
         new_folder(tmp_path / "file" / "out").__enter__()
     with pytest.raises(InputError, match="a part of its path is a file"):
         write_whole(tmp_path / "file" / "out", b"")
-
-
-def npz(**arrays):
-    file = io.BytesIO()
-    np.savez_compressed(file, **arrays)
-    return file.getvalue()
-
-
-def test_reads_arrays_back(tmp_path):
-    (tmp_path / "a.npz").write_bytes(npz(x=np.eye(3), names=np.array(["a", "ü"]), extra=np.int64(4)))
-    arrays = load_npz(tmp_path / "a.npz", {"x": 2, "names": 1})
-    np.testing.assert_array_equal(arrays["x"], np.eye(3))
-    assert arrays["names"].tolist() == ["a", "ü"]
-    assert arrays["extra"] == 4
-
-
-def raw(array):
-    file = io.BytesIO()
-    np.save(file, array, allow_pickle=True)
-    return file.getvalue()
-
-
-def zipped(content):
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as archive:
-        archive.writestr("x.npy", content)
-    return file.getvalue()
-
-
-HUGE = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999999,), }".ljust(118)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "is not a readable .npz"),
-        (b"not a zip at all", "is a pickle or holds Python objects"),
-        (npz(x=np.eye(30))[:-40], "is not a readable .npz"),
-        (npz(x=np.eye(30))[:200], "is not a readable .npz"),
-        (
-            npz(x=np.random.default_rng(0).random(99)).replace(b"\x00\x00\x00\x00", b"\x07\x00\x09\x00"),
-            "not a read",
-        ),
-        (raw(np.eye(3)), "holds one bare array"),
-        (raw(np.array([{}], dtype=object)), "is a pickle or holds Python objects"),
-        (npz(x=np.array([{}, 3], dtype=object)), "is a pickle or holds Python objects"),
-        (zipped(HUGE), "is not a readable .npz"),
-        (zipped(b"plain bytes"), "lacks the array x"),
-        (npz(y=np.eye(3)), "lacks the array x"),
-        (npz(x=np.ones(3)), r"x has shape \(3,\), expected 2 dimensions"),
-    ],
-    ids=range(12),
-)
-def test_damaged_arrays(tmp_path, content, message):
-    path = tmp_path / "a.npz"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=message) as caught:
-        load_npz(path, {"x": 2})
-    assert str(caught.value).startswith(f"{path}: ")
-
-
-def test_what_is_no_file(tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
-        load_npz(tmp_path / "absent.npz", {})
-    with pytest.raises(InputError, match="is a folder"):
-        load_npz(tmp_path, {})
-
-
-def test_conform_names_what_disagrees():
-    layout = {"a": ("N 3", np.float32), "b": ("N", np.int64)}
-    arrays = validate_arrays({"a": np.ones((2, 3), int), "b": [1, 2]}, layout)
-    assert arrays["a"].dtype == np.float32
-    with pytest.raises(ValueError, match=r"b must have shape \(N\), not \(3,\): axis 0 should be 2: N is 2 in a"):
-        validate_arrays({"a": np.ones((2, 3)), "b": [1, 2, 3]}, layout)
-    with pytest.raises(ValueError, match="axis 1 should be 3"):
-        validate_arrays({"a": np.ones((2, 4)), "b": [1, 2]}, layout)
-    with pytest.raises(ValueError, match="b must be of type int64, not float64"):
-        validate_arrays({"a": np.ones((2, 3)), "b": [1.0, 2]}, layout)
