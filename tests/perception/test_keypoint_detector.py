@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from onnx import TensorProto, helper
+from support.instances import rectangle_instance
 from support.onnx_graphs import write_constant, write_graph
 
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
-from jaxfit.perception.instances import Instance
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.keypoints.detector import BUILTIN_PATH
 
@@ -17,11 +17,7 @@ NAMES = ("bill_tip", "tail_tip", "nape")
 PLAIN = {"keypoint_names": ",".join(NAMES), "mean": "0", "std": "255"}
 
 
-def _bird(x0, y0, width, height):
-    return Instance(np.ones((height, width), bool), x0, y0, 1.0, "bird")
-
-
-UNSCALED = _bird(*CORNER_PX, 32, 64)
+UNSCALED = rectangle_instance(*CORNER_PX, 32, 64)
 """For a network of 32 × 64 pixels, its crop without a margin is the frame from CORNER_PX on, pixel by pixel."""
 
 
@@ -166,7 +162,8 @@ def _scene():
     for bird in points:
         for k, (px, py) in enumerate(bird):
             frame[..., 2 - k] += 220 * np.exp(-((x - px) ** 2 + (y - py) ** 2) / (2 * 6.0**2))
-    birds = [_bird(40, 35, 130, 85), _bird(265, 140, 75, 90), _bird(0, 205, 75, 80)]
+    boxes = [(40, 35, 130, 85), (265, 140, 75, 90), (0, 205, 75, 80)]
+    birds = [rectangle_instance(*box) for box in boxes]
     return np.round(frame).astype(np.uint8), birds, points
 
 
@@ -215,7 +212,7 @@ def test_crop_parameters_come_from_the_metadata(tmp_path):
     x, y = np.zeros((3, 64)), np.zeros((3, 64))
     for metadata, options, x0 in (({}, {}, -40), ({"pad_px": "16"}, {}, -16), ({"pad_px": "16"}, {"pad_px": 8}, -8)):
         path = write_constant(tmp_path / "k.onnx", (1, 3, 64, 64), {"simcc_x": x, "simcc_y": y}, PLAIN | metadata)
-        points, _ = load_keypoint_detector(path, **options)(FRAME, [_bird(100, 100, 64, 64)])
+        points, _ = load_keypoint_detector(path, **options)(FRAME, [rectangle_instance(100, 100, 64, 64)])
         scale = (64 - 2 * x0) / 64
         np.testing.assert_allclose(points[0], 100 + x0 + 0.5 * scale)
 

@@ -117,13 +117,13 @@ def test_recall_and_precision_on_the_noise_model(monkeypatch):
     heading = np.cumsum(np.cumsum(rng.normal(scale=0.02, size=(6, 300)), axis=1) * 0.3, axis=1)
     truth = flock(heading, 0)
     truth = truth.with_keypoints(truth.keypoints_px, np.ones_like(truth.confidence))
-    monkeypatch.setattr(noise, "_masks", lambda rng, truth, found: ({}, truth.box_px * found[..., None]))
-    monkeypatch.setattr(noise, "_area", lambda truth, n, t: 3000.0)
+    monkeypatch.setattr(noise, "_masks", lambda rng, truth, detected: ({}, truth.box_px * detected[..., None]))
+    monkeypatch.setattr(noise, "_visible_area", lambda truth, n, t: 3000.0)
     seen = np.ones(truth.confidence.shape, bool)
     left, right = np.array(PAIRS).T
 
     def judged(seed):
-        detected = noise.detect_noisily(truth, seen, PAIRS, seed)
+        detected = noise.simulate_detections(truth, seen, PAIRS, seed)
         found = repair_left_right_flips(detected, PAIRS)[1]
         points, exact = detected.keypoints_px, truth.keypoints_px
         both = (detected.confidence[:, :, left] > 0) & (detected.confidence[:, :, right] > 0)
@@ -138,8 +138,8 @@ def test_recall_and_precision_on_the_noise_model(monkeypatch):
     assert flipped.sum() > 30
     assert (found & flipped).sum() / flipped.sum() > 0.85
     assert (found & flipped).sum() / (found & (flipped | right_way)).sum() > 0.9
-    monkeypatch.setattr(noise, "SWAPS_ALL", 0)
-    monkeypatch.setattr(noise, "SWAPS_ONE", 0)
+    monkeypatch.setattr(noise, "FLIPS_ALL", 0)
+    monkeypatch.setattr(noise, "FLIPS_ONE", 0)
     found, _, right_way = judged(2)
     assert (found & right_way).sum() <= 0.001 * right_way.sum()
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.instances import rectangle_instance
 
 from jaxfit.perception.instances import Instance, instance_of
 from jaxfit.perception.segmentation.tiles import Tiled
@@ -77,7 +78,7 @@ class Scripted:
 
 
 def bird(x0, x1, score=0.5, label="bird", height=10):
-    return Instance(np.ones((height, x1 - x0), bool), x0, 0, score, label)
+    return rectangle_instance(x0, 0, x1 - x0, height, score, label)
 
 
 def segment(left, right):

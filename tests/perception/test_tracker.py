@@ -5,15 +5,15 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from support.instances import rectangle_instance
 
 from jaxfit.errors import InputError
-from jaxfit.perception.instances import Instance
 from jaxfit.perception.tracking import TRACKERS, load_tracker
 from jaxfit.perception.tracking.external_trackers import EXTERNAL_TRACKERS
 
 
 def bird(x, y=0, width=20, height=10, score=0.9):
-    return Instance(np.ones((height, width), bool), x, y, score, "bird")
+    return rectangle_instance(x, y, width, height, score)
 
 
 def follow(tracker, frames):
