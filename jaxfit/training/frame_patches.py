@@ -1,4 +1,4 @@
-"""Parts of simulated frames, as both networks learn from them: turned, mirrored, at another scale."""
+"""Random patches of simulated frames, for the training samples of both networks."""
 
 from __future__ import annotations
 
@@ -8,28 +8,40 @@ from jaxtyping import Float, Int, UInt8
 
 from jaxfit.training.scenes import LabelledFrames
 
-__all__ = ["random_turn", "surroundings"]
+__all__ = ["patch_around", "random_rotation"]
 
 
-def random_turn(rng: np.random.Generator, factor: float, most_degrees: float) -> tuple[Float[np.ndarray, "2 2"], bool]:
-    """A random rotation times `factor`, every other time mirrored, and whether it is."""
-    angle = np.radians(rng.uniform(-most_degrees, most_degrees))
-    turn = factor * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+def random_rotation(
+    rng: np.random.Generator, factor: float, max_degrees: float
+) -> tuple[Float[np.ndarray, "2 2"], bool]:
+    """Draw a rotation times `factor`, mirrored with probability 1/2; return the matrix and whether it mirrors."""
+    angle = np.radians(rng.uniform(-max_degrees, max_degrees))
+    matrix = factor * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     mirrored = bool(rng.random() < 0.5)
     if mirrored:
-        turn[:, 0] *= -1
-    return turn, mirrored
+        matrix[:, 0] *= -1
+    return matrix, mirrored
 
 
-def surroundings(
-    frames: LabelledFrames, s: int, middle: Float[np.ndarray, "2"], reach: float, factor: float
+def patch_around(
+    frames: LabelledFrames, s: int, centre_px: Float[np.ndarray, "2"], reach_px: float, factor: float
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"], Int[np.ndarray, "2"]]:
-    """A frame's pixels within `reach` of a point: picture and owner, perhaps empty, and where they begin.
+    """Cut a square patch out of a frame, clipped to the frame; the patch may be empty.
 
-    Where `factor` will shrink it, the picture is smoothed to what the smaller one can hold.
+    If `factor` reduces the picture, a Gaussian blur first removes the detail that would alias.
+
+    Args:
+        frames: the frames.
+        s: index of the frame.
+        centre_px: centre of the patch, pixels of the frame.
+        reach_px: half the side of the patch, pixels of the frame.
+        factor: scale of the later resampling.
+
+    Returns:
+        Picture, bird of each pixel, and x, y of the upper left corner in the frame.
     """
-    low = np.maximum(np.floor(middle - reach), 0).astype(int)
-    high = np.maximum(np.ceil(middle + reach), 0).astype(int)
+    low = np.maximum(np.floor(centre_px - reach_px), 0).astype(int)
+    high = np.maximum(np.ceil(centre_px + reach_px), 0).astype(int)
     part = slice(low[1], high[1]), slice(low[0], high[0])
     picture, owner = np.ascontiguousarray(frames.pictures[s][part]), np.ascontiguousarray(frames.owner[s][part])
     if factor < 1 and picture.size:

@@ -44,7 +44,8 @@ def image_input(model: OnnxModel, unbatched: bool = False) -> ImageInput:
             side, or a type other than floats.
     """
     if len(model.inputs) != 1:
-        raise InputError(model.path, f"has {len(model.inputs)} inputs: {model.describe()}", "one is expected")
+        problem = f"has {len(model.inputs)} inputs: {model.describe()}"
+        raise InputError(model.path, problem, "give a network with one input")
     port = model.inputs[0]
     axes = port.shape
     if len(axes) not in ((3, 4) if unbatched else (4,)):
