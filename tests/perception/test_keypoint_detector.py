@@ -9,7 +9,6 @@ from support.onnx_graphs import write_constant, write_graph
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception.keypoints import load_keypoint_detector
-from jaxfit.perception.keypoints.detector import BUILTIN_PATH
 
 FRAME = np.zeros((300, 400, 3), np.uint8)
 CORNER_PX = np.array([100, 60])
@@ -296,6 +295,5 @@ def test_unsupported_element_type(tmp_path):
         load_keypoint_detector(path)
 
 
-@pytest.mark.skipif(not BUILTIN_PATH.exists(), reason="this checkout has no built-in network")
 def test_builtin_network_detects_the_keypoints_of_the_murre():
     assert load_keypoint_detector().keypoint_names == MURRE_KEYPOINTS
