@@ -20,7 +20,7 @@ from jaxfit.fitting.summary import summarise
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.perception.instances import KeypointDetector, Segmenter
-from jaxfit.perception.track import Tracking, find_tracks, network_files, open_keypoint_detector
+from jaxfit.perception.track import TrackingResult, network_files, open_keypoint_detector, run_tracking
 from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_replaceable, new_folder
@@ -39,7 +39,7 @@ _logger = logging.getLogger(__name__)
 class Reconstruction(NamedTuple):
     """What came of a video."""
 
-    tracking: Tracking
+    tracking: TrackingResult
     """What was found."""
     solution: Solution
     """Its poses."""
@@ -95,9 +95,9 @@ def reconstruct(
         check_keypoints(nothing_yet, bird.keypoint_names, config.track.keypoints.file)
     with new_folder(folder, overwrite, marker=MARKER) as part:
         with clock("track"):
-            tracking = find_tracks(video, config.track, segmenter, keypoints, progress=progress)
-        if tracking.nothing is not None:
-            raise tracking.nothing
+            tracking = run_tracking(video, config.track, segmenter, keypoints, progress=progress)
+        if tracking.failure is not None:
+            raise tracking.failure
         found = tracking.observations
         with clock("fit"):
             solution = fit(found, bird, config.fit, progress=progress, source=video)
@@ -137,7 +137,7 @@ def _draw(
 
 
 def _summary(
-    tracking: Tracking,
+    tracking: TrackingResult,
     solution: Solution,
     bird: Bird,
     networks: dict[str, list[Path]],
@@ -148,9 +148,9 @@ def _summary(
     summary = summarise(solution, bird, clock.seconds)
     summary["versions"] |= {name: metadata.version(name) for name in LIBRARIES}
     return summary | {
-        "video": {"file": str(video), **info._asdict(), "damaged": tracking.damaged},
+        "video": {"file": str(video), **info._asdict(), "damaged": tracking.damaged_frames},
         "quality": {row.track_id: row._asdict() for row in track_quality(tracking.observations)},
-        "short_tracks": tracking.short,
+        "short_tracks": tracking.short_tracks,
         "seconds_of_tracking": {part: round(value, 3) for part, value in tracking.seconds.items()},
         "networks": {
             kind: {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}

@@ -22,7 +22,7 @@ __all__ = ["reconstruct", "track"]
 
 def track(options: argparse.Namespace) -> None:
     from jaxfit.data.formats.coco import write_coco
-    from jaxfit.perception.track import find_tracks
+    from jaxfit.perception.track import run_tracking
     from jaxfit.storage.files import check_writable
     from jaxfit.view.checks import check_outputs
 
@@ -31,13 +31,13 @@ def track(options: argparse.Namespace) -> None:
         check_outputs([options.out], options.video, options.overwrite)  # before the work, not after it
     check_writable(options.out)
     config = _reconstruct_config(options).track
-    tracking = find_tracks(options.video, config, progress=terminal)
+    tracking = run_tracking(options.video, config, progress=terminal)
     write_coco(tracking.observations, options.out)
-    if tracking.nothing:
-        _logger.warning("%s", tracking.nothing)
+    if tracking.failure:
+        _logger.warning("%s", tracking.failure)
     else:
         show(track_table(tracking.observations))
-    _left_out(tracking.short, config.min_track_frames)
+    _left_out(tracking.short_tracks, config.min_track_frames)
     birds, frames = tracking.observations.present.shape
     seconds = time.perf_counter() - began
     show(f"{counted(birds, 'bird')} over {counted(frames, 'frame')} in {seconds:.1f} s → {options.out}")
@@ -51,7 +51,7 @@ def reconstruct(options: argparse.Namespace) -> None:
     bird = find_bird(options.model)
     done = reconstruct(options.video, options.out, bird, config, overwrite=options.overwrite, progress=terminal)
     show(track_table(done.tracking.observations, done.solution))
-    _left_out(done.tracking.short, config.track.min_track_frames)
+    _left_out(done.tracking.short_tracks, config.track.min_track_frames)
     birds = counted(done.summary["tracks"], "bird")
     show(f"{counted(done.summary['poses'], 'pose')} of {birds} in {time.perf_counter() - began:.0f} s. Look at")
     for name, what in (

@@ -1,1 +1,1 @@
-"""From the frames of a video to tracks of keypoints and masks, by ONNX networks on a CPU."""
+"""Perception: from the frames of a video to tracks of keypoints and masks, with ONNX networks on a CPU."""

@@ -1,4 +1,4 @@
-"""What segmenters find in a frame, and what finds it: the contracts that every network is adapted to."""
+"""Instances, and the protocols of segmenters and keypoint detectors."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ __all__ = ["Instance", "KeypointDetector", "Segmenter", "instance_of"]
 
 
 class Instance(NamedTuple):
-    """One bird in one frame; its mask is kept as far as it reaches, not over the whole frame."""
+    """One bird in one frame. The mask covers the bird's box, not the whole frame."""
 
     mask: Bool[np.ndarray, "h w"]
-    """The visible bird, cut to the mask's own tight box: every border row and column holds a True."""
+    """The visible part of the bird, cropped to its tight box: every border row and column contains a True."""
     x0: int
-    """Column of the frame in which the mask begins."""
+    """Column of the frame at which the mask begins."""
     y0: int
-    """Row of the frame in which the mask begins."""
+    """Row of the frame at which the mask begins."""
     score: float
-    """Trust in it, within [0, 1]."""
+    """Confidence of the instance, within [0, 1]."""
     label: str
-    """Name of its class."""
+    """Name of the class."""
 
     @property
     def box_px(self) -> Float[np.ndarray, "4"]:
-        """x, y of the upper left corner, width, height: the tight box of the mask, image pixels."""
+        """The tight box of the mask: x, y of the upper left corner, width, height; image pixels."""
         height, width = self.mask.shape
         return np.array([self.x0, self.y0, width, height], np.float32)
 
     def encode(self, width: int, height: int) -> dict[str, Any]:
-        """Run lengths over a frame of that size, as `Observations.masks` holds them."""
+        """Encode the mask as run lengths over a frame of the given size, as in `Observations.masks`."""
         return encode_patch(self.mask, self.x0, self.y0, width, height)
 
 
 def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int = 0, y0: int = 0) -> Instance | None:
-    """An instance of a mask that is not tight yet; None of an empty mask.
+    """Create an instance from a mask that may have empty borders; return None for an empty mask.
 
     Args:
-        mask: a part of the frame, or all of it.
-        score, label: as `Instance` has them.
-        x0, y0: where that part begins in the frame, pixels; 0 or more.
+        mask: mask of the whole frame or of a part of the frame.
+        score, label: as in `Instance`.
+        x0, y0: position of this part in the frame, pixels; 0 or more.
     """
     box = box_of_mask(mask)
     if box is None:
@@ -54,24 +54,24 @@ def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int
 
 
 class Segmenter(Protocol):
-    """Finds the instances of a frame."""
+    """Detects the instances of a frame."""
 
     class_names: tuple[str, ...]
-    """Every class that it can name."""
+    """The classes that the segmenter reports."""
 
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
-        """Instances of a blue-green-red frame, the most trusted first; masks lie within the frame."""
+        """Return the instances of a blue-green-red frame, by falling score; masks lie within the frame."""
         ...
 
 
 class KeypointDetector(Protocol):
-    """Finds the keypoints of birds that a segmenter found."""
+    """Detects the keypoints of instances."""
 
     keypoint_names: tuple[str, ...]
-    """K names in the order of its output."""
+    """K names in the order of the output."""
 
     def __call__(
         self, frame: UInt8[np.ndarray, "H W 3"], instances: Sequence[Instance]
     ) -> tuple[Float[np.ndarray, "M K 2"], Float[np.ndarray, "M K"]]:
-        """Positions (x, y in image pixels, pixel centres at i + 0.5) and confidences within [0, 1], float32."""
+        """Return positions (x, y in image pixels, pixel centres at i + 0.5) and confidences within [0, 1], float32."""
         ...

@@ -1,4 +1,4 @@
-"""From a video to tracks of keypoints and masks: every frame segmented, every bird followed, its keypoints found."""
+"""Tracking of a video: segmentation of every frame, assignment of identities, detection of keypoints."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from jaxfit.perception.tracking import Tracker, TrackRecorder, drop_short_tracks
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.video.reader import FrameReader, read_frames
 
-__all__ = ["Tracking", "find_tracks", "network_files", "open_keypoint_detector", "open_segmenter", "track_video"]
+__all__ = ["TrackingResult", "network_files", "open_keypoint_detector", "open_segmenter", "run_tracking", "track_video"]
 
 _logger = logging.getLogger(__name__)
 
-LOOKS, FAINT = 8, 0.05
-"""Where no bird was found: frames that are looked at again, and the score from which on something is told."""
+RETRY_FRAMES, RETRY_MIN_SCORE = 8, 0.05
+"""After a video without any bird: number of frames that are segmented again, and their least score."""
 
 
-class Tracking(NamedTuple):
-    """What tracking found, and how."""
+class TrackingResult(NamedTuple):
+    """Tracks of a video, and how tracking went."""
 
     observations: Observations
-    """Birds that were seen long enough; frames that could be read, also those without a bird."""
-    short: dict[int, int]
-    """Track → frames of the birds that were left out because they were seen in too few."""
-    damaged: list[int]
-    """Frames that could not be read."""
-    nothing: InputError | None
-    """Where there is no track: what was looked for, what came nearest, what to try."""
+    """The tracks that are long enough; all readable frames, including frames without a bird."""
+    short_tracks: dict[int, int]
+    """Track → number of frames, for the excluded short tracks."""
+    damaged_frames: list[int]
+    """Numbers of the frames that could not be read."""
+    failure: InputError | None
+    """The reason and the remedy if there is no track."""
     seconds: dict[str, float]
-    """How long each part took; decoding only as far as the others waited for it."""
+    """Duration of each part; for decoding, only the time that the other parts waited."""
 
 
 def track_video(
@@ -56,160 +56,171 @@ def track_video(
     tracker: Tracker | None = None,
     progress: ProgressTask = silent,
 ) -> Observations:
-    """Find and follow every bird of a video, and its keypoints.
+    """Detect and track every bird of a video, and detect its keypoints.
 
-    Memory grows with what is found, not with the length of the video.
+    Memory grows with the number of detections, not with the length of the video.
 
     Args:
         source: a video, or a folder of frames.
-        config: which frames, which networks, how birds are followed.
-        segmenter: used instead of the one that `config` names.
-        keypoints: used instead of the one that `config` names.
-        tracker: used instead of the one that `config` names; it must be new.
-        progress: told of every frame.
+        config: frames, networks and tracker.
+        segmenter: replaces the segmenter of `config`.
+        keypoints: replaces the keypoint detector of `config`.
+        tracker: replaces the tracker of `config`; it must be new.
+        progress: reports every frame.
 
     Returns:
-        Observations of all frames that could be read. Without any bird they have no track, and a warning says what
-        was looked for.
+        Observations of all readable frames. If no bird is tracked, they have no tracks, and a warning says why.
 
     Raises:
-        InputError: no video, or a network or tracker that cannot be used.
+        InputError: the video cannot be read, or a network or tracker cannot be used.
     """
-    tracking = find_tracks(source, config, segmenter, keypoints, tracker, progress)
-    if tracking.nothing:
-        _logger.warning("%s", tracking.nothing)
+    tracking = run_tracking(source, config, segmenter, keypoints, tracker, progress)
+    if tracking.failure:
+        _logger.warning("%s", tracking.failure)
     return tracking.observations
 
 
 def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segmenter:
-    """The segmenter that a config names.
+    """Load the segmenter of a config.
 
     Args:
-        config: the whole of it.
-        min_score: in place of the config's; None leaves that.
+        config: the whole config of tracking.
+        min_score: replaces the score of the config; None keeps the score of the config.
 
     Raises:
-        InputError: it cannot be used.
+        InputError: the segmenter cannot be used.
     """
-    knobs = config.segmenter
-    require(knobs.kind in KINDS, "track.segmenter.kind", f"is {knobs.kind!r}", f"one of {', '.join(KINDS)}")
+    settings = config.segmenter
+    require(settings.kind in KINDS, "track.segmenter.kind", f"is {settings.kind!r}", f"one of {', '.join(KINDS)}")
     return load_segmenter(
-        knobs.file,
-        kind=knobs.kind,
-        names=knobs.names or None,
-        classes=knobs.classes or None,
-        min_score=knobs.min_score if min_score is None else min_score,
-        tile_px=knobs.tile_px,
-        tile_overlap=knobs.tile_overlap,
+        settings.file,
+        kind=settings.kind,
+        names=settings.names or None,
+        classes=settings.classes or None,
+        min_score=settings.min_score if min_score is None else min_score,
+        tile_px=settings.tile_px,
+        tile_overlap=settings.tile_overlap,
         threads=config.threads,
     )
 
 
 def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
-    """The keypoint detector that a config names.
+    """Load the keypoint detector of a config.
 
     Raises:
-        InputError: it cannot be used.
+        InputError: the keypoint detector cannot be used.
     """
-    knobs = config.keypoints
+    settings = config.keypoints
     return load_keypoint_detector(
-        knobs.file,
-        kind=knobs.kind,
-        names=knobs.names or None,
-        pad_px=knobs.pad_px,
-        dilate_px=knobs.dilate_px,
-        batch=knobs.batch,
+        settings.file,
+        kind=settings.kind,
+        names=settings.names or None,
+        pad_px=settings.pad_px,
+        dilate_px=settings.dilate_px,
+        batch=settings.batch,
         threads=config.threads,
     )
 
 
 def network_files(config: TrackConfig) -> dict[str, list[Path]]:
-    """The files of each network that a config names: `segmenter` and `keypoints`."""
+    """Return the files of the networks of a config, under the keys `segmenter` and `keypoints`."""
     keypoints = BUILTIN_PATH if config.keypoints.file == "builtin" else Path(config.keypoints.file)
     return {"segmenter": segmenter_files(config.segmenter.file), "keypoints": [keypoints]}
 
 
-def find_tracks(
+def run_tracking(
     source: str | Path,
     config: TrackConfig,
     segmenter: Segmenter | None = None,
     keypoints: KeypointDetector | None = None,
     tracker: Tracker | None = None,
     progress: ProgressTask = silent,
-) -> Tracking:
-    """What `track_video` does, with more about what was found."""
-    knobs, frames, given = config.tracker, config.frames, segmenter is not None
+) -> TrackingResult:
+    """Track a video as `track_video` does, and return short tracks, damaged frames and durations too."""
+    settings, frames, has_own_segmenter = config.tracker, config.frames, segmenter is not None
     reader = read_frames(source, frames.start, frames.stop, frames.step)
     tracker = tracker or load_tracker(
-        knobs.name, memory=knobs.memory, min_iou=knobs.min_iou, min_score=knobs.min_score, step=frames.step
+        settings.name,
+        memory=settings.memory,
+        min_iou=settings.min_iou,
+        min_score=settings.min_score,
+        step=frames.step,
     )
     keypoints = keypoints or open_keypoint_detector(config)
     segmenter = segmenter or open_segmenter(config)
     recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names))
-    clock, best, done, began = Clock(), 0.0, 0, time.perf_counter()
-    with _one_opencv_thread(), progress("Tracking", _count(reader, config)) as report_progress:
+    clock, best_score, frame_count, start = Clock(), 0.0, 0, time.perf_counter()
+    with _single_opencv_thread(), progress("Tracking", _expected_frames(reader, config)) as report_progress:
         for number, picture, _ in clock.each("decode", reader):
             with clock("segment"):
                 instances = segmenter(picture)
             with clock("track"):
                 identities = tracker.update(number, instances, picture)
-            followed = [(bird, one) for bird, one in zip(instances, identities, strict=True) if one is not None]
-            birds = [bird for bird, _ in followed]
+            tracked = [
+                (bird, identity) for bird, identity in zip(instances, identities, strict=True) if identity is not None
+            ]
+            birds = [bird for bird, _ in tracked]
             with clock("keypoints"):
                 points_px, confidence = keypoints(picture, birds)
             name, size_px = f"{reader.path.name}#{number}", (picture.shape[1], picture.shape[0])
             with clock("record"):
-                recorder.add(number, name, size_px, birds, [one for _, one in followed], points_px, confidence)
-            best, done = max([best, *(bird.score for bird in instances)]), done + 1
+                recorder.add(number, name, size_px, birds, [identity for _, identity in tracked], points_px, confidence)
+            best_score, frame_count = max([best_score, *(bird.score for bird in instances)]), frame_count + 1
             noun = "bird" if len(birds) == 1 else "birds"
-            report_progress(1, f"{done / (time.perf_counter() - began):.1f} frames/s, {len(birds)} {noun}")
-    if not done:
+            report_progress(1, f"{frame_count / (time.perf_counter() - start):.1f} frames/s, {len(birds)} {noun}")
+    if not frame_count:
         raise InputError(source, f"has no frame from {frames.start} on", "begin with an earlier frame")
     with clock("clean up"):
-        every = recorder.observations()
-        found = drop_short_tracks(every, config.min_track_frames)
+        all_tracks = recorder.observations()
+        observations = drop_short_tracks(all_tracks, config.min_track_frames)
         if config.repair_left_right_flips:
-            found, _ = repair_left_right_flips(found, mirror_pairs(found.keypoint_names))
-    counts = dict(zip(every.track_id.tolist(), every.present.sum(1).tolist(), strict=True))
-    short = {track: count for track, count in counts.items() if track not in found.track_id}
-    nothing = None
-    if not found.num_tracks:
-        nothing = _too_short(source, config, short, best) if short else _no_bird(source, config, done, given)
-    return Tracking(found, short, reader.damaged, nothing, clock.seconds)
+            observations, _ = repair_left_right_flips(observations, mirror_pairs(observations.keypoint_names))
+    lengths = dict(zip(all_tracks.track_id.tolist(), all_tracks.present.sum(1).tolist(), strict=True))
+    short_tracks = {track: length for track, length in lengths.items() if track not in observations.track_id}
+    failure = None
+    if not observations.num_tracks:
+        if short_tracks:
+            failure = _only_short_tracks(source, config, short_tracks, best_score)
+        else:
+            failure = _no_bird(source, config, frame_count, has_own_segmenter)
+    return TrackingResult(observations, short_tracks, reader.damaged, failure, clock.seconds)
 
 
-def _too_short(source: str | Path, config: TrackConfig, short: dict[int, int], best: float) -> InputError:
+def _only_short_tracks(
+    source: str | Path, config: TrackConfig, short_tracks: dict[int, int], best_score: float
+) -> InputError:
     problem = (
-        f"no bird was followed for {config.min_track_frames} frames: of {len(short)} that were seen, with scores up to "
-        f"{best:.2f}, none was in more than {max(short.values())}"
+        f"no bird was tracked for {config.min_track_frames} frames: there are {len(short_tracks)} shorter tracks, with "
+        f"scores up to {best_score:.2f} and at most {max(short_tracks.values())} frames"
     )
     return InputError(source, problem, "lower min_track_frames, or try another segmenter or tracker")
 
 
-def _no_bird(source: str | Path, config: TrackConfig, frames: int, given: bool) -> InputError:
-    """Where the config names the segmenter, a few frames are looked at again for what it hardly trusts."""
-    wanted, least = " or ".join(config.segmenter.classes) or "bird", config.segmenter.min_score
-    problem = f"no {wanted} was found in {frames} frames"
-    problem += "" if least is None else f" with a score of {least:g} or more"
-    if not given:
-        best = _second_look(source, config)
-        problem += f"; the highest score seen is {best:.2f}" if best else f"; nothing has even a score of {FAINT}"
+def _no_bird(source: str | Path, config: TrackConfig, frame_count: int, has_own_segmenter: bool) -> InputError:
+    """Create the error for a video without birds; the segmenter of the config reports its highest score."""
+    classes, min_score = " or ".join(config.segmenter.classes) or "bird", config.segmenter.min_score
+    problem = f"no {classes} was detected in {frame_count} frames"
+    problem += "" if min_score is None else f" with a score of {min_score:g} or more"
+    if not has_own_segmenter:
+        best = _highest_score(source, config)
+        problem += f"; the highest score is {best:.2f}" if best else f"; no score reaches {RETRY_MIN_SCORE}"
     remedy = "lower min_score, cut large frames into tiles (tile_px), or try another --segmenter or --classes"
     return InputError(source, problem, remedy)
 
 
-def _second_look(source: str | Path, config: TrackConfig) -> float:
-    """The highest score in some frames, evenly spaced where it is known how many there are."""
-    frames, segmenter = config.frames, open_segmenter(config, FAINT)
-    count = _count(read_frames(source, frames.start, frames.stop, frames.step), config) or LOOKS
-    stride = frames.step * max(int(count) // LOOKS, 1)
-    stop = frames.start + LOOKS * stride
-    looks = read_frames(source, frames.start, stop if frames.stop is None else min(stop, frames.stop), stride)
-    return max((instance.score for frame in looks for instance in segmenter(frame.picture)), default=0.0)
+def _highest_score(source: str | Path, config: TrackConfig) -> float:
+    """Return the highest score in RETRY_FRAMES frames, evenly spaced if the number of frames is known."""
+    frames, segmenter = config.frames, open_segmenter(config, RETRY_MIN_SCORE)
+    reader = read_frames(source, frames.start, frames.stop, frames.step)
+    count = _expected_frames(reader, config) or RETRY_FRAMES
+    stride = frames.step * max(int(count) // RETRY_FRAMES, 1)
+    stop = frames.start + RETRY_FRAMES * stride
+    retried = read_frames(source, frames.start, stop if frames.stop is None else min(stop, frames.stop), stride)
+    return max((instance.score for frame in retried for instance in segmenter(frame.picture)), default=0.0)
 
 
-def _count(reader: FrameReader, config: TrackConfig) -> int | None:
-    """How many frames are to come, as far as the container says."""
+def _expected_frames(reader: FrameReader, config: TrackConfig) -> int | None:
+    """Return the number of frames to process; None if the container does not say its length."""
     frames, total = config.frames, reader.info.frames
     if total is None and frames.stop is None:
         return None
@@ -218,8 +229,8 @@ def _count(reader: FrameReader, config: TrackConfig) -> int | None:
 
 
 @contextmanager
-def _one_opencv_thread() -> Iterator[None]:
-    """Networks have the cores; OpenCV's own threads would only wait for each other between two of their runs."""
+def _single_opencv_thread() -> Iterator[None]:
+    """Restrict OpenCV to one thread: the networks use all cores, and OpenCV's threads would slow them down."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

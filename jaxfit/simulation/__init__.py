@@ -1,6 +1,7 @@
-"""Birds with known truth.
+"""Simulation of birds with known truth.
 
-`scene` puts a whole one together: `behaviour` and `flock` move murres, `viewpoint` looks at them, `visibility` says
-what is seen, `ledge`, `texture` and `footage` film them, `noise` is what detectors would report. For any bird model and
-without surroundings, `motion` draws smooth poses from its prior and `detections` makes plain observations of them.
+`scene` simulates a whole scene of murres: `behaviour` and `flock` simulate their motion, `viewpoint` is the camera,
+`visibility` renders masks and occlusion, `ledge`, `texture` and `footage` render the pictures, and `noise` simulates
+the errors of detectors. For any bird model, `motion` draws smooth poses from the pose prior, and `detections` renders
+observations of these poses without a background.
 """

@@ -1,7 +1,7 @@
-"""What one bird does: postures at points in time, joined smoothly.
+"""Behaviour of one bird: keyframes with postures, and their interpolation.
 
-A behaviour writes `Key`s: at a time, a posture with its pitch, where the feet stand, which way the bird looks and
-how high it flies. Between keys everything follows a monotone cubic (PCHIP), so that nothing overshoots its keys.
+A behaviour adds keyframes (`Key`): time, posture with pitch, position of the feet, heading and altitude. Monotone cubic
+interpolation (PCHIP) between keyframes avoids overshoot.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from scipy.interpolate import PchipInterpolator
 
 from jaxfit.model.murre import POSTURES, Posture
 
-__all__ = ["BEHAVIOURS", "REACH", "Key", "Motion", "Performer", "motion_of"]
+__all__ = ["BEHAVIOURS", "JAB_DISTANCE", "Key", "Keyframes", "Motion", "interpolate_keyframes"]
 
 BEHAVIOURS = ("stand", "incubate", "preen", "walk", "flap", "approach", "jab", "fly_off")
 STEP_S = 0.28
-"""Time of a step."""
+"""Duration of a step, seconds."""
 STEP_UNITS = 2.4
-"""Length of a step."""
+"""Length of a step, model units."""
 FLAP_S = 0.11
-"""Time of half a wingbeat."""
+"""Duration of half a wingbeat, seconds."""
 
 
 @dataclass(frozen=True)
@@ -33,20 +33,20 @@ class Key:
     time_s: float
     posture: Posture
     feet: tuple[float, float]
-    """x, y in the world, model units."""
+    """x, y in the world frame, model units."""
     heading: float
-    """Direction that the bird looks in, radians from +y towards −x."""
+    """Direction of the body, radians from +y towards −x."""
     altitude: float = 0.0
-    """Height of its lowest point above the ledge."""
+    """Height of the lowest point above the ledge, model units."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """T frames of one bird before noise is added."""
+    """Motion of one bird over T frames, before sway is added."""
 
     body_pose: Float[np.ndarray, "T bones 3"]
     pitch: Float[np.ndarray, "T"]
-    """Of the body above the horizontal, radians."""
+    """Pitch of the body above the horizontal, radians."""
     feet: Float[np.ndarray, "T 2"]
     heading: Float[np.ndarray, "T"]
     altitude: Float[np.ndarray, "T"]
@@ -55,140 +55,141 @@ class Motion:
 
 
 @dataclass
-class Performer:
-    """A bird that performs one behaviour after another, writing keys."""
+class Keyframes:
+    """The keyframes of one bird that shows one behaviour after another."""
 
     rng: np.random.Generator
     keys: list[Key]
     labels: list[tuple[float, str]] = field(default_factory=list)
-    """From which time on which behaviour."""
+    """Start time and name of each behaviour."""
 
     @property
-    def now(self) -> Key:
-        """The last key."""
+    def last(self) -> Key:
+        """The last keyframe."""
         return self.keys[-1]
 
-    def to(self, posture: Posture | str, seconds: float, **changes) -> None:
-        """Add a key `seconds` later, in another posture and with other `changes`."""
+    def add(self, posture: Posture | str, seconds: float, **changes) -> None:
+        """Add a keyframe `seconds` later with the given posture and `changes`."""
         pose = POSTURES[posture] if isinstance(posture, str) else posture
-        self.keys.append(replace(self.now, time_s=self.now.time_s + seconds, posture=pose, **changes))
+        self.keys.append(replace(self.last, time_s=self.last.time_s + seconds, posture=pose, **changes))
 
-    def face(self, posture: str, target: tuple[float, float]) -> None:
-        """Turn towards a place, the shorter way round and no faster than a bird does."""
-        x, y = np.subtract(target, self.now.feet)
-        turn = (np.arctan2(-x, y) - self.now.heading + np.pi) % (2 * np.pi) - np.pi  # model +y looks to (−sin, cos)
-        self.to(posture, 0.25 + 0.25 * abs(turn), heading=self.now.heading + turn)
+    def turn_towards(self, posture: str, target: tuple[float, float]) -> None:
+        """Turn to a position by the smaller angle, at the speed of a bird."""
+        x, y = np.subtract(target, self.last.feet)
+        # the direction of a heading is (−sin, cos)
+        turn = (np.arctan2(-x, y) - self.last.heading + np.pi) % (2 * np.pi) - np.pi
+        self.add(posture, 0.25 + 0.25 * abs(turn), heading=self.last.heading + turn)
 
-    def perform(self, behaviour: str, until_s: float, target: tuple[float, float] | None = None) -> None:
-        """Write the keys of one behaviour, from the last key on; the next one begins at its last key.
+    def add_behaviour(self, behaviour: str, until_s: float, target: tuple[float, float] | None = None) -> None:
+        """Add the keyframes of one behaviour after the last keyframe.
 
         Args:
             behaviour: one of BEHAVIOURS.
-            until_s: when it should end. A walk that arrives ends before; what has begun, such as a wingbeat, is
-                finished after.
-            target: x, y in the world: where a walk leads to, or whom an approach or a jab is meant for. Only a
-                walk needs one.
+            until_s: intended end, seconds. A walk may end earlier, at its target. A movement that has begun, such as a
+                wingbeat, may end later.
+            target: x, y in the world frame: the end of a walk, or the neighbour of an approach or a jab. Only a walk
+                requires a target.
         """
-        self.labels.append((self.now.time_s, behaviour))
-        _ACTS[behaviour](self, until_s, target)
+        self.labels.append((self.last.time_s, behaviour))
+        _BEHAVIOUR_FUNCTIONS[behaviour](self, until_s, target)
 
 
 def blend(a: Posture | str, b: Posture | str, share: float) -> Posture:
-    """The posture `share` of the way from a to b."""
+    """Interpolate between two postures: share 0 is a, share 1 is b."""
     a, b = (POSTURES[p] if isinstance(p, str) else p for p in (a, b))
     return Posture(a.body_pose + share * (b.body_pose - a.body_pose), a.pitch_rad + share * (b.pitch_rad - a.pitch_rad))
 
 
-def _stand(bird: Performer, until_s: float, _target) -> None:
-    while bird.now.time_s < until_s:
-        bird.to(blend("standing", "alert", bird.rng.uniform(0, 0.6)), bird.rng.uniform(0.5, 1.2))
+def _stand(bird: Keyframes, until_s: float, _target) -> None:
+    while bird.last.time_s < until_s:
+        bird.add(blend("standing", "alert", bird.rng.uniform(0, 0.6)), bird.rng.uniform(0.5, 1.2))
 
 
-def _incubate(bird: Performer, until_s: float, _target) -> None:
-    while bird.now.time_s < until_s:
-        bird.to(blend("incubating", "standing", bird.rng.uniform(0, 0.12)), bird.rng.uniform(0.7, 1.5))
+def _incubate(bird: Keyframes, until_s: float, _target) -> None:
+    while bird.last.time_s < until_s:
+        bird.add(blend("incubating", "standing", bird.rng.uniform(0, 0.12)), bird.rng.uniform(0.7, 1.5))
 
 
-def _preen(bird: Performer, until_s: float, _target) -> None:
-    reach = f"preening_{bird.rng.choice(['left', 'right'])}"
-    bird.to(reach, bird.rng.uniform(0.5, 0.8))
-    while bird.now.time_s < until_s:
-        bird.to(blend("standing", reach, bird.rng.uniform(0.75, 0.9)), 0.2)
-        bird.to(reach, 0.2)
+def _preen(bird: Keyframes, until_s: float, _target) -> None:
+    preening = f"preening_{bird.rng.choice(['left', 'right'])}"
+    bird.add(preening, bird.rng.uniform(0.5, 0.8))
+    while bird.last.time_s < until_s:
+        bird.add(blend("standing", preening, bird.rng.uniform(0.75, 0.9)), 0.2)
+        bird.add(preening, 0.2)
 
 
-def _walk(bird: Performer, until_s: float, target) -> None:
-    bird.face("standing", target)
-    way, foot = np.hypot(*np.subtract(target, bird.now.feet)), 0
-    while bird.now.time_s < until_s and way > 0:
-        ahead = min(STEP_UNITS, way) * np.array([-np.sin(bird.now.heading), np.cos(bird.now.heading)])
+def _walk(bird: Keyframes, until_s: float, target) -> None:
+    bird.turn_towards("standing", target)
+    distance, foot = np.hypot(*np.subtract(target, bird.last.feet)), 0
+    while bird.last.time_s < until_s and distance > 0:
+        ahead = min(STEP_UNITS, distance) * np.array([-np.sin(bird.last.heading), np.cos(bird.last.heading)])
         step = f"walking_{('left', 'right')[foot]}"
-        bird.to(step, STEP_S, feet=tuple(np.add(bird.now.feet, ahead)))
-        way, foot = way - STEP_UNITS, 1 - foot
-    bird.to("standing", 0.3)
+        bird.add(step, STEP_S, feet=tuple(np.add(bird.last.feet, ahead)))
+        distance, foot = distance - STEP_UNITS, 1 - foot
+    bird.add("standing", 0.3)
 
 
-def _flap(bird: Performer, until_s: float, _target) -> None:
-    bird.to("wings_half", 0.25)
+def _flap(bird: Keyframes, until_s: float, _target) -> None:
+    bird.add("wings_half", 0.25)
     for _ in range(int(bird.rng.integers(3, 7))):
-        bird.to("flapping_up", FLAP_S)
-        bird.to("flapping_down", FLAP_S)
-    bird.to("wings_half", 0.2)
-    bird.to("standing", 0.35)
+        bird.add("flapping_up", FLAP_S)
+        bird.add("flapping_down", FLAP_S)
+    bird.add("wings_half", 0.2)
+    bird.add("standing", 0.35)
     _stand(bird, until_s, None)
 
 
-def _jab(bird: Performer, until_s: float, target) -> None:
+def _jab(bird: Keyframes, until_s: float, target) -> None:
     if target is not None:
-        bird.face("alert", target)
+        bird.turn_towards("alert", target)
     for _ in range(int(bird.rng.integers(2, 4))):
-        bird.to("jab", 0.16)
-        bird.to(blend("alert", "jab", 0.3), 0.2)
+        bird.add("jab", 0.16)
+        bird.add(blend("alert", "jab", 0.3), 0.2)
     _stand(bird, until_s, None)
 
 
-def _approach(bird: Performer, until_s: float, target) -> None:
+def _approach(bird: Keyframes, until_s: float, target) -> None:
     if target is not None:
-        offset = np.subtract(bird.now.feet, target)
+        offset = np.subtract(bird.last.feet, target)
         distance = max(float(np.hypot(*offset)), 1e-6)
-        if distance > REACH:
-            _walk(bird, until_s, tuple(np.add(target, offset * REACH / distance)))
-    bird.perform("jab", until_s, target)
+        if distance > JAB_DISTANCE:
+            _walk(bird, until_s, tuple(np.add(target, offset * JAB_DISTANCE / distance)))
+    bird.add_behaviour("jab", until_s, target)
 
 
-REACH = 17.0
-"""Distance of the feet from which a bird jabs at a neighbour, model units."""
+JAB_DISTANCE = 17.0
+"""Distance between the feet of two birds at which one jabs at the other, model units."""
 
 
-def _fly_off(bird: Performer, until_s: float, _target) -> None:
-    """Turns to the edge, leaps and flies away from the wall; afterwards it is out of the picture."""
+def _fly_off(bird: Keyframes, until_s: float, _target) -> None:
+    """Turn to the edge, leap and fly away from the wall, out of the picture."""
     outward = np.pi + bird.rng.uniform(-0.4, 0.4)
-    bird.face("standing", tuple(np.add(bird.now.feet, [-np.sin(outward), np.cos(outward)])))
-    bird.to("wings_half", 0.2)
-    heading = bird.now.heading
-    flight, way, speed, beat = POSTURES["wings_up"].pitch_rad, 0.0, 20.0, 0
-    start, ahead = np.array(bird.now.feet), np.array([-np.sin(heading), np.cos(heading)])
-    upright = bird.now.posture.pitch_rad
-    while way < 260:
+    bird.turn_towards("standing", tuple(np.add(bird.last.feet, [-np.sin(outward), np.cos(outward)])))
+    bird.add("wings_half", 0.2)
+    heading = bird.last.heading
+    flight, distance, speed, beat = POSTURES["wings_up"].pitch_rad, 0.0, 20.0, 0
+    start, ahead = np.array(bird.last.feet), np.array([-np.sin(heading), np.cos(heading)])
+    upright = bird.last.posture.pitch_rad
+    while distance < 260:
         seconds = FLAP_S
-        way += speed * seconds
+        distance += speed * seconds
         speed = min(speed + 420 * seconds, 420)
         pitch = flight + (upright - flight) * max(0.0, 1 - beat / 3)
-        bird.to(
+        bird.add(
             _pitched(("wings_up", "wings_down")[beat % 2], pitch),
             seconds,
-            feet=tuple(start + way * ahead),
+            feet=tuple(start + distance * ahead),
             altitude=min(3.0 * (beat + 1), 14.0),
         )
         beat += 1
-    bird.to("wings_half", max(until_s - bird.now.time_s, 0.1))
+    bird.add("wings_half", max(until_s - bird.last.time_s, 0.1))
 
 
 def _pitched(posture: str, pitch_rad: float) -> Posture:
     return Posture(POSTURES[posture].body_pose, pitch_rad)
 
 
-_ACTS: dict[str, Callable[[Performer, float, tuple[float, float] | None], None]] = {
+_BEHAVIOUR_FUNCTIONS: dict[str, Callable[[Keyframes, float, tuple[float, float] | None], None]] = {
     "stand": _stand,
     "incubate": _incubate,
     "preen": _preen,
@@ -200,19 +201,19 @@ _ACTS: dict[str, Callable[[Performer, float, tuple[float, float] | None], None]]
 }
 
 
-def motion_of(performer: Performer, frames: int, fps: float) -> Motion:
-    """The curves through a performer's keys at T frames; times before its first key hold that key."""
-    keys = performer.keys
+def interpolate_keyframes(keyframes: Keyframes, frames: int, fps: float) -> Motion:
+    """Interpolate keyframes at T frames; frames before the first keyframe have its values."""
+    keys = keyframes.keys
     times = np.array([key.time_s for key in keys])
     if (np.diff(times) <= 0).any():
-        raise ValueError("the keys' times must increase")
+        raise ValueError("the times of the keyframes must increase")
     at = np.clip(np.arange(frames) / fps, times[0], times[-1])
 
     def curve(values) -> np.ndarray:
         return PchipInterpolator(times, np.asarray(values, np.float64), axis=0)(at)
 
-    starts = np.array([start for start, _ in performer.labels])
-    names = np.array([BEHAVIOURS.index(name) for _, name in performer.labels])
+    starts = np.array([start for start, _ in keyframes.labels])
+    names = np.array([BEHAVIOURS.index(name) for _, name in keyframes.labels])
     return Motion(
         body_pose=curve([key.posture.body_pose for key in keys]),
         pitch=curve([key.posture.pitch_rad for key in keys]),

@@ -1,4 +1,4 @@
-"""What a detector would report of posed birds: noisy keypoints, outliers, and clean masks."""
+"""Simulated detections of posed birds: noisy keypoints, outliers, exact masks."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ def detect(
     masks: bool = True,
     camera: Camera = Camera(),
 ) -> Observations:
-    """Observations of several birds in one square image, as if none hid another.
+    """Simulate observations of several birds in one square image, without occlusion between birds.
 
     Args:
         bird: the model.
-        poses: one window (T frames) a bird, camera frame.
-        noise_px: standard deviation of each keypoint's x and y.
-        outliers: share of keypoints put anywhere in the image, with full confidence.
-        seed: the same seed gives the same noise.
-        masks: whether to draw them; each covers the bird whole.
-        camera: of the image.
+        poses: one window (T frames) per bird, camera frame.
+        noise_px: standard deviation of x and y of each keypoint, pixels.
+        outliers: share of keypoints with a uniformly random position in the image; their confidence is 1.
+        seed: seed of the noise.
+        masks: whether to render masks; masks are amodal.
+        camera: the camera of the image.
     """
     rng = np.random.default_rng(seed)
     rig = fold_bird(bird)
@@ -45,8 +45,8 @@ def detect(
         A = window_transforms(rig, pose)
         points = np.asarray(project(window_keypoints(rig, A, pose), camera), np.float64)
         points = points + rng.normal(size=points.shape) * noise_px
-        wrong = rng.random(points.shape[:2]) < outliers
-        keypoints_px.append(np.where(wrong[..., None], rng.uniform(0, size, points.shape), points))
+        is_outlier = rng.random(points.shape[:2]) < outliers
+        keypoints_px.append(np.where(is_outlier[..., None], rng.uniform(0, size, points.shape), points))
         screen = np.asarray(to_screen(window_vertices(rig, A, pose), camera))
         low, high = screen[..., :2].min(1), screen[..., :2].max(1)
         boxes.append(np.concatenate([low, high - low], axis=-1))

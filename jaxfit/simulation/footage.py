@@ -1,6 +1,6 @@
-"""The frames of a scene as a camera would give them: lit birds, shadows, motion blur, noise.
+"""Rendering of the frames of a scene: lighting, shadows, motion blur, sensor noise.
 
-Everything is computed in linear light and in blue, green, red, and turned into eight bits at the end.
+The colours are linear light in the order blue, green, red; the last step encodes them in eight bits.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 
 from jaxfit.model.bird import Bird
 from jaxfit.raster.zbuffer import hard_mask, interpolate, vertex_normals
-from jaxfit.simulation.flock import Actor
+from jaxfit.simulation.flock import SimulatedBird
 from jaxfit.simulation.ledge import Light, paint_ledge
 from jaxfit.simulation.motion import smooth_noise
 from jaxfit.simulation.texture import Noise, smoothstep
@@ -22,73 +22,73 @@ from jaxfit.simulation.viewpoint import Viewpoint
 __all__ = ["Footage"]
 
 SHUTTER = 0.4
-"""Share of a frame's time during which the shutter is open."""
+"""Exposure time as a share of the time between frames."""
 BLUR_STEP_PX = 4.0
-"""A bird that moves farther than this while the shutter is open is drawn at several moments."""
+"""A bird that moves farther than this during the exposure is rendered at several times."""
 GAMMA = 2.2
 
 
 class Footage:
-    """Draws the frames of one scene.
+    """Renders the frames of one scene.
 
     Args:
-        bird: the model, for faces, colours and where on the bird each vertex lies.
-        actors: the birds.
+        bird: the model, for faces, colours and rest vertices.
+        birds: the simulated birds.
         view: the camera.
-        ledge_depth: from edge to wall, model units.
-        light: sun and sky.
-        seed: of rock, feathers and noise.
+        ledge_depth: distance from the edge of the ledge to the wall, model units.
+        light: sunlight and skylight.
+        seed: seed of rock, feathers and noise.
     """
 
     def __init__(
-        self, bird: Bird, actors: Sequence[Actor], view: Viewpoint, ledge_depth: float, light: Light, seed: int
+        self, bird: Bird, birds: Sequence[SimulatedBird], view: Viewpoint, ledge_depth: float, light: Light, seed: int
     ):
         rng = np.random.default_rng((seed, 2))
-        self.actors, self.view, self.light = actors, view, light
+        self.birds, self.view, self.light = birds, view, light
         self.ledge = paint_ledge(rng, view, ledge_depth, light)
         self._feathers = Noise(rng, octaves=5, coarsest=16)
         V = len(bird.vertices)
-        self._faces = np.concatenate([np.asarray(bird.faces) + n * V for n in range(len(actors))])
+        self._faces = np.concatenate([np.asarray(bird.faces) + n * V for n in range(len(birds))])
         self._bird_faces = np.asarray(bird.faces)
         self._rest = np.asarray(bird.vertices)
-        self._colours = np.asarray(bird.vertex_colours)[:, ::-1] ** GAMMA * rng.uniform(0.85, 1.15, (len(actors), 1, 3))
-        # each bird a little lighter or darker, not of another hue
+        self._colours = np.asarray(bird.vertex_colours)[:, ::-1] ** GAMMA * rng.uniform(0.85, 1.15, (len(birds), 1, 3))
+        # birds differ in brightness more than in hue
         self._colours = np.clip(self._colours.mean(-1, keepdims=True) * 0.3 + self._colours * 0.7, 0.012, 0.9)
         self._grain = rng.normal(size=(2 * 256 + view.height, 2 * 256 + view.width)).astype(np.float32)
-        self._flicker = 1 + 0.01 * smooth_noise(rng, len(actors[0].behaviour))
+        self._flicker = 1 + 0.01 * smooth_noise(rng, len(birds[0].behaviour))
         self._noise = float(rng.uniform(0.004, 0.014))
         self._softness_px = float(rng.uniform(0.3, 0.8)) * view.width / 2592
-        self._offsets = rng.integers(0, 512, (len(actors[0].behaviour), 2))
+        self._offsets = rng.integers(0, 512, (len(birds[0].behaviour), 2))
         x, y = np.meshgrid(np.linspace(-1, 1, view.width), np.linspace(-1, 1, view.height))
         self._vignette = (1 - rng.uniform(0.02, 0.12) * (x**2 + y**2)).astype(np.float32)[..., None]
 
     def frame(self, t: int) -> UInt8[np.ndarray, "H W 3"]:
-        """Frame t as a camera would give it; blue, green, red."""
-        now = np.stack([actor.vertices_world[t] for actor in self.actors])
+        """Render frame t: blue, green, red."""
+        now = np.stack([bird.vertices_world[t] for bird in self.birds])
         last = len(self._offsets) - 1
         before, after = (
-            np.stack([actor.vertices_world[i] for actor in self.actors]) for i in (max(t - 1, 0), min(t + 1, last))
+            np.stack([bird.vertices_world[i] for bird in self.birds]) for i in (max(t - 1, 0), min(t + 1, last))
         )
         velocity = (after - before) / max(min(t + 1, last) - max(t - 1, 0), 1)
         travel = np.linalg.norm((self.view.to_screen(now + velocity) - self.view.to_screen(now))[..., :2], axis=-1)
-        moments = int(np.clip(np.ceil(SHUTTER * travel.max() / BLUR_STEP_PX), 1, 4))
+        exposures = int(np.clip(np.ceil(SHUTTER * travel.max() / BLUR_STEP_PX), 1, 4))
         picture = self._with_shadows(now)
         total: np.ndarray | None = None
-        for i in range(moments):
-            share = SHUTTER * ((i + 0.5) / moments - 0.5)  # the truth is that of the middle of the exposure
-            drawn = self._with_birds(picture, now + share * velocity)
-            total = drawn if total is None else total + drawn
+        for i in range(exposures):
+            share = SHUTTER * ((i + 0.5) / exposures - 0.5)  # the true poses are those in the middle of the exposure
+            rendered = self._with_birds(picture, now + share * velocity)
+            total = rendered if total is None else total + rendered
         assert total is not None
-        return self._expose(total / moments, t)
+        return self._expose(total / exposures, t)
 
     def _with_shadows(self, vertices_world: Float[np.ndarray, "N V 3"]) -> Float[np.ndarray, "H W 3"]:
-        """The ledge with the birds' shadows: one cast by the sun, one soft below each bird."""
+        """Render the ledge with the shadows of the birds: a shadow in sunlight, and a soft shadow in skylight."""
         to_sun, view = self.light.to_sun_world, self.view
-        fallen = vertices_world - vertices_world[..., 2:] * (to_sun / to_sun[2])
+        projected = vertices_world - vertices_world[..., 2:] * (to_sun / to_sun[2])
         below = vertices_world * [1, 1, 0]
         small = view._replace(width=view.width // 4, height=view.height // 4, focal_px=view.focal_px / 4)
         sun, sky = (np.zeros((small.height, small.width), np.float32) for _ in range(2))
-        for layer, points in ((sun, fallen), (sky, below)):
+        for layer, points in ((sun, projected), (sky, below)):
             for mesh in small.to_screen(points):
                 layer[hard_mask(mesh, self._bird_faces, small.width, small.height)] = 1
         sun = cv2.GaussianBlur(sun, (0, 0), 0.7 + small.width / 1500)
@@ -100,7 +100,7 @@ class Footage:
     def _with_birds(
         self, picture: Float[np.ndarray, "H W 3"], vertices_world: Float[np.ndarray, "N V 3"]
     ) -> Float[np.ndarray, "H W 3"]:
-        """The picture with the birds in it, drawn within their common box."""
+        """Render the birds into the picture, within their common box."""
         view = self.view
         screen = view.to_screen(vertices_world)
         low = np.maximum(np.floor(screen[..., :2].min((0, 1))).astype(int) - 1, 0)
@@ -126,7 +126,7 @@ class Footage:
         return out
 
     def _lit(self, attributes: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P 3"]:
-        """Plumage under sun and sky: feathers along the body, a little sheen on dark parts, darker towards the feet."""
+        """Shade the plumage: texture of feathers, sheen, and less skylight near the feet."""
         colour, normal, rest, height = np.split(attributes, [3, 6, 9], axis=1)
         normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
         across, along, up = (np.ascontiguousarray(rest[:, i]) for i in range(3))
@@ -135,13 +135,13 @@ class Footage:
         colour = colour * np.clip(1 + 0.13 * barbs + 0.10 * tracts, 0.5, 1.6)[:, None]
         sun = np.maximum(normal @ self.light.to_sun_world, 0)
         sky = 0.5 + 0.5 * normal[:, 2]
-        open_sky = 0.55 + 0.45 * smoothstep(0, 9, height[:, 0])  # the ledge and the body shade what is low
+        open_sky = 0.55 + 0.45 * smoothstep(0, 9, height[:, 0])  # ledge and body shade low parts
         light = 1.35 * self.light.sun * sun + (1 - 0.6 * self.light.sun) * (0.35 + 0.65 * sky) * open_sky
         sheen = 0.05 * sun**6 + 0.02 * sky
         return (colour * light[:, None] + (sheen * open_sky)[:, None]) * self.light.tint
 
     def _expose(self, linear: Float[np.ndarray, "H W 3"], t: int) -> UInt8[np.ndarray, "H W 3"]:
-        """Lens, sensor and eight bits: softness, vignetting, flicker, noise that dark parts show most."""
+        """Apply blur, vignetting, flicker, gamma and noise (most visible in dark parts), and encode eight bits."""
         soft = cv2.GaussianBlur(linear.astype(np.float32), (0, 0), max(self._softness_px, 0.2))
         soft *= self._vignette * np.float32(1.5 * self._flicker[t])
         encoded = cv2.pow(np.clip(soft, 0, 1), 1 / GAMMA)

@@ -1,4 +1,4 @@
-"""Smooth random motion of a bird, drawn from its own pose prior."""
+"""Smooth random motion of a bird, drawn from its pose prior."""
 
 from __future__ import annotations
 
@@ -13,43 +13,43 @@ from jaxfit.model.rotation import unwrap_axis_angle
 
 __all__ = ["smooth_motion", "smooth_noise"]
 
-FRAMES_A_KNOT = 20.0
-"""A new random target every 20 frames: at 25 frames/s, movements of about a second."""
+FRAMES_PER_KNOT = 20.0
+"""A random knot every 20 frames: at 25 frames/s, movements last about a second."""
 
 
 def smooth_noise(
-    rng: np.random.Generator, frames: int, shape: tuple[int, ...] = (), frames_a_knot: float = FRAMES_A_KNOT
+    rng: np.random.Generator, frames: int, shape: tuple[int, ...] = (), frames_per_knot: float = FRAMES_PER_KNOT
 ) -> Float[np.ndarray, "T *shape"]:
-    """Smooth random curves of about unit spread: standard normal knots, joined by cosine ramps.
+    """Draw smooth random curves of about unit standard deviation: standard normal knots, joined by cosine ramps.
 
     Args:
         rng: source of randomness.
         frames: length T.
-        shape: independent curves.
-        frames_a_knot: time between knots.
+        shape: shape of the array of independent curves.
+        frames_per_knot: number of frames between knots.
     """
-    knots = rng.normal(size=(int(frames / frames_a_knot) + 2, *shape))
-    at = np.arange(frames) / frames_a_knot
+    knots = rng.normal(size=(int(frames / frames_per_knot) + 2, *shape))
+    at = np.arange(frames) / frames_per_knot
     low = at.astype(int)
     ramp = ((1 - np.cos(np.pi * (at - low))) / 2).reshape(-1, *[1] * len(shape))
     return (1 - ramp) * knots[low] + ramp * knots[low + 1]
 
 
 def smooth_motion(bird: Bird, frames: int, seed: int, depth: float = 200.0, spread: float = 0.7) -> Pose:
-    """Poses of a bird seen from above that turns, leans, bends and drifts.
+    """Draw smooth poses of a bird seen from above that turns, leans, bends and drifts.
 
     Args:
-        bird: the model; body poses vary about its prior's mean.
+        bird: the model; body poses vary about the mean of its prior.
         frames: length T of the window.
-        seed: the same seed gives the same motion.
+        seed: seed of the motion.
         depth: distance from the camera in model units.
-        spread: size of the body movements, in standard deviations of the prior.
+        spread: amplitude of the body pose, in standard deviations of the prior.
 
     Returns:
-        A window's Pose, with one scale between 0.9 and 1.1, mean bone lengths and mean shape.
+        The pose of a window, with one scale between 0.9 and 1.1, mean bone lengths and mean shape.
     """
     rng = np.random.default_rng(seed)
-    from_above = Rotation.from_rotvec([np.pi, 0, 0])  # z up turned towards the camera
+    from_above = Rotation.from_rotvec([np.pi, 0, 0])  # rotates z up to z towards the camera
     heading = rng.uniform(-np.pi, np.pi) + 0.6 * smooth_noise(rng, frames)
     turned = Rotation.from_rotvec(heading[:, None] * [0, 0, 1])
     orient = turned * Rotation.from_rotvec(0.25 * smooth_noise(rng, frames, (3,))) * from_above

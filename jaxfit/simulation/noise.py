@@ -1,23 +1,23 @@
-"""What detectors would report of a scene: keypoints, confidences and masks with the faults that real ones have.
+"""Simulated detections of a scene: keypoints, confidences and masks with the errors of real detectors.
 
-The model, per bird; side is the longer side of its box, in pixels:
+The model of the errors, per bird (side is the longer side of its box, in pixels):
 
-- jitter: σ = JITTER · side + MOTION · |velocity a frame| (blur), × HIDDEN where the keypoint is not seen. 60 % of its
+- jitter: σ = JITTER · side + MOTION · |velocity per frame| (blur), times OCCLUDED for an occluded keypoint. 60 % of the
   variance is correlated in time (AR(1), ρ = 0.85), the rest is white;
-- gross outliers, in runs of some frames: the keypoint lands on a neighbour's of that name as that was detected, or
-  somewhere in the box, and stays there while the run lasts;
-- left and right swapped, for all pairs of a bird or for one, in runs;
-- missing keypoints, mostly hidden ones, and whole frames without a detection, in runs;
-- confidence falls with the jitter that was made, and most outliers are doubted, but through noise: swaps and some
-  outliers are trusted, some right points are not;
-- masks: of the visible part, eroded or grown by an amount that drifts, with ragged borders, now and then torn at
-  the tips, and now and then merged with a touching neighbour.
+- gross outliers in runs of frames: the keypoint lies on the detected keypoint of the same name of a neighbour, or at a
+  random position in the box, and stays there during the run;
+- left-right flips in runs, of all pairs of a bird or of one pair;
+- missing keypoints, mostly occluded keypoints, and frames without a detection, in runs;
+- confidences that decrease with the jitter and are low for most outliers, with noise: flips and some outliers have a
+  high confidence, and some correct keypoints a low confidence;
+- masks of the visible part, with a border that is eroded or dilated by a drifting amount and is ragged. Thin tips may
+  be lost, and a mask may merge with that of a touching neighbour.
 
-Rates hold for keypoints in the picture. What it leaves out: tracks are the true ones, without exchanged identities,
-false or double birds; confidence follows the error that was made more closely than a network's would.
+The rates apply to keypoints in the picture. Not simulated: exchanged identities, false detections, duplicates. The
+confidence depends on the error more closely than that of a network.
 
-The figures are estimates of what networks for animals do on video, not measured on any; they were set before anything
-was fitted to what they give.
+The parameters are estimates for animal pose networks on video, not measurements. They were chosen before any fit to
+these detections.
 """
 
 from __future__ import annotations
@@ -32,34 +32,34 @@ from jaxtyping import Bool, Float
 from jaxfit.data.masks import box_of_mask, encode_patch
 from jaxfit.data.observations import Observations
 
-__all__ = ["detect_noisily"]
+__all__ = ["simulate_detections"]
 
-JITTER, MOTION, HIDDEN = 0.012, 0.15, 2.5
+JITTER, MOTION, OCCLUDED = 0.012, 0.15, 2.5
 CORRELATED, RHO = 0.6, 0.85
-OUTLIERS_SEEN, OUTLIERS_HIDDEN, OUTLIERS_DOUBTED, STOLEN = 0.015, 0.06, 0.65, 0.4
-SWAPS_ALL, SWAPS_ONE = 0.008, 0.006
-MISSING_SEEN, MISSING_HIDDEN, MISSING_FRAMES = 0.015, 0.35, 0.012
-GRAIN = 0.04
-"""Size of the border's bumps as a share of the side."""
+OUTLIERS_VISIBLE, OUTLIERS_OCCLUDED, OUTLIERS_LOW_CONFIDENCE, OUTLIERS_ON_NEIGHBOUR = 0.015, 0.06, 0.65, 0.4
+FLIPS_ALL, FLIPS_ONE = 0.008, 0.006
+MISSING_VISIBLE, MISSING_OCCLUDED, MISSING_FRAMES = 0.015, 0.35, 0.012
+BORDER_WAVELENGTH = 0.04
+"""Size of the irregularities of a mask's border, as a share of the side."""
 RUN_FRAMES = 4.0
-"""Mean length of a run of outliers, swaps, gaps or mergers."""
+"""Mean length of a run of outliers, flips, missing detections or merged masks, frames."""
 ERODED, DRIFT, RAGGED, MERGED = 0.005, 0.007, 0.01, 0.02
-"""Shares of the side: the border's mean inset, its drift over time, its raggedness; share of frames that may merge."""
+"""Mask border: mean erosion, drift and raggedness as shares of the side. Last: share of frames that may merge."""
 
 
-def detect_noisily(
+def simulate_detections(
     truth: Observations,
-    seen: Bool[np.ndarray, "N T K"],
+    visible: Bool[np.ndarray, "N T K"],
     keypoint_pairs: Sequence[tuple[int, int]],
     seed: int,
 ) -> Observations:
-    """Observations as detectors would give them of true ones.
+    """Simulate the detections of true observations.
 
     Args:
         truth: exact keypoints, boxes and visible masks.
-        seen: whether the camera sees the keypoint.
-        keypoint_pairs: (left, right).
-        seed: the same seed gives the same faults.
+        visible: whether a keypoint is visible.
+        keypoint_pairs: pairs (left, right) of keypoint indices.
+        seed: seed of the errors.
     """
     rng = np.random.default_rng((seed, 3))
     N, T, K = truth.confidence.shape
@@ -68,35 +68,35 @@ def detect_noisily(
     side = np.where(truth.present, truth.box_px[..., 2:].max(-1), 1.0)[..., None]
     moved = np.zeros((N, T, K))
     moved[:, 1:] = np.where(labelled[:, 1:] & labelled[:, :-1], np.linalg.norm(np.diff(exact, axis=1), axis=-1), 0)
-    sigma = (JITTER * side + MOTION * np.minimum(moved, 0.2 * side)) * np.where(seen, 1, HIDDEN)
+    sigma = (JITTER * side + MOTION * np.minimum(moved, 0.2 * side)) * np.where(visible, 1, OCCLUDED)
     points = exact + sigma[..., None] * _jitter(rng, (N, T, K, 2))
     error = np.linalg.norm(points - exact, axis=-1) / side
 
-    everybody = _runs(rng, SWAPS_ALL, (N, T))
+    all_pairs = _runs(rng, FLIPS_ALL, (N, T))
     for left, right in keypoint_pairs:
         both = labelled[:, :, left] & labelled[:, :, right]
-        when = ((everybody | _runs(rng, SWAPS_ONE, (N, T))) & both)[..., None]
+        when = ((all_pairs | _runs(rng, FLIPS_ONE, (N, T))) & both)[..., None]
         a, b = points[:, :, left], points[:, :, right]
         points[:, :, left], points[:, :, right] = np.where(when, b, a), np.where(when, a, b)
 
-    wrong = _runs(rng, np.where(seen, OUTLIERS_SEEN, OUTLIERS_HIDDEN), (N, T, K))
-    points = np.where(wrong[..., None], _elsewhere(rng, truth, points, wrong), points)
-    doubted = wrong & (_held(rng.random((N, T, K)), wrong) < OUTLIERS_DOUBTED)
-    trust = 2.2 - 22 * error - 0.9 * ~seen - 2.6 * doubted + 0.8 * rng.normal(size=(N, T, K))
-    confidence = 1 / (1 + np.exp(-trust))
-    missing = _runs(rng, np.where(seen, MISSING_SEEN, MISSING_HIDDEN), (N, T, K)) | (confidence < 0.08)
-    # a detector finds a bird by what is to be seen of it
-    area = np.array([[_area(truth, n, t) for t in range(T)] for n in range(N)])
-    found = truth.present & ~_runs(rng, MISSING_FRAMES, (N, T)) & (area > 0.02 * side[..., 0] ** 2)
-    confidence = np.where(labelled & ~missing & found[..., None], confidence, 0)
+    is_outlier = _runs(rng, np.where(visible, OUTLIERS_VISIBLE, OUTLIERS_OCCLUDED), (N, T, K))
+    points = np.where(is_outlier[..., None], _outlier_positions(rng, truth, points, is_outlier), points)
+    low_confidence = is_outlier & (_hold_during_runs(rng.random((N, T, K)), is_outlier) < OUTLIERS_LOW_CONFIDENCE)
+    logit = 2.2 - 22 * error - 0.9 * ~visible - 2.6 * low_confidence + 0.8 * rng.normal(size=(N, T, K))
+    confidence = 1 / (1 + np.exp(-logit))
+    missing = _runs(rng, np.where(visible, MISSING_VISIBLE, MISSING_OCCLUDED), (N, T, K)) | (confidence < 0.08)
+    # birds with a small visible area are not detected
+    area = np.array([[_visible_area(truth, n, t) for t in range(T)] for n in range(N)])
+    detected = truth.present & ~_runs(rng, MISSING_FRAMES, (N, T)) & (area > 0.02 * side[..., 0] ** 2)
+    confidence = np.where(labelled & ~missing & detected[..., None], confidence, 0)
 
-    masks, boxes = _masks(rng, truth, found)
-    found &= boxes[..., 2] > 0
-    confidence = np.where(found[..., None], confidence, 0)
+    masks, boxes = _masks(rng, truth, detected)
+    detected &= boxes[..., 2] > 0
+    confidence = np.where(detected[..., None], confidence, 0)
     return Observations(
         track_id=truth.track_id,
         frame_index=truth.frame_index,
-        present=found,
+        present=detected,
         keypoints_px=points.astype(np.float32),
         confidence=confidence.astype(np.float32),
         box_px=boxes,
@@ -109,15 +109,15 @@ def detect_noisily(
 
 
 def _jitter(rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "N T *rest"]:
-    """Unit noise, part of it correlated from frame to frame."""
-    slow = rng.normal(size=shape)
+    """Draw noise of unit variance, partly correlated between frames."""
+    correlated = rng.normal(size=shape)
     for t in range(1, shape[1]):
-        slow[:, t] = RHO * slow[:, t - 1] + np.sqrt(1 - RHO**2) * slow[:, t]
-    return np.sqrt(CORRELATED) * slow + np.sqrt(1 - CORRELATED) * rng.normal(size=shape)
+        correlated[:, t] = RHO * correlated[:, t - 1] + np.sqrt(1 - RHO**2) * correlated[:, t]
+    return np.sqrt(CORRELATED) * correlated + np.sqrt(1 - CORRELATED) * rng.normal(size=shape)
 
 
 def _runs(rng: np.random.Generator, rate, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T *rest"]:
-    """Events along the second axis that hold `rate` of the time in runs of about RUN_FRAMES."""
+    """Draw events along the second axis that cover the share `rate` of the frames, in runs of about RUN_FRAMES."""
     rate = np.broadcast_to(rate, shape)
     begins = rng.random(shape) < rate / (RUN_FRAMES * (1 - rate) + rate)
     stays = rng.random(shape) < 1 - 1 / RUN_FRAMES
@@ -128,49 +128,49 @@ def _runs(rng: np.random.Generator, rate, shape: tuple[int, ...]) -> Bool[np.nda
     return on
 
 
-def _held(values: np.ndarray, on: Bool[np.ndarray, "N T K"]) -> np.ndarray:
-    """Values (N, T, K, …) that stay the same for as long as a run goes on."""
+def _hold_during_runs(values: np.ndarray, on: Bool[np.ndarray, "N T K"]) -> np.ndarray:
+    """Hold values (N, T, K, …) constant during each run."""
     held = values.copy()
     for t in range(1, on.shape[1]):
-        goes_on = (on[:, t] & on[:, t - 1]).reshape(*on[:, t].shape, *[1] * (values.ndim - 3))
-        held[:, t] = np.where(goes_on, held[:, t - 1], held[:, t])
+        continues = (on[:, t] & on[:, t - 1]).reshape(*on[:, t].shape, *[1] * (values.ndim - 3))
+        held[:, t] = np.where(continues, held[:, t - 1], held[:, t])
     return held
 
 
-def _elsewhere(
-    rng: np.random.Generator, truth: Observations, points: Float[np.ndarray, "N T K 2"], wrong: np.ndarray
+def _outlier_positions(
+    rng: np.random.Generator, truth: Observations, points: Float[np.ndarray, "N T K 2"], is_outlier: np.ndarray
 ) -> Float[np.ndarray, "N T K 2"]:
-    """Where outliers land: on the nearest neighbour's keypoint as it was detected, or anywhere in the own box."""
-    N, T, K = wrong.shape
+    """Draw outliers: the detected keypoint of the nearest neighbour, or a random position in the own box."""
+    N, T, K = is_outlier.shape
     low, size = truth.box_px[..., None, :2], truth.box_px[..., None, 2:]
-    anywhere = low + _held(rng.uniform(-0.1, 1.1, points.shape), wrong) * size
+    in_own_box = low + _hold_during_runs(rng.uniform(-0.1, 1.1, points.shape), is_outlier) * size
     if N < 2:
-        return anywhere
+        return in_own_box
     centre = truth.box_px[..., :2] + truth.box_px[..., 2:] / 2
     distance = np.linalg.norm(centre[:, None] - centre[None], axis=-1)  # N N T
     distance = np.where(truth.present[None] & ~np.eye(N, dtype=bool)[..., None], distance, np.inf)
     nearest, frames = distance.argmin(1), np.arange(T)  # N T
     near = np.take_along_axis(distance, nearest[:, None], 1)[:, 0] < 1.5 * truth.box_px[..., 2:].max(-1)
-    to_be_taken = near[..., None] & (truth.confidence > 0)[nearest, frames]
-    stolen = (_held(rng.random((N, T, K)), wrong) < STOLEN) & to_be_taken
-    return np.where(stolen[..., None], points[nearest, frames], anywhere)
+    has_neighbour = near[..., None] & (truth.confidence > 0)[nearest, frames]
+    on_neighbour = (_hold_during_runs(rng.random((N, T, K)), is_outlier) < OUTLIERS_ON_NEIGHBOUR) & has_neighbour
+    return np.where(on_neighbour[..., None], points[nearest, frames], in_own_box)
 
 
-def _area(truth: Observations, n: int, t: int) -> float:
+def _visible_area(truth: Observations, n: int, t: int) -> float:
     from pycocotools import mask as coco_mask
 
     rle = truth.masks.get((n, t))
     return 0.0 if rle is None else float(coco_mask.area(cast(Any, rle)))
 
 
-def _masks(rng: np.random.Generator, truth: Observations, found: np.ndarray):
-    """Masks with drifting, ragged borders, and their boxes (x, y, width, height)."""
-    N, T = found.shape
+def _masks(rng: np.random.Generator, truth: Observations, detected: np.ndarray):
+    """Simulate masks with drifting, ragged borders; return masks and boxes (x, y, width, height)."""
+    N, T = detected.shape
     drift = _jitter(rng, (N, T))
     merged = _runs(rng, MERGED, (N, T))
     boxes = np.zeros((N, T, 4), np.float32)
     masks = {}
-    for n, t in np.argwhere(found).tolist():
+    for n, t in np.argwhere(detected).tolist():
         mask = truth.mask(n, t)
         if mask is None:
             continue
@@ -182,25 +182,25 @@ def _masks(rng: np.random.Generator, truth: Observations, found: np.ndarray):
         top, bottom = max(y - margin, 0), min(y + height + margin, mask.shape[0])
         left, right = max(x - margin, 0), min(x + width + margin, mask.shape[1])
         part = np.ascontiguousarray(mask[top:bottom, left:right]).astype(np.uint8)
-        # signed distance to the border, moved by the drift and by smooth noise: thin tips get lost
+        # signed distance to the border plus drift and smooth noise; thin tips may be lost
         inside = cv2.distanceTransform(part, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - part, cv2.DIST_L2, 3)
-        patch = max(2, round(GRAIN * side))
+        patch = max(2, round(BORDER_WAVELENGTH * side))
         field = rng.normal(size=[4 + length // patch for length in part.shape]).astype(np.float32)
         field = cv2.resize(field, part.shape[::-1], interpolation=cv2.INTER_CUBIC)
-        reported = inside + side * (DRIFT * drift[n, t] - ERODED + RAGGED * field) > 0
-        box = box_of_mask(reported)
+        simulated = inside + side * (DRIFT * drift[n, t] - ERODED + RAGGED * field) > 0
+        box = box_of_mask(simulated)
         if box is None:
             continue
         boxes[n, t] = left + box[0], top + box[1], *box[2:]
-        masks[n, t] = encode_patch(reported, left, top, mask.shape[1], mask.shape[0])
+        masks[n, t] = encode_patch(simulated, left, top, mask.shape[1], mask.shape[0])
     return masks, boxes
 
 
 def _with_neighbour(truth: Observations, n: int, t: int, mask: np.ndarray, reach_px: int) -> np.ndarray:
-    """The mask together with the first neighbour's that touches it."""
-    grown = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach_px + 1,) * 2, np.uint8)) > 0
+    """Merge the mask with the mask of the first bird that touches it."""
+    dilated = cv2.dilate(mask.astype(np.uint8), np.ones((2 * reach_px + 1,) * 2, np.uint8)) > 0
     for other in range(truth.num_tracks):
-        theirs = truth.mask(other, t) if other != n else None
-        if theirs is not None and (grown & theirs).any():
-            return mask | theirs
+        other_mask = truth.mask(other, t) if other != n else None
+        if other_mask is not None and (dilated & other_mask).any():
+            return mask | other_mask
     return mask

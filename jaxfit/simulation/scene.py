@@ -1,4 +1,4 @@
-"""A simulated scene in a folder: footage, truth, and what detectors would report."""
+"""Simulation of a scene: footage, truth, and simulated detections."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from jaxfit.model.camera import Camera
 from jaxfit.model.describe import model_hash
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.simulation.behaviour import BEHAVIOURS
-from jaxfit.simulation.flock import Actor, act
+from jaxfit.simulation.flock import SimulatedBird, simulate_flock
 from jaxfit.simulation.footage import Footage
 from jaxfit.simulation.ledge import random_light
-from jaxfit.simulation.noise import detect_noisily
-from jaxfit.simulation.viewpoint import Viewpoint, look_down
-from jaxfit.simulation.visibility import keypoints_of, see
+from jaxfit.simulation.noise import simulate_detections
+from jaxfit.simulation.viewpoint import Viewpoint, random_viewpoint
+from jaxfit.simulation.visibility import mesh_keypoints, render_visibility
 from jaxfit.storage.files import new_folder, write_whole
 from jaxfit.video.writer import VideoWriter
 
@@ -34,23 +34,23 @@ __all__ = ["Scene", "simulate", "stage_scene"]
 
 VERSION = metadata.version("jaxfit")
 LEDGE_DEPTH = 62.0
-"""From the edge to the wall, model units (1.24 m)."""
+"""Distance from the edge of the ledge to the wall, model units (1.24 m)."""
 LARGEST_SIDE, SMALLEST_SIDE = 8192, 160
-MOST_POSES = 14_000
-"""Birds × frames that fit in memory on a small machine."""
+MAX_POSES = 14_000
+"""Largest birds × frames that fits in the memory of a small machine."""
 
 
 class Scene(NamedTuple):
-    """A scene before it is filmed."""
+    """A simulated scene without its footage."""
 
-    actors: list[Actor]
+    birds: list[SimulatedBird]
     view: Viewpoint
     truth: Observations
-    """Exact keypoints, visible and whole masks; boxes around the whole birds."""
+    """Exact keypoints, visible and amodal masks; boxes of the amodal masks."""
     poses: Solution
-    """Exact poses, in the real camera."""
+    """Exact poses, in the camera of the scene."""
     detections: Observations
-    """What detectors would report."""
+    """Simulated detections."""
 
 
 def stage_scene(
@@ -62,40 +62,44 @@ def stage_scene(
     seed: int = 0,
     progress: ProgressTask = silent,
 ) -> Scene:
-    """Let birds live on a ledge and say exactly what is to be seen of them.
+    """Simulate birds on a ledge, their exact observations, and the detections of a simulated detector.
 
     Args:
-        bird: the model, with names of joints as `jaxfit.load_murre` has them.
-        birds: on the ledge, at least 1.
-        frames: length, at least 2.
-        size: width and height of the picture in pixels.
-        fps: frames a second.
+        bird: the model, with the joint names of `jaxfit.load_murre`.
+        birds: number of birds, at least 1.
+        frames: number of frames, at least 2.
+        size: width and height of the picture, pixels.
+        fps: frames per second.
         seed: 0 or more; the same seed gives the same scene.
-        progress: told of every frame.
+        progress: reports every frame.
 
     Raises:
-        InputError: a number that makes no sense.
+        InputError: a number outside its range.
     """
     _check(birds, frames, size, fps, seed)
-    view = look_down(np.random.default_rng((seed, 0)), *size, LEDGE_DEPTH)
-    actors = act(bird, birds, frames, fps, LEDGE_DEPTH, view, seed)
-    vertices = np.stack([actor.vertices_world for actor in actors], axis=1)  # T N V 3
-    keypoints = keypoints_of(bird, vertices)
+    view = random_viewpoint(np.random.default_rng((seed, 0)), *size, LEDGE_DEPTH)
+    simulated_birds = simulate_flock(bird, birds, frames, fps, LEDGE_DEPTH, view, seed)
+    vertices = np.stack([simulated.vertices_world for simulated in simulated_birds], axis=1)  # T N V 3
+    keypoints = mesh_keypoints(bird, vertices)
     K = bird.num_keypoints
-    points, inside, seen = np.zeros((birds, frames, K, 2)), *np.zeros((2, birds, frames, K), bool)
-    boxes, whole, visible = np.zeros((birds, frames, 4), np.float32), {}, {}
+    points, inside, visible = np.zeros((birds, frames, K, 2)), *np.zeros((2, birds, frames, K), bool)
+    boxes, amodal_masks, visible_masks = np.zeros((birds, frames, 4), np.float32), {}, {}
     faces = np.asarray(bird.faces)
     with progress("Staging the scene", frames) as report_progress:
         for t in range(frames):
-            seen_now = see(vertices[t], keypoints[t], faces, view)
-            points[:, t], inside[:, t], seen[:, t] = seen_now.keypoints_px, seen_now.inside, seen_now.seen
+            rendered = render_visibility(vertices[t], keypoints[t], faces, view)
+            points[:, t], inside[:, t], visible[:, t] = (
+                rendered.keypoints_px,
+                rendered.inside,
+                rendered.keypoint_visible,
+            )
             for n in range(birds):
-                box = box_of_mask(seen_now.whole[n])
+                box = box_of_mask(rendered.amodal_masks[n])
                 if box is None:
-                    continue  # flown out of the picture
-                whole[n, t], boxes[n, t] = encode_mask(seen_now.whole[n]), box
-                if seen_now.visible[n].any():
-                    visible[n, t] = encode_mask(seen_now.visible[n])
+                    continue  # the bird is outside the picture
+                amodal_masks[n, t], boxes[n, t] = encode_mask(rendered.amodal_masks[n]), box
+                if rendered.visible_masks[n].any():
+                    visible_masks[n, t] = encode_mask(rendered.visible_masks[n])
             report_progress(1, "")
     present = boxes[..., 2] > 0
     labelled = inside & present[..., None]
@@ -110,13 +114,13 @@ def stage_scene(
         file_name=np.array([f"{FOOTAGE}#{t}" for t in range(frames)]),
         keypoint_names=bird.keypoint_names,
         skeleton=skeleton_pairs(bird.keypoint_names),
-        masks=visible,
-        amodal_masks=whole,
-        occluded=labelled & ~seen,
+        masks=visible_masks,
+        amodal_masks=amodal_masks,
+        occluded=labelled & ~visible,
     )
-    poses = _true_poses(bird, actors, view, truth, points, np.swapaxes(keypoints, 0, 1))
-    detections = detect_noisily(truth, seen, bird.keypoint_pairs, seed)
-    return Scene(actors, view, truth, poses, detections)
+    poses = _true_poses(bird, simulated_birds, view, truth, points, np.swapaxes(keypoints, 0, 1))
+    detections = simulate_detections(truth, visible, bird.keypoint_pairs, seed)
+    return Scene(simulated_birds, view, truth, poses, detections)
 
 
 def simulate(
@@ -131,29 +135,30 @@ def simulate(
     overwrite: bool = False,
     progress: ProgressTask = silent,
 ) -> Scene:
-    """Stage a scene, film it, and write everything; the same arguments give the same bytes.
+    """Simulate a scene and write its footage, truth and detections; the same arguments give the same bytes.
 
-    The folder then holds `footage.mp4`; `truth.json`, exact annotations as COCO (visible masks as `segmentation`,
-    whole ones as `amodal_segmentation`, hidden keypoints with visibility 1); `truth/`, exact poses as a result;
-    `detections.json`, what detectors would report (see `jaxfit.simulation.noise`); `scene.json`, the camera and what
-    each bird does when.
+    The folder contains `footage.mp4`; `truth.json`, exact annotations in COCO format (visible masks as `segmentation`,
+    amodal masks as `amodal_segmentation`, occluded keypoints with visibility 1); `truth/`, exact poses as a result
+    folder; `detections.json`, simulated detections (see `jaxfit.simulation.noise`); `scene.json`, the camera and the
+    behaviours of each bird.
 
     Args:
-        folder: to make, whole or not at all.
-        codec: as `VideoWriter` takes it.
-        overwrite: replace an earlier scene of that name.
-        bird, birds, frames, size, fps, seed, progress: as for `stage_scene`.
+        bird: the model, as for `stage_scene`.
+        folder: folder to create; after an error it does not exist.
+        birds, frames, size, fps, seed, progress: as for `stage_scene`.
+        codec: codec of the footage, as for `VideoWriter`.
+        overwrite: replace an existing scene.
 
     Raises:
-        InputError: a number that makes no sense, or the folder cannot be written.
+        InputError: a number outside its range, or the folder cannot be written.
     """
     with new_folder(folder, overwrite, marker=MARKER) as part:
         scene = stage_scene(bird, birds, frames, size, fps, seed, progress)
         rng = np.random.default_rng((seed, 4))
-        film = Footage(bird, scene.actors, scene.view, LEDGE_DEPTH, random_light(rng), seed)
+        footage = Footage(bird, scene.birds, scene.view, LEDGE_DEPTH, random_light(rng), seed)
         with progress("Filming", frames) as report_progress, VideoWriter(part / FOOTAGE, size, fps, codec) as video:
             for t in range(frames):
-                video.write(film.frame(t))
+                video.write(footage.frame(t))
                 report_progress(1, "")
         write_coco(scene.truth, part / TRUTH)
         write_coco(scene.detections, part / DETECTIONS)
@@ -167,11 +172,13 @@ def simulate(
 def _check(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> None:
     def require(name: str, value: object, holds: bool, remedy: str) -> None:
         if not holds:
-            raise InputError(f"simulate: {name}", f"{value} makes no scene", remedy)
+            raise InputError(f"simulate: {name}", f"is {value}", remedy)
 
     require("birds", birds, 1 <= birds <= 60, "give 1 to 60 birds")
-    longest = MOST_POSES // birds
-    require("frames", frames, 2 <= frames <= longest, f"give 2 to {longest} frames, and film more as further scenes")
+    longest = MAX_POSES // birds
+    require(
+        "frames", frames, 2 <= frames <= longest, f"give 2 to {longest} frames; simulate several scenes for more frames"
+    )
     remedy = f"give width and height as in 2592x1520, even, {SMALLEST_SIDE} to {LARGEST_SIDE} pixels, at most 3:1"
     sides_fit = len(size) == 2 and all(SMALLEST_SIDE <= side <= LARGEST_SIDE and side % 2 == 0 for side in size)
     sides_fit = sides_fit and max(size) <= 3 * min(size)
@@ -181,13 +188,13 @@ def _check(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int
 
 
 def _true_poses(
-    bird: Bird, actors: list[Actor], view: Viewpoint, truth: Observations, points_px: np.ndarray, keypoints_world
+    bird: Bird, birds: list[SimulatedBird], view: Viewpoint, truth: Observations, points_px: np.ndarray, keypoints_world
 ) -> Solution:
-    """The actors' poses as a result whose crop is the whole picture, so that its camera is the real one."""
+    """Return the true poses as a result. Its crop is the whole picture, so that its camera is that of the scene."""
     N, T = truth.present.shape
 
     def stack(name: str) -> np.ndarray:
-        return np.stack([np.asarray(getattr(actor.pose, name)) for actor in actors])
+        return np.stack([np.asarray(getattr(simulated.pose, name)) for simulated in birds])
 
     def each_frame(name: str) -> np.ndarray:
         values = stack(name)
@@ -218,11 +225,11 @@ def _true_poses(
 
 
 def _description(scene: Scene, birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> dict:
-    """What `scene.json` says: how the scene was made, its camera, and what each bird does from which frame on."""
-    acts = {}
-    for track, actor in zip(scene.truth.track_id.tolist(), scene.actors, strict=True):
-        starts = np.flatnonzero(np.diff(actor.behaviour, prepend=-1))
-        acts[track] = [{"from_frame": int(t), "behaviour": BEHAVIOURS[actor.behaviour[t]]} for t in starts]
+    """Return the content of `scene.json`: arguments, camera, and the behaviours of each bird with first frames."""
+    behaviours = {}
+    for track, simulated in zip(scene.truth.track_id.tolist(), scene.birds, strict=True):
+        starts = np.flatnonzero(np.diff(simulated.behaviour, prepend=-1))
+        behaviours[track] = [{"from_frame": int(t), "behaviour": BEHAVIOURS[simulated.behaviour[t]]} for t in starts]
     return {
         "made_by": f"jaxfit {VERSION}, simulated",
         "arguments": {"birds": birds, "frames": frames, "size": list(size), "fps": fps, "seed": seed},
@@ -232,5 +239,5 @@ def _description(scene: Scene, birds: int, frames: int, size: tuple[int, int], f
             "focal_px": scene.view.focal_px,
             "units": "model units; world z up, ledge at z = 0",
         },
-        "behaviour": acts,
+        "behaviour": behaviours,
     }

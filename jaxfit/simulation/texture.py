@@ -1,4 +1,4 @@
-"""Noise to paint with: tiles of fractal noise, looked up at any scale."""
+"""Fractal noise for textures: periodic tiles that are sampled at any scale."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ TILE = 1024
 
 
 def smoothstep(low: float, high: float, values: np.ndarray) -> np.ndarray:
-    """0 below low, 1 above high, smooth between; low may be the greater."""
+    """Map values to 0 below `low`, 1 above `high`, and smoothly in between; `low` may exceed `high`."""
     x = np.clip((values - low) / (high - low), 0, 1)
     return x * x * (3 - 2 * x)
 
 
 class Noise:
-    """A tile of fractal noise that repeats in both directions, with mean 0 and spread 1.
+    """A periodic tile of fractal noise, with mean 0 and standard deviation 1.
 
     Args:
         rng: source of randomness.
-        octaves: each has twice as many cells as the one before.
-        gain: strength of each octave against the one before.
-        coarsest: cells of the first octave across the tile, a power of two.
+        octaves: number of octaves; each has twice as many cells as the previous octave.
+        gain: amplitude of an octave relative to the previous octave.
+        coarsest: number of cells of the first octave along a side, a power of two.
     """
 
     def __init__(self, rng: np.random.Generator, octaves: int = 8, gain: float = 0.55, coarsest: int = 4):
@@ -39,8 +39,8 @@ class Noise:
         self.tile = (tile - tile.mean()) / tile.std()
 
     def __call__(self, u: np.ndarray, v: np.ndarray, period: float) -> Float[np.ndarray, "*B"]:
-        """Values at coordinates (u, v), the tile repeating every `period`."""
-        rows = -(-u.size // TILE)  # as a picture, which is what OpenCV looks up
+        """Sample the noise at coordinates (u, v); the tile has the side `period`."""
+        rows = -(-u.size // TILE)  # cv2.remap needs a two-dimensional picture
         x, y = (np.resize(np.asarray(c, np.float32) * np.float32(TILE / period) % TILE, (rows, TILE)) for c in (u, v))
         values = cv2.remap(self.tile, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         return values.reshape(-1)[: u.size].reshape(u.shape)

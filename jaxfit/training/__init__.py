@@ -1,1 +1,1 @@
-"""Training of the built-in networks on simulated footage alone. Needs the extra `train` (PyTorch)."""
+"""Training of the built-in networks on simulated footage only. It needs the extra `train` (PyTorch)."""

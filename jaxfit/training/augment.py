@@ -1,7 +1,7 @@
-"""Randomised appearance: what simulated footage must be put through so that a network learns birds, not the simulator.
+"""Random augmentation of the appearance of simulated pictures (domain randomisation, Tobin et al. 2017).
 
-After Tobin et al. 2017 (domain randomisation): light, texture, background, blur, noise and compression vary far beyond
-what a camera does, in the hope that real footage is one more variation.
+Light, texture, background, blur, noise and compression vary more than between real cameras, so that a network does not
+depend on the appearance of the simulation.
 """
 
 from __future__ import annotations
@@ -12,41 +12,41 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-__all__ = ["randomise"]
+__all__ = ["randomise_appearance"]
 
 
-def randomise(
+def randomise_appearance(
     rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], birds: Bool[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The same birds in the same places, otherwise lit, on other ground, by another camera.
+    """Randomise light, background and camera of a picture; the positions of the birds do not change.
 
     Args:
         rng: source of randomness.
         picture: blue, green, red, at the network's resolution.
-        birds: the pixels of birds, which stay birds.
+        birds: the pixels of birds.
     """
-    if rng.random() < 0.75:  # the rest stays as it was filmed, but for the camera
-        picture = _eight_bits(_restaged(rng, picture, birds))
-    picture = _developed(rng, picture)
-    picture = _blurred(rng, picture)
-    picture = _grainy(rng, picture)
+    if rng.random() < 0.75:  # otherwise only the camera is randomised
+        picture = _to_bytes(_randomise_scene(rng, picture, birds))
+    picture = _randomise_colours(rng, picture)
+    picture = _random_blur(rng, picture)
+    picture = _add_grain(rng, picture)
     if rng.random() < 0.6:
         _, coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 92))])
         picture = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
     return picture
 
 
-def _restaged(rng: np.random.Generator, picture: np.ndarray, birds: np.ndarray) -> Float[np.ndarray, "H W 3"]:
-    """The birds on other ground and in another light; within 0 and 1, or somewhat outside."""
+def _randomise_scene(rng: np.random.Generator, picture: np.ndarray, birds: np.ndarray) -> Float[np.ndarray, "H W 3"]:
+    """Randomise background and light; values may lie slightly outside 0 and 1."""
     image = picture.astype(np.float32) / 255
     if rng.random() < 0.45:
-        image = _on_other_ground(rng, image, birds)
+        image = _replace_ground(rng, image, birds)
     if rng.random() < 0.4:
-        image = _with_clutter(rng, image, birds)
-    if rng.random() < 0.5:  # plumage against ground: from black on white to grey on grey
-        alpha = _softened(birds)
-        lifted = image * rng.uniform(0.6, 1.8) + rng.uniform(0, 0.08)
-        image = image * (1 - alpha) + lifted * alpha
+        image = _add_clutter(rng, image, birds)
+    if rng.random() < 0.5:  # contrast between plumage and ground: from black on white to grey on grey
+        alpha = _soft_mask(birds)
+        scaled = image * rng.uniform(0.6, 1.8) + rng.uniform(0, 0.08)
+        image = image * (1 - alpha) + scaled * alpha
     if rng.random() < 0.5:
         image = image * np.exp(rng.uniform(0.1, 0.5) * _noise(rng, image.shape, 2))[..., None]
     if rng.random() < 0.25:
@@ -54,12 +54,12 @@ def _restaged(rng: np.random.Generator, picture: np.ndarray, birds: np.ndarray) 
     return image
 
 
-def _eight_bits(image: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
+def _to_bytes(image: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
     return np.clip(255 * image + 0.5, 0, 255).astype(np.uint8)
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, ...], octaves: int) -> Float[np.ndarray, "H W"]:
-    """Smooth noise of about unit size: grids of random numbers, each enlarged to the picture."""
+    """Draw smooth noise of about unit standard deviation: enlarged grids of random numbers."""
     height, width = shape[:2]
     total = np.zeros((height, width), np.float32)
     cells = int(rng.integers(2, 7))
@@ -70,12 +70,12 @@ def _noise(rng: np.random.Generator, shape: tuple[int, ...], octaves: int) -> Fl
     return total
 
 
-def _softened(birds: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 1"]:
+def _soft_mask(birds: Bool[np.ndarray, "H W"]) -> Float[np.ndarray, "H W 1"]:
     return cv2.GaussianBlur(birds.astype(np.float32), (0, 0), 0.7)[..., None]
 
 
-def _on_other_ground(rng: np.random.Generator, image: np.ndarray, birds: np.ndarray) -> np.ndarray:
-    """Two random colours mixed by noise, sometimes with streaks, sometimes with the ledge showing through."""
+def _replace_ground(rng: np.random.Generator, image: np.ndarray, birds: np.ndarray) -> np.ndarray:
+    """Replace the ground by two random colours mixed by noise, sometimes with streaks or the ledge shining through."""
     share = np.clip(0.5 + rng.uniform(0.2, 0.8) * _noise(rng, image.shape, int(rng.integers(2, 7))), 0, 1)[..., None]
     if rng.random() < 0.3:
         angle, length = rng.uniform(0, np.pi), rng.uniform(4, 40)
@@ -86,12 +86,12 @@ def _on_other_ground(rng: np.random.Generator, image: np.ndarray, birds: np.ndar
     ground = np.clip(first * (1 - share) + second * share, 0, 1)
     kept = rng.uniform(0, 0.7) if rng.random() < 0.5 else 0.0
     ground = ground * (1 - kept) + image * kept
-    alpha = _softened(birds)
+    alpha = _soft_mask(birds)
     return image * alpha + ground * (1 - alpha)
 
 
-def _with_clutter(rng: np.random.Generator, image: np.ndarray, birds: np.ndarray) -> np.ndarray:
-    """Stones, droppings and other things behind the birds; some as dark as a bird."""
+def _add_clutter(rng: np.random.Generator, image: np.ndarray, birds: np.ndarray) -> np.ndarray:
+    """Draw random ellipses and polygons behind the birds, some as dark as a bird."""
     drawn = np.ascontiguousarray(image)
     height, width = image.shape[:2]
     for _ in range(int(rng.integers(1, 9))):
@@ -106,12 +106,12 @@ def _with_clutter(rng: np.random.Generator, image: np.ndarray, birds: np.ndarray
             reach = rng.uniform(2, 0.14 * width, spokes)
             corners = centre + reach[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
             cv2.fillPoly(drawn, [corners.astype(np.int32)], colour, cv2.LINE_AA)
-    alpha = _softened(birds)
+    alpha = _soft_mask(birds)
     return image * alpha + drawn * (1 - alpha)
 
 
 def _cast_shadow(rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "H W"]:
-    """The edge of a shadow across everything."""
+    """Draw the factor of brightness of a shadow with one edge across the picture."""
     height, width = shape[:2]
     y, x = np.ogrid[:height, :width]
     angle = rng.uniform(0, 2 * np.pi)
@@ -119,19 +119,19 @@ def _cast_shadow(rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.n
     return (1 - rng.uniform(0.2, 0.6) / (1 + np.exp(-beyond / rng.uniform(0.5, 8)))).astype(np.float32)
 
 
-def _developed(rng: np.random.Generator, picture: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
-    """Exposure, contrast, white balance and saturation."""
+def _randomise_colours(rng: np.random.Generator, picture: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
+    """Randomise exposure, contrast, white balance and saturation."""
     tone = np.linspace(0, 1, 256) ** np.exp(rng.uniform(-0.35, 0.35))
     tone = (tone - 0.4) * rng.uniform(0.6, 1.4) + 0.4 + rng.uniform(-0.12, 0.12)
-    curves = _eight_bits(tone[None, :, None] * rng.uniform(0.85, 1.15, 3))
+    curves = _to_bytes(tone[None, :, None] * rng.uniform(0.85, 1.15, 3))
     picture = np.asarray(cv2.LUT(picture, curves))
     grey = cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
     saturation = rng.uniform(0.4, 1.6) if rng.random() < 0.9 else 0.0
     return np.asarray(cv2.addWeighted(picture, saturation, grey, 1 - saturation, 0), np.uint8)
 
 
-def _blurred(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
-    """Out of focus, moved, or enlarged from fewer pixels."""
+def _random_blur(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
+    """Apply a random blur: defocus, motion, or a lower resolution."""
     kind = rng.random()
     if kind < 0.35:
         return cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.3, 1.6))
@@ -152,13 +152,13 @@ def _blurred(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _grain() -> Float[np.ndarray, "512 512 3"]:
+def _noise_array() -> Float[np.ndarray, "512 512 3"]:
     return np.random.default_rng(0).standard_normal((512, 512, 3), np.float32)
 
 
-def _grainy(rng: np.random.Generator, picture: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
-    """Sensor noise: a random part of one sheet of grain, which is far faster than new grain."""
+def _add_grain(rng: np.random.Generator, picture: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
+    """Add sensor noise: a random part of one array of noise, which is much faster than new noise."""
     height, width = picture.shape[:2]
     y, x = rng.integers(0, [512 - height, 512 - width])
-    grain = _grain()[y : y + height, x : x + width]
+    grain = _noise_array()[y : y + height, x : x + width]
     return np.clip(picture + rng.uniform(0, 10) * grain + 0.5, 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Trained networks as ONNX files that need nothing but ONNX Runtime."""
+"""Export of trained networks to ONNX files."""
 
 # pyright: reportMissingImports=false
 
@@ -19,31 +19,31 @@ from jaxfit.storage.files import write_whole
 __all__ = ["export_onnx"]
 
 OPSET = 18
-LARGE = 256
-"""Arrays of fewer numbers are kept in 32 bits."""
+MIN_HALF_SIZE = 256
+"""Arrays with fewer elements stay in 32 bits."""
 
 
 def export_onnx(
     network: nn.Module,
     example: torch.Tensor,
-    free: Mapping[int, str],
+    variable_axes: Mapping[int, str],
     outputs: tuple[str, ...],
     metadata: Mapping[str, str],
     path: str | Path,
 ) -> None:
-    """Write a network whole, its weights in 16 bits, which halves the file and changes no result that matters.
+    """Write a network to an ONNX file, with weights in 16 bits: the file is half as large, with equivalent results.
 
     Args:
-        network: maps one tensor to tensors, in evaluation mode.
+        network: a module in evaluation mode that maps one tensor to tensors.
         example: an input.
-        free: axes of the input whose length is free, with a name each.
+        variable_axes: axis → name of the input's axes of variable length.
         outputs: names of the outputs, in their order.
-        metadata: kept in the file; what a reader needs to know of input and output.
-        path: an `.onnx` file, replaced if it exists.
+        metadata: metadata of the file, which describes input and output.
+        path: an `.onnx` file; an existing file is replaced.
     """
-    shapes = {axis: torch.export.Dim.DYNAMIC for axis in free}
+    shapes = {axis: torch.export.Dim.DYNAMIC for axis in variable_axes}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporter's own making
+        warnings.simplefilter("ignore")  # of the exporter itself
         program = torch.onnx.export(
             network,
             (example,),
@@ -56,25 +56,25 @@ def export_onnx(
         )
     assert program is not None
     model = program.model_proto
-    _halve(model)
-    for axis, name in free.items():
+    _convert_weights(model)
+    for axis, name in variable_axes.items():
         model.graph.input[0].type.tensor_type.shape.dim[axis].dim_param = name
     del model.metadata_props[:]
     for key, value in metadata.items():
         model.metadata_props.add(key=key, value=value)
     for node in model.graph.node:
         node.doc_string = ""
-        del node.metadata_props[:]  # the exporter's paths
+        del node.metadata_props[:]  # the exporter writes local paths into it
     onnx.checker.check_model(model)
     write_whole(path, model.SerializeToString())
 
 
-def _halve(model: onnx.ModelProto) -> None:
-    """Keep large weights in 16 bits; ONNX Runtime widens them once, when it loads the file."""
+def _convert_weights(model: onnx.ModelProto) -> None:
+    """Convert large weights to 16 bits; ONNX Runtime converts them back once, when it loads the file."""
     casts = []
     for weight in model.graph.initializer:
         values = numpy_helper.to_array(weight)
-        if values.dtype != np.float32 or values.size < LARGE:
+        if values.dtype != np.float32 or values.size < MIN_HALF_SIZE:
             continue
         name = weight.name
         weight.CopyFrom(numpy_helper.from_array(values.astype(np.float16), f"{name}_16"))

@@ -1,8 +1,8 @@
-"""The built-in keypoint network: for one bird on black, where each keypoint is, or that it is nowhere.
+"""The built-in keypoint network: the position of each keypoint in the crop of one bird.
 
-Every keypoint has a distribution over the cells of its map and one more place, `nowhere`, whose logit is 0. Training
-lowers the cross-entropy to the true place. What is exported sums that distribution around every cell with a smooth
-window, so that a peak's height is the probability that the keypoint lies near it: a confidence that means something.
+The network predicts, for each keypoint, a distribution over the cells of a map and the class `absent`, whose logit is
+0. Training minimises the cross-entropy to the true cell. The exported network convolves the distribution with a smooth
+window, so that the height of a peak, the confidence, is the probability that the keypoint lies near the peak.
 """
 
 # pyright: reportMissingImports=false
@@ -21,46 +21,48 @@ from torch.nn import functional
 from jaxfit.model.anatomy import MURRE_KEYPOINTS, other_side
 from jaxfit.perception.instances import Instance, instance_of
 from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX, crop_bird
-from jaxfit.training.augment import randomise
-from jaxfit.training.cuts import random_turn, surroundings
+from jaxfit.training.augment import randomise_appearance
+from jaxfit.training.frame_patches import patch_around, random_rotation
 from jaxfit.training.networks import FeaturePyramid
 from jaxfit.training.scenes import LabelledFrames
 
-__all__ = ["SIDE_PX", "STRIDE", "KeypointSample", "Peaks", "draw_sample", "keypoint_network", "loss"]
+__all__ = ["SIDE_PX", "STRIDE", "KeypointMaps", "KeypointSample", "draw_sample", "keypoint_network", "loss"]
 
 STRIDE, SIDE_PX = 4, 192
-PAPER_PIXELS_A_UNIT = 20.7
-"""Scale of the footage for which the crop's margins, PAD_PX and DILATE_PX, are meant: 2592 pixels across 2.5 m."""
+PAPER_PIXELS_PER_UNIT = 20.7
+"""Scale of the footage for which PAD_PX and DILATE_PX are chosen: 2592 pixels for 2.5 m; one unit is 2 cm."""
 SIGMA_CELLS = 0.9
-"""Width of the true place: labels are exact, but a cell is not a point."""
+"""Standard deviation of the target distribution. Labels are exact, but a cell is not a point."""
 WINDOW_CELLS = 1.6
-"""Width of the window that sums the distribution: 6 of 192 pixels, 3 % of a bird that fills its crop."""
-HIDDEN_WEIGHT, NOWHERE_WEIGHT = 0.5, 0.3
-LEAST_SEEN = 4
-"""Fewest visible keypoints of a bird to learn from."""
-_MIRRORED = [MURRE_KEYPOINTS.index(other_side(name)) for name in MURRE_KEYPOINTS]
+"""Standard deviation of the window: 6 of 192 pixels, which is 3 % of a bird that fills its crop."""
+OCCLUDED_WEIGHT, ABSENT_WEIGHT = 0.5, 0.3
+"""Weights in the loss of occluded keypoints and of keypoints outside the crop; visible keypoints have weight 1."""
+MIN_VISIBLE = 4
+"""Least number of visible keypoints of a bird in the training data."""
+_OTHER_SIDE = [MURRE_KEYPOINTS.index(other_side(name)) for name in MURRE_KEYPOINTS]
 
 
 class KeypointSample(NamedTuple):
-    """One bird and its keypoints."""
+    """The crop of one bird and its keypoints."""
 
     picture: Float[np.ndarray, "3 H W"]
     """Blue, green, red within 0 and 1."""
-    place: Float[np.ndarray, "K 2"]
+    position: Float[np.ndarray, "K 2"]
     """x, y in cells of the map, cell centres at i + 0.5."""
     present: Float[np.ndarray, "K"]
-    """1 where that place lies in the picture, 0 for nowhere."""
+    """1 if the keypoint lies in the picture, else 0."""
     weight: Float[np.ndarray, "K"]
+    """Weight in the loss."""
 
 
 def keypoint_network() -> FeaturePyramid:
-    """2 million numbers."""
+    """Create the network, with 2 million parameters."""
     heads = {"logits": len(MURRE_KEYPOINTS)}
     return FeaturePyramid((24, 48, 80, 128, 144), (0, 1, 2, 2, 2), (112, 80, 64), heads)
 
 
-class Peaks(nn.Module):
-    """The network as it is exported: maps of probabilities whose peaks are confidences."""
+class KeypointMaps(nn.Module):
+    """The exported network: maps whose peaks are the confidences of the keypoints."""
 
     def __init__(self, network: nn.Module, keypoints: int):
         super().__init__()
@@ -71,65 +73,66 @@ class Peaks(nn.Module):
         self.keypoints = keypoints
 
     def forward(self, pictures: Tensor) -> Tensor:
-        """(B, 3, H, W) → (B, K, h, w) within 0 and 1."""
+        """Compute maps (B, K, h, w) within 0 and 1 from pictures (B, 3, H, W)."""
         logits = self.network(pictures)["logits"]
         B, K, h, w = logits.shape
-        flat = functional.pad(logits.reshape(B, K, h * w), (0, 1))  # the last place is nowhere
+        flat = functional.pad(logits.reshape(B, K, h * w), (0, 1))  # the last class is `absent`
         maps = torch.softmax(flat, dim=-1)[..., :-1].reshape(B, K, h, w)
         return functional.conv2d(maps, self.window, padding=4, groups=self.keypoints)
 
 
 def draw_sample(rng: np.random.Generator, frames: LabelledFrames) -> KeypointSample:
-    """A random bird of a random frame: turned, mirrored, in another light, cut by a faulty mask."""
+    """Draw a random bird of a random frame, with random rotation, mirroring, appearance and errors of the mask."""
     while True:
         s = int(rng.integers(len(frames.pictures)))
-        birds = np.flatnonzero((frames.seen[s] == 2).sum(-1) >= LEAST_SEEN)
+        birds = np.flatnonzero((frames.visibility[s] == 2).sum(-1) >= MIN_VISIBLE)
         if not len(birds):
             continue
-        found = _turned(rng, frames, s, int(rng.choice(birds)))
-        if found is not None:
-            return _cut(rng, *found)
+        patch = _augmented_patch(rng, frames, s, int(rng.choice(birds)))
+        if patch is not None:
+            return _crop_sample(rng, *patch)
 
 
-def _turned(
+def _augmented_patch(
     rng: np.random.Generator, frames: LabelledFrames, s: int, n: int
 ) -> tuple[np.ndarray, Instance, np.ndarray, np.ndarray, float] | None:
-    """The bird's surroundings at about the network's scale; None where too little of it is seen.
+    """Resample the surroundings of a bird to about the network's scale; None if too little of the bird is visible.
 
     Returns:
-        Picture in another light, the bird, its keypoints in pixels, whether each is seen, and pixels of the paper's
-        footage for one of these.
+        Picture with random appearance, instance of the bird, keypoints in pixels of the picture, visibility of each
+        keypoint, and the scale of the picture relative to the paper's footage.
     """
     bird = instance_of(frames.owner[s] == n + 1, 1.0, "")
     if bird is None:
         return None
     h, w = bird.mask.shape
-    one = frames.pixels_a_unit[s] / PAPER_PIXELS_A_UNIT
-    if max(h, w) < 30 * one:
+    relative_scale = frames.pixels_per_unit[s] / PAPER_PIXELS_PER_UNIT
+    if max(h, w) < 30 * relative_scale:
         return None
-    margin = 2 * PAD_PX * one
+    margin = 2 * PAD_PX * relative_scale
     factor = SIDE_PX / (max(h, w) + margin) * rng.uniform(0.9, 1.1)
-    middle = np.array([bird.x0 + w / 2, bird.y0 + h / 2])
-    turn, mirrored = random_turn(rng, factor, 20)
-    points, seen = frames.keypoints_px[s, n], frames.seen[s, n]
+    centre_px = np.array([bird.x0 + w / 2, bird.y0 + h / 2])
+    rotation, mirrored = random_rotation(rng, factor, 20)
+    points_px, visibility = frames.keypoints_px[s, n], frames.visibility[s, n]
     if mirrored:
-        points, seen = points[_MIRRORED], seen[_MIRRORED]
-    picture, owner, low = surroundings(frames, s, middle, 0.75 * (max(h, w) + 2 * margin), factor)
+        points_px, visibility = points_px[_OTHER_SIDE], visibility[_OTHER_SIDE]
+    picture, owner, low = patch_around(frames, s, centre_px, 0.75 * (max(h, w) + 2 * margin), factor)
     side = int(1.5 * SIDE_PX)
-    affine = np.column_stack([turn, side / 2 - turn @ (middle - low)])
+    affine = np.column_stack([rotation, side / 2 - rotation @ (centre_px - low)])
     shift = affine[:, :2] @ (0.5, 0.5) - 0.5  # OpenCV counts pixel centres from 0
     warp = np.column_stack([affine[:, :2], affine[:, 2] + shift])
     picture = cv2.warpAffine(picture, warp, (side, side), flags=cv2.INTER_LINEAR)
     owner = cv2.warpAffine(owner, warp, (side, side), flags=cv2.INTER_NEAREST)
-    found = instance_of(_faulty(rng, owner == n + 1, owner > 0), 1.0, "")
-    if found is None:
+    instance = instance_of(_faulty_mask(rng, owner == n + 1, owner > 0), 1.0, "")
+    if instance is None:
         return None
-    picture = randomise(rng, picture, owner > 0)
-    return picture, found, (points - low) @ affine[:, :2].T + affine[:, 2], seen, float(one * factor)
+    picture = randomise_appearance(rng, picture, owner > 0)
+    points_px = (points_px - low) @ affine[:, :2].T + affine[:, 2]
+    return picture, instance, points_px, visibility, float(relative_scale * factor)
 
 
-def _faulty(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) -> np.ndarray:
-    """The mask as a segmenter may give it: worn or grown, with a part missing, or with some of a neighbour."""
+def _faulty_mask(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) -> np.ndarray:
+    """Simulate errors of a segmenter: erosion, dilation, a missing part, or a part of a neighbour."""
     kind = rng.random()
     side = int(rng.integers(2, 9))
     if kind < 0.25:
@@ -146,38 +149,43 @@ def _faulty(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) -> np
     return mask
 
 
-def _cut(
-    rng: np.random.Generator, picture: np.ndarray, bird: Instance, points: np.ndarray, seen: np.ndarray, one: float
+def _crop_sample(
+    rng: np.random.Generator,
+    picture: np.ndarray,
+    bird: Instance,
+    points_px: np.ndarray,
+    visibility: np.ndarray,
+    relative_scale: float,
 ) -> KeypointSample:
-    """The crop that the detector would make of this bird, with margins between narrow and wide."""
-    pad, dilate = (int(margin * one * rng.uniform(0.4, 2.0)) for margin in (PAD_PX, DILATE_PX))
-    alone, crop = crop_bird(picture, bird, (SIDE_PX, SIDE_PX), pad, max(dilate, 2))
-    place = crop.to_crop(points) / STRIDE
-    present = (seen > 0) & ((place >= 0) & (place < SIDE_PX / STRIDE)).all(-1)
-    weight = np.where(present, np.where(seen == 2, 1.0, HIDDEN_WEIGHT), NOWHERE_WEIGHT)
+    """Crop a bird as the detector does, with random margins."""
+    pad, dilate = (int(margin * relative_scale * rng.uniform(0.4, 2.0)) for margin in (PAD_PX, DILATE_PX))
+    crop_picture, crop = crop_bird(picture, bird, (SIDE_PX, SIDE_PX), pad, max(dilate, 2))
+    position = crop.to_crop(points_px) / STRIDE
+    present = (visibility > 0) & ((position >= 0) & (position < SIDE_PX / STRIDE)).all(-1)
+    weight = np.where(present, np.where(visibility == 2, 1.0, OCCLUDED_WEIGHT), ABSENT_WEIGHT)
     return KeypointSample(
-        np.moveaxis(alone, -1, 0).astype(np.float32) / 255,
-        place.astype(np.float32),
+        np.moveaxis(crop_picture, -1, 0).astype(np.float32) / 255,
+        position.astype(np.float32),
         present.astype(np.float32),
         weight.astype(np.float32),
     )
 
 
 def loss(maps: dict[str, Tensor], sample: Any) -> dict[str, Tensor]:
-    """Cross-entropy between where the network expects each keypoint and where it is.
+    """Compute the cross-entropy between the predicted and the true distribution of each keypoint.
 
     Args:
-        maps: the network's output.
-        sample: a KeypointSample of tensors, a batch.
+        maps: outputs of the network.
+        sample: a batch, a KeypointSample of tensors.
     """
     logits = maps["logits"].float()
     B, K, h, w = logits.shape
     x, y = (torch.arange(side, device=logits.device) + 0.5 for side in (w, h))
-    across = torch.exp(-0.5 * ((x - sample.place[..., :1]) / SIGMA_CELLS) ** 2)
-    down = torch.exp(-0.5 * ((y - sample.place[..., 1:]) / SIGMA_CELLS) ** 2)
-    target = (down[..., :, None] * across[..., None, :]).reshape(B, K, h * w)
+    target_x = torch.exp(-0.5 * ((x - sample.position[..., :1]) / SIGMA_CELLS) ** 2)
+    target_y = torch.exp(-0.5 * ((y - sample.position[..., 1:]) / SIGMA_CELLS) ** 2)
+    target = (target_y[..., :, None] * target_x[..., None, :]).reshape(B, K, h * w)
     target = target / target.sum(-1, keepdim=True).clamp(min=1e-6) * sample.present[..., None]
     target = torch.cat([target, 1 - sample.present[..., None]], dim=-1)
-    expected = functional.log_softmax(functional.pad(logits.reshape(B, K, h * w), (0, 1)), dim=-1)
-    entropy = -(target * expected).sum(-1)
-    return {"place": (entropy * sample.weight).sum() / sample.weight.sum()}
+    log_probability = functional.log_softmax(functional.pad(logits.reshape(B, K, h * w), (0, 1)), dim=-1)
+    entropy = -(target * log_probability).sum(-1)
+    return {"position": (entropy * sample.weight).sum() / sample.weight.sum()}

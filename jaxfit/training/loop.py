@@ -1,4 +1,4 @@
-"""The training loop that both networks share."""
+"""The training loop of both networks."""
 
 # pyright: reportMissingImports=false
 
@@ -21,17 +21,17 @@ __all__ = ["Schedule", "train"]
 
 
 class Schedule(NamedTuple):
-    """How long and how fast."""
+    """Length and learning rate of a training."""
 
     steps: int
     batch: int
     learning_rate: float
-    """AdamW's at its height: it rises over the first tenth and falls as a cosine (one cycle)."""
+    """Maximum of AdamW's learning rate: a rise over the first tenth, then a cosine decay (one cycle)."""
     weight_decay: float = 0.02
 
 
 class _Samples(Dataset):
-    """Sample i depends on the seed and i alone, whatever the number of workers."""
+    """A dataset whose sample i depends only on the seed and i, not on the number of workers."""
 
     def __init__(self, draw: Callable[..., Any], folder: Path, seed: int, count: int):
         self._draw, self._folder, self._seed, self._count = draw, folder, seed, count
@@ -41,7 +41,7 @@ class _Samples(Dataset):
         return self._count
 
     def __getitem__(self, i: int) -> Any:
-        if self._frames is None:  # opened by the worker, not sent to it
+        if self._frames is None:  # each worker opens the frames itself
             self._frames = load_frames(self._folder)
         return self._draw(np.random.default_rng((self._seed, i)), self._frames)
 
@@ -56,20 +56,20 @@ def train(
     progress: ProgressTask = silent,
     name: str = "Training",
 ) -> dict[str, float]:
-    """Train a network in place, on a GPU where there is one, in bfloat16 where the processor has it.
+    """Train a network in place, with bfloat16 autocast, on a GPU if PyTorch finds a GPU.
 
     Args:
         network: maps a batch of `picture` to maps by name.
-        draw: makes one sample, a NamedTuple of arrays that begins with `picture`; a function of a module.
-        loss: the parts of the loss of a batch.
-        frames_folder: what samples are drawn from, as `film_scenes` leaves it.
-        schedule: length and speed.
-        seed: of the samples; the network's own numbers are the caller's.
-        progress: told of every step and the loss.
-        name: of the task.
+        draw: draws one sample, a NamedTuple of arrays with the field `picture`; must be a module-level function.
+        loss: computes the terms of the loss of a batch.
+        frames_folder: folder of the frames, written by `film_scenes`.
+        schedule: number of steps, size of the batches, learning rate.
+        seed: seed of the samples; the caller initialises the network.
+        progress: reports every step and the loss.
+        name: name of the task, for the progress report.
 
     Returns:
-        Each part of the loss, averaged over the last tenth.
+        Each term of the loss, averaged over the last tenth of the steps.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.to(device).train()
@@ -80,11 +80,11 @@ def train(
         schedule.batch,
         num_workers=1,
         prefetch_factor=4,
-        worker_init_fn=_one_thread,
-        multiprocessing_context="spawn",  # JAX's threads do not survive a fork
+        worker_init_fn=_use_one_thread,
+        multiprocessing_context="spawn",  # a fork breaks JAX's threads
     )
     optimiser = torch.optim.AdamW(network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay)
-    rates = torch.optim.lr_scheduler.OneCycleLR(
+    scheduler = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, schedule.learning_rate, schedule.steps, pct_start=0.1, cycle_momentum=False
     )
     recent: list[dict[str, float]] = []
@@ -94,18 +94,18 @@ def train(
             picture = sample.picture.contiguous(memory_format=torch.channels_last)
             with torch.autocast(device.type, torch.bfloat16):
                 maps = network(picture)
-            parts = loss(maps, sample)
+            terms = loss(maps, sample)
             optimiser.zero_grad(set_to_none=True)
-            torch.stack(list(parts.values())).sum().backward()
+            torch.stack(list(terms.values())).sum().backward()
             nn.utils.clip_grad_norm_(network.parameters(), 5.0)
             optimiser.step()
-            rates.step()
-            recent = [*recent[-(schedule.steps // 10) :], {key: float(part.detach()) for key, part in parts.items()}]
+            scheduler.step()
+            recent = [*recent[-(schedule.steps // 10) :], {key: float(term.detach()) for key, term in terms.items()}]
             report_progress(1, " ".join(f"{key} {np.mean([r[key] for r in recent[-50:]]):.4f}" for key in recent[-1]))
     network.cpu().eval()
     return {key: float(np.mean([values[key] for values in recent])) for key in recent[-1]}
 
 
-def _one_thread(_worker: int) -> None:
+def _use_one_thread(_worker: int) -> None:
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

@@ -1,7 +1,7 @@
-"""The architecture of both built-in networks: a small residual encoder with a top-down path of features.
+"""The architecture of both built-in networks: a small residual encoder with a top-down feature pyramid.
 
-Plain 3×3 convolutions of few channels: they train and run faster on a CPU than the depthwise ones of mobile networks,
-which wait for memory. Batch normalisation folds into them at export.
+The convolutions are plain 3×3 convolutions with few channels. On a CPU they are faster than the depthwise convolutions
+of mobile networks, which are limited by memory bandwidth. The export folds batch normalisation into the convolutions.
 """
 
 # pyright: reportMissingImports=false
@@ -17,7 +17,7 @@ __all__ = ["FeaturePyramid", "count_parameters"]
 
 
 class _Residual(nn.Module):
-    """Two 3×3 convolutions around a shortcut (He et al. 2016)."""
+    """Two 3×3 convolutions with a shortcut (He et al. 2016)."""
 
     def __init__(self, channels: int):
         super().__init__()
@@ -34,15 +34,17 @@ def _convolution(inputs: int, outputs: int, stride: int = 1, side: int = 3) -> n
 
 
 class FeaturePyramid(nn.Module):
-    """Maps pictures to maps of a lower resolution (after Lin et al. 2017, with sums from coarse to fine).
+    """A network from pictures to maps of lower resolution, with sums of features from coarse to fine.
+
+    The stride of the output is 2 to the power of len(widths) − len(top_down).
 
     Args:
         widths: channels at strides 2, 4, 8, …
-        blocks: residual blocks at each of them.
-        top_down: channels of the way back, from the coarsest but one to the stride of the output.
+        blocks: residual blocks at each of these strides.
+        top_down: channels of the top-down path, from the second coarsest stride to the stride of the output.
         heads: name → channels of each output map.
 
-    The output's stride is 2 to the power of len(widths) − len(top_down).
+    Source: after Lin et al. 2017, Feature Pyramid Networks.
     """
 
     def __init__(self, widths: Sequence[int], blocks: Sequence[int], top_down: Sequence[int], heads: dict[str, int]):
@@ -61,7 +63,7 @@ class FeaturePyramid(nn.Module):
         self.heads = nn.ModuleDict({name: nn.Conv2d(last, channels, 3, 1, 1) for name, channels in heads.items()})
 
     def forward(self, pictures: Tensor) -> dict[str, Tensor]:
-        """Maps by name.
+        """Compute the output maps by name.
 
         Args:
             pictures: (B, 3, H, W), normalised; H and W are multiples of the coarsest stride.
@@ -77,5 +79,5 @@ class FeaturePyramid(nn.Module):
 
 
 def count_parameters(network: nn.Module) -> int:
-    """Trained numbers."""
+    """Count the trainable parameters."""
     return sum(p.numel() for p in network.parameters())

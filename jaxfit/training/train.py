@@ -1,4 +1,4 @@
-"""One command for each built-in network: film scenes, train on them, write the ONNX file."""
+"""Training of a built-in network: simulate frames, train, write the ONNX file."""
 
 # pyright: reportMissingImports=false
 
@@ -19,14 +19,14 @@ from jaxfit.training import keypoints, segmenter
 from jaxfit.training.export import export_onnx
 from jaxfit.training.loop import Schedule, train
 from jaxfit.training.networks import FeaturePyramid
-from jaxfit.training.scenes import FRAMES_A_SCENE, LabelledFrames, film_scenes, load_frames
+from jaxfit.training.scenes import FRAMES_PER_SCENE, LabelledFrames, film_scenes, load_frames
 
 __all__ = ["SCENES", "SCHEDULES", "train_network"]
 
 SCENES = 160
-"""Scenes learnt from, by seeds from 0; seeds of 1000 and more are left to tests."""
+"""Number of training scenes, with seeds from 0; seeds of 1000 and more are for tests."""
 SCHEDULES = {"segmenter": Schedule(3600, 12, 2e-3), "keypoints": Schedule(4000, 24, 2e-3)}
-"""Figures of the networks that the package brings along."""
+"""Schedules of the built-in networks."""
 
 
 def train_network(
@@ -38,41 +38,41 @@ def train_network(
     seed: int = 0,
     progress: ProgressTask = silent,
 ) -> dict[str, float]:
-    """Train one of the built-in networks and write it; numbers differ a little from one processor to another.
+    """Train a built-in network and write it; the weights differ slightly between processors.
 
     Args:
         which: `segmenter` or `keypoints`.
-        path: the `.onnx` file to write; an earlier one is replaced.
-        frames_folder: where the simulated frames are, or are filmed to; about 32 MB a scene.
-        scenes: how many to learn from, at most 900.
-        schedule: of training; None takes that of `SCHEDULES`.
-        seed: of the network's first numbers and of the samples.
-        progress: told of scenes and steps.
+        path: the `.onnx` file to write; an existing file is replaced.
+        frames_folder: folder of the simulated frames, created if it does not exist; about 32 MB per scene.
+        scenes: number of training scenes, at most 900.
+        schedule: schedule of the training; None uses `SCHEDULES`.
+        seed: seed of the initial weights and of the samples.
+        progress: reports scenes and steps.
 
     Returns:
-        Each part of the loss, averaged over the last tenth of training.
+        Each term of the loss, averaged over the last tenth of the steps.
 
     Raises:
-        ValueError: another `which`.
-        InputError: numbers that make no sense, or a folder that holds something else.
+        ValueError: unknown `which`.
+        InputError: a number outside its range, or a folder with other contents.
     """
     if which not in SCHEDULES:
         raise ValueError(f"which must be one of {', '.join(SCHEDULES)}, not {which!r}")
     schedule = schedule or SCHEDULES[which]
     if not 1 <= scenes <= 900:
-        raise InputError("train: scenes", f"{scenes} is no number to learn from", "give 1 to 900")
+        raise InputError("train: scenes", f"is {scenes}", "give 1 to 900")
     if schedule.steps < 20:
-        raise InputError("train: steps", f"{schedule.steps} teach nothing", "give 20 or more")
+        raise InputError("train: steps", f"is {schedule.steps}", "give 20 or more")
     if Path(path).suffix != ".onnx":
-        raise InputError(path, "is named as no network", "end it in .onnx")
-    check_writable(path)  # before the work, not after it
-    frames = _frames(Path(frames_folder), scenes, progress)
+        raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
+    check_writable(path)  # before the training, not after it
+    folder = Path(frames_folder)
+    frames = _load_or_film(folder, scenes, progress)
     torch.manual_seed(seed)
     if which == "segmenter":
         network, module = segmenter.segmenter_network(), segmenter
     else:
         network, module = keypoints.keypoint_network(), keypoints
-    folder = Path(frames_folder)
     losses = train(network, module.draw_sample, module.loss, folder, schedule, seed, progress, f"Training {which}")
     facts = {
         "trained_by": f"jaxfit {metadata.version('jaxfit')} train {which}",
@@ -84,18 +84,20 @@ def train_network(
     return losses
 
 
-def _frames(folder: Path, scenes: int, progress: ProgressTask) -> LabelledFrames:
+def _load_or_film(folder: Path, scenes: int, progress: ProgressTask) -> LabelledFrames:
+    """Load the frames, or simulate the frames if the folder does not exist."""
     if not folder.exists():
         return film_scenes(folder, range(scenes), progress=progress)
     frames = load_frames(folder)
-    if len(frames.pictures) != scenes * FRAMES_A_SCENE:
-        found = len(frames.pictures) // FRAMES_A_SCENE
-        raise InputError(folder, f"holds {found} scenes, not {scenes}", "choose another folder, or that many scenes")
+    if len(frames.pictures) != scenes * FRAMES_PER_SCENE:
+        existing = len(frames.pictures) // FRAMES_PER_SCENE
+        remedy = "give another folder or the same number of scenes"
+        raise InputError(folder, f"holds {existing} scenes, not {scenes}", remedy)
     return frames
 
 
 class _Probabilities(nn.Module):
-    """The segmenter as it is exported."""
+    """The exported segmenter: probabilities, centres and offsets."""
 
     def __init__(self, network: FeaturePyramid):
         super().__init__()
@@ -107,21 +109,21 @@ class _Probabilities(nn.Module):
 
 
 def _write_segmenter(network: FeaturePyramid, facts: dict[str, str], path: str | Path) -> None:
-    notes = {"names": repr({0: "bird"}), "longer_side": "864", **facts}
-    free = {2: "height", 3: "width"}
+    metadata_props = {"names": repr({0: "bird"}), "longer_side": "864", **facts}
+    variable_axes = {2: "height", 3: "width"}
     export_onnx(
         _Probabilities(network).eval(),
         torch.rand(1, 3, 256, 320),
-        free,
+        variable_axes,
         ("foreground", "centre", "offset"),
-        notes,
+        metadata_props,
         path,
     )
 
 
 def _write_keypoints(network: FeaturePyramid, facts: dict[str, str], path: str | Path) -> None:
     side = keypoints.SIDE_PX
-    notes = {
+    metadata_props = {
         "keypoint_names": ",".join(MURRE_KEYPOINTS),
         "mean": "0",
         "std": "255",
@@ -129,5 +131,5 @@ def _write_keypoints(network: FeaturePyramid, facts: dict[str, str], path: str |
         "input_size": f"{side},{side}",
         **facts,
     }
-    peaks = keypoints.Peaks(network, len(MURRE_KEYPOINTS)).eval()
-    export_onnx(peaks, torch.rand(2, 3, side, side), {0: "birds"}, ("heatmaps",), notes, path)
+    exported = keypoints.KeypointMaps(network, len(MURRE_KEYPOINTS)).eval()
+    export_onnx(exported, torch.rand(2, 3, side, side), {0: "birds"}, ("heatmaps",), metadata_props, path)

@@ -85,12 +85,12 @@ def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
     out = tmp_path / "obs.json"
     assert main(command(inputs, "track", out)) == 0
     (message,) = caplog.messages
-    assert "no bird was found in 12 frames" in message
+    assert "no bird was detected in 12 frames" in message
     assert "min_score" in message
     content = json.loads(out.read_text())
     assert (len(content["images"]), content["annotations"]) == (FRAMES, [])
     assert "0 birds over 12 frames" in capsys.readouterr().out.replace("\n", "")
-    words = "no bird was found in 12 frames", "min_score"
+    words = "no bird was detected in 12 frames", "min_score"
     refused(capsys, command(inputs, "reconstruct", tmp_path / "result"), *words, alone=False)
     assert not (tmp_path / "result").exists()
 
@@ -172,7 +172,7 @@ def test_what_cannot_be_tracked(name, inputs, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(module, "open_keypoint_detector", lambda _: keypoints)
     told("notes.txt", "ONNX", more=["--segmenter", inputs / "notes.txt"])
     strange = write_constant(tmp_path / "strange.onnx", (1, 3, 8, 8), {"logits": np.zeros(9)})
-    told("strange.onnx: has no layout that is known", "logits (1, 9)", "yolo:", more=["--segmenter", strange])
+    told("strange.onnx: has an unknown layout", "logits (1, 9)", "yolo:", more=["--segmenter", strange])
     layout = {"output0": np.zeros((116, 84)), "output1": np.zeros((32, 16, 16))}
     coco = write_constant(tmp_path / "coco.onnx", (1, 3, 64, 64), layout)
     told("lacks duck", "its classes are person", more=["--segmenter", coco, "--classes", "bird,duck"])

@@ -1,4 +1,4 @@
-"""The built-in segmenter's layout, on graphs whose maps are known."""
+"""Bottom-up segmentation, on graphs with known maps."""
 
 import numpy as np
 import pytest
@@ -37,38 +37,38 @@ def test_two_birds_that_touch(tmp_path):
     first, second = load_segmenter(path)(np.zeros((288, 384, 3), np.uint8))
     assert first.label == second.label == "bird"
     assert (first.score, second.score) == pytest.approx((0.9, 0.8))
-    # alone, an edge lies where the bilinear map passes 0.5: on the border of the cells
+    # an edge lies where the bilinear map is 0.5: on the border of the cells
     assert first.box_px.tolist() == [60, 60, 60, 60]
     assert first.mask[1:-1, 1:-1].all()
     assert second.box_px.tolist() == [120, 72, 84, 36]
 
 
-def test_cells_belong_to_the_centre_they_point_to_and_not_to_the_nearest(tmp_path):
-    # the long one's left end lies right below the other's centre, and beyond it
+def test_offsets_and_not_distances_assign_cells(tmp_path):
+    # the left end of the long bird lies below the centre of the other bird and beyond
     path = write(tmp_path / "net.onnx", maps_of(((10, 8, 20, 18), 0.9), ((2, 18, 58, 22), 0.8)))
     first, second = load_segmenter(path)(np.zeros((96, 128, 3), np.uint8))
     assert first.box_px.tolist() == [20, 16, 20, 20]
     assert second.box_px.tolist() == [4, 36, 112, 8]
 
 
-def test_a_bird_in_two_pieces_is_one(tmp_path):
+def test_occluded_bird_in_two_parts_is_one_instance(tmp_path):
     maps = maps_of(((10, 10, 30, 16), 0.9))
-    maps["foreground"][0, :, 18:22] = 0  # something stands in front of it
+    maps["foreground"][0, :, 18:22] = 0  # an occlusion
     (bird,) = load_segmenter(write(tmp_path / "net.onnx", maps))(np.zeros((96, 128, 3), np.uint8))
     assert bird.box_px.tolist() == [20, 20, 40, 12]
     assert not bird.mask[:, 18:22].any()
 
 
-def test_what_points_nowhere_or_is_hardly_there_belongs_to_nobody(tmp_path):
+def test_far_offsets_and_low_peaks_give_no_instance(tmp_path):
     maps = maps_of(((10, 10, 20, 20), 0.9), ((40, 30, 43, 33), 0.9), ((40, 10, 50, 20), 0.3))
     maps["foreground"][0, 40:46, 2:10] = 1
     maps["offset"][:, 40:46, 2:10] = 3  # 96 pixels right and below: no centre is near
     birds = load_segmenter(write(tmp_path / "net.onnx", maps))(np.zeros((96, 128, 3), np.uint8))
-    assert [bird.box_px.tolist() for bird in birds] == [[20, 20, 20, 20]]  # specks and faint peaks are none
+    assert [bird.box_px.tolist() for bird in birds] == [[20, 20, 20, 20]]  # others: too few cells, low score
 
 
-def test_the_frame_is_seen_as_it_was_learnt(tmp_path):
-    """Averaged over areas, blue-green-red within 0 and 1, in the upper left corner of sides of 32 times something."""
+def test_input_is_as_in_training(tmp_path):
+    """Area-averaged, blue-green-red within 0 and 1, in the upper left corner; sides are multiples of 32."""
     nodes = [
         helper.make_node("AveragePool", ["pictures"], ["cells"], kernel_shape=[2, 2], strides=[2, 2]),
         helper.make_node("Split", ["cells", "one_each"], ["blue", "green", "red"], axis=1),
@@ -88,32 +88,33 @@ def test_the_frame_is_seen_as_it_was_learnt(tmp_path):
     )
     frame = np.zeros((200, 288, 3), np.uint8)
     frame[60:120, 60:180, 0] = 255  # columns 20 to 60 of 96, rows 20 to 40
-    frame[90, 120, 1] = 255  # a ninth of a pixel, then a quarter of that: below every threshold
+    frame[90, 120, 1] = 255  # a ninth of an input pixel, a quarter of that in a cell: below every threshold
     segmenter = load_segmenter(path)
     assert segmenter(frame) == []
-    frame[84:90, 114:120, 1] = 255  # one whole cell in the middle, and no offsets: what is too far stays out
+    frame[84:90, 114:120, 1] = 255  # one whole cell in the middle; offsets are 0: distant cells are excluded
     (bird,) = segmenter(frame)
     assert bird.label == "murre"
     assert bird.box_px == pytest.approx([60, 60, 120, 60], abs=1)  # 67 rows stand for 66.7
     assert bird.mask[1:-1, 1:-1].all()
 
 
-def test_free_sides_are_multiples_of_32(tmp_path):
+def test_variable_sides_are_multiples_of_32(tmp_path):
     segmenter = BottomUp(OnnxModel(write(tmp_path / "n.onnx", maps_of(), (1, 3, "h", "w"), longer_side="864")))
-    assert segmenter._place((2592, 1520)).input_px == (864, 512)
-    assert segmenter._place((854, 480)).input_px == (864, 512)
-    assert segmenter._place((480, 854)).input_px == (512, 864)
+    assert segmenter._input_px((2592, 1520)) == (864, 512)
+    assert segmenter._input_px((854, 480)) == (864, 512)
+    assert segmenter._input_px((480, 854)) == (512, 864)
 
 
 @pytest.mark.parametrize(
-    ("metadata", "classes", "said"),
+    ("metadata", "classes", "message"),
     [
         ({"names": "['a', 'b']"}, None, "2 classes"),
         ({}, ["cat"], "lacks cat"),
         ({"longer_side": "x"}, None, "longer_side"),
+        ({"longer_side": "850"}, None, "a multiple of 32"),
     ],
 )
-def test_refusals(tmp_path, metadata, classes, said):
+def test_invalid_metadata_and_classes(tmp_path, metadata, classes, message):
     path = write(tmp_path / "net.onnx", maps_of(), **metadata)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         load_segmenter(path, classes=classes)

@@ -1,27 +1,24 @@
-"""A bird cut out alone: what is shown, what is blanked, and that points come back to where they were."""
+"""Crops of single birds: box, blanked pixels, conversion of points."""
 
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
+from support.instances import rectangle_instance
 
-from jaxfit.perception.instances import Instance, instance_of
+from jaxfit.perception.instances import instance_of
 from jaxfit.perception.keypoints import crop_bird
 
 
-def _rectangle(x0, y0, width, height):
-    return Instance(np.ones((height, width), bool), x0, y0, 1.0, "bird")
-
-
-def test_the_box_is_padded_then_widened_about_its_centre():
+def test_box_is_padded_then_enlarged_about_its_centre():
     frame = np.zeros((400, 400, 3), np.uint8)
-    _, crop = crop_bird(frame, _rectangle(100, 150, 60, 20), (192, 256), pad_px=10)
+    _, crop = crop_bird(frame, rectangle_instance(100, 150, 60, 20), (192, 256), pad_px=10)
     # 80 × 40 padded; 3:4 needs a height of 106.67, rounded to 107, 33 of the 67 rows above
     assert crop == (90, 107, 80, 107, (192, 256))
-    _, crop = crop_bird(frame, _rectangle(100, 150, 20, 60), (64, 64), pad_px=10)
+    _, crop = crop_bird(frame, rectangle_instance(100, 150, 20, 60), (64, 64), pad_px=10)
     assert crop == (70, 140, 80, 80, (64, 64))
 
 
-def test_only_what_the_dilated_mask_covers_is_shown():
+def test_pixels_outside_the_dilated_mask_are_black():
     rng = np.random.default_rng(0)
     frame = rng.integers(1, 256, (120, 150, 3), dtype=np.uint8)
     mask = np.zeros((120, 150), bool)
@@ -38,26 +35,26 @@ def test_only_what_the_dilated_mask_covers_is_shown():
     assert np.count_nonzero(undilated.any(-1)) == mask.sum()
 
 
-def test_beyond_the_frame_it_is_black():
+def test_crop_is_black_beyond_the_frame():
     frame = np.full((40, 50, 3), 200, np.uint8)
-    picture, crop = crop_bird(frame, _rectangle(0, 0, 10, 10), (50, 50), pad_px=20, dilate_px=100)
+    picture, crop = crop_bird(frame, rectangle_instance(0, 0, 10, 10), (50, 50), pad_px=20, dilate_px=100)
     assert crop == (-20, -20, 50, 50, (50, 50))
     assert not picture[:20].any()
     assert not picture[:, :20].any()
     assert (picture[20:, 20:] == 200).all()
-    whole, crop = crop_bird(frame, _rectangle(0, 0, 50, 40), (100, 100), pad_px=0, dilate_px=0)
+    whole, crop = crop_bird(frame, rectangle_instance(0, 0, 50, 40), (100, 100), pad_px=0, dilate_px=0)
     assert crop == (0, -5, 50, 50, (100, 100))
     assert (whole[12:88] == 200).all()
     assert not whole[:9].any()
 
 
 @pytest.mark.parametrize(("side", "size_px"), [(90, (64, 64)), (300, (96, 128)), (40, (192, 192))])
-def test_a_spot_stays_where_the_crop_says(side, size_px):
+def test_conversion_of_a_spot(side, size_px):
     point = np.array([211.3, 187.8])
     y, x = np.mgrid[:400, :420] + 0.5
     spot = np.exp(-((x - point[0]) ** 2 + (y - point[1]) ** 2) / (2 * 5.0**2))
     frame = np.repeat(np.round(255 * spot).astype(np.uint8)[..., None], 3, -1)
-    bird = _rectangle(205 - side // 3, 180 - side // 2, side, side)
+    bird = rectangle_instance(205 - side // 3, 180 - side // 2, side, side)
     picture, crop = crop_bird(frame, bird, size_px)
     weight = picture[..., 0].astype(float)
     rows, columns = np.indices(weight.shape) + 0.5
@@ -66,17 +63,17 @@ def test_a_spot_stays_where_the_crop_says(side, size_px):
     np.testing.assert_allclose(crop.to_crop(point), centre, atol=0.05)
 
 
-def test_there_and_back():
-    crop = crop_bird(np.zeros((99, 99, 3), np.uint8), _rectangle(3, 5, 40, 17), (192, 256))[1]
+def test_to_crop_inverts_to_image():
+    crop = crop_bird(np.zeros((99, 99, 3), np.uint8), rectangle_instance(3, 5, 40, 17), (192, 256))[1]
     points = np.random.default_rng(1).uniform(-50, 300, (2, 5, 2))
     np.testing.assert_allclose(crop.to_crop(crop.to_image(points)), points)
     np.testing.assert_allclose(crop.to_image(np.zeros(2)), [crop.x0, crop.y0])
     np.testing.assert_allclose(crop.to_image(np.array([192.0, 256.0])), [crop.x0 + crop.width, crop.y0 + crop.height])
 
 
-def test_shrinking_does_not_alias():
+def test_reduction_does_not_alias():
     frame = np.zeros((512, 512, 3), np.uint8)
-    frame[::2] = 250  # every other row: nothing but grey when shrunk
-    picture, crop = crop_bird(frame, _rectangle(0, 0, 512, 512), (64, 64), pad_px=0)
+    frame[::2] = 250  # every other row: uniform grey after the reduction
+    picture, crop = crop_bird(frame, rectangle_instance(0, 0, 512, 512), (64, 64), pad_px=0)
     assert crop.scale.tolist() == [8, 8]
     np.testing.assert_array_equal(picture, 125)

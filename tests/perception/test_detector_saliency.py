@@ -1,4 +1,4 @@
-"""A detector's boxes on its grids, and in each the mask of what stands out."""
+"""A detector with boxes on grids, and the mask of the salient object in each box."""
 
 from functools import partial
 
@@ -12,7 +12,7 @@ from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.perception.segmentation.yolox import Yolox
 
-load = partial(load_segmenter, threads=1)  # threads that wait for each other are slow on a busy machine
+load = partial(load_segmenter, threads=1)  # one thread is faster on a busy machine
 FIRST_OF_STRIDE_16, FIRST_OF_STRIDE_32 = 52 * 52, 52 * 52 + 26 * 26
 
 
@@ -29,7 +29,7 @@ def write_yolox(path, head, read=None):
 
 
 def write_saliency(path):
-    """What stands out is the input's first channel; a second output says the contrary."""
+    """The saliency is the first channel of the input; a second output is its negative."""
     nodes = [
         helper.make_node("Gather", ["input.1", "zero"], ["1959"], axis=1),
         helper.make_node("Neg", ["1959"], ["1960"]),
@@ -44,24 +44,30 @@ BIRD_ROW = (FIRST_OF_STRIDE_16 + 7 * 26 + 10, (0.5, 0.25, np.log(4), np.log(2)),
 BIRD_BOX = [272, 200, 400, 264]
 
 
-def test_boxes_are_decoded_on_their_grids(tmp_path):
+def test_boxes_are_decoded(tmp_path):
     rows = [
         BIRD_ROW,
-        (FIRST_OF_STRIDE_16 + 7 * 26 + 11, (-0.5, 0.25, np.log(4), np.log(2)), 0.7, 14, 0.9),  # the same box, unsurer
+        (
+            FIRST_OF_STRIDE_16 + 7 * 26 + 11,
+            (-0.5, 0.25, np.log(4), np.log(2)),
+            0.7,
+            14,
+            0.9,
+        ),  # the same box, lower score
         (3 * 52 + 2, (0.5, 0.5, 0, np.log(2)), 0.5, 14, 1),  # centre (20, 28), size (8, 16)
-        (FIRST_OF_STRIDE_32 + 13, (0, 0, 0, 0), 1, 14, 0.5),  # centre (0, 32), size 32: half of it outside
+        (FIRST_OF_STRIDE_32 + 13, (0, 0, 0, 0), 1, 14, 0.5),  # centre (0, 32), size 32: half of the box is outside
         (FIRST_OF_STRIDE_32 + 5, (0, 0, 0, 0), 1, 2, 0.9),  # no bird
-        (FIRST_OF_STRIDE_32 + 7, (0, 0, 0, 0), 0.5, 14, 0.5),  # not sure enough
+        (FIRST_OF_STRIDE_32 + 7, (0, 0, 0, 0), 0.5, 14, 0.5),  # score too low
     ]
     found = Yolox(OnnxModel(write_yolox(tmp_path / "d.onnx", yolox_head(*rows)), 1))(np.zeros((416, 832, 3), np.uint8))
-    boxes = [one.box_px for one in found]
+    boxes = [one.corners_px for one in found]
     np.testing.assert_allclose(boxes, [BIRD_BOX, [32, 40, 48, 72], [0, 32, 32, 96]], atol=1e-3)
     np.testing.assert_allclose([one.score for one in found], [0.72, 0.5, 0.5], atol=1e-6)
     assert {one.label for one in found} == {"bird"}
 
 
 @pytest.mark.parametrize(("pixel", "value"), [((0, 0, 9, 9), 7), ((0, 2, 9, 9), 3), ((0, 0, 415, 9), 114)])
-def test_the_detector_sees_raw_blue_green_red_over_grey(tmp_path, pixel, value):
+def test_detector_input_is_blue_green_red_with_a_grey_margin(tmp_path, pixel, value):
     cell, box, _, label, _ = BIRD_ROW
     head = yolox_head((cell, box, 0.5, label, 0))
     path = write_yolox(tmp_path / "d.onnx", head, {"output": {(0, cell, 5 + label): pixel}})
@@ -76,14 +82,14 @@ def segmenter(tmp_path):
 
 
 def scene(*ellipses):
-    """Red things upon blue: 140 is the brightest, and red needs 0.6 of it to be above a half, normalised."""
+    """Red objects on blue. The largest value is 140; after normalisation, red above 0.6 · 140 is above 1/2."""
     frame = np.full((416, 832, 3), (140, 0, 75), np.uint8)
     for centre, axes in ellipses:
         cv2.ellipse(frame, centre, axes, 0, 0, 360, (0, 0, 140), -1)
     return frame
 
 
-def test_the_mask_is_what_stands_out_in_the_box(segmenter):
+def test_mask_is_the_salient_object_in_the_box(segmenter):
     frame = scene(((336, 232), (60, 30)))
     (bird,) = segmenter(frame)
     truth = frame[..., 2] == 140
@@ -95,14 +101,14 @@ def test_the_mask_is_what_stands_out_in_the_box(segmenter):
     assert segmenter.class_names == ("bird",)
 
 
-def test_other_things_and_what_leaves_the_box_are_left_out(segmenter):
+def test_mask_excludes_other_objects_and_ends_at_the_box(segmenter):
     alone = segmenter(scene(((336, 232), (40, 20))))[0]
     (with_others,) = segmenter(scene(((336, 232), (40, 20)), ((285, 210), (5, 5)), ((420, 232), (12, 12))))
     np.testing.assert_array_equal(with_others.mask, alone.mask)
     (cut,) = segmenter(scene(((336, 232), (60, 200))))
-    assert (cut.y0, len(cut.mask)) == (196, 72)  # a twentieth of 64 beyond the box, out to whole pixels
+    assert (cut.y0, len(cut.mask)) == (196, 72)  # 64/20 beyond the box, rounded outwards
 
 
-def test_without_anything_that_stands_out_there_is_no_instance(segmenter):
+def test_no_salient_object_gives_no_instance(segmenter):
     assert segmenter(scene()) == []
     assert segmenter(np.zeros((416, 832, 3), np.uint8)) == []

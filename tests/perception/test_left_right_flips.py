@@ -1,4 +1,4 @@
-"""Left and right mixed up: found by continuity, and nothing touched where a bird merely turns."""
+"""Left-right flips are detected by continuity; keypoints of a turning bird do not change."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ K, SIDE = len(OFFSETS), 80
 
 
 def flock(heading, jitter=0.012, seed=0):
-    """Birds that turn to a heading (N T, radians) and drift; their keypoints jitter."""
+    """Birds with the given heading (N T, radians) that drift; their keypoints jitter."""
     rng = np.random.default_rng(seed)
     heading = np.atleast_2d(heading)
     N, T = heading.shape
@@ -36,53 +36,53 @@ def flock(heading, jitter=0.012, seed=0):
     )
 
 
-def mixed_up(seen, swapped):
-    """The same with the pairs of `swapped` (N T P) exchanged."""
+def with_flips(seen, flipped):
+    """Exchange the pairs of `flipped` (N T P)."""
     arrays = {name: getattr(seen, name).copy() for name in ("keypoints_px", "confidence", "occluded")}
-    for n, t, p in np.argwhere(swapped):
+    for n, t, p in np.argwhere(flipped):
         for array in arrays.values():
             array[n, t, list(PAIRS[p])] = array[n, t, list(PAIRS[p][::-1])]
     return dataclasses.replace(seen, **arrays)
 
 
-def without(seen, gone):
+def without_keypoints(seen, gone):
     return seen.with_keypoints(seen.keypoints_px, np.where(gone, 0, seen.confidence))
 
 
-def assert_repaired(found, expected, seen, truth):
-    np.testing.assert_array_equal(found, expected)
+def assert_repaired(flipped, expected, seen, truth):
+    np.testing.assert_array_equal(flipped, expected)
     for name in ("keypoints_px", "confidence", "occluded"):
         np.testing.assert_array_equal(getattr(seen, name), getattr(truth, name))
 
 
-def test_runs_of_swaps_are_exchanged_back():
-    """All pairs of one bird for a while; single pairs of the other, at its first frames and twice later."""
+def test_runs_of_flips_are_repaired():
+    """All pairs of one bird in one run; single pairs of the other bird in its first frames and in two later runs."""
     truth = flock(np.linspace(0, 3, 60) * [[1], [-1]])
-    swapped = np.zeros((2, 60, 3), bool)
-    swapped[0, 20:25] = swapped[1, :3, 1] = swapped[1, 30:36, 1] = swapped[1, 44:46, 2] = True
-    swapped[0, 22, 0] = False
-    repaired, found = repair_left_right_flips(mixed_up(truth, swapped), PAIRS)
-    assert_repaired(found, swapped, repaired, truth)
+    flipped = np.zeros((2, 60, 3), bool)
+    flipped[0, 20:25] = flipped[1, :3, 1] = flipped[1, 30:36, 1] = flipped[1, 44:46, 2] = True
+    flipped[0, 22, 0] = False
+    repaired, found = repair_left_right_flips(with_flips(truth, flipped), PAIRS)
+    assert_repaired(found, flipped, repaired, truth)
 
 
-def test_gaps_and_outliers_do_not_hide_a_swap():
+def test_flips_are_detected_despite_gaps_and_outliers():
     truth = flock(np.linspace(0, 2, 60))
-    swapped = np.zeros((1, 60, 3), bool)
-    swapped[0, 20:30] = True
+    flipped = np.zeros((1, 60, 3), bool)
+    flipped[0, 20:30] = True
     gone = np.zeros((1, 60, K), bool)
-    gone[0, 17:21] = gone[0, 24, [0, 2, 4]] = True  # at its beginning nothing is seen, later one of each pair
+    gone[0, 17:21] = gone[0, 24, [0, 2, 4]] = True  # the start of the flip is missing, later one keypoint of each pair
     points = truth.keypoints_px.copy()
     points[0, [26, 40], 3] += 300
-    hidden = without(truth.with_keypoints(points, truth.confidence), gone)
-    repaired, found = repair_left_right_flips(mixed_up(hidden, swapped), PAIRS)
+    hidden = without_keypoints(truth.with_keypoints(points, truth.confidence), gone)
+    repaired, found = repair_left_right_flips(with_flips(hidden, flipped), PAIRS)
     assert found[0, 21:30].all()
     assert not found[0, :17].any()
     assert not found[0, 30:].any()
     np.testing.assert_array_equal(repaired.keypoints_px[:, 21:], hidden.keypoints_px[:, 21:])
 
 
-def test_birds_that_turn_quickly_are_left_alone():
-    """Half a turn in four frames, to and fro and for good; spinning by 50° a frame; standing still."""
+def test_quick_turns_are_not_flips():
+    """Half a turn in four frames, there and back or only there; a spin of 50° per frame; standing still."""
     t = np.arange(100)
 
     def headings(frames):
@@ -94,36 +94,36 @@ def test_birds_that_turn_quickly_are_left_alone():
         # with half of all keypoints missing, half a turn in eight
         seen = flock(headings(8), 0.02, seed)
         gone = np.random.default_rng(seed).random(seen.confidence.shape) < 0.5
-        assert repair_left_right_flips(without(seen, gone), PAIRS)[1].mean() < 0.01
+        assert repair_left_right_flips(without_keypoints(seen, gone), PAIRS)[1].mean() < 0.01
 
 
-def test_the_longer_side_is_right_where_nothing_joins_them():
-    """Two parts that contradict each other and a long time unseen in between: nobody can tell, nothing is changed."""
+def test_the_longer_part_is_right_if_the_gap_is_short():
+    """Two contradicting parts with a long gap in between do not change: there is no sign of a flip."""
     truth = flock(np.zeros(60))
     gone = np.zeros((1, 60, K), bool)
     gone[:, 20:35] = True
     later = np.zeros((1, 60, 3), bool)
     later[:, 35:] = True
-    assert not repair_left_right_flips(without(mixed_up(truth, later), gone), PAIRS)[1].any()
-    # where they are joined the shorter part follows the longer one
+    assert not repair_left_right_flips(without_keypoints(with_flips(truth, later), gone), PAIRS)[1].any()
+    # without a gap the shorter part follows the longer part
     later[:] = False
     later[:, 48:] = True
-    assert_repaired(repair_left_right_flips(mixed_up(truth, later), PAIRS)[1], later, truth, truth)
+    assert_repaired(repair_left_right_flips(with_flips(truth, later), PAIRS)[1], later, truth, truth)
 
 
-def test_swaps_of_the_noise_model_are_found_and_nothing_else(monkeypatch):
-    """Jitter, outliers, missing keypoints and swaps in runs, as the simulated detectors make them."""
+def test_recall_and_precision_on_the_noise_model(monkeypatch):
+    """Jitter, outliers, missing keypoints and runs of flips, as the simulated detector makes them."""
     rng = np.random.default_rng(0)
     heading = np.cumsum(np.cumsum(rng.normal(scale=0.02, size=(6, 300)), axis=1) * 0.3, axis=1)
     truth = flock(heading, 0)
     truth = truth.with_keypoints(truth.keypoints_px, np.ones_like(truth.confidence))
-    monkeypatch.setattr(noise, "_masks", lambda rng, truth, found: ({}, truth.box_px * found[..., None]))
-    monkeypatch.setattr(noise, "_area", lambda truth, n, t: 3000.0)
+    monkeypatch.setattr(noise, "_masks", lambda rng, truth, detected: ({}, truth.box_px * detected[..., None]))
+    monkeypatch.setattr(noise, "_visible_area", lambda truth, n, t: 3000.0)
     seen = np.ones(truth.confidence.shape, bool)
     left, right = np.array(PAIRS).T
 
     def judged(seed):
-        detected = noise.detect_noisily(truth, seen, PAIRS, seed)
+        detected = noise.simulate_detections(truth, seen, PAIRS, seed)
         found = repair_left_right_flips(detected, PAIRS)[1]
         points, exact = detected.keypoints_px, truth.keypoints_px
         both = (detected.confidence[:, :, left] > 0) & (detected.confidence[:, :, right] > 0)
@@ -134,12 +134,12 @@ def test_swaps_of_the_noise_model_are_found_and_nothing_else(monkeypatch):
         other &= np.linalg.norm(points[:, :, right] - exact[:, :, left], axis=-1) < near
         return found, both & other & ~as_said, both & as_said & ~other
 
-    found, swapped, right_way = judged(1)
-    assert swapped.sum() > 30
-    assert (found & swapped).sum() / swapped.sum() > 0.85
-    assert (found & swapped).sum() / (found & (swapped | right_way)).sum() > 0.9
-    monkeypatch.setattr(noise, "SWAPS_ALL", 0)
-    monkeypatch.setattr(noise, "SWAPS_ONE", 0)
+    found, flipped, right_way = judged(1)
+    assert flipped.sum() > 30
+    assert (found & flipped).sum() / flipped.sum() > 0.85
+    assert (found & flipped).sum() / (found & (flipped | right_way)).sum() > 0.9
+    monkeypatch.setattr(noise, "FLIPS_ALL", 0)
+    monkeypatch.setattr(noise, "FLIPS_ONE", 0)
     found, _, right_way = judged(2)
     assert (found & right_way).sum() <= 0.001 * right_way.sum()
 

@@ -1,4 +1,4 @@
-"""The networks that the package brings along, on a scene that they never saw: from footage to tracks."""
+"""The built-in networks on a scene outside their training data."""
 
 import pytest
 
@@ -17,7 +17,7 @@ from jaxfit.simulation.scene import simulate
 FILES = BUILTIN, BUILTIN_PATH
 
 
-def test_they_are_small_and_say_where_they_come_from():
+def test_files_are_small_and_state_their_training_data():
     assert sum(file.stat().st_size for file in FILES) <= 8e6
     for file in FILES:
         assert "no real footage" in OnnxModel(file).metadata["trained_on"]
@@ -25,19 +25,19 @@ def test_they_are_small_and_say_where_they_come_from():
 
 
 @pytest.fixture(scope="module")
-def seen(tmp_path_factory):
+def evaluation(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unseen") / "scene"
     scene = simulate(load_murre(), folder, birds=4, frames=8, size=(1296, 760), seed=1005)
     found = track_video(folder / FOOTAGE, TrackConfig(min_track_frames=1))
     return evaluate_observations(found, scene.truth, folder)
 
 
-def test_birds_are_found_and_followed(seen):
-    assert seen.detection["ap50"] >= 0.9
-    assert seen.detection["mean_iou"] >= 0.85
-    assert seen.tracking["idf1"] >= 0.9
+def test_detection_and_tracking(evaluation):
+    assert evaluation.detection["ap50"] >= 0.9
+    assert evaluation.detection["mean_iou"] >= 0.85
+    assert evaluation.tracking["idf1"] >= 0.9
 
 
-def test_visible_keypoints_are_found(seen):
-    assert seen.keypoints["all"].visible > 100
-    assert seen.keypoints["all"].pck_05 >= 0.85
+def test_visible_keypoints(evaluation):
+    assert evaluation.keypoints["all"].visible > 100
+    assert evaluation.keypoints["all"].pck_05 >= 0.85

@@ -1,4 +1,4 @@
-"""Which segmenter a file holds; and what is said of files that hold none."""
+"""Loading of segmenters, and errors for unsupported files."""
 
 from functools import partial
 
@@ -10,9 +10,9 @@ from support.onnx_graphs import write_constant, write_reading
 
 from jaxfit.errors import InputError
 from jaxfit.perception.segmentation import KINDS, load_segmenter
-from jaxfit.perception.segmentation.placing import Placement, suppress
+from jaxfit.perception.segmentation.placement import Placement, non_maximum_suppression
 
-load = partial(load_segmenter, threads=1)  # threads that wait for each other are slow on a busy machine
+load = partial(load_segmenter, threads=1)  # one thread is faster on a busy machine
 HEAD, PROTOS = np.zeros((1, 116, 84)), np.zeros((1, 32, 16, 16))
 
 
@@ -25,11 +25,11 @@ def path(tmp_path):
     return tmp_path / "net.onnx"
 
 
-def test_a_layout_is_told_by_its_outputs_or_demanded(path):
+def test_outputs_determine_the_layout(path):
     write(path, output0=HEAD, output1=PROTOS)
     for kind in ("auto", "yolo"):
         assert load(path, kind=kind).class_names == ("bird",)
-    with pytest.raises(InputError, match="known are rf_detr: outputs dets"):
+    with pytest.raises(InputError, match="supported are rf_detr: outputs dets"):
         load(path, kind="rf_detr")
     with pytest.raises(ValueError, match="kind must be one of auto, bottom_up"):
         load(path, kind="other")
@@ -49,7 +49,7 @@ def test_a_layout_is_told_by_its_outputs_or_demanded(path):
         {"boxes": np.zeros((1, 9, 4)), "labels": np.zeros(9), "scores": np.zeros(9), "masks": np.zeros((9, 1, 8, 8))},
     ],
 )
-def test_an_unknown_layout_says_what_is_there_and_what_is_known(path, outputs):
+def test_unknown_layouts_are_reported_with_the_supported_layouts(path, outputs):
     write(path, (1, 3, 320, 320), **outputs)
     with pytest.raises(InputError) as error:
         load(path)
@@ -65,12 +65,12 @@ def test_an_unknown_layout_says_what_is_there_and_what_is_known(path, outputs):
         ((1, 4, 64, 64), TensorProto.FLOAT, "4 channels, not 3"),
         ((1, 64, 64, 3), TensorProto.FLOAT, "64 channels, not 3"),
         ((2, 3, 64, 64), TensorProto.FLOAT, "a batch of 2"),
-        ((1, 3, 64, "width"), TensorProto.FLOAT, "one free side"),
+        ((1, 3, 64, "width"), TensorProto.FLOAT, "one variable side"),
         ((1, 3, 64, 64), TensorProto.UINT8, "tensor.uint8"),
-        ((3, 64, 64), TensorProto.FLOAT, "no batch of pictures"),
+        ((3, 64, 64), TensorProto.FLOAT, "not a batch of pictures"),
     ],
 )
-def test_an_input_that_is_no_colour_picture(path, shape, kind, problem):
+def test_unsupported_inputs(path, shape, kind, problem):
     write(path, shape, kind, output0=np.zeros((1, 116, 9000)), output1=PROTOS)
     with pytest.raises(InputError, match=problem):
         load(path)
@@ -116,7 +116,7 @@ def test_files_that_cannot_be_loaded(tmp_path, path):
         load(path)
 
 
-def test_a_detector_needs_a_network_for_the_masks(tmp_path, path):
+def test_detector_needs_a_saliency_network(tmp_path, path):
     write(path, output=np.zeros((1, 84, 85)))
     with pytest.raises(InputError, match=r"no masks: .* \(add a network for the masks: net.onnx\+u2netp.onnx\)"):
         load(path)
@@ -126,13 +126,13 @@ def test_a_detector_needs_a_network_for_the_masks(tmp_path, path):
         load(f"{masks}+{masks}")
     with pytest.raises(InputError, match="saliency: first output"):
         load(f"{path}+{path}")
-    with pytest.raises(InputError, match="is one file"):
+    with pytest.raises(InputError, match=r"is one file, but kind yolox\+saliency needs two files"):
         load(path, kind="yolox+saliency")
-    with pytest.raises(InputError, match="yolo is one"):
+    with pytest.raises(InputError, match="kind yolo needs one file"):
         load(f"{path}+{masks}", kind="yolo")
 
 
-def test_a_name_with_a_plus_is_one_file(tmp_path):
+def test_file_name_with_a_plus(tmp_path):
     path = write(tmp_path / "a.onnx+b.onnx", output0=HEAD, output1=PROTOS)
     assert load(path).class_names == ("bird",)
 
@@ -146,32 +146,32 @@ def test_placements():
     assert (picture[[27, 73]] == 114).all()
     assert (picture[28:73] == 7).all()
     boxes = np.array([[0, 28, 100, 73], [50, 30, 60, 200]], np.float32)
-    np.testing.assert_allclose(centred.boxes_px(boxes), [[0, 0, 201, 90], [100.5, 4, 120.6, 90]], rtol=1e-6)
+    np.testing.assert_allclose(centred.to_frame(boxes), [[0, 0, 201, 90], [100.5, 4, 120.6, 90]], rtol=1e-6)
     cropped = Placement.cropped((201, 90), (30, 40), np.array([20, 10, 80, 90]))
     assert cropped.picture(frame).shape == (40, 30, 3)
-    np.testing.assert_allclose(cropped.boxes_px(np.array([[0, 0, 30, 40.0]])), [[20, 10, 80, 90]])
+    np.testing.assert_allclose(cropped.to_frame(np.array([[0, 0, 30, 40.0]])), [[20, 10, 80, 90]])
 
 
-def test_a_mask_is_read_between_its_pixels():
+def test_masks_are_interpolated():
     placement = Placement.cropped((60, 40), (20, 20), np.array([10, 10, 50, 30]))
-    rows, columns = np.indices((5, 10)) + 0.5  # over the crop: 4 pixels each
+    rows, columns = np.indices((5, 10)) + 0.5  # over the crop: 4 pixels per cell
     half = placement.instance(columns - 5.3, np.array([12.0, 10, 47.6, 29.4]), 0.0, 1, "bird")
     # x − 10 > 5.3 · 4, to the last centre below 47.6
     assert half is not None
     assert half.box_px.tolist() == [31, 10, 17, 19]
     both = np.stack([columns, rows, np.ones_like(rows)])
     corner = placement.instance(both, np.array([0.0, 0, 60, 40]), 0.0, 1, "bird", np.array([1, 0.0, -9.4]))
-    # the map ends at its outermost centres, and its border goes on beyond them: 9.5 − 9.4 > 0
+    # beyond the outermost centres the map is constant: 9.5 − 9.4 > 0
     assert corner is not None
     assert corner.box_px.tolist() == [48, 0, 12, 40]
     assert placement.instance(columns, np.array([70.0, 0, 80, 9]), 0.0, 1, "bird") is None
     assert placement.instance(columns, np.array([20.6, 0, 21.4, 9]), 0.0, 1, "bird") is None
 
 
-def test_suppression_within_a_class():
+def test_non_maximum_suppression_within_a_class():
     boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [0, 0, 10, 10], [5, 0, 15, 10]], np.float32)
     scores, labels = np.array([0.8, 0.9, 0.5, 0.7], np.float32), np.array([3, 3, 4, 3])
-    # 9 / 11 of the first two, 6 / 14 of the surest and the last
-    assert suppress(boxes, scores, labels, 0.5).tolist() == [1, 3, 2]
-    assert suppress(boxes, scores, labels, 0.4).tolist() == [1, 2]
-    assert suppress(boxes[:0], scores[:0], labels[:0], 0.5).tolist() == []
+    # IoU of the first two: 9 / 11; of the best and the last: 6 / 14
+    assert non_maximum_suppression(boxes, scores, labels, 0.5).tolist() == [1, 3, 2]
+    assert non_maximum_suppression(boxes, scores, labels, 0.4).tolist() == [1, 2]
+    assert non_maximum_suppression(boxes[:0], scores[:0], labels[:0], 0.5).tolist() == []

@@ -1,4 +1,4 @@
-"""Segmentation networks of every known layout, on graphs whose answers are known."""
+"""Segmentation networks of every supported layout, on graphs with known outputs."""
 
 import json
 from functools import partial
@@ -12,13 +12,13 @@ from jaxfit.errors import InputError
 from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.perception.segmentation.classes import COCO, coco_by_category
 
-load = partial(load_segmenter, threads=1)  # threads that wait for each other are slow on a busy machine
+load = partial(load_segmenter, threads=1)  # one thread is faster on a busy machine
 BIRD, CAT = 14, 15
 COLOUR = (51, 102, 204)  # blue, green, red: shares 0.2, 0.4, 0.8
 
 
 def yolo_protos():
-    """32 prototypes, of which the first is a column's middle, the second a row's, the third 1."""
+    """32 prototypes: the first is the centre of the column, the second the centre of the row, the third 1."""
     protos = np.zeros((1, 32, 160, 160), np.float32)
     protos[0, 1], protos[0, 0] = np.indices((160, 160)) + 0.5
     protos[0, 2] = 1
@@ -60,7 +60,7 @@ def test_yolo_raw_head(tmp_path):
     # 1280 x 720 at a half is 640 x 360, with 140 rows of grey above and below
     box, right_of = (320, 320, 200, 100), (1, 0, -80.1)  # columns of a quarter of the input: x > 320.4 there
     rows = [
-        (box, BIRD, 0.6, (0, 0, 1)),  # overlaps the next, which is surer
+        (box, BIRD, 0.6, (0, 0, 1)),  # overlaps the next row, which has a higher score
         ((322, 320, 200, 100), BIRD, 0.9, right_of),
         (box, CAT, 0.95, (0, 0, 1)),
         ((100, 300, 40, 40), BIRD, 0.7, (0, 1, -75)),  # rows of a quarter of the input: y > 300 there
@@ -85,13 +85,13 @@ def test_yolo_final_head(tmp_path):
     rows = [((220, 270, 420, 370), BIRD, 0.5, (0, 0, 1)), ((220, 270, 420, 370), BIRD, 0.9, (1, 0, -80.1))]
     path = write_yolo(tmp_path / "seg.onnx", final_head(*rows, ((0, 200, 9, 209), 0, 0.9, (0, 0, 1))))
     first, second = load(path)(np.zeros((720, 1280, 3), np.uint8))
-    # no suppression: that is the network's own business
+    # no suppression: the network does it
     assert (box_of(first), pytest.approx(first.score)) == ([641, 260, 199, 200], 0.9)
     assert (box_of(second), pytest.approx(second.score)) == ([440, 260, 400, 200], 0.5)
 
 
 @pytest.mark.parametrize("kind", [TensorProto.FLOAT, TensorProto.FLOAT16])
-def test_yolo_sees_red_green_blue_in_a_grey_frame(tmp_path, kind):
+def test_yolo_input_is_red_green_blue_with_a_grey_margin(tmp_path, kind):
     head = final_head(*(((0, 140 + 20 * i, 20, 160 + 20 * i), BIRD, 0, (0, 0, 1)) for i in range(4)))
     at = [(0, 0, 320, 5), (0, 1, 320, 5), (0, 2, 320, 5), (0, 0, 139, 5)]
     read = {"output0": {(0, i, 4): pixel for i, pixel in enumerate(at)}}
@@ -103,12 +103,12 @@ def test_yolo_sees_red_green_blue_in_a_grey_frame(tmp_path, kind):
     assert by_row == pytest.approx({0: 0.8, 40: 0.4, 80: 0.2, 120: 114 / 255}, abs=1e-3)
 
 
-def test_yolo_of_free_size_takes_the_metadata(tmp_path):
+def test_yolo_of_variable_size_uses_the_metadata(tmp_path):
     head = final_head(((0, 0, 32, 32), 0, 0.5, (0, 0, 1)))
     path = write_yolo(
         tmp_path / "seg.onnx",
         head,
-        {"output0": {(0, 0, 4): (0, 0, 255, 319)}},  # beyond this the graph would fail
+        {"output0": {(0, 0, 4): (0, 0, 255, 319)}},  # a larger index would fail
         (1, 3, "height", "width"),
         names="{0: 'murre'}",
         imgsz="[256, 320]",
@@ -143,7 +143,7 @@ def test_rf_detr(tmp_path):
     assert load(path, min_score=0.9)(frame) == []
 
 
-def test_rf_detr_sees_imagenet_colours_without_a_border(tmp_path):
+def test_rf_detr_input_is_normalised_and_stretched(tmp_path):
     outputs = rf_detr_outputs()
     outputs["dets"][0, 5:7], outputs["masks"][0, 5:7] = (0.9, 0.9, 0.1, 0.1), 1
     read = {"labels": {(0, 4, 16): (0, 0, 0, 0), (0, 5, 16): (0, 1, 431, 431), (0, 6, 16): (0, 2, 0, 431)}}
@@ -159,10 +159,10 @@ def test_rf_detr_names(tmp_path):
         path = write_reading(tmp_path / "seg.onnx", (1, 3, 432, 432), rf_detr_outputs(slots), {}, metadata)
         return load(path, names=names).class_names
 
-    assert classes(2) == ("class_0",)  # the last slot is no object
+    assert classes(2) == ("class_0",)  # the last slot is "no object"
     assert classes(3, names=("egg", "bird")) == ("bird",)
-    told = json.dumps({"class_id_to_name": {"1": "murre"}})
-    assert classes(2, rfdetr_inference=told) == ("murre",)
+    metadata = json.dumps({"class_id_to_name": {"1": "murre"}})
+    assert classes(2, rfdetr_inference=metadata) == ("murre",)
     with pytest.raises(InputError, match="class_0, class_1"):
         classes(3)
     with pytest.raises(InputError, match="2 classes"):
@@ -172,7 +172,7 @@ def test_rf_detr_names(tmp_path):
 
 
 def write_mask_rcnn(path, boxes, labels, scores, input_shape=(3, "height", "width"), **metadata):
-    """Every mask is the input's red."""
+    """Every mask is the red channel of the input."""
     batched = len(input_shape) == 4
     nodes = [
         helper.make_node("Gather", ["images", "zero"], ["red"], axis=1 if batched else 0),
@@ -206,14 +206,14 @@ def red_until(x, width, height):
 def test_mask_rcnn(tmp_path):
     boxes = [(10, 5, 90, 50), (20.4, 5, 90, 50.5), (20, 5, 90, 50), (60, 5, 90, 50)]
     path = write_mask_rcnn(tmp_path / "m.onnx", boxes, [16, 16, 17, 16], [0.6, 0.9, 0.95, 0.9])
-    first, second = load(path)(red_until(50, 100, 60))  # the fourth box holds no red
+    first, second = load(path)(red_until(50, 100, 60))  # the fourth box contains no red
     assert (box_of(first), box_of(second)) == ([20, 5, 30, 45], [10, 5, 40, 45])
     assert (pytest.approx(first.score), first.label) == (0.9, "bird")
     path = write_mask_rcnn(tmp_path / "m.onnx", boxes[:1], [1], [0.6], names="['murre']")
     assert [one.label for one in load(path)(red_until(50, 100, 60))] == ["murre"]
 
 
-def test_mask_rcnn_sees_long_frames_shrunk(tmp_path):
+def test_mask_rcnn_reduces_long_frames(tmp_path):
     path = write_mask_rcnn(tmp_path / "m.onnx", [(0, 0, 1333, 50)], [16], [0.9])
     (found,) = load(path)(red_until(1334, 2666, 100))
     assert box_of(found) == [0, 0, 1334, 100]

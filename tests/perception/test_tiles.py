@@ -1,22 +1,23 @@
-"""Birds seen in tiles are the birds of the whole frame, each once."""
+"""Segmentation in tiles gives every bird of the whole frame once."""
 
 import numpy as np
 import pytest
+from support.instances import rectangle_instance
 
 from jaxfit.perception.instances import Instance, instance_of
 from jaxfit.perception.segmentation.tiles import Tiled
 
 
 class Perfect:
-    """Sees every bird, which is an area of one number, as far as it lies in what it is shown."""
+    """Segments every bird: a bird is the area of one value."""
 
     class_names = ("bird",)
 
     def __init__(self):
-        self.shown = []
+        self.shapes = []
 
     def __call__(self, frame):
-        self.shown.append(frame.shape[:2])
+        self.shapes.append(frame.shape[:2])
         values = frame[..., 0]
         found = [instance_of(values == v, v / 255, "bird") for v in np.unique(values[values > 0])]
         return sorted((one for one in found if one is not None), key=lambda one: -one.score)
@@ -41,7 +42,7 @@ def assert_same(found: list[Instance], expected: list[Instance]):
     [
         [],
         [(10, 10, 30, 40)],
-        [(60, 20, 75, 40)],  # within what two tiles share
+        [(60, 20, 75, 40)],  # within the intersection of two tiles
         [(60, 60, 75, 75)],  # four tiles
         [(60, 20, 110, 40)],  # cut by an edge of both
         [(5, 5, 290, 195)],  # through all tiles
@@ -49,23 +50,23 @@ def assert_same(found: list[Instance], expected: list[Instance]):
         [(78, 20, 82, 40), (150, 150, 151, 151)],
     ],
 )
-def test_as_if_the_frame_were_seen_at_once(boxes):
+def test_tiles_give_the_instances_of_the_whole_frame(boxes):
     frame = frame_with(*boxes)
     assert_same(Tiled(Perfect(), 80, 0.25)(frame), Perfect()(frame))
 
 
-def test_tiles_end_with_the_frame_and_overlap_enough():
+def test_positions_of_tiles():
     segmenter = Perfect()
     Tiled(segmenter, 80, 0.25)(frame_with())
     # 1 + ⌈(300 − 80) / 60⌉ columns, 1 + ⌈(200 − 80) / 60⌉ rows
-    assert segmenter.shown == [(80, 80)] * (5 * 3)
+    assert segmenter.shapes == [(80, 80)] * (5 * 3)
     segmenter = Perfect()
     Tiled(segmenter, 250, 0.0)(frame_with())
-    assert segmenter.shown == [(200, 250)] * 2
+    assert segmenter.shapes == [(200, 250)] * 2
 
 
-class Told:
-    """Says what it is told for each tile, one after the other."""
+class Scripted:
+    """Returns the given instances, tile by tile."""
 
     class_names = ("bird", "cat")
 
@@ -77,17 +78,17 @@ class Told:
 
 
 def bird(x0, x1, score=0.5, label="bird", height=10):
-    return Instance(np.ones((height, x1 - x0), bool), x0, 0, score, label)
+    return rectangle_instance(x0, 0, x1 - x0, height, score, label)
 
 
-def told(left, right):
+def segment(left, right):
     """Columns 0 to 80 and 60 to 140."""
-    return Tiled(Told(left, right), 80, 0.25)(np.zeros((80, 140, 3), np.uint8))
+    return Tiled(Scripted(left, right), 80, 0.25)(np.zeros((80, 140, 3), np.uint8))
 
 
-def test_parts_become_one_with_the_best_score():
-    # 60 to 80 is common: the left sees it all, the right begins at 64 and reaches on to 100
-    (one,) = told([bird(50, 80, 0.6)], [bird(4, 40, 0.9)])
+def test_parts_are_merged_with_the_best_score():
+    # the intersection is 60 to 80: the left part ends with it, the right part is 64 to 100
+    (one,) = segment([bird(50, 80, 0.6)], [bird(4, 40, 0.9)])
     assert (one.box_px.tolist(), one.score) == ([50, 0, 50, 10], 0.9)
     assert one.mask.all()
 
@@ -95,27 +96,27 @@ def test_parts_become_one_with_the_best_score():
 @pytest.mark.parametrize(
     ("left", "right"),
     [
-        (bird(50, 80), bird(4, 40, label="cat")),  # another kind
+        (bird(50, 80), bird(4, 40, label="cat")),  # another class
         (bird(40, 60), bird(0, 20)),  # they touch
         (bird(50, 80), bird(4, 40)._replace(y0=6)),  # the boxes overlap, the masks by 4 of 10 rows
     ],
 )
-def test_others_stay_apart(left, right):
-    assert len(told([left], [right])) == 2
+def test_different_birds_are_not_merged(left, right):
+    assert len(segment([left], [right])) == 2
 
 
-def test_half_of_the_smaller_one_is_enough():
-    assert len(told([bird(50, 70)], [bird(5, 40)])) == 1  # 5 of the left's 10 common columns
-    assert len(told([bird(50, 69)], [bird(5, 40)])) == 2  # 4 of 9
+def test_half_of_the_smaller_mask_is_enough():
+    assert len(segment([bird(50, 70)], [bird(5, 40)])) == 1  # 5 of the 10 columns of the left mask in the intersection
+    assert len(segment([bird(50, 69)], [bird(5, 40)])) == 2  # 4 of 9
 
 
-def test_birds_told_apart_in_one_tile_are_not_joined_by_another():
-    # the right tile takes two neighbours for one bird: it goes to the one it shares more with
-    found = told([bird(60, 72), bird(72, 80, 0.4)], [bird(0, 19, 0.3)])
+def test_instances_of_one_tile_are_never_merged():
+    # the right tile merges two neighbours: this mask is merged with the larger share
+    found = segment([bird(60, 72), bird(72, 80, 0.4)], [bird(0, 19, 0.3)])
     assert sorted((one.x0, one.mask.shape[1]) for one in found) == [(60, 19), (72, 8)]
 
 
 @pytest.mark.parametrize(("tile_px", "overlap"), [(8, 0.25), (80, 1.0), (80, -0.1)])
-def test_senseless_tiles(tile_px, overlap):
+def test_invalid_tiles(tile_px, overlap):
     with pytest.raises(ValueError, match="must be"):
         Tiled(Perfect(), tile_px, overlap)

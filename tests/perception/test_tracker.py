@@ -1,20 +1,19 @@
-"""Trackers: who is who, for how long one is remembered, and what is asked of a package that may be missing."""
+"""Trackers: assignment, memory, and the adapter to an optional package."""
 
 import sys
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from support.instances import rectangle_instance
 
 from jaxfit.errors import InputError
-from jaxfit.perception.instances import Instance
 from jaxfit.perception.tracking import TRACKERS, load_tracker
-from jaxfit.perception.tracking.iou import _overlaps
-from jaxfit.perception.tracking.packaged import PACKAGED
+from jaxfit.perception.tracking.external_trackers import EXTERNAL_TRACKERS
 
 
 def bird(x, y=0, width=20, height=10, score=0.9):
-    return Instance(np.ones((height, width), bool), x, y, score, "bird")
+    return rectangle_instance(x, y, width, height, score)
 
 
 def follow(tracker, frames):
@@ -22,24 +21,18 @@ def follow(tracker, frames):
     return [tracker.update(t, [bird(x) for x in columns]) for t, columns in frames.items()]
 
 
-def test_overlaps_by_hand():
-    a = np.array([[0.0, 0, 4, 2]])
-    b = np.array([[0.0, 0, 4, 2], [2, 0, 4, 2], [4, 0, 4, 2], [1, 1, 2, 1], [50, 50, 1, 1]])
-    np.testing.assert_allclose(_overlaps(a, b), [[1, 4 / 12, 0, 2 / 8, 0]])
-
-
-def test_birds_keep_their_identity_in_whatever_order_they_come():
+def test_identities_do_not_depend_on_the_order_of_instances():
     assert follow(load_tracker(), {0: [0, 100], 1: [104, 3], 2: [6, 108, 200]}) == [[1, 2], [2, 1], [1, 2, 3]]
 
 
-def test_all_birds_together_are_joined_best():
-    """The greatest overlap of all, 17/23 of box 2 and bird 1, is not taken: 17/23 + 4/36 < 13/27 + 14/26."""
+def test_assignment_maximises_the_sum_of_ious():
+    """The pair with the greatest IoU, 17/23 of box 2 and bird 1, is not assigned: 17/23 + 4/36 < 13/27 + 14/26."""
     tracker = load_tracker()
     tracker.update(0, [bird(0), bird(10)])
     assert tracker.update(1, [bird(7), bird(16)]) == [1, 2]
 
 
-def test_boxes_must_overlap_by_more_than_asked():
+def test_iou_must_exceed_min_iou():
     # shifted by 10 of 20 columns: 10 / 30 are shared
     for least, expected in ((0.33, [1]), (1 / 3, [2]), (0.4, [2])):
         tracker = load_tracker(min_iou=least)
@@ -47,17 +40,17 @@ def test_boxes_must_overlap_by_more_than_asked():
         assert tracker.update(1, [bird(10)]) == expected
     tracker = load_tracker(min_iou=0.0)
     tracker.update(0, [bird(0)])
-    assert tracker.update(1, [bird(20)]) == [2]  # they touch
+    assert tracker.update(1, [bird(20)]) == [2]  # the boxes touch
 
 
 @pytest.mark.parametrize("seen", [False, True])
 @pytest.mark.parametrize("name", TRACKERS)
-def test_memory_counts_frames_that_are_missing_too(name, seen):
-    """Missed in five frames a bird is remembered, in six it is not: whether it was not found or the frames are lost."""
-    if name in PACKAGED:
+def test_memory_counts_missing_frames(name, seen):
+    """A track survives five missed frames, but not six, whether the bird or the whole frame is missing."""
+    if name in EXTERNAL_TRACKERS:
         pytest.importorskip("trackers", reason="the optional trackers package is not installed")
     for step in (1, 3):
-        for missed, back in ((5, 1), (6, None if name in PACKAGED else 2)):
+        for missed, back in ((5, 1), (6, None if name in EXTERNAL_TRACKERS else 2)):
             tracker = load_tracker(name, step=step)
             for t in range(4):
                 tracker.update(t * step, [bird(50)])
@@ -67,7 +60,7 @@ def test_memory_counts_frames_that_are_missing_too(name, seen):
             assert tracker.update((4 + missed) * step, [bird(50)]) == [back]
 
 
-def test_an_identity_is_never_used_again():
+def test_identities_are_never_reused():
     tracker, rng, gone, before = load_tracker(memory=1), np.random.default_rng(0), set(), set()
     last = {}
     for t in range(300):
@@ -81,13 +74,13 @@ def test_an_identity_is_never_used_again():
     assert len(gone) > 50
 
 
-def test_a_frame_without_birds_first():
+def test_first_frame_without_birds():
     assert follow(load_tracker(), {0: [], 1: [], 7: [5]}) == [[], [], [1]]
 
 
-@pytest.mark.parametrize("name", PACKAGED)
-def test_packaged_trackers_predict_where_a_bird_will_be(name):
-    """Two cross, and one is missed as they meet; the first detection alone is no track yet in two of the three."""
+@pytest.mark.parametrize("name", EXTERNAL_TRACKERS)
+def test_external_trackers_predict_positions(name):
+    """Two birds cross and one is missed meanwhile; in two of the trackers a track starts with the second detection."""
     pytest.importorskip("trackers", reason="the optional trackers package is not installed")
     tracker = load_tracker(name, memory=10)
     found = []
@@ -100,8 +93,8 @@ def test_packaged_trackers_predict_where_a_bird_will_be(name):
     assert sorted(found[5]) == [1, 2]
 
 
-@pytest.mark.parametrize("name", PACKAGED)
-def test_packaged_trackers_begin_nothing_with_doubtful_birds(name):
+@pytest.mark.parametrize("name", EXTERNAL_TRACKERS)
+def test_external_trackers_start_no_track_with_a_low_score(name):
     pytest.importorskip("trackers", reason="the optional trackers package is not installed")
     for least, expected in ((0.3, 1), (0.5, None)):
         tracker = load_tracker(name, min_score=least)
@@ -109,7 +102,7 @@ def test_packaged_trackers_begin_nothing_with_doubtful_birds(name):
 
 
 class FakeDetections(SimpleNamespace):
-    """As much of `supervision.Detections` as the adapter touches."""
+    """The part of `supervision.Detections` that the adapter uses."""
 
     @staticmethod
     def empty():
@@ -120,7 +113,7 @@ class FakeDetections(SimpleNamespace):
 
 
 class FakeTracker:
-    """Leaves the first bird out, gives the others back in reverse, the last one not tracked yet."""
+    """Drops the first instance and returns the others in reverse order; the last instance has no track yet."""
 
     def __init__(self, **settings):
         self.settings, self.calls = settings, []
@@ -142,8 +135,8 @@ def fake_package(monkeypatch):
         monkeypatch.setitem(sys.modules, name, module)
 
 
-@pytest.mark.parametrize("name", PACKAGED)
-def test_the_adapter_brings_identities_to_their_birds(fake_package, name):
+@pytest.mark.parametrize("name", EXTERNAL_TRACKERS)
+def test_adapter_assigns_identities_to_instances(fake_package, name):
     tracker = load_tracker(name, memory=3, min_iou=0.2, min_score=0.4, step=2)
     inner, frame = tracker._tracker, np.zeros((9, 9, 3), np.uint8)
     assert inner.settings["lost_track_buffer"] == 3
@@ -156,20 +149,20 @@ def test_the_adapter_brings_identities_to_their_birds(fake_package, name):
     np.testing.assert_array_equal(detections.xyxy[1], [30, 5, 38, 9])
     np.testing.assert_array_equal(detections.confidence, np.float32([0.9, 0.75, 0.9, 0.9]))
     assert (shown is frame) == (name == "botsort")
-    # 12 and 14 are missing; a gap of any length costs no more than it takes to forget all
+    # 12 and 14 are missing; a gap of any length needs at most memory + 1 empty updates
     tracker.update(16, birds[:2])
     assert [len(found) for found, _ in inner.calls] == [4, 0, 0, 2]
     assert tracker.update(9016, []) == []
     assert [len(found) for found, _ in inner.calls[4:]] == [0] * 5
 
 
-def test_a_missing_package_says_how_to_get_it(monkeypatch):
+def test_missing_package_is_reported_with_the_command_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "trackers", None)
     with pytest.raises(InputError, match=r'tracker ocsort: needs the package \w+.*pip install "jaxfit\[trackers\]"'):
         load_tracker("ocsort")
 
 
-def test_what_makes_no_sense_is_refused(fake_package):
+def test_invalid_settings_are_rejected(fake_package):
     with pytest.raises(InputError, match=r"tracker sort: is unknown \(choose one of iou, bytetrack, ocsort, botsort\)"):
         load_tracker("sort")
     for wrong in ({"memory": -1}, {"min_iou": 1.5}, {"min_score": -0.1}, {"step": 0}):

@@ -1,4 +1,4 @@
-"""The faults of simulated detectors: as often, as large and as informative as said."""
+"""The errors of simulated detections have the stated rates and sizes."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from scipy.stats import spearmanr
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.simulation import noise
-from jaxfit.simulation.noise import detect_noisily
+from jaxfit.simulation.noise import simulate_detections
 
 N, T, K, W, H = 3, 400, 20, 320, 200
 PAIRS = ((0, 1), (2, 3), (4, 5))
@@ -17,7 +17,7 @@ PAIRS = ((0, 1), (2, 3), (4, 5))
 
 @pytest.fixture(scope="module")
 def truth():
-    """Three discs that stand still: two touch, the third has left for the second half."""
+    """Three discs that stand still: two touch, the third is absent in the second half."""
     rng = np.random.default_rng(0)
     rows, columns = np.mgrid[:H, :W] + 0.5
     centres, radius = np.array([[80, 100], [159, 100], [260, 100]]), 40
@@ -43,23 +43,23 @@ def truth():
 
 
 @pytest.fixture(scope="module")
-def seen():
-    """The last five keypoints are always hidden."""
+def visible():
+    """The last five keypoints are always occluded."""
     return np.broadcast_to(np.arange(K) < 15, (N, T, K))
 
 
 @pytest.fixture(scope="module")
-def detected(truth, seen):
-    return detect_noisily(truth, seen, PAIRS, seed=1)
+def detected(truth, visible):
+    return simulate_detections(truth, visible, PAIRS, seed=1)
 
 
 def error_px(detected, truth):
     return np.linalg.norm(detected.keypoints_px - truth.keypoints_px, axis=-1)
 
 
-def test_the_jitter_has_the_stated_size(detected, truth):
+def test_jitter_has_the_stated_size(detected, truth):
     used = detected.confidence > 0
-    plain = np.arange(6, 15)  # no pair, not hidden
+    plain = np.arange(6, 15)  # no pair, not occluded
     error = error_px(detected, truth)[..., plain][used[..., plain]]
     # median of a Rayleigh distribution of σ = JITTER · 80 px, a little more for the outliers
     assert np.median(error) == pytest.approx(noise.JITTER * 80 * np.sqrt(2 * np.log(2)), rel=0.1)
@@ -67,16 +67,16 @@ def test_the_jitter_has_the_stated_size(detected, truth):
     assert 2 < np.median(hidden) / np.median(error) < 3.2
 
 
-def test_motion_makes_it_worse(truth, seen):
+def test_motion_increases_the_jitter(truth, visible):
     shift = 6.0 * (np.arange(T) % 2)[None, :, None, None] * [1, 0]  # 6 px a frame
     moving = dataclasses.replace(truth, keypoints_px=truth.keypoints_px + shift)
-    still, moved = (detect_noisily(t, seen, PAIRS, seed=2) for t in (truth, moving))
+    still, moved = (simulate_detections(t, visible, PAIRS, seed=2) for t in (truth, moving))
     used = (still.confidence > 0) & (moved.confidence > 0)
     ratio = np.median(error_px(moved, moving)[used]) / np.median(error_px(still, truth)[used])
     assert 1.4 < ratio < 2.2
 
 
-def test_part_of_the_error_is_correlated_in_time(detected, truth):
+def test_error_is_partly_correlated_in_time(detected, truth):
     along = (detected.keypoints_px - truth.keypoints_px)[:2, :, 6:15]
     used = (detected.confidence > 0)[:2, :, 6:15, None] & (np.abs(along) < 5)
     both = used[:, 1:] & used[:, :-1]
@@ -84,18 +84,18 @@ def test_part_of_the_error_is_correlated_in_time(detected, truth):
     assert np.corrcoef(a, b)[0, 1] == pytest.approx(noise.CORRELATED * noise.RHO, abs=0.1)
 
 
-def test_outliers_come_as_often_as_said(detected, truth):
+def test_rate_of_outliers(detected, truth):
     used = detected.confidence > 0
     far = error_px(detected, truth) > 8
     rate = far[..., 6:15][used[..., 6:15]].mean()
-    assert 0.3 * noise.OUTLIERS_SEEN < rate < 1.5 * noise.OUTLIERS_SEEN
+    assert 0.3 * noise.OUTLIERS_VISIBLE < rate < 1.5 * noise.OUTLIERS_VISIBLE
 
 
-def test_swaps_put_left_where_right_is(detected, truth):
+def test_rate_of_left_right_flips(detected, truth):
     to_other = np.linalg.norm(detected.keypoints_px[..., 0, :] - truth.keypoints_px[..., 1, :], axis=-1)
-    swapped = (to_other < 3) & (detected.confidence[..., 0] > 0)
-    rate = swapped[:2].mean()
-    assert 0.2 * (noise.SWAPS_ALL + noise.SWAPS_ONE) < rate < 3 * (noise.SWAPS_ALL + noise.SWAPS_ONE)
+    flipped = (to_other < 3) & (detected.confidence[..., 0] > 0)
+    rate = flipped[:2].mean()
+    assert 0.2 * (noise.FLIPS_ALL + noise.FLIPS_ONE) < rate < 3 * (noise.FLIPS_ALL + noise.FLIPS_ONE)
 
 
 def test_missing_points_and_frames(detected, truth):
@@ -112,10 +112,10 @@ def test_confidence_is_informative_but_not_perfect(detected, truth):
     rank = spearmanr(detected.confidence[used], error_px(detected, truth)[used]).statistic
     assert -0.9 < rank < -0.2
     wrong = used & (error_px(detected, truth) > 20)
-    assert (detected.confidence[wrong] > 0.3).any(), "some wrong points are trusted"
+    assert (detected.confidence[wrong] > 0.3).any(), "some outliers have a high confidence"
 
 
-def test_masks_are_ragged_and_their_boxes_are_theirs(detected, truth):
+def test_masks_are_ragged_and_boxes_are_tight(detected, truth):
     for t in range(0, T // 2, 20):
         if not detected.present[2, t]:
             continue
@@ -128,7 +128,7 @@ def test_masks_are_ragged_and_their_boxes_are_theirs(detected, truth):
         assert (columns.max() + 1, rows.max() + 1) == (x + width, y + height)
 
 
-def test_touching_neighbours_merge_now_and_then(detected, truth):
+def test_masks_of_touching_neighbours_may_merge(detected, truth):
     area = np.array([detected.mask(0, t).sum() if detected.present[0, t] else 0 for t in range(T)])
     true = truth.mask(0, 0).sum()
     assert 0.003 < (area > 1.6 * true).mean() < 0.1
@@ -136,34 +136,34 @@ def test_touching_neighbours_merge_now_and_then(detected, truth):
     assert max(alone) < 1.5 * true
 
 
-def test_the_seed_decides(truth, seen, detected):
-    again, other = (detect_noisily(truth, seen, PAIRS, seed) for seed in (1, 2))
+def test_seed_determines_the_detections(truth, visible, detected):
+    again, other = (simulate_detections(truth, visible, PAIRS, seed) for seed in (1, 2))
     np.testing.assert_array_equal(again.keypoints_px, detected.keypoints_px)
     assert (other.keypoints_px != detected.keypoints_px).any()
 
 
-def test_outliers_stay_while_their_run_lasts(detected, truth):
+def test_outliers_stay_in_place_during_a_run(detected, truth):
     offset = detected.keypoints_px - truth.keypoints_px
     far = (np.linalg.norm(offset, axis=-1) > 12) & (detected.confidence > 0)
-    far[..., :6] = False  # pairs may be swapped
+    far[..., :6] = False  # pairs may be flipped
     both = far[:, 1:] & far[:, :-1]
     step = np.linalg.norm(np.diff(detected.keypoints_px, axis=1), axis=-1)[both]
     assert len(step) > 50
     assert np.median(step) < 4
 
 
-def test_nothing_points_to_where_nothing_is(truth, seen):
-    """A keypoint outside the picture has no place: no swap and no neighbour's outlier may take it."""
+def test_no_detection_at_keypoints_outside_the_picture(truth, visible):
+    """A keypoint outside the picture has no position for flips or for outliers of a neighbour."""
     confidence = truth.confidence.copy()
     confidence[1, :, [0, 9]] = 0
     partly = truth.with_keypoints(truth.keypoints_px, confidence)
-    detected = detect_noisily(partly, seen, PAIRS, seed=4)
+    detected = simulate_detections(partly, visible, PAIRS, seed=4)
     used = detected.confidence > 0
     assert not used[1, :, 0].any()
     assert np.linalg.norm(detected.keypoints_px[used], axis=-1).min() > 20
 
 
-def test_stolen_keypoints_are_the_neighbours_detected_ones(detected, truth):
+def test_outliers_on_a_neighbour_are_its_detected_keypoints(detected, truth):
     used = detected.confidence > 0
     for n, other in ((0, 1), (1, 0)):
         distance = np.linalg.norm(detected.keypoints_px[n] - truth.keypoints_px[other], axis=-1)

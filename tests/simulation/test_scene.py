@@ -1,4 +1,4 @@
-"""Simulated scenes: what is written as truth must be what is filmed, and the birds must behave."""
+"""Simulated scenes: agreement of truth and footage, and plausible behaviour."""
 
 import filecmp
 import json
@@ -16,11 +16,11 @@ from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.truth import read_truth
 from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.behaviour import BEHAVIOURS
-from jaxfit.simulation.flock import act
+from jaxfit.simulation.flock import simulate_flock
 from jaxfit.simulation.footage import Footage
 from jaxfit.simulation.ledge import random_light
 from jaxfit.simulation.scene import LEDGE_DEPTH, simulate, stage_scene
-from jaxfit.simulation.viewpoint import look_down
+from jaxfit.simulation.viewpoint import random_viewpoint
 from jaxfit.video.reader import read_frames
 
 MURRE = load_murre()
@@ -34,13 +34,13 @@ def scene():
 
 @pytest.fixture(scope="module")
 def flock():
-    """Seven birds for four seconds, not filmed."""
-    view = look_down(np.random.default_rng(0), *SIZE, LEDGE_DEPTH)
-    return act(MURRE, 7, 100, 25.0, LEDGE_DEPTH, view, 1), view
+    """Seven birds for four seconds, without footage."""
+    view = random_viewpoint(np.random.default_rng(0), *SIZE, LEDGE_DEPTH)
+    return simulate_flock(MURRE, 7, 100, 25.0, LEDGE_DEPTH, view, 1), view
 
 
-def test_the_camera_sees_where_its_rays_go():
-    view = look_down(np.random.default_rng(1), *SIZE, LEDGE_DEPTH)
+def test_projection_inverts_the_rays():
+    view = random_viewpoint(np.random.default_rng(1), *SIZE, LEDGE_DEPTH)
     rays = view.rays()
     points = view.position_world + 130.0 * rays[[0, 100, 279], [5, 200, 479]]
     np.testing.assert_allclose(view.to_screen(points)[:, :2], [[5.5, 0.5], [200.5, 100.5], [479.5, 279.5]], atol=1e-2)
@@ -48,7 +48,7 @@ def test_the_camera_sees_where_its_rays_go():
     assert np.linalg.det(view.R_cam_world) == pytest.approx(1)
 
 
-def test_the_true_poses_give_the_masks_and_keypoints(scene):
+def test_true_poses_agree_with_masks_and_keypoints(scene):
     posed = PosedBirds(scene.poses, MURRE)
     faces = np.asarray(posed.faces)
     for n, t in np.argwhere(scene.truth.present)[::5].tolist():
@@ -57,14 +57,14 @@ def test_the_true_poses_give_the_masks_and_keypoints(scene):
         assert (own != true).sum() <= 0.01 * true.sum() + 2
         points = np.asarray(MURRE.keypoint_weights) @ np.asarray(screen)
         labelled = scene.truth.confidence[n, t] > 0
-        # the keypoint is a mean of vertices in space, so its projection is nearly the mean of theirs
+        # a keypoint is a mean of vertices, so its projection is nearly the mean of their projections
         np.testing.assert_allclose(points[labelled, :2], scene.truth.keypoints_px[n, t][labelled], atol=0.2)
     np.testing.assert_allclose(
         scene.poses.keypoints_px[scene.truth.confidence > 0], scene.truth.keypoints_px[scene.truth.confidence > 0]
     )
 
 
-def test_the_truth_measured_against_itself_is_perfect(scene):
+def test_metrics_of_the_truth_are_perfect(scene):
     overall = evaluate(scene.poses, MURRE, scene.truth, truth_solution=scene.poses).overall
     assert overall["pck@0.05"] == 1
     assert overall["iou"] > 0.99
@@ -73,34 +73,34 @@ def test_the_truth_measured_against_itself_is_perfect(scene):
     assert overall["size_error"] < 1e-6
 
 
-def test_visible_masks_share_out_the_whole_ones(scene):
+def test_visible_masks_partition_the_union_of_amodal_masks(scene):
     for t in range(scene.truth.num_frames):
-        visible, whole = np.zeros(SIZE[::-1], int), np.zeros(SIZE[::-1], bool)
+        visible, amodal = np.zeros(SIZE[::-1], int), np.zeros(SIZE[::-1], bool)
         for n in np.flatnonzero(scene.truth.present[:, t]).tolist():
-            mine, all_of_me = scene.truth.mask(n, t), scene.truth.whole_mask(n, t)
-            whole |= all_of_me
-            if mine is not None:
-                assert not (mine & ~all_of_me).any()
-                visible += mine
+            own, own_amodal = scene.truth.mask(n, t), scene.truth.whole_mask(n, t)
+            amodal |= own_amodal
+            if own is not None:
+                assert not (own & ~own_amodal).any()
+                visible += own
         assert visible.max() <= 1
-        np.testing.assert_array_equal(visible > 0, whole)
+        np.testing.assert_array_equal(visible > 0, amodal)
 
 
-def test_keypoints_said_to_be_seen_lie_on_the_bird(scene):
+def test_visible_keypoints_lie_on_the_bird(scene):
     truth = scene.truth
     for n, t in np.argwhere(truth.present)[::7].tolist():
-        seen = (truth.confidence[n, t] > 0) & ~truth.occluded[n, t]
-        rows, columns = np.nonzero(truth.whole_mask(n, t))  # a bill's tip is thinner than these small pixels
-        for x, y in truth.keypoints_px[n, t][seen]:
+        visible = (truth.confidence[n, t] > 0) & ~truth.occluded[n, t]
+        rows, columns = np.nonzero(truth.whole_mask(n, t))  # the tip of a bill is thinner than a pixel
+        for x, y in truth.keypoints_px[n, t][visible]:
             assert np.min(np.hypot(columns + 0.5 - x, rows + 0.5 - y)) < 3.5
 
 
-def test_some_keypoints_are_hidden(scene):
+def test_some_keypoints_are_occluded(scene):
     labelled = scene.truth.confidence > 0
     assert 0.05 < scene.truth.occluded[labelled].mean() < 0.7
 
 
-def test_birds_stand_on_the_ledge_until_they_fly(flock):
+def test_birds_stand_on_the_ledge_before_they_fly(flock):
     actors, _ = flock
     fly_off = BEHAVIOURS.index("fly_off")
     for actor in actors:
@@ -112,7 +112,7 @@ def test_birds_stand_on_the_ledge_until_they_fly(flock):
     assert flown.vertices_world[-1, :, 1].max() < -20
 
 
-def test_seven_birds_show_every_behaviour_that_leads(flock):
+def test_seven_birds_show_all_behaviours(flock):
     shown = {BEHAVIOURS[b] for actor in flock[0] for b in actor.behaviour}
     assert shown == set(BEHAVIOURS)
 
@@ -125,8 +125,8 @@ def test_joints_stay_within_their_limits(flock):
         assert (pose <= high + 1e-5).all()
 
 
-def test_bodies_do_not_run_into_each_other(flock):
-    """Checked on vertices: hardly any part of a body lies in the upright core of another."""
+def test_bodies_do_not_overlap(flock):
+    """No vertex of a trunk lies near the centre of the trunk of another bird."""
     actors, _ = flock
     weights = np.asarray(MURRE.skin_weights)
     names = MURRE.joint_names
@@ -150,9 +150,9 @@ def test_motion_is_smooth_and_continuous(flock):
         assert jnp.isfinite(actor.pose.transl).all()
 
 
-def test_the_footage_shows_the_birds_and_nothing_else(scene):
-    film = Footage(MURRE, scene.actors, scene.view, LEDGE_DEPTH, random_light(np.random.default_rng(0)), 3)
-    first, later = film.frame(0).astype(int), film.frame(8).astype(int)
+def test_pictures_change_only_near_birds(scene):
+    footage = Footage(MURRE, scene.birds, scene.view, LEDGE_DEPTH, random_light(np.random.default_rng(0)), 3)
+    first, later = footage.frame(0).astype(int), footage.frame(8).astype(int)
     assert first.shape == (*SIZE[::-1], 3)
     changed = np.abs(later - first).max(-1) > 40
     near = np.zeros(SIZE[::-1], bool)
@@ -163,10 +163,10 @@ def test_the_footage_shows_the_birds_and_nothing_else(scene):
     assert changed.any()
     rows, columns = np.nonzero(changed)
     close = [near[max(r - 9, 0) : r + 10, max(c - 9, 0) : c + 10].any() for r, c in zip(rows, columns, strict=True)]
-    assert np.mean(close) > 0.97  # shadows fall a little beside
+    assert np.mean(close) > 0.97  # shadows lie beside the birds
 
 
-def test_the_same_seed_gives_the_same_bytes(tmp_path):
+def test_same_seed_gives_the_same_bytes(tmp_path):
     for name in ("a", "b"):
         simulate(MURRE, tmp_path / name, birds=2, frames=4, size=SIZE, seed=5)
     files = [p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file()]
@@ -176,7 +176,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path):
     assert len(match) == len(files)
 
 
-def test_a_scene_reads_back(tmp_path):
+def test_written_scene_is_read_back(tmp_path):
     scene = simulate(MURRE, tmp_path / "s", birds=2, frames=5, size=SIZE, seed=6)
     frames = list(read_frames(tmp_path / "s" / "footage.mp4"))
     assert len(frames) == 5
@@ -211,7 +211,7 @@ def test_a_scene_reads_back(tmp_path):
         {"fps": float("nan")},
     ],
 )
-def test_a_scene_that_makes_no_sense_is_refused(wrong, tmp_path):
+def test_invalid_arguments_are_rejected(wrong, tmp_path):
     with pytest.raises(InputError, match=next(iter(wrong))):
         simulate(MURRE, tmp_path / "s", **({"frames": 2, "size": SIZE} | wrong))
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Small networks in ONNX files, laid out as exporters do, with contents that a test knows."""
+"""Small ONNX networks with the layouts of exporters and known contents."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ def write_graph(
     kind: int = TensorProto.FLOAT,
     output_kinds: Mapping[str, int] | None = None,
 ) -> Path:
-    """Names with their shapes (a word or None for a free side); inputs are of `kind`, outputs floats unless told."""
+    """Write a graph from names and shapes (a word or None for a variable side); outputs are floats by default."""
     kinds = dict.fromkeys(outputs, TensorProto.FLOAT) | dict(output_kinds or {})
     graph = helper.make_graph(
         nodes,
@@ -43,7 +43,7 @@ def write_constant(
     metadata: Mapping[str, str] | None = None,
     kind: int = TensorProto.FLOAT,
 ) -> Path:
-    """A network that says the same of every picture: `outputs`, each without the batch's axis, once a picture."""
+    """Write a network with the same outputs for every picture; `outputs` have no batch axis."""
     nodes = [
         helper.make_node("Cast", ["input"], ["numbers"], to=TensorProto.FLOAT),
         helper.make_node("ReduceMean", ["numbers"], ["mean"], axes=[1, 2, 3], keepdims=1),
@@ -67,9 +67,9 @@ def write_reading(
     metadata: Mapping[str, str] | None = None,
     kind: int = TensorProto.FLOAT,
 ) -> Path:
-    """A network whose outputs are constant but for what it reads of its input.
+    """Write a network whose outputs are constant, except for values copied from the input.
 
-    `read`: output → index into it → index of the input whose value stands there.
+    `read`: output → index into the output → index into the input.
     """
     nodes, constants = [helper.make_node("Cast", ["images"], ["numbers"], to=TensorProto.FLOAT)], {}
     for name, value in outputs.items():

@@ -1,4 +1,4 @@
-"""Training on simulated frames: labels, samples, losses and what is exported. Needs the extra `train`."""
+"""Training on simulated frames: labels, samples, losses, export. It needs the extra `train`."""
 
 import numpy as np
 import pytest
@@ -11,10 +11,10 @@ from jaxfit.perception.keypoints import load_keypoint_detector  # noqa: E402
 from jaxfit.perception.onnx_model import OnnxModel  # noqa: E402
 from jaxfit.perception.segmentation import load_segmenter  # noqa: E402
 from jaxfit.training import keypoints, scenes, segmenter  # noqa: E402
-from jaxfit.training.augment import randomise  # noqa: E402
+from jaxfit.training.augment import randomise_appearance  # noqa: E402
 from jaxfit.training.loop import Schedule  # noqa: E402
 from jaxfit.training.networks import FeaturePyramid  # noqa: E402
-from jaxfit.training.scenes import FRAMES_A_SCENE, LabelledFrames, film_scenes, load_frames  # noqa: E402
+from jaxfit.training.scenes import FRAMES_PER_SCENE, LabelledFrames, film_scenes, load_frames  # noqa: E402
 from jaxfit.training.train import train_network  # noqa: E402
 
 K = len(MURRE_KEYPOINTS)
@@ -34,82 +34,82 @@ def frames(folder):
 
 
 def two_squares():
-    """Two white squares on black, 10 pixels to the unit: bird 1 left, bird 2 right, keypoints along the diagonal."""
+    """Two white squares on black, 10 pixels per unit: bird 1 left, bird 2 right, keypoints along the diagonal."""
     pictures, owner = np.zeros((1, 400, 600, 3), np.uint8), np.zeros((1, 400, 600), np.uint8)
-    points, seen = np.zeros((1, 3, K, 2), np.float32), np.zeros((1, 3, K), np.uint8)
+    points, visibility = np.zeros((1, 3, K, 2), np.float32), np.zeros((1, 3, K), np.uint8)
     for n, x0 in enumerate((100, 300)):
         owner[0, 150:250, x0 : x0 + 100] = n + 1
         pictures[0, 150:250, x0 : x0 + 100] = 255
         points[0, n] = np.linspace((x0 + 5, 155), (x0 + 95, 245), K)
-        seen[0, n] = 2
-    return LabelledFrames(pictures, owner, points, seen, np.array([10.0], np.float32))
+        visibility[0, n] = 2
+    return LabelledFrames(pictures, owner, points, visibility, np.array([10.0], np.float32))
 
 
-def test_labels_agree_with_each_other(frames):
-    assert frames.pictures.shape[0] == FRAMES_A_SCENE
+def test_visible_keypoints_lie_on_their_bird(frames):
+    assert frames.pictures.shape[0] == FRAMES_PER_SCENE
     assert frames.pictures.std() > 10
-    seen = np.argwhere(frames.seen == 2)
-    assert len(seen) > 100
+    visible = np.argwhere(frames.visibility == 2)
+    assert len(visible) > 100
     own = 0
-    for s, n, k in seen:
+    for s, n, k in visible:
         x, y = frames.keypoints_px[s, n, k].astype(int)
         own += (frames.owner[s, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] == n + 1).any()
-    assert own > 0.99 * len(seen)  # what is seen of a bird lies on it; the thinnest tips fall between pixels
+    assert own > 0.99 * len(visible)  # the thinnest tips fall between pixels
 
 
-def test_the_same_seed_gives_the_same_frames(frames):
-    again = scenes._film(0)
+def test_same_seed_gives_the_same_frames(frames):
+    again = scenes._film_scene(0)
     assert np.array_equal(again.owner, frames.owner)
     assert np.array_equal(again.pictures, frames.pictures)
 
 
-def test_randomised_birds_stay_where_they_are():
+def test_random_appearance():
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 256, (96, 96, 3), np.uint8)
     birds = np.zeros((96, 96), bool)
     birds[30:60, 30:60] = True
-    results = [randomise(np.random.default_rng(i), picture, birds) for i in range(40)]
+    results = [randomise_appearance(np.random.default_rng(i), picture, birds) for i in range(40)]
     assert all(result.shape == picture.shape and result.dtype == np.uint8 for result in results)
-    assert np.array_equal(results[3], randomise(np.random.default_rng(3), picture, birds))
+    assert np.array_equal(results[3], randomise_appearance(np.random.default_rng(3), picture, birds))
     assert np.std([result.mean() for result in results]) > 10
 
 
 def test_segmenter_targets():
-    """Every cell of a square points to its middle, wherever it was turned to."""
+    """The offset of every cell of a square ends at the centre of the square."""
     tried = 0
     for i in range(12):
         sample = segmenter.draw_sample(np.random.default_rng(i), two_squares())
         side = segmenter.SIDE_PX // segmenter.STRIDE
         at = (np.indices((side, side))[::-1] + 0.5) * segmenter.STRIDE
         ends = at + sample.offset * segmenter.OFFSET_UNIT_PX
-        birds = sample.pulls[0] > 0
-        weights = np.unique(np.round(sample.pulls[0][birds], 8))
-        assert len(weights) == np.round(sample.pulls.sum())  # each bird weighs 1, both are of another size as cut
+        birds = sample.offset_weight[0] > 0
+        weights = np.unique(np.round(sample.offset_weight[0][birds], 8))
+        assert len(weights) == np.round(sample.offset_weight.sum())  # the weights of a bird sum to 1
         for weight in weights:
-            mine = np.abs(sample.pulls[0] - weight) < 1e-7
-            assert ends[:, mine].std(axis=1).max() < 1e-3
+            own_cells = np.abs(sample.offset_weight[0] - weight) < 1e-7
+            assert ends[:, own_cells].std(axis=1).max() < 1e-3
             tried += 1
         assert sample.foreground[0][birds].mean() > 0.9
     assert tried > 8
 
 
 def test_keypoint_targets():
-    """Keypoints lie on the diagonal of a square, evenly, also when it is turned, mirrored and cut."""
+    """Keypoints lie at equal distances on the diagonal of a square, also after augmentation and cropping."""
     for i in range(12):
         sample = keypoints.draw_sample(np.random.default_rng(i), two_squares())
-        place = sample.place
-        order = keypoints._MIRRORED
-        for candidate in (place, place[order]):
+        position = sample.position
+        order = keypoints._OTHER_SIDE
+        for candidate in (position, position[order]):
             steps = np.diff(candidate, axis=0)
             if np.ptp(steps, axis=0).max() < 1e-3:
                 break
         else:
             pytest.fail("the keypoints are no longer on a line")
         assert np.hypot(*steps.mean(0)) * (K - 1) * keypoints.STRIDE > 60  # the square fills much of its crop
-        assert (sample.present == ((place >= 0) & (place < 48)).all(-1)).all()
+        assert (sample.present == ((position >= 0) & (position < 48)).all(-1)).all()
 
 
-def test_losses_are_least_where_the_maps_are_right():
+def test_losses_are_lowest_for_the_true_maps():
     sample = segmenter.draw_sample(np.random.default_rng(1), two_squares())
     batch = segmenter.SegmenterSample(*(torch.from_numpy(part)[None] for part in sample))
     right = {
@@ -128,26 +128,26 @@ def test_losses_are_least_where_the_maps_are_right():
     crops = keypoints.KeypointSample(*(torch.from_numpy(part)[None] for part in crop))
     logits = torch.full((1, K, 48, 48), -30.0)
     centres = torch.arange(48) + 0.5
-    for k, (x, y) in enumerate(crop.place):
+    for k, (x, y) in enumerate(crop.position):
         if crop.present[k]:
             logits[0, k] = 20 - ((centres - x) ** 2 + (centres[:, None] - y) ** 2) / (2 * keypoints.SIGMA_CELLS**2)
-    nowhere = torch.full((1, K, 48, 48), -30.0)
-    near = keypoints.loss({"logits": logits}, crops)["place"]
-    flat = keypoints.loss({"logits": torch.zeros(1, K, 48, 48)}, crops)["place"]
-    assert flat == pytest.approx(np.log(48 * 48 + 1), rel=1e-4)  # every place as likely as any other
+    absent = torch.full((1, K, 48, 48), -30.0)
+    near = keypoints.loss({"logits": logits}, crops)["position"]
+    flat = keypoints.loss({"logits": torch.zeros(1, K, 48, 48)}, crops)["position"]
+    assert flat == pytest.approx(np.log(48 * 48 + 1), rel=1e-4)  # a uniform distribution
     assert near < 0.5 * flat
-    assert near < keypoints.loss({"logits": nowhere}, crops)["place"]
+    assert near < keypoints.loss({"logits": absent}, crops)["position"]
 
 
 def test_peaks_are_probabilities():
     class Logits(torch.nn.Module):
         def forward(self, pictures):
             logits = torch.full((1, 3, 12, 12), -20.0)
-            logits[0, 0, 5, 7] = 20.0  # surely here
-            logits[0, 1, 3, 3] = 0.0  # here or nowhere
+            logits[0, 0, 5, 7] = 20.0  # certainly here
+            logits[0, 1, 3, 3] = 0.0  # here or absent, with equal probability
             return {"logits": logits}
 
-    maps = keypoints.Peaks(Logits(), 3)(torch.zeros(1, 3, 48, 48))[0]
+    maps = keypoints.KeypointMaps(Logits(), 3)(torch.zeros(1, 3, 48, 48))[0]
     assert maps[0, 5, 7] == pytest.approx(1, abs=1e-3)
     assert maps[1, 3, 3] == pytest.approx(0.5, abs=1e-3)
     assert maps[2].max() < 1e-3
@@ -160,19 +160,19 @@ def test_pyramid_strides():
     assert {name: tuple(map_.shape) for name, map_ in maps.items()} == {"a": (1, 2, 16, 24), "b": (1, 1, 16, 24)}
 
 
-def test_a_segmenter_learns_and_is_read_back(folder, frames, tmp_path):
+def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
     losses = train_network("segmenter", tmp_path / "s.onnx", folder, scenes=1, schedule=QUICK)
     assert set(losses) == {"foreground", "centre", "offset"}
     model = OnnxModel(tmp_path / "s.onnx")
     assert "no real footage" in model.metadata["trained_on"]
-    assert "/" not in "".join(model.metadata.values()).replace("<", "")  # nobody's paths
+    assert "/" not in "".join(model.metadata.values()).replace("<", "")  # no local paths
     assert load_segmenter(tmp_path / "s.onnx").class_names == ("bird",)
     outputs = model(np.zeros((1, 3, 64, 96), np.float32))
     assert outputs["foreground"].shape == (1, 1, 32, 48)
     assert (tmp_path / "s.onnx").stat().st_size < 3.5e6
 
 
-def test_keypoints_are_learnt_and_read_back(folder, tmp_path):
+def test_trained_keypoint_network_is_read_back(folder, tmp_path):
     train_network("keypoints", tmp_path / "k.onnx", folder, scenes=1, schedule=QUICK)
     detector = load_keypoint_detector(tmp_path / "k.onnx")
     assert detector.keypoint_names == MURRE_KEYPOINTS
@@ -180,7 +180,7 @@ def test_keypoints_are_learnt_and_read_back(folder, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ({"scenes": 0}, "scenes"),
         ({"scenes": 3}, "holds 1 scenes"),
@@ -188,8 +188,8 @@ def test_keypoints_are_learnt_and_read_back(folder, tmp_path):
         ({"path": "n.pt"}, ".onnx"),
     ],
 )
-def test_refusals(folder, tmp_path, arguments, said):
+def test_invalid_arguments_are_rejected(folder, tmp_path, arguments, message):
     path = tmp_path / arguments.pop("path", "n.onnx")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         train_network("segmenter", path, folder, **{"scenes": 1, **arguments})
     assert not path.exists()

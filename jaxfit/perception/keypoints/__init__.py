@@ -1,4 +1,4 @@
-"""Keypoints of birds that were found already: crops of single birds, and the networks that look at them."""
+"""Keypoint detection: crops of single birds, and the networks that process the crops."""
 
 from jaxfit.perception.keypoints.crops import Crop, crop_bird
 from jaxfit.perception.keypoints.detector import load_keypoint_detector

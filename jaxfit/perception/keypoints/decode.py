@@ -1,4 +1,4 @@
-"""Positions and confidences out of heatmaps and coordinate classes."""
+"""Decoding of heatmaps and SimCC vectors into positions and confidences."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import numpy as np
 import scipy.special
 from jaxtyping import Bool, Float, Int
 
-__all__ = ["activated", "heatmap_peaks", "simcc_peaks", "subcell_offsets"]
+__all__ = ["apply_activation", "heatmap_peaks", "simcc_peaks", "subcell_offsets"]
 
-_FLOOR = 1e-6  # what a logarithm takes for nothing
+_FLOOR = 1e-6  # lower bound before the logarithm
 
 
-def activated(
+def apply_activation(
     values: Float[np.ndarray, "N K *B"], activation: str
 ) -> tuple[Float[np.ndarray, "N K *B"], Bool[np.ndarray, "N K"]]:
-    """The network's output as confidences, and where it holds only numbers; where not, all of it becomes 0.
+    """Apply the activation that turns the network's output into confidences.
 
     Args:
-        values: one map, or one row, for each keypoint.
-        activation: one of `ACTIVATIONS`; a softmax runs over a whole map.
+        values: one map or one vector for each keypoint.
+        activation: one of `ACTIVATIONS`; the softmax runs over a whole map.
+
+    Returns:
+        The confidences, and whether all values of a keypoint are finite. If not, its confidences are those of zeros.
     """
     axes = tuple(range(2, values.ndim))
     finite = np.asarray(np.isfinite(values).all(axis=axes))
@@ -31,7 +34,7 @@ def activated(
 
 
 def heatmap_peaks(heatmaps: Float[np.ndarray, "N K h w"]) -> tuple[Int[np.ndarray, "N K 2"], Float[np.ndarray, "N K"]]:
-    """Cells (x, y) with the largest values, and these."""
+    """Return the cells (x, y) of the largest values, and the largest values."""
     flat = heatmaps.reshape(*heatmaps.shape[:2], -1)
     best = flat.argmax(axis=-1)
     y, x = np.divmod(best, heatmaps.shape[-1])
@@ -41,17 +44,17 @@ def heatmap_peaks(heatmaps: Float[np.ndarray, "N K h w"]) -> tuple[Int[np.ndarra
 def subcell_offsets(
     heatmaps: Float[np.ndarray, "N K h w"], cells: Int[np.ndarray, "N K 2"]
 ) -> Float[np.ndarray, "N K 2"]:
-    """How far (x, y), in cells, a heatmap's peak lies from the centre of its largest cell.
+    """Estimate the offset (x, y), in cells, from the centre of the largest cell to the peak of the heatmap.
 
-    The peak of the quadric that the central differences of ln(heatmap) about the cell describe: −H⁻¹ ∇, exact for
-    a Gaussian of any width and direction. 0 where they describe no peak, and across the border in a cell at it;
-    at most one cell.
+    The offset is −H⁻¹ ∇, with the gradient ∇ and the Hessian H of ln(heatmap) from central differences at the cell. It
+    is exact for a Gaussian of any width and direction. It is 0 where H is not that of a peak, is 0 across the border
+    for a cell at the border, and is at most one cell.
 
-    Source: Zhang et al. 2020 (DARK), equations 7 and 8, without their smoothing.
+    Source: Zhang et al. 2020 (DARK), equations 7 and 8, without the smoothing.
     """
     N, K, h, w = heatmaps.shape
-    rows = _mirrored(cells[..., 1, None] + np.arange(-1, 2), h)[..., :, None]
-    columns = _mirrored(cells[..., 0, None] + np.arange(-1, 2), w)[..., None, :]
+    rows = _mirror(cells[..., 1, None] + np.arange(-1, 2), h)[..., :, None]
+    columns = _mirror(cells[..., 0, None] + np.arange(-1, 2), w)[..., None, :]
     n, k = np.arange(N)[:, None, None, None], np.arange(K)[:, None, None]
     around = heatmaps[n, k, rows, columns].astype(np.float64)  # (N, K, 3, 3)
     log = np.log(np.maximum(around, _FLOOR))
@@ -70,7 +73,7 @@ def subcell_offsets(
 def simcc_peaks(
     simcc_x: Float[np.ndarray, "N K X"], simcc_y: Float[np.ndarray, "N K Y"]
 ) -> tuple[Int[np.ndarray, "N K 2"], Float[np.ndarray, "N K"]]:
-    """Bins (x, y) with the largest values, and the smaller of the two values.
+    """Return the bins (x, y) of the largest values, and the smaller of the two values.
 
     Source: `get_simcc_maximum` of MMPose 1.
     """
@@ -78,6 +81,6 @@ def simcc_peaks(
     return bins, np.minimum(simcc_x.max(axis=-1), simcc_y.max(axis=-1))
 
 
-def _mirrored(index: Int[np.ndarray, "*B"], length: int) -> Int[np.ndarray, "*B"]:
-    """−1 → 1 and length → length − 2: what lies across the border has no slope."""
+def _mirror(index: Int[np.ndarray, "*B"], length: int) -> Int[np.ndarray, "*B"]:
+    """Mirror indices at the border (−1 → 1, length → length − 2), so that the slope across the border is 0."""
     return np.clip((length - 1) - np.abs((length - 1) - np.abs(index)), 0, length - 1)

@@ -1,4 +1,4 @@
-"""Keypoint networks in ONNX files, made to look at one bird after the other."""
+"""Keypoint detection with an ONNX network on crops of single birds."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from jaxfit.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, MURRE_KEYPOINTS
 from jaxfit.perception.instances import Instance
 from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX, crop_bird
-from jaxfit.perception.keypoints.heads import HeatmapHead, SimccHead, find_head
-from jaxfit.perception.keypoints.notes import read_notes
-from jaxfit.perception.keypoints.pictures import PictureInput, picture_input
+from jaxfit.perception.keypoints.inputs import KeypointInput, read_input
+from jaxfit.perception.keypoints.metadata import read_metadata
+from jaxfit.perception.keypoints.output_layouts import HeatmapLayout, SimccLayout, detect_layout
 from jaxfit.perception.onnx_model import OnnxModel
 
 __all__ = ["NAME_SETS", "OnnxKeypoints", "load_keypoint_detector"]
@@ -24,43 +24,43 @@ NAME_SETS = {"murre": MURRE_KEYPOINTS, "aves": AVES_KEYPOINTS, "avian-mesh": AVI
 
 
 class OnnxKeypoints:
-    """A `KeypointDetector`: crops birds, runs the network on batches of them, brings its points back."""
+    """A `KeypointDetector`: crops the birds, runs the network on batches of crops, and converts to image pixels."""
 
     keypoint_names: tuple[str, ...]
 
     def __init__(
         self,
         model: OnnxModel,
-        pictures: PictureInput,
-        head: HeatmapHead | SimccHead,
+        network_input: KeypointInput,
+        layout: HeatmapLayout | SimccLayout,
         keypoint_names: Sequence[str],
         pad_px: int,
         dilate_px: int,
         batch: int,
     ):
         self.keypoint_names = tuple(keypoint_names)
-        self._model, self._pictures, self._head = model, pictures, head
+        self._model, self._input, self._layout = model, network_input, layout
         self._pad_px, self._dilate_px = pad_px, dilate_px
-        self._batch = pictures.batch or batch
+        self._batch = network_input.batch or batch
 
     def __call__(
         self, frame: UInt8[np.ndarray, "H W 3"], instances: Sequence[Instance]
     ) -> tuple[Float[np.ndarray, "M K 2"], Float[np.ndarray, "M K"]]:
-        """See `KeypointDetector`."""
+        """Detect keypoints, as `KeypointDetector` describes."""
         K = len(self.keypoint_names)
         points_px, confidence = np.zeros((len(instances), K, 2), np.float32), np.zeros((len(instances), K), np.float32)
-        width, height = self._pictures.size_px
+        width, height = self._input.size_px
         for start in range(0, len(instances), self._batch):
             birds = instances[start : start + self._batch]
-            batch = np.zeros((self._pictures.batch or len(birds), height, width, 3), np.uint8)
+            batch = np.zeros((self._input.batch or len(birds), height, width, 3), np.uint8)
             crops = []
             for i, bird in enumerate(birds):
                 batch[i], crop = crop_bird(frame, bird, (width, height), self._pad_px, self._dilate_px)
                 crops.append(crop)
-            found_px, trust = self._head(self._model(self._pictures(batch)))
+            crop_points_px, crop_confidence = self._layout(self._model(self._input.array(batch)))
             for i, crop in enumerate(crops):
-                points_px[start + i] = crop.to_image(found_px[i])
-                confidence[start + i] = trust[i]
+                points_px[start + i] = crop.to_image(crop_points_px[i])
+                confidence[start + i] = crop_confidence[i]
         return points_px, confidence
 
 
@@ -74,50 +74,53 @@ def load_keypoint_detector(
     batch: int = 16,
     threads: int | None = None,
 ) -> OnnxKeypoints:
-    """A keypoint network, its layout told from its inputs and outputs.
+    """Load a keypoint network; its inputs and outputs determine its layout.
 
     Args:
-        spec: `builtin`, or an ONNX file; what its metadata may say stands in `notes`.
-        kind: one of `KINDS`; `auto` takes what fits.
-        names: of its keypoints, in the order of its output, or a key of `NAME_SETS`; None or none take the file's.
-        pad_px, dilate_px: of the crops (`crop_bird`), image pixels; None takes the file's, or the paper's 40 and 70.
-        batch: crops in one run, where the network leaves that open.
-        threads: cores that one run may use; None takes all.
+        spec: `builtin`, or an ONNX file; `jaxfit.perception.keypoints.metadata` describes its optional metadata.
+        kind: one of `KINDS`; `auto` uses the layout that fits.
+        names: names of the keypoints in the order of the output, or a key of `NAME_SETS`; None or empty uses the
+            names in the file.
+        pad_px, dilate_px: parameters of the crops (`crop_bird`), image pixels; None uses the values in the file, or
+            the paper's 40 and 70.
+        batch: number of crops in one run, if the network does not fix it.
+        threads: number of cores for one run; None uses all cores.
 
     Raises:
-        InputError: no such file, no keypoint network, other channels than three, an unknown layout, no names or
-            another number of them.
+        InputError: the file does not exist, is not a keypoint network, has an unknown layout or not three channels,
+            or the names are missing or of the wrong number.
     """
     model = OnnxModel(BUILTIN_PATH if spec == "builtin" else spec, threads)
-    notes = read_notes(model)
-    pictures = picture_input(model, notes)
-    width, height = pictures.size_px
-    outputs = model(pictures(np.zeros((pictures.batch or 1, height, width, 3), np.uint8)))
-    head, count = find_head(model, outputs, kind, pictures.size_px, pictures.channels_last, notes)
+    metadata = read_metadata(model)
+    network_input = read_input(model, metadata)
+    width, height = network_input.size_px
+    outputs = model(network_input.array(np.zeros((network_input.batch or 1, height, width, 3), np.uint8)))
+    layout, count = detect_layout(model, outputs, kind, network_input, metadata)
     return OnnxKeypoints(
         model,
-        pictures,
-        head,
-        _names(model, count, names or notes.keypoint_names),
-        _given(pad_px, notes.pad_px, PAD_PX),
-        _given(dilate_px, notes.dilate_px, DILATE_PX),
+        network_input,
+        layout,
+        _choose_names(model, count, names or metadata.keypoint_names),
+        _first_given(pad_px, metadata.pad_px, PAD_PX),
+        _first_given(dilate_px, metadata.dilate_px, DILATE_PX),
         batch,
     )
 
 
-def _names(model: OnnxModel, count: int, given: Sequence[str] | str | None) -> Sequence[str]:
+def _choose_names(model: OnnxModel, count: int, given: Sequence[str] | str | None) -> Sequence[str]:
     sets = ", ".join(f"`{name}` ({len(keypoints)})" for name, keypoints in NAME_SETS.items())
     if not given:
-        remedy = f"give them in the order of its output, or one of {sets}"
+        remedy = f"give the names in the order of the output, or one of {sets}"
         raise InputError(model.path, f"does not name its {count} keypoints", remedy)
     if isinstance(given, str) and given not in NAME_SETS:
-        raise InputError(given, "is no set of keypoint names", f"known are {sets}; or give the {count} names")
+        raise InputError(given, "is not a set of keypoint names", f"supported are {sets}; or give the {count} names")
     names = NAME_SETS[given] if isinstance(given, str) else given
     if len(names) != count:
-        problem = f"has {count} keypoints, but {len(names)} are named"
-        raise InputError(model.path, problem, f"name each, in the order of its output: {model.describe()}")
+        problem = f"has {count} keypoints, but {len(names)} names are given"
+        remedy = f"give one name for each keypoint in the order of the output: {model.describe()}"
+        raise InputError(model.path, problem, remedy)
     return names
 
 
-def _given(*values: int | None) -> int:
+def _first_given(*values: int | None) -> int:
     return next(value for value in values if value is not None)

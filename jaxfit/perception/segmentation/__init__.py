@@ -1,4 +1,4 @@
-"""From a frame to its instances: networks of several layouts behind one protocol."""
+"""Segmentation: from a frame to its instances, with networks of several layouts behind one protocol."""
 
 from jaxfit.perception.segmentation.load import KINDS, load_segmenter, segmenter_files
 

@@ -1,4 +1,4 @@
-"""Which classes a network can name, and which of them are wanted."""
+"""Class names of networks, and the choice of the classes to keep."""
 
 from __future__ import annotations
 
@@ -19,59 +19,62 @@ _NAMES = (
     "refrigerator,book,clock,vase,scissors,teddy bear,hair drier,toothbrush"
 )
 COCO = tuple(_NAMES.split(","))
-"""The 80 classes of COCO, in the order of networks that number them without gaps."""
+"""The 80 classes of COCO, in the order of networks with consecutive class numbers."""
 _UNUSED_CATEGORIES = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 
 
 def coco_by_category() -> dict[int, str]:
-    """COCO's own numbers, 1 to 90 with gaps, as torchvision and RF-DETR use them."""
+    """Return COCO's category numbers (1 to 90 with gaps) → names, as in torchvision and RF-DETR."""
     numbers = (number for number in range(1, 91) if number not in _UNUSED_CATEGORIES)
     return dict(zip(numbers, COCO, strict=True))
 
 
 def names_of(model: OnnxModel, names: Sequence[str] | None, count: int | None) -> dict[int, str]:
-    """The class of each index of a network that numbers its classes from 0 on.
+    """Return index → name of the classes of a network that numbers its classes from 0.
 
-    Told names come first, then the file's own (`names` of its metadata, a Python literal as Ultralytics writes it),
-    then COCO's; a network of another number of classes that nothing names has `class_0`, `class_1` and so on.
+    The given names have priority over the file's metadata (`names`, a Python literal, as Ultralytics writes it), and
+    the metadata over COCO's names. A network without names whose number of classes is not COCO's has the names
+    `class_0`, `class_1` and so on.
 
     Args:
-        count: of its classes; None where its shapes do not show it.
+        model: the network.
+        names: names in the order of the classes; None uses the file's names.
+        count: number of classes; None if the shapes of the network do not contain it.
 
     Raises:
-        InputError: another number of names than classes, or metadata that cannot be read.
+        InputError: the numbers of names and classes differ, or the metadata cannot be read.
     """
     own = literal_metadata(model, "names") if names is None else list(names)
     if own is None:
         own = COCO if count in (None, len(COCO)) else [f"class_{i}" for i in range(count or 0)]
     try:
-        found = {int(i): str(name) for i, name in (own.items() if isinstance(own, dict) else enumerate(own))}
+        by_index = {int(i): str(name) for i, name in (own.items() if isinstance(own, dict) else enumerate(own))}
     except (ValueError, TypeError) as error:
-        problem = f"metadata `names` is no list of classes: {own!r:.80}"
+        problem = f"metadata `names` is not a list of classes: {own!r:.80}"
         raise InputError(model.path, problem, "give the names of its classes") from error
-    if sorted(found) != list(range(len(found) if count is None else count)):
-        problem = f"has {count} classes, but its names are {', '.join(found.values())}"
-        raise InputError(model.path, problem, "give one name for each class, in their order")
-    return found
+    if sorted(by_index) != list(range(len(by_index) if count is None else count)):
+        problem = f"has {count} classes, but its names are {', '.join(by_index.values())}"
+        raise InputError(model.path, problem, "give one name for each class, in the order of the classes")
+    return by_index
 
 
-def choose_classes(source: object, found: Mapping[int, str], wanted: Sequence[str] | None) -> dict[int, str]:
-    """The indices that are kept, with their names.
+def choose_classes(source: object, names: Mapping[int, str], chosen: Sequence[str] | None) -> dict[int, str]:
+    """Return index → name of the classes to keep.
 
     Args:
         source: the file, for messages.
-        found: index → name of every class.
-        wanted: names; None takes `bird` where there is one, or the only class there is.
+        names: index → name of every class.
+        chosen: names of the classes to keep; None keeps `bird`, or the only class.
 
     Raises:
-        InputError: a wanted class that the network lacks, or no choice made among several without a bird.
+        InputError: the network lacks a chosen class, or has several classes without `bird` and `chosen` is None.
     """
-    listing = f"its classes are {', '.join(found.values())}"
-    if wanted is None:
-        if "bird" not in found.values() and len(found) > 1:
-            raise InputError(source, f"has no class called bird; {listing}", "say which of them are birds")
-        return {i: name for i, name in found.items() if name == "bird"} or dict(found)
-    missing = [name for name in wanted if name not in found.values()]
-    if missing or not wanted:
-        raise InputError(source, f"lacks {', '.join(missing) or 'a class to look for'}; {listing}", "ask for these")
-    return {i: name for i, name in found.items() if name in wanted}
+    listing = f"its classes are {', '.join(names.values())}"
+    if chosen is None:
+        if "bird" not in names.values() and len(names) > 1:
+            raise InputError(source, f"has no class called bird; {listing}", "choose the classes that are birds")
+        return {i: name for i, name in names.items() if name == "bird"} or dict(names)
+    missing = [name for name in chosen if name not in names.values()]
+    if missing or not chosen:
+        raise InputError(source, f"lacks {', '.join(missing) or 'a class to keep'}; {listing}", "choose from these")
+    return {i: name for i, name in names.items() if name in chosen}

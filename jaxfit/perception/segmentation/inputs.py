@@ -1,4 +1,4 @@
-"""What networks ask for as their input, and say of themselves."""
+"""Inputs of segmentation networks, and literals in their metadata."""
 
 from __future__ import annotations
 
@@ -11,70 +11,75 @@ from jaxtyping import Float
 from jaxfit.errors import InputError
 from jaxfit.perception.onnx_model import OnnxModel
 
-__all__ = ["IMAGENET_MEAN", "IMAGENET_STD", "STRIDES", "ImageInput", "cell_count", "image_input", "literal_metadata"]
+__all__ = ["STRIDES", "ImageInput", "cell_count", "image_input", "literal_metadata"]
 
-IMAGENET_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
-IMAGENET_STD = np.array([0.229, 0.224, 0.225], np.float32)
-"""Mean and deviation of ImageNet's colours, red-green-blue within [0, 1]."""
 STRIDES = (8, 16, 32)
-"""Pixels of the input that a cell of each grid spans, in both YOLO families."""
+"""Cell sizes of the grids of both YOLO families, pixels of the input."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
 class ImageInput(NamedTuple):
-    """The picture that a network takes."""
+    """The picture that a network expects."""
 
     size_px: tuple[int, int] | None
-    """Width and height; None where both are free."""
+    """Width and height; None for a variable size."""
     dtype: type
     batched: bool
 
     def array(self, picture: Float[np.ndarray, "h w 3"]) -> np.ndarray:
-        """A picture, its colours scaled and in order, as the network's one input: channels first."""
+        """Convert a picture with the final scale and order of colours to the input array, with the channels first."""
         chw = np.ascontiguousarray(picture.transpose(2, 0, 1), self.dtype)
         return chw[None] if self.batched else chw
 
 
 def image_input(model: OnnxModel, unbatched: bool = False) -> ImageInput:
-    """What the network's one input asks for.
+    """Read the expected picture from the network's declaration of its input.
 
     Args:
-        unbatched: whether a lone picture (3, h, w) may be asked for.
+        model: the network.
+        unbatched: whether an input without a batch axis (3, h, w) is allowed.
 
     Raises:
-        InputError: several inputs, another number of channels or axes, a batch above 1, one side free and one not,
-            another type than floats.
+        InputError: several inputs, a wrong number of channels or axes, a batch above 1, one fixed and one variable
+            side, or a type other than floats.
     """
     if len(model.inputs) != 1:
-        raise InputError(model.path, f"takes {len(model.inputs)} inputs: {model.describe()}", "give one of one picture")
+        problem = f"has {len(model.inputs)} inputs: {model.describe()}"
+        raise InputError(model.path, problem, "give a network with one input")
     port = model.inputs[0]
     axes = port.shape
     if len(axes) not in ((3, 4) if unbatched else (4,)):
-        raise InputError(model.path, f"its input {port} is no batch of pictures", "export it as (1, 3, height, width)")
+        raise InputError(
+            model.path, f"its input {port} is not a batch of pictures", "export it as (1, 3, height, width)"
+        )
     if axes[-3] not in (3, None):
         problem = f"its input {port} has {axes[-3]} channels, not 3"
-        raise InputError(model.path, problem, "give a network of colour pictures, channels before height and width")
+        raise InputError(
+            model.path, problem, "give a network for colour pictures, with the channels before height and width"
+        )
     if len(axes) == 4 and axes[0] not in (1, None):
         raise InputError(model.path, f"its input {port} is a batch of {axes[0]}", "export it for a batch of 1")
     if port.kind not in _TYPES:
-        raise InputError(model.path, f"its input {port} is {port.kind}", "export it with floats as input")
+        raise InputError(model.path, f"its input {port} is {port.kind}", "export it with an input of floats")
     height, width = axes[-2:]
     if (height is None) != (width is None):
-        raise InputError(model.path, f"its input {port} has one free side", "export it with both fixed or both free")
+        raise InputError(
+            model.path, f"its input {port} has one variable side", "export it with both sides fixed or both variable"
+        )
     size = None if height is None or width is None else (width, height)
     return ImageInput(size, _TYPES[port.kind], len(axes) == 4)
 
 
 def cell_count(size_px: tuple[int, int]) -> int:
-    """Cells of all grids together, over an input of that width and height."""
+    """Return the number of cells of all grids over an input of the given width and height."""
     return sum((size_px[0] // stride) * (size_px[1] // stride) for stride in STRIDES)
 
 
 def literal_metadata(model: OnnxModel, key: str) -> Any:
-    """A Python literal from the file's metadata; None where there is none.
+    """Read a Python literal from the file's metadata; None if the key is absent.
 
     Raises:
-        InputError: the text is no literal.
+        InputError: the text is not a literal.
     """
     if key not in model.metadata:
         return None

@@ -1,10 +1,9 @@
-"""The segmenter that a file holds."""
+"""Loading of a segmenter from one or two ONNX files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from jaxfit.errors import InputError
 from jaxfit.perception.instances import Segmenter
@@ -20,28 +19,12 @@ from jaxfit.perception.segmentation.yolox import Yolox
 __all__ = ["BUILTIN", "KINDS", "load_segmenter", "segmenter_files"]
 
 BUILTIN = Path(__file__).parents[1] / "networks" / "segmenter.onnx"
-"""The network that the package brings along."""
+"""The built-in segmenter."""
 
 
-class _Kind(NamedTuple):
-    layout: str
-    """What its networks look like, for messages."""
-    fits: Callable[[OnnxModel], bool]
-    load: Callable[[OnnxModel, Sequence[str] | None, float | None, Sequence[str] | None], Segmenter]
-
-
-_KINDS = {
-    "bottom_up": _Kind("outputs foreground, centre, offset", BottomUp.fits, BottomUp),
-    "rf_detr": _Kind(
-        "outputs dets (1, queries, 4), labels (1, queries, slots), masks (1, queries, h, w)", RfDetrSeg.fits, RfDetrSeg
-    ),
-    "mask_rcnn": _Kind("outputs boxes (N, 4), labels (N), scores (N), masks (N, 1, H, W)", MaskRcnn.fits, MaskRcnn),
-    "yolo": _Kind(
-        "outputs (1, 4 + classes + 32, anchors) or (1, rows, 6 + 32), and (1, 32, h, w)", YoloSeg.fits, YoloSeg
-    ),
-}
-KINDS = ("auto", *_KINDS, "yolox+saliency")
-"""What `load_segmenter` takes as `kind`."""
+_NETWORKS = {"bottom_up": BottomUp, "rf_detr": RfDetrSeg, "mask_rcnn": MaskRcnn, "yolo": YoloSeg}
+KINDS = ("auto", *_NETWORKS, "yolox+saliency")
+"""The values that `load_segmenter` accepts as `kind`."""
 
 
 def load_segmenter(
@@ -55,24 +38,24 @@ def load_segmenter(
     tile_overlap: float = 0.25,
     threads: int | None = None,
 ) -> Segmenter:
-    """A segmenter from one or two ONNX files, whose inputs and outputs tell its layout.
+    """Load a segmenter from one or two ONNX files; the inputs and outputs determine its layout.
 
     Args:
-        spec: `builtin`; or a file; or two as `detector.onnx+saliency.onnx`, a YOLOX detector and a network such
-            as U²-Net that masks what stands out in each of its boxes.
-        kind: one of `KINDS`; a name demands that layout, `auto` takes whichever fits.
-        classes: names of the classes to keep; None takes `bird`, or the only class there is.
-        min_score: least score of an instance, within [0, 1]; None takes the layout's own.
-        names: all classes of the network in their order, where the file does not hold them.
-        tile_px: side of the square tiles that frames are cut into, pixels; None takes frames whole. Small birds
-            in large frames need it: 2592 x 1520 shrunk to 640 x 640 keeps a sixteenth of their pixels.
-        tile_overlap: share of a tile that neighbours have in common, within [0, 1); wider than a bird is best.
-        threads: cores that a network may use; None takes all.
+        spec: `builtin`; or a file; or two files as `detector.onnx+saliency.onnx`: a YOLOX detector, and a network such
+            as U²-Net that segments the salient object in each box.
+        kind: one of `KINDS`; a name requires this layout, `auto` uses the layout that fits.
+        classes: names of the classes to keep; None keeps `bird`, or the only class.
+        min_score: least score of an instance, within [0, 1]; None uses the default of the layout.
+        names: names of all classes in their order; None uses the names in the file.
+        tile_px: side of the square tiles of a frame, pixels; None uses no tiles. Small birds in large frames need
+            tiles: a reduction from 2592 x 1520 to 640 x 640 keeps a sixteenth of the pixels.
+        tile_overlap: share of a tile that lies in the next tile, within [0, 1); best wider than a bird.
+        threads: number of cores for a network; None uses all cores.
 
     Raises:
-        ValueError: another kind, or a tile size, an overlap or a score that is none.
-        InputError: no such file, none that can be loaded, an unknown layout (with what was found and
-            what is known), another number of channels, or classes that the network lacks.
+        ValueError: unknown kind, or an invalid size of tiles, overlap or score.
+        InputError: a file does not exist, cannot be loaded, has an unknown layout (the message lists the outputs and
+            the supported layouts), has not three channels, or lacks a class.
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}")
@@ -83,7 +66,7 @@ def load_segmenter(
 
 
 def segmenter_files(spec: str) -> list[Path]:
-    """The one or two files that a `spec` of `load_segmenter` stands for."""
+    """Return the one or two files of a `spec` of `load_segmenter`."""
     first, plus, second = spec.partition(".onnx+")
     if plus and not Path(spec).is_file():
         return [Path(first + ".onnx"), Path(second)]
@@ -101,25 +84,25 @@ def _load(
     path, *second = segmenter_files(spec)
     if second:
         if kind not in ("auto", "yolox+saliency"):
-            raise InputError(spec, f"names two files, but {kind} is one", "give one file, or kind auto")
+            raise InputError(spec, f"is two files, but kind {kind} needs one file", "give one file, or kind auto")
         detector, saliency = OnnxModel(path, threads), OnnxModel(second[0], threads)
         if not Yolox.fits(detector):
-            raise _unknown(detector, "YOLOX detector: one output (1, cells of strides 8, 16, 32, 5 + classes)")
+            raise _unknown_layout(detector, f"YOLOX detector: {Yolox.layout}")
         if not Saliency.fits(saliency):
-            raise _unknown(saliency, "saliency: first output (1, 1, h, w)")
+            raise _unknown_layout(saliency, "saliency: first output (1, 1, h, w)")
         return DetectorAndSaliency(Yolox(detector, classes, min_score, names), Saliency(saliency))
     if kind == "yolox+saliency":
-        raise InputError(spec, f"is one file, but {kind} is two", "give detector.onnx+saliency.onnx")
+        raise InputError(spec, f"is one file, but kind {kind} needs two files", "give detector.onnx+saliency.onnx")
     model = OnnxModel(path, threads)
-    wanted = {name: _KINDS[name] for name in _KINDS if kind in ("auto", name)}
-    for candidate in wanted.values():
-        if candidate.fits(model):
-            return candidate.load(model, classes, min_score, names)
+    candidates = {name: network for name, network in _NETWORKS.items() if kind in ("auto", name)}
+    for network in candidates.values():
+        if network.fits(model):
+            return network(model, classes, min_score, names)
     if Yolox.fits(model):
-        problem = f"finds boxes but no masks: {model.describe()}"
+        problem = f"detects boxes, but no masks: {model.describe()}"
         raise InputError(model.path, problem, f"add a network for the masks: {model.path.name}+u2netp.onnx")
-    raise _unknown(model, "; ".join(f"{name}: {known.layout}" for name, known in wanted.items()))
+    raise _unknown_layout(model, "; ".join(f"{name}: {network.layout}" for name, network in candidates.items()))
 
 
-def _unknown(model: OnnxModel, known: str) -> InputError:
-    return InputError(model.path, f"has no layout that is known here: {model.describe()}", f"known are {known}")
+def _unknown_layout(model: OnnxModel, supported: str) -> InputError:
+    return InputError(model.path, f"has an unknown layout: {model.describe()}", f"supported are {supported}")

@@ -1,4 +1,4 @@
-"""Large frames in overlapping tiles, so that small birds keep their pixels."""
+"""Segmentation of large frames in overlapping tiles, so that small birds keep their resolution."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxfit.perception.instances import Instance, Segmenter
 
 __all__ = ["Tiled"]
 
-SAME_BIRD = 0.5  # share of the smaller mask, of what both tiles could see
+MIN_SHARE = 0.5  # of the smaller mask within the intersection of two tiles
 
 
 class _Tile(NamedTuple):
@@ -20,27 +20,27 @@ class _Tile(NamedTuple):
     x1: int
     y1: int
 
-    def common(self, other: _Tile) -> _Tile:
+    def intersection(self, other: _Tile) -> _Tile:
         x0, y0 = max(self.x0, other.x0), max(self.y0, other.y0)
         return _Tile(x0, y0, max(x0, min(self.x1, other.x1)), max(y0, min(self.y1, other.y1)))
 
 
 class Tiled:
-    """A segmenter that sees a frame tile by tile.
+    """A segmenter that runs another segmenter on the tiles of a frame and merges the instances.
 
-    Tiles are squares, spread evenly so that the first and the last end with the frame. Instances of two tiles are the
-    same bird if they bear one label and, within the part of the frame that both tiles show, their masks share at least
-    half of the smaller one. That joins the parts of a bird that an edge cuts, and drops what
-    both tiles found whole. The surest pairs are joined first, and no bird has two instances of one tile, since those
-    were told apart where they were seen together. A joined bird has the union of the masks and the best score.
+    Tiles are squares with equal distances; the first and the last tile touch the border of the frame. Two instances of
+    different tiles are the same bird if their labels agree and if, within the intersection of the tiles, their masks
+    share at least half of the smaller mask. This rule merges the parts of a bird at the edge of a tile and removes
+    duplicates. Pairs with the largest share are merged first. Two instances of the same tile are never merged, because
+    the segmenter separated them. A merged bird has the union of the masks and the best score.
 
     Args:
-        segmenter: sees the tiles.
+        segmenter: runs on each tile.
         tile_px: side of a tile.
-        overlap: least share of a tile that neighbours have in common.
+        overlap: least share of a tile that lies in the next tile.
 
     Raises:
-        ValueError: a tile below 16 pixels, an overlap outside of [0, 1).
+        ValueError: a tile below 16 pixels, or an overlap outside [0, 1).
     """
 
     def __init__(self, segmenter: Segmenter, tile_px: int, overlap: float = 0.25):
@@ -52,19 +52,19 @@ class Tiled:
         self.class_names = segmenter.class_names
 
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
-        """As `Segmenter`."""
+        """Segment a frame, as `Segmenter` describes."""
         height, width = frame.shape[:2]
-        found: list[tuple[Instance, _Tile]] = []
-        for y0, y1 in _spans(height, self._tile_px, self._overlap):
-            for x0, x1 in _spans(width, self._tile_px, self._overlap):
-                part = self._segmenter(np.ascontiguousarray(frame[y0:y1, x0:x1]))
+        detections: list[tuple[Instance, _Tile]] = []
+        for y0, y1 in _tile_spans(height, self._tile_px, self._overlap):
+            for x0, x1 in _tile_spans(width, self._tile_px, self._overlap):
+                instances = self._segmenter(np.ascontiguousarray(frame[y0:y1, x0:x1]))
                 tile = _Tile(x0, y0, x1, y1)
-                found += [(one._replace(x0=one.x0 + x0, y0=one.y0 + y0), tile) for one in part]
-        return sorted(_joined(found), key=lambda instance: -instance.score)
+                detections += [(bird._replace(x0=bird.x0 + x0, y0=bird.y0 + y0), tile) for bird in instances]
+        return sorted(_merge(detections), key=lambda instance: -instance.score)
 
 
-def _spans(length: int, tile: int, overlap: float) -> list[tuple[int, int]]:
-    """Starts and ends of the fewest tiles along one side that overlap as much."""
+def _tile_spans(length: int, tile: int, overlap: float) -> list[tuple[int, int]]:
+    """Return starts and ends of the smallest number of tiles along one side that have the overlap."""
     if length <= tile:
         return [(0, length)]
     count = 1 + int(np.ceil((length - tile) / (tile * (1 - overlap))))
@@ -72,54 +72,57 @@ def _spans(length: int, tile: int, overlap: float) -> list[tuple[int, int]]:
     return [(int(start), int(start) + tile) for start in starts]
 
 
-def _joined(found: list[tuple[Instance, _Tile]]) -> list[Instance]:
+def _merge(detections: list[tuple[Instance, _Tile]]) -> list[Instance]:
+    """Merge the instances of the same bird."""
     pairs = [
         (share, i, j)
-        for i in range(len(found))
-        for j in range(i + 1, len(found))
-        if (share := _shared(*found[i], *found[j])) >= SAME_BIRD
+        for i in range(len(detections))
+        for j in range(i + 1, len(detections))
+        if (share := _shared_part(*detections[i], *detections[j])) >= MIN_SHARE
     ]
-    owner = list(range(len(found)))
-    birds = {i: [i] for i in owner}
+    bird_of = list(range(len(detections)))
+    birds = {i: [i] for i in bird_of}
     for _, i, j in sorted(pairs, key=lambda pair: -pair[0]):
-        one, other = birds[owner[i]], birds[owner[j]]
-        if {found[k][1] for k in one} & {found[k][1] for k in other}:
-            continue  # so also where they are one bird already
-        one += birds.pop(owner[j])
-        for k in other:
-            owner[k] = owner[i]
-    return [_union([found[k][0] for k in bird]) for bird in birds.values()]
+        first, second = birds[bird_of[i]], birds[bird_of[j]]
+        if {detections[k][1] for k in first} & {detections[k][1] for k in second}:
+            continue  # a common tile; this is also the case if both are the same bird already
+        first += birds.pop(bird_of[j])
+        for k in second:
+            bird_of[k] = bird_of[i]
+    return [_union([detections[k][0] for k in bird]) for bird in birds.values()]
 
 
-def _shared(one: Instance, its: _Tile, other: Instance, others: _Tile) -> float:
-    """What the masks share where both tiles look, as a part of the smaller one."""
-    if its == others or one.label != other.label:
+def _shared_part(first: Instance, first_tile: _Tile, second: Instance, second_tile: _Tile) -> float:
+    """Compute the intersection of two masks, as a share of the smaller mask within the intersection of the tiles."""
+    if first_tile == second_tile or first.label != second.label:
         return 0.0
-    region = its.common(others)
-    smaller = min(np.count_nonzero(_part(one, region)), np.count_nonzero(_part(other, region)))
+    region = first_tile.intersection(second_tile)
+    smaller = min(np.count_nonzero(_mask_within(first, region)), np.count_nonzero(_mask_within(second, region)))
     if not smaller:
         return 0.0
-    both = region.common(_reach(one)).common(_reach(other))
-    return np.count_nonzero(_part(one, both) & _part(other, both)) / smaller
+    both = region.intersection(_extent(first)).intersection(_extent(second))
+    return np.count_nonzero(_mask_within(first, both) & _mask_within(second, both)) / smaller
 
 
-def _reach(instance: Instance) -> _Tile:
+def _extent(instance: Instance) -> _Tile:
+    """Return the box of an instance."""
     height, width = instance.mask.shape
     return _Tile(instance.x0, instance.y0, instance.x0 + width, instance.y0 + height)
 
 
-def _part(instance: Instance, region: _Tile) -> Bool[np.ndarray, "h w"]:
-    """The instance's mask as far as it lies in the region."""
-    inside = region.common(_reach(instance))
+def _mask_within(instance: Instance, region: _Tile) -> Bool[np.ndarray, "h w"]:
+    """Return the part of an instance's mask that lies in the region."""
+    inside = region.intersection(_extent(instance))
     x, y = instance.x0, instance.y0
     return instance.mask[inside.y0 - y : inside.y1 - y, inside.x0 - x : inside.x1 - x]
 
 
 def _union(instances: list[Instance]) -> Instance:
+    """Combine the instances of one bird: the union of the masks, the label and score of the best instance."""
     best = max(instances, key=lambda instance: instance.score)
     if len(instances) == 1:
         return best
-    corners = np.array([_reach(instance) for instance in instances])
+    corners = np.array([_extent(instance) for instance in instances])
     (x0, y0), (x1, y1) = corners[:, :2].min(0).tolist(), corners[:, 2:].max(0).tolist()
     mask = np.zeros((y1 - y0, x1 - x0), bool)
     for instance in instances:

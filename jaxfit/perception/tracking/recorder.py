@@ -1,4 +1,4 @@
-"""From results frame by frame to observations, without holding a frame."""
+"""Collects the results of each frame into observations, without keeping pictures in memory."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class _Frame(NamedTuple):
     size_px: tuple[int, int]
 
 
-class _Sighting(NamedTuple):
-    """One tracked bird in one frame."""
+class _TrackedInstance(NamedTuple):
+    """One instance of a track."""
 
     t: int
     box_px: np.ndarray
@@ -32,17 +32,17 @@ class _Sighting(NamedTuple):
 
 
 class TrackRecorder:
-    """Collects what was found in each frame; a bird takes a kilobyte or two a frame.
+    """Collects the tracked instances of all frames; one instance needs one or two kilobytes.
 
     Args:
         keypoint_names: K names in the order of the detector's output.
-        skeleton: pairs of keypoints, counted from 0, that a drawing connects.
+        skeleton: pairs of keypoint indices that a drawing connects.
     """
 
     def __init__(self, keypoint_names: Sequence[str], skeleton: Sequence[tuple[int, int]] = ()):
         self._names, self._skeleton = tuple(keypoint_names), tuple(skeleton)
         self._frames: list[_Frame] = []
-        self._tracks: dict[int, list[_Sighting]] = {}
+        self._tracks: dict[int, list[_TrackedInstance]] = {}
 
     def add(
         self,
@@ -54,26 +54,25 @@ class TrackRecorder:
         keypoints_px: Float[np.ndarray, "M K 2"],
         confidence: Float[np.ndarray, "M K"],
     ) -> None:
-        """Take down one frame, also one without a bird; damaged frames are left out altogether.
+        """Add one frame; a frame without instances is added too, a damaged frame is not.
 
         Args:
             frame_index: number of the frame in the video; it increases from call to call.
-            file_name: what the frame is called.
-            size_px: its width and height.
-            instances: M birds.
-            identities: what a tracker says of them; those that are None are left out.
+            file_name: name of the frame.
+            size_px: width and height of the frame.
+            instances: M instances.
+            identities: the tracker's identity of each instance; instances with None are skipped.
             keypoints_px: x, y in image pixels.
-            confidence: within [0, 1]; 0 where a keypoint was not found.
+            confidence: within [0, 1]; 0 where a keypoint was not detected.
 
         Raises:
-            ValueError: a `frame_index` that does not increase, an identity that stands twice, arrays of other lengths
-                or for other keypoints.
+            ValueError: `frame_index` does not increase, an identity occurs twice, or an array has the wrong shape.
         """
         if self._frames and frame_index <= self._frames[-1].frame_index:
             raise ValueError(f"frame_index must increase, but {frame_index} follows {self._frames[-1].frame_index}")
-        tracked = [one for one in identities if one is not None]
+        tracked = [identity for identity in identities if identity is not None]
         if len(set(tracked)) < len(tracked):
-            raise ValueError(f"identities must name each bird once, not {list(identities)}")
+            raise ValueError(f"identities must contain each bird once, not {list(identities)}")
         shape = (len(instances), len(self._names))
         if np.shape(keypoints_px) != (*shape, 2) or np.shape(confidence) != shape:
             raise ValueError(
@@ -82,25 +81,30 @@ class TrackRecorder:
             )
         t = len(self._frames)
         self._frames.append(_Frame(int(frame_index), file_name, size_px))
-        for instance, one, points, trust in zip(instances, identities, keypoints_px, confidence, strict=True):
-            if one is not None:
+        for instance, identity, points_px, point_confidence in zip(
+            instances, identities, keypoints_px, confidence, strict=True
+        ):
+            if identity is not None:
                 rle = instance.encode(*size_px)
-                sighting = _Sighting(t, instance.box_px, instance.score, rle, np.array(points), np.array(trust))
-                self._tracks.setdefault(one, []).append(sighting)
+                self._tracks.setdefault(identity, []).append(
+                    _TrackedInstance(
+                        t, instance.box_px, instance.score, rle, np.array(points_px), np.array(point_confidence)
+                    )
+                )
 
     def observations(self) -> Observations:
-        """Everything so far; tracks in the order of their identities, perhaps none."""
+        """Return the observations of all frames so far; tracks are sorted by identity, and there may be no track."""
         tracks = sorted(self._tracks)
         N, T, K = len(tracks), len(self._frames), len(self._names)
         present, score = np.zeros((N, T), bool), np.zeros((N, T), np.float32)
         keypoints_px, confidence = np.zeros((N, T, K, 2), np.float32), np.zeros((N, T, K), np.float32)
         box_px = np.zeros((N, T, 4), np.float32)
         masks = {}
-        for n, one in enumerate(tracks):
-            for seen in self._tracks[one]:
-                cell = n, seen.t
-                present[cell], score[cell], box_px[cell], masks[cell] = True, seen.score, seen.box_px, seen.rle
-                keypoints_px[cell], confidence[cell] = seen.keypoints_px, seen.confidence
+        for n, identity in enumerate(tracks):
+            for tracked in self._tracks[identity]:
+                at = n, tracked.t
+                present[at], score[at], box_px[at], masks[at] = True, tracked.score, tracked.box_px, tracked.rle
+                keypoints_px[at], confidence[at] = tracked.keypoints_px, tracked.confidence
         return Observations(
             track_id=np.array(tracks, int),
             frame_index=np.array([frame.frame_index for frame in self._frames], int),

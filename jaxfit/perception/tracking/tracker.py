@@ -1,4 +1,4 @@
-"""Which bird of one frame is which of the next: the contract of trackers, and how one is chosen."""
+"""The tracker protocol, and the function that loads a tracker by name."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from jaxtyping import UInt8
 
 from jaxfit.errors import InputError
 from jaxfit.perception.instances import Instance
-from jaxfit.perception.tracking.iou import IouTracker
-from jaxfit.perception.tracking.packaged import PACKAGED, PackagedTracker
+from jaxfit.perception.tracking.external_trackers import EXTERNAL_TRACKERS, ExternalTracker
+from jaxfit.perception.tracking.iou_tracker import IouTracker
 
 __all__ = ["TRACKERS", "Tracker", "load_tracker"]
 
-TRACKERS = ("iou", *PACKAGED)
-"""The names that `load_tracker` knows."""
+TRACKERS = ("iou", *EXTERNAL_TRACKERS)
+"""The names that `load_tracker` accepts."""
 
 
 class Tracker(Protocol):
-    """Gives every bird an identity that it keeps from frame to frame."""
+    """Assigns each bird an identity that is constant from frame to frame."""
 
     def update(
         self, frame_index: int, instances: Sequence[Instance], frame: UInt8[np.ndarray, "H W 3"] | None = None
     ) -> list[int | None]:
-        """The identities of one frame's birds.
+        """Return the identities of one frame's instances.
 
         Args:
-            frame_index: number of the frame in the video; it increases from call to call. Frames that are left
-                out count as frames in which no bird was seen.
-            instances: what a segmenter found in it.
-            frame: its picture, for trackers that look at it.
+            frame_index: number of the frame in the video; it increases from call to call. A skipped frame counts as a
+                frame without instances.
+            instances: the instances of the frame.
+            frame: the picture, for trackers that use it.
 
         Returns:
-            One for each instance, from 1 on, never two the same and never one that another bird had; None where
-            it is not tracked, or not yet.
+            One identity (1 or more) for each instance. The identities of a frame differ, and an identity is never
+            reused for another bird. None where the instance has no track, or no track yet.
 
         Raises:
             ValueError: `frame_index` does not increase.
@@ -46,19 +46,19 @@ class Tracker(Protocol):
 def load_tracker(
     name: str = "iou", *, memory: int = 5, min_iou: float = 0.1, min_score: float = 0.6, step: int = 1
 ) -> Tracker:
-    """A tracker for one video.
+    """Create a tracker for one video.
 
     Args:
-        name: `iou`, the paper's; or `bytetrack`, `ocsort` or `botsort` of the optional `trackers` package, for scenes
-            where birds cross: they predict where a bird will be.
-        memory: frames for which a bird may be missed without losing its identity.
-        min_iou: boxes of the same bird overlap by more than this.
-        min_score: instances trusted less begin no track; the paper's tracker takes all.
-        step: numbers from one frame that is looked at to the next.
+        name: `iou`, the paper's tracker; or `bytetrack`, `ocsort` or `botsort` of the optional `trackers` package.
+            These three predict the position of each bird, which helps where birds cross.
+        memory: number of frames for which a bird may be missed without losing its identity.
+        min_iou: lower bound of the IoU between boxes of the same bird.
+        min_score: instances with a lower score start no track; the tracker `iou` uses all instances.
+        step: difference between the numbers of consecutive processed frames.
 
     Raises:
-        InputError: an unknown name, or a package that is not installed.
-        ValueError: a setting that makes no sense.
+        InputError: unknown name, or a package that is not installed.
+        ValueError: a setting outside its range.
     """
     if memory < 0 or not 0 <= min_iou <= 1 or not 0 <= min_score <= 1 or step < 1:
         raise ValueError(
@@ -67,6 +67,6 @@ def load_tracker(
         )
     if name == "iou":
         return IouTracker(memory, min_iou, step)
-    if name in PACKAGED:
-        return PackagedTracker(name, memory, min_iou, min_score, step)
+    if name in EXTERNAL_TRACKERS:
+        return ExternalTracker(name, memory, min_iou, min_score, step)
     raise InputError(f"tracker {name}", "is unknown", f"choose one of {', '.join(TRACKERS)}")

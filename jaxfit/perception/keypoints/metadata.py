@@ -1,15 +1,15 @@
-"""What the exporter of a keypoint network wrote into its file, as key and value of ONNX' `metadata_props`.
+"""Metadata of a keypoint network: keys and values of `metadata_props` in the ONNX file.
 
-| key | value | without it |
+| key | value | default |
 |---|---|---|
-| `keypoint_names` | names, by comma, in the order of the output | they must be given |
-| `mean`, `std` | one number or three, by comma, in 0–255, in the network's colour order | see `pictures` |
-| `colour` | `rgb` or `bgr`, the order that the network takes | `rgb` |
-| `input_size` | `width,height`, where the network leaves its own open | `256,256` |
-| `activation` | `none`, `sigmoid` or `softmax`: what turns its output into confidences | `none` |
-| `alignment` | where cells of a heatmap lie, see `ALIGNMENTS` | `centres`; with offsets `deeplabcut` |
-| `locref_std` | pixels that an offset of 1 stands for | 7.2801, DeepLabCut's |
-| `pad_px`, `dilate_px` | the crops that it was trained on, see `crops` | 40, 70 |
+| `keypoint_names` | names in the order of the output, separated by commas | none: the user must give the names |
+| `mean`, `std` | one or three numbers of 0–255, separated by commas, in the network's colour order | see `inputs` |
+| `colour` | `rgb` or `bgr`, the colour order of the input | `rgb` |
+| `input_size` | `width,height`, for an input of variable size | `256,256` |
+| `activation` | `none`, `sigmoid` or `softmax`: the function that turns the output into confidences | `none` |
+| `alignment` | position of the cells of a heatmap, see `ALIGNMENTS` | `centres`; with offsets `deeplabcut` |
+| `locref_std` | length in pixels of an offset of 1 | 7.2801, DeepLabCut's |
+| `pad_px`, `dilate_px` | parameters of the training crops, see `crops` | 40, 70 |
 """
 
 from __future__ import annotations
@@ -21,25 +21,26 @@ from typing import Any, NamedTuple, TypeVar
 from jaxfit.errors import InputError
 from jaxfit.perception.onnx_model import OnnxModel
 
-__all__ = ["ACTIVATIONS", "ALIGNMENTS", "Notes", "read_notes"]
+__all__ = ["ACTIVATIONS", "ALIGNMENTS", "KeypointMetadata", "read_metadata"]
 
 ACTIVATIONS = ("none", "sigmoid", "softmax")
 
 ALIGNMENTS = ("centres", "deeplabcut", "msra", "udp")
-"""Where the centre of cell i lies, in pixels of W a side (centres at i + 0.5), if w cells cover it:
+"""Position of the centre of cell i, in input pixels (pixel centres at i + 0.5), for w cells over W pixels:
 
-- `centres`: (i + 0.5) · W/w, the cells divide the picture among themselves;
-- `deeplabcut`: (i + 0.5) · stride + 0.5, since its coordinates count pixel centres at whole numbers;
-- `msra`: i · W/w + 0.5, as MMPose's heatmaps of that name (SimpleBaseline, HRNet);
-- `udp`: i · (W − 1)/(w − 1) + 0.5, as MMPose's of that name (ViTPose): outermost cells on outermost pixels.
+- `centres`: (i + 0.5) · W/w; the cells divide the picture evenly;
+- `deeplabcut`: (i + 0.5) · stride + 0.5; DeepLabCut's pixel centres have integer coordinates;
+- `msra`: i · W/w + 0.5; MMPose's codec `MSRAHeatmap` (SimpleBaseline, HRNet);
+- `udp`: i · (W − 1)/(w − 1) + 0.5; MMPose's codec `UDPHeatmap` (ViTPose): the outermost cells lie on the outermost
+  pixels.
 
 Source: `HeatmapPredictor` of DeepLabCut 3, `MSRAHeatmap` and `UDPHeatmap` of MMPose 1."""
 
 T = TypeVar("T")
 
 
-class Notes(NamedTuple):
-    """The table above, read; None where the file does not say."""
+class KeypointMetadata(NamedTuple):
+    """The values of the table above; None for a key that is absent and has no default."""
 
     keypoint_names: tuple[str, ...] | None
     mean: tuple[float, ...] | None
@@ -53,11 +54,11 @@ class Notes(NamedTuple):
     dilate_px: int | None
 
 
-def read_notes(model: OnnxModel) -> Notes:
-    """What the file says of its network.
+def read_metadata(model: OnnxModel) -> KeypointMetadata:
+    """Read the metadata of a keypoint network.
 
     Raises:
-        InputError: a value that is not what its key stands for.
+        InputError: a value that is not valid for its key.
     """
 
     def value(key: str, read: Callable[[str], T], default: Any = None) -> T:
@@ -69,7 +70,7 @@ def read_notes(model: OnnxModel) -> Notes:
         except ValueError as error:
             raise InputError(model.path, f"its metadata `{key}` is {text[:100]!r}", f"expected {error}") from error
 
-    return Notes(
+    return KeypointMetadata(
         keypoint_names=value("keypoint_names", _names),
         mean=value("mean", _colour_values),
         std=value("std", lambda text: _positive(_colour_values(text))),

@@ -1,4 +1,4 @@
-"""Which outputs of a keypoint network mean what, and their way to pixels of its input."""
+"""Output layouts of keypoint networks, and their decoding into input pixels."""
 
 from __future__ import annotations
 
@@ -10,43 +10,44 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit.errors import InputError
-from jaxfit.perception.keypoints.decode import activated, heatmap_peaks, simcc_peaks, subcell_offsets
-from jaxfit.perception.keypoints.notes import Notes
+from jaxfit.perception.keypoints.decode import apply_activation, heatmap_peaks, simcc_peaks, subcell_offsets
+from jaxfit.perception.keypoints.inputs import KeypointInput
+from jaxfit.perception.keypoints.metadata import KeypointMetadata
 from jaxfit.perception.onnx_model import OnnxModel
 
-__all__ = ["KINDS", "HeatmapHead", "SimccHead", "find_head"]
+__all__ = ["KINDS", "HeatmapLayout", "SimccLayout", "detect_layout"]
 
 KINDS = ("auto", "heatmap", "deeplabcut", "simcc")
-KNOWN = (
-    "known are heatmaps (N, K, h, w), the same with offsets (N, 2K, h, w) as DeepLabCut has them, both also with the "
-    "channels last, and `simcc_x` (N, K, a·width) with `simcc_y` (N, K, a·height) as RTMPose is exported"
+_SUPPORTED = (
+    "supported are heatmaps (N, K, h, w); heatmaps with offsets (N, 2K, h, w) as in DeepLabCut; both also with the "
+    "channels last; `simcc_x` (N, K, a·width) with `simcc_y` (N, K, a·height) as in RTMPose"
 )
 Outputs = Mapping[str, np.ndarray]
 Points = tuple[Float[np.ndarray, "N K 2"], Float[np.ndarray, "N K"]]
-"""x, y in input pixels, centres at i + 0.5, and confidences within [0, 1]."""
+"""Positions (x, y in input pixels, pixel centres at i + 0.5), and confidences within [0, 1]."""
 
 
 @dataclass(frozen=True)
-class HeatmapHead:
-    """One heatmap for each keypoint, with or without offsets from the cells' centres.
+class HeatmapLayout:
+    """One heatmap for each keypoint, with or without offsets from the centres of the cells.
 
-    Offsets come as x and y of the first keypoint, x and y of the second, … in units of `locref_std` pixels. Without
-    them, the peak is found between the cells (`subcell_offsets`).
+    The channels of the offsets are x and y of the first keypoint, x and y of the second keypoint, and so on, in units
+    of `locref_std` pixels. Without offsets, `subcell_offsets` locates the peak between the cells.
     """
 
     heatmap: str
-    """Name of the output."""
+    """Name of the output with the heatmaps."""
     locref: str | None
-    """Name of the output with the offsets."""
+    """Name of the output with the offsets; None without offsets."""
     channels_last: bool
     size_px: tuple[int, int]
-    """Of the network's input."""
+    """Width and height of the network's input."""
     activation: str
     alignment: str
     locref_std: float
 
     def __call__(self, outputs: Outputs) -> Points:
-        heatmaps, finite = activated(self._channels_first(outputs[self.heatmap]), self.activation)
+        heatmaps, finite = apply_activation(self._channels_first(outputs[self.heatmap]), self.activation)
         cells, peaks = heatmap_peaks(heatmaps)
         first, stride = self._grid(heatmaps.shape[-1], heatmaps.shape[-2])
         if self.locref is None:
@@ -64,7 +65,7 @@ class HeatmapHead:
         return maps.transpose(0, 3, 1, 2) if self.channels_last else maps
 
     def _grid(self, width: int, height: int) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-        """Centre of the first cell and distance of the cells, input pixels, x and y."""
+        """Return the centre of the first cell and the distance between cells, x and y in input pixels."""
         cells, pixels = np.array([width, height]), np.array(self.size_px)
         stride = pixels / cells
         if self.alignment == "msra":
@@ -72,16 +73,16 @@ class HeatmapHead:
         if self.alignment == "udp":
             return np.full(2, 0.5), (pixels - 1) / np.maximum(cells - 1, 1)
         if self.alignment == "deeplabcut":
-            stride = np.round(stride)  # its maps may reach over a picture whose sides are no multiples of it
+            stride = np.round(stride)  # the maps extend beyond a picture whose sides are not multiples of the stride
             return stride / 2 + 0.5, stride
         return stride / 2, stride
 
 
 @dataclass(frozen=True)
-class SimccHead:
-    """Classes of coordinates: for each keypoint, a value for every bin along x and every bin along y.
+class SimccLayout:
+    """SimCC: for each keypoint, one value for every bin along x and for every bin along y.
 
-    MMPose counts pixel centres at whole numbers, so bin i of n lies at i · side/n + 0.5.
+    MMPose's pixel centres have integer coordinates, so bin i of n lies at i · side/n + 0.5.
 
     Source: Li et al. 2022 (SimCC); `SimCCLabel` of MMPose 1.
     """
@@ -91,53 +92,54 @@ class SimccHead:
     y: str
     """Name of the output along y."""
     size_px: tuple[int, int]
-    """Of the network's input."""
+    """Width and height of the network's input."""
     activation: str
 
     def __call__(self, outputs: Outputs) -> Points:
-        x, x_finite = activated(outputs[self.x].astype(np.float32, copy=False), self.activation)
-        y, y_finite = activated(outputs[self.y].astype(np.float32, copy=False), self.activation)
+        x, x_finite = apply_activation(outputs[self.x].astype(np.float32, copy=False), self.activation)
+        y, y_finite = apply_activation(outputs[self.y].astype(np.float32, copy=False), self.activation)
         bins, values = simcc_peaks(x, y)
         points = bins * (np.array(self.size_px) / [x.shape[2], y.shape[2]]) + 0.5
         return points, _confidence(values, x_finite & y_finite)
 
 
-def find_head(
-    model: OnnxModel, outputs: Outputs, kind: str, size_px: tuple[int, int], channels_last: bool, notes: Notes
-) -> tuple[HeatmapHead | SimccHead, int]:
-    """The head of a network, told from the outputs of a first run.
+def detect_layout(
+    model: OnnxModel, outputs: Outputs, kind: str, network_input: KeypointInput, metadata: KeypointMetadata
+) -> tuple[HeatmapLayout | SimccLayout, int]:
+    """Determine the layout of a network's outputs from the outputs of a first run.
 
     Args:
-        model: named in messages.
-        outputs: of one run.
-        kind: one of `KINDS`; `heatmap` overlooks offsets.
-        size_px: width and height of the input.
-        channels_last: of the input; decides where the output fits both orders.
-        notes: what the file says.
+        model: the network, for messages.
+        outputs: outputs of one run.
+        kind: one of `KINDS`; `heatmap` ignores offsets.
+        network_input: the input; if an output fits both orders of axes, the order of the input decides.
+        metadata: metadata of the file.
 
     Returns:
-        The head, and the number of its keypoints.
+        The layout, and the number of keypoints.
 
     Raises:
-        InputError: a kind that does not exist, or a layout that is not known.
+        InputError: unknown kind or unknown layout.
     """
     if kind not in KINDS:
-        raise InputError(kind, "is no kind of keypoint network", f"known are {', '.join(KINDS)}")
+        raise InputError(kind, "is not a kind of keypoint network", f"supported are {', '.join(KINDS)}")
+    size_px = network_input.size_px
     if kind in ("auto", "simcc") and (pair := _simcc_pair(outputs, size_px)):
-        return SimccHead(*pair, size_px, notes.activation), outputs[pair[0]].shape[1]
-    if kind != "simcc" and (found := _heatmaps(outputs, size_px, channels_last)):
-        heatmap, locref, last = found
+        return SimccLayout(*pair, size_px, metadata.activation), outputs[pair[0]].shape[1]
+    if kind != "simcc" and (names := _heatmaps(outputs, size_px, network_input.channels_last)):
+        heatmap, locref, last = names
         if kind == "heatmap":
             locref = None
         if locref or kind != "deeplabcut":
-            alignment = notes.alignment or ("deeplabcut" if locref else "centres")
-            head = HeatmapHead(heatmap, locref, last, size_px, notes.activation, alignment, notes.locref_std)
-            return head, outputs[heatmap].shape[3 if last else 1]
-    what = "" if kind == "auto" else f" of kind `{kind}`"
-    raise InputError(model.path, f"is no keypoint network{what} that is known: {model.describe()}", KNOWN)
+            alignment = metadata.alignment or ("deeplabcut" if locref else "centres")
+            layout = HeatmapLayout(heatmap, locref, last, size_px, metadata.activation, alignment, metadata.locref_std)
+            return layout, outputs[heatmap].shape[3 if last else 1]
+    required = "" if kind == "auto" else f" of kind `{kind}`"
+    raise InputError(model.path, f"is not a supported keypoint network{required}: {model.describe()}", _SUPPORTED)
 
 
 def _simcc_pair(outputs: Outputs, size_px: tuple[int, int]) -> tuple[str, str] | None:
+    """Return the names of the outputs along x and y."""
     named = ("simcc_x", "simcc_y")
     pair = named if set(named) <= set(outputs) else tuple(outputs)
     if len(pair) != 2 or any(np.ndim(outputs[name]) != 3 for name in pair):
@@ -148,12 +150,12 @@ def _simcc_pair(outputs: Outputs, size_px: tuple[int, int]) -> tuple[str, str] |
 
 
 def _heatmaps(outputs: Outputs, size_px: tuple[int, int], channels_last: bool) -> tuple[str, str | None, bool] | None:
-    """Name of the heatmaps, name of the offsets, whether channels come last."""
+    """Return the name of the heatmaps, the name of the offsets, and whether the channels come last."""
     maps = {name: np.shape(value) for name, value in outputs.items() if np.ndim(value) == 4}
     for heatmap, locref in permutations(maps, 2):
         n, a, b, c = maps[heatmap]
-        for last, wanted in ((False, (n, 2 * a, b, c)), (True, (n, a, b, 2 * c))):
-            if maps[locref] == wanted and _covers(maps[heatmap], last, size_px):
+        for last, expected in ((False, (n, 2 * a, b, c)), (True, (n, a, b, 2 * c))):
+            if maps[locref] == expected and _covers(maps[heatmap], last, size_px):
                 return heatmap, locref, last
     if len(maps) == 1:
         ((heatmap, shape),) = maps.items()
@@ -164,7 +166,7 @@ def _heatmaps(outputs: Outputs, size_px: tuple[int, int], channels_last: bool) -
 
 
 def _covers(shape: tuple[int, ...], channels_last: bool, size_px: tuple[int, int]) -> bool:
-    """Whether square cells make up the picture, to the rounding of their number."""
+    """Whether the cells over the input are square, up to the rounding of their number."""
     height, width = shape[1:3] if channels_last else shape[2:]
     if not height or not width:
         return False

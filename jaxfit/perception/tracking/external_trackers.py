@@ -1,4 +1,4 @@
-"""Trackers of the optional `trackers` package, which predict where a bird will be."""
+"""Adapter to the trackers of the optional `trackers` package, which predict the position of each bird."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from jaxtyping import UInt8
 from jaxfit.errors import InputError
 from jaxfit.perception.instances import Instance
 
-__all__ = ["PACKAGED", "PackagedTracker"]
+__all__ = ["EXTERNAL_TRACKERS", "ExternalTracker"]
 
-PACKAGED = ("bytetrack", "ocsort", "botsort")
+EXTERNAL_TRACKERS = ("bytetrack", "ocsort", "botsort")
 """ByteTrack (Zhang et al. 2022), OC-SORT (Cao et al. 2023), BoT-SORT (Aharon et al. 2022)."""
 
 
-class PackagedTracker:
-    """ByteTrack, OC-SORT or BoT-SORT as Roboflow's `trackers` has them.
+class ExternalTracker:
+    """ByteTrack, OC-SORT or BoT-SORT of Roboflow's package `trackers`.
 
-    Each bird is tracked from its second frame on, sooner than the package would: short tracks are dropped afterwards,
-    when it is known which ones they are.
+    A track starts with the second detection of a bird, which is earlier than the package's default: short tracks are
+    removed later, when their lengths are known.
 
     Args:
-        name: one of `PACKAGED`.
-        memory: frames for which a bird may be missed; frames that the video lacks are missed ones.
-        min_iou: least intersection over union of a bird's box and where it is expected (times its score in BoT-SORT).
-        min_score: instances trusted less begin no track.
-        step: numbers from one frame that is looked at to the next.
+        name: one of `EXTERNAL_TRACKERS`.
+        memory: number of frames for which a bird may be missed; frames that are absent from the video count as missed.
+        min_iou: least intersection over union of a bird's box and its predicted box (times the score in BoT-SORT).
+        min_score: instances with a lower score start no track.
+        step: difference between the numbers of consecutive processed frames.
 
     Raises:
         InputError: the package is not installed.
@@ -43,7 +43,7 @@ class PackagedTracker:
             raise InputError(f"tracker {name}", problem, 'pip install "jaxfit[trackers]"') from error
         self._detections, self._step, self._memory = supervision.Detections, step, memory
         settings: dict[str, Any] = {
-            # the package counts its buffer at 30 frames a second; at that rate it means frames
+            # the package scales its buffer to 30 frames/s; at a frame rate of 30 the buffer is a number of frames
             "lost_track_buffer": memory,
             "frame_rate": 30.0,
             "minimum_consecutive_frames": 1,
@@ -59,29 +59,29 @@ class PackagedTracker:
             self._tracker = trackers.BoTSORTTracker(
                 minimum_iou_threshold_first_assoc=min_iou, track_activation_threshold=min_score, **settings
             )
-        self._looks = name == "botsort"  # at the picture, for the camera's own motion
+        self._uses_picture = name == "botsort"  # to estimate the motion of the camera
         self._frame_index: int | None = None
 
     def update(
         self, frame_index: int, instances: Sequence[Instance], frame: UInt8[np.ndarray, "H W 3"] | None = None
     ) -> list[int | None]:
-        """The identities of one frame's birds, as `Tracker` says."""
+        """Return the identities of one frame's instances, as `Tracker` describes."""
         if self._frame_index is not None:
             if frame_index <= self._frame_index:
                 raise ValueError(f"frame_index must increase, but {frame_index} follows {self._frame_index}")
             missing = (frame_index - self._frame_index) // self._step - 1
-            for _ in range(min(missing, self._memory + 1)):  # by then every track has ended
+            for _ in range(min(missing, self._memory + 1)):  # after so many frames every track has ended
                 self._tracker.update(self._detections.empty())
         self._frame_index = frame_index
         boxes = np.array([instance.box_px for instance in instances], np.float32).reshape(-1, 4)
-        found = self._detections(
+        detections = self._detections(
             xyxy=np.concatenate([boxes[:, :2], boxes[:, :2] + boxes[:, 2:]], axis=1),
             confidence=np.array([instance.score for instance in instances], np.float32),
             data={"instance": np.arange(len(instances))},
         )
-        tracked = self._tracker.update(found, frame if self._looks else None)
+        tracked = self._tracker.update(detections, frame if self._uses_picture else None)
         identities: list[int | None] = [None] * len(instances)
-        if len(tracked):  # in an order of its own, and without those that BoT-SORT leaves out
-            for instance, one in zip(tracked.data["instance"], tracked.tracker_id, strict=True):
-                identities[instance] = int(one) + 1 if one >= 0 else None
+        if len(tracked):  # the package changes the order, and BoT-SORT drops detections
+            for instance, tracker_id in zip(tracked.data["instance"], tracked.tracker_id, strict=True):
+                identities[instance] = int(tracker_id) + 1 if tracker_id >= 0 else None
         return identities
