@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxfit.data.masks import decode_mask
 from jaxfit.errors import InputError
-from jaxfit.storage.files import validate_arrays
+from jaxfit.storage.arrays import validate_arrays
 
 __all__ = ["Observations", "check_keypoints", "reorder_keypoints"]
 

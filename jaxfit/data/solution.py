@@ -15,7 +15,8 @@ from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.pose import Pose
-from jaxfit.storage.files import new_folder, validate_arrays, write_whole
+from jaxfit.storage.arrays import validate_arrays
+from jaxfit.storage.files import new_folder, write_whole
 from jaxfit.storage.npz import load_npz
 
 __all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution", "write_solution"]

@@ -15,7 +15,7 @@ from jaxfit.errors import InputError
 from jaxfit.fitting.window import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
-from jaxfit.storage.files import validate_arrays
+from jaxfit.storage.arrays import validate_arrays
 from jaxfit.storage.npz import load_npz
 
 __all__ = ["Start", "load_start"]

@@ -1,4 +1,4 @@
-"""Files and folders written whole or not at all, and arrays whose layout is checked."""
+"""Files and folders written whole or not at all."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
-
-import numpy as np
 
 from jaxfit.errors import InputError
 
@@ -21,7 +19,6 @@ __all__ = [
     "check_writable",
     "new_file",
     "new_folder",
-    "validate_arrays",
     "write_whole",
 ]
 
@@ -230,40 +227,3 @@ def _take_place(part: Path, path: Path) -> None:
         old.rename(path)
         raise
     shutil.rmtree(old, ignore_errors=True)
-
-
-def validate_arrays(values: Mapping[str, Any], layout: Mapping[str, tuple[str, Any]]) -> dict[str, np.ndarray]:
-    """Arrays of one container, read-only, with their shapes checked against each other.
-
-    Args:
-        values: name → array-like.
-        layout: name → (shape, dtype). A shape is words such as ``"N T 3"``: a number is that size, and a word
-            means one size wherever it stands.
-
-    Returns:
-        Name → a read-only copy with that dtype.
-
-    Raises:
-        ValueError: an array of another kind or shape, naming it, what was expected and what came.
-    """
-    sizes: dict[str, tuple[int, str]] = {}
-    arrays = {}
-    for name, (shape, dtype) in layout.items():
-        array, dtype = np.array(values[name]), np.dtype(dtype)
-        # an empty list has no kind of its own
-        if array.size and array.dtype.kind not in {"f": "fiu", "i": "iu"}.get(dtype.kind, dtype.kind):
-            raise ValueError(f"{name} must be of type {dtype.name}, not {array.dtype}")
-        words = shape.split()
-        if array.ndim != len(words):
-            raise ValueError(f"{name} must have shape ({', '.join(words)}), not {array.shape}")
-        for axis, (word, size) in enumerate(zip(words, array.shape, strict=True)):
-            expected, origin = (int(word), "") if word.isdigit() else sizes.setdefault(word, (size, name))
-            if size != expected:
-                why = f": {word} is {expected} in {origin}" if origin else ""
-                raise ValueError(
-                    f"{name} must have shape ({', '.join(words)}), not {array.shape}: "
-                    f"axis {axis} should be {expected}{why}"
-                )
-        arrays[name] = array if dtype.kind == "U" else array.astype(dtype)
-        arrays[name].flags.writeable = False
-    return arrays

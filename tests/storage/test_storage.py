@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from jaxfit.errors import InputError
-from jaxfit.storage.files import new_folder, validate_arrays, write_whole
+from jaxfit.storage.arrays import validate_arrays
+from jaxfit.storage.files import new_folder, write_whole
 from jaxfit.storage.npz import load_npz
 
 
