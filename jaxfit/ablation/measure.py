@@ -13,8 +13,8 @@ from jaxfit.ablation.runs import run_folder
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import load_solution
 from jaxfit.errors import InputError
+from jaxfit.evaluation.aggregation import Evaluation
 from jaxfit.evaluation.evaluate import evaluate
-from jaxfit.evaluation.figures import Evaluation
 from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.truth import read_behaviours, read_truth
 from jaxfit.progress import ProgressTask, silent

@@ -15,7 +15,7 @@ from jaxfit.data.track_quality import track_quality
 if TYPE_CHECKING:
     from jaxfit.data.observations import Observations
     from jaxfit.data.solution import Solution
-    from jaxfit.evaluation.figures import Evaluation
+    from jaxfit.evaluation.aggregation import Evaluation
 
 __all__ = [
     "breakdown_tables",
@@ -62,7 +62,7 @@ def right_aligned(*columns: str, **options: Any) -> Table:
 
 def evaluation_tables(result: Evaluation) -> list[Table]:
     """What `evaluate` found, a row for every track: in the picture, and in space where that was measured."""
-    from jaxfit.evaluation.figures import COLUMNS
+    from jaxfit.evaluation.aggregation import COLUMNS
 
     def frames(row: dict[str, float]) -> str:
         return f"{row['frames']:.0f}"
@@ -98,7 +98,7 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
 
 def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -> list[Table]:
     """What `evaluate` found, a row for every behaviour or keypoint."""
-    from jaxfit.evaluation.figures import COLUMNS, COLUMNS_KEYPOINT
+    from jaxfit.evaluation.aggregation import COLUMNS, COLUMNS_KEYPOINT
 
     if by == "keypoint":
         table = right_aligned("keypoint", "frames", *COLUMNS_KEYPOINT)

@@ -13,10 +13,10 @@ from jaxfit.data.posed import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
+from jaxfit.evaluation.aggregation import COLUMNS, COLUMNS_KEYPOINT, Evaluation, metrics_of
 from jaxfit.evaluation.bootstrap import BirdSums
-from jaxfit.evaluation.figures import COLUMNS, COLUMNS_KEYPOINT, Evaluation, figures
+from jaxfit.evaluation.keypoint_errors import correct_keypoints, squared_errors, squared_velocity_errors
 from jaxfit.evaluation.matching import match
-from jaxfit.evaluation.samples import correct_keypoints, squared_errors, squared_velocity_errors
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
@@ -112,29 +112,29 @@ def evaluate(
         unmatched &= ~spatial.measured
 
     picture = (solution.keypoints_px, observed, annotated_points)
-    samples = {
+    errors = {
         "pck@0.05": metrics.pck_per_image(*picture, true_side, 0.05)[..., None],
         "pck@0.10": metrics.pck_per_image(*picture, true_side, 0.10)[..., None],
         "iou": overlap[..., None],
         "me_p": squared_errors(*picture, own_side),
         "me_v": squared_velocity_errors(*picture, own_side, solution.frame_index),
-        **(spatial.samples() if spatial else {}),
+        **(spatial.errors() if spatial else {}),
     }
     # an image's share of one keypoint is whether it is correct
-    of_keypoints = samples | {
+    of_keypoints = errors | {
         "pck@0.05": correct_keypoints(*picture, true_side, 0.05),
         "pck@0.10": correct_keypoints(*picture, true_side, 0.10),
     }
     rows = np.flatnonzero(either.any(1)).tolist()
-    sums = BirdSums.of(solution.track_id[rows].tolist(), {name: values[rows] for name, values in samples.items()})
+    sums = BirdSums.of(solution.track_id[rows].tolist(), {name: values[rows] for name, values in errors.items()})
 
     def count(what: np.ndarray) -> float:
         return float(what.sum())
 
     return Evaluation(
-        overall=figures(samples),
+        overall=metrics_of(errors),
         tracks={
-            int(solution.track_id[n]): {"frames": count(measured[n]), **figures(samples, _only(n, measured.shape))}
+            int(solution.track_id[n]): {"frames": count(measured[n]), **metrics_of(errors, _only(n, measured.shape))}
             for n in rows
         },
         frames=int(measured.sum()),
@@ -147,14 +147,14 @@ def evaluate(
             str(name): {
                 "birds": count((either & (does == name)).any(1)),
                 "frames": count(measured & (does == name)),
-                **figures(samples, does == name),
+                **metrics_of(errors, does == name),
             }
             for name in np.unique(does[does != ""])
         },
         keypoints={
             name: {
                 "count": count(annotated_points[..., k]),
-                **figures({column: of_keypoints[column][..., k : k + 1] for column in COLUMNS_KEYPOINT}),
+                **metrics_of({column: of_keypoints[column][..., k : k + 1] for column in COLUMNS_KEYPOINT}),
             }
             for k, name in enumerate(bird.keypoint_names)
         },

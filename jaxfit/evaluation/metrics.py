@@ -12,7 +12,13 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxfit.data.masks import box_of_mask
-from jaxfit.evaluation.samples import correct_keypoints, distances, points, squared_errors, squared_velocity_errors
+from jaxfit.evaluation.keypoint_errors import (
+    correct_keypoints,
+    distances,
+    points,
+    squared_errors,
+    squared_velocity_errors,
+)
 
 __all__ = [
     "iou",

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.frame_numbers import consecutive
+
 __all__ = ["acceleration_errors", "best_scale", "crop_rotation"]
 
 
@@ -84,7 +86,7 @@ def acceleration_errors(predicted: Any, truth: Any, counted: Any, frame_index: A
     """
     predicted, truth, counted = np.asarray(predicted, np.float64), np.asarray(truth, np.float64), np.asarray(counted)
     errors = np.full(predicted.shape[:-1], np.nan)
-    steps = np.diff(np.asarray(frame_index)) == 1
+    steps = consecutive(frame_index)
     triple = counted[..., :-2] & counted[..., 1:-1] & counted[..., 2:] & steps[:-1] & steps[1:]
     difference = np.linalg.norm(np.diff(predicted - truth, 2, axis=-3), axis=-1)
     errors[..., 1:-1, :] = np.where(triple[..., None], difference, np.nan)

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
+from jaxfit.evaluation.keypoint_errors import distances
 from jaxfit.evaluation.matching import match
 from jaxfit.evaluation.metrics_3d import acceleration_errors, best_scale, crop_rotation
-from jaxfit.evaluation.samples import distances
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig, fold_bird, joint_transforms, posed_joints
 from jaxfit.model.pose import Pose
@@ -115,7 +115,7 @@ class SpatialErrors:
             ratio = _apparent_size(solution, bird) / _apparent_size(truth, truth_bird)[n, t]
         self.size_ratio = ratio * (rest if np.isfinite(rest) else 1.0)
 
-    def samples(self) -> dict[str, Float[np.ndarray, "N T _"]]:
+    def errors(self) -> dict[str, Float[np.ndarray, "N T _"]]:
         """What every bird, frame and point adds to the means; NaN where nothing is measured."""
         p, q, length = self.predicted, self.truth, self.body_length[..., None]
         seen = np.broadcast_to(self.measured[..., None], p.shape[:-1])

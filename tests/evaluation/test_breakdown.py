@@ -10,9 +10,9 @@ from support.evaluated import BIRD, N, T, sides, solution, truth
 
 from jaxfit.cli.tables import breakdown_tables, plain_json
 from jaxfit.errors import InputError
+from jaxfit.evaluation.aggregation import COLUMNS_KEYPOINT
 from jaxfit.evaluation.bootstrap import paired_ratio
 from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, Evaluation, evaluate
-from jaxfit.evaluation.figures import COLUMNS_KEYPOINT
 from jaxfit.evaluation.truth import read_behaviours
 
 K = BIRD.num_keypoints

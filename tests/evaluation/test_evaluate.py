@@ -50,6 +50,19 @@ def test_velocity_counts_neighbouring_frames_alone():
     assert evaluate(solution(keypoints_px=points), BIRD, truth()).tracks[5]["me_v"] == pytest.approx(0, abs=1e-6)
 
 
+def test_every_second_frame_has_velocity_and_acceleration():
+    """Velocity and acceleration are per frame of the file: with twice the frame numbers, all metrics stay the same."""
+    points = solution().keypoints_px.copy()
+    points[0, 1] += [6, 8]
+    moved = solution(keypoints_px=points, body_pose=solution().body_pose[:, ::-1])
+    expected = evaluate(moved, BIRD, truth(), truth_solution=solution()).overall
+    every_second = 2 * truth().frame_index
+    result, seen, poses = (dataclasses.replace(each, frame_index=every_second) for each in (moved, truth(), solution()))
+    assert expected["me_v"] > 0
+    assert expected["acceleration"] > 0
+    assert evaluate(result, BIRD, seen, truth_solution=poses).overall == expected
+
+
 def test_overlap_of_a_shifted_mesh():
     moved = solution(crop=solution().crop + np.float32([7, 0, 0]))
     seen, overlap = truth(), []

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from support.birds import pose_window, skin_by_hand, solution_of, toy_bird
 
 from jaxfit.errors import InputError
-from jaxfit.evaluation.figures import figures
+from jaxfit.evaluation.aggregation import metrics_of
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.model.pose import Pose
 
@@ -93,7 +93,7 @@ def errors(solution, truth=None, **models):
 
 
 def row_of(errors, where=None):
-    return figures(errors.samples(), where)
+    return metrics_of(errors.errors(), where)
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.4, 7.0])

@@ -171,7 +171,7 @@ def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> So
         joint_names=bird.joint_names,
         status=np.full(N, "ok"),
         loss={},
-        focal=camera.focal_px,
+        focal_px=camera.focal_px,
         crop_px=camera.size_px,
     )
 

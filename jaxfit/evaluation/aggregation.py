@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from jaxfit.evaluation.bootstrap import BirdSums, Interval
 from jaxfit.evaluation.spatial import COLUMNS_3D
 
-__all__ = ["COLUMNS", "COLUMNS_3D", "COLUMNS_KEYPOINT", "Evaluation", "figures"]
+__all__ = ["COLUMNS", "COLUMNS_3D", "COLUMNS_KEYPOINT", "Evaluation", "metrics_of"]
 
 COLUMNS = ("pck@0.05", "pck@0.10", "iou", "me_p", "me_v")
 COLUMNS_KEYPOINT = ("pck@0.05", "pck@0.10", "me_p", "me_v")
@@ -87,7 +87,7 @@ class Evaluation:
         )
 
 
-def figures(
+def metrics_of(
     samples: Mapping[str, Float[np.ndarray, "N T _"]], where: Bool[np.ndarray, "N T"] | None = None
 ) -> dict[str, float]:
     """Every metric of some samples.

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.frame_numbers import consecutive
+
 __all__ = ["correct_keypoints", "distances", "points", "squared_errors", "squared_velocity_errors"]
 
 
@@ -91,7 +93,7 @@ def squared_velocity_errors(
     frames = np.arange(T) if frame_index is None else np.asarray(frame_index)
     if frames.shape != (T,):
         raise ValueError(f"frame_index must have shape ({T},), not {frames.shape}")
-    both = visible[..., 1:, :] & visible[..., :-1, :] & (np.diff(frames) == 1)[:, None]
+    both = visible[..., 1:, :] & visible[..., :-1, :] & consecutive(frames)[:, None]
     side = _sides(longest_side, visible.shape[:-1])[..., :-1, :]
     with np.errstate(invalid="ignore"):
         squared = ((np.diff(predicted, axis=-3) - np.diff(observed, axis=-3)) ** 2).sum(-1) / side**2
