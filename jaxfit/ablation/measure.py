@@ -19,6 +19,7 @@ from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.truth import read_behaviours, read_truth
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import write_whole
+from jaxfit.storage.json_values import json_text
 
 __all__ = ["Result", "check_shared", "measure_grid"]
 
@@ -91,7 +92,7 @@ def measure_grid(
                     truth_bird=truth_bird,
                     behaviours=behaviours,
                 )
-                write_whole(path, json.dumps(found.to_dict(), indent=1).encode())
+                write_whole(path, json_text(found.to_dict(), indent=1).encode())
             try:
                 found = Evaluation.from_dict(json.loads(path.read_text(encoding="utf-8")))
                 summary = json.loads((own / "summary.json").read_text(encoding="utf-8"))

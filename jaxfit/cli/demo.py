@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from jaxfit.cli.observation_tables import matching_line, observation_tables
-from jaxfit.cli.tables import evaluation_tables, plain_json, show, track_table
+from jaxfit.cli.tables import evaluation_tables, show, track_table
 from jaxfit.config.schema import load_reconstruct_config
 from jaxfit.data.formats.scene_folder import FOOTAGE, MARKER
 from jaxfit.errors import InputError
@@ -18,6 +18,7 @@ from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.progress import terminal
 from jaxfit.simulation.scene import simulate
 from jaxfit.storage.files import check_replaceable, write_whole
+from jaxfit.storage.json_values import json_text
 
 __all__ = ["run_demo"]
 
@@ -48,7 +49,7 @@ def run_demo(folder: Path) -> Evaluation:
     solution, matching = match_tracks(done.solution, scene.truth, "overlap", scene_folder)
     result = evaluate(solution, bird, scene.truth, terminal, scene_folder, truth_solution=scene.poses)
     metrics = {"detection": seen.detection, "tracking": seen.tracking, **result.overall}
-    write_whole(folder / METRICS, plain_json(metrics).encode())
+    write_whole(folder / METRICS, json_text(metrics).encode())
     show(track_table(found, done.solution))
     for table in observation_tables(seen):
         show(table)

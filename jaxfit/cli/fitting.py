@@ -7,11 +7,12 @@ import time
 
 import numpy as np
 
-from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, plain_json, right_aligned, show
+from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, right_aligned, show
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.errors import InputError
 from jaxfit.model.files import find_bird
 from jaxfit.progress import terminal
+from jaxfit.storage.json_values import json_text
 
 __all__ = ["evaluate", "fit", "overlay"]
 
@@ -79,7 +80,7 @@ def evaluate(options: argparse.Namespace) -> None:
     )
     if options.json:
         named = {"matched_by": matching.by, "follows": matching.follows}
-        print(plain_json(result.to_dict() | named))  # noqa: T201
+        print(json_text(result.to_dict() | named))  # noqa: T201
         return
     for table in evaluation_tables(result):
         show(table)
@@ -103,7 +104,7 @@ def _evaluate_observations(options: argparse.Namespace) -> None:
     result = evaluate_observations(read_coco(options.result), read_truth(options.truth)[0], options.truth)
     if options.json:
         keypoints = {name: row._asdict() for name, row in result.keypoints.items()}
-        print(plain_json(asdict(result) | {"keypoints": keypoints}))  # noqa: T201
+        print(json_text(asdict(result) | {"keypoints": keypoints}))  # noqa: T201
         return
     for table in observation_tables(result):
         show(table)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,7 +20,6 @@ __all__ = [
     "breakdown_tables",
     "counted",
     "evaluation_tables",
-    "plain_json",
     "right_aligned",
     "show",
     "show_facts",
@@ -166,19 +164,6 @@ def show_facts(facts: dict[str, Any]) -> None:
     for key, value in facts.items():
         table.add_row(key.replace("_", " "), _fact(value))
     show(table)
-
-
-def plain_json(content: Any) -> str:
-    """JSON in which what is not a number is null."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {str(k): plain(v) for k, v in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(v) for v in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(plain(content), indent=2)
 
 
 def _figure(value: float) -> str:

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from support.evaluated import BIRD, N, T, sides, solution, truth
 
-from jaxfit.cli.tables import breakdown_tables, plain_json
+from jaxfit.cli.tables import breakdown_tables
 from jaxfit.errors import InputError
 from jaxfit.evaluation.aggregation import COLUMNS_KEYPOINT
 from jaxfit.evaluation.bootstrap import paired_ratio
 from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, Evaluation, evaluate
 from jaxfit.evaluation.truth import read_behaviours
+from jaxfit.storage.json_values import json_text
 
 K = BIRD.num_keypoints
 ACTS = {5: [(0, "stand"), (12, "preen")], 3: [(0, "walk"), (11, "stand")]}
@@ -99,10 +100,10 @@ def test_all_of_it_can_be_stored():
         evaluate(solution(valid=valid), BIRD, truth().select(tracks=[1]), **kept),  # NaN here and there
         evaluate(moved(0, 1), BIRD, truth()),
     ):
-        text = plain_json(result.to_dict())
+        text = json_text(result.to_dict())
         assert "NaN" not in text
         back = Evaluation.from_dict(json.loads(text))
-        assert plain_json(back.to_dict()) == text
+        assert json_text(back.to_dict()) == text
         assert back.sums == result.sums
         assert set(back.tracks) == set(result.tracks)
         assert back.intervals["iou"]._fields == ("low", "high")
