@@ -13,6 +13,7 @@ from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.observed import evaluate_observations
+from jaxfit.evaluation.truth import Truth
 from jaxfit.model.files import load_murre
 from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.progress import terminal
@@ -45,9 +46,10 @@ def run_demo(folder: Path) -> Evaluation:
     scene = simulate(bird, scene_folder, BIRDS, FRAMES, SIZE, seed=SEED, overwrite=True, progress=terminal)
     done = reconstruct(scene_folder / FOOTAGE, result_folder, bird, config, overwrite=True, progress=terminal)
     found = done.tracking.observations
-    seen = evaluate_observations(found, scene.truth, scene_folder)
-    solution, matching = match_tracks(done.solution, scene.truth, "overlap", scene_folder)
-    result = evaluate(solution, bird, scene.truth, terminal, scene_folder, truth_solution=scene.poses)
+    truth = Truth(scene.truth, scene.poses, source=scene_folder)
+    seen = evaluate_observations(found, truth)
+    solution, matching = match_tracks(done.solution, truth, "overlap")
+    result = evaluate(solution, bird, truth, terminal)
     metrics = {"detection": seen.detection, "tracking": seen.tracking, **result.overall}
     write_whole(folder / METRICS, json_text(metrics).encode())
     show(track_table(found, done.solution))

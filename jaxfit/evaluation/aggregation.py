@@ -1,4 +1,4 @@
-"""What an evaluation holds, and how its figures come of samples."""
+"""Aggregation of per-keypoint errors into metrics, and the metrics of one result."""
 
 from __future__ import annotations
 
@@ -16,65 +16,67 @@ from jaxfit.evaluation.spatial import COLUMNS_3D
 __all__ = ["COLUMNS", "COLUMNS_3D", "COLUMNS_KEYPOINT", "Evaluation", "metrics_of"]
 
 COLUMNS = ("pck@0.05", "pck@0.10", "iou", "me_p", "me_v")
+"""Metrics in the image."""
 COLUMNS_KEYPOINT = ("pck@0.05", "pck@0.10", "me_p", "me_v")
+"""Metrics of one keypoint."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Metrics of a result; NaN where there is nothing to measure (no mask, no two frames in a row)."""
+    """Metrics of a result. NaN where nothing is measured: no mask, no two consecutive frames."""
 
     overall: dict[str, float]
-    """COLUMNS over all birds: PCK and IoU as means over images, me_p and me_v as RMS over keypoints; with true
-    poses also COLUMNS_3D, which `SpatialErrors` defines."""
+    """COLUMNS over all birds: PCK and IoU are means over images, me_p and me_v are RMS errors over keypoints. With
+    true poses also COLUMNS_3D, which `SpatialErrors` defines."""
     tracks: dict[int, dict[str, float]]
-    """The same for every track by its id, and the number of its frames as `frames`."""
+    """Track id → the same metrics of this track, and its number of measured frames as `frames`."""
     frames: int
-    """Birds × frames measured."""
+    """Number of measured pairs of bird and frame."""
     missing: int
-    """Annotated birds × frames that the result has no pose for, also those of tracks that it lacks; they enter no
-    metric."""
+    """Number of annotated pairs of bird and frame without a pose in the result, including birds that the result
+    lacks; no metric counts them."""
     unmatched: int = 0
-    """Poses × frames of the result whose track or frame the truth lacks; they enter no metric."""
+    """Number of poses of tracks or frames that the truth lacks; no metric counts them."""
     frames_3d: int = 0
-    """Birds × frames measured in space."""
+    """Number of pairs of bird and frame with 3D errors."""
     points_3d: Literal["", "joints", "keypoints"] = ""
-    """What was measured in space; empty without true poses."""
+    """The points of the 3D errors; empty without true poses."""
     intervals: dict[str, Interval] = field(default_factory=dict)
-    """95 % intervals over birds of what is in `overall`, as `BirdSums.interval` defines them; the median of the
-    orientation, which is no mean, has none. NaN twice for fewer than two birds."""
+    """95 % intervals over birds of the metrics in `overall`, as `BirdSums.interval` defines them. The median of the
+    orientation error has no interval, since it is not a mean. NaN for fewer than two birds."""
     behaviours: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Behaviour → the same as in `overall`, the number of `birds` that show it, and of their `frames`; empty where
-    behaviours are not known. A pair of frames belongs to what the bird does in the earlier one, a triple to the
-    middle one."""
+    """Behaviour → the metrics of `overall`, the number of `birds` that show the behaviour, and the number of
+    `frames`; empty where behaviours are not known. A pair of frames belongs to the behaviour in the earlier frame, a
+    triple of frames to the behaviour in the middle frame."""
     keypoints: dict[str, dict[str, float]] = field(default_factory=dict)
-    """Keypoint → COLUMNS_KEYPOINT of this one alone, over all birds, and in how many frames it is annotated as
-    `count`."""
+    """Keypoint → COLUMNS_KEYPOINT of this keypoint over all birds, and the number of frames that annotate the
+    keypoint as `count`."""
     sums: BirdSums = field(default_factory=lambda: BirdSums((), {}, {}))
-    """What all figures over birds are made of, for `paired_ratio` of results of the same birds."""
+    """Sums per bird, from which `paired_ratio` compares results of the same birds."""
 
     def to_dict(self) -> dict[str, Any]:
-        """All of it in what JSON knows; the metrics over all birds stand at the top."""
+        """Return the content as mappings and lists for JSON; the metrics over all birds are at the top level."""
         content = asdict(self)
         return content.pop("overall") | content
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Evaluation:
-        """What `to_dict` gave, also after JSON, which makes null of NaN and text of the tracks' ids.
+        """Return the evaluation of a `to_dict`, also after JSON, where NaN is null and the track ids are text.
 
         Raises:
-            KeyError: something is missing, as in what an older version wrote.
+            KeyError: an entry is missing, as in a file of an older version.
         """
 
         def rows(name: str) -> dict[str, dict[str, float]]:
-            return {key: _numbers(row) for key, row in content[name].items()}
+            return {key: _null_to_nan(row) for key, row in content[name].items()}
 
         sums = content["sums"]
         return cls(
-            overall=_numbers({name: content[name] for name in (*COLUMNS, *COLUMNS_3D) if name in content}),
+            overall=_null_to_nan({name: content[name] for name in (*COLUMNS, *COLUMNS_3D) if name in content}),
             tracks={int(track): row for track, row in rows("tracks").items()},
             **{name: content[name] for name in ("frames", "missing", "unmatched", "frames_3d", "points_3d")},
             intervals={
-                name: Interval(*_numbers(dict(enumerate(bounds))).values())
+                name: Interval(*_null_to_nan(dict(enumerate(bounds))).values())
                 for name, bounds in content["intervals"].items()
             },
             behaviours=rows("behaviours"),
@@ -88,25 +90,25 @@ class Evaluation:
 
 
 def metrics_of(
-    samples: Mapping[str, Float[np.ndarray, "N T _"]], where: Bool[np.ndarray, "N T"] | None = None
+    errors: Mapping[str, Float[np.ndarray, "N T _"]], where: Bool[np.ndarray, "N T"] | None = None
 ) -> dict[str, float]:
-    """Every metric of some samples.
+    """Return every metric of some errors.
 
     Args:
-        samples: metric → what each bird, frame and point adds, as `BirdSums.of` takes it.
-        where: the birds and frames to take; None for all.
+        errors: metric → the error of each bird, frame and point, as `BirdSums.of` takes it; NaN does not count.
+        where: the birds and frames that count; None for all.
 
     Returns:
-        Metric → value over all of them, also the median of the orientation's errors.
+        Metric → value, and the median of the orientation errors.
     """
-    num_birds = len(next(iter(samples.values())))
-    row = BirdSums.of(range(num_birds), samples, where).values()
-    if "orientation_deg" in samples:
-        angles = samples["orientation_deg"] if where is None else samples["orientation_deg"][where]
+    num_birds = len(next(iter(errors.values())))
+    row = BirdSums.of(range(num_birds), errors, where).values()
+    if "orientation_deg" in errors:
+        angles = errors["orientation_deg"] if where is None else errors["orientation_deg"][where]
         angles = angles[np.isfinite(angles)]
         row["orientation_median_deg"] = float(np.median(angles)) if angles.size else math.nan
     return {name: row[name] for name in (*COLUMNS, *COLUMNS_3D) if name in row}
 
 
-def _numbers(row: Mapping[Any, float | None]) -> dict[Any, float]:
+def _null_to_nan(row: Mapping[Any, float | None]) -> dict[Any, float]:
     return {name: math.nan if value is None else value for name, value in row.items()}
