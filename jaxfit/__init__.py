@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.errors import InputError
     from jaxfit.evaluation.evaluate import Evaluation, evaluate
     from jaxfit.evaluation.matching import match_tracks
+    from jaxfit.evaluation.truth import Truth, read_truth
     from jaxfit.fitting.fit import fit
     from jaxfit.model.bird import Bird
     from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
@@ -43,6 +44,7 @@ __all__ = [
     "Scene",
     "Solution",
     "TrackConfig",
+    "Truth",
     "ablate",
     "contact_sheet",
     "evaluate",
@@ -59,6 +61,7 @@ __all__ = [
     "overlay",
     "overlay_frame",
     "read_coco",
+    "read_truth",
     "reconstruct",
     "save_bird",
     "save_solution",
@@ -85,6 +88,7 @@ _HOMES = {
     "errors": ("InputError",),
     "evaluation.evaluate": ("Evaluation", "evaluate"),
     "evaluation.matching": ("match_tracks",),
+    "evaluation.truth": ("Truth", "read_truth"),
     "fitting.fit": ("fit",),
     "model.bird": ("Bird",),
     "model.files": ("find_bird", "load_bird", "load_murre", "save_bird"),

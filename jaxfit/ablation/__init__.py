@@ -1,1 +1,1 @@
-"""Ablations: a grid of configs crossed, fitted in batches, measured and reported."""
+"""Ablations: every config of a grid is fitted to the same birds, measured and reported."""

@@ -1,4 +1,4 @@
-"""An ablation as a whole: what `jaxfit ablate` does."""
+"""A whole ablation: fit, measure and report every config of a grid."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Literal, NamedTuple
 from jaxfit.ablation.claims import Verdict, judge
 from jaxfit.ablation.grid import load_grid
 from jaxfit.ablation.measure import Result, check_shared, measure_grid
-from jaxfit.ablation.report import write_report
 from jaxfit.ablation.runs import claim_folder, fit_grid
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.truth import read_truth
+from jaxfit.extras import require_extra
 from jaxfit.fitting.fit import check_observations
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
@@ -21,14 +21,14 @@ __all__ = ["Ablation", "ablate"]
 
 
 class Ablation(NamedTuple):
-    """What came of a grid."""
+    """The outcome of an ablation."""
 
     results: list[Result]
-    """Of every run, in the grid's order."""
+    """One for every run, in the order of the grid."""
     verdicts: list[Verdict]
-    """Of every claim that has runs to compare."""
+    """One for every claim and metric, where the grid has runs to compare."""
     fitted: int
-    """Runs that were fitted now; the folder held the others."""
+    """Number of runs that this call fitted; the folder held the other runs."""
 
 
 def ablate(
@@ -40,36 +40,38 @@ def ablate(
     matching: Literal["auto", "ids", "overlap"] = "auto",
     progress: ProgressTask = silent,
 ) -> Ablation:
-    """Fit the same birds under every config of a grid, measure them, and write tables, a plot and a report.
+    """Fit the same birds under every config of a grid, measure the results, and write tables, a plot and a report.
 
-    Every run is stored as soon as its batch is done, and is not done again: the same call goes on where an
-    interruption left off. A term that is defined in a notebook is known to the folder by its name alone; sweep such a
-    one by `sweep`, which stores nothing.
+    Runs are stored batch by batch, and stored runs are not fitted again: after an interruption, the same call
+    continues. The folder records a term that is defined in a notebook by name only; use `sweep` for such a term, which
+    stores nothing.
 
     Args:
         observations: COCO file that all runs are fitted to.
         truth: COCO file of annotations, or the folder of a simulated scene.
-        folder: where runs and report go.
-        grid: `ablation` (the paper's) or a YAML file, see `load_grid`.
+        folder: for the runs and the report.
+        grid: `ablation` (the grid of the paper) or a YAML file, see `load_grid`.
         bird: the model; None takes the murre.
-        matching: by which tracks are matched, as `match_tracks`.
-        progress: told of every part.
+        matching: how tracks and birds are matched, see `match_tracks`.
+        progress: shows the progress of every part.
 
     Raises:
-        ModuleNotFoundError: Matplotlib or tabulate is missing (extra `report`).
-        InputError: a file that cannot be read, a grid or config that makes no sense, a truth of other birds, a folder
-            that holds something else.
+        InputError: Matplotlib or tabulate is missing (extra `report`), a file cannot be read, the grid or a config is
+            invalid, the truth and the observations share no bird, or the folder holds something else.
     """
+    require_extra("report", "ablate")
+    from jaxfit.ablation.report import write_report
+
     observations, truth, folder = Path(observations), Path(truth), Path(folder)
     crossed, bird = load_grid(grid), bird or load_murre()
-    observed = read_coco(observations)
+    observed, true = read_coco(observations), read_truth(truth)
     if matching != "overlap":
-        check_shared(observed, read_truth(truth)[0], truth)
+        check_shared(observed, true)
     check_observations(observed, bird, observations)
     inputs = {"observations": observations, "truth": truth}
     claim_folder(folder, crossed.runs, inputs, bird)
     fitted = fit_grid(observed, bird, crossed.runs, folder, progress, observations)
-    results = measure_grid(crossed.runs, folder, truth, matching, progress)
+    results = measure_grid(crossed.runs, folder, true, matching, progress)
     verdicts = judge(crossed.claims, results)
     write_report(results, verdicts, folder, inputs, bird.name)
     return Ablation(results, verdicts, fitted)

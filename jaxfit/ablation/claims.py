@@ -1,4 +1,4 @@
-"""What a grid was to show, and whether it does: runs compared in pairs, over the same birds."""
+"""Verdicts on the claims of a grid: pairs of runs compared over the same birds."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from jaxfit.evaluation.bootstrap import Ratio, paired_ratio
 __all__ = ["CLAIMED", "Verdict", "judge", "pairs_of"]
 
 CLAIMED = ("me_p", "me_v")
-"""Metrics that claims are about; lower is better."""
+"""The metrics of claims; lower is better."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One claim in one metric."""
+    """The verdict on one claim in one metric."""
 
     claim: ClaimConfig
     metric: str
     pairs: int
-    """Pairs of runs that differ in nothing but what the claim is about."""
+    """Number of pairs of runs that differ only in the keys of the claim."""
     agree: int
-    """How many of them go the claimed way."""
+    """Number of pairs in which the better run of the claim has the lower error."""
     ratio: Ratio
-    """Better over worse: geometric mean over the pairs; below 1 where the claim is right."""
+    """Error of the better over the worse run, as the geometric mean over pairs; below 1 where the claim is right."""
 
     @property
     def holds(self) -> str:
-        """`holds`, `does not hold`, or `not decided` where the interval over birds has 1 inside.
+        """The verdict: `holds`, `does not hold`, or `not decided` where the interval over birds contains 1.
 
-        A claim of harmlessness holds unless harm is shown.
+        A claim of harmlessness holds unless the interval lies above 1.
         """
         if self.ratio.high < 1:
             return "holds"
@@ -45,11 +45,12 @@ class Verdict:
 
 
 def judge(claims: Sequence[ClaimConfig], results: Sequence[Result]) -> list[Verdict]:
-    """Compare what each claim names, in every metric; claims without a pair of runs are left out."""
+    """Return the verdict on each claim in each metric; claims without a pair of runs are skipped."""
     verdicts = []
+    sums = {result.run.name: result.evaluation.sums for result in results}
+    runs = [result.run for result in results]
     for claim in claims:
-        of_run = {result.run.name: result.evaluation.sums for result in results}
-        pairs = [(of_run[a.name], of_run[b.name]) for a, b in pairs_of(claim, [result.run for result in results])]
+        pairs = [(sums[better.name], sums[worse.name]) for better, worse in pairs_of(claim, runs)]
         for metric in CLAIMED if pairs else ():
             agree = sum(better.value(metric) < worse.value(metric) for better, worse in pairs)
             verdicts.append(Verdict(claim, metric, len(pairs), agree, paired_ratio(pairs, metric)))
@@ -57,7 +58,7 @@ def judge(claims: Sequence[ClaimConfig], results: Sequence[Result]) -> list[Verd
 
 
 def pairs_of(claim: ClaimConfig, runs: Sequence[Run]) -> list[tuple[Run, Run]]:
-    """Runs that should be better, each with those that it is to be compared with."""
+    """Return the pairs (better, worse) of a claim: runs with equal values of all keys that the claim does not name."""
     named = {*claim.better, *claim.worse}
 
     def rest(run: Run) -> dict[str, Any]:

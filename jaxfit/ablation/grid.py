@@ -1,4 +1,4 @@
-"""A grid of runs: values of config keys, crossed."""
+"""A grid of runs: all combinations of values of config keys."""
 
 from __future__ import annotations
 
@@ -68,34 +68,37 @@ class GridConfig:
 
 @dataclass(frozen=True)
 class Run:
-    """One point of a grid."""
+    """One config of a grid."""
 
     name: str
-    """Made from the varied values; a folder's name."""
+    """Made from the position and the varied values; also the name of the folder of the run."""
     levels: Mapping[str, Any]
-    """The values of all keys that differ between runs, by their paths, as the grid writes them (`=path` and all)."""
+    """Path of every key that differs between runs → its value, as the grid file writes it (also as `=path`)."""
     config: FitConfig
 
     def value(self, path: str) -> Any:
-        """The value of a key in this run's config."""
+        """Return the value of a key in the config of this run."""
         return get_value(self.config, path)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid, crossed."""
+    """The runs and claims of a grid."""
 
     runs: tuple[Run, ...]
     claims: tuple[ClaimConfig, ...]
 
 
 def load_grid(source: str | Path) -> Grid:
-    """Read a grid by the name of the shipped one (`ablation`) or the path of a YAML file, and cross it.
+    """Read a grid file and return its runs and claims.
 
-    Runs that come out equal are one.
+    Runs with equal configs are merged.
+
+    Args:
+        source: `ablation`, the name of the shipped grid, or the path of a YAML file.
 
     Raises:
-        InputError: an unreadable file, an unknown key, a value that makes no sense, a cross without a run, a claim
+        InputError: the file cannot be read, a key is unknown, a value is invalid, a cross has no run, or a claim is
             about a key that does not vary.
     """
     grid = read_config(GridConfig, source, "ablation")
@@ -115,10 +118,15 @@ def load_grid(source: str | Path) -> Grid:
 
 
 def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) -> tuple[Run, ...]:
-    """A run for each point, which says by path what differs from the base; runs that come out equal are one.
+    """Return a run for each point; runs with equal configs are merged.
+
+    Args:
+        base: the config that every run starts from.
+        points: for each run, path of a config key → value that replaces the value of the base.
+        source: the grid file, for error messages.
 
     Raises:
-        InputError: an unknown key, or a value that makes no sense.
+        InputError: a key is unknown, or a value is invalid.
     """
     configs: list[FitConfig] = []
     kept: list[Mapping[str, Any]] = []
@@ -128,7 +136,7 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
         except ConfigKeyError as error:
             raise InputError(source, error.problem, error.remedy) from None
         if config in configs:
-            _logger.warning("%s: two runs are the same, kept once: %s", source, point)
+            _logger.warning("%s: two runs have the same config, one run is kept: %s", source, point)
         else:
             configs.append(config)
             kept.append(point)
@@ -152,7 +160,7 @@ def _name(values: Mapping[str, Any]) -> str:
 
 
 def short(value: Any) -> str:
-    """A value in few letters: 10000, 1e6, true."""
+    """Return a short text of a value: 10000, 1e6, true."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return str(value).lower()
     return re.sub(r"e\+?(-?)0*", r"e\1", f"{value:g}")

@@ -1,4 +1,4 @@
-"""me_p and me_v over the key that a grid sweeps, a line for each setting of the rest."""
+"""Plot of me_p and me_v over the key with the most values in a grid; one line per combination of other values."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from jaxfit.ablation.table import format_cell, heading
 
 __all__ = ["plot", "swept"]
 
-_LABELS = {"me_p": "me_p (share of the bird's longer side)", "me_v": "me_v (the same, a frame)"}
+_LABELS = {"me_p": "me_p (fraction of the bird's longer side)", "me_v": "me_v (the same fraction, per frame)"}
 _STYLES = ("-", "--", "-.", ":")
 _MARKERS = "osD^v<>Pp*"
 
 
 def plot(results: Sequence[Result]) -> bytes:
-    """A PNG with a panel each for me_p and me_v.
+    """Return a PNG with one panel for me_p and one for me_v.
 
-    The horizontal axis is the number with the most levels among the varied keys (for the paper's grid λ_vel). Runs
-    that share all other levels are joined by a line; those that stand alone are drawn as a line across. Bars are 95 %
+    The horizontal axis is the varied key with the most numbers (λ_vel for the grid of the paper). A line joins runs
+    with the same values of all other keys; a horizontal line shows a run without such partners. Bars are 95 %
     intervals over birds.
     """
     path = swept(results)
@@ -36,9 +36,9 @@ def plot(results: Sequence[Result]) -> bytes:
     figure = Figure(figsize=(12, 5.2), layout="constrained")
     panels = figure.subplots(1, len(CLAIMED))
     x_of = [_number(result, path) for result in results]
-    above = [x for x in x_of if x > 0]
-    logarithmic = bool(path and above) and max(above) >= 20 * min(above)
-    apart = 1.1 if logarithmic else 1.03
+    positive = [x for x in x_of if x > 0]
+    logarithmic = bool(path and positive) and max(positive) >= 20 * min(positive)
+    shift = 1.1 if logarithmic else 1.03
     for panel, metric in zip(panels, CLAIMED, strict=True):
         for i, (key, members) in enumerate(lines.items()):
             label = ", ".join(part for part in key if part not in common) or "all"
@@ -48,16 +48,16 @@ def plot(results: Sequence[Result]) -> bytes:
             if len(members) == 1:
                 panel.axhline(value[0], linewidth=1, alpha=0.8, **style)
                 continue
-            # side by side
-            x = np.array([_number(r, path) for r in members]) * apart ** (i - (len(lines) - 1) / 2)
+            # shifted, so that the error bars of different lines do not overlap
+            x = np.array([_number(r, path) for r in members]) * shift ** (i - (len(lines) - 1) / 2)
             order = np.argsort(x)
             error = np.abs(bounds - value)[:, order]
             marker = _MARKERS[i % len(_MARKERS)]
             panel.errorbar(x[order], value[order], error, marker=marker, markersize=4, elinewidth=0.6, **style)
         panel.set(xlabel=heading(path) if path else "run", ylabel=_LABELS[metric], title=metric)
         if logarithmic:
-            # symlog gives 0, a term that is switched off, a place to the left of the others
-            panel.set_xscale("symlog", linthresh=min(above), linscale=0.5)
+            # a logarithmic scale has no place for 0, the weight of a term that is switched off; symlog has
+            panel.set_xscale("symlog", linthresh=min(positive), linscale=0.5)
         panel.set_yscale("log")
         panel.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
         panel.yaxis.set_major_formatter("{x:g}")
@@ -72,7 +72,7 @@ def plot(results: Sequence[Result]) -> bytes:
 
 
 def swept(results: Sequence[Result]) -> str:
-    """Path of the varied key with the most numbers; an empty text where none has two."""
+    """Return the path of the varied key with the most numbers; an empty text where no key has two numbers."""
 
     def numbers(path: str) -> int:
         levels = {result.run.levels[path] for result in results}
@@ -83,4 +83,5 @@ def swept(results: Sequence[Result]) -> str:
 
 
 def _number(result: Result, path: str) -> float:
+    """Return the value of the key in this run; without a key, the position of the run."""
     return float(result.run.value(path)) if path else float(result.run.name.partition("_")[0])

@@ -1,4 +1,4 @@
-"""Everything an ablation writes for people: tables, a plot, and a page that stands alone."""
+"""The report of an ablation: tables, a plot, and one HTML page without external files."""
 
 from __future__ import annotations
 
@@ -20,47 +20,47 @@ __all__ = ["FILES", "write_report"]
 
 FILES = {
     "report.html": "everything on one page",
-    "table.txt": "the table, and what was claimed",
-    "table.md": "both for Markdown",
-    "table.tex": "the table for LaTeX (package booktabs)",
-    "table.csv": "all figures with their intervals",
-    "plot.png": "me_p and me_v",
+    "table.txt": "the table of runs and the table of claims",
+    "table.md": "both tables for Markdown",
+    "table.tex": "the table of runs for LaTeX (package booktabs)",
+    "table.csv": "all metrics with their intervals",
+    "plot.png": "plot of me_p and me_v",
 }
-"""What is written, and what it holds."""
+"""Name of each file → its content."""
 
 
 def write_report(
     results: Sequence[Result], verdicts: Sequence[Verdict], folder: Path, inputs: dict[str, Path], model: str
 ) -> None:
-    """Write FILES into the ablation's folder.
+    """Write FILES into the folder of the ablation.
 
     Args:
         results: all runs.
-        verdicts: what `judge` found; may be empty.
-        folder: the ablation's.
-        inputs: what the files are called → the files that were fitted and compared with.
-        model: the bird's name.
+        verdicts: the result of `judge`; may be empty.
+        folder: the folder of the ablation.
+        inputs: name in the report → input file.
+        model: name of the model.
     """
-    picture = plot(results)
+    png = plot(results)
 
-    def both(form: str) -> str:
+    def both_tables(form: str) -> str:
         parts = [results_table(results, form), CAPTION]
         return "\n\n".join([*parts, claims_table(verdicts, form)] if verdicts else parts) + "\n"
 
     texts = {
-        "table.txt": both("simple"),
-        "table.md": both("github"),
+        "table.txt": both_tables("simple"),
+        "table.md": both_tables("github"),
         "table.tex": results_table(results, "latex_booktabs") + "\n",
         "table.csv": results_csv(results),
-        "report.html": _page(results, verdicts, picture, inputs, model),
+        "report.html": _page(results, verdicts, png, inputs, model),
     }
     for name, text in texts.items():
         write_whole(folder / name, text.encode())
-    write_whole(folder / "plot.png", picture)
+    write_whole(folder / "plot.png", png)
 
 
 def _page(
-    results: Sequence[Result], verdicts: Sequence[Verdict], picture: bytes, inputs: dict[str, Path], model: str
+    results: Sequence[Result], verdicts: Sequence[Verdict], png: bytes, inputs: dict[str, Path], model: str
 ) -> str:
     template = (resources.files("jaxfit.ablation") / "report.html").read_text(encoding="utf-8")
     birds = max(len(result.evaluation.sums.birds) for result in results)
@@ -70,16 +70,16 @@ def _page(
     at_once = max(result.runs_at_once for result in results)
     values = {
         "title": f"{len(results)} runs, {birds} birds",
-        "what": f"Each run fits the same birds under another config: {files}; model {model}.",
+        "what": f"Each run fits the same birds with another config. Files: {files}. Model: {model}.",
         "swept": heading(swept(results)) or "runs",
         "caption": CAPTION,
-        "made": f"jaxfit {__version__}; {steps} steps a run; up to {at_once} runs at once, {minutes:.1f} minutes of "
-        f"fitting in all, {minutes / len(results):.2f} a run. Every run is a folder of results in runs/, with its "
-        "config.yaml.",
+        "made": f"jaxfit {__version__}; {steps} steps per run; up to {at_once} runs in one batch; {minutes:.1f} "
+        f"minutes for all fits, {minutes / len(results):.2f} minutes per run. The folder runs/ holds the results "
+        "and the config.yaml of every run.",
     }
     return Template(template).substitute(
         {name: html.escape(text) for name, text in values.items()},
-        claims=claims_table(verdicts, "html") if verdicts else "<p>The grid claims nothing.</p>",
+        claims=claims_table(verdicts, "html") if verdicts else "<p>The grid makes no claims.</p>",
         table=results_table(results, "html"),
-        plot=base64.b64encode(picture).decode(),
+        plot=base64.b64encode(png).decode(),
     )

@@ -1,4 +1,4 @@
-"""The runs of an ablation: planned into batches, each stored as soon as it is done, none done twice."""
+"""The runs of an ablation: fitted in batches, and stored batch by batch so that no run is fitted twice."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import hashlib
 import json
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -18,7 +18,7 @@ from jaxfit.config.schema import FitConfig
 from jaxfit.config.yaml_file import build_config, config_to_yaml
 from jaxfit.data.formats.scene_folder import TRUE_POSES, TRUTH
 from jaxfit.data.observations import Observations
-from jaxfit.data.solution import write_solution
+from jaxfit.data.solution import Solution, write_solution
 from jaxfit.errors import InputError
 from jaxfit.fitting.batch import frames_per_batch
 from jaxfit.fitting.fit import fit_runs, windows_of
@@ -29,30 +29,30 @@ from jaxfit.model.describe import model_hash
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import new_folder, write_whole
 
-__all__ = ["FRAMES_AT_ONCE", "claim_folder", "fit_grid", "plan_batches", "run_folder"]
+__all__ = ["FRAMES_AT_ONCE", "FittedBatch", "claim_folder", "fit_batches", "fit_grid", "plan_batches", "run_folder"]
 
 FRAMES_AT_ONCE = 3000
-"""Birds × frames from which on a larger batch is no faster, but loses more where it is interrupted."""
+"""Birds × frames of a batch. A larger batch is not faster, and an interruption loses more work."""
 FORMAT_VERSION = 1
 _GRID, _RUNS, _READY = "ablation.json", "runs", ".ready-"
 
 
 def run_folder(folder: Path, run: Run) -> Path:
-    """Where the result of a run lies: a folder of results."""
+    """Return the result folder of a run."""
     return folder / _RUNS / run.name
 
 
 def claim_folder(folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bird: Bird) -> None:
-    """Make a folder that of this ablation, or see that it is.
+    """Record this ablation in a new folder, or check that an existing folder belongs to this ablation.
 
     Args:
-        folder: where.
-        runs: the grid, crossed.
-        inputs: what the files are called → the files that the results depend on.
+        folder: the folder of the ablation.
+        runs: the grid.
+        inputs: name in messages → file that the results depend on.
         bird: the model.
 
     Raises:
-        InputError: the folder holds something else, or another ablation: what differs is named.
+        InputError: the folder holds something else, or another ablation; the message names the difference.
     """
     own = {
         "format_version": FORMAT_VERSION,
@@ -63,17 +63,17 @@ def claim_folder(folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bir
     path = folder / _GRID
     if not path.is_file():
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(folder, f"holds something, but no {_GRID}", "choose another --out")
+            raise InputError(folder, f"holds files, but no {_GRID}", "choose another --out")
         write_whole(path, json.dumps(own, indent=1).encode())
         return
     try:
         held = json.loads(path.read_text(encoding="utf-8"))
         differs = [name for name in own if name != "runs" and held[name] != own[name]]
-        # by meaning: a later version's config may hold keys that an earlier one did not write
-        as_before = {name: build_config(FitConfig, yaml.safe_load(text)) for name, text in held["runs"].items()}
+        # compare configs, not text: a later version may write keys that an earlier version did not have
+        held_configs = {name: build_config(FitConfig, yaml.safe_load(text)) for name, text in held["runs"].items()}
     except (OSError, ValueError, KeyError, AttributeError, yaml.YAMLError, InputError) as error:
         raise InputError(path, f"cannot be read: {error}", "choose another --out") from None
-    if as_before != {run.name: run.config for run in runs}:
+    if held_configs != {run.name: run.config for run in runs}:
         differs.insert(0, "grid")
     if differs:
         raise InputError(
@@ -82,7 +82,7 @@ def claim_folder(folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bir
 
 
 def _digest(path: Path) -> str:
-    """SHA-256 of a file, or of the truth in the folder of a simulated scene."""
+    """Return the SHA-256 of a file, or of the truth in the folder of a simulated scene."""
     digest = hashlib.sha256()
     for file in [path / TRUTH, *sorted((path / TRUE_POSES).glob("*.npz"))] if path.is_dir() else [path]:
         with file.open("rb") as opened:
@@ -91,8 +91,11 @@ def _digest(path: Path) -> str:
 
 
 def plan_batches(observations: Observations, bird: Bird, runs: Sequence[Run], source: object) -> list[list[int]]:
-    """Positions of the runs that are fitted together, batch by batch: those of one program, in the grid's order, as
-    many as the memory holds and no more than keep the cores busy."""
+    """Return the positions of the runs of every batch.
+
+    The runs of a batch share one compiled program and keep the order of the grid. The memory and ``FRAMES_AT_ONCE``
+    limit the size of a batch.
+    """
     groups: dict[Any, list[int]] = {}
     for r, run in enumerate(runs):
         groups.setdefault(config_to_yaml(compiled_part(run.config)), []).append(r)
@@ -106,6 +109,46 @@ def plan_batches(observations: Observations, bird: Bird, runs: Sequence[Run], so
     return batches
 
 
+class FittedBatch(NamedTuple):
+    """Runs that were fitted together."""
+
+    runs: list[int]
+    """Positions of the runs in the grid."""
+    solutions: list[Solution]
+    """The result of each run."""
+    seconds_per_run: float
+    """Time of the fit, divided by the number of runs."""
+
+
+def fit_batches(
+    observations: Observations,
+    bird: Bird,
+    runs: Sequence[Run],
+    progress: ProgressTask = silent,
+    stored: Collection[int] = (),
+    source: object = "observations",
+) -> Iterator[FittedBatch]:
+    """Fit the runs of a grid, batch by batch.
+
+    A batch is fitted as a whole even where some of its runs are stored, so the results of an interrupted ablation do
+    not depend on the interruption. Only batches whose runs are all stored are skipped.
+
+    Args:
+        observations: keypoints and masks.
+        bird: the model.
+        runs: the grid.
+        progress: shows the progress of every part.
+        stored: positions of the runs that are stored already.
+        source: name of the observations in error messages.
+    """
+    for batch in plan_batches(observations, bird, runs, source):
+        if not all(r in stored for r in batch):
+            began = time.perf_counter()
+            configs = [runs[r].config for r in batch]
+            solutions = fit_runs(observations, bird, configs, None, progress, source)
+            yield FittedBatch(batch, solutions, (time.perf_counter() - began) / len(batch))
+
+
 def fit_grid(
     observations: Observations,
     bird: Bird,
@@ -114,36 +157,30 @@ def fit_grid(
     progress: ProgressTask = silent,
     source: object = "observations",
 ) -> int:
-    """Fit every run that the folder does not hold yet, and store it there.
+    """Fit and store every run that the folder lacks.
 
-    A batch is always fitted as planned, so that an interrupted ablation ends with the same numbers. It is written
-    to one side and then moved in, so that a run is there as a whole or not at all, and no finished one is lost.
+    The results of a batch are written into a temporary folder and then moved, so that the folder of a run is complete
+    whenever it exists, and a stored run is never lost.
 
     Returns:
-        How many runs were fitted now.
+        The number of runs that this call fitted and stored.
     """
-    for ready in sorted(folder.glob(f"{_READY}*")):  # an interruption may have come between two moves
+    for ready in sorted(folder.glob(f"{_READY}*")):  # an interruption between two moves leaves this folder
         _move_in(ready, folder)
-    for part in folder.glob(f".{_READY}*.part"):  # or while they were written
+    for part in folder.glob(f".{_READY}*.part"):  # an interruption of the writes leaves this folder
         shutil.rmtree(part)
-    fitted = 0
-    for b, batch in enumerate(plan_batches(observations, bird, runs, source)):
-        missing = [r for r in batch if not run_folder(folder, runs[r]).is_dir()]
-        if not missing:
-            continue
-        began = time.perf_counter()
-        solutions = fit_runs(observations, bird, [runs[r].config for r in batch], None, progress, source)
-        seconds = {"fit": (time.perf_counter() - began) / len(batch)}
+    stored = {r for r, run in enumerate(runs) if run_folder(folder, run).is_dir()}
+    for b, batch in enumerate(fit_batches(observations, bird, runs, progress, stored, source)):
         ready = folder / f"{_READY}{b}"
         with new_folder(ready) as part:
-            for r, solution in zip(batch, solutions, strict=True):
-                if r in missing:
+            for r, solution in zip(batch.runs, batch.solutions, strict=True):
+                if r not in stored:
                     (part / runs[r].name).mkdir()
-                    summary = summarise(solution, bird, seconds) | {"runs_at_once": len(batch)}
+                    summary = summarise(solution, bird, {"fit": batch.seconds_per_run})
+                    summary |= {"runs_at_once": len(batch.runs)}
                     write_solution(solution, bird, config_to_yaml(runs[r].config), summary, part / runs[r].name)
         _move_in(ready, folder)
-        fitted += len(missing)
-    return fitted
+    return len(runs) - len(stored)
 
 
 def _move_in(ready: Path, folder: Path) -> None:

@@ -1,20 +1,19 @@
-"""A sweep in memory: the same birds under a few configs, for a notebook."""
+"""A sweep in memory: fit the same birds under several configs, for a notebook."""
 
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jaxfit.ablation.grid import cross
 from jaxfit.ablation.measure import Result
-from jaxfit.ablation.runs import plan_batches
+from jaxfit.ablation.runs import fit_batches
 from jaxfit.config.schema import FitConfig
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate
-from jaxfit.fitting.fit import fit_runs
+from jaxfit.evaluation.truth import Truth
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 
@@ -22,11 +21,11 @@ __all__ = ["Sweep", "sweep"]
 
 
 class Sweep(NamedTuple):
-    """What came of a sweep, run by run."""
+    """The outcome of a sweep, run by run."""
 
     solutions: list[Solution]
     results: list[Result]
-    """The runs and their figures, as `jaxfit.ablation` tabulates and plots them."""
+    """The runs and their metrics, for the tables and plots of `jaxfit.ablation`."""
 
 
 def sweep(
@@ -34,35 +33,32 @@ def sweep(
     bird: Bird,
     config: FitConfig,
     values: Mapping[str, Sequence[Any]],
-    truth: Observations,
+    truth: Truth | Observations,
     *,
-    truth_solution: Solution | None = None,
     progress: ProgressTask = silent,
 ) -> Sweep:
-    """Fit the same birds under every combination of some values, and measure each; nothing is stored.
+    """Fit the same birds under every combination of some values, and measure every result; nothing is stored.
 
-    Runs that differ only in weights, settings, step sizes or the filter are fitted at once, as one compiled program.
+    Runs that differ only in weights, hyperparameters, step sizes or the filter are fitted together, as one compiled
+    program.
 
     Args:
         observations: keypoints and masks.
         bird: the model.
-        config: what every run starts from.
-        values: path of a config key (`terms.velocity`, `filter_window`) → its values; the last key changes fastest.
-        truth: the annotations, of the same track ids.
-        truth_solution: the true poses, for errors in space, as `evaluate` takes them.
-        progress: told of every part.
+        config: the config that every run starts from.
+        values: path of a config key (`terms.velocity`, `filter_window`) → values; the last key changes fastest.
+        truth: the annotations of the same track ids, optionally with exact poses and behaviours.
+        progress: shows the progress of every part.
 
     Raises:
-        InputError: as `fit` and `evaluate`; an unknown key, or a value that makes no sense.
+        InputError: as `fit` and `evaluate`; or a key is unknown, or a value is invalid.
     """
     points = [dict(zip(values, point, strict=True)) for point in itertools.product(*values.values())]
     runs = cross(config, points, "sweep")
-    found: dict[int, tuple[Solution, Result]] = {}
-    for batch in plan_batches(observations, bird, runs, "observations"):
-        began = time.perf_counter()
-        solutions = fit_runs(observations, bird, [runs[r].config for r in batch], progress=progress)
-        seconds = (time.perf_counter() - began) / len(batch)
-        for r, solution in zip(batch, solutions, strict=True):
-            evaluation = evaluate(solution, bird, truth, progress, truth_solution=truth_solution)
-            found[r] = solution, Result(runs[r], evaluation, seconds, len(batch))
-    return Sweep(*(list(each) for each in zip(*(found[r] for r in range(len(runs))), strict=True)))
+    solutions: dict[int, Solution] = {}
+    results: dict[int, Result] = {}
+    for batch in fit_batches(observations, bird, runs, progress):
+        for r, solution in zip(batch.runs, batch.solutions, strict=True):
+            evaluation = evaluate(solution, bird, truth, progress)
+            solutions[r], results[r] = solution, Result(runs[r], evaluation, batch.seconds_per_run, len(batch.runs))
+    return Sweep([solutions[r] for r in range(len(runs))], [results[r] for r in range(len(runs))])

@@ -1,4 +1,4 @@
-"""The table of an ablation: a row a run, the best first, as text, CSV, Markdown, LaTeX and HTML."""
+"""Tables of an ablation as text, CSV, Markdown, LaTeX and HTML: one row per run, the best run first."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HEADINGS = {
     "filter_window": "median filter",
     "common_size": "common size",
 }
-"""What the paper calls some keys; all others are called by their path."""
+"""Path of a key → its name in the paper; other keys are shown by their path."""
 SHOWN: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("me_p", "me_p", lambda v: f"{v:.4f}"),
     ("me_v", "me_v", lambda v: f"{v:.4f}"),
@@ -30,21 +30,22 @@ SHOWN: tuple[tuple[str, str, Callable[[float], str]], ...] = (
     ("iou", "IoU", lambda v: f"{v:.3f}"),
     ("pck@0.05", "PCK@0.05", lambda v: f"{v:.3f}"),
 )
-"""Metrics of the table, their headings and how they are written; the first two with their intervals."""
+"""Metric, heading and number format of each column; the first two columns also show intervals."""
 CAPTION = (
-    "Sorted by me_p. me_p, me_v: RMS error of the projected keypoints' position and frame-to-frame velocity over the "
-    "longer side of the predicted mask's box; in brackets 95 % bootstrap intervals over birds. MPJPE: mean error of "
-    "joints in space, per cent of body length. Poses: birds × frames measured."
+    "Runs are sorted by me_p. me_p and me_v: RMS error of the position and of the frame-to-frame velocity of the "
+    "projected keypoints, divided by the longer side of the box of the predicted mask; brackets: 95 % bootstrap "
+    "intervals over birds. MPJPE: mean 3D error of the joints, per cent of the body length. Poses: number of measured "
+    "pairs of bird and frame."
 )
 
 
 def heading(path: str) -> str:
-    """What a varied key is called."""
+    """Return the heading of a varied key."""
     return HEADINGS.get(path, path)
 
 
 def format_cell(path: str, level: Any) -> str:
-    """A level as people read it: `yes` and `no`, a dash for a weight of 0 or a filter of one frame."""
+    """Return the text of a value: `yes` or `no` for a bool, a dash for a weight of 0 or a filter of one frame."""
     if isinstance(level, bool):
         return "yes" if level else "no"
     if isinstance(level, str) and level.startswith("="):
@@ -55,12 +56,12 @@ def format_cell(path: str, level: Any) -> str:
 
 
 def ranked(results: Sequence[Result]) -> list[Result]:
-    """The best first, by me_p; what could not be measured last."""
-    return sorted(results, key=lambda result: (math.isnan(_figure(result, "me_p")), _figure(result, "me_p")))
+    """Return the results sorted by me_p, the best first; results without me_p are last."""
+    return sorted(results, key=lambda result: (math.isnan(_metric(result, "me_p")), _metric(result, "me_p")))
 
 
 def results_table(results: Sequence[Result], form: str) -> str:
-    """The table in one of tabulate's formats: `simple`, `github`, `latex_booktabs`, `html`, …"""
+    """Return the table of runs in a format of tabulate: `simple`, `github`, `latex_booktabs`, `html`, …"""
     shown = [column for column in SHOWN if any(column[0] in result.evaluation.overall for result in results)]
     paths = list(results[0].run.levels)
     head = ["run", *map(heading, paths), *(title for _, title, _ in shown), "poses"]
@@ -68,7 +69,7 @@ def results_table(results: Sequence[Result], form: str) -> str:
         [
             result.run.name.partition("_")[0],
             *(format_cell(path, level) for path, level in result.run.levels.items()),
-            *(_written(result, *column, bounds=i < 2) for i, column in enumerate(shown)),
+            *(_cell(result, *column, bounds=i < 2) for i, column in enumerate(shown)),
             str(result.evaluation.frames),
         ]
         for result in ranked(results)
@@ -77,8 +78,8 @@ def results_table(results: Sequence[Result], form: str) -> str:
 
 
 def claims_table(verdicts: Sequence[Verdict], form: str) -> str:
-    """Each claim's verdict, in one of tabulate's formats."""
-    head = ["claim", "metric", "pairs", "agree", "better / worse", "95 % interval", "here"]
+    """Return the table of verdicts in a format of tabulate."""
+    head = ["claim", "metric", "pairs", "agree", "better / worse", "95 % interval", "verdict"]
     rows = [
         [
             verdict.claim.claim,
@@ -95,22 +96,22 @@ def claims_table(verdicts: Sequence[Verdict], form: str) -> str:
 
 
 def results_csv(results: Sequence[Result]) -> str:
-    """All figures of all runs with their intervals, the varied keys by their paths."""
+    """Return all metrics of all runs with their intervals as CSV; varied keys are named by their paths."""
     paths = list(results[0].run.levels)
     metrics = list(dict.fromkeys(name for result in results for name in result.evaluation.overall))
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
     out.writerow(["run", *paths, *(f"{m}{end}" for m in metrics for end in ("", "_low", "_high")), "poses", "missing"])
     for result in ranked(results):
-        figures = []
+        values = []
         for metric in metrics:
             bounds = result.evaluation.intervals.get(metric, (math.nan, math.nan))
-            figures += [_figure(result, metric), *bounds]
+            values += [_metric(result, metric), *bounds]
         out.writerow(
             [
                 result.run.name,
-                *(_plain(result.run, path) for path in paths),
-                *("" if math.isnan(value) else f"{value:.6g}" for value in figures),
+                *(_csv_value(result.run, path) for path in paths),
+                *("" if math.isnan(value) else f"{value:.6g}" for value in values),
                 result.evaluation.frames,
                 result.evaluation.missing,
             ]
@@ -127,8 +128,8 @@ def _alignment(rows: list[list[str]]) -> list[str]:
     return ["right" if all(row[i][:1] in "0123456789–" for row in rows) else "left" for i in range(len(rows[0]))]
 
 
-def _written(result: Result, metric: str, _title: str, write: Callable[[float], str], bounds: bool) -> str:
-    value = _figure(result, metric)
+def _cell(result: Result, metric: str, _title: str, write: Callable[[float], str], bounds: bool) -> str:
+    value = _metric(result, metric)
     if math.isnan(value):
         return "–"
     interval = result.evaluation.intervals.get(metric)
@@ -137,10 +138,10 @@ def _written(result: Result, metric: str, _title: str, write: Callable[[float], 
     return f"{write(value)} ({write(interval.low)}–{write(interval.high)})"
 
 
-def _figure(result: Result, metric: str) -> float:
+def _metric(result: Result, metric: str) -> float:
     return result.evaluation.overall.get(metric, math.nan)
 
 
-def _plain(run: Run, path: str) -> Any:
+def _csv_value(run: Run, path: str) -> Any:
     value = run.value(path)
     return str(value).lower() if isinstance(value, bool) else value

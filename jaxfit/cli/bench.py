@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from jaxfit.cli.tables import plain_json, show_facts
+from jaxfit.cli.tables import show_facts
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.extras import require_extra
 from jaxfit.model.files import find_bird
 from jaxfit.progress import terminal
 from jaxfit.storage.files import check_writable
+from jaxfit.storage.json_values import json_text
 
 __all__ = ["bench"]
 
@@ -38,7 +39,7 @@ def bench(options: argparse.Namespace) -> None:
     else:
         result = bench_fit(bird or find_bird("murre"), options.birds, options.frames, progress=terminal)
     if options.json:
-        print(plain_json(result))  # noqa: T201
+        print(json_text(result))  # noqa: T201
     else:
         # curves are for the plot and JSON
         show_facts({key: value for key, value in result.items() if not isinstance(value, dict)})

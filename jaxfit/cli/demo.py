@@ -6,18 +6,20 @@ import time
 from pathlib import Path
 
 from jaxfit.cli.observation_tables import matching_line, observation_tables
-from jaxfit.cli.tables import evaluation_tables, plain_json, show, track_table
+from jaxfit.cli.tables import evaluation_tables, show, track_table
 from jaxfit.config.schema import load_reconstruct_config
 from jaxfit.data.formats.scene_folder import FOOTAGE, MARKER
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.observed import evaluate_observations
+from jaxfit.evaluation.truth import Truth
 from jaxfit.model.files import load_murre
 from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.progress import terminal
 from jaxfit.simulation.scene import simulate
 from jaxfit.storage.files import check_replaceable, write_whole
+from jaxfit.storage.json_values import json_text
 
 __all__ = ["run_demo"]
 
@@ -44,11 +46,12 @@ def run_demo(folder: Path) -> Evaluation:
     scene = simulate(bird, scene_folder, BIRDS, FRAMES, SIZE, seed=SEED, overwrite=True, progress=terminal)
     done = reconstruct(scene_folder / FOOTAGE, result_folder, bird, config, overwrite=True, progress=terminal)
     found = done.tracking.observations
-    seen = evaluate_observations(found, scene.truth, scene_folder)
-    solution, matching = match_tracks(done.solution, scene.truth, "overlap", scene_folder)
-    result = evaluate(solution, bird, scene.truth, terminal, scene_folder, truth_solution=scene.poses)
+    truth = Truth(scene.truth, scene.poses, source=scene_folder)
+    seen = evaluate_observations(found, truth)
+    solution, matching = match_tracks(done.solution, truth, "overlap")
+    result = evaluate(solution, bird, truth, terminal)
     metrics = {"detection": seen.detection, "tracking": seen.tracking, **result.overall}
-    write_whole(folder / METRICS, plain_json(metrics).encode())
+    write_whole(folder / METRICS, json_text(metrics).encode())
     show(track_table(found, done.solution))
     for table in observation_tables(seen):
         show(table)

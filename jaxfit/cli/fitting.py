@@ -7,11 +7,12 @@ import time
 
 import numpy as np
 
-from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, plain_json, right_aligned, show
+from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, right_aligned, show
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.errors import InputError
 from jaxfit.model.files import find_bird
 from jaxfit.progress import terminal
+from jaxfit.storage.json_values import json_text
 
 __all__ = ["evaluate", "fit", "overlay"]
 
@@ -53,7 +54,7 @@ def evaluate(options: argparse.Namespace) -> None:
     from jaxfit.data.solution import load_solution
     from jaxfit.evaluation.evaluate import evaluate
     from jaxfit.evaluation.matching import match_tracks
-    from jaxfit.evaluation.truth import read_behaviours, read_truth
+    from jaxfit.evaluation.truth import read_truth
 
     if options.result.is_file():
         if options.by:
@@ -61,25 +62,15 @@ def evaluate(options: argparse.Namespace) -> None:
         _evaluate_observations(options)
         return
     solution, bird = load_solution(options.result)
-    truth, poses, truth_bird = read_truth(options.truth)
-    behaviours = read_behaviours(options.truth)
-    if options.by == "behaviour" and behaviours is None:
+    truth = read_truth(options.truth)
+    if options.by == "behaviour" and truth.behaviours is None:
         remedy = "give the folder of a simulated scene, or leave out --by behaviour"
         raise InputError(options.truth, "does not say what the birds do", remedy)
-    solution, matching = match_tracks(solution, truth, options.match, options.truth)
-    result = evaluate(
-        solution,
-        bird,
-        truth,
-        terminal,
-        options.truth,
-        truth_solution=poses,
-        truth_bird=truth_bird,
-        behaviours=behaviours,
-    )
+    solution, matching = match_tracks(solution, truth, options.match)
+    result = evaluate(solution, bird, truth, terminal)
     if options.json:
         named = {"matched_by": matching.by, "follows": matching.follows}
-        print(plain_json(result.to_dict() | named))  # noqa: T201
+        print(json_text(result.to_dict() | named))  # noqa: T201
         return
     for table in evaluation_tables(result):
         show(table)
@@ -100,10 +91,10 @@ def _evaluate_observations(options: argparse.Namespace) -> None:
     from jaxfit.evaluation.observed import evaluate_observations
     from jaxfit.evaluation.truth import read_truth
 
-    result = evaluate_observations(read_coco(options.result), read_truth(options.truth)[0], options.truth)
+    result = evaluate_observations(read_coco(options.result), read_truth(options.truth))
     if options.json:
         keypoints = {name: row._asdict() for name, row in result.keypoints.items()}
-        print(plain_json(asdict(result) | {"keypoints": keypoints}))  # noqa: T201
+        print(json_text(asdict(result) | {"keypoints": keypoints}))  # noqa: T201
         return
     for table in observation_tables(result):
         show(table)

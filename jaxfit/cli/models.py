@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from jaxfit.cli.tables import counted, plain_json, right_aligned, show, show_facts
+from jaxfit.cli.tables import counted, right_aligned, show, show_facts
 from jaxfit.errors import InputError
 from jaxfit.model.files import find_bird, save_bird
+from jaxfit.storage.json_values import json_text
 
 __all__ = ["model_import", "model_info", "model_view", "prior_learn"]
 
@@ -24,7 +25,7 @@ def model_info(options: argparse.Namespace) -> None:
 
     facts = describe_bird(find_bird(options.file))
     if options.json:
-        print(plain_json(facts))  # noqa: T201
+        print(json_text(facts))  # noqa: T201
     else:
         show_facts(facts)
 

@@ -36,7 +36,7 @@ _TRACKING = {
 def observation_tables(result: ObservationsEvaluation) -> list[Table]:
     """Birds, keypoints and tracks; no keypoints where the files share none."""
     birds = right_aligned("frames", "birds", "found", *_DETECTION.values())
-    counts = (str(result.counts[name]) for name in ("frames", "true", "found"))
+    counts = (str(result.counts[name]) for name in ("frames", "true", "detected"))
     birds.add_row(*counts, *(_share(result.detection[name]) for name in _DETECTION))
     birds.caption = (
         f"{result.compared} match from an IoU of 0.5 on; AP by score, the others of every bird in the file; mean IoU: "
@@ -69,7 +69,7 @@ def uncounted_lines(result: ObservationsEvaluation) -> list[str]:
     if counts["ignored"]:
         excused = f"; {counted(counts['excused'], 'found one')} on them" if counts["excused"] else ""
         lines.append(f"no figure counts {counted(counts['ignored'], 'bird')} hardly to be seen{excused}")
-    for name, whose in (("true_elsewhere", "the observations lack"), ("found_elsewhere", "the truth lacks")):
+    for name, whose in (("true_elsewhere", "the observations lack"), ("detected_elsewhere", "the truth lacks")):
         if counts[name]:
             lines.append(f"no figure counts {counted(counts[name], 'bird')} in frames that {whose}")
     return lines
@@ -78,8 +78,8 @@ def uncounted_lines(result: ObservationsEvaluation) -> list[str]:
 def matching_line(matching: Matching) -> str:
     """Whose track is whose, by overlap."""
     pairs = ", ".join(f"{track} → {bird}" for track, bird in matching.follows.items()) or "none"
-    strays = f"; tracks that follow nobody: {_listed(matching.strays)}" if matching.strays else ""
-    lost = f"; birds that no track follows: {_listed(matching.lost)}" if matching.lost else ""
+    strays = f"; tracks that follow nobody: {_listed(matching.unmatched)}" if matching.unmatched else ""
+    lost = f"; birds that no track follows: {_listed(matching.missed)}" if matching.missed else ""
     return f"tracks matched by overlap, named as the truth's birds: {pairs}{strays}{lost}"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,13 +14,12 @@ from jaxfit.data.track_quality import track_quality
 if TYPE_CHECKING:
     from jaxfit.data.observations import Observations
     from jaxfit.data.solution import Solution
-    from jaxfit.evaluation.figures import Evaluation
+    from jaxfit.evaluation.aggregation import Evaluation
 
 __all__ = [
     "breakdown_tables",
     "counted",
     "evaluation_tables",
-    "plain_json",
     "right_aligned",
     "show",
     "show_facts",
@@ -62,7 +60,7 @@ def right_aligned(*columns: str, **options: Any) -> Table:
 
 def evaluation_tables(result: Evaluation) -> list[Table]:
     """What `evaluate` found, a row for every track: in the picture, and in space where that was measured."""
-    from jaxfit.evaluation.figures import COLUMNS
+    from jaxfit.evaluation.aggregation import COLUMNS
 
     def frames(row: dict[str, float]) -> str:
         return f"{row['frames']:.0f}"
@@ -98,7 +96,7 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
 
 def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -> list[Table]:
     """What `evaluate` found, a row for every behaviour or keypoint."""
-    from jaxfit.evaluation.figures import COLUMNS, COLUMNS_KEYPOINT
+    from jaxfit.evaluation.aggregation import COLUMNS, COLUMNS_KEYPOINT
 
     if by == "keypoint":
         table = right_aligned("keypoint", "frames", *COLUMNS_KEYPOINT)
@@ -166,19 +164,6 @@ def show_facts(facts: dict[str, Any]) -> None:
     for key, value in facts.items():
         table.add_row(key.replace("_", " "), _fact(value))
     show(table)
-
-
-def plain_json(content: Any) -> str:
-    """JSON in which what is not a number is null."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {str(k): plain(v) for k, v in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(v) for v in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(plain(content), indent=2)
 
 
 def _figure(value: float) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -17,6 +16,7 @@ from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.pose import Pose
 from jaxfit.storage.arrays import validate_arrays
 from jaxfit.storage.files import new_folder, write_whole
+from jaxfit.storage.json_values import json_text
 from jaxfit.storage.npz import load_npz
 
 __all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution", "write_solution"]
@@ -153,7 +153,7 @@ def save_solution(
 
 def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Mapping[str, Any], folder: Path) -> None:
     """The files that `save_solution` writes, into a folder that exists: one that is still being made."""
-    summary_json = json.dumps(_plain(summary), indent=2, allow_nan=False)
+    summary_json = json_text(summary)
     arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in LAYOUT}
     terms = list(solution.loss)
     arrays["loss"] = np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
@@ -165,19 +165,6 @@ def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Ma
     write_whole(folder / _CONFIG, config_yaml.encode())
     write_whole(folder / _SUMMARY, summary_json.encode())
     save_bird(bird, folder / _MODEL)
-
-
-def _plain(value: Any) -> Any:
-    """``value`` in the types of JSON."""
-    if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
-        value = np.asarray(value).tolist()
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def load_solution(folder: str | Path) -> tuple[Solution, Bird]:

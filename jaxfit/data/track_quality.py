@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from jaxfit.data.frame_numbers import consecutive, frame_step
 from jaxfit.data.observations import Observations
 
 __all__ = ["TrackQuality", "track_quality"]
@@ -43,8 +44,8 @@ def track_quality(observations: Observations) -> list[TrackQuality]:
     Frames are consecutive where their numbers differ by the file's own step, the greatest that divides all differences.
     """
     numbers = observations.frame_index
-    step = max(int(np.gcd.reduce(np.diff(numbers))), 1) if len(numbers) > 1 else 1
-    jitter = _second_differences(observations, step)
+    step = frame_step(numbers)
+    jitter = _second_differences(observations)
     found = []
     for n in range(observations.num_tracks):
         at = np.flatnonzero(observations.present[n])
@@ -67,13 +68,13 @@ def track_quality(observations: Observations) -> list[TrackQuality]:
     return found
 
 
-def _second_differences(observations: Observations, step: int) -> Float[np.ndarray, "N M K"]:
+def _second_differences(observations: Observations) -> Float[np.ndarray, "N M K"]:
     """Length of the second difference at each of the M = T − 2 inner frames, in longer sides of the box; NaN where it
     is not known."""
     points = observations.keypoints_px.astype(np.float64)
     known = observations.confidence >= CONFIDENT
     side = observations.box_px[:, 1:-1, 2:].max(-1)
-    beside = (np.diff(observations.frame_index) == step)[None, :, None]
+    beside = consecutive(observations.frame_index)[None, :, None]
     known = known[:, :-2] & known[:, 1:-1] & known[:, 2:] & beside[:, :-1] & beside[:, 1:] & (side > 0)[..., None]
     bent = np.linalg.norm(points[:, :-2] - 2 * points[:, 1:-1] + points[:, 2:], axis=-1)
     return np.where(known, bent / np.where(side > 0, side, 1)[..., None], np.nan)

@@ -1,1 +1,1 @@
-"""How good a result is: metrics, and a result against annotations."""
+"""Evaluation: metrics of results and of observations against the truth."""

@@ -1,23 +1,25 @@
-"""How well a result agrees with annotations: over all birds, for every bird, behaviour and keypoint."""
+"""Evaluation of a result against the truth: overall, and by bird, behaviour and keypoint."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.posed import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
+from jaxfit.evaluation.aggregation import COLUMNS, COLUMNS_KEYPOINT, Evaluation, metrics_of
 from jaxfit.evaluation.bootstrap import BirdSums
-from jaxfit.evaluation.figures import COLUMNS, COLUMNS_KEYPOINT, Evaluation, figures
+from jaxfit.evaluation.keypoint_errors import correct_keypoints, squared_errors, squared_velocity_errors
 from jaxfit.evaluation.matching import match
-from jaxfit.evaluation.samples import correct_keypoints, squared_errors, squared_velocity_errors
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
+from jaxfit.evaluation.truth import Truth
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.raster.zbuffer import hard_mask
@@ -27,83 +29,57 @@ __all__ = ["COLUMNS", "COLUMNS_3D", "Evaluation", "evaluate"]
 _logger = logging.getLogger(__name__)
 
 _REMEDY = "give the annotations of the same video"
-_HARDLY = 0.05
-"""Median IoU below which a result has nothing to do with its truth, however badly it was fitted."""
+_LEAST_MEDIAN_IOU = 0.05
+"""Results with a smaller median IoU probably belong to another video: even a bad fit overlaps more."""
 
 
 def evaluate(
-    solution: Solution,
-    bird: Bird,
-    truth: Observations,
-    progress: ProgressTask = silent,
-    source: object = "truth",
-    *,
-    truth_solution: Solution | None = None,
-    truth_bird: Bird | None = None,
-    behaviours: Mapping[int, Sequence[tuple[int, str]]] | None = None,
+    solution: Solution, bird: Bird, truth: Truth | Observations, progress: ProgressTask = silent
 ) -> Evaluation:
-    """Compare a result with annotations of the same video, matched by track id and frame number.
+    """Compare a result with the truth about the same video, matched by track id and frame number.
 
-    Tracks that a tracker named are given the truth's ids by `match_tracks` first.
+    The track ids of a tracker differ from the ids of the truth; `match_tracks` replaces them.
 
     PCK counts annotated keypoints, hidden ones included, within 5 and 10 % of the longer side of the annotated mask
-    (of the box where there is no mask); IoU compares the mesh's hard mask with the annotated one, the whole bird's
-    where that is known; me_p and me_v, of the same keypoints, are relative to the longer side of the mesh's mask.
-    True poses add errors in space, also where nothing is annotated.
+    (of the box where there is no mask). IoU compares the hard mask of the mesh with the annotated mask, which is the
+    mask of the whole bird where that is known. me_p and me_v are RMS errors of the same keypoints, relative to the
+    longer side of the mask of the mesh; me_v is per frame of the result's file (see `metrics.me_v`). True poses add
+    3D errors, also for birds and frames without an annotation.
 
     Args:
         solution: the result.
-        bird: its model.
-        truth: the annotations.
-        progress: told of every bird and frame.
-        source: what the truth was read from, for messages.
-        truth_solution: the true poses, in crops that are the real camera (see `SpatialErrors`).
-        truth_bird: their model; None where it is the result's.
-        behaviours: what each true bird does, by its track id: from which frame on, beginning with the first, and
-            what (`read_behaviours`); None where that is not known.
+        bird: the model of the result.
+        truth: the annotations, optionally with exact poses and behaviours (`Truth`, `read_truth`).
+        progress: shows the progress over birds and frames.
 
     Raises:
-        InputError: other keypoints than the model's, no track and frame in common, pictures of another size, true
-            poses that are none, or a bird whose behaviour is not told.
+        InputError: the truth has other keypoints than the model, no common track and frame, images of another size,
+            exact poses that follow the birds, or no behaviour for a bird while it has behaviours of others.
     """
-    truth = check_keypoints(truth, bird.keypoint_names, source)
-    n_truth, t_truth, shared = match(solution, truth.track_id, truth.frame_index)
-    annotated = shared & truth.present[n_truth, t_truth]
-    measured = annotated & solution.valid
+    truth = Truth.of(truth)
+    source, seen = truth.source, check_keypoints(truth.observations, bird.keypoint_names, truth.source)
+    n_truth, t_truth, shared = match(solution, seen.track_id, seen.frame_index)
+    measured = shared & seen.present[n_truth, t_truth] & solution.valid
     if not measured.any():
         raise InputError(
             source,
-            f"shares no bird with the result: tracks {_some(truth.track_id)}, frames {_some(truth.frame_index)} "
+            f"shares no bird with the result: tracks {_some(seen.track_id)}, frames {_some(seen.frame_index)} "
             f"against {_some(solution.track_id)}, {_some(solution.frame_index)}",
             _REMEDY,
         )
-    _check_sizes(solution, truth, measured, (n_truth, t_truth), source)
+    _check_sizes(solution, seen, measured, (n_truth, t_truth), source)
     spatial = None
-    if truth_solution is not None:
-        spatial = SpatialErrors(solution, bird, truth_solution, truth_bird or bird, source)
+    if truth.solution is not None:
+        spatial = SpatialErrors(solution, bird, truth.solution, truth.bird or bird, source)
     either = measured if spatial is None else measured | spatial.measured
-    does = np.full(measured.shape, "") if behaviours is None else _behaviours(behaviours, solution, either, source)
-    observed = truth.keypoints_px[n_truth, t_truth]
-    annotated_points = (truth.confidence[n_truth, t_truth] > 0) & measured[..., None]
-    overlap = np.full(measured.shape, np.nan)
-    true_side, own_side = overlap.copy(), overlap.copy()
-    posed = PosedBirds(solution, bird)
-    faces = np.asarray(posed.faces)
-    with progress("Measuring", int(measured.sum())) as report_progress:
-        for n, t in np.argwhere(measured).tolist():
-            at = int(n_truth[n, 0]), int(t_truth[t])
-            mask = truth.whole_mask(*at)
-            own = hard_mask(posed.vertices_screen(n, t), faces, *truth.image_size(*at))
-            own_side[n, t] = metrics.longest_side_of_mask(own)
-            true_side[n, t] = truth.box_px[at][2:].max() if mask is None else metrics.longest_side_of_mask(mask)
-            if mask is not None:
-                overlap[n, t] = metrics.iou(own, mask)
-            report_progress(1, "")
-
-    overlaps = overlap[np.isfinite(overlap)]
-    if overlaps.size and np.median(overlaps) < _HARDLY:
+    behaviour = np.full(measured.shape, "")
+    if truth.behaviours is not None:
+        behaviour = _behaviour_of_frames(truth.behaviours, solution, either, source)
+    masks = _compare_masks(solution, bird, seen, measured, (n_truth, t_truth), progress)
+    overlaps = masks.iou[np.isfinite(masks.iou)]
+    if overlaps.size and np.median(overlaps) < _LEAST_MEDIAN_IOU:
         _logger.warning(
-            "hardly any bird of the result lies where %s has one (median IoU %.2f): is it the truth of another video?",
+            "the birds of the result hardly overlap the birds of %s (median IoU %.2f); check the video of the truth",
             source,
             np.median(overlaps),
         )
@@ -111,50 +87,54 @@ def evaluate(
     if spatial is not None:
         unmatched &= ~spatial.measured
 
-    picture = (solution.keypoints_px, observed, annotated_points)
-    samples = {
-        "pck@0.05": metrics.pck_per_image(*picture, true_side, 0.05)[..., None],
-        "pck@0.10": metrics.pck_per_image(*picture, true_side, 0.10)[..., None],
-        "iou": overlap[..., None],
-        "me_p": squared_errors(*picture, own_side),
-        "me_v": squared_velocity_errors(*picture, own_side, solution.frame_index),
-        **(spatial.samples() if spatial else {}),
+    annotated = (seen.confidence[n_truth, t_truth] > 0) & measured[..., None]
+    keypoints = (solution.keypoints_px, seen.keypoints_px[n_truth, t_truth], annotated)
+    errors = {
+        "pck@0.05": metrics.pck_per_image(*keypoints, masks.true_side_px, 0.05)[..., None],
+        "pck@0.10": metrics.pck_per_image(*keypoints, masks.true_side_px, 0.10)[..., None],
+        "iou": masks.iou[..., None],
+        "me_p": squared_errors(*keypoints, masks.predicted_side_px),
+        "me_v": squared_velocity_errors(*keypoints, masks.predicted_side_px, solution.frame_index),
+        **(spatial.errors() if spatial else {}),
     }
-    # an image's share of one keypoint is whether it is correct
-    of_keypoints = samples | {
-        "pck@0.05": correct_keypoints(*picture, true_side, 0.05),
-        "pck@0.10": correct_keypoints(*picture, true_side, 0.10),
+    # the PCK of an image with a single keypoint is 1 or 0: whether this keypoint is correct
+    errors_of_keypoints = errors | {
+        "pck@0.05": correct_keypoints(*keypoints, masks.true_side_px, 0.05),
+        "pck@0.10": correct_keypoints(*keypoints, masks.true_side_px, 0.10),
     }
     rows = np.flatnonzero(either.any(1)).tolist()
-    sums = BirdSums.of(solution.track_id[rows].tolist(), {name: values[rows] for name, values in samples.items()})
+    sums = BirdSums.of(solution.track_id[rows].tolist(), {name: values[rows] for name, values in errors.items()})
 
-    def count(what: np.ndarray) -> float:
-        return float(what.sum())
+    def count(counted: np.ndarray) -> float:
+        return float(counted.sum())
 
     return Evaluation(
-        overall=figures(samples),
+        overall=metrics_of(errors),
         tracks={
-            int(solution.track_id[n]): {"frames": count(measured[n]), **figures(samples, _only(n, measured.shape))}
+            int(solution.track_id[n]): {
+                "frames": count(measured[n]),
+                **metrics_of({name: values[n : n + 1] for name, values in errors.items()}),
+            }
             for n in rows
         },
         frames=int(measured.sum()),
-        missing=int(truth.present.sum() - measured.sum()),
+        missing=int(seen.present.sum() - measured.sum()),
         unmatched=int(unmatched.sum()),
         frames_3d=int(spatial.measured.sum()) if spatial else 0,
         points_3d=spatial.points if spatial else "",
         intervals=sums.intervals(),
         behaviours={
             str(name): {
-                "birds": count((either & (does == name)).any(1)),
-                "frames": count(measured & (does == name)),
-                **figures(samples, does == name),
+                "birds": count((either & (behaviour == name)).any(1)),
+                "frames": count(measured & (behaviour == name)),
+                **metrics_of(errors, behaviour == name),
             }
-            for name in np.unique(does[does != ""])
+            for name in np.unique(behaviour[behaviour != ""])
         },
         keypoints={
             name: {
-                "count": count(annotated_points[..., k]),
-                **figures({column: of_keypoints[column][..., k : k + 1] for column in COLUMNS_KEYPOINT}),
+                "count": count(annotated[..., k]),
+                **metrics_of({column: errors_of_keypoints[column][..., k : k + 1] for column in COLUMNS_KEYPOINT}),
             }
             for k, name in enumerate(bird.keypoint_names)
         },
@@ -162,38 +142,73 @@ def evaluate(
     )
 
 
-def _only(n: int, shape: tuple[int, ...]) -> Bool[np.ndarray, "N T"]:
-    return np.broadcast_to((np.arange(shape[0]) == n)[:, None], shape)
+class _MaskComparison(NamedTuple):
+    """NaN where nothing is measured."""
+
+    iou: Float[np.ndarray, "N T"]
+    """Of the mask of the mesh and the annotated mask."""
+    true_side_px: Float[np.ndarray, "N T"]
+    """Longer side of the annotated mask, or of the annotated box where there is no mask."""
+    predicted_side_px: Float[np.ndarray, "N T"]
+    """Longer side of the mask of the mesh."""
 
 
-def _behaviours(
+def _compare_masks(
+    solution: Solution,
+    bird: Bird,
+    seen: Observations,
+    measured: Bool[np.ndarray, "N T"],
+    at: tuple[np.ndarray, np.ndarray],
+    progress: ProgressTask,
+) -> _MaskComparison:
+    """Draw the mask of every measured mesh and compare it with the annotation at these positions of the truth."""
+    iou, true_side, predicted_side = np.full((3, *measured.shape), np.nan)
+    posed = PosedBirds(solution, bird)
+    faces = np.asarray(posed.faces)
+    with progress("Measuring", int(measured.sum())) as report_progress:
+        for n, t in np.argwhere(measured).tolist():
+            n_truth, t_truth = int(at[0][n, 0]), int(at[1][t])
+            true = seen.whole_mask(n_truth, t_truth)
+            predicted = hard_mask(posed.vertices_screen(n, t), faces, *seen.image_size(n_truth, t_truth))
+            predicted_side[n, t] = metrics.longest_side_of_mask(predicted)
+            if true is None:
+                true_side[n, t] = seen.box_px[n_truth, t_truth, 2:].max()
+            else:
+                true_side[n, t] = metrics.longest_side_of_mask(true)
+                iou[n, t] = metrics.iou(predicted, true)
+            report_progress(1, "")
+    return _MaskComparison(iou, true_side, predicted_side)
+
+
+def _behaviour_of_frames(
     behaviours: Mapping[int, Sequence[tuple[int, str]]],
     solution: Solution,
     measured: Bool[np.ndarray, "N T"],
     source: object,
 ) -> np.ndarray:
-    """What each bird does in each frame, (N, T) text; empty where nothing is measured."""
-    does = np.full(measured.shape, "", dtype=object)
+    """Return the behaviour of each bird in each frame, (N, T) text; empty where nothing is measured."""
+    behaviour = np.full(measured.shape, "", dtype=object)
     for n, track in enumerate(solution.track_id.tolist()):
         if not measured[n].any():
             continue
         if track not in behaviours:
-            raise InputError(source, f"does not say what bird {track} does", "give behaviours of all birds, or none")
+            raise InputError(source, f"has no behaviour for bird {track}", "give behaviours of all birds, or of none")
         starts, names = zip(*behaviours[track], strict=True)
         at = np.searchsorted(starts, solution.frame_index, side="right") - 1
-        does[n] = np.where(measured[n], np.array(names, dtype=object)[at], "")
-    return does
+        behaviour[n] = np.where(measured[n], np.array(names, dtype=object)[at], "")
+    return behaviour
 
 
 def _check_sizes(
-    solution: Solution, truth: Observations, measured: np.ndarray, at: tuple[np.ndarray, np.ndarray], source: object
+    solution: Solution, seen: Observations, measured: np.ndarray, at: tuple[np.ndarray, np.ndarray], source: object
 ) -> None:
+    """Raise InputError where an image of the truth has another size than the image of the result."""
     for n, t in np.argwhere(measured).tolist():
-        own, true = tuple(solution.image_size_px[n, t].tolist()), truth.image_size(int(at[0][n, 0]), int(at[1][t]))
+        own, true = tuple(solution.image_size_px[n, t].tolist()), seen.image_size(int(at[0][n, 0]), int(at[1][t]))
         if own != true:
             problem = (
-                f"has track {solution.track_id[n]}, frame {solution.frame_index[t]} in a picture of "
-                f"{true[0]}×{true[1]}, but the result was fitted to one of {own[0]}×{own[1]}"
+                f"has track {solution.track_id[n]}, frame {solution.frame_index[t]} in an image of "
+                f"{true[0]}×{true[1]} pixels, but the result was fitted to an image of {own[0]}×{own[1]}"
             )
             raise InputError(source, problem, _REMEDY)
 

@@ -1,4 +1,4 @@
-"""Which bird and frame of a result is which of the truth's: by track id or by place, and by the frame's number."""
+"""Correspondence of tracks and frames between a result and the truth: by track id or overlap, and by frame number."""
 
 from __future__ import annotations
 
@@ -6,29 +6,37 @@ import dataclasses
 from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy.optimize import linear_sum_assignment
 
+from jaxfit.data.boxes import box_iou, box_of_keypoints
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
+from jaxfit.evaluation.truth import Truth
 
-__all__ = ["Matching", "follow", "match", "match_tracks"]
+__all__ = ["Matching", "match", "match_by_overlap", "match_tracks"]
 
-NEAR = 0.5
-"""IoU of the boxes around the keypoints from which on a track is where a bird is."""
-_FEWEST = 3
-"""Annotated keypoints that a box needs."""
+LEAST_IOU = 0.5
+"""A track and a bird agree in a frame where the boxes of their keypoints have at least this IoU."""
+_LEAST_KEYPOINTS = 3
+"""Fewest annotated keypoints of a box."""
 
 
 def match(
     solution: Solution, track_id: Int[np.ndarray, "M"], frame_index: Int[np.ndarray, "L"]
 ) -> tuple[Int[np.ndarray, "N 1"], Int[np.ndarray, "T"], Bool[np.ndarray, "N T"]]:
-    """Positions in the truth of a result's tracks and frames.
+    """Return the positions in the truth of the tracks and frames of a result.
+
+    Args:
+        solution: the result, N tracks over T frames.
+        track_id: ids of the M tracks of the truth.
+        frame_index: numbers of the L frames of the truth.
 
     Returns:
-        Positions of the tracks and of the frames, which together index an (M, L, …) array of the truth as
-        (N, T, …), and whether the truth knows both; elsewhere the positions mean nothing.
+        Positions of the tracks, positions of the frames, and whether the truth has both the track and the frame.
+        Together, the positions index an (M, L, …) array of the truth as an (N, T, …) array; positions are arbitrary
+        where the truth lacks the track or the frame.
     """
     rows = {int(track): n for n, track in enumerate(track_id)}
     columns = {int(frame): t for t, frame in enumerate(frame_index)}
@@ -38,102 +46,87 @@ def match(
 
 
 class Matching(NamedTuple):
-    """Whose track is whose."""
+    """Correspondence between the tracks of a result and the birds of the truth."""
 
     by: Literal["ids", "overlap"]
+    """How the tracks were matched."""
     follows: dict[int, int]
-    """The result's track → the true track."""
-    strays: list[int]
-    """Tracks of the result that follow nobody."""
-    lost: list[int]
-    """True tracks that none of the result follows."""
+    """Track of the result → the bird that the track follows, as a track id of the truth."""
+    unmatched: list[int]
+    """Tracks of the result that follow no bird."""
+    missed: list[int]
+    """Birds of the truth that no track follows."""
 
 
 def match_tracks(
-    solution: Solution,
-    truth: Observations,
-    how: Literal["auto", "ids", "overlap"] = "auto",
-    source: object = "truth",
+    solution: Solution, truth: Truth | Observations, how: Literal["auto", "ids", "overlap"] = "auto"
 ) -> tuple[Solution, Matching]:
-    """Name the tracks of a result as the truth names the birds that they follow.
+    """Replace the track ids of a result by the ids of the birds that the tracks follow.
 
-    Tracks that were fitted to annotations have the truth's ids; those that a tracker found have ids of its own. With
-    ``auto`` the ids are believed unless some track follows another bird than the one of its id (see ``follow``), and
-    where every bird stands in a photograph of its own.
+    A fit to annotations keeps the ids of the truth; a tracker makes ids of its own. With ``auto``, tracks are matched
+    by id unless a track follows another bird than the bird with the track's id (see `match_by_overlap`). ``auto``
+    also matches photographs by id, where every bird has an image of its own.
 
     Args:
         solution: the result.
         truth: the annotations.
-        how: by which the tracks are matched.
-        source: what the truth was read from, for messages.
+        how: ``ids``, ``overlap`` or ``auto``.
 
     Returns:
-        The result with the truth's ids, for `evaluate`; strays have ids that the truth lacks. And what was matched.
+        The result with the ids of the truth, for `evaluate`, and the matching. Unmatched tracks get ids that the truth
+        does not use.
 
     Raises:
-        InputError: other keypoints than the result's, or photographs that should be matched by overlap.
+        InputError: the truth has other keypoints than the result, or photographs cannot be matched by overlap.
     """
-    own, true = solution.track_id.tolist(), truth.track_id.tolist()
+    truth = Truth.of(truth)
+    own, true = solution.track_id.tolist(), truth.observations.track_id.tolist()
     follows = {track: track for track in own if track in true}
     by: Literal["ids", "overlap"] = "ids"
-    if how == "overlap" or (how == "auto" and not truth.own_images):
-        near = follow(solution, truth, source)
-        if how == "overlap" or any(track != bird for track, bird in near.items()):
-            follows, by = near, "overlap"
-    strays = [track for track in own if track not in follows]
-    lost = [bird for bird in true if bird not in follows.values()]
+    if how == "overlap" or (how == "auto" and not truth.observations.own_images):
+        overlapping = match_by_overlap(solution, truth)
+        if how == "overlap" or any(track != bird for track, bird in overlapping.items()):
+            follows, by = overlapping, "overlap"
+    unmatched = [track for track in own if track not in follows]
+    missed = [bird for bird in true if bird not in follows.values()]
     if by == "overlap":
-        fresh = iter(range(max(true, default=0) + 1, max(true, default=0) + 1 + len(strays)))
-        names = [follows[track] if track in follows else next(fresh) for track in own]
-        solution = dataclasses.replace(solution, track_id=np.array(names, np.int64))
-    return solution, Matching(by, follows, strays, lost)
+        unused = iter(range(max(true, default=0) + 1, max(true, default=0) + 1 + len(unmatched)))
+        ids = [follows[track] if track in follows else next(unused) for track in own]
+        solution = dataclasses.replace(solution, track_id=np.array(ids, np.int64))
+    return solution, Matching(by, follows, unmatched, missed)
 
 
-def follow(solution: Solution, truth: Observations, source: object = "truth") -> dict[int, int]:
-    """Which bird each track follows, one-to-one, so that most frames agree.
+def match_by_overlap(solution: Solution, truth: Truth | Observations) -> dict[int, int]:
+    """Match tracks and birds one-to-one, such that they agree in the greatest total number of frames.
 
-    A track and a bird agree in a frame where the boxes around their keypoints have an IoU of ``NEAR`` or more: those
-    keypoints that are annotated in this frame, at least three. A track can only follow a bird with which it agrees in
-    half of the frames that have both.
+    A track and a bird agree in a frame where the boxes around their keypoints have an IoU of at least ``LEAST_IOU``.
+    Both boxes enclose the keypoints that are annotated in this frame, at least three. A track can follow a bird only
+    if the two agree in at least half of the frames that have both.
 
     Args:
         solution: the result.
         truth: the annotations.
-        source: what they were read from, for messages.
 
     Returns:
-        The result's track → the true track, for those that follow one.
+        Track of the result → bird of the truth, for the matched tracks.
 
     Raises:
-        InputError: other keypoints than the result's, or every bird in a photograph of its own.
+        InputError: the truth has other keypoints than the result, or every bird has a photograph of its own.
     """
-    truth = check_keypoints(truth, solution.keypoint_names, source)
-    if truth.own_images:
-        raise InputError(source, "holds photographs, where no bird is followed", "match the birds by their ids")
-    _, at_truth, at_own = np.intersect1d(truth.frame_index, solution.frame_index, return_indices=True)
-    annotated = truth.confidence[:, at_truth] > 0
-    boxed = annotated.sum(-1) >= _FEWEST
-    boxes = _boxes(truth.keypoints_px[:, at_truth], annotated)
-    agree = np.zeros((len(solution.track_id), truth.num_tracks), int)
-    for n, points in enumerate(solution.keypoints_px[:, at_own]):
-        both = boxed & solution.valid[n, at_own]
-        near = both & (_iou(_boxes(np.broadcast_to(points, (*annotated.shape, 2)), annotated), boxes) >= NEAR)
-        agree[n] = np.where(2 * near.sum(1) >= both.sum(1), near.sum(1), 0)
+    truth = Truth.of(truth)
+    seen = check_keypoints(truth.observations, solution.keypoint_names, truth.source)
+    if seen.own_images:
+        remedy = "match the birds by their ids"
+        raise InputError(truth.source, "holds photographs, in which no bird can be followed", remedy)
+    _, at_truth, at_own = np.intersect1d(seen.frame_index, solution.frame_index, return_indices=True)
+    annotated = seen.confidence[:, at_truth] > 0
+    has_box = annotated.sum(-1) >= _LEAST_KEYPOINTS
+    boxes_px = box_of_keypoints(seen.keypoints_px[:, at_truth], annotated)
+    agree = np.zeros((len(solution.track_id), seen.num_tracks), int)
+    for n, keypoints in enumerate(solution.keypoints_px[:, at_own]):
+        both = has_box & solution.valid[n, at_own]
+        own_boxes_px = box_of_keypoints(np.broadcast_to(keypoints, (*annotated.shape, 2)), annotated)
+        overlapping = (both & (box_iou(own_boxes_px, boxes_px) >= LEAST_IOU)).sum(1)
+        agree[n] = np.where(2 * overlapping >= both.sum(1), overlapping, 0)
     pairs = zip(*linear_sum_assignment(agree, maximize=True), strict=True)
-    return {int(solution.track_id[n]): int(truth.track_id[m]) for n, m in pairs if agree[n, m]}
-
-
-def _boxes(points: Float[np.ndarray, "M T K 2"], counted: Bool[np.ndarray, "M T K"]) -> Float[np.ndarray, "M T 4"]:
-    """Left, upper, right, lower edge."""
-    low = np.where(counted[..., None], points, np.inf).min(2)
-    high = np.where(counted[..., None], points, -np.inf).max(2)
-    return np.concatenate([low, high], axis=-1)
-
-
-def _iou(a: Float[np.ndarray, "M T 4"], b: Float[np.ndarray, "M T 4"]) -> Float[np.ndarray, "M T"]:
-    """NaN where a box is none."""
-    with np.errstate(invalid="ignore"):
-        width, height = np.moveaxis(np.minimum(a[..., 2:], b[..., 2:]) - np.maximum(a[..., :2], b[..., :2]), -1, 0)
-        shared = np.maximum(width, 0) * np.maximum(height, 0)
-        area_a, area_b = ((box[..., 2:] - box[..., :2]).prod(-1) for box in (a, b))
-        return shared / (area_a + area_b - shared)
+    return {int(solution.track_id[n]): int(seen.track_id[m]) for n, m in pairs if agree[n, m]}

@@ -1,7 +1,7 @@
-"""How close a fit is to what was seen, or to the truth. NumPy, exactly defined, one number each.
+"""Metrics of a fit against annotations or the truth: one number each, in NumPy.
 
-Leading axes (…) are images or frames, of any number. A keypoint counts where ``visible``; where nothing
-counts, the result is NaN and no warning.
+Leading axes (…) are images or frames, of any number. A keypoint counts where ``visible``; where no keypoint counts,
+the metric is NaN, without a warning.
 """
 
 from __future__ import annotations
@@ -12,7 +12,13 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxfit.data.masks import box_of_mask
-from jaxfit.evaluation.samples import correct_keypoints, distances, points, squared_errors, squared_velocity_errors
+from jaxfit.evaluation.keypoint_errors import (
+    correct_keypoints,
+    distances,
+    squared_errors,
+    squared_velocity_errors,
+    validate_points,
+)
 
 __all__ = [
     "iou",
@@ -27,15 +33,15 @@ __all__ = [
 ]
 
 
-def _mean(samples: np.ndarray) -> float:
-    counted = samples[np.isfinite(samples)]
+def _mean(errors: np.ndarray) -> float:
+    counted = errors[np.isfinite(errors)]
     return float(counted.mean()) if counted.size else float("nan")
 
 
 def pck_per_image(
     predicted_px: Any, observed_px: Any, visible: Any, longest_side_px: Any, threshold: float
 ) -> np.ndarray:
-    """Percentage of correct keypoints, for each image.
+    """Return the percentage of correct keypoints (PCK) of each image.
 
     PCK_i = |{k visible : ‖predicted_ik − observed_ik‖ ≤ threshold · side_i}| / |{k visible}|
 
@@ -46,13 +52,13 @@ def pck_per_image(
         observed_px: (…, K, 2) in the same pixels.
         visible: (…, K) bool.
         longest_side_px: (…) longest side of the bird in the same pixels.
-        threshold: share of the side, such as 0.05.
+        threshold: fraction of the side, such as 0.05.
 
     Returns:
-        (…) shares in [0, 1]; NaN where no keypoint is visible.
+        (…) fractions in [0, 1]; NaN where no keypoint is visible.
 
     Raises:
-        ValueError: shapes that do not agree.
+        ValueError: the shapes do not agree.
     """
     correct = correct_keypoints(predicted_px, observed_px, visible, longest_side_px, threshold)
     counted = np.isfinite(correct).sum(-1)
@@ -67,49 +73,49 @@ def pck(
     threshold: float,
     reduction: Literal["per_image", "pooled"] = "per_image",
 ) -> float:
-    """Percentage of correct keypoints, over all images.
+    """Return the percentage of correct keypoints (PCK) over all images.
 
-    ``per_image``: the mean of PCK_i over the images that show a keypoint. This is what AVES reports; its
-    longest side is that of the annotated mask, last minus first pixel (``longest_side_of_mask`` − 1), and its
-    comparison is <. ``pooled``: correct over visible keypoints of all images together, so that an image
-    with more keypoints weighs more.
+    ``per_image``: the mean of PCK_i over the images that show a keypoint. AVES reports this mean; there the longest
+    side is the last minus the first pixel of the annotated mask (``longest_side_of_mask`` − 1), and the comparison
+    is <. ``pooled``: the number of correct over the number of visible keypoints of all images together, so that an
+    image with more keypoints has a greater weight.
 
     Args:
         predicted_px: (…, K, 2) pixels.
         observed_px: (…, K, 2) in the same pixels.
         visible: (…, K) bool.
         longest_side_px: (…) longest side of the bird in the same pixels.
-        threshold: share of the side, such as 0.05.
-        reduction: how the images come together.
+        threshold: fraction of the side, such as 0.05.
+        reduction: how the images are combined.
 
     Returns:
-        Share in [0, 1].
+        Fraction in [0, 1].
 
     Raises:
-        ValueError: shapes that do not agree, or another reduction.
+        ValueError: the shapes do not agree, or the reduction is unknown.
 
-    Source: Wang et al. 2021, *Birds of a Feather*, the fitter's evaluation code.
+    Source: Wang et al. 2021, *Birds of a Feather*, evaluation code of the fit.
     """
     if reduction not in ("per_image", "pooled"):
         raise ValueError(f'reduction must be "per_image" or "pooled", not {reduction!r}')
-    figure = pck_per_image if reduction == "per_image" else correct_keypoints
-    return _mean(figure(predicted_px, observed_px, visible, longest_side_px, threshold))
+    errors = pck_per_image if reduction == "per_image" else correct_keypoints
+    return _mean(errors(predicted_px, observed_px, visible, longest_side_px, threshold))
 
 
 def iou(mask_a: Any, mask_b: Any) -> float:
-    """Intersection over union |A ∩ B| / |A ∪ B| of two masks; NaN where both are empty.
+    """Return the intersection over union |A ∩ B| / |A ∪ B| of two masks; NaN where both are empty.
 
     Args:
         mask_a: (H, W) bool.
         mask_b: (H, W) bool.
 
     Raises:
-        ValueError: masks of different shapes.
+        ValueError: the masks have different shapes.
     """
     mask_a, mask_b = np.asarray(mask_a, bool), np.asarray(mask_b, bool)
     if mask_a.shape != mask_b.shape:
         raise ValueError(f"mask_a and mask_b must have one shape, not {mask_a.shape} and {mask_b.shape}")
-    # a bird is small in its picture
+    # pixels outside the box need not be read: a bird is small in its image
     x, y, width, height = box_of_mask(mask_a) or (0, 0, 0, 0)
     box = slice(y, y + height), slice(x, x + width)
     both = np.count_nonzero(mask_a[box] & mask_b[box])
@@ -118,13 +124,13 @@ def iou(mask_a: Any, mask_b: Any) -> float:
 
 
 def longest_side_of_mask(mask: Any) -> float:
-    """Longest side of the mask's tight box in pixels, first and last pixel included; NaN for an empty mask.
+    """Return the longest side of the mask's tight box in pixels, both ends included; NaN for an empty mask.
 
     Args:
         mask: (H, W) bool.
 
     Raises:
-        ValueError: ``mask`` has not two dimensions.
+        ValueError: ``mask`` does not have two dimensions.
     """
     mask = np.asarray(mask, bool)
     if mask.ndim != 2:
@@ -134,11 +140,11 @@ def longest_side_of_mask(mask: Any) -> float:
 
 
 def me_p(predicted: Any, observed: Any, visible: Any, longest_side: Any) -> float:
-    """RMS error of the projected keypoints' position, as a share of the bird's size.
+    """Return the RMS error of the projected keypoints' position, as a fraction of the bird's size.
 
     me_p = √( mean over visible keypoints of ‖predicted − observed‖² / side² )
 
-    Keypoints without a finite prediction, or in a frame without a side, are left out: count them apart.
+    Keypoints without a finite prediction, or in a frame without a side, do not count.
 
     Args:
         predicted: (…, K, 2) pixels.
@@ -147,7 +153,7 @@ def me_p(predicted: Any, observed: Any, visible: Any, longest_side: Any) -> floa
         longest_side: (…) longest side of the predicted mask's box in the same pixels.
 
     Raises:
-        ValueError: shapes that do not agree.
+        ValueError: the shapes do not agree.
 
     Source: Hägerlind et al. 2024, evaluation.
     """
@@ -155,23 +161,27 @@ def me_p(predicted: Any, observed: Any, visible: Any, longest_side: Any) -> floa
 
 
 def me_v(predicted: Any, observed: Any, visible: Any, longest_side: Any, frame_index: Any = None) -> float:
-    """RMS error of the projected keypoints' frame-to-frame velocity, as a share of the bird's size.
+    """Return the RMS error of the projected keypoints' velocity, as a fraction of the bird's size per frame.
 
     v_t = (predicted_t+1 − predicted_t) − (observed_t+1 − observed_t)
     me_v = √( mean over pairs (t, t+1) of ‖v_t‖² / side_t² )
 
-    A pair counts where the keypoint is visible in both frames and the frames follow each other in the video;
-    it is divided by the side of the earlier frame. Pairs without finite predictions or side are left out.
+    Velocity is the displacement from one frame of the file to the next. In a file of every n-th frame of a video, it
+    spans n frames of the video and is not divided by n, so compare me_v only between files of the same step.
+
+    A pair counts where the keypoint is visible in both frames and the frames are consecutive: their numbers differ by
+    the step of the file (`jaxfit.data.frame_numbers.frame_step`). The error of a pair is divided by the side of the
+    earlier frame. Pairs without finite predictions or side do not count.
 
     Args:
         predicted: (…, T, K, 2) pixels.
         observed: (…, T, K, 2) in the same pixels.
         visible: (…, T, K) bool.
         longest_side: (…, T) longest side of the predicted mask's box in the same pixels.
-        frame_index: (T,) numbers of the frames in the video; None where all follow each other.
+        frame_index: (T,) numbers of the frames in the video; None where all frames are consecutive.
 
     Raises:
-        ValueError: shapes that do not agree.
+        ValueError: the shapes do not agree.
 
     Source: Hägerlind et al. 2024, evaluation.
     """
@@ -179,38 +189,38 @@ def me_v(predicted: Any, observed: Any, visible: Any, longest_side: Any, frame_i
 
 
 def mpjpe(predicted: Any, truth: Any, visible: Any = None) -> float:
-    """Mean distance between predicted and true points, in their unit.
+    """Return the mean distance between predicted and true points, in their unit.
 
     Args:
         predicted: (…, K, 3).
         truth: (…, K, 3) in the same frame and unit.
-        visible: (…, K) bool; None for all. Points that are not finite are left out.
+        visible: (…, K) bool; None for all. Points that are not finite do not count.
 
     Raises:
-        ValueError: shapes that do not agree.
+        ValueError: the shapes do not agree.
     """
     return _mean(distances(predicted, truth, visible))
 
 
 def procrustes_align(predicted: Any, truth: Any, visible: Any = None) -> np.ndarray:
-    """Predicted points after the rotation, scale and translation of each frame that brings them closest.
+    """Align the predicted points of each frame to the true points by a rotation, a scale and a translation.
 
     min over s ≥ 0, R ∈ SO(3), t of Σ_k ‖s R p_k + t − q_k‖² over the visible points.
 
     Args:
         predicted: (…, K, 3).
         truth: (…, K, 3) in any frame and unit.
-        visible: (…, K) bool; None for all. Points that are not finite are left out of the alignment.
+        visible: (…, K) bool; None for all. Points that are not finite do not enter the alignment.
 
     Returns:
-        (…, K, 3) in the truth's frame and unit; NaN in frames with fewer than three points to align.
+        (…, K, 3) in the truth's frame and unit; NaN in frames with fewer than three points.
 
     Raises:
-        ValueError: shapes that do not agree.
+        ValueError: the shapes do not agree.
 
     Source: Umeyama 1991, equations 40 to 42.
     """
-    predicted, truth, visible = points(predicted, truth, visible)
+    predicted, truth, visible = validate_points(predicted, truth, visible)
     used = visible & np.isfinite(predicted).all(-1) & np.isfinite(truth).all(-1)
     weight = used[..., None] / np.maximum(used.sum(-1), 1)[..., None, None]
     mean_p = (np.where(used[..., None], predicted, 0) * weight).sum(-2, keepdims=True)
@@ -228,14 +238,14 @@ def procrustes_align(predicted: Any, truth: Any, visible: Any = None) -> np.ndar
 
 
 def pa_mpjpe(predicted: Any, truth: Any, visible: Any = None) -> float:
-    """Mean distance after aligning each frame by ``procrustes_align``, in the truth's unit.
+    """Return the mean distance after ``procrustes_align`` of each frame, in the truth's unit.
 
     Args:
         predicted: (…, K, 3).
         truth: (…, K, 3).
-        visible: (…, K) bool; None for all. Frames with fewer than three points are left out.
+        visible: (…, K) bool; None for all. Frames with fewer than three points do not count.
 
     Raises:
-        ValueError: shapes that do not agree.
+        ValueError: the shapes do not agree.
     """
     return mpjpe(procrustes_align(predicted, truth, visible), truth, visible)

@@ -1,4 +1,4 @@
-"""How well observations of a video agree with its annotations: birds found, keypoints, tracks."""
+"""Evaluation of observations against annotations of the same video: detection, keypoints and tracking."""
 
 from __future__ import annotations
 
@@ -8,74 +8,74 @@ from typing import Literal
 import numpy as np
 
 from jaxfit.data.observations import Observations
-from jaxfit.evaluation.detection import KeypointRow, average_precision, found_keypoints, matches
+from jaxfit.evaluation.detection import KeypointRow, average_precision, keypoint_accuracy, matches
 from jaxfit.evaluation.overlap import overlap
 from jaxfit.evaluation.tracking import clear, hota, idf1
+from jaxfit.evaluation.truth import Truth
 
 __all__ = ["ObservationsEvaluation", "evaluate_observations"]
 
 
 @dataclass(frozen=True)
 class ObservationsEvaluation:
-    """Figures of observations; NaN where there is nothing to measure. All but AP take every bird of the file, whatever
-    its score."""
+    """Metrics of observations; NaN where nothing is measured. All metrics except AP count every bird of the file,
+    whatever its score."""
 
     detection: dict[str, float]
-    """``ap50``, ``ap50-95``; ``precision``, ``recall`` and ``mean_iou`` of the matches."""
+    """``ap50`` and ``ap50-95``; ``precision``, ``recall`` and ``mean_iou`` of the matches."""
     keypoints: dict[str, KeypointRow]
-    """Of the matched birds, by name, and ``all``; empty where the files share no keypoint."""
+    """Keypoint, or ``all`` → accuracy for the matched birds; empty where the files share no keypoint."""
     tracking: dict[str, float]
     """``hota``, ``deta``, ``assa``, ``mota``, ``idf1``, ``switches``, ``fragments``."""
     counts: dict[str, int]
-    """``frames`` compared; birds × frames: ``true`` and ``found`` ones that count, ``ignored`` and ``excused`` ones
-    that do not, and those that stand in frames the other file lacks: ``true_elsewhere``, ``found_elsewhere``."""
+    """``frames``: compared frames. Pairs of bird and frame: ``true`` and ``detected`` count; ``ignored`` and
+    ``excused`` do not count; ``true_elsewhere`` and ``detected_elsewhere`` are in frames that the other file lacks."""
     compared: Literal["masks", "boxes"]
-    """What the IoU is of."""
+    """The regions of the IoU."""
 
 
-def evaluate_observations(
-    observations: Observations, truth: Observations, source: object = "truth"
-) -> ObservationsEvaluation:
-    """Compare what was found in a video with annotations of it, over the frames that both hold.
+def evaluate_observations(observations: Observations, truth: Truth | Observations) -> ObservationsEvaluation:
+    """Compare the detected birds of a video with annotations of the video, over the frames that both files hold.
 
-    Birds match by the IoU of visible masks (see ``overlap``, also for birds that are ignored), one-to-one, from 0.5
-    on. The figures are defined in ``detection`` and ``tracking``.
+    Birds match one-to-one by the IoU of their visible masks, from 0.5 on. ``overlap`` also defines the ignored birds,
+    ``detection`` and ``tracking`` define the metrics.
 
     Args:
-        observations: what was found; its tracks may have any numbers.
+        observations: detected birds; their track ids are arbitrary.
         truth: the annotations.
-        source: what they were read from, for messages.
 
     Raises:
-        InputError: no frame in common, frames of another size, or photographs instead of video.
+        InputError: no common frame, frames of different sizes, or photographs instead of video.
     """
-    both = overlap(observations, truth, source)
+    truth = Truth.of(truth)
+    both = overlap(observations, truth)
     pairs = matches(both)
-    ap50, ap = average_precision(observations, truth, both)
-    true, found = int(both.true.sum()), int(both.found.sum())
-    named = (both.iou, both.true, both.found)
+    ap50, ap = average_precision(observations, truth.observations, both)
+    true, detected = int(both.true.sum()), int(both.detected.sum())
+    birds = (both.iou, both.true, both.detected)
     return ObservationsEvaluation(
         {
             "ap50": ap50,
             "ap50-95": ap,
-            "precision": len(pairs) / found if found else float("nan"),
+            "precision": len(pairs) / detected if detected else float("nan"),
             "recall": len(pairs) / true if true else float("nan"),
             "mean_iou": float(both.iou[tuple(pairs.T)].mean()) if len(pairs) else float("nan"),
         },
-        found_keypoints(observations, truth, both, pairs),
-        {**hota(*named)._asdict(), **clear(*named)._asdict(), "idf1": idf1(*named)},
+        keypoint_accuracy(observations, truth.observations, both, pairs),
+        {**hota(*birds)._asdict(), **clear(*birds)._asdict(), "idf1": idf1(*birds)},
         {
             "frames": len(both.true_frame),
             "true": true,
-            "found": found,
+            "detected": detected,
             "ignored": int(both.ignored.sum()),
             "excused": int(both.excused.sum()),
-            "true_elsewhere": _elsewhere(truth, both.true_frame),
-            "found_elsewhere": _elsewhere(observations, both.found_frame),
+            "true_elsewhere": _elsewhere(truth.observations, both.true_frame),
+            "detected_elsewhere": _elsewhere(observations, both.detected_frame),
         },
         both.kind,
     )
 
 
 def _elsewhere(observations: Observations, frames: np.ndarray) -> int:
+    """Return the number of birds in all other frames."""
     return int(observations.present.sum() - observations.present[:, frames].sum())

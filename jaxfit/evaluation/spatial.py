@@ -1,4 +1,4 @@
-"""A result against true poses: both brought into one camera frame, up to what one camera cannot know."""
+"""3D errors of a result against true poses, in one camera frame, without the position and size of the bird."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
+from jaxfit.evaluation.keypoint_errors import distances
 from jaxfit.evaluation.matching import match
 from jaxfit.evaluation.metrics_3d import acceleration_errors, best_scale, crop_rotation
-from jaxfit.evaluation.samples import distances
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig, fold_bird, joint_transforms, posed_joints
 from jaxfit.model.pose import Pose
@@ -37,46 +37,47 @@ _REMEDY = "give the truth that the simulation wrote with the scene"
 
 
 class SpatialErrors:
-    """How far a result's birds are from the true ones in space, matched by track and frame number.
+    """3D errors of the birds of a result, matched with the true birds by track id and frame number.
 
-    The true poses are a result too, whose crop is the square in which the crop's camera is the real one: its
-    centre is the principal point and focal · size / crop_px the focal length, in image pixels, the same in every
-    frame. The result's own crops follow the birds; ``crop_rotation`` turns what they hold into the true
-    camera's frame.
+    The crop of the true poses is the same in every frame, and the camera of this crop is the real camera: the centre
+    of the crop is the principal point, and focal · size / crop_px is the focal length, both in image pixels. The
+    crops of the result follow the birds; ``crop_rotation`` rotates their content into the frame of the real camera.
 
-    Then two things are taken out that no single camera sees: where the bird is (each frame's points are taken
-    relative to its root) and how large it is, since a larger bird farther away looks the same (``best_scale``,
-    one factor a track). With p and q what remains of the result and of the truth, in the truth's model units:
+    Then two quantities are removed that a single camera cannot observe. The position of the bird: the points of each
+    frame are taken relative to the root. The size of the bird, since a larger bird at a greater distance looks the
+    same: the points of a track are multiplied by one factor (``best_scale``). Let p and q be the resulting points of
+    the result and of the truth, in model units of the truth:
 
     - ``mpjpe``: mean over points and frames of ‖p − q‖;
-    - ``pa_mpjpe``: the same after the rotation, scale and translation of each frame that fit best;
-    - ``mpjpe/length``, ``pa_mpjpe/length``: the same as shares of the true bird's body length: rest distance
-      from bill_tip to tail_tip times its scale in that frame; NaN where the model has no such keypoints;
+    - ``pa_mpjpe``: the same after the best rotation, scale and translation of each frame;
+    - ``mpjpe/length``, ``pa_mpjpe/length``: the same as a fraction of the body length of the true bird, which is the
+      rest distance from bill_tip to tail_tip times the scale in this frame; NaN where the model lacks a keypoint;
     - ``orientation_deg``, ``orientation_median_deg``: mean and median over frames of the angle between the global
-      orientations, in degrees; NaN where the models have other joints, whose rest poses need not agree;
-    - ``acceleration``: mean over points and triples of successive frames of ‖Δ²p − Δ²q‖, in units per frame²;
-    - ``size_error``, ``size_bias``: mean over frames of |r − 1| and of r − 1, where r is the predicted over the true
-      apparent size: rest body length · scale · focal (image pixels) / depth of the root (rest lengths drop out
-      for one model, and are 1 where a model lacks the keypoints).
+      orientations, in degrees; NaN where the models have different joints, since their rest poses may differ;
+    - ``acceleration``: mean over points and triples of consecutive frames of ‖Δ²p − Δ²q‖, in model units per squared
+      frame of the file (``acceleration_errors``);
+    - ``size_error``, ``size_bias``: mean over frames of |r − 1| and of r − 1. r is the ratio of the predicted to the
+      true apparent size: rest body length · scale · focal (image pixels) / depth of the root. The rest lengths cancel
+      if both models are the same; they are 1 where a model lacks the keypoints.
 
-    The points are the joints, by name, where both models have the same, with joint 0 as the root; otherwise the
-    keypoints, with their mean as the root.
+    The points are the joints, matched by name, where both models have the same joints, and joint 0 is the root.
+    Otherwise the points are the keypoints, and their mean is the root.
 
     Args:
         solution: the result.
-        bird: its model.
+        bird: the model of the result.
         truth: the true poses.
-        truth_bird: their model.
-        source: what the truth was read from, for messages.
+        truth_bird: the model of the true poses.
+        source: the file or folder of the truth, for error messages.
 
     Raises:
-        InputError: no track or frame in common, other keypoints, or a truth whose crop is not one camera.
+        InputError: no common track and frame, different keypoints, or true poses without a single camera.
     """
 
     points: Literal["joints", "keypoints"]
-    """What is compared."""
+    """The points that are compared."""
     measured: Bool[np.ndarray, "N T"]
-    """Where both have a pose."""
+    """Where both the result and the truth have a pose."""
 
     def __init__(
         self, solution: Solution, bird: Bird, truth: Solution, truth_bird: Bird, source: object = "truth"
@@ -90,7 +91,7 @@ class SpatialErrors:
         self.frame_index = solution.frame_index
         principal, focal = _real_camera(truth, source)
         centre = solution.crop[..., :2] + solution.crop[..., 2:] / 2
-        R = crop_rotation(centre, principal, focal)  # here and below: NaN, or nothing, where not measured
+        R = crop_rotation(centre, principal, focal)  # here and below: arbitrary or NaN where not measured
 
         same = sorted(solution.joint_names) == sorted(truth.joint_names)
         self.points = "joints" if same else "keypoints"
@@ -115,11 +116,11 @@ class SpatialErrors:
             ratio = _apparent_size(solution, bird) / _apparent_size(truth, truth_bird)[n, t]
         self.size_ratio = ratio * (rest if np.isfinite(rest) else 1.0)
 
-    def samples(self) -> dict[str, Float[np.ndarray, "N T _"]]:
-        """What every bird, frame and point adds to the means; NaN where nothing is measured."""
+    def errors(self) -> dict[str, Float[np.ndarray, "N T _"]]:
+        """Return the errors of every bird, frame and point; a metric is their mean. NaN where nothing is measured."""
         p, q, length = self.predicted, self.truth, self.body_length[..., None]
-        seen = np.broadcast_to(self.measured[..., None], p.shape[:-1])
-        direct, aligned = distances(p, q, seen), distances(metrics.procrustes_align(p, q, seen), q, seen)
+        counted = np.broadcast_to(self.measured[..., None], p.shape[:-1])
+        direct, aligned = distances(p, q, counted), distances(metrics.procrustes_align(p, q, counted), q, counted)
 
         def of_frames(values: Float[np.ndarray, "N T"]) -> Float[np.ndarray, "N T 1"]:
             return np.where(self.measured, values, np.nan)[..., None]
@@ -137,19 +138,19 @@ class SpatialErrors:
 
 
 def _real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:
-    """Principal point and focal length of the camera that filmed, image pixels."""
+    """Return the principal point and the focal length of the real camera, image pixels."""
     crops = truth.crop[truth.valid].astype(np.float64)
     if not len(crops):
-        raise InputError(source, "its true poses are all empty", _REMEDY)
+        raise InputError(source, "its true poses are all invalid", _REMEDY)
     if not np.isfinite(crops).all() or np.ptp(crops, axis=0).max() > 1e-3 or not crops[0, 2] > 0:
         problem = "its true poses lie in crops that follow the birds, not in one camera"
-        raise InputError(source, problem, f"{_REMEDY}; another fit's result is none")
+        raise InputError(source, problem, f"{_REMEDY}; the result of a fit is no truth")
     x0, y0, size = crops[0]
     return np.array([x0 + size / 2, y0 + size / 2]), truth.focal_px * size / truth.crop_px
 
 
 def _rest_length(bird: Bird) -> float:
-    """From bill tip to tail tip at rest, model units."""
+    """Return the distance from bill tip to tail tip at rest, model units; NaN without these keypoints."""
     names = bird.keypoint_names
     if not {"bill_tip", "tail_tip"} <= set(names):
         return float("nan")
@@ -158,13 +159,13 @@ def _rest_length(bird: Bird) -> float:
 
 
 def _apparent_size(solution: Solution, bird: Bird) -> np.ndarray:
-    """Image pixels per model unit at the root, (N, T); the root turns about its own rest position."""
+    """Return the image pixels per model unit at the root, (N, T); the pose rotates about the root's rest position."""
     depth = solution.transl[..., 2] + solution.scale * float(np.asarray(bird.joints)[0, 2])
     return solution.scale * (solution.focal_px * solution.crop[..., 2] / solution.crop_px) / depth
 
 
 def _joints(solution: Solution, bird: Bird) -> np.ndarray:
-    """Joints in the camera frame of the crop, (N, T, J, 3)."""
+    """Return the joints in the camera frame of the crop, (N, T, J, 3)."""
     return np.asarray(_pose_joints(fold_bird(bird), solution.pose), np.float64)
 
 

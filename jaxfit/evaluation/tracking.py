@@ -1,7 +1,7 @@
-"""How well tracks keep to their birds: CLEAR, identity and HOTA figures. NumPy, exactly defined.
+"""Tracking metrics: CLEAR MOT, IDF1 and HOTA, in NumPy.
 
-M true and N found tracks over T frames. ``iou`` is 0 where one of the two is not there; a figure that has nothing to
-measure is NaN.
+M true and N detected tracks over T frames. ``iou`` is 0 where a bird is not present; a metric is NaN where nothing is
+measured.
 """
 
 from __future__ import annotations
@@ -12,63 +12,63 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import linear_sum_assignment
 
-from jaxfit.evaluation.overlap import MATCHED, assign
+from jaxfit.evaluation.overlap import MATCH_IOU, assign
 
 __all__ = ["Clear", "Hota", "clear", "hota", "idf1"]
 
 _ALPHAS = np.arange(1, 20) / 20
 _CONTINUED = 1000.0
-"""Outweighs every similarity of one frame."""
+"""Added to the similarity of a pair that matched in the frame before; greater than any sum of IoUs in one frame."""
 
 
 class Clear(NamedTuple):
-    """Figures of CLEAR MOT."""
+    """Metrics of CLEAR MOT."""
 
     mota: float
     """1 − (misses + false alarms + switches) / true birds: at most 1, and below 0 with more errors than birds."""
     switches: int
-    """Times that a bird is matched with another track than the last one it was matched with."""
+    """How often a bird is matched with another track than in its last match."""
     fragments: int
-    """Times that a bird is lost and found again; frames in which it is not there, or ignored, are no loss."""
+    """How often the matches of a bird are interrupted; frames in which the bird is absent or ignored do not count."""
 
 
 def clear(
     iou: Float[np.ndarray, "T M N"],
     true: Bool[np.ndarray, "T M"],
-    found: Bool[np.ndarray, "T N"],
-    at_least: float = MATCHED,
+    detected: Bool[np.ndarray, "T N"],
+    at_least: float = MATCH_IOU,
 ) -> Clear:
-    """Count misses, false alarms and switches, frame after frame.
+    """Count misses, false alarms, switches and fragments.
 
-    Pairs match from an IoU of ``at_least``; those of the frame before are kept where they still match, the others
-    are assigned with the greatest sum of IoUs.
+    Pairs match from an IoU of ``at_least`` on. Pairs of the frame before are kept where they still match; the other
+    birds are assigned with the greatest sum of IoUs.
 
     Args:
-        iou: of every true and found bird.
-        true: where the true birds are.
-        found: where the found ones are.
-        at_least: IoU.
+        iou: IoU of every true and detected bird.
+        true: where the true birds are present.
+        detected: where the detected birds are present.
+        at_least: least IoU of a match.
 
     Source: Bernardin and Stiefelhagen 2008, *Evaluating Multiple Object Tracking Performance: The CLEAR MOT
-    Metrics*; fragments: Li et al. 2009, *Learning to Associate*; what goes on from the frame before, as in the code
-    of the MOTChallenge (TrackEval): a frame without any true or found bird breaks nothing.
+    Metrics*; fragments: Li et al. 2009, *Learning to Associate*. Pairs are kept as in the code
+    of the MOTChallenge (TrackEval): a frame without any true or any detected bird interrupts no pair.
     """
     matched = np.zeros(true.shape, bool)
     before, last = np.full(true.shape[1], -1), np.full(true.shape[1], -1)
     switches = 0
-    for t in np.flatnonzero(true.any(1) & found.any(1)):
-        goes_on = (before[:, None] == np.arange(found.shape[1])) & (iou[t] >= at_least)
-        rows, columns = assign(iou[t] + _CONTINUED * goes_on, at_least)
+    for t in np.flatnonzero(true.any(1) & detected.any(1)):
+        continued = (before[:, None] == np.arange(detected.shape[1])) & (iou[t] >= at_least)
+        rows, columns = assign(iou[t] + _CONTINUED * continued, at_least)
         switches += int(((last[rows] >= 0) & (last[rows] != columns)).sum())
         before[:] = -1
         before[rows] = last[rows] = columns
         matched[t, rows] = True
-    errors = true.sum() + found.sum() - 2 * matched.sum() + switches
+    errors = true.sum() + detected.sum() - 2 * matched.sum() + switches
     mota = 1 - errors / true.sum() if true.any() else np.nan
-    return Clear(float(mota), switches, sum(_losses(matched[true[:, m], m]) for m in range(true.shape[1])))
+    return Clear(float(mota), switches, sum(_interruptions(matched[true[:, m], m]) for m in range(true.shape[1])))
 
 
-def _losses(matched: Bool[np.ndarray, "T"]) -> int:
+def _interruptions(matched: Bool[np.ndarray, "T"]) -> int:
     times = np.flatnonzero(matched)
     return int((np.diff(times) > 1).sum())
 
@@ -76,13 +76,13 @@ def _losses(matched: Bool[np.ndarray, "T"]) -> int:
 def idf1(
     iou: Float[np.ndarray, "T M N"],
     true: Bool[np.ndarray, "T M"],
-    found: Bool[np.ndarray, "T N"],
-    at_least: float = MATCHED,
+    detected: Bool[np.ndarray, "T N"],
+    at_least: float = MATCH_IOU,
 ) -> float:
-    """How much of all birds the best naming of whole tracks gets right.
+    """Return IDF1, the F1 score of the identities of whole tracks.
 
-    IDF1 = 2 IDTP / (true + found), where IDTP counts the matching frames of the one-to-one pairs of tracks that
-    have most of them.
+    IDF1 = 2 IDTP / (true + detected). IDTP is the number of matching frames of the one-to-one pairs of tracks with the
+    greatest total number of matching frames.
 
     Args: as for ``clear``.
 
@@ -90,7 +90,7 @@ def idf1(
     """
     together = (iou >= at_least).sum(0)
     right = together[linear_sum_assignment(together, maximize=True)].sum()
-    birds = true.sum() + found.sum()
+    birds = true.sum() + detected.sum()
     return float(2 * right / birds) if birds else float("nan")
 
 
@@ -100,28 +100,28 @@ class Hota(NamedTuple):
     hota: float
     """√(DetA · AssA) of each threshold."""
     deta: float
-    """Detection: matches / (true + found − matches)."""
+    """Detection: matches / (true + detected − matches)."""
     assa: float
-    """Association: over all matches, the mean share of both tracks' frames in which they match each other."""
+    """Association: mean over all matches of (frames in which the two tracks match) / (frames of either track)."""
 
 
-def hota(iou: Float[np.ndarray, "T M N"], true: Bool[np.ndarray, "T M"], found: Bool[np.ndarray, "T N"]) -> Hota:
-    """Detection and association in one figure.
+def hota(iou: Float[np.ndarray, "T M N"], true: Bool[np.ndarray, "T M"], detected: Bool[np.ndarray, "T N"]) -> Hota:
+    """Return HOTA, which combines detection and association, and both parts.
 
-    Frames are assigned by IoU times how well the two tracks agree over the whole video, which does not depend on
-    the threshold.
+    Birds are assigned in each frame by the IoU times the agreement of the two tracks over the whole video. The
+    assignment does not depend on the threshold.
 
     Args: as for ``clear``.
 
-    Source: Luiten et al. 2021, *HOTA: A Higher Order Metric for Evaluating Multi-Object Tracking*; the
-    assignment as in its code, TrackEval.
+    Source: Luiten et al. 2021, *HOTA: A Higher Order Metric for Evaluating Multi-Object Tracking*;
+    assignment as in TrackEval, the code of the authors.
     """
-    birds = true.sum() + found.sum()
+    birds = true.sum() + detected.sum()
     if not birds:
         return Hota(*[float("nan")] * 3)
-    either = iou.sum(1, keepdims=True) + iou.sum(2, keepdims=True) - iou
-    together = np.divide(iou, either, out=np.zeros_like(iou), where=either > 0).sum(0)
-    frames = true.sum(0)[:, None] + found.sum(0)
+    union = iou.sum(1, keepdims=True) + iou.sum(2, keepdims=True) - iou
+    together = np.divide(iou, union, out=np.zeros_like(iou), where=union > 0).sum(0)
+    frames = true.sum(0)[:, None] + detected.sum(0)
     agreement = together / np.maximum(frames - together, 1)
     paired = np.zeros_like(iou)
     for t in range(len(iou)):
@@ -131,6 +131,6 @@ def hota(iou: Float[np.ndarray, "T M N"], true: Bool[np.ndarray, "T M"], found: 
     for a, alpha in enumerate(_ALPHAS):
         matches = (paired >= alpha - np.finfo(float).eps).sum(0)
         deta[a] = matches.sum() / (birds - matches.sum())
-        share = matches / np.maximum(frames - matches, 1)
-        assa[a] = (matches * share).sum() / max(matches.sum(), 1)
+        fraction = matches / np.maximum(frames - matches, 1)
+        assa[a] = (matches * fraction).sum() / max(matches.sum(), 1)
     return Hota(float(np.sqrt(deta * assa).mean()), float(deta.mean()), float(assa.mean()))

@@ -1,7 +1,9 @@
-"""What a result is measured against, read from wherever it lies."""
+"""The truth that results are measured against: annotations and, where they are known, exact poses and behaviours."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from jaxfit.data.formats.coco import read_coco
@@ -12,55 +14,77 @@ from jaxfit.data.solution import Solution, load_solution
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
 
-__all__ = ["read_behaviours", "read_truth"]
+__all__ = ["Truth", "read_behaviours", "read_truth"]
 
 
-def read_truth(path: str | Path) -> tuple[Observations, Solution | None, Bird | None]:
-    """Read annotations, and true poses where there are any.
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """The truth about the birds of one video."""
+
+    observations: Observations
+    """The annotations."""
+    solution: Solution | None = None
+    """The exact poses, in crops that are the real camera (see `SpatialErrors`); None where they are not known."""
+    bird: Bird | None = None
+    """The model of the exact poses; None stands for the model of the result."""
+    behaviours: Mapping[int, Sequence[tuple[int, str]]] | None = None
+    """Track id → pairs of a first frame and the behaviour that begins there, in the order of frames; the first pair
+    begins with frame 0. None where behaviours are not known."""
+    source: object = "truth"
+    """The file or folder of the truth, for error messages."""
+
+    @classmethod
+    def of(cls, truth: Truth | Observations) -> Truth:
+        """Return the truth itself, or annotations as a truth without poses."""
+        return truth if isinstance(truth, Truth) else cls(truth)
+
+
+def read_truth(path: str | Path) -> Truth:
+    """Read the truth from a COCO file or from the folder of a simulated scene.
 
     Args:
-        path: a COCO file of annotations, or the folder of a simulated scene, which holds them as
-            ``truth.json`` and the true poses as the folder of results ``truth/``.
+        path: a COCO file of annotations; or the folder of a simulated scene, which holds the annotations as
+            ``truth.json``, the exact poses as the result folder ``truth/`` and the behaviours in ``scene.json``.
 
     Returns:
-        The annotations; the true poses and their model, or None twice for a COCO file.
+        The truth; without poses, model and behaviours for a COCO file, and without behaviours for a folder without
+        ``scene.json``.
 
     Raises:
-        InputError: no such file, a folder without truth, or files that cannot be read.
+        InputError: the file does not exist, the folder holds no truth, or a file cannot be read.
     """
     path = Path(path)
     if not path.is_dir():
-        return read_coco(path), None, None
+        return Truth(read_coco(path), source=path)
     if not (path / TRUTH).is_file():
         remedy = "give a COCO file of annotations, or the folder of a simulated scene"
         raise InputError(path, f"is a folder without {TRUTH}", remedy)
     if not (path / TRUE_POSES).is_dir():
         remedy = f"give {path / TRUTH} to compare in the image alone"
         raise InputError(path, f"holds no true poses (a folder {TRUE_POSES}/)", remedy)
-    return read_coco(path / TRUTH), *load_solution(path / TRUE_POSES)
+    return Truth(read_coco(path / TRUTH), *load_solution(path / TRUE_POSES), read_behaviours(path), path)
 
 
 def read_behaviours(path: str | Path) -> dict[int, list[tuple[int, str]]] | None:
-    """Read what each bird of a simulated scene does when.
+    """Read the behaviours of the birds of a simulated scene.
 
     Args:
         path: as for `read_truth`.
 
     Returns:
-        Track id → from which frame on, and what, in the order of frames and beginning with frame 0; None where
-        behaviours are not told: for a COCO file, or a folder without ``scene.json``.
+        As `Truth.behaviours`; None for a COCO file and for a folder without ``scene.json``.
 
     Raises:
-        InputError: a ``scene.json`` that cannot be read.
+        InputError: ``scene.json`` cannot be read.
     """
     path = Path(path)
     if not (path / MARKER).is_file():
         return None
     behaviours = {}
-    for track, told in read_json(path / MARKER)["behaviour"].entries():
-        acts = [(act["from_frame"].integer(0), act["behaviour"].text()) for act in told]
-        starts = [start for start, _ in acts]
+    for track, entries in read_json(path / MARKER)["behaviour"].entries():
+        pairs = [(entry["from_frame"].integer(0), entry["behaviour"].text()) for entry in entries]
+        starts = [start for start, _ in pairs]
         if not track.isdecimal() or starts[:1] != [0] or starts != sorted(set(starts)):
-            told.fail("must say for a bird's number from which frame on it does what, in order, from frame 0 on")
-        behaviours[int(track)] = acts
+            entries.fail("must be the behaviours of a track id, with from_frame increasing from 0")
+        behaviours[int(track)] = pairs
     return behaviours

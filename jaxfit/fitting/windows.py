@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfit.config.schema import FitConfig
+from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.masks import decode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
@@ -137,7 +138,7 @@ def load_targets(windows: Windows, mask_px: int) -> Targets:
 def _timeline(observations: Observations) -> Int[np.ndarray, "L"]:
     """Position of every frame number from first to last, in the file's own step; −1 where it has none."""
     numbers = observations.frame_index
-    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    step = frame_step(numbers)
     if len(numbers) and (numbers[-1] - numbers[0]) // step > 100 * len(numbers):
         raise InputError(
             "observations",

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.observations import Observations
 from jaxfit.data.posed import PosedBirds
 from jaxfit.data.solution import Solution
@@ -101,7 +102,7 @@ def overlay(
     check_belongs(solution, observations, video, info)
     drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
     numbers = solution.frame_index
-    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    step = frame_step(numbers)
     first, last = int(numbers[0]), int(numbers[-1])
     fps = (info.fps or FOLDER_FPS) / step
     wanted = [pair for row in sheet_pairs(solution) for pair in row]

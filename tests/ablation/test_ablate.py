@@ -1,4 +1,4 @@
-"""Ablations from end to end: table and report, going on after a kill, and what is refused."""
+"""Ablations from end to end: table and report, continuation after a kill, and rejected input."""
 
 import csv
 import json
@@ -9,11 +9,13 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import import_module
 
 import pytest
 from support.cli_files import refused
 
 from jaxfit.cli.main import main
+from jaxfit.errors import InputError
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -67,7 +69,7 @@ def test_the_table_is_that_of_its_runs(done):
     }
 
 
-def test_figures_are_those_of_evaluate(done, inputs, capsys):
+def test_metrics_are_those_of_evaluate(done, inputs, capsys):
     row = rows(done)[0]
     folder = done / "runs" / row["run"]
     capsys.readouterr()
@@ -156,6 +158,18 @@ def test_a_truth_of_other_tracks_is_refused_before_the_work(inputs, grid, tmp_pa
     path.write_text(json.dumps(content))
     words = ("shares no track", "104, 107, 109", "4, 7, 9", "--match overlap")
     refused(capsys, command(inputs, grid, tmp_path / "out", truth=path), str(path), *words)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_extra_is_one_input_error(inputs, monkeypatch, tmp_path):
+    monkeypatch.setattr("jaxfit.extras.find_spec", lambda name: None)
+    for module in ("matplotlib", "matplotlib.figure", "tabulate"):
+        monkeypatch.setitem(sys.modules, module, None)  # importing it raises ModuleNotFoundError
+    for module in ("ablate", "report", "plot", "table"):
+        monkeypatch.delitem(sys.modules, f"jaxfit.ablation.{module}", raising=False)
+    ablate = import_module("jaxfit.ablation.ablate").ablate
+    with pytest.raises(InputError, match=r"^ablate: needs Matplotlib and tabulate.*jaxfit\[report\]"):
+        ablate(inputs / "birds.json", inputs / "birds.json", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -67,7 +67,7 @@ def test_equal_runs_are_one(tmp_path, caplog):
     text = "crosses:\n  - cross: {terms.velocity: [0, 2], terms.keypoints: [100, =terms.velocity]}\n"
     text += "  - cross: {terms.velocity: [2]}"
     assert len(load_grid(grid_file(tmp_path, text)).runs) == 4
-    assert "kept once" in caplog.text
+    assert "one run is kept" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from jaxfit.ablation.grid import Run
 from jaxfit.ablation.measure import Result
 from jaxfit.ablation.table import results_table
 from jaxfit.errors import InputError
+from jaxfit.evaluation.aggregation import Evaluation
 from jaxfit.evaluation.bootstrap import Interval
-from jaxfit.evaluation.figures import Evaluation
 from jaxfit.fitting.fit import fit_runs
 from jaxfit.model.camera import Camera
 from jaxfit.simulation.detections import detect

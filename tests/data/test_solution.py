@@ -145,7 +145,7 @@ def test_a_summary_that_is_no_json_writes_nothing(tmp_path):
         ({"keypoint_names": ("a",)}, "keypoint_names must have shape .* K is 12 in keypoints_cam"),
         ({"status": ["ok"]}, "status must have shape .* N is 2"),
         ({"loss": {"mask": [1.0]}}, r"loss\[mask\] must have shape"),
-        ({"focal_px": 0}, "focal must be above 0"),
+        ({"focal_px": 0}, "focal_px must be above 0"),
         ({"crop_px": 0}, "crop_px must be 1 or more"),
         ({"scale": np.ones((N, T), complex)}, "scale must be of type float32, not complex128"),
     ],

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from support.evaluated import BIRD, N, T, sides, solution, truth
 
-from jaxfit.cli.tables import breakdown_tables, plain_json
+from jaxfit.cli.tables import breakdown_tables
 from jaxfit.errors import InputError
+from jaxfit.evaluation.aggregation import COLUMNS_KEYPOINT
 from jaxfit.evaluation.bootstrap import paired_ratio
 from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, Evaluation, evaluate
-from jaxfit.evaluation.figures import COLUMNS_KEYPOINT
-from jaxfit.evaluation.truth import read_behaviours
+from jaxfit.evaluation.truth import Truth, read_behaviours
+from jaxfit.storage.json_values import json_text
 
 K = BIRD.num_keypoints
 ACTS = {5: [(0, "stand"), (12, "preen")], 3: [(0, "walk"), (11, "stand")]}
@@ -28,7 +29,7 @@ def moved(n, t, k=slice(None), by=(6, 8)):
 
 
 def test_behaviours_are_a_partition():
-    result = evaluate(moved(0, 1), BIRD, truth(), behaviours=ACTS)
+    result = evaluate(moved(0, 1), BIRD, Truth(truth(), behaviours=ACTS))
     rows = result.behaviours
     assert [(name, row["birds"], row["frames"]) for name, row in rows.items()] == [
         ("preen", 1, 2),
@@ -45,7 +46,7 @@ def test_behaviours_are_a_partition():
 
 def test_a_pair_of_frames_belongs_to_the_behaviour_of_the_earlier_one():
     """Bird 5 preens from frame 12 on: the jump from 11 to 12 is one of the standing bird."""
-    rows = evaluate(moved(0, 2), BIRD, truth(), behaviours=ACTS).behaviours
+    rows = evaluate(moved(0, 2), BIRD, Truth(truth(), behaviours=ACTS)).behaviours
     assert math.isnan(rows["preen"]["me_v"])  # 12 and 14 are no neighbours
     # standing pairs: 10-11 and 11-12 of bird 5, 11-12 of bird 3
     assert rows["stand"]["me_v"] == pytest.approx(math.sqrt(100 / sides()[0, 1] ** 2 / 3), rel=0.02)
@@ -93,16 +94,15 @@ def test_two_results_of_the_same_birds():
 def test_all_of_it_can_be_stored():
     true = solution(crop=np.array(solution().crop))
     valid = np.array([[True] * T, [True, False, True, False]])
-    kept = {"truth_solution": true, "behaviours": ACTS}
     for result in (
-        evaluate(moved(0, 1), BIRD, truth(), **kept),
-        evaluate(solution(valid=valid), BIRD, truth().select(tracks=[1]), **kept),  # NaN here and there
+        evaluate(moved(0, 1), BIRD, Truth(truth(), true, behaviours=ACTS)),
+        evaluate(solution(valid=valid), BIRD, Truth(truth().select(tracks=[1]), true, behaviours=ACTS)),  # NaN metrics
         evaluate(moved(0, 1), BIRD, truth()),
     ):
-        text = plain_json(result.to_dict())
+        text = json_text(result.to_dict())
         assert "NaN" not in text
         back = Evaluation.from_dict(json.loads(text))
-        assert plain_json(back.to_dict()) == text
+        assert json_text(back.to_dict()) == text
         assert back.sums == result.sums
         assert set(back.tracks) == set(result.tracks)
         assert back.intervals["iou"]._fields == ("low", "high")
@@ -117,7 +117,7 @@ def test_one_bird_has_no_interval():
 
 
 def test_tables_of_behaviours_and_keypoints():
-    result = evaluate(moved(0, 1), BIRD, truth(), behaviours=ACTS, truth_solution=solution())
+    result = evaluate(moved(0, 1), BIRD, Truth(truth(), solution(), behaviours=ACTS))
     picture, space = breakdown_tables(result, "behaviour")
     assert list(picture.columns[0].cells) == list(space.columns[0].cells) == ["preen", "stand", "walk"]
     assert list(picture.columns[2].cells) == ["2", "5", "1"]
@@ -127,9 +127,9 @@ def test_tables_of_behaviours_and_keypoints():
 
 
 def test_a_bird_that_does_nothing_known():
-    with pytest.raises(InputError, match=r"^s: does not say what bird 3 does"):
-        evaluate(solution(), BIRD, truth(), source="s", behaviours={5: ACTS[5]})
-    assert evaluate(solution(), BIRD, truth().select(tracks=[0]), behaviours={5: ACTS[5]}).behaviours["stand"]
+    with pytest.raises(InputError, match=r"^s: has no behaviour for bird 3"):
+        evaluate(solution(), BIRD, Truth(truth(), source="s", behaviours={5: ACTS[5]}))
+    assert evaluate(solution(), BIRD, Truth(truth().select(tracks=[0]), behaviours={5: ACTS[5]})).behaviours["stand"]
 
 
 def test_behaviours_are_read_from_a_scene(tmp_path):
@@ -142,9 +142,9 @@ def test_behaviours_are_read_from_a_scene(tmp_path):
     for content, message in (
         ({}, "lacks the key behaviour"),
         ({"behaviour": [1]}, "behaviour must be an object"),
-        ({"behaviour": late}, r"behaviour\.3 must say for a bird's number from which frame on"),
-        ({"behaviour": {"three": acts["3"]}}, r"behaviour\.three must say"),
-        ({"behaviour": {"3": acts["3"][::-1]}}, r"behaviour\.3 must say"),
+        ({"behaviour": late}, r"behaviour\.3 must be the behaviours of a track id"),
+        ({"behaviour": {"three": acts["3"]}}, r"behaviour\.three must be the behaviours"),
+        ({"behaviour": {"3": acts["3"][::-1]}}, r"behaviour\.3 must be the behaviours"),
         ({"behaviour": {"3": [{"from_frame": 0}]}}, r"behaviour\.3\[0\] lacks the key behaviour"),
     ):
         (tmp_path / "scene.json").write_text(json.dumps(content))

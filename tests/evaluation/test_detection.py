@@ -10,6 +10,7 @@ from support.rectangles import HEIGHT, WIDTH, birds, steady
 from jaxfit.data.masks import encode_mask
 from jaxfit.errors import InputError
 from jaxfit.evaluation.observed import evaluate_observations
+from jaxfit.evaluation.truth import Truth
 
 HERE, THERE, AWAY = (10, 10, 20, 10), (60, 10, 20, 10), (10, 60, 20, 10)
 PERFECT = pytest.approx({"ap50": 1, "ap50-95": 1, "precision": 1, "recall": 1, "mean_iou": 1})
@@ -29,8 +30,8 @@ def test_what_was_there_is_perfect():
         name: pytest.approx(1) for name in ("hota", "deta", "assa")
     }
     assert result.keypoints["all"] == (12, 1, 1, 12, 1, 1)
-    assert result.counts == {"frames": 3, "true": 6, "found": 6} | dict.fromkeys(
-        ("ignored", "excused", "true_elsewhere", "found_elsewhere"), 0
+    assert result.counts == {"frames": 3, "true": 6, "detected": 6} | dict.fromkeys(
+        ("ignored", "excused", "true_elsewhere", "detected_elsewhere"), 0
     )
     assert result.compared == "masks"
 
@@ -98,7 +99,7 @@ def test_who_finds_an_ignored_bird_is_excused():
     for box, excused in ((on, 1), (half, 1), (off, 0), (WHOLE, 0)):
         found = birds({1: {0: WHOLE}, 2: {1: box}}, [0, 1], score=scores([0.5, 0], [0, 0.9]))
         result = evaluate_observations(found, hidden)
-        assert (result.counts["excused"], result.counts["found"]) == (excused, 2 - excused)
+        assert (result.counts["excused"], result.counts["detected"]) == (excused, 2 - excused)
         assert result.detection["precision"] == (1 if excused else 1 / 2)
         assert result.detection["ap50"] == pytest.approx(1 if excused else 1 / 2)
         assert result.tracking["mota"] == (1 if excused else 0)
@@ -137,10 +138,10 @@ def test_only_shared_frames_are_compared():
     found = birds({1: steady(HERE, [4, 5, 6])}, [4, 5, 6, 7])
     result = evaluate_observations(found, truth)
     assert result.detection == PERFECT
-    assert {name: result.counts[name] for name in ("frames", "true_elsewhere", "found_elsewhere")} == {
+    assert {name: result.counts[name] for name in ("frames", "true_elsewhere", "detected_elsewhere")} == {
         "frames": 2,
         "true_elsewhere": 1,
-        "found_elsewhere": 1,
+        "detected_elsewhere": 1,
     }
 
 
@@ -213,7 +214,7 @@ def test_nothing_at_all():
 def test_files_that_do_not_belong_together():
     truth = birds({1: {0: HERE}}, [0])
     with pytest.raises(InputError, match=r"truth.json.*shares no frame"):
-        evaluate_observations(birds({1: {5: HERE}}, [5]), truth, "truth.json")
+        evaluate_observations(birds({1: {5: HERE}}, [5]), Truth(truth, source="truth.json"))
     smaller = birds({1: {0: HERE}}, [0], masks=False, image_size_px=np.array([[60, 50]]))
     with pytest.raises(InputError, match=r"frame 0 of 120×100 pixels, the observations of 60×50"):
         evaluate_observations(smaller, truth)

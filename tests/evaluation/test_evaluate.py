@@ -11,6 +11,7 @@ from jaxfit.data.posed import PosedBirds
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import COLUMNS, evaluate
 from jaxfit.evaluation.matching import match_tracks
+from jaxfit.evaluation.truth import Truth
 
 
 def test_the_truth_is_perfect():
@@ -48,6 +49,19 @@ def test_velocity_counts_neighbouring_frames_alone():
     points = solution().keypoints_px.copy()
     points[0, 3] += [6, 8]
     assert evaluate(solution(keypoints_px=points), BIRD, truth()).tracks[5]["me_v"] == pytest.approx(0, abs=1e-6)
+
+
+def test_every_second_frame_has_velocity_and_acceleration():
+    """Velocity and acceleration are per frame of the file: with twice the frame numbers, all metrics stay the same."""
+    points = solution().keypoints_px.copy()
+    points[0, 1] += [6, 8]
+    moved = solution(keypoints_px=points, body_pose=solution().body_pose[:, ::-1])
+    expected = evaluate(moved, BIRD, Truth(truth(), solution())).overall
+    every_second = 2 * truth().frame_index
+    result, seen, poses = (dataclasses.replace(each, frame_index=every_second) for each in (moved, truth(), solution()))
+    assert expected["me_v"] > 0
+    assert expected["acceleration"] > 0
+    assert evaluate(result, BIRD, Truth(seen, poses)).overall == expected
 
 
 def test_overlap_of_a_shifted_mesh():
@@ -98,7 +112,7 @@ def test_invisible_keypoints_and_absent_masks_do_not_count():
 def test_nothing_in_common():
     for changes in ({"track_id": np.array([50, 30])}, {"frame_index": np.arange(4)}):
         with pytest.raises(InputError, match=r"truth\.json: shares no bird with the result: .*annotations"):
-            evaluate(solution(), BIRD, dataclasses.replace(truth(), **changes), source="truth.json")
+            evaluate(solution(), BIRD, Truth(dataclasses.replace(truth(), **changes), source="truth.json"))
     with pytest.raises(InputError, match=r"shares no bird"):
         evaluate(solution(valid=np.zeros((N, T), bool)), BIRD, truth())
     renamed = dataclasses.replace(truth(), keypoint_names=("beak", *BIRD.keypoint_names[1:]))
@@ -108,7 +122,7 @@ def test_nothing_in_common():
 
 def test_pictures_of_another_size():
     larger = dataclasses.replace(truth(), image_size_px=np.full((T, 2), [640, 400]), masks={})
-    with pytest.raises(InputError, match=r"truth: has track 5, frame 10 in a picture of 640×400, but .* 320×280"):
+    with pytest.raises(InputError, match=r"truth: has track 5, frame 10 in an image of 640×400 pixels, but .* 320×280"):
         evaluate(solution(), BIRD, larger)
     sizes = np.zeros((N, T, 2), int)
     sizes[1] = WIDTH, HEIGHT
@@ -140,25 +154,25 @@ def test_tracks_named_by_a_tracker():
     assert evaluate(own, BIRD, truth()) == evaluate(solution(), BIRD, truth())
 
 
-def test_the_truth_of_another_video_is_told(caplog):
-    evaluate(solution(), BIRD, truth(), source="t.json")
+def test_the_truth_of_another_video_is_reported(caplog):
+    evaluate(solution(), BIRD, Truth(truth(), source="t.json"))
     assert not caplog.records
     elsewhere = solution(crop=solution().crop + np.float32([200, 0, 0]))
-    evaluate(elsewhere, BIRD, truth(), source="t.json")
+    evaluate(elsewhere, BIRD, Truth(truth(), source="t.json"))
     (record,) = caplog.records
     assert record.levelname == "WARNING"
-    assert "where t.json has one (median IoU 0.00)" in record.message
+    assert "hardly overlap the birds of t.json (median IoU 0.00)" in record.message
 
 
 def test_progress_counts_the_birds():
     from contextlib import contextmanager
 
-    ticks = []
+    reported = []
 
     @contextmanager
     def watch(name, total):
-        ticks.append(total)
-        yield lambda done, note: ticks.append(-done)
+        reported.append(total)
+        yield lambda done, note: reported.append(-done)
 
     evaluate(solution(), BIRD, truth(), progress=watch)
-    assert ticks == [N * T] + [-1] * (N * T)
+    assert reported == [N * T] + [-1] * (N * T)

@@ -8,7 +8,8 @@ from support.rectangles import HEIGHT, WIDTH, birds, steady
 
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
-from jaxfit.evaluation.matching import follow, match_tracks
+from jaxfit.evaluation.matching import match_by_overlap, match_tracks
+from jaxfit.evaluation.truth import Truth
 
 NAMES = ("bill", "back", "wing", "tail")
 LEFT, RIGHT, BELOW = (0, 0, 30, 20), (60, 0, 30, 20), (0, 60, 30, 20)
@@ -60,7 +61,7 @@ def test_ids_are_believed_where_they_are_right():
 def test_ids_are_believed_of_a_bird_that_was_fitted_badly():
     """It lies nowhere near its own bird nor another: leaving it out would flatter the result."""
     own = result({1: steady(LEFT, FRAMES), 2: steady(BELOW, FRAMES)})
-    assert follow(own, truth(TWO)) == {1: 1}
+    assert match_by_overlap(own, truth(TWO)) == {1: 1}
     assert match_tracks(own, truth(TWO))[1] == ("ids", {1: 1, 2: 2}, [], [])
     assert match_tracks(own, truth(TWO), "overlap")[1] == ("overlap", {1: 1}, [2], [2])
 
@@ -85,7 +86,7 @@ def test_strays_and_birds_that_nobody_follows():
 
 def test_the_track_that_follows_longer_has_the_bird():
     own = result({8: steady(LEFT, [0]), 9: steady(LEFT, [1, 2, 3])})
-    assert follow(own, truth(TWO)) == {9: 1}
+    assert match_by_overlap(own, truth(TWO)) == {9: 1}
 
 
 def test_one_to_one_with_most_frames_in_all():
@@ -93,27 +94,27 @@ def test_one_to_one_with_most_frames_in_all():
     near_both = (0, 0, 33, 20)
     there = truth({1: steady(LEFT, FRAMES), 2: steady((3, 0, 33, 20), FRAMES)})
     own = result({8: steady(near_both, FRAMES), 9: steady((0, 0, 20, 20), FRAMES)})
-    assert follow(own, there) == {8: 2, 9: 1}
+    assert match_by_overlap(own, there) == {8: 2, 9: 1}
 
 
 @pytest.mark.parametrize(("away", "followed"), [(2, {5: 1}), (3, {})])
 def test_half_of_the_frames_must_agree(away, followed):
     boxes = steady(LEFT, FRAMES) | steady(BELOW, range(away))
-    assert follow(result({5: boxes}), truth(TWO)) == followed
+    assert match_by_overlap(result({5: boxes}), truth(TWO)) == followed
 
 
 @pytest.mark.parametrize(("shift", "followed"), [(10, {5: 1}), (11, {})])
 def test_how_near_is_near(shift, followed):
     """Boxes of 30 px, 10 px apart: 20 shared of 40."""
     x, y, w, h = LEFT
-    assert follow(result({5: steady((x + shift, y, w, h), FRAMES)}), truth(TWO)) == followed
+    assert match_by_overlap(result({5: steady((x + shift, y, w, h), FRAMES)}), truth(TWO)) == followed
 
 
 def test_frames_go_by_number_and_poses_that_are_missing_do_not_count():
     there = truth({1: {3: LEFT, 5: LEFT, 6: LEFT}}, [3, 4, 5, 6])
     own = result({5: {4: LEFT, 5: LEFT}, 6: {3: RIGHT, 9: LEFT}}, [3, 4, 5, 9])
-    assert follow(own, there) == {5: 1}
-    assert follow(result({5: {9: LEFT}}, [9]), there) == {}
+    assert match_by_overlap(own, there) == {5: 1}
+    assert match_by_overlap(result({5: {9: LEFT}}, [9]), there) == {}
 
 
 def test_boxes_are_of_what_is_annotated():
@@ -123,9 +124,9 @@ def test_boxes_are_of_what_is_annotated():
     confidence[0, :, 3:] = 0
     part = dataclasses.replace(there, confidence=confidence)
     own = result({5: steady(LEFT, FRAMES)})
-    assert follow(own, part) == {5: 1}
+    assert match_by_overlap(own, part) == {5: 1}
     confidence[0, :, 2:] = 0
-    assert follow(own, dataclasses.replace(there, confidence=confidence)) == {}
+    assert match_by_overlap(own, dataclasses.replace(there, confidence=confidence)) == {}
 
 
 def test_photographs_go_by_id():
@@ -133,7 +134,7 @@ def test_photographs_go_by_id():
     own = result({2: {0: LEFT}, 1: {0: LEFT}}, [0])
     assert match_tracks(own, there)[1].by == "ids"
     with pytest.raises(InputError, match=r"t\.json: holds photographs"):
-        match_tracks(own, there, "overlap", "t.json")
+        match_tracks(own, Truth(there, source="t.json"), "overlap")
 
 
 def test_nobody_is_there():
@@ -147,4 +148,4 @@ def test_any_naming_is_found_out(seed):
     boxes = {1 + i: {t: (*rng.integers(0, 60, 2), 30, 30) for t in range(12)} for i in range(6)}
     ids = rng.permutation(20)[:6].tolist()
     own = result(dict(zip(ids, boxes.values(), strict=True)), range(12))
-    assert follow(own, truth(boxes, range(12))) == dict(zip(ids, boxes, strict=True))
+    assert match_by_overlap(own, truth(boxes, range(12))) == dict(zip(ids, boxes, strict=True))

@@ -120,6 +120,9 @@ def test_me_v_by_hand():
     assert me_v(predicted, observed, visible, sides) == pytest.approx(math.sqrt((5 / 20) ** 2 / 3))
     # a gap between frames 2 and 4 takes that pair out
     assert me_v(predicted, observed, visible, sides, [1, 2, 4, 5]) == 0
+    # every second frame: consecutive frames differ by the file's step, which is 2
+    assert me_v(predicted, observed, visible, sides, [4, 6, 8, 10]) == me_v(predicted, observed, visible, sides)
+    assert me_v(predicted, observed, visible, sides, [2, 4, 8, 10]) == 0
     # a keypoint missing in frame 0 or 3 takes its pair out
     visible[3] = 0
     assert me_v(predicted, observed, visible, sides) == pytest.approx(math.sqrt((5 / 20) ** 2 / 2))

@@ -52,5 +52,7 @@ def test_acceleration_by_hand():
     assert acceleration_error(truth + np.arange(3), truth, every, range(5)) == pytest.approx(0)
     gap = np.array([True, True, True, False, True])
     assert acceleration_error(predicted, truth, gap, range(5)) == pytest.approx(5)
-    assert math.isnan(acceleration_error(predicted, truth, every, [0, 2, 4, 6, 8]))
+    assert acceleration_error(predicted, truth, every, [0, 2, 4, 6, 8]) == pytest.approx(5 * (1 + 2 + 1) / 3)
+    assert acceleration_error(predicted, truth, every, [0, 2, 4, 6, 14]) == pytest.approx(5 * (1 + 2) / 2)
+    assert math.isnan(acceleration_error(predicted[:4], truth[:4], every[:4], [0, 2, 5, 7]))
     assert math.isnan(acceleration_error(predicted[:2], truth[:2], every[:2], [0, 1]))

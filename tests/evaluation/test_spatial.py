@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from support.birds import pose_window, skin_by_hand, solution_of, toy_bird
 
 from jaxfit.errors import InputError
-from jaxfit.evaluation.figures import figures
+from jaxfit.evaluation.aggregation import metrics_of
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.model.pose import Pose
 
@@ -93,7 +93,7 @@ def errors(solution, truth=None, **models):
 
 
 def row_of(errors, where=None):
-    return figures(errors.samples(), where)
+    return metrics_of(errors.errors(), where)
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.4, 7.0])
@@ -252,9 +252,12 @@ def test_joints_are_compared_by_name():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"crop": in_crop_cameras(true_poses()).crop}, "follow the birds, not in one camera .*another fit's result"),
+        (
+            {"crop": in_crop_cameras(true_poses()).crop},
+            "follow the birds, not in one camera .*a fit is no truth",
+        ),
         ({"crop": np.full((N, T, 3), np.nan)}, "not in one camera"),
-        ({"valid": np.zeros((N, T), bool)}, "are all empty"),
+        ({"valid": np.zeros((N, T), bool)}, "are all invalid"),
         ({"keypoint_names": ("beak", *BIRD.keypoint_names[1:])}, "other keypoints"),
     ],
     ids=["crops", "nan", "empty", "keypoints"],

@@ -11,7 +11,7 @@ from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.solution import save_solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, evaluate
-from jaxfit.evaluation.truth import read_truth
+from jaxfit.evaluation.truth import Truth, read_truth
 
 
 @pytest.fixture
@@ -26,16 +26,16 @@ def one_camera():
 
 
 def test_a_coco_file(scene):
-    observations, poses, bird = read_truth(scene / "truth.json")
-    np.testing.assert_array_equal(observations.track_id, [3, 5])
-    assert poses is None
-    assert bird is None
+    known = read_truth(scene / "truth.json")
+    np.testing.assert_array_equal(known.observations.track_id, [3, 5])
+    assert (known.solution, known.bird, known.behaviours) == (None, None, None)
+    assert known.source == scene / "truth.json"
 
 
 def test_a_scene(scene):
-    observations, poses, bird = read_truth(scene)
-    assert observations.num_tracks == 2
-    result = evaluate(solution(), BIRD, observations, truth_solution=poses, truth_bird=bird)
+    known = read_truth(scene)
+    assert known.observations.num_tracks == 2
+    result = evaluate(solution(), BIRD, known)
     assert tuple(result.overall) == (*COLUMNS, *COLUMNS_3D)
     assert (result.frames, result.frames_3d, result.points_3d) == (8, 8, "joints")
     for row in (result.overall, *result.tracks.values()):
@@ -46,15 +46,15 @@ def test_a_scene(scene):
 
 def test_poses_count_where_nothing_is_annotated(scene):
     """A bird that the annotations lack has errors in space alone; one model serves for both."""
-    _, poses, _ = read_truth(scene)
-    result = evaluate(solution(), BIRD, truth().select(tracks=[1]), truth_solution=poses)
+    poses = read_truth(scene).solution
+    result = evaluate(solution(), BIRD, Truth(truth().select(tracks=[1]), poses))
     assert (result.frames, result.frames_3d) == (4, 8)
     assert set(result.tracks) == {3, 5}
     assert result.tracks[5]["frames"] == 0
     assert np.isnan(result.tracks[5]["me_p"])
     assert result.tracks[5]["mpjpe"] == pytest.approx(0, abs=1e-4)
     one = dataclasses.replace(poses, valid=poses.valid & [[True], [False]])
-    result = evaluate(solution(), BIRD, truth(), truth_solution=one)
+    result = evaluate(solution(), BIRD, Truth(truth(), one))
     assert (result.frames, result.frames_3d) == (8, 4)
     assert np.isnan(result.tracks[3]["mpjpe"])
 
@@ -69,7 +69,7 @@ def test_a_fit_is_no_truth(scene):
     moving = one_camera()
     moving[0, 1, 0] += 3
     with pytest.raises(InputError, match=r"^scene: its true poses lie in crops that follow the birds"):
-        evaluate(solution(), BIRD, truth(), source="scene", truth_solution=solution(crop=moving), truth_bird=toy_bird())
+        evaluate(solution(), BIRD, Truth(truth(), solution(crop=moving), toy_bird(), source="scene"))
 
 
 def test_folders_without_truth(scene, tmp_path_factory):

@@ -29,7 +29,7 @@ def evaluation(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unseen") / "scene"
     scene = simulate(load_murre(), folder, birds=4, frames=8, size=(1296, 760), seed=1005)
     found = track_video(folder / FOOTAGE, TrackConfig(min_track_frames=1))
-    return evaluate_observations(found, scene.truth, folder)
+    return evaluate_observations(found, scene.truth)
 
 
 def test_detection_and_tracking(evaluation):

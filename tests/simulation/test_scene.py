@@ -13,7 +13,7 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.posed import PosedBirds
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import evaluate
-from jaxfit.evaluation.truth import read_truth
+from jaxfit.evaluation.truth import Truth, read_truth
 from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.behaviour import BEHAVIOURS
 from jaxfit.simulation.flock import simulate_flock
@@ -65,7 +65,7 @@ def test_true_poses_agree_with_masks_and_keypoints(scene):
 
 
 def test_metrics_of_the_truth_are_perfect(scene):
-    overall = evaluate(scene.poses, MURRE, scene.truth, truth_solution=scene.poses).overall
+    overall = evaluate(scene.poses, MURRE, Truth(scene.truth, scene.poses)).overall
     assert overall["pck@0.05"] == 1
     assert overall["iou"] > 0.99
     assert overall["me_p"] == overall["me_v"] == 0
@@ -181,12 +181,14 @@ def test_written_scene_is_read_back(tmp_path):
     frames = list(read_frames(tmp_path / "s" / "footage.mp4"))
     assert len(frames) == 5
     assert frames[0].picture.shape == (*SIZE[::-1], 3)
-    truth, poses, bird = read_truth(tmp_path / "s")
-    np.testing.assert_array_equal(truth.occluded, scene.truth.occluded)
-    np.testing.assert_allclose(truth.keypoints_px, scene.truth.keypoints_px, atol=1e-3)
-    np.testing.assert_array_equal(truth.whole_mask(0, 2), scene.truth.whole_mask(0, 2))
-    np.testing.assert_array_equal(poses.body_pose, scene.poses.body_pose)
-    assert bird.keypoint_names == MURRE.keypoint_names
+    truth = read_truth(tmp_path / "s")
+    seen = truth.observations
+    np.testing.assert_array_equal(seen.occluded, scene.truth.occluded)
+    np.testing.assert_allclose(seen.keypoints_px, scene.truth.keypoints_px, atol=1e-3)
+    np.testing.assert_array_equal(seen.whole_mask(0, 2), scene.truth.whole_mask(0, 2))
+    np.testing.assert_array_equal(truth.solution.body_pose, scene.poses.body_pose)
+    assert truth.bird.keypoint_names == MURRE.keypoint_names
+    assert set(truth.behaviours) == {1, 2}
     detections = read_coco(tmp_path / "s" / "detections.json")
     np.testing.assert_array_equal(detections.present, scene.detections.present)
     description = json.loads((tmp_path / "s" / "scene.json").read_text())

@@ -23,6 +23,7 @@ from typing import cast
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.observations import Observations
 
 __all__ = ["repair_left_right_flips"]
@@ -62,7 +63,7 @@ def repair_left_right_flips(
     vector = (ends[..., 1, :] - ends[..., 0, :]) / np.maximum(side_px, 1)[..., None, None]
     weight = observations.confidence[:, :, pairs].min(-1).astype(np.float64)
     numbers = observations.frame_index
-    time = (numbers - numbers[0]) // max(int(np.gcd.reduce(np.diff(numbers))), 1)
+    time = (numbers - numbers[0]) // frame_step(numbers)
     median_change = _median_change(vector, weight, time)
 
     common = _flipped_frames(vector, weight, time, median_change)[..., None]
