@@ -17,8 +17,6 @@
 namespace jaxfit {
 namespace {
 
-constexpr int64_t kMaxSamples = 8;
-
 // Calls visit(row, column) for every pixel of touched tiles, empty(row, column) for the rest.
 template <typename Visit, typename Empty>
 inline void for_each_pixel(const Strip& s, Visit visit, Empty empty) {

@@ -8,9 +8,11 @@
 
 namespace jaxfit {
 
+constexpr int64_t kMaxSamples = 8;
+
 struct Frame {
-  int64_t width, height;  // px
-  int64_t samples;        // along a pixel's side
+  int64_t width, height;  // px, 1 to kMaxSize
+  int64_t samples;        // along a pixel's side, 1 to kMaxSamples
 };
 
 struct Rows {
