@@ -152,7 +152,7 @@ ffi::Error silhouette_gradient(ffi::ThreadPool pool, Floats vertices, Indices fa
   return ffi::Error::Success();
 }
 
-// `gradient` may be null: then only the loss is computed.
+// If `gradient` is null, only the loss is computed.
 ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const Indices& faces,
                          const ffi::AnyBuffer& target, const Floats& weight, ffi::Result<Floats>& loss,
                          ffi::Result<Floats>* gradient, float sigma, float radius, int32_t kind_number) {
