@@ -11,7 +11,6 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfit.benchmarks import render as benchmark
 from jaxfit.raster import kernels as native
 from jaxfit.raster import zbuffer as render
 from jaxfit.raster.zbuffer import reference
@@ -287,21 +286,3 @@ def test_without_kernels_a_process_of_its_own_renders_and_says_so():
     expected = reference.raster(np.float32([[2, 2, 1], [12, 3, 1], [6, 13, 1]]), np.array([[0, 1, 2]]), 16, 16, 1)
     assert int(found.stdout) == (expected[0] >= 0).sum()
     assert found.stderr.count("renderings in NumPy") == 1
-
-
-def test_the_benchmark_reports_its_settings_and_rates(monkeypatch):
-    seconds = iter((0.5, 0.25, 2.0, 4.0))
-
-    def run_in_known_time(run, repeats):
-        assert repeats == 1
-        run()
-        return next(seconds)
-
-    monkeypatch.setattr(benchmark, "median_seconds", run_in_known_time)
-    found = benchmark.bench_render(crops=2, birds=2, repeats=1)
-    assert (found["crops"], found["birds"], found["isa"]) == (2, 2, native.current_isa())
-    assert (found["faces"], found["frame_faces"]) == (5712, 5712)
-    assert (found["crops_per_s"], found["interpolated_crops_per_s"]) == (4, 8)
-    assert (found["full_frames_per_s"], found["full_frame_ms"], found["mask_ms"]) == (0.5, 2e3, 4e3)
-    with pytest.raises(ValueError, match="birds: expected at least 1, got 0"):
-        benchmark.bench_render(birds=0)
