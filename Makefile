@@ -1,20 +1,22 @@
-# Every target works as the first command on a fresh clone: it makes the virtual environment it needs.
+# Every target works as the first command in a fresh clone: it makes the virtual environment that it needs.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 export JAXFIT_REFERENCE
 
-.PHONY: install test lint bench demo notebooks clean
+.PHONY: install test extended lint bench demo notebooks clean
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make install    the package with its native kernels, in $(VENV)"
-	@echo "make test       the test suite (under ten minutes on two cores)"
+	@echo "make install    the package with its compiled kernels, in $(VENV)"
+	@echo "make test       the test suite (under eight minutes on two cores)"
+	@echo "make extended   the slow tests, and those that install packages in environments of their own"
 	@echo "make lint       formatting, lint and types"
 	@echo "make bench      benchmarks against the committed baseline"
 	@echo "make demo       simulate a short scene, reconstruct it from its footage and show it"
-	@echo "make notebooks  run the notebooks and store what they show (six minutes)"
+	@echo "make notebooks  run the notebooks and store their output (six minutes)"
 	@echo "make clean      remove the environment and everything built"
 
 install: $(VENV)/installed
@@ -24,14 +26,17 @@ $(VENV)/installed: pyproject.toml $(wildcard kernels/*)
 	  { echo "jaxfit needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)"; exit 1; }
 	@command -v $${CXX:-c++} >/dev/null || \
 	  { echo "No C++ compiler found. Install one (Debian: apt install g++; macOS: xcode-select --install)"; \
-	    echo "or name it: make CXX=/path/to/compiler. Without it jaxfit would run hundreds of times slower."; exit 1; }
+	    echo "or name it: make CXX=/path/to/compiler. Without a compiler jaxfit runs hundreds of times slower."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --editable ".[$(EXTRAS)]"
 	@touch $@
 
 test: install
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+	$(PYTEST)
+
+extended: install
+	$(PYTEST) -m extended
 
 lint: install
 	$(BIN)/ruff check jaxfit tests notebooks

@@ -1,4 +1,4 @@
-// From a face to the blocks that it reaches, and to the distances of their pixels. Part of silhouette.cc.
+// Finds the blocks that a face reaches and computes the distances of their pixels. Part of silhouette.cc.
 #pragma once
 
 #include "faces.h"
@@ -6,14 +6,14 @@
 namespace jaxfit {
 namespace {
 
-// Sixteen signed distances from one face: to the three edges' lines (`across`, positive inside) and, along each edge,
-// from its middle (`along`).
+// Positions of sixteen points relative to the three edges of one face: the signed distance to the line of each edge
+// (`across`, positive inside) and the position along each edge, measured from its middle (`along`).
 struct Distances {
   Vec across[3], along[3];
 };
 
-// d itself: the smallest squared distance to an edge, negative inside. `clamped` and `beyond` split the position along
-// each edge into the nearest point's and the rest.
+// `d` is the smallest squared distance to an edge, negative inside. `clamped` is the position of the nearest point on
+// each edge, and `beyond` is the remaining distance along the edge.
 struct Nearest {
   Vec clamped[3], beyond[3], square[3], smallest, d, minus_d;
 };
@@ -31,7 +31,7 @@ INLINE Nearest nearest_edge(const Distances& at, const Vec half[3]) {
   return n;
 }
 
-// How the blocks of a window are numbered: row by row, for each width of a row from 1 to 16.
+// Row and column of the sixteen blocks of a window, for each width of the window from 1 to 16 blocks.
 struct Windows {
   alignas(64) float column[kLanes + 1][kLanes], row[kLanes + 1][kLanes];
   uint8_t column_of[kLanes + 1][kLanes], row_of[kLanes + 1][kLanes];
@@ -45,11 +45,11 @@ struct Windows {
 };
 constexpr Windows kWindows;
 
-// Calls visit(signed distances of the block's pixels, place in `products`, column, row) for each open block in reach.
+// Calls visit(distances of the pixels, nearest edges, place in `products`, column, row) for each open block in reach.
 template <typename Visit>
 INLINE void for_each_block(const Faces& f, int lane, Scale scale, const Workspace& ws, Visit visit) {
   const int32_t left = f.left[lane], right = f.right[lane], top = f.top[lane], bottom = f.bottom[lane];
-  const float reach = scale.radius + 2.1213204f * scale.k;  // a block's centre to its corner pixels: 1.5·√2
+  const float reach = scale.radius + 2.1213204f * scale.k;  // 1.5·√2 px from a block's centre to its corner pixels
   const float block_size = kBlock * scale.k;
   const Vec offset_x = (load(kWindows.column[4]) - all(1.5f)) * all(scale.k);
   const Vec offset_y = (load(kWindows.row[4]) - all(1.5f)) * all(scale.k);

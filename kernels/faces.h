@@ -1,4 +1,4 @@
-// The scratch of one image and its faces, sixteen at a time, made ready for the blocks. Part of silhouette.cc.
+// The scratch memory of one image, and its faces, prepared sixteen at a time. Part of silhouette.cc.
 #pragma once
 
 #include "silhouette.h"
@@ -7,21 +7,21 @@
 namespace jaxfit {
 namespace {
 
-constexpr int kBlock = 4;  // pixels; a block fills a register's sixteen lanes
-constexpr float kSaturated = 1e5f;   // a silhouette is 1 to within 1e-5 from here
-constexpr float kFarAway = 1048576.f;  // px; coordinates are clamped to this, so that squares stay finite
+constexpr int kBlock = 4;  // pixels along a side; a block has one pixel for each of the sixteen lanes
+constexpr float kSaturated = 1e5f;   // from this product on, the silhouette is within 1e-5 of 1
+constexpr float kFarAway = 1048576.f;  // px; coordinates are clamped to ± this, so that squares stay finite
 constexpr float kMinDepth = 1e-8f;
-constexpr float kNegligible = 6.3f;   // scaled; p is below 2^-39 from here
-constexpr float kShortest = 1e-12f;  // an edge's length is held above this
-constexpr float kMinArea = 1e-8f;    // of |2·area|, in units of half the image
+constexpr float kNegligible = 6.3f;   // scaled distance from which p is below 2^-39
+constexpr float kShortest = 1e-12f;  // least length of an edge; shorter lengths are raised to this
+constexpr float kMinArea = 1e-8f;    // greatest |2·area| of a skipped face, in units of half the image
 
-// Sixteen faces, lengths scaled by k, vertices in the order that makes the area positive.
+// Sixteen faces. Lengths are scaled by k. The order of the vertices makes the area positive.
 struct Faces {
-  float x0[kLanes], y0[kLanes];                      // the first vertex, in px: the origin of the rest
+  float x0[kLanes], y0[kLanes];                      // first vertex, in px, and origin of the other quantities
   float tx[3][kLanes], ty[3][kLanes];                // unit tangents of the edges 01, 12, 20
-  float shift[3][kLanes], half[3][kLanes];           // minus the edge's middle along its tangent; half its length
+  float shift[3][kLanes], half[3][kLanes];           // minus the middle's place along the tangent; half the length
   float height[kLanes];                              // distance of vertex 0 from edge 12
-  float reach[3][kLanes];                            // blur radius plus a block's half-width across the edge
+  float reach[3][kLanes];                            // minus (blur radius + half the extent of a block across the edge)
   int32_t left[kLanes], right[kLanes], top[kLanes], bottom[kLanes];  // the blocks around the face, inclusive
   int32_t vertex[3][kLanes];
   uint32_t visible;
@@ -29,12 +29,12 @@ struct Faces {
 };
 
 struct Workspace {
-  float* x;         // vertex coordinates in px; NaN behind the camera
+  float* x;         // vertex coordinates in px; x is NaN behind the camera
   float* y;
-  float* products;  // Π (1 + e) by block and pixel; later the factor of p in the gradient
-  uint8_t* open;    // a bit for each block that is still to be evaluated, rows of `row_bytes`
+  float* products;  // Π (1 + e) for each block and pixel; later the factor of p in the gradient
+  uint8_t* open;    // one bit per block, set while the block is evaluated; rows of `row_bytes`
   Faces* faces;
-  int64_t blocks, row_bytes;  // blocks along a side
+  int64_t blocks, row_bytes;  // number of blocks along a side; bytes of a row in `open`
   int64_t num_chunks;
 };
 
@@ -44,7 +44,7 @@ struct Layout {
   int64_t blocks, row_bytes, vertices, products, open, chunks;  // the last four in floats
   explicit Layout(const Mesh& mesh, int64_t size)
       : blocks((size + kBlock - 1) / kBlock),
-        row_bytes((blocks + 7) / 8 + 4),  // a row is read four bytes at a time
+        row_bytes((blocks + 7) / 8 + 4),  // a row is read four bytes at a time, so it has four bytes more
         vertices(round_up(mesh.num_vertices)),
         products(blocks * blocks * kLanes),
         open(round_up((blocks * row_bytes + 3) / 4)),
@@ -74,7 +74,7 @@ INLINE void close(const Workspace& ws, int64_t column, int64_t row) {
 }
 
 struct Scale {
-  float k;       // scaled units a pixel
+  float k;       // scaled units per pixel
   float radius;  // in scaled units
   float size;    // px
   float slope;   // -∂(p's exponent) / ∂(scaled distance), the constant factor of the gradient in px
@@ -86,7 +86,7 @@ INLINE Scale scale_of(Blur blur, int64_t size) {
   return {k, radius < kNegligible ? radius : kNegligible, static_cast<float>(size), 2.f / (blur.sigma * k)};
 }
 
-// False if any coordinate is not finite.
+// Copies the vertices. Returns false if any coordinate is not finite.
 bool load_vertices(const Mesh& mesh, Workspace& ws) {
   float zero = 0;  // stays 0 only while every coordinate is finite
   for (int64_t i = 0; i < mesh.num_vertices; ++i) {
@@ -100,7 +100,8 @@ bool load_vertices(const Mesh& mesh, Workspace& ws) {
   return zero == 0;
 }
 
-// Neighbouring faces stand far apart in this order, so that every block soon has some that cover it.
+// Returns the stride of the order of the faces. It puts neighbouring faces far apart, so that every block soon meets a
+// face that covers it.
 INLINE int64_t stride_of(int64_t n) {
   int64_t stride = static_cast<int64_t>(static_cast<double>(n) * 0.6180339887498949);
   for (;; ++stride) {
@@ -135,7 +136,7 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
   x1 = select(turned, x2, x1), y1 = select(turned, y2, y1);
   x2 = select(turned, x1_old, x2), y2 = select(turned, y1_old, y2);
   const Vec px_x[2] = {x1, x2}, px_y[2] = {y1, y2};
-  // Exactly 0 where two corners are equal, so long as the compiler forms no fused product here.
+  // The area is exactly 0 where two corners are equal, if the compiler does not fuse these products.
   const Mask seen = abs(area) > all(kMinArea * 0.25f * scale.size * scale.size);
   const Vec k = all(scale.k);
   x1 = x1 * k, y1 = y1 * k, x2 = x2 * k, y2 = y2 * k, area = abs(area) * k * k;
@@ -155,7 +156,7 @@ INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
     if (i == 1) store(f.height, area * inverse);
   }
 
-  // Pixel i has its centre at i + 1/2.
+  // The centre of pixel i is at i + 1/2.
   const Vec margin = all(scale.radius / scale.k);
   const Vec shift_low = margin + all(0.5f), shift_high = margin - all(0.5f);
   const Vec zero = all(0.f);

@@ -1,43 +1,42 @@
-// Argument checks and bindings: from XLA's buffers, with any leading batch dimensions, to one call an image.
+// XLA's handlers: they check the buffers, split the batch into images, and call the kernels once for each image.
 //
-// vmap_method="expand_dims" gives every operand the same number of leading dimensions, each the batch's size or 1;
-// results have the full sizes.
+// With vmap_method="expand_dims" every operand has the same number of leading dimensions. Each leading dimension is
+// that of the batch or 1. Results have all dimensions of the batch.
 #include "ffi.h"
 
+#include <algorithm>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
+#include "guard.h"
 #include "instruction_set.h"
 #include "parallel.h"
+#include "shapes.h"
 
 namespace jaxfit {
 namespace {
 
 namespace ffi = xla::ffi;
 
+using Dimensions = ffi::AnyBuffer::Dimensions;
 using Floats = ffi::Buffer<ffi::F32>;
 using Indices = ffi::Buffer<ffi::S32>;
 
-std::string shape_of(ffi::AnyBuffer::Dimensions dims) {
-  std::string text = "(";
-  for (size_t i = 0; i < dims.size(); ++i) text += (i ? ", " : "") + std::to_string(dims[i]);
-  return text + ")";
-}
-
-// The batch's dimensions, taken from a result.
+// The dimensions of the batch: the leading dimensions of a result whose items have `item_rank` dimensions.
 struct Batch {
   std::vector<int64_t> dims;
   int64_t count = 1;
 
-  Batch(ffi::AnyBuffer::Dimensions result, size_t item_rank) {
+  Batch(Dimensions result, size_t item_rank) {
     for (size_t i = 0; i + item_rank < result.size(); ++i) dims.push_back(result[i]), count *= result[i];
   }
 };
 
-// Where each image's part of one operand begins.
+// The place of each image's part in an operand.
 struct Operand {
-  std::vector<int64_t> strides;  // in items, 0 where the operand is shared
-  int64_t item = 1, items = 1;
+  std::vector<int64_t> strides;  // in items; 0 where all images share one item
+  int64_t item = 1, items = 1;   // numbers in an item, items in the operand
 
   int64_t offset(const Batch& batch, int64_t image) const {
     int64_t at = 0;
@@ -46,26 +45,39 @@ struct Operand {
   }
 };
 
-// Checks `dims` against batch and item shape (-1: any); false with `error` set.
-bool bind(const char* name, ffi::AnyBuffer::Dimensions dims, const Batch& batch, std::vector<int64_t> item,
-          Operand& out, std::string& error) {
+// Throws std::invalid_argument where `dims` does not fit the batch and the shape of an item.
+Operand bind(const char* name, Dimensions dims, const Batch& batch, std::vector<int64_t> item) {
   const size_t leading = batch.dims.size();
   bool fits = dims.size() == leading + item.size();
   for (size_t i = 0; fits && i < leading; ++i) fits = dims[i] == 1 || dims[i] == batch.dims[i];
-  for (size_t i = 0; fits && i < item.size(); ++i) fits = item[i] < 0 || dims[leading + i] == item[i];
-  if (!fits) {
-    error = std::string(name) + " has shape " + shape_of(dims) + ", which does not fit a batch of shape (";
-    for (int64_t d : batch.dims) error += std::to_string(d) + ", ";
-    error += ") of items (";
-    for (int64_t d : item) error += (d < 0 ? std::string("any") : std::to_string(d)) + ", ";
-    error += ")";
-    return false;
-  }
+  for (size_t i = 0; fits && i < item.size(); ++i) fits = item[i] == kAny || dims[leading + i] == item[i];
+  if (!fits)
+    throw std::invalid_argument(std::string(name) + ": expected the batch dimensions " + text_of(batch.dims) +
+                                " (or 1 in place of any of them) followed by " + text_of(item) + ", got " +
+                                text_of(dims));
+  Operand out;
   for (size_t i = leading; i < dims.size(); ++i) out.item *= dims[i];
   out.strides.assign(leading, 0);
   for (size_t i = leading; i-- > 0; out.items *= dims[i])
     if (dims[i] != 1) out.strides[i] = out.items;
-  return true;
+  return out;
+}
+
+void check_result(const char* name, Dimensions dims, const Batch& batch, const std::vector<int64_t>& item) {
+  std::vector<int64_t> expected = batch.dims;
+  expected.insert(expected.end(), item.begin(), item.end());
+  if (!std::equal(dims.begin(), dims.end(), expected.begin(), expected.end()))
+    throw std::invalid_argument(std::string(name) + ": expected shape " + text_of(expected) + ", got " +
+                                text_of(dims));
+}
+
+// Returns the width and height of a square image, which the last dimension gives.
+int64_t size_of(const char* name, Dimensions dims) {
+  const int64_t size = dims.size() ? dims[dims.size() - 1] : 0;
+  if (size < 1 || size > kMaxSize)
+    throw std::invalid_argument(std::string(name) + ": expected a square image of 1 to " + std::to_string(kMaxSize) +
+                                " pixels a side, got shape " + text_of(dims));
+  return size;
 }
 
 struct Meshes {
@@ -74,101 +86,96 @@ struct Meshes {
   Operand vertices_at, faces_at;
   int64_t num_vertices = 0, num_faces = 0;
 
+  Meshes(const Floats& vertices, const Indices& faces, const Batch& batch)
+      : vertices(vertices.typed_data()),
+        faces(faces.typed_data()),
+        vertices_at(bind("vertices", vertices.dimensions(), batch, {kAny, 3})),
+        faces_at(bind("faces", faces.dimensions(), batch, {kAny, 3})),
+        num_vertices(vertices_at.item / 3),
+        num_faces(faces_at.item / 3) {
+    const int64_t n = faces_at.items * faces_at.item;
+    bool inside = true;
+    for (int64_t i = 0; i < n; ++i) inside &= this->faces[i] >= 0 && this->faces[i] < num_vertices;
+    if (!inside) throw std::invalid_argument("faces: an index is not in [0, " + std::to_string(num_vertices) + ")");
+  }
+
   Mesh of(const Batch& batch, int64_t image) const {
     return {vertices + vertices_at.offset(batch, image), faces + faces_at.offset(batch, image), num_vertices,
             num_faces};
   }
 };
 
-bool bind_meshes(const Floats& vertices, const Indices& faces, const Batch& batch, Blur blur, Meshes& out,
-                 std::string& error) {
-  if (!(blur.sigma > 0) || !(blur.radius >= 0)) {
-    error = "blur: sigma must be positive and radius not negative";
-    return false;
-  }
-  if (!bind("vertices", vertices.dimensions(), batch, {-1, 3}, out.vertices_at, error) ||
-      !bind("faces", faces.dimensions(), batch, {-1, 3}, out.faces_at, error))
-    return false;
-  out.vertices = vertices.typed_data(), out.faces = faces.typed_data();
-  out.num_vertices = out.vertices_at.item / 3, out.num_faces = out.faces_at.item / 3;
-  const int64_t n = out.faces_at.items * out.faces_at.item;
-  bool inside = true;
-  for (int64_t i = 0; i < n; ++i) inside &= out.faces[i] >= 0 && out.faces[i] < out.num_vertices;
-  if (!inside) error = "faces: an index is not in [0, " + std::to_string(out.num_vertices) + ")";
-  return inside;
+Blur checked_blur(float sigma, float radius) {
+  if (!(sigma > 0) || !(radius >= 0))
+    throw std::invalid_argument("blur: expected a positive sigma and a radius of at least 0");
+  return {sigma, radius};
 }
 
-ffi::Error invalid(const std::string& message) { return ffi::Error::InvalidArgument("jaxfit: " + message); }
-
-ffi::Error finish(bool fine) {
-  return fine ? ffi::Error::Success()
-              : ffi::Error(ffi::ErrorCode::kResourceExhausted, "jaxfit: no memory for the silhouette's scratch");
+LossKind checked_kind(int32_t kind) {
+  if (kind != static_cast<int32_t>(LossKind::kL1) && kind != static_cast<int32_t>(LossKind::kSmoothL1))
+    throw std::invalid_argument("kind: expected 0 or 1, got " + std::to_string(kind));
+  return static_cast<LossKind>(kind);
 }
 
 ffi::Error silhouette(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::Result<Floats> image, float sigma,
                       float radius) {
-  const auto dims = image->dimensions();
-  if (dims.size() < 2 || dims[dims.size() - 1] != dims[dims.size() - 2]) return invalid("the image is not square");
-  const int64_t size = dims[dims.size() - 1];
-  const Batch batch(dims, 2);
-  const Blur blur{sigma, radius};
-  Meshes meshes;
-  std::string error;
-  if (!bind_meshes(vertices, faces, batch, blur, meshes, error)) return invalid(error);
+  const int64_t size = size_of("image", image->dimensions());
+  const Batch batch(image->dimensions(), 2);
+  check_result("image", image->dimensions(), batch, {size, size});
+  const Blur blur = checked_blur(sigma, radius);
+  const Meshes meshes(vertices, faces, batch);
   const Kernels& kernels = current_kernels();
   float* out = image->typed_data();
-  return finish(for_each_task(pool, batch.count, [=, &batch, &meshes, &kernels](int64_t i) {
+  for_each_task(pool, batch.count, [=, &batch, &meshes, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
     kernels.silhouette(mesh, blur, size, scratch(kernels.workspace(mesh, size)), out + i * size * size);
-  }));
+  });
+  return ffi::Error::Success();
 }
 
 ffi::Error silhouette_gradient(ffi::ThreadPool pool, Floats vertices, Indices faces, Floats cotangent,
                                ffi::Result<Floats> gradient, float sigma, float radius) {
   const Batch batch(gradient->dimensions(), 2);
-  const Blur blur{sigma, radius};
-  Meshes meshes;
-  Operand cotangent_at;
-  std::string error;
-  if (!bind_meshes(vertices, faces, batch, blur, meshes, error)) return invalid(error);
-  const auto dims = cotangent.dimensions();
-  const int64_t size = dims.size() ? dims[dims.size() - 1] : 0;
-  if (!bind("cotangent", dims, batch, {size, size}, cotangent_at, error)) return invalid(error);
+  const Blur blur = checked_blur(sigma, radius);
+  const Meshes meshes(vertices, faces, batch);
+  check_result("gradient", gradient->dimensions(), batch, {meshes.num_vertices, 3});
+  const int64_t size = size_of("cotangent", cotangent.dimensions());
+  const Operand cotangent_at = bind("cotangent", cotangent.dimensions(), batch, {size, size});
   const Kernels& kernels = current_kernels();
   const float* from = cotangent.typed_data();
   float* out = gradient->typed_data();
-  return finish(for_each_task(pool, batch.count, [=, &batch, &meshes, &cotangent_at, &kernels](int64_t i) {
+  for_each_task(pool, batch.count, [=, &batch, &meshes, &cotangent_at, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
     kernels.silhouette_gradient(mesh, blur, size, scratch(kernels.workspace(mesh, size)),
                                 from + cotangent_at.offset(batch, i), out + i * 3 * mesh.num_vertices);
-  }));
+  });
+  return ffi::Error::Success();
 }
 
+// If `gradient` is null, only the loss is computed.
 ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const Indices& faces,
                          const ffi::AnyBuffer& target, const Floats& weight, ffi::Result<Floats>& loss,
-                         float* gradient, float sigma, float radius, int32_t kind) {
+                         ffi::Result<Floats>* gradient, float sigma, float radius, int32_t kind_number) {
   const Batch batch(loss->dimensions(), 0);
-  const Blur blur{sigma, radius};
-  Meshes meshes;
-  Operand target_at, weight_at;
-  std::string error;
-  if (!bind_meshes(vertices, faces, batch, blur, meshes, error)) return invalid(error);
-  const auto dims = target.dimensions();
-  const int64_t size = dims.size() ? dims[dims.size() - 1] : 0;
-  if (!bind("target", dims, batch, {size, size}, target_at, error) ||
-      !bind("weight", weight.dimensions(), batch, {}, weight_at, error))
-    return invalid(error);
+  const Blur blur = checked_blur(sigma, radius);
+  const LossKind kind = checked_kind(kind_number);
+  const Meshes meshes(vertices, faces, batch);
+  if (gradient) check_result("gradient", (*gradient)->dimensions(), batch, {meshes.num_vertices, 3});
+  const int64_t size = size_of("target", target.dimensions());
+  const Operand target_at = bind("target", target.dimensions(), batch, {size, size});
+  const Operand weight_at = bind("weight", weight.dimensions(), batch, {});
   const auto type = target.element_type();
   const bool bytes = type == ffi::U8 || type == ffi::PRED;
-  if (!bytes && type != ffi::F32) return invalid("target: expected bool, uint8 or float32");
+  if (!bytes && type != ffi::F32) throw std::invalid_argument("target: expected bool, uint8 or float32");
   const auto* pixels = static_cast<const char*>(target.untyped_data());
   const Kernels& kernels = current_kernels();
   const float* weights = weight.typed_data();
   float* out = loss->typed_data();
-  return finish(for_each_task(pool, batch.count, [=, &batch, &meshes, &target_at, &weight_at, &kernels](int64_t i) {
+  float* slopes = gradient ? (*gradient)->typed_data() : nullptr;
+  for_each_task(pool, batch.count, [=, &batch, &meshes, &target_at, &weight_at, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
-    float* slope = gradient ? gradient + i * 3 * mesh.num_vertices : nullptr;
-    if (weights[weight_at.offset(batch, i)] == 0) {  // a missing frame costs nothing
+    float* slope = slopes ? slopes + i * 3 * mesh.num_vertices : nullptr;
+    if (weights[weight_at.offset(batch, i)] == 0) {  // a missing frame: nothing is rendered
       out[i] = 0;
       if (slope) std::fill(slope, slope + 3 * mesh.num_vertices, 0.f);
       return;
@@ -179,9 +186,9 @@ ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const In
       image.bytes = reinterpret_cast<const uint8_t*>(pixels) + at;
     else
       image.floats = reinterpret_cast<const float*>(pixels) + at;
-    kernels.mask_loss(mesh, blur, size, scratch(kernels.workspace(mesh, size)), image, static_cast<LossKind>(kind),
-                      out + i, slope);
-  }));
+    kernels.mask_loss(mesh, blur, size, scratch(kernels.workspace(mesh, size)), image, kind, out + i, slope);
+  });
+  return ffi::Error::Success();
 }
 
 ffi::Error mask_loss(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target, Floats weight,
@@ -192,51 +199,61 @@ ffi::Error mask_loss(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::
 ffi::Error mask_loss_and_gradient(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target,
                                   Floats weight, ffi::Result<Floats> loss, ffi::Result<Floats> gradient, float sigma,
                                   float radius, int32_t kind) {
-  return run_mask_loss(pool, vertices, faces, target, weight, loss, gradient->typed_data(), sigma, radius, kind);
+  return run_mask_loss(pool, vertices, faces, target, weight, loss, &gradient, sigma, radius, kind);
 }
 
 auto with_mesh() { return ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Arg<Floats>().Arg<Indices>(); }
 
+auto with_mesh_and_target() { return with_mesh().Arg<ffi::AnyBuffer>().Arg<Floats>(); }
+
 }  // namespace
 
 XLA_FFI_Error* silhouette_handler(XLA_FFI_CallFrame* frame) {
-  static const auto* handler =
-      with_mesh().Ret<Floats>().Attr<float>("sigma").Attr<float>("radius").To(silhouette).release();
-  return handler->Call(frame);
+  return call_guarded(frame->api, [frame] {
+    static const auto* handler =
+        with_mesh().Ret<Floats>().Attr<float>("sigma").Attr<float>("radius").To(silhouette).release();
+    return handler->Call(frame);
+  });
 }
 
 XLA_FFI_Error* silhouette_gradient_handler(XLA_FFI_CallFrame* frame) {
-  static const auto* handler =
-      with_mesh().Arg<Floats>().Ret<Floats>().Attr<float>("sigma").Attr<float>("radius").To(silhouette_gradient)
-          .release();
-  return handler->Call(frame);
+  return call_guarded(frame->api, [frame] {
+    static const auto* handler = with_mesh()
+                                     .Arg<Floats>()
+                                     .Ret<Floats>()
+                                     .Attr<float>("sigma")
+                                     .Attr<float>("radius")
+                                     .To(silhouette_gradient)
+                                     .release();
+    return handler->Call(frame);
+  });
 }
 
 XLA_FFI_Error* mask_loss_handler(XLA_FFI_CallFrame* frame) {
-  static const auto* handler = with_mesh()
-                                   .Arg<ffi::AnyBuffer>()
-                                   .Arg<Floats>()
-                                   .Ret<Floats>()
-                                   .Attr<float>("sigma")
-                                   .Attr<float>("radius")
-                                   .Attr<int32_t>("kind")
-                                   .To(mask_loss)
-                                   .release();
-  return handler->Call(frame);
+  return call_guarded(frame->api, [frame] {
+    static const auto* handler = with_mesh_and_target()
+                                     .Ret<Floats>()
+                                     .Attr<float>("sigma")
+                                     .Attr<float>("radius")
+                                     .Attr<int32_t>("kind")
+                                     .To(mask_loss)
+                                     .release();
+    return handler->Call(frame);
+  });
 }
 
 XLA_FFI_Error* mask_loss_and_gradient_handler(XLA_FFI_CallFrame* frame) {
-  static const auto* handler = with_mesh()
-                                   .Arg<ffi::AnyBuffer>()
-                                   .Arg<Floats>()
-                                   .Ret<Floats>()
-                                   .Ret<Floats>()
-                                   .Attr<float>("sigma")
-                                   .Attr<float>("radius")
-                                   .Attr<int32_t>("kind")
-                                   .To(mask_loss_and_gradient)
-                                   .release();
-  return handler->Call(frame);
+  return call_guarded(frame->api, [frame] {
+    static const auto* handler = with_mesh_and_target()
+                                     .Ret<Floats>()
+                                     .Ret<Floats>()
+                                     .Attr<float>("sigma")
+                                     .Attr<float>("radius")
+                                     .Attr<int32_t>("kind")
+                                     .To(mask_loss_and_gradient)
+                                     .release();
+    return handler->Call(frame);
+  });
 }
 
 }  // namespace jaxfit

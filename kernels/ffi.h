@@ -1,4 +1,4 @@
-// The handlers that XLA calls.
+// The handlers that XLA calls. An error returns as an XLA error; no exception leaves a handler.
 #pragma once
 
 #include "xla/ffi/api/ffi.h"

@@ -23,17 +23,17 @@ struct Choice {
 };
 
 std::vector<Choice> choices() {
-  std::vector<Choice> found;
+  std::vector<Choice> available;
 #ifdef JAXFIT_X86
   __builtin_cpu_init();
   const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
       __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-    found.push_back({"avx512", &kernels_avx512, &renderer_avx512});
-  if (avx2) found.push_back({"avx2", &kernels_avx2, &renderer_avx2});
+    available.push_back({"avx512", &kernels_avx512, &renderer_avx512});
+  if (avx2) available.push_back({"avx2", &kernels_avx2, &renderer_avx2});
 #endif
-  found.push_back({"baseline", &kernels_baseline, &renderer_baseline});
-  return found;
+  available.push_back({"baseline", &kernels_baseline, &renderer_baseline});
+  return available;
 }
 
 std::atomic<int>& chosen() {
@@ -42,8 +42,8 @@ std::atomic<int>& chosen() {
 }
 
 const std::vector<Choice>& all_choices() {
-  static const std::vector<Choice> found = choices();
-  return found;
+  static const std::vector<Choice> all = choices();
+  return all;
 }
 
 }  // namespace

@@ -1,4 +1,4 @@
-// Which of the compiled instruction sets runs.
+// The choice of one of the compiled instruction sets.
 #pragma once
 
 #include <string>
@@ -9,13 +9,13 @@
 
 namespace jaxfit {
 
-// The sets that this build has and this processor can run, best first; "baseline" is always the last.
+// Returns the compiled sets that this processor can run, best first. "baseline" is always the last.
 std::vector<std::string> available_isas();
 
-// The set in use: the best available one, until chosen otherwise.
+// Returns the set in use. Initially it is the best available set.
 std::string current_isa();
 
-// Throws std::invalid_argument for a set that is not available; "auto" is the best one.
+// Chooses the set to use; "auto" is the best set. Throws std::invalid_argument if the set is not available.
 void choose_isa(const std::string& name);
 
 const Kernels& current_kernels();

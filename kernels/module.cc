@@ -1,4 +1,4 @@
-// The Python module: XLA's handlers as capsules, the renderer, and the choice of instruction set.
+// The Python module: XLA's handlers as capsules, the renderer, and the choice of the instruction set.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
@@ -11,15 +11,15 @@ namespace nb = nanobind;
 
 NB_MODULE(_kernels, m) {
   m.def("handlers", [] {
-    nb::dict found;
+    nb::dict handlers;
     const auto add = [&](const char* name, XLA_FFI_Handler* handler) {
-      found[name] = nb::capsule(reinterpret_cast<void*>(handler));
+      handlers[name] = nb::capsule(reinterpret_cast<void*>(handler));
     };
     add("jaxfit_silhouette", jaxfit::silhouette_handler);
     add("jaxfit_silhouette_gradient", jaxfit::silhouette_gradient_handler);
     add("jaxfit_mask_loss", jaxfit::mask_loss_handler);
     add("jaxfit_mask_loss_and_gradient", jaxfit::mask_loss_and_gradient_handler);
-    return found;
+    return handlers;
   });
   jaxfit::add_renderer(m);
   m.def("available_isas", &jaxfit::available_isas);

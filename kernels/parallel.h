@@ -1,4 +1,4 @@
-// Runs many tasks on a thread pool and on the calling thread.
+// Runs tasks on a thread pool and on the calling thread.
 #pragma once
 
 #include <algorithm>
@@ -6,6 +6,7 @@
 #include <condition_variable>
 #include <cstdint>
 #include <cstdlib>
+#include <exception>
 #include <memory>
 #include <mutex>
 #include <new>
@@ -13,7 +14,8 @@
 
 namespace jaxfit {
 
-// Scratch that each thread keeps from call to call, since fresh pages cost as much as a small image.
+// Returns at least `bytes` of 64-byte aligned scratch memory. Each thread keeps its memory from call to call, because
+// the first use of fresh pages takes as long as a small image.
 inline void* scratch(size_t bytes) {
   struct Free {
     void operator()(void* p) const { std::free(p); }
@@ -31,43 +33,54 @@ inline void* scratch(size_t bytes) {
   return memory.get();
 }
 
-// Calls task(i) for each i in [0, count), each on one thread; returns false if one threw.
+// Calls task(i) once for each i in [0, count). If tasks throw, rethrows the first exception on the calling thread and
+// skips the tasks that have not started.
 //
-// Threads claim tasks one by one, the caller among them, and the caller waits for claimed tasks only. So a pool
-// whose threads are all busy elsewhere slows this down but cannot block it; a helper that starts late finds nothing
-// left to claim, and touches only the state it shares ownership of.
+// The calling thread and the threads of the pool claim tasks one by one. The calling thread waits for claimed tasks
+// only, so a busy pool slows the work down but cannot block it. A pool thread that starts late finds no task to claim
+// and touches only the shared state, which it owns jointly. For the same reason a failure to schedule is harmless: the
+// calling thread does the work.
 template <typename Pool, typename Task>
-bool for_each_task(Pool& pool, int64_t count, Task task) {
+void for_each_task(Pool& pool, int64_t count, Task task) {
   struct State {
     explicit State(int64_t count, Task task) : count(count), task(std::move(task)) {}
     const int64_t count;
     const Task task;
     std::atomic<int64_t> next{0};
     std::atomic<bool> failed{false};
-    std::mutex mutex;
+    std::mutex mutex;  // guards `done` and `error`
     std::condition_variable finished;
     int64_t done = 0;
+    std::exception_ptr error;
 
-    void work() {
-      int64_t mine = 0;
-      for (int64_t i; (i = next.fetch_add(1)) < count; ++mine) try {
+    void work() noexcept {
+      int64_t claimed = 0;
+      for (int64_t i; (i = next.fetch_add(1)) < count; ++claimed) {
+        if (failed) continue;
+        try {
           task(i);
         } catch (...) {
+          std::lock_guard<std::mutex> lock(mutex);
+          if (!error) error = std::current_exception();
           failed = true;
         }
-      if (!mine) return;
+      }
+      if (!claimed) return;
       std::lock_guard<std::mutex> lock(mutex);
-      done += mine;
+      done += claimed;
       if (done == count) finished.notify_all();
     }
   };
   auto state = std::make_shared<State>(count, std::move(task));
   const int64_t helpers = std::min<int64_t>(pool.num_threads(), count) - 1;
-  for (int64_t i = 0; i < helpers; ++i) pool.Schedule([state] { state->work(); });
+  try {
+    for (int64_t i = 0; i < helpers; ++i) pool.Schedule([state] { state->work(); });
+  } catch (...) {  // no memory or no thread for a helper
+  }
   state->work();
   std::unique_lock<std::mutex> lock(state->mutex);
   state->finished.wait(lock, [&] { return state->done == state->count; });
-  return !state->failed;
+  if (state->error) std::rethrow_exception(std::exchange(state->error, nullptr));
 }
 
 }  // namespace jaxfit

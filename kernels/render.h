@@ -5,7 +5,8 @@
 
 namespace jaxfit {
 
-// They fill arrays that the caller has made and checked; jaxfit/raster/zbuffer/operator.py is the only one.
+// Adds the functions to the module. They fill arrays of the caller. Arguments that do not fit each other raise
+// ValueError. jaxfit/raster/zbuffer/operator.py is the only caller.
 void add_renderer(nanobind::module_& m);
 
 }  // namespace jaxfit

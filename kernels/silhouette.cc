@@ -1,13 +1,13 @@
-// The raster core, compiled once an instruction set (JAXFIT_AVX512, JAXFIT_AVX2, neither).
+// The soft silhouette. This file is compiled once for each instruction set (JAXFIT_AVX512, JAXFIT_AVX2, neither).
 //
 // For a pixel and a face, d is the squared distance to the nearest edge segment, negative inside, and
-// silhouette = 1 - Π (1 - p) with p = sigmoid(-d / s). With e = exp(-d / s) this is 1 - 1 / Π (1 + e): no division a
-// face. All lengths are scaled by k = √(log2(e) / s), so that e = 2^(-d).
+// silhouette = 1 - Π (1 - p) with p = sigmoid(-d / s). With e = exp(-d / s) this equals 1 - 1 / Π (1 + e), which needs
+// no division per face. All lengths are scaled by k = √(log2(e) / s), so that e = 2^(-d).
 //
-// The image is cut into blocks of 4×4 pixels. For each face, one evaluation over sixteen block *centres* at a time, a
-// window of the blocks around the face, says which of them it can reach; those are evaluated pixel by pixel. A block
-// whose every product has passed kSaturated is done: no later face visits it, and it has no gradient, as
-// d silhouette / d d = -Π (1 - p) · p / s vanishes there.
+// The image is divided into blocks of 4×4 pixels. For each face, sixteen block *centres* at a time, a window of the
+// blocks around the face, are evaluated to find the blocks that the face can reach. The pixels of these blocks are then
+// evaluated. A block is closed when all its products exceed kSaturated: later faces skip the block, and the block has
+// no gradient, because d silhouette / d d = -Π (1 - p) · p / s vanishes there.
 #include "blocks.h"
 
 #if defined(JAXFIT_AVX512)
@@ -21,7 +21,7 @@
 namespace jaxfit {
 namespace {
 
-// Fills `products` and closes the blocks that saturate.
+// Multiplies the factors of all faces into `products` and closes the blocks that saturate.
 void accumulate_products(Scale scale, Workspace& ws) {
   const Vec outside = all(-scale.radius * scale.radius);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
@@ -39,7 +39,7 @@ void accumulate_products(Scale scale, Workspace& ws) {
   }
 }
 
-// Starts every product at 1; pixels that the last blocks have beyond the image count as full.
+// Sets every product to 1 and opens every block. Pixels of the last blocks outside the image get the value kFull.
 void clear_products(int64_t size, Workspace& ws) {
   const int64_t whole = size / kBlock;
   for (int64_t i = 0; i < ws.blocks * ws.blocks; ++i) store(ws.products + i * kLanes, all(1.f));
@@ -51,14 +51,15 @@ void clear_products(int64_t size, Workspace& ws) {
   for (int64_t i = 0; i < ws.blocks * ws.row_bytes; ++i) ws.open[i] = 0xFF;
 }
 
-// Adds the gradient of every open block; `products` now holds, a pixel, the factor of p · (pixel - nearest point).
+// Adds the gradient of every open block. For each pixel `products` holds the factor of p · (pixel - nearest point).
 void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
   const Vec outside = all(scale.radius * scale.radius);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
     const Faces& f = ws.faces[c];
     for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
       const int lane = __builtin_ctz(todo);
-      // An edge's pull on its ends: across and along it, and both weighted by where along it the pull acts.
+      // For each edge the sums of four quantities over the pixels: the pull across and along the edge, and both
+      // multiplied by the position along the edge where the pull acts.
       Vec sums[12];
       for (int i = 0; i < 12; ++i) sums[i] = all(0.f);
       bool any = false;
@@ -98,7 +99,6 @@ void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
   }
 }
 
-
 // Calls visit(place in `products`, column, row) for every block.
 template <typename Visit>
 INLINE void for_each_place(const Workspace& ws, Visit visit) {
@@ -107,7 +107,7 @@ INLINE void for_each_place(const Workspace& ws, Visit visit) {
       visit(ws.products + (row * ws.blocks + column) * kLanes, column, row);
 }
 
-// A 4×4 block of a row-major image, `fill` beyond the image's edge.
+// Returns a 4×4 block of a row-major image, with `fill` outside the image.
 INLINE Vec load_block(const float* image, int64_t size, int64_t column, int64_t row, float fill) {
   const int64_t x0 = column * kBlock, y0 = row * kBlock;
   alignas(64) float values[kLanes];
@@ -129,7 +129,7 @@ INLINE Vec load_block(const uint8_t* image, int64_t size, int64_t column, int64_
   return from_bytes(values, kBlock);
 }
 
-// Turns the products into the gradient's factors, given d loss / d silhouette; closes blocks that have none.
+// Replaces the products by the factors of the gradient, given d loss / d silhouette. Closes blocks without gradient.
 INLINE void set_factor(Vec cotangent, Vec transmitted, Scale scale, const Workspace& ws, float* place, int64_t column,
                        int64_t row) {
   const Vec factor = cotangent * transmitted;
@@ -145,14 +145,14 @@ float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, boo
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     const Vec transmitted = one / load(place);
     const Vec error = (one - transmitted) - load_block(target, size, column, row, static_cast<Pixel>(1));
-    const Vec size_of = abs(error);
+    const Vec magnitude = abs(error);
     Vec slope;
     if (kind == LossKind::kL1) {
-      part = part + size_of;
-      slope = flip_sign(keep(size_of > all(0.f), one), error);
+      part = part + magnitude;
+      slope = flip_sign(keep(magnitude > all(0.f), one), error);
     } else {
       const Vec square = all(0.5f) * error * error;
-      part = part + select(size_of > one, size_of - all(0.5f), square);
+      part = part + select(magnitude > one, magnitude - all(0.5f), square);
       slope = max(min(error, one), all(-1.f));
     }
     if (column % 16 == 15) total += sum(part), part = all(0.f);
@@ -169,7 +169,7 @@ void clear_gradient(float* gradient, int64_t vertices, float value) {
   for (int64_t i = 0; i < vertices; ++i) gradient[3 * i] = gradient[3 * i + 1] = value, gradient[3 * i + 2] = 0;
 }
 
-// Prepares `products`; false where a coordinate is not finite.
+// Computes `products`. Returns false if a coordinate is not finite.
 bool render(const Mesh& mesh, int64_t size, Scale scale, Workspace& ws) {
   if (!load_vertices(mesh, ws)) return false;
   set_up_faces(mesh, scale, ws);

@@ -10,25 +10,25 @@ namespace jaxfit {
 
 struct Blur {
   float sigma;   // softness s in px²: p = sigmoid(-d / s)
-  float radius;  // px; a face further from a pixel than this leaves it alone
+  float radius;  // px; a face does not affect the pixels outside it at this distance or farther
 };
 
 enum class LossKind : int32_t { kL1 = 0, kSmoothL1 = 1 };
 
-// A mask with one byte (zero or not) or one float (in [0, 1]) a pixel; exactly one pointer is set.
+// A mask with one byte (zero or not zero) or one float (in [0, 1]) per pixel. Exactly one pointer is set.
 struct Target {
   const uint8_t* bytes;
   const float* floats;
 };
 
-// The entry points of one instruction set. `gradient` is (V, 3) and is overwritten; the depths' part is zero.
+// The entry points of one instruction set. `gradient` is (V, 3) and is overwritten. Its depth column is 0.
 struct Kernels {
-  // Bytes of 64-byte aligned `memory` that one image at a time needs.
+  // Returns the size of `memory` in bytes for one image. `memory` is 64-byte aligned.
   size_t (*workspace)(const Mesh&, int64_t size);
   void (*silhouette)(const Mesh&, Blur, int64_t size, void* memory, float* image);
   void (*silhouette_gradient)(const Mesh&, Blur, int64_t size, void* memory, const float* cotangent,
                               float* gradient);
-  // `gradient` may be null: then only the loss is computed.
+  // If `gradient` is null, only the loss is computed.
   void (*mask_loss)(const Mesh&, Blur, int64_t size, void* memory, Target, LossKind, float* loss,
                     float* gradient);
 };

@@ -1,4 +1,4 @@
-// Sixteen lanes in two AVX2 registers; included by simd.h.
+// Sixteen lanes in two AVX2 registers. simd.h includes this file.
 #pragma once
 
 #include <immintrin.h>
@@ -56,7 +56,7 @@ INLINE Vec flip_sign(Vec x, Vec s) {
   const __m256 sign = _mm256_set1_ps(-0.0f);
   return {_mm256_xor_ps(x.a, _mm256_and_ps(sign, s.a)), _mm256_xor_ps(x.b, _mm256_and_ps(sign, s.b))};
 }
-INLINE __m256 scale_exp2(__m256 p, __m256 n) {  // n is shifted by 1.5 · 2^23, so its low bits hold the exponent
+INLINE __m256 scale_exp2(__m256 p, __m256 n) {  // n has an offset of 1.5 · 2^23, so its low bits hold the exponent
   return _mm256_castsi256_ps(
       _mm256_add_epi32(_mm256_castps_si256(p), _mm256_slli_epi32(_mm256_castps_si256(n), 23)));
 }

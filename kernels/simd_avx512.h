@@ -1,4 +1,4 @@
-// Sixteen lanes in one AVX-512 register; included by simd.h.
+// Sixteen lanes in one AVX-512 register. simd.h includes this file.
 #pragma once
 
 #include <immintrin.h>
@@ -30,9 +30,9 @@ INLINE Vec select(Mask m, Vec a, Vec b) { return {_mm512_mask_blend_ps(m.m, b.v,
 INLINE Vec keep(Mask m, Vec a) { return {_mm512_maskz_mov_ps(m.m, a.v)}; }
 INLINE Vec fma_where(Mask m, Vec a, Vec b, Vec c) { return {_mm512_mask3_fmadd_ps(a.v, b.v, c.v, m.m)}; }
 
-// a held to [-limit, limit].
+// a clamped to [-limit, limit].
 INLINE Vec clamp_to(Vec a, Vec limit) { return {_mm512_range_ps(a.v, limit.v, 0x2)}; }
-// -d for d ≥ 0, but d where any of a, b, c has a minus sign.
+// For d ≥ 0: d where any of a, b, c has a minus sign, else -d.
 INLINE Vec negate_unless_any_negative(Vec d, Vec a, Vec b, Vec c) {
   const __m512i any = _mm512_ternarylogic_epi32(_mm512_castps_si512(a.v), _mm512_castps_si512(b.v),
                                                 _mm512_castps_si512(c.v), 0xFE);
@@ -45,7 +45,7 @@ INLINE Vec negate_if_any_negative(Vec d, Vec a, Vec b, Vec c) {
   return {_mm512_castsi512_ps(_mm512_ternarylogic_epi32(_mm512_castps_si512(d.v), any,
                                                         _mm512_set1_epi32(INT32_MIN), 0xF8))};
 }
-// a, its sign flipped where s is negative.
+// a, with its sign flipped where s has a minus sign.
 INLINE Vec flip_sign(Vec a, Vec s) {
   return {_mm512_castsi512_ps(_mm512_ternarylogic_epi32(_mm512_castps_si512(a.v), _mm512_castps_si512(s.v),
                                                         _mm512_set1_epi32(INT32_MIN), 0x78))};
@@ -56,20 +56,20 @@ INLINE Vec exp2(Vec x) {
   const Vec p = fma(fma(half, f, all(kExpFloor[1])), f, all(kExpFloor[0]));
   return {_mm512_scalef_ps(p.v, x.v)};
 }
-// P (1 + e) where m; an infinite product stays so.
+// product · (1 + e) where m. An infinite product stays infinite.
 INLINE Vec grow(Vec product, Vec e, Mask m) { return fma_where(m, product, e, product); }
-INLINE Vec reciprocal(Vec a) {  // one Newton step: 2^-28
+INLINE Vec reciprocal(Vec a) {  // with one Newton step, to a relative error of 2^-28
   const Vec r = {_mm512_rcp14_ps(a.v)};
   return r * Vec{_mm512_fnmadd_ps(a.v, r.v, _mm512_set1_ps(2.0f))};
 }
 INLINE float sum(Vec a) { return _mm512_reduce_add_ps(a.v); }
-INLINE Vec from_bytes(const uint8_t* p, int64_t stride) {  // a 4×4 block: 1 where the byte is not zero
+INLINE Vec from_bytes(const uint8_t* p, int64_t stride) {  // a 4×4 block of bytes: 1 where the byte is not 0
   int32_t r[4];
   for (int i = 0; i < 4; ++i) __builtin_memcpy(&r[i], p + i * stride, 4);
   const __m128i b = _mm_set_epi32(r[3], r[2], r[1], r[0]);
   return {_mm512_maskz_mov_ps(_mm_test_epi8_mask(b, b), _mm512_set1_ps(1.0f))};
 }
-INLINE __m512 fold_quarters(__m512 a, __m512 b) {  // (a01+a23 | b01+b23), in quarters
+INLINE __m512 fold_quarters(__m512 a, __m512 b) {  // quarters of the result: a0 + a2, a1 + a3, b0 + b2, b1 + b3
   return _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xEE));
 }
 INLINE __m512 fold_eighths(__m512 a, __m512 b) {
@@ -85,12 +85,12 @@ INLINE void reduce12(const Vec sums[12], float total[16]) {
   __m512 group[3];
   for (int i = 0; i < 3; ++i) {
     const Vec* s = sums + 4 * i;
-    // Sums 0 to 3 of the group, each as four partial sums, in the four quarters.
+    // Quarter q holds sum q of the group, as four partial sums.
     group[i] = fold_eighths(fold_quarters(s[0].v, s[1].v), fold_quarters(s[2].v, s[3].v));
   }
   const __m512 zero = _mm512_setzero_ps();
   const __m512 t = fold_singles(fold_pairs(group[0], group[1]), fold_pairs(group[2], zero));
-  // Quarter q holds sum q of groups 0, 1, 2; four times a group's number plus q is wanted.
+  // Quarter q holds sum q of the groups 0, 1, 2. In `total`, sum q of group g has the index 4 g + q.
   const __m512i order = _mm512_setr_epi32(0, 4, 8, 12, 1, 5, 9, 13, 2, 6, 10, 14, 3, 7, 11, 15);
   _mm512_store_ps(total, _mm512_permutexvar_ps(order, t));
 }

@@ -1,4 +1,5 @@
-// Sixteen lanes in four of the compiler's vectors of four: SSE2 on x86, NEON on ARM, whatever there is elsewhere; included by simd.h.
+// Sixteen lanes in four compiler vectors of four lanes. The compiler uses SSE2 on x86, NEON on ARM, and the vector
+// instructions of other processors where they exist. simd.h includes this file.
 #pragma once
 
 #if defined(__SSE2__)
@@ -67,7 +68,7 @@ INLINE Vec negate_if_any_negative(Vec d, Vec a, Vec b, Vec c) {
   EACH(r.q[i] = floats(ints(d.q[i]) | ((ints(a.q[i]) | ints(b.q[i]) | ints(c.q[i])) & INT32_MIN)));
 }
 INLINE Vec flip_sign(Vec a, Vec s) { Vec r; EACH(r.q[i] = floats(ints(a.q[i]) ^ (ints(s.q[i]) & INT32_MIN))); }
-INLINE Vec scale_exp2(Vec p, Vec n) {  // n is shifted by 1.5 · 2^23, so its low bits hold the exponent
+INLINE Vec scale_exp2(Vec p, Vec n) {  // n has an offset of 1.5 · 2^23, so its low bits hold the exponent
   Vec r;
   EACH(r.q[i] = floats(ints(p.q[i]) + (ints(n.q[i]) << 23)));
 }

@@ -1,6 +1,6 @@
-// Some rows of an image, and the faces drawn into them. Part of zbuffer.cc.
+// A strip: some rows of an image, and the faces drawn into them. Part of zbuffer.cc.
 //
-// As in simd.h, everything is in an anonymous namespace and nothing uses the standard library's templates.
+// As in simd.h, everything is in an anonymous namespace, and templates of the standard library are not used.
 #pragma once
 
 #include "zbuffer.h"
@@ -9,8 +9,8 @@ namespace jaxfit {
 namespace {
 
 constexpr int kLanes = 8;
-constexpr int64_t kTile = 32;  // pixels; a tile's samples fill whole registers
-constexpr double kNear = 1e-3f;  // as a float, as the vertices are
+constexpr int64_t kTile = 32;  // pixels; the samples of a tile fill whole registers
+constexpr double kNear = 1e-3f;  // rounded to float, because vertices are floats
 
 typedef double Doubles __attribute__((vector_size(64)));
 typedef int64_t Longs __attribute__((vector_size(64)));
@@ -18,20 +18,21 @@ typedef float Floats __attribute__((vector_size(32)));
 typedef int32_t Ints __attribute__((vector_size(32)));
 
 struct Face {
-  double x[3], y[3];   // of the corners, in samples
+  double x[3], y[3];   // corners, in samples
   double k[3];         // 1 / (depth · |2·area|)
-  double low, high;    // the least and greatest 1/depth
-  double turn;         // the area's sign
-  int32_t index, left, right, top, bottom;  // which face; its samples, inclusive, rows from the strip's first
+  double low, high;    // least and greatest 1/depth
+  double turn;         // sign of the area
+  int32_t index;       // index of the face in the mesh
+  int32_t left, right, top, bottom;  // range of samples, inclusive; rows count from the first row of the strip
 };
 
 struct Strip {
   Frame frame;
   Rows rows;
   int64_t columns, lines, tiles;  // samples in a line, lines of samples, tiles in a line
-  float* near;                    // 1/depth, -1 where nothing is; like `face` undefined in untouched tiles
-  int32_t* face;                  // place in `faces`
-  uint8_t* touched;               // a byte a tile
+  float* near;                    // 1/depth, -1 without a face; undefined in untouched tiles, as is `face`
+  int32_t* face;                  // place in `faces`, -1 without a face
+  uint8_t* touched;               // one byte per tile
   Face* faces;
   int32_t num_faces;
 };
@@ -62,12 +63,12 @@ size_t workspace(const Mesh& mesh, Frame frame, Rows rows) {
 double least(double a, double b) { return a < b ? a : b; }
 double most(double a, double b) { return a > b ? a : b; }
 
-// False where the face is not seen in the strip.
+// Prepares a face. Returns false if the face is not visible in the strip.
 bool set_up(const Mesh& mesh, int64_t index, const Strip& s, Face& f) {
   const int32_t* corner = mesh.faces + 3 * index;
   const float *a = mesh.vertices + 3 * corner[0], *b = mesh.vertices + 3 * corner[1],
               *c = mesh.vertices + 3 * corner[2];
-  // Most faces are in other strips. A comparison with NaN is false.
+  // This test comes first, because most faces lie in other strips. A comparison with NaN is false.
   const double scale = static_cast<double>(s.frame.samples);
   const double first = static_cast<double>(s.rows.first) * scale, end = static_cast<double>(s.rows.end) * scale;
   const double y0 = a[1] * scale, y1 = b[1] * scale, y2 = c[1] * scale;
@@ -133,7 +134,7 @@ void draw_face(const Strip& s, const Face& f, int32_t number) {
       Ints old_face;
       __builtin_memcpy(&old_near, near_at, sizeof old_near);
       __builtin_memcpy(&old_face, face_at, sizeof old_face);
-      // Rounded to float, so that faces which meet or coincide tie: the first keeps the sample.
+      // Rounding makes the depths equal where faces meet or coincide. Then the first face keeps the sample.
       const Floats own = __builtin_convertvector(nearness, Floats);
       const Ints better = __builtin_convertvector(inside, Ints) & (Ints)(own > old_near);
       const Ints new_near = (better & (Ints)own) | (~better & (Ints)old_near);
@@ -159,7 +160,7 @@ Strip rasterise(const Mesh& mesh, Frame frame, Rows rows, void* memory) {
   return s;
 }
 
-// Perspective-correct weights of the corners at a sample that the face covers; returns 1/depth.
+// Computes perspective-correct weights of the corners at a sample that the face covers. Returns 1/depth.
 inline __attribute__((always_inline)) double weigh(const Face& f, double x, double y, double weights[3]) {
   double dx[3], dy[3];
   for (int i = 0; i < 3; ++i) dx[i] = f.x[i] - x, dy[i] = (f.y[i] - y) * f.turn;
@@ -168,7 +169,7 @@ inline __attribute__((always_inline)) double weigh(const Face& f, double x, doub
     weights[i] = (dx[j] * dy[k] - dy[j] * dx[k]) * f.k[i];
   }
   const double total = (weights[0] + weights[1]) + weights[2];
-  if (total == 0) weights[0] = 1;  // rounded away, far outside the image
+  if (total == 0) weights[0] = 1;  // all weights rounded to 0: a corner is far outside the image
   const double inverse = total == 0 ? 1 : 1 / total;
   for (int i = 0; i < 3; ++i) weights[i] *= inverse;
   return least(most(total, f.low), f.high);

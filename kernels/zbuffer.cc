@@ -1,9 +1,9 @@
-// The z-buffer, compiled once an instruction set (JAXFIT_AVX512, JAXFIT_AVX2, neither).
+// The z-buffer. This file is compiled once for each instruction set (JAXFIT_AVX512, JAXFIT_AVX2, neither).
 //
-// It repeats jaxfit/raster/zbuffer/reference.py operation by operation, in double, so that both see the same face at every
-// sample; that needs -ffp-contract=off. First every face writes its nearness (1/depth) and its number where it is the
-// nearest so far; then each sample that was written recomputes the weights of its face. Only tiles of columns that a
-// face has reached are cleared and read again: a few birds in a large image cost what they cover.
+// The code repeats the operations of jaxfit/raster/zbuffer/reference.py in double precision, so that both find the same
+// face at every sample. This requires -ffp-contract=off. First, every face writes its nearness (1/depth) and its number
+// to the samples where it is the nearest face so far. Then the weights of the nearest face are computed again at every
+// sample. Only tiles of columns that a face reaches are cleared and read, so the time depends on the covered area.
 #include "strip.h"
 
 #if defined(JAXFIT_AVX512)
@@ -17,9 +17,7 @@
 namespace jaxfit {
 namespace {
 
-constexpr int64_t kMaxSamples = 8;
-
-// Calls visit(row, column) for every pixel of touched tiles, empty(row, column) for the rest.
+// Calls visit(row, column) for every pixel of the touched tiles and empty(row, column) for every other pixel.
 template <typename Visit, typename Empty>
 inline void for_each_pixel(const Strip& s, Visit visit, Empty empty) {
   for (int64_t row = s.rows.first; row < s.rows.end; ++row)
@@ -64,7 +62,7 @@ void mask(const Mesh& mesh, Frame frame, Rows rows, void* memory, uint8_t* mask)
       [](int64_t, int64_t) {});
 }
 
-// One face's share of a pixel: its weights summed over the samples that see it.
+// The part of one face in a pixel: its weights, summed over the samples where the face is visible.
 struct Share {
   const int32_t* corner;
   double weights[3];
@@ -72,16 +70,16 @@ struct Share {
 
 struct Pixel {
   Share shares[kMaxSamples * kMaxSamples];
-  int count;     // of shares
-  int covered;   // samples
-  int32_t face;  // the nearest sample's, or -1
+  int count;     // number of shares
+  int covered;   // number of covered samples
+  int32_t face;  // the face at the nearest sample, or -1
 };
 
 void gather(const Mesh& mesh, const Strip& s, int64_t row, int64_t column, Pixel& pixel) {
   const int64_t n = s.frame.samples;
   float nearest = -1;
   int32_t last = -1;
-  double sum0 = 0, sum1 = 0, sum2 = 0;  // of the share of `last`, in registers
+  double sum0 = 0, sum1 = 0, sum2 = 0;  // the weights of the share of `last`, in registers
   const auto close = [&] {
     if (last >= 0) pixel.shares[pixel.count++] = {mesh.faces + 3 * s.faces[last].index, {sum0, sum1, sum2}};
   };
@@ -103,7 +101,7 @@ void gather(const Mesh& mesh, const Strip& s, int64_t row, int64_t column, Pixel
   close();
 }
 
-// Σ weight · attribute over the samples of a pixel.
+// Returns Σ weight · attribute over the samples of a pixel.
 double total(const Pixel& pixel, const float* attributes, int64_t channels, int64_t channel) {
   double sum = 0;
   for (int i = 0; i < pixel.count; ++i)
@@ -143,7 +141,7 @@ void draw(const Mesh& mesh, Frame frame, Rows rows, void* memory, const float* c
     if (!pixel.covered) return;
     uint8_t* at = image + 3 * (row * frame.width + column);
     for (int c = 0; c < 3; ++c) {
-      // Rounded to float first, so that a half is a half however it was summed.
+      // Rounding to float first removes the rounding errors of the sums, so that exact halves always round up.
       const float mixed = static_cast<float>((1 - pixel.covered / samples) * at[c] +
                                              255 * (total(pixel, colours, 3, c) / samples));
       at[c] = static_cast<uint8_t>(mixed > 0 ? mixed < 255 ? mixed + 0.5f : 255.f : 0.f);

@@ -1,4 +1,4 @@
-// What is seen at the pixels of an image: the nearest face, its attributes, the mask. For rows of one image at a time.
+// The renderer: the nearest face, the mask and interpolated attributes at the pixels of some rows of one image.
 #pragma once
 
 #include <cstddef>
@@ -8,27 +8,29 @@
 
 namespace jaxfit {
 
+constexpr int64_t kMaxSamples = 8;
+
 struct Frame {
-  int64_t width, height;  // px
-  int64_t samples;        // along a pixel's side
+  int64_t width, height;  // px, 1 to kMaxSize
+  int64_t samples;        // number along the side of a pixel, 1 to kMaxSamples
 };
 
 struct Rows {
   int64_t first, end;  // pixel rows [first, end)
 };
 
-// The entry points of one instruction set. Results are row-major and point to their image's first pixel; only the
-// given rows are written. `memory` is 64-byte aligned and of `workspace` bytes. Rows do not depend on each other.
+// The entry points of one instruction set. Results are row-major and point to the first pixel of the image. Only the
+// given rows are written. Rows do not depend on each other. `memory` is 64-byte aligned and has `workspace` bytes.
 struct Renderer {
   size_t (*workspace)(const Mesh&, Frame, Rows);
-  // One sample a pixel: face (H, W), barycentric (H, W, 3), depth (H, W).
+  // Writes face (H, W), barycentric (H, W, 3) and depth (H, W). One sample per pixel.
   void (*fragments)(const Mesh&, Frame, Rows, void* memory, int32_t* face, float* barycentric, float* depth);
-  // One sample a pixel; writes 1 where the mesh is and leaves the rest.
+  // Writes 1 at the pixels that the mesh covers and nothing elsewhere. One sample per pixel.
   void (*mask)(const Mesh&, Frame, Rows, void* memory, uint8_t* mask);
-  // attributes (V, C); values (H, W, C), coverage (H, W), face (H, W).
+  // Reads attributes (V, C). Writes values (H, W, C), coverage (H, W) and face (H, W).
   void (*interpolate)(const Mesh&, Frame, Rows, void* memory, const float* attributes, int64_t channels,
                       float* values, float* coverage, int32_t* face);
-  // colours (V, 3) over image (H, W, 3), of which only covered pixels are written.
+  // Blends colours (V, 3) into image (H, W, 3). Only covered pixels are written.
   void (*draw)(const Mesh&, Frame, Rows, void* memory, const float* colours, uint8_t* image);
 };
 

@@ -1,4 +1,4 @@
-"""The renderer's benchmark: crops of one bird, and full frames of several."""
+"""Benchmark of the renderer: crops of one bird, and full frames with several birds."""
 
 import os
 
@@ -12,8 +12,8 @@ from jaxfit.raster import zbuffer as render
 CROP_PX, FRAME_PX, BIRD_PX = 256, (2592, 1520), 350
 
 
-def _seen(vertices: np.ndarray, longest_px: float) -> np.ndarray:
-    """The mesh from its shortest side, its longest `longest_px`: x and y about 0, depth in pixels in front of 10⁴."""
+def _view(vertices: np.ndarray, longest_px: float) -> np.ndarray:
+    """Return the mesh seen along its shortest side, in pixels: x and y around 0, depth around 10⁴."""
     low, high = vertices.min(0), vertices.max(0)
     order = np.argsort(low - high, kind="stable")[[1, 0, 2]]
     centred = (vertices - (low + high) / 2)[:, order] * (longest_px / (high - low).max())
@@ -21,18 +21,18 @@ def _seen(vertices: np.ndarray, longest_px: float) -> np.ndarray:
 
 
 def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, repeats: int = 15) -> dict:
-    """Times the renderer on crops (face, barycentrics and depth) and on full frames (anti-aliased colours).
+    """Measure the time of the renderer on crops (face, barycentrics, depth) and full frames (anti-aliased colours).
 
     Args:
-        bird: a model, seen at rest along its shortest side; by default a generated mesh of 5,712 faces.
-        crops: images of 256 pixels in a batch, the bird 180 pixels long and moved a little in each.
-        birds: in a frame of 2592×1520 pixels, each 350 pixels long and of half the mesh's faces.
-        repeats: runs, of which the median counts.
+        bird: a model, rendered at rest along its shortest side. The default is a generated mesh of 5,712 faces.
+        crops: number of images of 256 pixels in a batch. The bird is about 180 pixels long and moves a little.
+        birds: number of birds in a frame of 2592×1520 pixels. Each is 350 pixels long and has half the faces.
+        repeats: number of runs. The median is returned.
 
     Returns:
-        `crops_per_s`, `interpolated_crops_per_s` (three channels, 4 samples a pixel), `mask_ms` (one bird's hard mask
-        in a full frame), `full_frames_per_s` and `full_frame_ms` (`draw`, 4 samples a pixel), `faces` of a crop,
-        `frame_faces`, `crops`, `birds`, `threads`, `isa` (None: the reference ran).
+        `crops_per_s`, `interpolated_crops_per_s` (three channels, 4 samples per pixel), `mask_ms` (hard mask of a bird
+        in a full frame), `full_frames_per_s` and `full_frame_ms` (`draw`, 4 samples per pixel), `faces` of a crop,
+        `frame_faces`, `crops`, `birds`, `threads`, `isa` (None if the reference ran).
 
     Raises:
         ValueError: a count is not positive.
@@ -47,7 +47,7 @@ def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, rep
     colours = np.random.default_rng(0).random((len(vertices), 3)).astype(np.float32)
 
     middle = np.array([CROP_PX / 2, CROP_PX / 2, 0], np.float32)
-    batch = jittered_frames(_seen(vertices, 0.7 * CROP_PX) + middle, crops, CROP_PX)
+    batch = jittered_frames(_view(vertices, 0.7 * CROP_PX) + middle, crops, CROP_PX)
     zbuffer_s = median_seconds(lambda: render.zbuffer(batch, faces, CROP_PX, CROP_PX), repeats)
     interpolate_s = median_seconds(lambda: render.interpolate(batch, faces, colours, CROP_PX, CROP_PX), repeats)
 
@@ -55,7 +55,7 @@ def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, rep
     columns = int(np.ceil(np.sqrt(birds)))
     x, y = (np.arange(birds) % columns + 0.5) / columns, (np.arange(birds) // columns + 0.5) / columns
     places = np.stack([width * x, height * y, np.zeros(birds)], 1)[:, None].astype(np.float32)
-    flock = (_seen(vertices, BIRD_PX) + places).reshape(-1, 3)
+    flock = (_view(vertices, BIRD_PX) + places).reshape(-1, 3)
     flock_faces = np.concatenate([faces[::2] + i * len(vertices) for i in range(birds)])
     flock_colours, frame = np.tile(colours, (birds, 1)), np.full((height, width, 3), 128, np.uint8)
     frame_s = median_seconds(lambda: render.draw(frame, flock, flock_faces, flock_colours), repeats)

@@ -1,4 +1,4 @@
-"""The raster core's benchmark: loss and vertex gradient of many frames of one bird."""
+"""Benchmark of the soft silhouette: mask loss and vertex gradient of many frames of one bird."""
 
 import math
 import os
@@ -15,10 +15,10 @@ from jaxfit.raster import silhouette as raster
 
 
 def bird_like_mesh() -> tuple[np.ndarray, np.ndarray]:
-    """A body and two wings of four overlapping sheets of feathers each: 5,712 faces, as many as the AVES bird.
+    """Return a body and two wings, each with four overlapping layers of feathers: 5,712 faces, as in the AVES bird.
 
     Returns:
-        Vertices (V, 3), in no unit, z = 1, and faces (F, 3).
+        Vertices (V, 3) without a unit, with z = 1, and faces (F, 3).
     """
     around, along, layers, span, chord = 24, 26, 4, 31, 9
     angle = np.linspace(0, 2 * math.pi, around, endpoint=False)
@@ -40,7 +40,7 @@ def bird_like_mesh() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _grid_faces(rows: int, columns: int, wrap: bool) -> np.ndarray:
-    """Two triangles for each of rows × columns quads; with `wrap` the last column meets the first."""
+    """Return two triangles for each of rows × columns quads. With `wrap` the last column joins the first column."""
     width = columns if wrap else columns + 1
     r, c = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     a, b = r * width + c, r * width + (c + 1) % width
@@ -48,7 +48,11 @@ def _grid_faces(rows: int, columns: int, wrap: bool) -> np.ndarray:
 
 
 def fitted_to_image(vertices: Float[np.ndarray, "V 3"], size: int) -> np.ndarray:
-    """The mesh seen along its shortest side, its longest 0.7 of the image's width: x and y in pixels, depth 1."""
+    """Return the mesh seen along its shortest side, with its longest side scaled to 0.7 of the image's width.
+
+    Returns:
+        Vertices (V, 3): x and y in pixels, depth 1.
+    """
     low, high = vertices.min(0), vertices.max(0)
     longest, second = np.argsort(low - high, kind="stable")[:2]
     xy = (vertices - (low + high) / 2)[:, [second, longest]] * (0.7 * size / (high - low)[longest]) + size / 2
@@ -56,7 +60,7 @@ def fitted_to_image(vertices: Float[np.ndarray, "V 3"], size: int) -> np.ndarray
 
 
 def jittered_frames(vertices: Float[np.ndarray, "V 3"], frames: int, size: int, seed: int = 0) -> np.ndarray:
-    """Each frame turned, scaled and shifted a little about the image's middle: (frames, V, 3)."""
+    """Return frames with small random rotations, scales and shifts about the image's centre: (frames, V, 3)."""
     rng = np.random.default_rng(seed)
     angle, scale = rng.normal(0, 0.1, frames), 1 + rng.normal(0, 0.03, frames)
     turn = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1).reshape(-1, 2, 2)
@@ -65,7 +69,7 @@ def jittered_frames(vertices: Float[np.ndarray, "V 3"], frames: int, size: int, 
 
 
 def median_seconds(run: Callable[[], object], repeats: int) -> float:
-    """Median time of one run, in seconds; a first one, which may compile, does not count."""
+    """Return the median time of one run in seconds. A first run, which may compile, is not counted."""
     jax.block_until_ready(run())
     times = []
     for _ in range(repeats):
@@ -83,24 +87,24 @@ def bench_silhouette(
     faces: Int[Array | np.ndarray, "F 3"] | None = None,
     reference_frames: int = 1,
 ) -> dict:
-    """Times mask loss plus vertex gradient over a batch of frames, and checks the gradient.
+    """Measure the time of mask loss and vertex gradient over a batch of frames, and the error of the gradient.
 
-    Without a mesh, a bird-like one of 5,712 faces is made; with the AVX-512 kernels it takes 0.9
-    to 1.0 of the time of the AVES bird's. The matrix product is timed right after the frames, on the same cores.
+    The default mesh is a generated bird of 5,712 faces. With the AVX-512 kernels it takes 0.9 to 1.0 of the time of the
+    AVES bird. The matrix product is measured directly after the frames, on the same cores.
 
     Args:
-        frames: images in a batch.
-        repeats: runs, of which the median counts.
-        size: the images' width and height in pixels.
-        vertices: a mesh in any unit, seen along its shortest side and jittered to make the frames.
-        faces: that mesh's faces.
-        reference_frames: frames whose gradient is compared to the plain JAX reference, about ten seconds each; 0
-            leaves `gradient_error` None.
+        frames: number of images in a batch.
+        repeats: number of runs. The median is returned.
+        size: width and height of the images in pixels.
+        vertices: a mesh in any unit. The frames are jittered views along its shortest side.
+        faces: the faces of the mesh.
+        reference_frames: number of frames whose gradient is compared with the plain JAX reference. Each takes about ten
+            seconds. With 0, `gradient_error` is None.
 
     Returns:
-        `ms_per_frame`, `loss_ms_per_frame` (without gradient), `frames`, `faces`, `size`, `threads`, `isa` (None:
-        the reference ran), `gradient_error` (norm of the difference over norm), `matmul_ms` (a 1024³ float32 product)
-        and `matmul_ratio` (a frame's time over it), and `scaling`: rows of `frames`, `faces`, `ms_per_frame`.
+        `ms_per_frame`, `loss_ms_per_frame` (without gradient), `frames`, `faces`, `size`, `threads`, `isa` (None if the
+        reference ran), `gradient_error` (norm of the difference over the norm), `matmul_ms` (a 1024³ float32 product),
+        `matmul_ratio` (`ms_per_frame` over `matmul_ms`), and `scaling`: rows of `frames`, `faces`, `ms_per_frame`.
 
     Raises:
         ValueError: only one of vertices and faces is given, or a count is not positive.
@@ -123,9 +127,9 @@ def bench_silhouette(
     loss_only = jax.jit(jax.vmap(loss, in_axes=(0, None)))
     with_gradient = jax.jit(jax.vmap(jax.value_and_grad(loss), in_axes=(0, None)))
 
-    def time_of(count: int, chosen) -> dict:
-        seconds = median_seconds(lambda: with_gradient(batch[:count], chosen), repeats)
-        return {"frames": count, "faces": len(chosen), "ms_per_frame": 1e3 * seconds / count}
+    def time_of(count: int, some_faces) -> dict:
+        seconds = median_seconds(lambda: with_gradient(batch[:count], some_faces), repeats)
+        return {"frames": count, "faces": len(some_faces), "ms_per_frame": 1e3 * seconds / count}
 
     whole = time_of(frames, faces)
     a = jax.random.normal(jax.random.key(0), (1024, 1024))
@@ -133,7 +137,7 @@ def bench_silhouette(
     matmul_ms = 1e3 * median_seconds(lambda: matmul(a), repeats)
 
     counts = sorted({max(1, frames // 4), max(1, frames // 2)})
-    # Every second or fourth face covers the same bird, so that only the number changes.
+    # Every second or fourth face covers the same area, so that only the number of faces changes.
     scaling = [time_of(count, faces) for count in counts]
     scaling += [time_of(frames, faces[::step]) for step in (4, 2)] + [whole]
 
@@ -151,7 +155,7 @@ def bench_silhouette(
 
 
 def _gradient_error(loss, batch, faces) -> float:
-    """The largest relative error of a frame's vertex gradient against the plain JAX reference."""
+    """Return the largest relative error of a frame's vertex gradient against the plain JAX reference."""
     fast, slow = (jax.jit(jax.grad(lambda v, b=b: loss(v, faces, b))) for b in ("auto", "reference"))
     errors = []
     for vertices in batch:

@@ -1,1 +1,1 @@
-"""The raster core: the soft silhouette, the z-buffer, and the compiled kernels of both."""
+"""The soft silhouette, the z-buffer renderer, and the compiled kernels of both."""

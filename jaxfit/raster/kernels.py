@@ -1,8 +1,9 @@
-"""The compiled kernels: the only module that loads them and registers them with XLA.
+"""Load the compiled kernels and register them with XLA; no other module does this.
 
-A build without a C++ compiler has none: that is announced once, and the references take over. Kernels that are there
-but do not load are an error. The environment variable `JAXFIT_KERNEL_ISA` chooses the instruction set for the process
-(avx512, avx2 or baseline; by default the best one that the processor has), or does without the kernels (none).
+An installation without a C++ compiler has no kernels. A warning says so once, and the reference implementations run in
+place of the kernels. Kernels that exist but do not load are an error. The environment variable `JAXFIT_KERNEL_ISA`
+chooses the instruction set of the process: avx512, avx2 or baseline. The default is the best instruction set of the
+processor. The value none switches the kernels off.
 """
 
 import functools
@@ -23,14 +24,14 @@ _logger = logging.getLogger(__name__)
 
 @functools.cache
 def _kernels() -> ModuleType | None:
-    """The extension module, its handlers registered; None, said once, where it was not built or not wanted."""
+    """The extension module with its handlers registered. None, with one warning, if it is not built or switched off."""
     slower = "silhouettes run in plain JAX and renderings in NumPy, hundreds of times slower"
     if os.environ.get(ISA_VARIABLE) == "none":
         _logger.warning("%s=none: %s.", ISA_VARIABLE, slower)
         return None
     if importlib.util.find_spec(_MODULE) is None:
         _logger.warning(
-            "jaxfit was installed without its compiled kernels, so %s. Install a C++17 compiler and reinstall jaxfit.",
+            "jaxfit was installed without its compiled kernels, so %s. Install GCC or Clang and reinstall jaxfit.",
             slower,
         )
         return None
@@ -42,10 +43,10 @@ def _kernels() -> ModuleType | None:
 
 
 def require_kernels() -> ModuleType:
-    """The extension module.
+    """Return the extension module.
 
     Raises:
-        RuntimeError: the kernels were not built, or are switched off.
+        RuntimeError: the kernels are not built or are switched off.
     """
     kernels = _kernels()
     if kernels is None:
@@ -54,30 +55,30 @@ def require_kernels() -> ModuleType:
 
 
 def kernels_available() -> bool:
-    """Whether the compiled kernels were built with this installation, and are not switched off."""
+    """Whether this installation has compiled kernels that are not switched off."""
     return _kernels() is not None
 
 
 def available_isas() -> tuple[str, ...]:
-    """The instruction sets that the kernels can use on this processor, best first; empty without kernels."""
+    """The instruction sets that the kernels can use on this processor, best first. Empty without kernels."""
     kernels = _kernels()
     return tuple(kernels.available_isas()) if kernels else ()
 
 
 def current_isa() -> str | None:
-    """The instruction set in use, None without kernels."""
+    """The instruction set in use. None without kernels."""
     kernels = _kernels()
     return kernels.current_isa() if kernels else None
 
 
 def choose_isa(name: str) -> None:
-    """Chooses the instruction set of every later kernel call in this process.
+    """Choose the instruction set of every later kernel call in this process.
 
     Args:
         name: one of `available_isas()`, or "auto" for the best of them.
 
     Raises:
-        ValueError: the processor or the build has no such instruction set.
-        RuntimeError: the kernels were not built.
+        ValueError: the processor or the build does not have this instruction set.
+        RuntimeError: the kernels are not built or are switched off.
     """
     require_kernels().choose_isa(name)

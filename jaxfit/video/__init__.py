@@ -1,1 +1,1 @@
-"""Frames out of videos, and frames into videos."""
+"""Read the frames of videos, and write frames as videos."""

@@ -1,4 +1,4 @@
-"""What videos are written as; apart from the libraries that write them, so that help can name it at once."""
+"""Codecs and containers for written videos. This module imports no video library, so that help texts load fast."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ CODECS = {
     "vp9": ("libvpx-vp9", {"deadline": "realtime", "cpu-used": "8", "row-mt": "1", "crf": "32", "b": "0"}),
     "mpeg4": ("mpeg4", {"qmin": "3", "qmax": "5"}),
 }
-"""Name → encoder and its settings. Browsers play h264 and vp9; mpeg4 only players.
+"""Name → encoder and its settings. Browsers play h264 and vp9. Only players play mpeg4.
 
-Without ``cpu-independent`` x264 wrote other bytes in every third run, on one machine and even by one thread."""
+Without ``cpu-independent`` x264 wrote different bytes in every third run, on one machine and even with one thread."""
 CONTAINERS = {".mp4": ("h264", "vp9", "mpeg4"), ".webm": ("vp9",)}
-"""A file's ending decides the container; its codecs, the first that this installation has being taken."""
+"""File name extension → codecs of the container, in the order of preference."""

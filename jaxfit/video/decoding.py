@@ -1,4 +1,4 @@
-"""A video's frames, decoded: numbered for good, damaged ones told apart."""
+"""Decode the frames of a video. Frame numbers are stable across damaged frames."""
 
 from __future__ import annotations
 
@@ -25,52 +25,51 @@ __all__ = ["EXACT", "Frame", "decode", "frame_rate", "opened"]
 _logger = logging.getLogger(__name__)
 
 EXACT = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.BITEXACT
-"""Colours are converted alike on every machine."""
+"""Settings that convert colours identically on every machine."""
 
 _MATROSKA = "matroska,webm"
-_STAMPED = ("mov,mp4,m4a,3gp,3g2,mj2", _MATROSKA)  # every packet has a time stamp of its own: seeks are exact
-_REORDERED = ("h264", "hevc")  # AVI has no time stamps, and nothing makes up right ones for these
-_CHUNK_HEADER = 8  # bytes between what AVI's index names and the packet
-_MOST_HEADERS = 1024  # bytes between packets of Matroska that need no explanation
+_STAMPED = ("mov,mp4,m4a,3gp,3g2,mj2", _MATROSKA)  # every packet has a time stamp, so seeks are exact
+_REORDERED = ("h264", "hevc")  # AVI has no time stamps, and FFmpeg cannot derive correct time stamps for these
+_CHUNK_HEADER = 8  # bytes between the position in the index of an AVI file and the packet
+_MOST_HEADERS = 1024  # bytes; a larger gap between the packets of a Matroska file is damage
 
 
 class Frame(NamedTuple):
     """One frame of a video."""
 
     index: int
-    """Its number, counted from 0: the same number is the same picture, wherever reading began."""
+    """Number of the frame, from 0. The number of a picture does not depend on the first frame that is read."""
     picture: UInt8[np.ndarray, "H W 3"]
-    """Blue-green-red."""
+    """Pixels, in the channel order blue, green, red."""
     time_s: float | None
-    """Seconds since frame 0: the container's time stamps, or by the frame rate where it has none; None where there is
-    neither."""
+    """Seconds since frame 0, from the time stamps of the container or else from the frame rate. None without both."""
 
 
-def decode(path: Path, wanted: range, stopped: Callable[[], bool]) -> Generator[Frame | int, None, None]:
-    """Those frames of a video, in order; the bare number of one that is damaged or lost.
+def decode(path: Path, numbers: range, stopped: Callable[[], bool]) -> Generator[Frame | int, None, None]:
+    """Yield the requested frames of a video in order. For a damaged or lost frame, yield only its number.
 
-    What comes before is not decoded where the container has time stamps (mp4, mkv, webm): its packets are counted,
-    then decoding begins at a keyframe before. It is the third last: a stream that refreshes bit by bit instead
-    of having true keyframes needs up to two of its marks until pictures are whole.
+    If the container has time stamps (mp4, mkv, webm), the packets of earlier frames are counted and not decoded.
+    Decoding starts at the third last keyframe before the first requested frame. A stream with gradual refresh has no
+    true keyframes, and needs up to two of its recovery points until its pictures are complete.
 
     Args:
         path: the file.
-        wanted: numbers.
-        stopped: asked between packets whether to end.
+        numbers: numbers of the requested frames.
+        stopped: called between packets; True ends the decoding.
 
     Raises:
-        InputError: no video that can be read, or not a single picture in it.
+        InputError: the file is not a readable video, or no picture of it can be decoded.
     """
-    if not wanted:
+    if not numbers:
         return
     with opened(path) as (container, stream):
-        begun = _begin(container, stream, wanted.start, stopped)
+        begun = _begin(container, stream, numbers.start, stopped)
         if begun is not None:
-            yield from _read(path, container, stream, *begun, wanted, stopped)
+            yield from _read(path, container, stream, *begun, numbers, stopped)
             return
     with opened(path) as (container, stream):
         line = _timeline(container, stream)
-        yield from _read(path, container, stream, _demuxed(container, stream), line, wanted, stopped)
+        yield from _read(path, container, stream, _demuxed(container, stream), line, numbers, stopped)
 
 
 def _read(
@@ -79,7 +78,7 @@ def _read(
     stream: Any,
     packets: Iterator[tuple[Any, bool]],
     line: Timeline,
-    wanted: range,
+    numbers: range,
     stopped: Callable[[], bool],
 ) -> Iterator[Frame | int]:
     rate, any_picture, problem = frame_rate(stream), False, ""
@@ -95,42 +94,42 @@ def _read(
             line.finish()
         else:
             if not any_picture and picture.rotation:
-                _logger.warning("%s: is to be shown turned by %d°; its frames are not", path, picture.rotation)
+                _logger.warning("%s: players rotate this video by %d°, the frames here are not", path, picture.rotation)
             any_picture = True
             line.show(picture)
         for number, packet, whole in line.ready():
-            if number in wanted and whole is None:
+            if number in numbers and whole is None:
                 yield number
-            elif number in wanted:
+            elif number in numbers:
                 time_s = number / rate if rate else None
                 if line.stamped and line.origin is not None:
                     time_s = float((packet.stamp - line.origin) * stream.time_base)
                 yield Frame(number, whole.to_ndarray(format="bgr24", interpolation=EXACT), time_s)
-            if number >= wanted[-1]:
+            if number >= numbers[-1]:
                 return
         if picture is None:
             break
     if not any_picture:
-        raise InputError(path, f"no frame can be decoded{problem}", "it may be incomplete or damaged")
+        raise InputError(path, f"no frame can be decoded{problem}", "the file may be incomplete or damaged")
     _warn_if_short(path, container, stream, line, problem)
 
 
 def _decoded(
     packets: Iterator[tuple[Any, bool]], stream: Any, line: Timeline, stopped: Callable[[], bool]
 ) -> Iterator[Any]:
-    """Pictures as the decoder gives them; every packet is told to the timeline before."""
+    """Yield decoded pictures in the order of the decoder. Every packet is added to the timeline first."""
     problem = None
     packets = _checked_by_index(packets, stream, line)
     while not stopped():
         try:
             packet, torn = next(packets, (None, False))
-        except av.error.FFmpegError as error:  # of the container: what is in the decoder still comes
+        except av.error.FFmpegError as error:  # the container is damaged: the decoder still returns its last pictures
             problem, packet, torn = error, None, False
         if packet is not None:
             _add(line, packet, torn)
         try:
-            pictures = stream.decode(packet)  # nothing more empties the decoder
-        except av.error.FFmpegError:  # of one packet: its frame is missed when the next comes
+            pictures = stream.decode(packet)  # None flushes the decoder
+        except av.error.FFmpegError:  # one packet is damaged: the timeline misses its frame at the next picture
             pictures, line.troubled = [], True
         yield from pictures
         if packet is None:
@@ -140,7 +139,7 @@ def _decoded(
 
 
 def _add(line: Timeline, packet: Any, torn: bool) -> Packet | None:
-    # VP8 has packets that only serve as references: a bit of their first byte says so
+    # VP8 has packets that serve only as references. A bit of the first byte marks these packets.
     hidden = packet.stream.codec_context.name == "vp8" and not memoryview(packet)[0] & 0x10
     if hidden or packet.is_discard:
         line.skipped += 1
@@ -149,11 +148,11 @@ def _add(line: Timeline, packet: Any, torn: bool) -> Packet | None:
 
 
 def _demuxed(container: Any, stream: Any) -> Iterator[tuple[Any, bool]]:
-    """The packets of a stream, none of them empty, and whether bytes were skipped before each."""
+    """Yield the non-empty packets of a stream, each with whether bytes were skipped before the packet."""
     matroska, end, torn = container.format.name == _MATROSKA, None, False
-    # only all streams together fill a file
+    # in Matroska all streams are read, because gaps between packets of one stream are normal
     for packet in container.demux() if matroska else container.demux(stream):
-        if not packet.size:  # AVI's way to repeat a picture; the last of every stream
+        if not packet.size:  # a repeated picture in AVI, or the end of a stream
             continue
         if matroska and packet.pos is not None:
             torn = torn or (end is not None and packet.pos - end > _MOST_HEADERS)
@@ -164,7 +163,10 @@ def _demuxed(container: Any, stream: Any) -> Iterator[tuple[Any, bool]]:
 
 
 def _checked_by_index(packets: Iterator[tuple[Any, bool]], stream: Any, line: Timeline) -> Iterator[tuple[Any, bool]]:
-    """AVI counts packets to know their time: where damage hides some, its index tells the right one."""
+    """Correct the times of AVI packets by the index of the file.
+
+    FFmpeg derives the time of an AVI packet by counting packets, which is wrong after packets that damage hides.
+    """
     index = stream.index_entries
     if stream.container.format.name != "avi" or len(index) < max(1, stream.frames):
         yield from packets
@@ -178,7 +180,7 @@ def _checked_by_index(packets: Iterator[tuple[Any, bool]], stream: Any, line: Ti
                     line.add(index[at].timestamp, index[at].is_keyframe, lost=True)
                 at += 1
             if at == len(index) or index[at].pos + _CHUNK_HEADER > packet.pos:
-                continue  # bytes of a damaged packet that look like another one
+                continue  # bytes of a damaged packet that look like a packet
             shift, at = index[at].timestamp - packet.dts, at + 1
             packet.pts = None if packet.pts is None else packet.pts + shift
             packet.dts += shift
@@ -188,13 +190,16 @@ def _checked_by_index(packets: Iterator[tuple[Any, bool]], stream: Any, line: Ti
 def _begin(
     container: Any, stream: Any, start: int, stopped: Callable[[], bool]
 ) -> tuple[Iterator[tuple[Any, bool]], Timeline] | None:
-    """Packets from a keyframe before a frame on, or from the first; None where the keyframe is not found again."""
+    """Return the packets from a keyframe before frame `start`, or from the first packet, and their timeline.
+
+    Returns None if the seek does not find the keyframe again.
+    """
     if not start or container.format.name not in _STAMPED:
         return _demuxed(container, stream), _timeline(container, stream)
-    found = _keyframe(container, stream, start, stopped)
-    if found is None:
+    keyframe = _keyframe(container, stream, start, stopped)
+    if keyframe is None:
         return None
-    place, mark = found
+    place, mark = keyframe
     try:
         container.seek(place.stamp, stream=stream)
         packets = _demuxed(container, stream)
@@ -209,10 +214,13 @@ def _begin(
 
 
 def _keyframe(container: Any, stream: Any, start: int, stopped: Callable[[], bool]) -> tuple[Place, tuple] | None:
-    """The third last keyframe up to a frame, by counting packets; None where there is none, or stamps are unusable."""
+    """Return the third last keyframe up to frame `start`, found by counting packets.
+
+    Returns None if there is no such keyframe or the time stamps are unusable.
+    """
     line = _timeline(container, stream)
     waiting: dict[int, tuple] = {}
-    found: deque[tuple[Place, tuple]] = deque(maxlen=3)
+    keyframes: deque[tuple[Place, tuple]] = deque(maxlen=3)
     try:
         for packet, torn in _demuxed(container, stream):
             if stopped():
@@ -224,15 +232,15 @@ def _keyframe(container: Any, stream: Any, start: int, stopped: Callable[[], boo
                 waiting[added.order] = _mark(packet)
             if packet.dts is None:
                 continue
-            # no later packet is shown before it is decoded
+            # no later packet is shown before this decoding time
             for number, settled, there in line.settle(packet.dts):
                 if number > start:
-                    return found[0] if found else None
+                    return keyframes[0] if keyframes else None
                 if there and settled.order in waiting:
-                    found.append((line.place(number, settled), waiting.pop(settled.order)))
+                    keyframes.append((line.place(number, settled), waiting.pop(settled.order)))
     except av.error.FFmpegError:
         pass
-    return found[0] if found else None
+    return keyframes[0] if keyframes else None
 
 
 def _mark(packet: Any) -> tuple:
@@ -241,7 +249,7 @@ def _mark(packet: Any) -> tuple:
 
 def _timeline(container: Any, stream: Any, place: Place | None = None) -> Timeline:
     rate, kind = frame_rate(stream), container.format.name
-    # where a hole in the file is noticed, its frames can be counted; mp4 and AVI list their packets
+    # Matroska has no list of packets, so the frames in a gap of the file are counted by the interval
     interval = float(1 / (rate * stream.time_base)) if rate and kind == _MATROSKA else None
     return Timeline(interval, not (kind == "avi" and stream.codec_context.name in _REORDERED), place)
 
@@ -249,39 +257,39 @@ def _timeline(container: Any, stream: Any, place: Place | None = None) -> Timeli
 def _warn_if_short(path: Path, container: Any, stream: Any, line: Timeline, problem: str) -> None:
     count = line.number + line.skipped
     if problem or count < stream.frames:
-        _logger.warning("%s: breaks off after %d of %s frames%s", path, count, stream.frames or "more", problem)
+        _logger.warning("%s: ends after %d of %s frames%s", path, count, stream.frames or "more", problem)
     elif not stream.frames and container.duration and line.last is not None and len(container.streams) == 1:
         promised, end = container.duration / av.time_base, float(line.last * stream.time_base)
         if end + 1 < promised:
-            _logger.warning("%s: breaks off after %.1f of %.1f seconds", path, end, promised)
+            _logger.warning("%s: ends after %.1f of %.1f seconds", path, end, promised)
 
 
 def frame_rate(stream: Any) -> float | None:
-    """Frames a second, their mean."""
+    """Return the mean frame rate in frames per second."""
     rate = stream.average_rate or stream.guessed_rate
     return float(rate) if rate else None
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """The container of a file and its first video stream.
+    """Open a file. Gives its container and its first video stream.
 
     Raises:
-        InputError: no video that can be read.
+        InputError: the file is not a readable video.
     """
     try:
-        # a playlist may name addresses: nothing but files is opened
+        # only files are opened, because a playlist may name network addresses
         container = av.open(str(path), options={"protocol_whitelist": "file"})
     except av.error.FFmpegError as error:
-        problem = f"is no video that can be read: {error.strerror}"
-        raise InputError(path, problem, "it may be incomplete, or of another kind") from error
+        problem = f"is not a readable video: {error.strerror}"
+        raise InputError(path, problem, "the file may be incomplete or of another type") from error
     with container:
-        # the cover of a piece of music is a video stream, too
-        found = [one for one in container.streams.video if not one.disposition & Disposition.attached_pic]
-        if not found:
-            raise InputError(path, "holds no video stream", "give a video or a folder of images")
-        stream: Any = found[0]
+        # the cover picture of a music file is also a video stream
+        streams = [one for one in container.streams.video if not one.disposition & Disposition.attached_pic]
+        if not streams:
+            raise InputError(path, "has no video stream", "give a video or a folder of images")
+        stream: Any = streams[0]
         if stream.codec_context is None:
-            raise InputError(path, "is coded in a way that this PyAV cannot decode", "convert it to H.264")
-        stream.thread_type = "SLICE"  # several frames at once would leave it to chance which damage is noticed
+            raise InputError(path, "has a codec that this PyAV cannot decode", "convert the video to H.264")
+        stream.thread_type = "SLICE"  # with threads for frames, the detected damage would vary from run to run
         yield container, stream

@@ -1,4 +1,4 @@
-"""Which number a decoded picture has, and which pictures a damaged one spoils: from the packets of a video."""
+"""Number decoded pictures, and determine which pictures damage affects, from the packets of a video."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ from typing import Any, NamedTuple
 
 __all__ = ["Packet", "Place", "Timeline"]
 
-_REORDER = 16  # pictures that codecs hold back at most, to show them in another order
+_REORDER = 16  # the most pictures that a codec delays to change their order
 
 
 class Packet(NamedTuple):
-    """What numbering needs of a packet; they sort by time."""
+    """The properties of a packet that numbering needs. Packets sort by time."""
 
     stamp: int
-    """Presentation time stamp; once these prove unusable, `order`."""
+    """Presentation time stamp, or `order` if the time stamps are unusable."""
     order: int
-    """Place in the file, as decoding goes."""
+    """Position of the packet in decoding order."""
     groups: tuple[int, ...]
-    """The keyframes, counted, without which its picture is wrong: its own, for leading pictures also the one before."""
+    """Numbers of the keyframes that its picture depends on: its own keyframe and, for a leading picture, the previous
+    keyframe."""
     starts: bool
-    """Whether it is a keyframe."""
+    """Whether the packet is a keyframe."""
     lost: bool
-    """Known from the index alone: damage hides it."""
+    """Whether damage hides the packet, so that only the index of the file lists the packet."""
 
 
 class Place(NamedTuple):
-    """A keyframe to begin at, and what numbering knows there."""
+    """A keyframe where decoding can start, and the state of the numbering there."""
 
     number: int
     stamp: int
@@ -40,34 +41,35 @@ class Place(NamedTuple):
 
 
 class Timeline:
-    """Gives every packet its number, in the order of time stamps, and every decoded picture that of its packet.
+    """Number packets in the order of their time stamps, and give every decoded picture the number of its packet.
 
-    A number is a rank: how many of the file's packets are to be shown earlier. It needs no frame rate, holds for a
-    variable one, and does not change when a picture cannot be decoded. Two cases differ. Where damage hides packets
-    and the container keeps no list of them, a gap in steps that were even so far counts as the frames that the
-    rate puts there; where steps are uneven, nobody can know, and the count goes on. Where time stamps are
-    missing or contradict each other, pictures are counted as they are decoded.
+    A number is a rank: the number of packets in the file that are shown earlier. It needs no frame rate, it is correct
+    for a variable frame rate, and it does not change if a picture cannot be decoded. There are two exceptions. First,
+    damage may hide packets in a container without a list of packets. If the steps between frames were even before the
+    gap, the frame rate gives the number of frames in the gap. If the steps were uneven, the number is unknown, and
+    counting continues without a gap. Second, time stamps may be missing or contradict each other. Then pictures are
+    counted in decoding order.
 
-    A picture that is damaged or does not come spoils what is decoded after it, up to the next keyframe: decoders
-    do not say which of these pictures repeat the damage.
+    A damaged or missing picture spoils all pictures that are decoded after it, up to the next keyframe, because
+    decoders do not report which of these pictures repeat the damage.
 
     Args:
-        interval: ticks between frames, to fill gaps by; None where that is unknown.
-        stamped: False where time stamps are known to be guesses.
-        place: the keyframe that the first packet is; None begins the file.
+        interval: ticks of the time base between frames, to count the frames of gaps. None if unknown.
+        stamped: False if the time stamps are known to be guesses.
+        place: the keyframe of the first packet. None for the start of the file.
     """
 
     def __init__(self, interval: float | None, stamped: bool = True, place: Place | None = None):
         self.number = 0 if place is None else place.number
-        """Of the next frame: how many have theirs already."""
+        """Number of the next frame, which is the count of numbered frames."""
         self.stamped = stamped
         self.origin = None if place is None else place.origin
         self.skipped = 0 if place is None else place.skipped
-        """Packets that are not to be shown, and have no number."""
+        """Count of packets that are never shown and have no number."""
         self.troubled = False
-        """Whether the decoder refused anything."""
+        """Whether the decoder rejected a packet or reported a corrupt picture."""
         self.last: int | None = None
-        """Time stamp of the latest packet that has its number."""
+        """Time stamp of the last numbered packet."""
         self._floor = -math.inf if place is None else place.stamp
         self._interval = interval
         self._steady = place is None or place.steady
@@ -81,12 +83,12 @@ class Timeline:
     def add(
         self, stamp: int | None, starts: bool, *, lost: bool = False, corrupt: bool = False, torn: bool = False
     ) -> Packet | None:
-        """Take a packet, in the order of the file; None where its frame comes before the place to begin at.
+        """Add the next packet of the file. Returns None if its frame is shown before the starting place.
 
         Args:
-            stamp, starts, lost: as `Packet` has them.
-            corrupt: the container knows it as damaged.
-            torn: the container skipped bytes before it, and whatever packets were in them.
+            stamp, starts, lost: as in `Packet`.
+            corrupt: whether the container marks the packet as damaged.
+            torn: whether the container skipped bytes, and perhaps packets, before this packet.
         """
         if self.stamped and (stamp is None or (self.last is not None and stamp <= self.last)):
             self._count()
@@ -102,7 +104,7 @@ class Timeline:
         heapq.heappush(self._pending, packet)
         if torn:
             self._torn = packet.order
-        if lost:  # what is in the decoder comes out of order, if it comes
+        if lost:  # the decoder returns its pending pictures out of order, or not at all
             for one in self._pending:
                 self._spoil(one)
         elif corrupt or (torn and not starts):
@@ -110,31 +112,35 @@ class Timeline:
         return packet
 
     def settle(self, before: float) -> Iterator[tuple[int, Packet, bool]]:
-        """Number and packet of all that is shown before a time stamp, and whether the packet itself is there."""
+        """Number the frames that are shown before a time stamp.
+
+        Yields the number, a packet, and True if the packet is that of the frame. A frame in a gap has no packet: then
+        the packet after the gap and False are given.
+        """
         while self._pending and self._pending[0].stamp < before:
             yield from self._next()
 
     def place(self, number: int, packet: Packet) -> Place:
-        """The place of a keyframe that `settle` just gave."""
+        """Return the place of a keyframe that `settle` has just yielded."""
         origin = packet.stamp if self.origin is None else self.origin
         return Place(number, packet.stamp, origin, self._steady, self.skipped)
 
     def show(self, picture: Any) -> None:
-        """Take a decoded picture, as the decoder gives them."""
+        """Add the next picture of the decoder."""
         stamp = picture.pts
         if self.stamped:
             if stamp is not None and stamp < self._floor:
                 return
             if all(packet.stamp != stamp for packet in self._pending):
                 if self.troubled and stamp is not None:
-                    return  # damage upsets the order, too: its number was given up already
+                    return  # damage also changes the order: the number of this picture is already counted as missed
                 self._count()
         if not self.stamped:
-            came = [packet for packet in self._pending if not packet.lost]
-            # a keyframe is known again: whatever was to be shown before it has not come
-            keys = [packet for packet in came if packet.starts] if picture.key_frame else []
-            stamp = min(keys or came).stamp if came else self._order
-            if not came:
+            present = [packet for packet in self._pending if not packet.lost]
+            # a keyframe can be recognised: all frames that are shown before this keyframe are missing
+            keys = [packet for packet in present if packet.starts] if picture.key_frame else []
+            stamp = min(keys or present).stamp if present else self._order
+            if not present:
                 self.add(None, picture.key_frame)
         self._miss(math.inf if stamp is None else stamp)
         *gap, (number, packet, _) = self._next()
@@ -146,11 +152,11 @@ class Timeline:
         self._held.append((number, packet, picture))
 
     def finish(self) -> None:
-        """No more pictures come: what waits for one is lost."""
+        """End the pictures. Packets that still wait for a picture are missed."""
         self._miss(math.inf)
 
     def ready(self) -> Iterator[tuple[int, Packet, Any]]:
-        """Number, packet and picture of the frames whose fate is sure, in order; None for a damaged picture."""
+        """Yield number, packet and picture (None if damaged) of the frames that no later packet can change."""
         oldest = min((packet.order for packet in self._pending), default=math.inf)
         while self._held and self._held[0][1].order < oldest:
             number, packet, picture = self._held.popleft()
@@ -171,11 +177,11 @@ class Timeline:
         return numbered
 
     def _gap(self, packet: Packet) -> int:
-        """How many frames are lost right before it."""
+        """Return the number of frames that are lost directly before a packet."""
         if self._interval is None or not self._steady or self.last is None:
             return 0
         steps = (packet.stamp - self.last) / self._interval
-        # time stamps are rounded to whole ticks, of which an interval may have few
+        # time stamps are rounded to whole ticks, and an interval may have only a few ticks
         even = abs(steps - round(steps)) * self._interval <= 1 + 0.02 * self._interval
         self._steady = even and (round(steps) == 1 or packet.order <= self._torn + _REORDER)
         return max(0, round(steps) - 1) if self._steady else 0

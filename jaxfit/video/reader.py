@@ -1,4 +1,4 @@
-"""Frames out of a video or a folder of images, decoded ahead in a thread."""
+"""Read the frames of a video or of a folder of images. A thread decodes ahead."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ _logger = logging.getLogger(__name__)
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
-_AHEAD = 3  # pictures: enough to even out decoding, and 35 MB at 2592×1520
+_AHEAD = 3  # pictures; enough to even out the decoding time, and 35 MB at 2592×1520
 _NUMBERS = re.compile(r"(\d*)(\D+|$)")
 
 
 class VideoInfo(NamedTuple):
-    """What a video says of itself."""
+    """Properties of a video or of a folder of images."""
 
     frames: int | None
-    """How many; None where the container does not say (``.mkv``, ``.webm``, streams)."""
+    """Number of frames. None if the container does not store it (``.mkv``, ``.webm``, streams)."""
     fps: float | None
-    """Frames a second, their mean; of a folder of images what its reader was told, or None."""
+    """Mean frame rate in frames per second. For a folder of images, the rate given to the reader, or None."""
     size_px: tuple[int, int]
-    """Width and height; of a folder's first image that can be read."""
+    """Width and height. For a folder, those of its first readable image."""
 
 
 def probe_video(path: str | Path, *, fps: float | None = None) -> VideoInfo:
-    """Count, rate and size of a video or a folder of images, without reading the frames.
+    """Return frame count, rate and size of a video or of a folder of images, without reading the frames.
 
     Raises:
         InputError: as ``read_frames``.
@@ -50,10 +50,10 @@ def probe_video(path: str | Path, *, fps: float | None = None) -> VideoInfo:
         files = image_files(path)
         first = next((image for image in map(_read_image, files) if image is not None), None)
         if first is None:
-            raise InputError(path, "holds no image that can be read", "the files may be damaged, or no images")
+            raise InputError(path, "has no readable image", "the files may be damaged or not be images")
         return VideoInfo(len(files), fps, (first.shape[1], first.shape[0]))
     if fps is not None:
-        raise InputError(path, "is a file, whose frame rate is its own", "give a rate for folders of images alone")
+        raise InputError(path, "is a video, which has its own frame rate", "give a rate only for a folder of images")
     with opened(path) as (_, stream):
         return VideoInfo(stream.frames or None, frame_rate(stream), (stream.width, stream.height))
 
@@ -61,44 +61,44 @@ def probe_video(path: str | Path, *, fps: float | None = None) -> VideoInfo:
 def read_frames(
     path: str | Path, start: int = 0, stop: int | None = None, step: int = 1, *, fps: float | None = None
 ) -> FrameReader:
-    """The frames of a video, or of a folder of images in the order of their names (2 before 10).
+    """Return a reader of the frames of a video, or of a folder of images in the order of their names (2 before 10).
 
-    Frames are numbered from 0 in the order in which they are shown, and a number always means the same picture,
-    wherever reading starts (`Timeline` says how, and what is done for a variable frame rate). Damaged ones are
-    left out, with all that builds on them, up to the next keyframe; the numbers after them stay right. One
-    warning tells which, `FrameReader.damaged` likewise. A decoder notices damage by contradictions alone: in VP8
-    and VP9 most goes unnoticed. A file that breaks off ends the frames with a warning. Frames come as they are
-    stored: a rotation that the file asks players for is warned of and not applied.
+    Frames are numbered from 0 in the order in which they are shown. The number of a picture does not depend on `start`
+    (`Timeline` describes the numbering and the treatment of variable frame rates). Damaged frames are skipped, together
+    with the frames that depend on them, up to the next keyframe. The numbers of later frames stay correct. One warning
+    lists the skipped frames, and so does `FrameReader.damaged`. A decoder detects damage only by contradictions in the
+    data: in VP8 and VP9 most damage is not detected. If a file is truncated, the frames end with a warning. A rotation
+    that the file requests from players is not applied, and a warning reports the rotation.
 
     Args:
-        path: a file of any kind that FFmpeg reads, or a folder of images.
-        start: number of the first frame wanted.
-        stop: number of the frame to stop before; None reads to the end.
-        step: every how many-th frame.
-        fps: frames a second of a folder of images, which has none of its own.
+        path: a file of any type that FFmpeg reads, or a folder of images.
+        start: number of the first frame to read.
+        stop: number of the frame before which reading stops. None reads to the end.
+        step: distance between the numbers of the frames to read.
+        fps: frame rate of a folder of images in frames per second.
 
     Returns:
-        What to iterate over.
+        A reader, to iterate over.
 
     Raises:
-        ValueError: a negative start or stop, a step below 1, an fps that is not above 0.
-        InputError: no such file or folder, no video, no video stream, no image in the folder or none that can be
-            read, fps given for a file; while reading: no frame that can be decoded, an image of another size.
+        ValueError: start or stop is negative, step is below 1, or fps is not positive and finite.
+        InputError: the path does not exist, is not a readable video, has no video stream or has no readable image; or
+            fps is given for a file. During reading: no frame can be decoded, or an image has another size.
     """
     return FrameReader(path, start, stop, step, fps=fps)
 
 
 class FrameReader:
-    """Iterates over frames, and says what it left out; ``read_frames`` makes it, and documents the arguments.
+    """Iterates over frames and lists the skipped frames. ``read_frames`` makes readers and documents the arguments.
 
-    Every iteration reads anew. A thread decodes a few frames ahead, so that memory does not grow with the video's
-    length; it ends with the iteration, however that ends, and what goes wrong in it is raised here.
+    Every iteration reads the video again. A thread decodes a few frames ahead, so the memory does not depend on the
+    length of the video. The thread ends with the iteration. The iteration raises the exceptions of the thread.
     """
 
     path: Path
     info: VideoInfo
     damaged: list[int]
-    """Numbers of the frames wanted that were left out, so far: all of them after an iteration."""
+    """Numbers of the requested frames that were skipped so far. Complete after an iteration."""
 
     def __init__(
         self, path: str | Path, start: int = 0, stop: int | None = None, step: int = 1, *, fps: float | None = None
@@ -106,32 +106,32 @@ class FrameReader:
         if start < 0 or (stop is not None and stop < 0) or step < 1:
             raise ValueError(f"start and stop must be 0 or more and step 1 or more, not {start}, {stop}, {step}")
         if fps is not None and not 0 < fps < float("inf"):
-            raise ValueError(f"fps must be above 0 and finite, not {fps}")
+            raise ValueError(f"fps must be positive and finite, not {fps}")
         self.path = _existing(path)
         self.info = probe_video(self.path, fps=fps)
         self.damaged = []
-        self._wanted = range(start, sys.maxsize if stop is None else stop, step)
+        self._numbers = range(start, sys.maxsize if stop is None else stop, step)
 
     def __iter__(self) -> Iterator[Frame]:
         self.damaged = []
         try:
-            with closing(_ahead(self._read)) as found:
-                for one in found:
-                    if isinstance(one, Frame):
-                        yield one
+            with closing(_ahead(self._read)) as items:
+                for item in items:
+                    if isinstance(item, Frame):
+                        yield item
                     else:
-                        self.damaged.append(one)
+                        self.damaged.append(item)
         finally:
             if self.damaged:
-                count, spans = len(self.damaged), _spans(self.damaged, self._wanted.step)
-                _logger.warning("%s: damaged and left out: %d frames (%s)", self.path, count, spans)
+                count, spans = len(self.damaged), _spans(self.damaged, self._numbers.step)
+                _logger.warning("%s: %d damaged frames are skipped (%s)", self.path, count, spans)
 
     def _read(self, stopped: Callable[[], bool]) -> Generator[Frame | int, None, None]:
         if not self.path.is_dir():
-            yield from decode(self.path, self._wanted, stopped)
+            yield from decode(self.path, self._numbers, stopped)
             return
         files, fps = image_files(self.path), self.info.fps
-        for i in range(len(files))[self._wanted.start : self._wanted.stop : self._wanted.step]:
+        for i in range(len(files))[self._numbers.start : self._numbers.stop : self._numbers.step]:
             picture = _read_image(files[i])
             if picture is None:
                 yield i
@@ -139,12 +139,12 @@ class FrameReader:
             size = picture.shape[1], picture.shape[0]
             if size != self.info.size_px:
                 problem = f"is {size[0]}×{size[1]}, but the images before are {'×'.join(map(str, self.info.size_px))}"
-                raise InputError(files[i], problem, "all of a folder must have one size")
+                raise InputError(files[i], problem, "all images of a folder must have one size")
             yield Frame(i, picture, i / fps if fps else None)
 
 
 def _ahead(source: Callable[[Callable[[], bool]], Generator[Frame | int, None, None]]) -> Generator[Frame | int]:
-    """What a source gives, made by a thread that is a few items ahead."""
+    """Yield the items of a source that runs in a thread, a few items ahead."""
     stopping, free, made = Event(), Semaphore(_AHEAD), SimpleQueue()
 
     def work() -> None:
@@ -156,7 +156,7 @@ def _ahead(source: Callable[[Callable[[], bool]], Generator[Frame | int, None, N
                     if stopping.is_set():
                         break
                     made.put(item)
-                    del item  # the picture is the reader's now
+                    del item  # the consumer owns the picture now
         except BaseException as error:
             end = error
         made.put(_End(end))
@@ -173,7 +173,8 @@ def _ahead(source: Callable[[Callable[[], bool]], Generator[Frame | int, None, N
     finally:
         stopping.set()
         free.release()
-        if thread.is_alive() and thread is not current_thread():  # a garbage collection may end it anywhere
+        # a garbage collection may close this generator in any thread
+        if thread.is_alive() and thread is not current_thread():
             thread.join()
 
 
@@ -182,7 +183,7 @@ class _End(NamedTuple):
 
 
 def _spans(numbers: list[int], step: int) -> str:
-    """3, 7–12, …: ten at most."""
+    """Format numbers as spans such as "3, 7–12, …", at most ten."""
     starts = [i for i, number in enumerate(numbers) if not i or number - numbers[i - 1] != step]
     pairs = [(numbers[a], numbers[b - 1]) for a, b in zip(starts, [*starts[1:], len(numbers)], strict=True)]
     shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in pairs[:10])
@@ -190,17 +191,21 @@ def _spans(numbers: list[int], step: int) -> str:
 
 
 def _existing(path: str | Path) -> Path:
-    path = Path(path).absolute()  # "concat:…" and the like are files here, not protocols
+    path = Path(path).absolute()  # names such as "concat:…" are file names here, not protocols
     if not path.exists():
         raise InputError(path, "does not exist", "give a video or a folder of images")
     return path
 
 
 def image_files(folder: Path) -> list[Path]:
-    """The images of a folder in the order of their names, numbers by value; InputError where there is none."""
+    """Return the images of a folder in the order of their names, with numbers sorted by value.
+
+    Raises:
+        InputError: the folder has no images.
+    """
     files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
     if not files:
-        raise InputError(folder, "holds no images", f"their names end in {', '.join(IMAGE_SUFFIXES)}")
+        raise InputError(folder, "has no images", f"names of images end in {', '.join(IMAGE_SUFFIXES)}")
     return sorted(files, key=lambda file: [(int(n or 0), text) for n, text in _NUMBERS.findall(file.name)])
 
 

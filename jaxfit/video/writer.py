@@ -1,4 +1,4 @@
-"""Frames into a video that players and browsers show."""
+"""Write frames as a video for players and browsers."""
 
 from __future__ import annotations
 
@@ -24,36 +24,37 @@ __all__ = ["VideoWriter"]
 
 _logger = logging.getLogger(__name__)
 
-# As many on every machine: some encoders split a picture by threads, and with it the bytes they write.
+# The same number on every machine, because the written bytes of some encoders depend on the number of threads.
 _THREADS = 4
-_BT709 = 1  # the number of matrix, primaries and transfer alike in H.273
+_BT709 = 1  # number of the matrix, the primaries and the transfer function in H.273
 
 
 class VideoWriter:
-    """Writes a video frame by frame; the file appears whole at the end, or not at all.
+    """Writes a video frame by frame. The complete file appears at the end, or no file if an error occurs.
 
-    ``with VideoWriter("out.mp4", (width, height), fps) as video: video.write(frame)``. 4:2:0 colours in the
-    BT.709 matrix, a keyframe at least every second, the index at the front of an ``.mp4``. 4:2:0 needs even
-    sides: an odd side is padded by repeating the last row or column, and ``written_size_px`` says what came
-    of it. The same frames give the same bytes from one run to the next, whatever the number of cores.
+    ``with VideoWriter("out.mp4", (width, height), fps) as video: video.write(frame)``. Colours are 4:2:0 with the
+    BT.709 matrix, a keyframe is written at least every second, and the index is at the front of an ``.mp4``. 4:2:0
+    needs an even width and height: an odd side is padded by repeating the last row or column, and ``written_size_px``
+    is the padded size. The same frames give the same bytes in every run and for any number of cores.
 
     Args:
-        path: an ``.mp4`` or ``.webm``; an existing file is replaced, missing folders are made.
+        path: an ``.mp4`` or ``.webm`` file. An existing file is replaced, and missing folders are made.
         size_px: width and height of every frame.
-        fps: frames a second.
-        codec: a name of ``CODECS``, or ``auto``: the first of the container's (``CONTAINERS``). Where this
-            installation lacks it, the container's next is taken with a warning, and ``fallback`` is True.
+        fps: frames per second.
+        codec: a name in ``CODECS``, or ``auto`` for the first codec of the container (``CONTAINERS``). If this
+            installation lacks the codec, the next codec of the container is used with a warning, and ``fallback`` is
+            True.
 
     Raises:
-        ValueError: another codec or one that the container does not hold; a size or rate that is none.
-        InputError: another ending, no codec for this container, no frame written, or the system refuses the
-            write (disk full, permissions).
+        ValueError: the codec is unknown, or the size or rate is invalid.
+        InputError: the file name extension is unknown, the container does not support the codec, no codec of the
+            container is installed, no frame was written, or the system rejects the write (disk full, permissions).
     """
 
     codec: str
-    """The codec that is written: a name of ``CODECS``."""
+    """Codec of the written video, a name in ``CODECS``."""
     fallback: bool
-    """Whether it is another than the one asked for (for ``auto``: than the container's first)."""
+    """Whether the codec differs from the requested codec (for ``auto``, from the first codec of the container)."""
 
     def __init__(self, path: str | Path, size_px: tuple[int, int], fps: float | Fraction, codec: str = "auto"):
         self.path = Path(path)
@@ -61,29 +62,30 @@ class VideoWriter:
             raise ValueError(f"codec must be auto or one of {', '.join(CODECS)}, not {codec!r}")
         suited = CONTAINERS.get(self.path.suffix.lower())
         if suited is None:
-            raise InputError(self.path, "is named as no video", f"end it in {' or '.join(CONTAINERS)}")
+            raise InputError(self.path, "has no video extension", f"end the name in {' or '.join(CONTAINERS)}")
         if codec not in ("auto", *suited):
-            raise InputError(self.path, f"{codec} does not go into such a file", f"choose {' or '.join(suited)}")
+            raise InputError(self.path, f"cannot hold the codec {codec}", f"choose {' or '.join(suited)}")
         width, height = (int(side) for side in size_px)
         if not (1 <= width <= 16384 and 1 <= height <= 16384):
-            raise ValueError(f"size_px must be a width and a height within 1 and 16384, not {size_px}")
+            raise ValueError(f"size_px must be a width and a height from 1 to 16384, not {size_px}")
         if not 0 < fps < math.inf:
-            raise ValueError(f"fps must be above 0 and finite, not {fps}")
+            raise ValueError(f"fps must be positive and finite, not {fps}")
         self.size_px = width, height
         self.written_size_px = width + width % 2, height + height % 2
-        # denominators up to 1001 hold the rates of television (30000/1001) exactly
+        # denominators up to 1001 represent the rates of television (30000/1001) exactly
         self.fps = Fraction(fps).limit_denominator(1001)
         if not self.fps:
             raise ValueError(f"fps must be 1/1001 or more, not {fps}")
         self.frames = 0
-        wanted = suited[0] if codec == "auto" else codec
-        found = next((name for name in (wanted, *suited) if _has_encoder(name)), None)
-        if found is None:
-            raise InputError(self.path, f"no encoder for {', '.join(suited)} here", "install another build of PyAV")
-        self.codec, self.fallback = found, found != wanted
+        requested = suited[0] if codec == "auto" else codec
+        chosen = next((name for name in (requested, *suited) if _has_encoder(name)), None)
+        if chosen is None:
+            problem = f"PyAV has no encoder for {', '.join(suited)}"
+            raise InputError(self.path, problem, "install another build of PyAV")
+        self.codec, self.fallback = chosen, chosen != requested
         if self.fallback:
-            note = "" if found != "mpeg4" else "; players show it, browsers do not"
-            _logger.warning("%s: no %s encoder here, written as %s%s", self.path.name, wanted, found, note)
+            note = "" if chosen != "mpeg4" else "; players play it, browsers do not"
+            _logger.warning("%s: PyAV has no %s encoder, written as %s%s", self.path.name, requested, chosen, note)
         self._stream: Any = None
         self._writing = self._write()
 
@@ -107,7 +109,7 @@ class VideoWriter:
             try:
                 yield
                 if not self.frames:
-                    raise InputError(self.path, "no frame came: no video is written", "check the frames asked for")
+                    raise InputError(self.path, "has no frames and is not written", "check the requested frames")
                 container.mux(stream.encode(None))
             finally:
                 self._stream = None
@@ -120,18 +122,18 @@ class VideoWriter:
         """Append one frame.
 
         Args:
-            frame: (H, W, 3) uint8, blue-green-red, H and W as ``size_px`` says.
+            frame: (H, W, 3) uint8 in the channel order blue, green, red, with the size ``size_px``.
 
         Raises:
-            ValueError: a frame of another shape or type, or outside of the ``with``.
-            InputError: the system refuses the write.
+            ValueError: the shape or type of the frame is wrong, or the writer is not open.
+            InputError: the system rejects the write.
         """
         width, height = self.size_px
         if frame.shape != (height, width, 3) or frame.dtype != np.uint8:
             expected = f"uint8 of shape {(height, width, 3)}"
             raise ValueError(f"frame must be {expected}, not {frame.dtype} of shape {frame.shape}")
         if self._stream is None:
-            raise ValueError("write needs the writer to be open: use it in a `with`")
+            raise ValueError("the writer is not open: call write inside a `with` block")
         if self.size_px != self.written_size_px:
             frame = np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
         picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="bgr24")

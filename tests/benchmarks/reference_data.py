@@ -1,4 +1,4 @@
-"""Where the reference data lies that demo and benchmarks use: published models and annotated photographs."""
+"""Find the reference data of demo and benchmarks: published models and annotated photographs."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ __all__ = ["reference_bird", "reference_folder"]
 
 
 def reference_folder() -> Path | None:
-    """The folder named by JAXFIT_REFERENCE, else `../shared`; None where it holds no bird model."""
+    """Return the folder that JAXFIT_REFERENCE names, or else `../shared`. None if it has no bird model."""
     folder = Path(os.environ.get("JAXFIT_REFERENCE") or Path("..") / "shared")
     return folder if (folder / "models" / "aves").is_dir() else None
 
 
 def reference_bird() -> Bird | None:
-    """The AVES model of the reference data, if that is there."""
+    """Return the AVES model of the reference data. None without the data."""
     folder = reference_folder()
     return None if folder is None else import_model("aves", [folder / "models" / "aves"])

@@ -1,8 +1,8 @@
 """Measure speed and quality and compare them with the committed baseline.
 
-Quality is held tight; time is held loosely and as a ratio to a fixed matrix product of the same run, because
-machines differ and are noisy. `--update` writes the baseline anew, `--full` adds the scene of 9 birds × 100 frames
-(some ten minutes on two cores).
+The tolerances are small for quality and large for time, because machines differ and are noisy. Times are also given as
+a ratio to a fixed matrix product in the same run. `--update` replaces the baseline. `--full` adds the scene of 9 birds
+× 100 frames (about ten minutes on two cores).
 """
 
 from __future__ import annotations
@@ -37,25 +37,25 @@ BASELINE = Path(__file__).with_name("baseline.json")
 
 @dataclass(frozen=True)
 class Metric:
-    """One figure: which way is better, and how far from the baseline it may move that way's opposite."""
+    """A measured value, the direction of improvement, and the allowed worsening against the baseline."""
 
     name: str
     value: float
     unit: str
     better: str
-    """`less` or `more`."""
+    """Direction of improvement, `less` or `more`."""
     tolerance: float
-    """Allowed worsening: a share of the baseline for `less`, absolute for `more`."""
+    """Allowed worsening: a fraction of the baseline for `less`, an absolute value for `more`."""
 
     def worse(self, baseline: float) -> bool:
-        """Whether this figure has got worse than tolerated."""
+        """Whether the value is worse than the baseline by more than the tolerance."""
         if self.better == "less":
             return self.value > baseline * (1 + self.tolerance)
         return self.value < baseline - self.tolerance
 
 
-def raster_core() -> Iterator[Metric]:
-    """The mask loss and its gradient on a generated mesh of AVES' size."""
+def soft_silhouette() -> Iterator[Metric]:
+    """Measure the mask loss and its gradient on a generated mesh with as many faces as AVES."""
     result = bench_silhouette()
     yield Metric("silhouette: loss and gradient", result["ms_per_frame"], "ms/frame", "less", 1.0)
     yield Metric("silhouette: ratio to matrix product", result["matmul_ratio"], "1", "less", 0.5)
@@ -63,7 +63,7 @@ def raster_core() -> Iterator[Metric]:
 
 
 def renderer() -> Iterator[Metric]:
-    """The z-buffer on crops and the overlay of nine birds on a full frame, of the same generated mesh."""
+    """Measure the z-buffer on crops and the overlay of nine birds on a full frame, with the same generated mesh."""
     result = bench_render()
     yield Metric("render: crop", 1e3 / result["crops_per_s"], "ms", "less", 2.0)
     yield Metric("render: anti-aliased crop", 1e3 / result["interpolated_crops_per_s"], "ms", "less", 2.0)
@@ -72,7 +72,7 @@ def renderer() -> Iterator[Metric]:
 
 
 def photographs(bird: Bird, reference: Path) -> Iterator[Metric]:
-    """Five species of photographs: from a regressor's starting points, and from nothing."""
+    """Measure fits of photographs of five species, with and without starting poses from a regressor."""
     for name in ("aves", "photo"):
         config, rows, seconds = load_config(name), [], 0.0
         for path in sorted((reference / "cub").glob("*.json")):
@@ -93,19 +93,19 @@ def photographs(bird: Bird, reference: Path) -> Iterator[Metric]:
 
 
 def windows(bird: Bird) -> Iterator[Metric]:
-    """The paper's setting against single frames, on 2 simulated birds × 100 frames."""
+    """Measure the paper's setting against single frames on 2 simulated birds × 100 frames."""
     results = {
         name: bench_fit(bird, birds=2, frames=100, config=load_config(name), seed=7, progress=terminal)
         for name in ("paper", "baseline")
     }
-    for figure in ("me_p", "me_v", "pa_mpjpe"):
-        ratio = results["paper"][figure] / results["baseline"][figure]
-        yield Metric(f"windows: {figure}, paper", results["paper"][figure], "1", "less", 0.1)
-        yield Metric(f"windows: {figure}, paper over baseline", ratio, "1", "less", 0.1)
+    for name in ("me_p", "me_v", "pa_mpjpe"):
+        ratio = results["paper"][name] / results["baseline"][name]
+        yield Metric(f"windows: {name}, paper", results["paper"][name], "1", "less", 0.1)
+        yield Metric(f"windows: {name}, paper over baseline", ratio, "1", "less", 0.1)
 
 
 def scene(bird: Bird) -> Iterator[Metric]:
-    """9 birds × 100 frames through the paper's 600 + 400 steps."""
+    """Measure a fit of 9 birds × 100 frames with the paper's 600 + 400 steps."""
     result = bench_fit(bird, progress=terminal)
     yield Metric("scene of 9 birds: fit", result["minutes"], "min", "less", 1.0)
     yield Metric("scene of 9 birds: first run's compilation", result["compile_s"], "s", "less", 2.0)
@@ -113,24 +113,24 @@ def scene(bird: Bird) -> Iterator[Metric]:
 
 
 def main() -> int:
-    """Run the benchmarks; 1 where a figure got worse than tolerated."""
+    """Run the benchmarks. Returns 1 if a metric is worse than tolerated."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--update", action="store_true", help="write the baseline anew")
-    parser.add_argument("--full", action="store_true", help="also the scene of 9 birds × 100 frames")
-    parser.add_argument("--json", type=Path, help="also write the figures there")
+    parser.add_argument("--update", action="store_true", help="replace the baseline")
+    parser.add_argument("--full", action="store_true", help="also run the scene of 9 birds × 100 frames")
+    parser.add_argument("--json", type=Path, help="also write the metrics to this file")
     options = parser.parse_args()
     cli.use_cache()
     console = Console()
     reference, bird = reference_folder(), reference_bird()
-    metrics = [*raster_core(), *renderer()]
+    metrics = [*soft_silhouette(), *renderer()]
     if reference is not None and bird is not None:
         metrics += photographs(bird, reference)
         metrics += windows(bird)
         metrics += scene(bird) if options.full else ()
     else:
-        console.print("no reference data (JAXFIT_REFERENCE): only the raster core and the renderer are measured")
+        console.print("no reference data (JAXFIT_REFERENCE): only the silhouette and the renderer are measured")
     known = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
-    table = Table("figure", "value", "baseline", "unit", "better", "")
+    table = Table("metric", "value", "baseline", "unit", "better", "")
     failed = False
     for metric in metrics:
         before = known.get(metric.name)
@@ -140,11 +140,11 @@ def main() -> int:
         shown = "–" if before is None else f"{before:.4g}"
         table.add_row(metric.name, f"{metric.value:.4g}", shown, metric.unit, metric.better, verdict)
     console.print(table)
-    figures = {metric.name: float(f"{metric.value:.6g}") for metric in metrics}
+    values = {metric.name: float(f"{metric.value:.6g}") for metric in metrics}
     if options.json:
-        options.json.write_text(json.dumps(figures, indent=2, ensure_ascii=False) + "\n")
+        options.json.write_text(json.dumps(values, indent=2, ensure_ascii=False) + "\n")
     if options.update:
-        BASELINE.write_text(json.dumps(known | figures, indent=2, ensure_ascii=False) + "\n")
+        BASELINE.write_text(json.dumps(known | values, indent=2, ensure_ascii=False) + "\n")
         return 0
     return int(failed)
 

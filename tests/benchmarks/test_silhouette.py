@@ -1,8 +1,11 @@
-"""The raster core's benchmark reports what it promises."""
+"""The benchmark of the soft silhouette: its mesh, its measurement of time and its report."""
+
+import itertools
 
 import numpy as np
 import pytest
 
+from jaxfit.benchmarks import silhouette as benchmark
 from jaxfit.benchmarks.silhouette import bench_silhouette, bird_like_mesh, fitted_to_image
 from jaxfit.raster import silhouette as raster
 
@@ -24,18 +27,33 @@ def test_a_mesh_is_fitted_to_the_image():
     np.testing.assert_allclose((screen.min(0) + screen.max(0)) / 2, [50, 50, 1], rtol=1e-5)
 
 
-def test_report():
+def test_median_seconds(monkeypatch):
+    clock = itertools.accumulate([10.0, 5.0, 0.0, 1.0, 0.0, 3.0])  # three runs, of 5, 1 and 3 seconds
+    monkeypatch.setattr(benchmark.time, "perf_counter", lambda: next(clock))
+    runs = []
+    assert benchmark.median_seconds(lambda: runs.append(len(runs)), 3) == 3
+    assert len(runs) == 4  # the first run is not measured
+
+
+def test_report(monkeypatch):
+    seconds = iter(range(1, 8))
+
+    def run_in_known_time(run, repeats):
+        assert repeats == 1
+        run()
+        return next(seconds)
+
+    monkeypatch.setattr(benchmark, "median_seconds", run_in_known_time)
     vertices, faces = bird_like_mesh()
     found = bench_silhouette(frames=4, repeats=1, size=64, vertices=vertices, faces=faces[::50])
     assert (found["frames"], found["faces"], found["size"]) == (4, len(faces[::50]), 64)
     assert found["isa"] == raster.current_isa()
     assert found["threads"] >= 1
     assert 0 <= found["gradient_error"] < 1e-3
-    for name in ("ms_per_frame", "loss_ms_per_frame", "matmul_ms", "matmul_ratio"):
-        assert found[name] > 0
-    assert found["matmul_ratio"] == pytest.approx(found["ms_per_frame"] / found["matmul_ms"])
-    rows = {(row["frames"], row["faces"]) for row in found["scaling"]}
-    assert rows == {(1, 115), (2, 115), (4, 115), (4, 58), (4, 29)}
+    assert (found["ms_per_frame"], found["matmul_ms"], found["loss_ms_per_frame"]) == (1e3 / 4, 2e3, 7e3 / 4)
+    assert found["matmul_ratio"] == pytest.approx(1 / 8)
+    rows = [(row["frames"], row["faces"], row["ms_per_frame"]) for row in found["scaling"]]
+    assert rows == [(1, 115, 3e3), (2, 115, 4e3 / 2), (4, 29, 5e3 / 4), (4, 58, 6e3 / 4), (4, 115, 1e3 / 4)]
 
 
 def test_wrong_arguments():

@@ -159,7 +159,7 @@ def test_what_cannot_be_tracked(name, inputs, tmp_path, monkeypatch, capsys):
         refused(capsys, [name, str(inputs / video), "--out", str(out), *map(str, more)], *words)
 
     told("none.mp4: does not exist", video="none.mp4")
-    told("notes.txt: is no video", video="notes.txt")
+    told("notes.txt: is not a readable video", video="notes.txt")
     told("`stop` is 3", more=["--start", 4, "--stop", 3])
     told("none.yaml", "cannot read", more=["--config", tmp_path / "none.yaml"])
     (tmp_path / "bad.yaml").write_text("base: reconstruct\ntrack: {segmentor: x}\n")

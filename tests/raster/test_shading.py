@@ -56,8 +56,8 @@ def test_wrong_arguments():
         (lambda: vertex_normals(VERTICES[:, :2], FACES), r"vertices: expected shape \(…, V, 3\)"),
         (lambda: vertex_normals(VERTICES, FACES[:, :2]), r"faces: expected shape \(F, 3\)"),
         (lambda: shade(VERTICES, FACES, GREY[:4]), "colours: expected the shape of vertices"),
-        (lambda: shade(VERTICES, FACES, GREY, light=(0, 0, 0)), "light: expected a direction"),
-        (lambda: shade(VERTICES, FACES, GREY, ambient=1.5), "ambient: expected a share"),
+        (lambda: shade(VERTICES, FACES, GREY, light=(0, 0, 0)), "light: expected a finite direction"),
+        (lambda: shade(VERTICES, FACES, GREY, ambient=1.5), "ambient: expected a fraction"),
     ]:
         with pytest.raises(ValueError, match=message):
             call()

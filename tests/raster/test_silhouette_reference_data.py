@@ -10,13 +10,14 @@ import pytest
 from jaxfit.raster import silhouette as raster
 
 CASES = ("triangle", "triangle_edge_of_frame", "icosphere", "aves_template_a", "aves_template_b", "avian_mesh_a")
-SMALL = CASES[:3]  # the reference takes ten seconds for a bird's loss and gradient, so one bird stands for all
+SMALL = CASES[:3]
+SLOW = pytest.param("aves_template_a", marks=pytest.mark.extended)  # 20 s, so one bird stands for all
 CENTRE = 128
 
 
 @pytest.fixture(params=["avx512", "avx2", "baseline"])
 def each_isa(request):
-    """Runs the test once an instruction set."""
+    """Runs the test once for each instruction set."""
     if request.param not in raster.available_isas():
         pytest.skip(f"no {request.param} kernels here: {raster.available_isas()}")
     raster.choose_isa(request.param)
@@ -34,11 +35,11 @@ def project(vertices_cam, focal):
     return jnp.concatenate([focal * vertices_cam[:, :2] / vertices_cam[:, 2:] + CENTRE, vertices_cam[:, 2:]], 1)
 
 
-def relative_error(found, expected):
-    return np.linalg.norm(np.asarray(found, np.float64) - expected) / np.linalg.norm(expected)
+def relative_error(actual, expected):
+    return np.linalg.norm(np.asarray(actual, np.float64) - expected) / np.linalg.norm(expected)
 
 
-# Compiled once a mesh size and backend.
+# Compiled once for each mesh size and backend.
 @functools.partial(jax.jit, static_argnames="backend")
 def loss_and_gradient(vertices, faces, target, focal, backend):
     def loss_of(vertices):
@@ -49,7 +50,7 @@ def loss_and_gradient(vertices, faces, target, focal, backend):
 
 @functools.partial(jax.jit, static_argnames="backend")
 def image_and_gradient(vertices, faces, target, focal, backend):
-    """The image, and the loss's gradient by way of it: this is the kernel that takes a cotangent image."""
+    """The image, and the gradient of the loss through the image: by the kernel that takes a cotangent image."""
     image, pull = jax.vjp(
         lambda v: raster.silhouette(project(v, focal), faces, target.shape[0], backend=backend), vertices
     )
@@ -60,12 +61,12 @@ def check(data, case, backend):
     vertices, faces, target, expected, loss, gradient = (
         data[f"{case}/{name}"] for name in ("vertices", "faces", "target", "silhouette", "loss", "grad_vertices")
     )
-    found_loss, found_gradient = loss_and_gradient(vertices, faces, target, data["focal"], backend)
-    assert found_loss == pytest.approx(float(loss), rel=1e-5)
-    assert relative_error(found_gradient, gradient) < 1e-4
+    actual_loss, actual_gradient = loss_and_gradient(vertices, faces, target, data["focal"], backend)
+    assert actual_loss == pytest.approx(float(loss), rel=1e-5)
+    assert relative_error(actual_gradient, gradient) < 1e-4
     if backend == "native" or case in SMALL:
-        image, by_image = image_and_gradient(vertices, faces, target, data["focal"], backend)
-        assert relative_error(by_image, gradient) < 1e-4
+        image, image_gradient = image_and_gradient(vertices, faces, target, data["focal"], backend)
+        assert relative_error(image_gradient, gradient) < 1e-4
     else:
         image = raster.silhouette(project(vertices, data["focal"]), faces, len(target), backend=backend)
     np.testing.assert_allclose(image, expected, atol=1e-4)
@@ -76,7 +77,7 @@ def test_kernels_agree_with_pytorch3d(data, case, each_isa):
     check(data, case, "native")
 
 
-@pytest.mark.parametrize("case", [*SMALL, "aves_template_a"])
+@pytest.mark.parametrize("case", [*SMALL, SLOW])
 def test_reference_agrees_with_pytorch3d(data, case):
     check(data, case, "reference")
 

@@ -11,7 +11,6 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfit.benchmarks.render import bench_render
 from jaxfit.raster import kernels as native
 from jaxfit.raster import zbuffer as render
 from jaxfit.raster.zbuffer import reference
@@ -287,13 +286,3 @@ def test_without_kernels_a_process_of_its_own_renders_and_says_so():
     expected = reference.raster(np.float32([[2, 2, 1], [12, 3, 1], [6, 13, 1]]), np.array([[0, 1, 2]]), 16, 16, 1)
     assert int(found.stdout) == (expected[0] >= 0).sum()
     assert found.stderr.count("renderings in NumPy") == 1
-
-
-def test_the_benchmark_reports_what_it_ran():
-    found = bench_render(crops=2, birds=2, repeats=1)
-    assert (found["crops"], found["birds"], found["isa"]) == (2, 2, native.current_isa())
-    assert (found["faces"], found["frame_faces"]) == (5712, 5712)
-    for name in ("crops_per_s", "interpolated_crops_per_s", "mask_ms", "full_frames_per_s"):
-        assert found[name] > 0
-    with pytest.raises(ValueError, match="birds: expected at least 1, got 0"):
-        bench_render(birds=0)

@@ -1,4 +1,4 @@
-"""Small videos, and what is damaged in them."""
+"""Small videos, and damage to their files."""
 
 from fractions import Fraction
 
@@ -13,7 +13,7 @@ BITS, CELL_PX = 8, 16
 
 
 def frames(size=SIZE, count=COUNT):
-    """Colour fields that move, smooth enough for 4:2:0, with a patch of pure red, green and blue each."""
+    """Yield a moving colour field, smooth enough for 4:2:0, with a pure blue, a pure green and a pure red patch."""
     rng = np.random.default_rng(0)
     field = cv2.resize(rng.integers(40, 215, (4, 6, 3), dtype=np.uint8), size, interpolation=cv2.INTER_LINEAR)
     for i in range(count):
@@ -31,7 +31,7 @@ def write(path, codec="auto", size=SIZE, count=COUNT):
 
 
 def numbered(i):
-    """A moving texture above black and white cells that hold its number."""
+    """Return a picture of a moving texture above black and white cells that encode the number i."""
     field = np.random.default_rng(7).integers(0, 255, (12, 24, 3), dtype=np.uint8)
     field = cv2.resize(field, (BITS * CELL_PX, 64), interpolation=cv2.INTER_LINEAR)
     bits = [255 * (i >> bit & 1) for bit in range(BITS)]
@@ -40,13 +40,13 @@ def numbered(i):
 
 
 def number_in(picture):
-    """What `numbered` wrote into it."""
+    """Return the number that `numbered` encoded in a picture."""
     centres = picture[-CELL_PX // 2, CELL_PX // 2 :: CELL_PX].mean(-1)
     return sum(1 << bit for bit in range(BITS) if centres[bit] > 127)
 
 
 def encode(path, codec="libx264", count=100, gop=20, ticks=None, options=None, b_frames=None):
-    """A video of `numbered` pictures at 25 frames a second, or each at its report_progress of 1/100 s."""
+    """Write a video of `numbered` pictures at 25 frames per second, or at the given times in ticks of 1/100 s."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25 if ticks is None else 100, options=options or {})
         stream.width, stream.height, stream.pix_fmt = BITS * CELL_PX, 64 + CELL_PX, "yuv420p"
@@ -63,13 +63,13 @@ def encode(path, codec="libx264", count=100, gop=20, ticks=None, options=None, b
 
 
 def packets(path):
-    """Position, size and whether it is a keyframe of every packet, in the order of the file."""
+    """Return position, size and keyframe flag of every packet in the order of the file."""
     with av.open(str(path)) as container:
         return [(packet.pos, packet.size, packet.is_keyframe) for packet in container.demux(video=0) if packet.size]
 
 
 def overwrite(path, at, length):
-    """Put random bytes over a part of a file."""
+    """Overwrite a part of a file with random bytes."""
     content = bytearray(path.read_bytes())
     assert 0 < at < at + length < len(content)
     content[at : at + length] = np.random.default_rng(1).integers(0, 256, length, dtype=np.uint8).tobytes()

@@ -1,4 +1,4 @@
-"""Reading videos: a number is always the same picture, damage is told and left out, the thread ends."""
+"""Reading videos: frame numbers are stable, damage is reported and skipped, and the thread ends."""
 
 import collections
 import gc
@@ -36,7 +36,7 @@ def films(tmp_path_factory):
 
 @pytest.fixture
 def shown(monkeypatch):
-    """How many pictures were decoded."""
+    """The count of decoded pictures."""
     count = []
 
     class Counting(decoding.Timeline):
@@ -50,7 +50,7 @@ def shown(monkeypatch):
 
 @pytest.fixture
 def told(caplog):
-    """Warnings so far, as text."""
+    """The messages of the warnings so far."""
     caplog.set_level(logging.WARNING, "jaxfit")
     return lambda: [record.getMessage() for record in caplog.records]
 
@@ -60,7 +60,7 @@ def threads():
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_number_is_the_same_picture_wherever_reading_begins(films, shown, told, name):
+def test_frame_numbers_do_not_depend_on_the_start(films, shown, told, name):
     reader = read_frames(films[name])
     every = list(reader)
     assert [number_in(frame.picture) for frame in every] == [frame.index for frame in every] == list(range(100))
@@ -95,7 +95,7 @@ def test_a_variable_frame_rate(tmp_path, name):
 @pytest.mark.parametrize("name", ["b_frames.mp4", "open.mp4", "b_frames.mkv", "plain.avi", "b_frames.avi", "h264.avi"])
 @pytest.mark.parametrize("hit", [40, 47, 53])
 def test_a_damaged_packet(tmp_path, films, told, name, hit):
-    """Whatever is given is right to the pixel; what is not is told; from the next keyframe on all is there."""
+    """Every returned frame is exact, every other frame is reported, and all frames from the next keyframe on return."""
     (tmp_path / name).write_bytes(films[name].read_bytes())
     position, size, _ = packets(films[name])[hit]
     overwrite(tmp_path / name, position + size // 3, size // 2)
@@ -111,7 +111,7 @@ def test_a_damaged_packet(tmp_path, films, told, name, hit):
     assert any(abs(i - hit) <= 4 for i in reader.damaged)
     assert all(36 <= i < 60 for i in reader.damaged)
     (warning,) = told()
-    assert f"{name}: damaged and left out: {len(reader.damaged)} frames (" in warning
+    assert f"{name}: {len(reader.damaged)} damaged frames are skipped (" in warning
     late = read_frames(tmp_path / name, 45, 70, 5)
     assert sorted([*(frame.index for frame in late), *late.damaged]) == [45, 50, 55, 60, 65]
     assert late.damaged == [i for i in reader.damaged if i in (45, 50, 55)]
@@ -119,7 +119,7 @@ def test_a_damaged_packet(tmp_path, films, told, name, hit):
 
 @pytest.mark.parametrize("name", ["plain.avi", "b_frames.avi", "h264.avi", "b_frames.mkv", "vp9.webm"])
 def test_lost_packets(tmp_path, films, told, name):
-    """Damage that hides packets from the container: numbers after it are those of the whole file."""
+    """Damage hides packets from the container. Later numbers are those of the undamaged file."""
     (tmp_path / name).write_bytes(films[name].read_bytes())
     known = packets(films[name])
     begin = next(i for i in range(36, 60) if known[i][2])
@@ -133,7 +133,7 @@ def test_lost_packets(tmp_path, films, told, name):
 
 
 def test_lost_packets_of_uneven_time(tmp_path):
-    """Nobody knows how many they were: the count goes on, time does not lie."""
+    """The number of lost packets is unknown: counting continues without a gap, and the times stay correct."""
     ticks = np.cumsum(np.random.default_rng(3).integers(1, 9, 100)) - 1
     encode(tmp_path / "a.mkv", ticks=ticks.tolist())
     known = packets(tmp_path / "a.mkv")
@@ -145,7 +145,7 @@ def test_lost_packets_of_uneven_time(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["b_frames.mp4", "plain.avi", "vp9.webm"])
-def test_a_file_cut_short(tmp_path, films, told, name):
+def test_a_truncated_file(tmp_path, films, told, name):
     position, size, _ = packets(films[name])[70]
     content = films[name].read_bytes()
     if name.endswith("mp4"):  # its index stands at the end unless asked for otherwise
@@ -157,15 +157,18 @@ def test_a_file_cut_short(tmp_path, films, told, name):
     read = [frame.index for frame in reader]
     assert read == list(range(len(read)))
     assert 60 < len(read) <= 71
-    assert sum("breaks off after" in text for text in told()) == 1
+    assert sum("ends after" in text for text in told()) == 1
 
 
-def test_nothing_before_the_frames(tmp_path):
+def test_a_file_truncated_before_its_frames(tmp_path):
     write(tmp_path / "a.mp4")
     whole = (tmp_path / "a.mp4").read_bytes()
-    for size, problem in ((60, "(is|holds) no video"), (whole.find(b"mdat") + 8, "no frame can be decoded")):
+    for size, problem in (
+        (60, "(not a readable|has no) video"),
+        (whole.find(b"mdat") + 8, "no frame can be decoded"),
+    ):
         (tmp_path / "c.mp4").write_bytes(whole[:size])
-        with pytest.raises(InputError, match=rf"c\.mp4: {problem}"):
+        with pytest.raises(InputError, match=rf"c\.mp4: .*{problem}"):
             list(read_frames(tmp_path / "c.mp4"))
     assert not threads()
 
@@ -181,9 +184,9 @@ def test_some_frames(tmp_path):
     for wrong in ((-1, None, 1), (0, -1, 1), (0, None, 0)):
         with pytest.raises(ValueError, match="step 1 or more"):
             read_frames(tmp_path / "a.mp4", *wrong)
-    with pytest.raises(ValueError, match="fps must be above 0"):
+    with pytest.raises(ValueError, match="fps must be positive and finite"):
         read_frames(tmp_path, fps=0)
-    with pytest.raises(InputError, match="whose frame rate is its own"):
+    with pytest.raises(InputError, match="which has its own frame rate"):
         read_frames(tmp_path / "a.mp4", fps=25)
 
 
@@ -211,40 +214,40 @@ def test_images_that_cannot_be_read(tmp_path, told):
     assert reader.info == VideoInfo(12, 2, SIZE)
     assert [(frame.index, frame.time_s) for frame in reader] == [(i, i / 2) for i in (1, 2, *range(5, 12))]
     assert reader.damaged == [0, 3, 4]
-    assert told() == [f"{tmp_path}: damaged and left out: 3 frames (0, 3–4)"]
+    assert told() == [f"{tmp_path}: 3 damaged frames are skipped (0, 3–4)"]
     cv2.imwrite(str(tmp_path / "7.png"), np.zeros((10, 20, 3), np.uint8))
     with pytest.raises(InputError, match=r"7\.png: is 20×10, but the images before are 64×48"):
         list(reader)
     for file in tmp_path.iterdir():
         file.write_bytes(b"")
-    with pytest.raises(InputError, match="holds no image that can be read"):
+    with pytest.raises(InputError, match="has no readable image"):
         read_frames(tmp_path)
 
 
-def test_what_is_no_video(tmp_path):
+def test_files_that_are_not_videos(tmp_path):
     with pytest.raises(InputError, match=r"absent\.mp4: does not exist"):
         read_frames(tmp_path / "absent.mp4")
-    with pytest.raises(InputError, match="holds no images"):
+    with pytest.raises(InputError, match="has no images"):
         read_frames(tmp_path)
     for name, content in (("a.mp4", b"no video at all\n" * 500), ("b.mp4", b""), ("c.txt", b"some words")):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match="is no video that can be read"):
+        with pytest.raises(InputError, match="is not a readable video"):
             read_frames(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["sound.wav", "sound.mp4", "sound.mkv"])
-def test_sound_alone(tmp_path, name):
+def test_a_file_with_only_sound(tmp_path, name):
     with av.open(str(tmp_path / name), "w") as container:
         stream = container.add_stream("pcm_s16le" if name.endswith("wav") else "aac", rate=8000)
         sound = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
         sound.rate = 8000
         container.mux(stream.encode(sound))
         container.mux(stream.encode(None))
-    with pytest.raises(InputError, match="holds no video stream"):
+    with pytest.raises(InputError, match="has no video stream"):
         read_frames(tmp_path / name)
 
 
-def test_a_playlist_opens_no_address(tmp_path):
+def test_a_playlist_opens_no_network_address(tmp_path):
     text = "#EXTM3U\n#EXT-X-TARGETDURATION:10\n#EXTINF:10,\nhttp://127.0.0.1:9/a.ts\n#EXT-X-ENDLIST\n"
     (tmp_path / "a.m3u8").write_text(text)
     with pytest.raises(InputError):
@@ -297,7 +300,7 @@ def test_an_interrupt():
     assert not threads()
 
 
-def test_no_more_is_made_ahead_than_wanted():
+def test_the_thread_decodes_only_a_few_frames_ahead():
     made, taken, most = 0, 0, 0
 
     def source(stopped):
@@ -314,7 +317,7 @@ def test_no_more_is_made_ahead_than_wanted():
     assert most <= _AHEAD + 2  # one in the reader's hands, one that waits for its turn
 
 
-def test_errors_of_the_thread_come_out():
+def test_errors_of_the_thread_are_raised():
     def source(stopped):
         yield 1
         raise InputError("a", "broken")
@@ -326,6 +329,6 @@ def test_errors_of_the_thread_come_out():
     assert not threads()
 
 
-def test_numbered_pictures_can_be_told():
+def test_number_in_reads_the_number_of_a_picture():
     assert [number_in(numbered(i)) for i in range(256)] == list(range(256))
     assert Frame(1, numbered(1), None).index == 1

@@ -1,4 +1,4 @@
-"""Videos: what is written comes back, the same bytes twice, whole or not at all."""
+"""Writing videos: frames survive a round trip, bytes are reproducible, and no incomplete file remains."""
 
 import logging
 import re
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.films import COUNT, FPS, SIZE, frames, write
 
-from jaxfit import video
 from jaxfit.errors import InputError
+from jaxfit.video import writer as writer_module
 from jaxfit.video.reader import VideoInfo, probe_video, read_frames
 from jaxfit.video.writer import VideoWriter
 
@@ -77,15 +77,15 @@ def test_television_rates_are_exact(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("missing", "asked", "written", "note"),
+    ("missing", "requested", "written", "note"),
     [
-        (("libx264",), "auto", "vp9", "no h264 encoder here, written as vp9$"),
+        (("libx264",), "auto", "vp9", "PyAV has no h264 encoder, written as vp9$"),
         (("libx264",), "h264", "vp9", "no h264"),
         (("libx264", "libvpx-vp9"), "auto", "mpeg4", "browsers do not"),
-        (("mpeg4",), "mpeg4", "h264", "no mpeg4 encoder here, written as h264$"),
+        (("mpeg4",), "mpeg4", "h264", "PyAV has no mpeg4 encoder, written as h264$"),
     ],
 )
-def test_another_codec_is_said(tmp_path, monkeypatch, caplog, missing, asked, written, note):
+def test_a_fallback_codec_is_reported(tmp_path, monkeypatch, caplog, missing, requested, written, note):
     class WithoutSome:
         @staticmethod
         def Codec(name, mode):  # noqa: N802
@@ -94,9 +94,9 @@ def test_another_codec_is_said(tmp_path, monkeypatch, caplog, missing, asked, wr
         def __getattr__(self, name):
             return getattr(av, name)
 
-    monkeypatch.setattr(video, "av", WithoutSome())
+    monkeypatch.setattr(writer_module, "av", WithoutSome())
     with caplog.at_level(logging.WARNING):
-        writer = write(tmp_path / "a.mp4", asked, count=2)
+        writer = write(tmp_path / "a.mp4", requested, count=2)
     assert (writer.codec, writer.fallback) == (written, True)
     (record,) = caplog.records
     assert record.getMessage().startswith("a.mp4: ")
@@ -104,9 +104,9 @@ def test_another_codec_is_said(tmp_path, monkeypatch, caplog, missing, asked, wr
     assert len(list(read_frames(tmp_path / "a.mp4"))) == 2
 
 
-def test_no_codec_at_all(tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "_has_encoder", lambda codec: False)
-    with pytest.raises(InputError, match=r"a\.webm: no encoder for vp9 here"):
+def test_a_container_without_an_encoder(tmp_path, monkeypatch):
+    monkeypatch.setattr(writer_module, "_has_encoder", lambda codec: False)
+    with pytest.raises(InputError, match=r"a\.webm: PyAV has no encoder for vp9"):
         VideoWriter(tmp_path / "a.webm", SIZE, FPS)
 
 
@@ -118,13 +118,16 @@ def write_and_stop(path):
         raise KeyboardInterrupt
 
 
-def test_half_a_video_is_never_left(tmp_path):
+def test_no_incomplete_video_remains(tmp_path):
     write(tmp_path / "old.mp4", count=3)
     before = (tmp_path / "old.mp4").read_bytes()
     for name in ("old.mp4", "new.mp4", "folder/new.webm"):
         with pytest.raises(KeyboardInterrupt):
             write_and_stop(tmp_path / name)
-        with pytest.raises(InputError, match="no frame came"), VideoWriter(tmp_path / name, SIZE, FPS):
+        with (
+            pytest.raises(InputError, match="has no frames and is not written"),
+            VideoWriter(tmp_path / name, SIZE, FPS),
+        ):
             pass
     assert [file.name for file in tmp_path.rglob("*")] == ["old.mp4"]
     assert (tmp_path / "old.mp4").read_bytes() == before
@@ -148,12 +151,12 @@ def test_a_full_disk(tmp_path):
     ("change", "message"),
     [
         ({"codec": "h265"}, "codec must be auto or one of h264, vp9, mpeg4, not 'h265'"),
-        ({"path": "a.webm", "codec": "h264"}, r"a\.webm: h264 does not go into such a file \(choose vp9"),
-        ({"path": "a.avi"}, r"a\.avi: is named as no video \(end it in \.mp4 or \.webm"),
-        ({"path": "a"}, "is named as no video"),
+        ({"path": "a.webm", "codec": "h264"}, r"a\.webm: cannot hold the codec h264 \(choose vp9"),
+        ({"path": "a.avi"}, r"a\.avi: has no video extension \(end the name in \.mp4 or \.webm"),
+        ({"path": "a"}, "has no video extension"),
         ({"size_px": (0, 4)}, "size_px must be"),
-        ({"fps": 0}, "fps must be above 0"),
-        ({"fps": float("nan")}, "fps must be above 0"),
+        ({"fps": 0}, "fps must be positive and finite"),
+        ({"fps": float("nan")}, "fps must be positive and finite"),
         ({"fps": 1e-9}, "fps must be 1/1001 or more"),
     ],
 )
@@ -164,7 +167,7 @@ def test_wrong_use(change, message):
 
 def test_frames_that_do_not_fit(tmp_path):
     writer = VideoWriter(tmp_path / "a.mp4", SIZE, FPS)
-    with pytest.raises(ValueError, match="needs the writer to be open"):
+    with pytest.raises(ValueError, match="the writer is not open"):
         writer.write(next(frames()))
     for frame in (np.zeros((64, 48, 3), np.uint8), np.zeros((48, 64, 3)), np.zeros((48, 64), np.uint8)):
         with (

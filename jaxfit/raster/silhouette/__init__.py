@@ -1,6 +1,6 @@
-"""The soft silhouette of a triangle mesh and its loss against a mask, with gradients: the raster core.
+"""The soft silhouette of a triangle mesh and its loss against a mask, with gradients.
 
-`operator` holds the operations, `reference` defines them in plain JAX, `native` runs them in compiled kernels.
+`operator` holds the public operations. `reference` defines their results in plain JAX. `native` calls the kernels.
 """
 
 from jaxfit.raster.silhouette.native import available_isas, choose_isa, current_isa, kernels_available

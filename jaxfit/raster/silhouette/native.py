@@ -1,4 +1,4 @@
-"""The silhouette's calls into the compiled kernels, which `jaxfit.raster.kernels` loads."""
+"""Calls of the silhouette into the compiled kernels, which `jaxfit.raster.kernels` loads."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ def _shape_like(vertices) -> jax.ShapeDtypeStruct:
 
 
 def silhouette(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], size: int, blur: Blur):
-    """The image (size, size)."""
+    """Return the soft silhouette, an image of shape (size, size)."""
     image = jax.ShapeDtypeStruct((size, size), jnp.float32)
     return _call("jaxfit_silhouette", image, vertices, faces, blur=blur)
 
@@ -39,7 +39,7 @@ def silhouette(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], size: in
 def silhouette_gradient(
     vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], cotangent: Float[Array, "size size"], blur: Blur
 ) -> Float[Array, "V 3"]:
-    """The gradient of Σ cotangent · silhouette with respect to the vertices."""
+    """Return the gradient of Σ cotangent · silhouette with respect to the vertices."""
     return _call("jaxfit_silhouette_gradient", _shape_like(vertices), vertices, faces, cotangent, blur=blur)
 
 
@@ -51,7 +51,7 @@ def mask_loss(
     kind: str,
     blur: Blur,
 ) -> Float[Array, ""]:
-    """The loss, 0 where the weight is 0; otherwise the weight is not applied."""
+    """Return the unweighted loss. A weight of 0 gives a loss of 0 and skips the rendering."""
     loss = jax.ShapeDtypeStruct((), jnp.float32)
     operands = (vertices, faces, target, weight)
     return _call("jaxfit_mask_loss", loss, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))
@@ -65,7 +65,7 @@ def mask_loss_and_gradient(
     kind: str,
     blur: Blur,
 ) -> tuple[Float[Array, ""], Float[Array, "V 3"]]:
-    """`mask_loss` and its gradient with respect to the vertices, in one pass."""
+    """Return `mask_loss` and its gradient with respect to the vertices. One pass computes both."""
     results = (jax.ShapeDtypeStruct((), jnp.float32), _shape_like(vertices))
     operands = (vertices, faces, target, weight)
     return _call("jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))

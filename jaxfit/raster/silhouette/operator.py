@@ -1,4 +1,4 @@
-"""The differentiable operations: soft silhouette and mask loss of one image; batch them by `vmap`."""
+"""The differentiable operations: soft silhouette and mask loss of one image. `vmap` batches them."""
 
 import functools
 from typing import Any, Literal
@@ -26,33 +26,33 @@ def silhouette(
     blur: Blur | None = None,
     backend: Backend = "auto",
 ) -> Float[Array, "{size} {size}"]:
-    """Soft silhouette of a triangle mesh in a square image.
+    """Return the soft silhouette of a triangle mesh in a square image.
 
-    S = 1 − Π_f (1 − sigmoid(−d_f / s)) over every face f that contains the pixel's centre or lies within the blur
-    radius of it; d_f is the squared distance in px² to the face's nearest edge, negative inside.
+    S = 1 − Π_f (1 − sigmoid(−d_f / s)) over every face f that contains the pixel's centre or is closer to the centre
+    than the blur radius. d_f is the squared distance in px² to the nearest edge of the face, negative inside.
 
-    Faces with |2·area| ≤ 1e-8 (size/2)² px² or two equal corners, and those with a vertex at a depth of 1e-8 or less,
-    are skipped. If any coordinate of any vertex is NaN or infinite, the whole image and its gradient are NaN.
-    Coordinates beyond ±2²⁰ px are clamped. The kernels leave a pixel once its S is within 1e-5 of 1.
+    Skipped are faces with |2·area| ≤ 1e-8 (size/2)² px², with two equal corners, or with a vertex at a depth of 1e-8 or
+    less. If any coordinate of any vertex is NaN or infinite, the whole image and its gradient are NaN. Coordinates
+    beyond ±2²⁰ px are clamped. The kernels stop evaluating a block of pixels when all its S are within 1e-5 of 1.
 
     Args:
-        vertices_screen: x and y in pixels (x right, y down, pixel centres at i + 0.5), and the depth in the camera
-            frame in any unit. The gradient with respect to depth is 0.
+        vertices_screen: x and y in pixels (x right, y down, pixel centres at i + 0.5), and depth in the camera frame
+            in any unit. The gradient with respect to depth is 0.
         faces: vertex indices, in any orientation.
-        size: the image's width and height in pixels.
-        blur: softness and radius in pixels, by default `Blur.for_size(size)`.
-        backend: "auto" takes the compiled kernels on the CPU where they were built, the reference elsewhere;
-            "native" insists on the kernels, "reference" on plain JAX.
+        size: width and height of the image in pixels.
+        blur: softness and radius. The default is `Blur.for_size(size)`.
+        backend: "native" runs the compiled kernels and "reference" runs plain JAX. "auto" runs the kernels if they are
+            built and the platform is the CPU, and otherwise the reference.
 
     Returns:
         S in [0, 1], row-major: `image[row, column]`.
 
     Raises:
-        ValueError: an argument's shape, type or value is not as described.
+        ValueError: the shape, type or value of an argument is not as described.
         RuntimeError: backend="native" without kernels.
 
-    Source: Liu et al., "Soft Rasterizer" (2019), eqs. 1 and 4, as computed by PyTorch3D with no limit on the number
-    of faces a pixel.
+    Source: Liu et al., "Soft Rasterizer" (2019), eqs. 1 and 4, as computed by PyTorch3D without a limit on the number
+    of faces per pixel.
     """
     _check_mesh(vertices_screen, faces)
     if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not 0 < size <= 2**14:
@@ -73,28 +73,28 @@ def mask_loss(
     blur: Blur | None = None,
     backend: Backend = "auto",
 ) -> Float[Array, ""]:
-    """How far a mesh's soft silhouette is from a mask, summed over the pixels.
+    """Return the difference between the soft silhouette of a mesh and a mask, summed over the pixels.
 
-    L = w · Σ ρ(S − target), with ρ(e) = |e| for "l1"; for "smooth_l1" ρ(e) = e²/2 where |e| < 1, else |e| − 1/2.
+    L = w · Σ ρ(S − target). For "l1", ρ(e) = |e|. For "smooth_l1", ρ(e) = e²/2 if |e| < 1, else |e| − 1/2.
 
-    Differentiated with respect to the vertices' x and y and to the weight, in reverse mode; the target is a
-    constant. Loss and gradient come from one pass of the kernel; without differentiation only the loss is computed.
+    The loss is differentiable in reverse mode with respect to the weight and to x and y of the vertices. The target is
+    a constant. One pass of the kernel computes loss and gradient. Without differentiation it computes only the loss.
 
     Args:
         vertices_screen: as for `silhouette`.
         faces: as for `silhouette`.
-        target: square; bool or uint8, where anything but 0 is inside, or floats in [0, 1].
-        weight: w. An image of weight 0 costs nothing: its loss and all its gradients, that with respect to the
-            weight included, are 0, even where its vertices are not finite.
+        target: a square image of bool or uint8, where any value but 0 is inside, or of floats in [0, 1].
+        weight: w. An image of weight 0 is not rendered. Its loss and all its gradients are 0, also the gradient with
+            respect to the weight, and even if its vertices are not finite.
         kind: "l1" or "smooth_l1".
         blur: as for `silhouette`.
         backend: as for `silhouette`.
 
     Returns:
-        The loss in pixels (an area).
+        The loss, an area in px².
 
     Raises:
-        ValueError: an argument's shape, type or value is not as described.
+        ValueError: the shape, type or value of an argument is not as described.
         RuntimeError: backend="native" without kernels.
 
     Source: Hägerlind et al., "Temporally-consistent 3D Reconstruction of Seabirds" (2024), the term E_msk.
@@ -142,13 +142,13 @@ def _choose(backend: str) -> str:
     return backend
 
 
-def _dispatch(backend: str, native_form, reference_form, *operands):
-    """One form or the other; for "auto" only the one for the platform is in its program."""
+def _dispatch(backend: str, native_function, reference_function, *operands):
+    """Call one of two functions. For "auto", the program of a platform contains only the function for that platform."""
     if backend == "native":
-        return native_form(*operands)
+        return native_function(*operands)
     if backend == "reference":
-        return reference_form(*operands)
-    return jax.lax.platform_dependent(*operands, cpu=native_form, default=reference_form)
+        return reference_function(*operands)
+    return jax.lax.platform_dependent(*operands, cpu=native_function, default=reference_function)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))

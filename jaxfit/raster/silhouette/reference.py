@@ -1,6 +1,6 @@
-"""The soft silhouette in plain JAX: the specification that the compiled kernels are tested against.
+"""The soft silhouette in plain JAX: the specification that the tests compare the compiled kernels with.
 
-Runs on any platform and differentiates by JAX's own rules, a few hundred times slower than the kernels.
+The reference runs on any platform and JAX derives its gradients. It is a few hundred times slower than the kernels.
 """
 
 import math
@@ -12,23 +12,23 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 KINDS = ("l1", "smooth_l1")
 MIN_DEPTH = 1e-8  # a face with a vertex at or behind this depth is skipped
-MIN_AREA = 1e-8  # ... and one whose |2·area| is at most this, in units of half the image, or two corners equal
-FAR_AWAY = 2.0**20  # px; coordinates are clamped to this, so that their squares stay finite
+MIN_AREA = 1e-8  # a face with at most this |2·area|, in units of half the image, is skipped
+FAR_AWAY = 2.0**20  # px; coordinates are clamped to ± this, so that their squares stay finite
 _FACES_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
 class Blur:
-    """How soft the silhouette's edge is. Not differentiated, and constant under jit.
+    """Softness of the silhouette's edge. It has no gradient and is constant under jit.
 
-    The defaults of PyTorch3D's silhouette examples are 1e-4 of half the image squared, see `Blur.for_size`.
+    `Blur.for_size` gives the values of PyTorch3D's silhouette examples.
     """
 
     sigma: float
     """Softness s in px²: a face covers a pixel at signed squared distance d by sigmoid(−d/s)."""
 
     radius: float
-    """px. A face that does not contain a pixel and is this far away or further leaves it alone."""
+    """px. A face does not affect the pixels outside it at this distance or farther."""
 
     def __post_init__(self):
         if not (math.isfinite(self.sigma) and self.sigma > 0):
@@ -38,13 +38,13 @@ class Blur:
 
     @staticmethod
     def for_size(size: int) -> "Blur":
-        """The usual blur for a square image: s = 1e-4 (size/2)², radius = (size/2) √(1e-4 ln(1e4 − 1))."""
+        """Return the usual blur of a square image: s = 1e-4 (size/2)², radius = (size/2) √(1e-4 ln(1e4 − 1))."""
         half = size / 2
         return Blur(sigma=1e-4 * half**2, radius=half * math.sqrt(1e-4 * math.log(1e4 - 1)))
 
 
 def _segment_distance_squared(x, y, a, b):
-    """Squared distance of the pixels (x, y) from the segment a–b; a and b are (x, y) pairs."""
+    """Squared distance of the pixels (x, y) from the segment a–b. a and b are (x, y) pairs."""
     edge_x, edge_y = b[0] - a[0], b[1] - a[1]
     length_squared = jnp.maximum(edge_x**2 + edge_y**2, 1e-20)
     along = jnp.clip(((x - a[0]) * edge_x + (y - a[1]) * edge_y) / length_squared, 0, 1)
@@ -52,15 +52,15 @@ def _segment_distance_squared(x, y, a, b):
 
 
 def _side(x, y, a, b):
-    """Twice the area of (a, b, pixel), positive where that triangle turns from +x to +y."""
+    """Twice the area of the triangle (a, b, pixel), positive if the triangle turns from +x to +y."""
     return (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
 
 
 def _log_transmitted(corners, x, y, size, blur):
-    """log(1 − p) of faces (f, 3, 3) at pixels x (1, size), y (size, 1), summed over the faces: (size, size)."""
+    """Σ_f log(1 − p) over faces (f, 3, 3) at the pixels x (1, size) and y (size, 1): an image (size, size)."""
     behind = jnp.any(corners[..., 2] <= MIN_DEPTH, -1)
     area = _side(corners[:, 2, 0], corners[:, 2, 1], corners[:, 0].T, corners[:, 1].T)
-    # Rounding can give an area to a face with two equal corners.
+    # Rounding can give a positive area to a face with two equal corners.
     folded = jnp.any(jnp.all(corners[..., :2] == jnp.roll(corners[..., :2], 1, 1), -1), -1)
     skipped = behind | folded | (jnp.abs(area) <= MIN_AREA * (size / 2) ** 2)
     some_triangle = jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], corners.dtype)
@@ -83,7 +83,7 @@ def _log_transmitted_of_mesh(vertices, faces, size, blur):
     xy = jnp.clip(vertices[:, :2], -FAR_AWAY, FAR_AWAY)
     vertices = jnp.concatenate([xy, jax.lax.stop_gradient(vertices[:, 2:])], -1)
 
-    # Few faces at a time, recomputed in the backward pass: memory stays that of a few dozen images.
+    # A few faces at a time, which the backward pass computes again: the memory is that of a few dozen images.
     count = faces.shape[0]
     padding = -count % _FACES_AT_ONCE
     chunks = jnp.pad(faces, ((0, padding), (0, 0))).reshape(-1, _FACES_AT_ONCE, 3)
@@ -104,10 +104,10 @@ def _log_transmitted_of_mesh(vertices, faces, size, blur):
 def silhouette(
     vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], size: int, blur: Blur
 ) -> Float[Array, "size size"]:
-    """1 − Π (1 − p) over all faces; see `jaxfit.raster.silhouette.silhouette`."""
+    """Return 1 − Π (1 − p) over all faces. See `jaxfit.raster.silhouette.silhouette`."""
     finite = jnp.all(jnp.isfinite(vertices))
     image = -jnp.expm1(_log_transmitted_of_mesh(jnp.where(finite, vertices, 0.0), faces, size, blur))
-    # The gradient shall be NaN too, with respect to every x and y.
+    # This term also makes the gradient NaN, with respect to every x and y.
     return image + jnp.sum(vertices[:, :2] * jnp.where(finite, 0.0, jnp.nan))
 
 
@@ -119,12 +119,12 @@ def mask_loss(
     kind: str,
     blur: Blur,
 ) -> Float[Array, ""]:
-    """The loss, 0 where the weight is 0; otherwise the weight is not applied."""
+    """Return the unweighted loss. A weight of 0 gives a loss of 0."""
     missing = weight == 0
     image = silhouette(jnp.where(missing, 0.0, vertices), faces, target.shape[-1], blur)
     mask = target if jnp.issubdtype(target.dtype, jnp.floating) else (target != 0).astype(image.dtype)
     error = image - mask
-    size_of = jnp.abs(error)
+    magnitude = jnp.abs(error)
     if kind == "smooth_l1":
-        size_of = jnp.where(size_of < 1, 0.5 * error**2, size_of - 0.5)
-    return jnp.where(missing, 0.0, jnp.sum(size_of))
+        magnitude = jnp.where(magnitude < 1, 0.5 * error**2, magnitude - 0.5)
+    return jnp.where(missing, 0.0, jnp.sum(magnitude))

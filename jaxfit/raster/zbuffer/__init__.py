@@ -1,6 +1,6 @@
-"""A z-buffer renderer for looking at meshes: what is seen where, masks, attributes, overlays. Not differentiable.
+"""A z-buffer renderer: visible faces, masks, interpolated attributes and overlays. Not differentiable.
 
-`raster` holds the operations, `reference` defines them in NumPy, `shading` lights a mesh.
+`operator` holds the public operations. `reference` defines their results in NumPy. `shading` computes lit colours.
 """
 
 from jaxfit.raster.zbuffer.operator import Fragments, draw, hard_mask, interpolate, zbuffer

@@ -1,4 +1,4 @@
-"""The z-buffer renderer's operations: NumPy in, NumPy out, nothing differentiable."""
+"""The operations of the z-buffer renderer. They take and return NumPy arrays and are not differentiable."""
 
 import math
 from typing import Any, NamedTuple
@@ -15,39 +15,39 @@ MAX_SIZE, MAX_SAMPLES = 2**14, 8
 
 
 class Fragments(NamedTuple):
-    """What is seen at every pixel's centre."""
+    """The visible face at the centre of every pixel."""
 
     face: Int32[np.ndarray, "*B H W"]
-    """Index of the nearest face, −1 where there is none."""
+    """Index of the nearest face. −1 without a face."""
 
     barycentric: Float32[np.ndarray, "*B H W 3"]
-    """Perspective-correct weights of that face's vertices, which sum to 1; 0 where there is no face."""
+    """Perspective-correct weights of the vertices of that face. Their sum is 1. Without a face they are 0."""
 
     depth: Float32[np.ndarray, "*B H W"]
-    """In the camera frame, in the vertices' unit; inf where there is no face."""
+    """Depth in the camera frame, in the unit of the vertices. inf without a face."""
 
 
 def zbuffer(
     vertices_screen: Float[Array | np.ndarray, "*B V 3"], faces: Int[Array | np.ndarray, "F 3"], width: int, height: int
 ) -> Fragments:
-    """The nearest face at every pixel's centre.
+    """Return the nearest face at the centre of every pixel.
 
-    At a centre inside a face's projection, with screen-space barycentrics λ, 1/depth = Σ λ_i / z_i, and the weights
-    are λ_i · depth / z_i. Edges belong to the face; equal depths go to the face with the lower index. Both sides of a
-    face are seen.
+    At a centre inside the projection of a face, with screen-space barycentrics λ, 1/depth = Σ λ_i / z_i, and the
+    weights are λ_i · depth / z_i. Edges belong to the face. Of faces with equal depths, the face with the lowest index
+    is visible. Both sides of a face are visible.
 
-    Faces are not clipped: one with a vertex at a depth of 1e-3 or less, or with a coordinate that is not finite, is
-    skipped, and so is one without area. Coordinates are taken as float32.
+    Faces are not clipped. A face is skipped if a vertex has a depth of 1e-3 or less, if a coordinate is not finite, or
+    if the area is 0. Coordinates are converted to float32.
 
     Args:
         vertices_screen: x and y in pixels (x right, y down, pixel centres at i + 0.5) and depth in the camera frame,
             in any unit, as `jaxfit.model.camera.to_screen` gives them.
         faces: vertex indices, in any orientation, the same for the whole batch.
-        width: of the image in pixels, 1 to 16384.
-        height: likewise.
+        width: width of the image in pixels, 1 to 16384.
+        height: height of the image in pixels, 1 to 16384.
 
     Raises:
-        ValueError: an argument's shape, type or value is not as described.
+        ValueError: the shape, type or value of an argument is not as described.
 
     Source: Pineda, "A parallel algorithm for polygon rasterization" (1988); Heckbert & Moreton, "Interpolation for
     polygon texture mapping and shading" (1991).
@@ -67,11 +67,11 @@ def zbuffer(
 def hard_mask(
     vertices_screen: Float[Array | np.ndarray, "V 3"], faces: Int[Array | np.ndarray, "F 3"], width: int, height: int
 ) -> Bool[np.ndarray, "{height} {width}"]:
-    """The pixels whose centre lies inside the projection of some face, its edges included.
+    """Return the mask of the pixels whose centre lies inside the projection of a face or on its edge.
 
-    It costs what the mesh covers, however large the image.
+    The time depends on the area that the mesh covers, not on the size of the image.
 
-    Args, skipped faces and errors are those of `zbuffer`, for one mesh.
+    Arguments, skipped faces and errors are those of `zbuffer`, for one mesh.
     """
     vertices, faces, batch = _mesh(vertices_screen, faces)
     if batch:
@@ -93,25 +93,25 @@ def interpolate(
     height: int,
     samples: int = 2,
 ) -> tuple[Float32[np.ndarray, "*B H W C"], Float32[np.ndarray, "*B H W"], Int32[np.ndarray, "*B H W"]]:
-    """Vertex attributes over the image, anti-aliased.
+    """Return interpolated vertex attributes over the image, anti-aliased.
 
-    Every pixel has samples² samples on a regular grid, each of which sees the nearest face as in `zbuffer`.
+    Every pixel has samples² samples on a regular grid. At each sample the nearest face is visible, as in `zbuffer`.
 
     Args:
         vertices_screen: as for `zbuffer`.
         faces: as for `zbuffer`.
-        attributes: any number of channels a vertex, in any unit; leading dimensions may be left out or 1.
+        attributes: any number of channels for each vertex, in any unit. Leading dimensions may be omitted or 1.
         width: as for `zbuffer`.
         height: as for `zbuffer`.
-        samples: along a pixel's side, 1 to 8.
+        samples: number of samples along the side of a pixel, 1 to 8.
 
     Returns:
-        Values: the attributes, interpolated perspective-correctly and summed over the covered samples, over
-        samples² (premultiplied by the coverage). Coverage: the share of covered samples, 0 to 1. Face: that of
-        the nearest sample, −1 where nothing is covered.
+        Values: the sum of the perspective-correct attributes over the covered samples, divided by samples². The values
+        are therefore premultiplied by the coverage. Coverage: the fraction of covered samples, 0 to 1. Face: the
+        visible face at the nearest sample, −1 without a covered sample.
 
     Raises:
-        ValueError: an argument's shape, type or value is not as described.
+        ValueError: the shape, type or value of an argument is not as described.
     """
     vertices, faces, batch = _mesh(vertices_screen, faces)
     _check_size(width, height)
@@ -136,22 +136,22 @@ def draw(
     colours: Float[Array | np.ndarray, "V 3"],
     samples: int = 2,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A mesh over an image, anti-aliased: (1 − coverage) · image + 255 · interpolated colours, rounded.
+    """Return an image with a mesh drawn over it: (1 − coverage) · image + 255 · interpolated colours, rounded.
 
-    Several birds are drawn in one call, as one mesh, so that the nearer hides the farther.
+    Draw several birds in one call, as one mesh, so that near birds hide far birds.
 
     Args:
-        image: left as it is; the order of its channels is that of the colours.
-        vertices_screen: as for `zbuffer`, in this image's pixels.
+        image: the background, which is not changed. Its channels have the order of the colours.
+        vertices_screen: as for `zbuffer`, in pixels of this image.
         faces: as for `zbuffer`.
-        colours: of the vertices, in [0, 1].
+        colours: colours of the vertices, in [0, 1].
         samples: as for `interpolate`.
 
     Returns:
         A new image.
 
     Raises:
-        ValueError: an argument's shape, type or value is not as described.
+        ValueError: the shape, type or value of an argument is not as described.
     """
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
         got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
@@ -173,7 +173,7 @@ def draw(
 
 
 def _mesh(vertices_screen: Any, faces: Any) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
-    """Checked and contiguous: float32 vertices (B, V, 3), int32 faces, and the batch's own shape."""
+    """Check a mesh. Returns contiguous float32 vertices (B, V, 3), contiguous int32 faces, and the batch shape."""
     vertices, indices = np.asarray(vertices_screen), np.asarray(faces)
     if vertices.ndim < 2 or vertices.shape[-1] != 3:
         raise ValueError(f"vertices_screen: expected shape (…, V, 3), got {vertices.shape}")
@@ -186,24 +186,24 @@ def _mesh(vertices_screen: Any, faces: Any) -> tuple[np.ndarray, np.ndarray, tup
     batch, count = vertices.shape[:-2], vertices.shape[-2]
     if indices.size and not 0 <= indices.min() <= indices.max() < count:
         raise ValueError(f"faces: expected indices in [0, {count}), got {indices.min()} to {indices.max()}")
-    with np.errstate(over="ignore"):  # too far for float32: infinite, so its faces are skipped
+    with np.errstate(over="ignore"):  # coordinates too large for float32 become infinite, and their faces are skipped
         vertices = np.ascontiguousarray(vertices, np.float32)
     return vertices.reshape(math.prod(batch), count, 3), np.ascontiguousarray(indices, np.int32), batch
 
 
 def _attributes(attributes: Any, batch: tuple[int, ...], count: int, name: str = "attributes") -> np.ndarray:
-    """Float32 (B, V, C), contiguous."""
-    found = np.asarray(attributes)
-    if not np.issubdtype(found.dtype, np.floating):
-        raise ValueError(f"{name}: expected floats, got {found.dtype}")
-    wanted = (*batch, count)
+    """Check attributes. Returns them as contiguous float32 (B, V, C)."""
+    given = np.asarray(attributes)
+    if not np.issubdtype(given.dtype, np.floating):
+        raise ValueError(f"{name}: expected floats, got {given.dtype}")
+    leading = (*batch, count)
     try:
-        full = np.broadcast_to(found, (*wanted, *found.shape[-1:]))
+        full = np.broadcast_to(given, (*leading, *given.shape[-1:]))
     except ValueError:
         full = None
-    if full is None or found.ndim < 2 or found.shape[-2] != count:
-        raise ValueError(f"{name}: expected shape ({', '.join(map(str, wanted))}, channels), got {found.shape}")
-    return np.ascontiguousarray(full, np.float32).reshape(math.prod(batch), count, found.shape[-1])
+    if full is None or given.ndim < 2 or given.shape[-2] != count:
+        raise ValueError(f"{name}: expected shape ({', '.join(map(str, leading))}, channels), got {given.shape}")
+    return np.ascontiguousarray(full, np.float32).reshape(math.prod(batch), count, given.shape[-1])
 
 
 def _check_size(width: Any, height: Any) -> None:

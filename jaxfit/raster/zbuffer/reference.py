@@ -1,20 +1,24 @@
-"""The z-buffer in NumPy, one face at a time: the definition that the compiled kernel repeats bit by bit.
+"""The z-buffer in NumPy, one face at a time. The compiled kernel computes the same bits.
 
-A sample p sees a face where the three edge functions s·((a − p) × (b − p)) are at least 0, s being the sign of the
-face's area. Of one edge the two faces that share it compute the same number, one with the other sign: no sample on a
-shared edge is lost. In float64 these products are exact for any float32 pixel coordinates below a few thousand.
+A face covers a sample p if its three edge functions s·((a − p) × (b − p)) are at least 0, where s is the sign of the
+area of the face. Two faces that share an edge compute the same number with opposite signs, so every sample on a shared
+edge is covered. In float64 these products are exact for all float32 pixel coordinates below a few thousand.
 """
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
-NEAR_DEPTH = 1e-3  # a face with a vertex at or before this depth is skipped
+NEAR_DEPTH = 1e-3  # a face with a vertex at this depth or less is skipped
 
 
 def raster(
     vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], width: int, height: int, samples: int
 ) -> tuple[Int32[np.ndarray, "R C"], Float[np.ndarray, "R C 3"], Float[np.ndarray, "R C"]]:
-    """The nearest face of every sample, samples² a pixel: its index or −1, barycentrics and 1/depth (−1: nothing)."""
+    """Return the nearest face of every sample, with samples² samples per pixel.
+
+    Returns:
+        Index of the face, its barycentrics, and 1/depth. Without a face they are −1, 0 and −1.
+    """
     rows, columns = height * samples, width * samples
     face = np.full((rows, columns), -1, np.int32)
     barycentric = np.zeros((rows, columns, 3))
@@ -36,9 +40,9 @@ def raster(
         weight = edge * (inverse_depth / abs(area))[:, None, None]
         total = (weight[0] + weight[1]) + weight[2]
         near = np.clip(total, inverse_depth.min(), inverse_depth.max())
-        # Rounded, so that faces which meet or coincide tie: the first keeps the sample.
+        # Rounding makes the depths equal where faces meet or coincide. Then the first face keeps the sample.
         better = (edge >= 0).all(0) & (near.astype(np.float32) > nearness[box].astype(np.float32))
-        weight[0, total == 0], total[total == 0] = 1, 1  # rounded away, far outside the image
+        weight[0, total == 0], total[total == 0] = 1, 1  # rounded to 0: a corner is far outside
         face[box][better] = index
         nearness[box][better] = near[better]
         barycentric[box][better] = np.moveaxis(weight * (1 / total), 0, -1)[better]
@@ -46,7 +50,7 @@ def raster(
 
 
 def fragments(vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], width: int, height: int):
-    """Face, barycentrics and depth of one image; see `jaxfit.raster.zbuffer.zbuffer`."""
+    """Return face, barycentrics and depth of one image. See `jaxfit.raster.zbuffer.zbuffer`."""
     face, barycentric, nearness = raster(vertices, faces, width, height, 1)
     depth = np.where(face >= 0, 1 / nearness, np.inf)
     return face, barycentric.astype(np.float32), depth.astype(np.float32)
@@ -60,7 +64,7 @@ def interpolate(
     height: int,
     samples: int,
 ) -> tuple[Float[np.ndarray, "H W C"], Float[np.ndarray, "H W"], Int32[np.ndarray, "H W"]]:
-    """Values, coverage and face of one image; see `jaxfit.raster.zbuffer.interpolate`."""
+    """Return values, coverage and face of one image. See `jaxfit.raster.zbuffer.interpolate`."""
     face, barycentric, nearness = raster(vertices, faces, width, height, samples)
     seen = face >= 0
     values = np.zeros((*face.shape, attributes.shape[-1]))
@@ -77,16 +81,16 @@ def draw(
     colours: Float32[np.ndarray, "V 3"],
     samples: int,
 ) -> None:
-    """Draws over the image, in place; see `jaxfit.raster.zbuffer.draw`."""
+    """Draw over the image in place. See `jaxfit.raster.zbuffer.draw`."""
     values, coverage, _ = interpolate(vertices, faces, colours, image.shape[1], image.shape[0], samples)
     touched = coverage > 0
     mixed = (1 - coverage[touched, None]) * image[touched] + 255 * values[touched]
-    # Rounded to float32 first, so that a half is a half however it was summed.
+    # Rounding to float32 first removes the rounding errors of the sums, so that exact halves always round up.
     image[touched] = np.clip(mixed.astype(np.float32) + np.float32(0.5), 0, 255).astype(np.uint8)
 
 
 def _by_pixel(samples_of: np.ndarray, samples: int) -> np.ndarray:
-    """(H·s, W·s, …) → (H, W, s², …)."""
+    """Reshape (H·s, W·s, …) to (H, W, s², …)."""
     rows, columns = samples_of.shape[:2]
     split = samples_of.reshape(rows // samples, samples, columns // samples, samples, *samples_of.shape[2:])
     return np.moveaxis(split, 2, 1).reshape(rows // samples, columns // samples, samples**2, *samples_of.shape[2:])

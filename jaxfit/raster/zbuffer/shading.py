@@ -1,4 +1,4 @@
-"""Colours of a lit mesh, vertex by vertex."""
+"""Normals and lit colours of the vertices of a mesh."""
 
 import math
 
@@ -8,23 +8,24 @@ from jaxtyping import Array, Float, Float32, Int
 __all__ = ["shade", "vertex_normals"]
 
 LIGHT = (-0.4, -0.8, -0.6)
-"""From the scene towards the light, camera frame (x right, y down, z forward): above, left, on the camera's side."""
+"""Direction from the scene to the light, in the camera frame (x right, y down, z forward). The light is above, left of
+the scene and on the side of the camera."""
 
 
 def vertex_normals(
     vertices: Float[Array | np.ndarray, "*B V 3"], faces: Int[Array | np.ndarray, "F 3"]
 ) -> Float32[np.ndarray, "*B V 3"]:
-    """Unit normals: the sum of the normals of a vertex' faces, each weighted by the face's area.
+    """Return unit normals of the vertices: the normalised sum of the face normals, weighted by the face areas.
 
-    They point outwards where the faces turn counter-clockwise seen from outside, in right-handed axes (the camera
-    frame's are). A vertex of no face, or of faces without area, has the normal 0.
+    The normals point outwards if the faces turn counter-clockwise seen from outside, in right-handed axes such as those
+    of the camera frame. A vertex without faces, or only with faces of area 0, has the normal 0.
 
     Args:
         vertices: in any unit and frame.
         faces: vertex indices.
 
     Raises:
-        ValueError: an argument's shape is not as described.
+        ValueError: the shape of an argument is not as described.
     """
     vertices, faces = _checked(vertices, faces)
     corners = vertices[..., faces, :]
@@ -47,23 +48,23 @@ def shade(
     light: tuple[float, float, float] = LIGHT,
     ambient: float = 0.45,
 ) -> Float32[np.ndarray, "V 3"]:
-    """Colours under a sky and one distant light: colour · (a · (3 − n_y)/4 + (1 − a) · ((1 + n · l)/2)²), clipped.
+    """Return colours under a sky and a distant light: colour · (a · (3 − n_y)/4 + (1 − a) · ((1 + n · l)/2)²).
 
-    The sky is bright above (−y) and half as bright below. The light wraps around the bird, so that nothing is black.
-    A mesh whose faces turn inwards, by the sign of its volume, is lit as if they turned outwards.
+    The sky is bright above (−y) and half as bright below. The light wraps around the bird, so that no part is black.
+    If the volume of the mesh is negative, its faces turn inwards, and the normals are reversed.
 
     Args:
         vertices: camera frame, any unit.
         faces: vertex indices.
-        colours: in [0, 1], of the unlit vertices.
-        light: l, the direction from the bird to the light, camera frame, any length but 0.
-        ambient: a, the sky's share of the light, 0 to 1.
+        colours: colours of the unlit vertices, in [0, 1].
+        light: l, the direction from the bird to the light, in the camera frame, of any length but 0.
+        ambient: a, the fraction of the light that comes from the sky, 0 to 1.
 
     Returns:
-        Colours in [0, 1], for `jaxfit.raster.zbuffer.draw`.
+        Colours, clipped to [0, 1], for `jaxfit.raster.zbuffer.draw`.
 
     Raises:
-        ValueError: an argument's shape or value is not as described.
+        ValueError: the shape or value of an argument is not as described.
     """
     vertices, faces = _checked(vertices, faces)
     colours = np.asarray(colours)
@@ -71,9 +72,9 @@ def shade(
         raise ValueError(f"colours: expected the shape of vertices, {vertices.shape}, (V, 3), got {colours.shape}")
     towards = np.asarray(light, np.float64)
     if towards.shape != (3,) or not np.isfinite(towards).all() or not towards.any():
-        raise ValueError(f"light: expected a direction (3,) other than 0, got {light!r}")
+        raise ValueError(f"light: expected a finite direction (3,) other than 0, got {light!r}")
     if not 0 <= ambient <= 1:
-        raise ValueError(f"ambient: expected a share in [0, 1], got {ambient!r}")
+        raise ValueError(f"ambient: expected a fraction in [0, 1], got {ambient!r}")
     corners = (vertices - vertices.mean(0))[faces]
     volume = np.sum(np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2])
     normals = vertex_normals(vertices, faces) * (-1 if volume < 0 else 1)
