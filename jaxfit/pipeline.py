@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxfit.clock import Clock
-from jaxfit.config.schema import OverlayConfig, ReconstructConfig, config_to_yaml, load_reconstruct_config
+from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
+from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, write_solution

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxfit.cli.observation_tables import matching_line, observation_tables
 from jaxfit.cli.tables import evaluation_tables, plain_json, show, track_table
-from jaxfit.config.schema import load_reconstruct_config
+from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.data.formats.scene_folder import FOOTAGE, MARKER
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import Evaluation, evaluate

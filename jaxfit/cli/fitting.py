@@ -17,7 +17,8 @@ __all__ = ["evaluate", "fit", "overlay"]
 
 
 def fit(options: argparse.Namespace) -> None:
-    from jaxfit.config.schema import config_to_yaml, load_config
+    from jaxfit.config.fit import load_config
+    from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import save_solution
     from jaxfit.fitting.fit import fit
     from jaxfit.fitting.start import load_start

@@ -13,7 +13,7 @@ from jaxfit.model.files import find_bird
 from jaxfit.progress import terminal
 
 if TYPE_CHECKING:
-    from jaxfit.config.schema import ReconstructConfig
+    from jaxfit.config.reconstruct import ReconstructConfig
 
 _logger = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ def reconstruct(options: argparse.Namespace) -> None:
 
 def _reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
     """The config of `--config`, with what other options say laid over it."""
-    from jaxfit.config.schema import load_reconstruct_config
+    from jaxfit.config.reconstruct import load_reconstruct_config
 
     def given(**values: Any) -> dict[str, Any]:
         return {name: value for name, value in values.items() if value is not None}

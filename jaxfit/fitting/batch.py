@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxfit.config.schema import FitConfig
+from jaxfit.config.fit import FitConfig
 from jaxfit.fitting.diagnose import name_failures
 from jaxfit.fitting.lane import Hyperparameters, Problem
 from jaxfit.fitting.solve import Report, StageState, advance, begin, report

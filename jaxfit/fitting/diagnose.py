@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from jaxfit.config.schema import FitConfig
+from jaxfit.config.fit import FitConfig
 from jaxfit.errors import InputError
 from jaxfit.fitting.lane import Hyperparameters, Lane, Problem, lane_window
 from jaxfit.fitting.stages import needs_mask, stage_hyperparameters, stage_problem

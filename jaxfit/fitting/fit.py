@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfit.config.schema import FitConfig
+from jaxfit.config.fit import FitConfig
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import Lanes, fit_batch, frames_per_batch

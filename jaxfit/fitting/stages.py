@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jaxfit.config.schema import FitConfig, InitialiseConfig, StageConfig
+from jaxfit.config.fit import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.fitting.adam import ADAM
 from jaxfit.fitting.lane import Hyperparameters, Problem, Solver
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit.config.schema import CropConfig, FitConfig
+from jaxfit.config.fit import CropConfig, FitConfig
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.fitting.filtering import weighted_median_filter

@@ -4,7 +4,8 @@ import dataclasses
 
 import pytest
 
-from jaxfit.config.schema import FitConfig, StageConfig, config_to_yaml, load_config, shipped_configs
+from jaxfit.config.fit import FitConfig, StageConfig, load_config, shipped_fit_configs
+from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.errors import InputError
 from jaxfit.objective.registry import find_term, known_terms
 
@@ -16,7 +17,7 @@ def written(tmp_path, text, name="mine.yaml"):
 
 
 def test_the_shipped_ones():
-    assert {"paper", "baseline", "aves"} <= set(shipped_configs())
+    assert {"paper", "baseline", "aves"} <= set(shipped_fit_configs())
     paper, baseline = load_config("paper"), load_config("baseline")
     assert (paper.window, paper.common_size, paper.filter_window) == (100, True, 5)
     assert [(s.steps, s.learning_rate) for s in paper.stages] == [(600, 0.01), (400, 0.01)]
@@ -37,7 +38,7 @@ def test_the_shipped_ones():
     assert (baseline.window, baseline.common_size, baseline.filter_window) == (1, False, 1)
 
 
-@pytest.mark.parametrize("name", shipped_configs())
+@pytest.mark.parametrize("name", shipped_fit_configs())
 def test_round_trip(tmp_path, name):
     config = load_config(name)
     path = written(tmp_path, config_to_yaml(config))
@@ -132,7 +133,7 @@ LEAST_SQUARES = STAGE.replace("steps: 1", "steps: 1, solver: levenberg_marquardt
         (STAGE % ", learning_rate: 0", ["`stages[0].learning_rate`", "0"]),
         (STAGE % ", solver: newton", ["`stages[0].solver`", "newton", "levenberg_marquardt"]),
         (LEAST_SQUARES.replace("keypoints", "mask") % "", ["`stages[0].solver`", "'mask'", "adam", "velocity"]),
-        (LEAST_SQUARES % ", optimised: [transl, betas]", ["`stages[0].solver`", "betas", "`free`"]),
+        (LEAST_SQUARES % ", optimised: [transl, betas]", ["`stages[0].solver`", "betas", "`optimised`"]),
         (LEAST_SQUARES % ", carry_moments: true", ["`stages[0].carry_moments`", "Adam"]),
         (STAGE % ", blur: 0", ["`stages[0].blur`", "0"]),
         ("window: 3\n", ["`stages`", "missing", "base: paper"]),

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfit.config.schema import FitConfig, StageConfig
+from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.solve import advance, begin
 from jaxfit.fitting.stages import stage_hyperparameters, stage_problem
 from jaxfit.model.camera import Camera, project
