@@ -8,10 +8,10 @@ from typing import Literal, NamedTuple
 from jaxfit.ablation.claims import Verdict, judge
 from jaxfit.ablation.grid import load_grid
 from jaxfit.ablation.measure import Result, check_shared, measure_grid
-from jaxfit.ablation.report import write_report
 from jaxfit.ablation.runs import claim_folder, fit_grid
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.truth import read_truth
+from jaxfit.extras import require_extra
 from jaxfit.fitting.prepare import Preparation
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
@@ -56,10 +56,12 @@ def ablate(
         progress: told of every part.
 
     Raises:
-        ModuleNotFoundError: Matplotlib or tabulate is missing (extra `report`).
-        InputError: a file that cannot be read, a grid or config that makes no sense, a truth of other birds, a folder
-            that holds something else.
+        InputError: Matplotlib or tabulate is missing (extra `report`); a file that cannot be read, a grid or config
+            that makes no sense, a truth of other birds, a folder that holds something else.
     """
+    require_extra("report", "ablate")
+    from jaxfit.ablation.report import write_report
+
     observations, truth, folder = Path(observations), Path(truth), Path(folder)
     crossed, bird = load_grid(grid), bird or load_murre()
     observed = read_coco(observations)

@@ -11,7 +11,7 @@ import sys
 import time
 
 import pytest
-from support.cli_files import refused
+from support.cli_files import rejected
 
 from jaxfit.cli.main import main
 
@@ -139,13 +139,13 @@ def test_a_kill_between_two_moves(done, inputs, grid, tmp_path):
 def test_another_grid_or_other_inputs_are_refused(done, inputs, grid, tmp_path, capsys):
     other = tmp_path / "other.yaml"
     other.write_text(grid.read_text().replace("5]", "6]"))
-    refused(capsys, command(inputs, other, done), str(done), "another grid", "another --out")
+    rejected(capsys, command(inputs, other, done), str(done), "another grid", "another --out")
     moved = tmp_path / "moved.json"
     moved.write_text((inputs / "birds.json").read_text() + " ")
-    refused(capsys, command(inputs, grid, done, obs=moved), "another observations")
+    rejected(capsys, command(inputs, grid, done, obs=moved), "another observations")
     (done.parent / "full").mkdir()
     (done.parent / "full" / "file").touch()
-    refused(capsys, command(inputs, grid, done.parent / "full"), "no ablation.json")
+    rejected(capsys, command(inputs, grid, done.parent / "full"), "no ablation.json")
 
 
 def test_a_truth_of_other_tracks_is_refused_before_the_work(inputs, grid, tmp_path, capsys):
@@ -155,11 +155,11 @@ def test_a_truth_of_other_tracks_is_refused_before_the_work(inputs, grid, tmp_pa
     path = tmp_path / "truth.json"
     path.write_text(json.dumps(content))
     words = ("shares no track", "104, 107, 109", "4, 7, 9", "--match overlap")
-    refused(capsys, command(inputs, grid, tmp_path / "out", truth=path), str(path), *words)
+    rejected(capsys, command(inputs, grid, tmp_path / "out", truth=path), str(path), *words)
     assert not (tmp_path / "out").exists()
 
 
 def test_an_unknown_key_is_refused(inputs, tmp_path, capsys):
     path = tmp_path / "grid.yaml"
     path.write_text("crosses: [{cross: {terms.velocty: [1, 2]}}]")
-    refused(capsys, command(inputs, path, tmp_path / "out"), str(path), "velocty", "velocity")
+    rejected(capsys, command(inputs, path, tmp_path / "out"), str(path), "velocty", "velocity")

@@ -58,7 +58,7 @@ def test_round_trip(tmp_path):
     assert load_reconstruct_config(written(tmp_path, config_to_yaml(config), "again.yaml")) == config
     assert config.track.frames.stop == 7
     assert config.track.segmenter.classes == ("bird",)
-    assert config.fit == load_config("aves")  # nothing of the paper's shines through
+    assert config.fit == load_config("aves")  # no value of the paper's config is left
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_round_trip(tmp_path):
         ("base: middle.yaml\nfit: {common_size: true}", "baseline", {"window": 4, "common_size": True}),
     ],
 )
-def test_a_fit_has_bases_of_its_own(tmp_path, text, of, changes):
+def test_the_fit_has_a_base_of_its_own(tmp_path, text, of, changes):
     written(tmp_path, "base: baseline\nwindow: 4\n", "own.yaml")
     written(tmp_path, "fit: {base: own.yaml}\n", "middle.yaml")
     fit = load_reconstruct_config(written(tmp_path, text)).fit
@@ -107,7 +107,7 @@ def test_a_fit_has_bases_of_its_own(tmp_path, text, of, changes):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_mistakes_are_named(tmp_path, text, names):
+def test_errors_name_the_key(tmp_path, text, names):
     path = written(tmp_path, f"base: reconstruct\n{text}\n")
     with pytest.raises(InputError) as caught:
         load_reconstruct_config(path)
@@ -118,21 +118,21 @@ def test_mistakes_are_named(tmp_path, text, names):
         assert name in message, f"{name!r} is not in {message!r}"
 
 
-def test_mistakes_in_a_file_of_the_fit_name_that_file(tmp_path):
+def test_errors_in_the_file_of_the_fit_name_that_file(tmp_path):
     fit = written(tmp_path, "base: paper\nwindow: 0\n", "fit.yaml")
     with pytest.raises(InputError) as caught:
         load_reconstruct_config(written(tmp_path, "base: reconstruct\nfit: fit.yaml\n"))
     assert str(caught.value).startswith(f"{fit}: `fit.window` is 0")
 
 
-def test_files_that_do_not_fit():
+def test_configs_of_the_wrong_kind():
     with pytest.raises(InputError, match=r"paper: is the config of a fit.*fit: paper"):
         load_reconstruct_config("paper")
     with pytest.raises(InputError, match=r"reconstruct: `fit` is not a known key"):
         load_config("reconstruct")
 
 
-def test_what_is_missing_and_circles(tmp_path):
+def test_a_missing_fit_and_a_circle_of_bases(tmp_path):
     with pytest.raises(InputError, match=r"`fit` is missing.*base: reconstruct"):
         load_reconstruct_config(written(tmp_path, "track: {threads: 2}\n"))
     written(tmp_path, "base: below.yaml\n", "below.yaml")
