@@ -28,9 +28,10 @@ class CropConfig:
     padding: float = 0.15
     """Margin on each side of the window's largest box, as a fraction of the box's longer side."""
     size_px: int = 256
-    """Side of the crop that the fit works on, in pixels."""
+    """Side of the crops in which silhouettes and masks are compared, in pixels. All other quantities in pixels refer to
+    a 256-pixel crop, so that this setting does not change the objective."""
     focal_px: float = 2167.0
-    """Focal length of the crop camera, in pixels of the crop; the principal point is the middle of the crop."""
+    """Focal length of the crop camera, in pixels of a 256-pixel crop; the principal point is the middle of the crop."""
 
     def __post_init__(self):
         require_at_least(self, 16, "size_px")
@@ -52,7 +53,8 @@ class InitialiseConfig:
     candidates: int = 64
     """Number of best orientations per frame from which the sequence of the window is chosen."""
     smoothness: float = 400.0
-    """Cost of a rotation of 1 radian between consecutive frames in the choice of the sequence, in squared pixels."""
+    """Cost of a rotation of 1 radian between consecutive frames in the choice of the sequence, in squared pixels of a
+    256-pixel crop."""
     hypotheses: int = 1
     """Number of distinct starting poses that are fitted side by side until a stage with `keep_best` ends."""
 
@@ -129,7 +131,8 @@ class FitConfig:
     stages: tuple[StageConfig, ...]
     """The stages of the fit, in their order."""
     terms: Mapping[str, Any]
-    """Weight of each term, as a number, or as `{weight: …, setting: …}` with settings such as sigma_px."""
+    """Weight of each term, as a number, or as `{weight: …, setting: …}` with settings such as sigma_px (in pixels of
+    a 256-pixel crop)."""
     window: int = 100
     """Number of frames that are fitted together; longer tracks are cut into windows, and 1 fits every frame alone."""
     common_size: bool = True

@@ -61,6 +61,7 @@ def documented_yaml(config: Any) -> str:
 
 
 def _documented_lines(config: Any, comments: bool = True) -> Iterator[str]:
+    """Yield the lines of a config as YAML, with the description of each key above the key if `comments`."""
     texts = field_help(type(config))
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
