@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.ablation.ablate import ablate
     from jaxfit.ablation.sweep import sweep
+    from jaxfit.config.fit import FitConfig, load_config
     from jaxfit.config.paths import with_values
     from jaxfit.config.perception import TrackConfig
-    from jaxfit.config.schema import FitConfig, ReconstructConfig, load_config, load_reconstruct_config
+    from jaxfit.config.reconstruct import ReconstructConfig, load_reconstruct_config
     from jaxfit.data.formats.coco import read_coco, write_coco
     from jaxfit.data.observations import Observations
     from jaxfit.data.solution import Solution, load_solution, save_solution
@@ -78,9 +79,10 @@ __all__ = [
 _HOMES = {
     "ablation.ablate": ("ablate",),
     "ablation.sweep": ("sweep",),
+    "config.fit": ("FitConfig", "load_config"),
     "config.paths": ("with_values",),
     "config.perception": ("TrackConfig",),
-    "config.schema": ("FitConfig", "ReconstructConfig", "load_config", "load_reconstruct_config"),
+    "config.reconstruct": ("ReconstructConfig", "load_reconstruct_config"),
     "data.formats.coco": ("read_coco", "write_coco"),
     "data.observations": ("Observations",),
     "data.solution": ("Solution", "load_solution", "save_solution"),
@@ -101,9 +103,9 @@ _HOMES = {
     "view.overlay": ("overlay", "overlay_frame"),
     "view.sheet": ("contact_sheet",),
 }
-"""Module → the public names that it holds, each imported at its first use: together they take seconds."""
+"""Module → its public names. A module is imported at the first use of a name: all modules together take seconds."""
 
-if not TYPE_CHECKING:  # there, a name that is none stays an error
+if not TYPE_CHECKING:  # so that type checkers report unknown names
 
     def __getattr__(name: str) -> Any:
         for home, names in _HOMES.items():

@@ -1,4 +1,4 @@
-"""How long the parts of some work take."""
+"""Measurement of the time that the parts of a computation take."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ T = TypeVar("T")
 
 
 class Clock:
-    """Adds up the time of each of several parts: `with clock("read"): …`."""
+    """Sums the time of each part: `with clock("read"): …`."""
 
     seconds: dict[str, float]
-    """Part → its time so far, in the order in which they began."""
+    """Part → time so far in seconds, in the order of the first use of the parts."""
 
     def __init__(self):
         self.seconds = {}
@@ -30,7 +30,7 @@ class Clock:
             self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - began
 
     def each(self, part: str, items: Iterable[T]) -> Iterator[T]:
-        """The same items; to get each of them is the part."""
+        """Yield the items, and count the time to get each item as `part`."""
         source, none = iter(items), object()
         while True:
             with self(part):

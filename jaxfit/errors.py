@@ -1,4 +1,4 @@
-"""The one error that means: what you gave jaxfit cannot be used as it is."""
+"""The error for input that jaxfit cannot use."""
 
 __all__ = ["InputError"]
 

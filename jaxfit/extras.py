@@ -1,4 +1,4 @@
-"""Optional packages, which come with the extras of the installation."""
+"""Check of optional packages, which the extras of the installation add."""
 
 from __future__ import annotations
 
@@ -15,7 +15,12 @@ _EXTRAS = {
 
 
 def require_extra(extra: str, source: str) -> None:
-    """Raise InputError where a package of the extra is missing, before the work of `source` begins."""
-    what, packages = _EXTRAS[extra]
+    """Raise InputError if a package of an extra is missing.
+
+    Args:
+        extra: name of the extra in `pip install "jaxfit[extra]"`.
+        source: the command or function that needs the extra, for the message.
+    """
+    names, packages = _EXTRAS[extra]
     if not all(find_spec(package) for package in packages):
-        raise InputError(source, f"needs {what}, which are not installed", f'pip install "jaxfit[{extra}]"')
+        raise InputError(source, f"needs {names}, which are not installed", f'run pip install "jaxfit[{extra}]"')

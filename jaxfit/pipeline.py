@@ -1,4 +1,4 @@
-"""From a video to posed birds, drawn: what `jaxfit reconstruct` does."""
+"""The whole reconstruction: from a video to poses and an overlay, as `jaxfit reconstruct` does."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxfit.clock import Clock
-from jaxfit.config.schema import OverlayConfig, ReconstructConfig, config_to_yaml, load_reconstruct_config
+from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
+from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, write_solution
@@ -37,14 +38,14 @@ _logger = logging.getLogger(__name__)
 
 
 class Reconstruction(NamedTuple):
-    """What came of a video."""
+    """The result of a reconstruction."""
 
     tracking: TrackingResult
-    """What was found."""
+    """Tracks of keypoints and masks."""
     solution: Solution
-    """Its poses."""
+    """Poses."""
     summary: dict[str, Any]
-    """What `summary.json` says."""
+    """Content of `summary.json`: metrics, timings, versions."""
 
 
 def reconstruct(
@@ -57,54 +58,54 @@ def reconstruct(
     overwrite: bool = False,
     progress: ProgressTask = silent,
 ) -> Reconstruction:
-    """Find, follow, pose and draw the birds of a video.
+    """Track the birds of a video, fit their poses and draw them on the video.
 
-    The folder then holds `observations.json` as `jaxfit track` writes it; the poses as `jaxfit fit` writes them, with
-    `config.yaml` for the whole of it, and in `summary.json` also the quality of tracks and the networks' hashes;
-    `overlay.mp4` and its contact sheet `overlay.png`. It appears whole or not at all.
+    The function writes to the folder: `observations.json` as `jaxfit track`; the files of `jaxfit fit`, with the whole
+    config in `config.yaml`, and with the quality of tracks and the hashes of networks in `summary.json`; `overlay.mp4`
+    and its contact sheet `overlay.png`. The folder is written completely or not at all.
 
     Args:
         video: a video, or a folder of frames.
-        folder: where the result goes.
-        bird: the model; None takes the murre.
-        config: what to do; None takes `reconstruct`.
-        segmenter, keypoints: used instead of those that `config` names.
-        overwrite: replace an earlier result in that folder.
-        progress: told of every part.
+        folder: folder for the result.
+        bird: the model; None uses the murre.
+        config: all settings; None uses the shipped config `reconstruct`.
+        segmenter, keypoints: networks that replace the networks of `config`.
+        overwrite: replace an earlier result in the folder.
+        progress: receives the progress of every part.
 
     Returns:
-        The result. A bird whose fit fails has a status that says so, and the others are as they are.
+        The result. A failed fit of one bird appears in the bird's status and does not affect other birds.
 
     Raises:
-        InputError: no video, a network or tracker that cannot be used, keypoints that are not the model's, a folder
-            that cannot be written, or holds the video or something else already; a video without a bird.
+        InputError: no video; an unusable network or tracker; keypoints that differ from the model's; a folder that
+            cannot be written, holds the video or holds other files; a video without birds.
     """
     video, folder, clock = Path(video), Path(folder), Clock()
-    given = {"segmenter": segmenter is not None, "keypoints": keypoints is not None}
+    replaced = {"segmenter": segmenter is not None, "keypoints": keypoints is not None}
     with clock("load"):
         config = config or load_reconstruct_config()
         info = probe_video(video)
-        check_outputs([folder / OVERLAY], video, overwrite=True)  # before the work, not after it
+        check_outputs([folder / OVERLAY], video, overwrite=True)  # before the long work
         if folder.resolve() in video.resolve().parents:
-            raise InputError(folder, "holds the video, which would be lost", "choose another --out")
+            raise InputError(folder, "holds the video, which the result would replace", "choose another --out")
         check_replaceable(folder, overwrite, MARKER)
         bird = bird or load_murre()
         keypoints = keypoints or open_keypoint_detector(config.track)
-        named = {kind: files for kind, files in network_files(config.track).items() if not given[kind]}
-        nothing_yet = TrackRecorder(keypoints.keypoint_names).observations()
-        check_keypoints(nothing_yet, bird.keypoint_names, config.track.keypoints.file)
+        networks = {kind: files for kind, files in network_files(config.track).items() if not replaced[kind]}
+        empty = TrackRecorder(keypoints.keypoint_names).observations()
+        check_keypoints(empty, bird.keypoint_names, config.track.keypoints.file)
     with new_folder(folder, overwrite, marker=MARKER) as part:
         with clock("track"):
             tracking = run_tracking(video, config.track, segmenter, keypoints, progress=progress)
         if tracking.failure is not None:
             raise tracking.failure
-        found = tracking.observations
+        observations = tracking.observations
         with clock("fit"):
-            solution = fit(found, bird, config.fit, progress=progress, source=video)
-        write_coco(found, part / OBSERVATIONS)
+            solution = fit(observations, bird, config.fit, progress=progress, source=video)
+        write_coco(observations, part / OBSERVATIONS)
         with clock("overlay"):
-            _draw(solution, bird, video, part / OVERLAY, found, config.overlay, progress)
-        summary = _summary(tracking, solution, bird, named, video, info, clock)
+            _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
+        summary = _summary(tracking, solution, bird, networks, video, info, clock)
         write_solution(solution, bird, config_to_yaml(config), summary, part)
     return Reconstruction(tracking, solution, summary)
 
@@ -114,21 +115,22 @@ def _draw(
     bird: Bird,
     video: Path,
     out: Path,
-    found: Observations,
+    observations: Observations,
     config: OverlayConfig,
     progress: ProgressTask,
 ) -> None:
+    """Write the overlay and its contact sheet, unless the config or a lack of poses prevents it."""
     if not config.write:
         return
     if not solution.valid.any():
-        _logger.warning("%s: no bird could be posed, so that there is nothing to draw", video)
+        _logger.warning("%s: no bird has a pose, so there is no overlay", video)
         return
     overlay(
         solution,
         bird,
         video,
         out,
-        observations=found if config.detections else None,
+        observations=observations if config.detections else None,
         side_views=config.side_views,
         max_width=config.max_width_px,
         codec=config.codec,
@@ -145,6 +147,7 @@ def _summary(
     info: VideoInfo,
     clock: Clock,
 ) -> dict[str, Any]:
+    """Return the content of `summary.json`; `networks` maps each kind of network to its files."""
     summary = summarise(solution, bird, clock.seconds)
     summary["versions"] |= {name: metadata.version(name) for name in LIBRARIES}
     return summary | {

@@ -1,4 +1,4 @@
-"""Progress on long work: one protocol, silent by default, a bar on the terminal for the command line."""
+"""Progress of long computations: silent by default, a bar on the terminal for the command line."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 __all__ = ["ProgressTask", "ReportProgress", "silent", "terminal"]
 
 ReportProgress = Callable[[float, str], None]
-"""Called with the amount of work just done and a short note."""
+"""Function of the amount of work since the last call and a short note."""
 ProgressTask = Callable[[str, float | None], AbstractContextManager[ReportProgress]]
-"""Opens a task of a given name and total amount of work; None where nobody knows it."""
+"""Function that opens a task with a name and a total amount of work; None is an unknown amount."""
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def silent(_name: str, _total: float | None) -> Iterator[ReportProgress]:
 
 @contextmanager
 def terminal(name: str, total: float | None) -> Iterator[ReportProgress]:
-    """A bar with elapsed and remaining time on stderr; plain lines where that is not a terminal."""
+    """Show a bar with elapsed and remaining time on stderr, or plain lines if stderr is not a terminal."""
     console = Console(stderr=True)
     columns = (
         TextColumn("{task.description}"),

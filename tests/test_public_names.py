@@ -1,4 +1,4 @@
-"""The public names: all there, where type checkers look for them too, and imported only when they are used."""
+"""The public names exist, also for type checkers, and each name is imported at its first use."""
 
 import ast
 import inspect
@@ -12,8 +12,8 @@ import pytest
 import jaxfit
 
 
-def test_every_public_name_is_the_one_of_its_module():
-    """What runs, what type checkers read and what is promised are three lists of the same names."""
+def test_every_public_name_comes_from_its_module():
+    """The names at run time, for type checkers and in `__all__` are the same."""
     tree = ast.parse(inspect.getsource(jaxfit))
     typed = next(node for node in tree.body if isinstance(node, ast.If))  # if TYPE_CHECKING
     static = {(alias.name, node.module) for node in typed.body for alias in node.names}
@@ -26,7 +26,7 @@ def test_every_public_name_is_the_one_of_its_module():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "output"),
     [
         (["--help"], 0, "COMMAND"),
         (["--version"], 0, jaxfit.__version__),
@@ -34,7 +34,7 @@ def test_every_public_name_is_the_one_of_its_module():
         (["simulate", "--out", "x", "--codec", "av1"], 2, "invalid choice: 'av1'"),
     ],
 )
-def test_what_needs_no_library_loads_none(arguments, code, said):
+def test_help_and_wrong_arguments_load_no_library(arguments, code, output):
     script = Path(sys.executable).with_name("jaxfit")
     command = [sys.executable, "-X", "importtime", script, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -43,14 +43,22 @@ def test_what_needs_no_library_loads_none(arguments, code, said):
     assert "jaxfit.cli.main" in loaded
     assert not loaded & {"jax", "numpy", "cv2", "av", "scipy", "yaml"}
     assert done.returncode == code
-    assert said in done.stdout + "".join(line for line in lines if not line.startswith("import time:"))
+    assert output in done.stdout + "".join(line for line in lines if not line.startswith("import time:"))
 
 
 def test_commands_load_what_they_need():
-    """No command waits for the video libraries or the objective unless it uses them."""
+    """Only commands that use the video libraries or the objective import them; `jaxfit demo` uses everything."""
     code = "import pkgutil, sys, jaxfit.cli as c\n"
-    code += "for m in pkgutil.iter_modules(c.__path__): __import__(f'jaxfit.cli.{m.name}')\n"
+    code += "names = [m.name for m in pkgutil.iter_modules(c.__path__) if m.name != 'demo']\n"
+    code += "for name in names: __import__(f'jaxfit.cli.{name}')\n"
     code += "print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "jaxfit.model.files" in loaded
     assert not set(loaded) & {"av", "cv2", "trimesh", "jaxfit.objective.objective", "jaxfit.evaluation.evaluate"}
+
+
+def test_a_missing_extra_is_named():
+    code = "import sys; sys.modules['matplotlib'] = None\nimport jaxfit\n"
+    code += "try: jaxfit.ablate('a.json', 'b.json', 'out')\nexcept jaxfit.InputError as error: print(error)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert 'pip install "jaxfit[report]"' in done.stdout, done.stderr

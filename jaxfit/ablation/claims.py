@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jaxfit.ablation.grid import ClaimConfig, Run
+from jaxfit.ablation.grid import Run
 from jaxfit.ablation.measure import Result
+from jaxfit.config.grid import ClaimConfig
 from jaxfit.evaluation.bootstrap import Ratio, paired_ratio
 
 __all__ = ["CLAIMED", "Verdict", "judge", "pairs_of"]

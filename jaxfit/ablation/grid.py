@@ -6,64 +6,20 @@ import itertools
 import logging
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jaxfit.config.checks import ConfigKeyError
+from jaxfit.config.fit import FitConfig, load_config
+from jaxfit.config.grid import ClaimConfig, GridConfig
 from jaxfit.config.paths import get_value, with_values
-from jaxfit.config.schema import FitConfig, load_config
-from jaxfit.config.yaml_file import ConfigKeyError, read_config, require
+from jaxfit.config.yaml_file import read_config
 from jaxfit.errors import InputError
 
-__all__ = ["ClaimConfig", "CrossConfig", "Grid", "GridConfig", "Run", "cross", "load_grid", "short"]
+__all__ = ["Grid", "Run", "cross", "load_grid", "short"]
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class CrossConfig:
-    """Runs that are every combination of some values."""
-
-    cross: Mapping[str, Any]
-    """Path of a config key → its values; the last key changes fastest. `=path` stands for the value there."""
-    set: Mapping[str, Any] = field(default_factory=dict)
-    """Path of a config key → the value that all of these runs have."""
-
-
-@dataclass(frozen=True)
-class ClaimConfig:
-    """Something that a grid can show: runs of one kind are better than runs of another."""
-
-    claim: str
-    """In words."""
-    better: Mapping[str, Any]
-    """Path of a config key → the value, as the grid writes it, of those that should be better."""
-    worse: Mapping[str, Any]
-    """The same of those that they are compared with: runs with equal values of all keys that neither names."""
-    harmless: bool = False
-    """Whether no difference is enough."""
-
-
-@dataclass(frozen=True)
-class GridConfig:
-    """What an ablation runs, and what it is to show."""
-
-    crosses: tuple[CrossConfig, ...]
-    """One after the other."""
-    config: str = "paper"
-    """The config of a fit that every run starts from: a shipped one's name or a YAML file's path."""
-    claims: tuple[ClaimConfig, ...] = ()
-    """What to compare; any number, in words of one's own."""
-
-    def __post_init__(self):
-        require(len(self.crosses) > 0, "crosses", "is empty", "an ablation needs a cross")
-        for i, each in enumerate(self.crosses):
-            require(len(each.cross) > 0, f"crosses[{i}].cross", "is empty", "name a key and its values")
-            for path, values in each.cross.items():
-                where = f"crosses[{i}].cross.{path}"
-                require(isinstance(values, list), where, f"is {values!r}", "a list of values is expected")
-                require(len(values) > 0, where, "is empty, so that the cross has no run", "give it a value")
-                require(path not in each.set, where, "stands in `set` too", "keep one of them")
 
 
 @dataclass(frozen=True)
@@ -101,7 +57,7 @@ def load_grid(source: str | Path) -> Grid:
         InputError: the file cannot be read, a key is unknown, a value is invalid, a cross has no run, or a claim is
             about a key that does not vary.
     """
-    grid = read_config(GridConfig, source, "ablation")
+    grid = read_config(GridConfig, source)
     base = load_config(grid.config)
     levels = [
         {**each.set, **dict(zip(each.cross, values, strict=True))}

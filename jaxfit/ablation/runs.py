@@ -14,8 +14,9 @@ import numpy as np
 import yaml
 
 from jaxfit.ablation.grid import Run
-from jaxfit.config.schema import FitConfig
-from jaxfit.config.yaml_file import build_config, config_to_yaml
+from jaxfit.config.build import build_config
+from jaxfit.config.fit import FitConfig
+from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.scene_folder import TRUE_POSES, TRUTH
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution, write_solution

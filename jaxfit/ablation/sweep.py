@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from jaxfit.ablation.grid import cross
 from jaxfit.ablation.measure import Result
 from jaxfit.ablation.runs import fit_batches
-from jaxfit.config.schema import FitConfig
+from jaxfit.config.fit import FitConfig
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxfit.config.schema import FitConfig, load_config
+from jaxfit.config.fit import FitConfig, load_config
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate

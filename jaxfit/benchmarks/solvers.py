@@ -13,7 +13,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from jaxfit.config.schema import load_config
+from jaxfit.config.fit import load_config
 from jaxfit.data.observations import Observations
 from jaxfit.fitting.adam import ADAM
 from jaxfit.fitting.fit import check_observations, windows_of

@@ -1,1 +1,1 @@
-"""The commands, a module a group: each is one short function that calls the library and prints what came of it."""
+"""The command line: one module per group of commands; a command calls the library and prints the result."""

@@ -1,4 +1,4 @@
-"""Sweep configs, and see what each change is worth."""
+"""Command that compares a grid of configs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ __all__ = ["ablate"]
 
 
 def ablate(options: argparse.Namespace) -> None:
+    """Fit and measure every run of a grid, and print the metrics and the verdicts on claims."""
     require_extra("report", "ablate")
     from jaxfit.ablation.ablate import ablate
     from jaxfit.ablation.report import FILES
     from jaxfit.ablation.table import CAPTION, claims_table, results_table
 
-    began = time.perf_counter()
+    start = time.perf_counter()
     done = ablate(
         options.observations,
         options.truth,
@@ -33,8 +34,8 @@ def ablate(options: argparse.Namespace) -> None:
     show(CAPTION)
     if done.verdicts:
         show("\n" + claims_table(done.verdicts, "simple"))
-    before = len(done.results) - done.fitted
-    held = f", {before} held already" if before else ""
-    show(f"\n{counted(done.fitted, 'run')} fitted in {(time.perf_counter() - began) / 60:.1f} min{held}. Look at")
-    for name, what in FILES.items():
-        show(f"  {options.out / name}: {what}")
+    earlier = len(done.results) - done.fitted
+    reused = f", {counted(earlier, 'earlier run')} reused" if earlier else ""
+    show(f"\n{counted(done.fitted, 'run')} fitted in {(time.perf_counter() - start) / 60:.1f} min{reused}. Files:")
+    for name, text in FILES.items():
+        show(f"  {options.out / name}: {text}")

@@ -1,4 +1,4 @@
-"""Measure speed on this machine."""
+"""Command that measures speed on this machine."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ __all__ = ["bench"]
 
 
 def bench(options: argparse.Namespace) -> None:
+    """Measure one part of jaxfit and print the result."""
     from jaxfit.benchmarks.fit import bench_fit, noisy_scene
     from jaxfit.benchmarks.render import bench_render
     from jaxfit.benchmarks.silhouette import bench_silhouette
@@ -28,12 +29,12 @@ def bench(options: argparse.Namespace) -> None:
         result = bench_render(bird)
     elif options.what == "solvers":
         bird = bird or find_bird("murre")
-        if options.plot:  # before the work, not after it
+        if options.plot:  # before the long work
             require_extra("report", "--plot")
             check_writable(options.plot)
-        given = options.observations
-        seen = read_coco(given) if given else noisy_scene(bird, options.birds, options.frames)[1]
-        result = bench_solvers(seen, bird, progress=terminal)
+        path = options.observations
+        observations = read_coco(path) if path else noisy_scene(bird, options.birds, options.frames)[1]
+        result = bench_solvers(observations, bird, progress=terminal)
         if options.plot:
             plot_solvers(result, options.plot)
     else:
@@ -41,5 +42,5 @@ def bench(options: argparse.Namespace) -> None:
     if options.json:
         print(json_text(result))  # noqa: T201
     else:
-        # curves are for the plot and JSON
+        # the plot and JSON have the curves, which are dicts
         show_facts({key: value for key, value in result.items() if not isinstance(value, dict)})

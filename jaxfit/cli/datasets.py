@@ -1,4 +1,4 @@
-"""Published data sets as observations."""
+"""Commands that convert published data sets to observations."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ __all__ = ["murre"]
 
 
 def murre(options: argparse.Namespace) -> None:
+    """Convert common_murre_temporal to a COCO file and print how the layout was interpreted."""
     from jaxfit.data.formats.coco import write_coco
     from jaxfit.data.formats.common_murre import LICENSE, read_common_murre
     from jaxfit.model.anatomy import MURRE_KEYPOINTS
@@ -21,13 +22,13 @@ def murre(options: argparse.Namespace) -> None:
     chosen = {"none": None, "murre": MURRE_KEYPOINTS}
     names = chosen[options.keypoints] if options.keypoints in chosen else options.keypoints.split(",")
     observations, readings = read_common_murre(options.folder, names, terminal)
-    told = "; ".join(f"{question}: {answer}" for question, answer in readings.items())
+    interpretation = "; ".join(f"{question}: {answer}" for question, answer in readings.items())
     info = {
-        "description": f"common_murre_temporal as jaxfit read it; its layout is inferred, not published. {told}",
+        "description": f"common_murre_temporal; its layout is inferred, not published. {interpretation}",
         "license": LICENSE,
     }
     write_coco(observations, options.out, info)
-    show("the layout of this data set is inferred, not published; it was read so:")
+    show("The layout of this data set is inferred, not published:")
     show_facts(readings)
     birds, frames = counted(observations.num_tracks, "bird"), counted(len(observations.frame_index), "frame")
-    show(f"{birds}, {frames} → {options.out} (licence {LICENSE}: not for commercial use; the video itself is not read)")
+    show(f"{birds}, {frames} → {options.out} (licence {LICENSE}: no commercial use; the video itself is not read)")

@@ -1,4 +1,4 @@
-"""Simulate a short scene, reconstruct it from its footage alone, and measure what came of it against the truth."""
+"""The demo: simulate a short scene, reconstruct the scene from its footage, and measure the result."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxfit.cli.observation_tables import matching_line, observation_tables
 from jaxfit.cli.tables import evaluation_tables, show, track_table
-from jaxfit.config.schema import load_reconstruct_config
+from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.data.formats.scene_folder import FOOTAGE, MARKER
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
@@ -28,55 +28,59 @@ METRICS = "evaluation.json"
 
 
 def run_demo(folder: Path) -> Evaluation:
-    """Leave a scene and what was made of its footage in a folder, and print how well it agrees with the truth.
+    """Write a simulated scene and its reconstruction to a folder, and print how well the two agree.
 
     Args:
-        folder: for `scene/`, `result/` and `evaluation.json`; an earlier demo there is replaced.
+        folder: receives `scene/`, `result/` and `evaluation.json`; an earlier demo in the folder is replaced.
+
+    Returns:
+        The metrics of the reconstruction.
 
     Raises:
-        InputError: the folder cannot be written, or holds something else than an earlier demo.
+        InputError: the folder cannot be written, or holds files other than an earlier demo.
     """
-    began = time.perf_counter()
+    start = time.perf_counter()
     scene_folder, result_folder = folder / "scene", folder / "result"
     _check_folder(folder)
     check_replaceable(scene_folder, True, MARKER)
     check_replaceable(result_folder, True, "poses.npz")
     bird, config = load_murre(), load_reconstruct_config()
-    show(f"{BIRDS} murres on a ledge, {FRAMES} frames, simulated; then reconstructed from the footage alone")
+    show(f"simulating {BIRDS} murres on a ledge over {FRAMES} frames, then reconstructing them from the footage alone")
     scene = simulate(bird, scene_folder, BIRDS, FRAMES, SIZE, seed=SEED, overwrite=True, progress=terminal)
     done = reconstruct(scene_folder / FOOTAGE, result_folder, bird, config, overwrite=True, progress=terminal)
-    found = done.tracking.observations
+    observations = done.tracking.observations
     truth = Truth(scene.truth, scene.poses, source=scene_folder)
-    seen = evaluate_observations(found, truth)
+    observed = evaluate_observations(observations, truth)
     solution, matching = match_tracks(done.solution, truth, "overlap")
     result = evaluate(solution, bird, truth, terminal)
-    metrics = {"detection": seen.detection, "tracking": seen.tracking, **result.overall}
+    metrics = {"detection": observed.detection, "tracking": observed.tracking, **result.overall}
     write_whole(folder / METRICS, json_text(metrics).encode())
-    show(track_table(found, done.solution))
-    for table in observation_tables(seen):
+    show(track_table(observations, done.solution))
+    for table in observation_tables(observed):
         show(table)
     show(matching_line(matching))
     for table in evaluation_tables(result):
         show(table)
     seconds = done.summary["seconds"]
     parts = ", ".join(f"{name} {seconds[name]:.0f}" for name in ("track", "fit", "overlay"))
-    show(f"done in {time.perf_counter() - began:.0f} s ({parts}). Look at")
-    for path, what in (
-        (result_folder / OVERLAY, "the posed birds on the footage, and each from its side"),
+    show(f"done in {time.perf_counter() - start:.0f} s ({parts}). Files:")
+    for path, text in (
+        (result_folder / OVERLAY, "the posed birds on the footage, and every bird from its side"),
         ((result_folder / OVERLAY).with_suffix(".png"), "a contact sheet"),
         (result_folder, "observations.json, poses.npz, summary.json"),
-        (scene_folder, "footage and truth"),
-        (folder / METRICS, "the figures above"),
+        (scene_folder, "footage and ground truth"),
+        (folder / METRICS, "the metrics above"),
     ):
-        show(f"  {path}: {what}")
+        show(f"  {path}: {text}")
     return result
 
 
 def _check_folder(folder: Path) -> None:
+    """Raise InputError unless the folder is absent, empty or an earlier demo."""
     if not folder.exists():
         return
     if not folder.is_dir():
         raise InputError(folder, "is a file, not a folder", "choose another --out")
     if any(folder.iterdir()) and not (folder / "scene" / MARKER).is_file():
-        problem = "holds files, but no earlier demo, and is left alone"
+        problem = "holds files that are not an earlier demo"
         raise InputError(folder, problem, "choose another --out, new or empty")

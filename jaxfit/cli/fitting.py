@@ -1,4 +1,4 @@
-"""Pose birds, measure how well, draw them."""
+"""Commands that fit poses, evaluate results and draw results."""
 
 from __future__ import annotations
 
@@ -18,22 +18,24 @@ __all__ = ["evaluate", "fit", "overlay"]
 
 
 def fit(options: argparse.Namespace) -> None:
-    from jaxfit.config.schema import config_to_yaml, load_config
+    """Fit the poses of birds to observations and write a result."""
+    from jaxfit.config.fit import load_config
+    from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import save_solution
     from jaxfit.fitting.fit import fit
     from jaxfit.fitting.initial_pose_file import load_initial_poses
     from jaxfit.fitting.summary import summarise
     from jaxfit.storage.files import check_replaceable
 
-    began = time.perf_counter()
-    check_replaceable(options.out, options.overwrite, "poses.npz")  # before the work, not after it
+    start = time.perf_counter()
+    check_replaceable(options.out, options.overwrite, "poses.npz")  # before the long work
     config = load_config(options.config)
     bird = find_bird(options.model)
     observations = read_coco(options.observations)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
     read = time.perf_counter()
     solution = fit(observations, bird, config, initial_poses, terminal, source=options.observations)
-    seconds = {"read": read - began, "fit": time.perf_counter() - read}
+    seconds = {"read": read - start, "fit": time.perf_counter() - read}
     summary = summarise(solution, bird, seconds)
     save_solution(solution, bird, config_to_yaml(config), summary, options.out, options.overwrite)
     table = right_aligned("track", "frames", "objective")
@@ -50,6 +52,7 @@ def fit(options: argparse.Namespace) -> None:
 
 
 def evaluate(options: argparse.Namespace) -> None:
+    """Compare a result or observations with the truth and print metrics."""
     from jaxfit.cli.observation_tables import matching_line
     from jaxfit.data.solution import load_solution
     from jaxfit.evaluation.evaluate import evaluate
@@ -58,19 +61,20 @@ def evaluate(options: argparse.Namespace) -> None:
 
     if options.result.is_file():
         if options.by:
-            raise InputError(options.result, "holds observations, which have no tables --by", "give a folder of poses")
+            remedy = "give the folder of a result, or remove --by"
+            raise InputError(options.result, "holds observations, for which there are no tables --by", remedy)
         _evaluate_observations(options)
         return
     solution, bird = load_solution(options.result)
     truth = read_truth(options.truth)
     if options.by == "behaviour" and truth.behaviours is None:
-        remedy = "give the folder of a simulated scene, or leave out --by behaviour"
-        raise InputError(options.truth, "does not say what the birds do", remedy)
+        remedy = "give the folder of a simulated scene, or remove --by behaviour"
+        raise InputError(options.truth, "holds no behaviours of the birds", remedy)
     solution, matching = match_tracks(solution, truth, options.match)
     result = evaluate(solution, bird, truth, terminal)
     if options.json:
-        named = {"matched_by": matching.by, "follows": matching.follows}
-        print(json_text(result.to_dict() | named))  # noqa: T201
+        matched = {"matched_by": matching.by, "follows": matching.follows}
+        print(json_text(result.to_dict() | matched))  # noqa: T201
         return
     for table in evaluation_tables(result):
         show(table)
@@ -79,12 +83,13 @@ def evaluate(options: argparse.Namespace) -> None:
     if matching.by == "overlap":
         show(matching_line(matching))
     if result.missing:
-        show(f"no figure counts {counted(result.missing, 'annotated bird')} without a pose in this result")
+        show(f"not counted: {counted(result.missing, 'annotated bird')} without a pose in this result")
     if result.unmatched:
-        show(f"no figure counts {counted(result.unmatched, 'pose')} of tracks or frames that the truth lacks")
+        show(f"not counted: {counted(result.unmatched, 'pose')} of tracks or frames that the truth lacks")
 
 
 def _evaluate_observations(options: argparse.Namespace) -> None:
+    """Compare observations with the truth and print detection, keypoint and tracking metrics."""
     from dataclasses import asdict
 
     from jaxfit.cli.observation_tables import observation_tables, uncounted_lines
@@ -103,12 +108,13 @@ def _evaluate_observations(options: argparse.Namespace) -> None:
 
 
 def overlay(options: argparse.Namespace) -> None:
+    """Draw a result on its video, or on one frame of its video."""
     from jaxfit.data.solution import load_solution
     from jaxfit.view.overlay import overlay, overlay_frame
 
     solution, bird = load_solution(options.result)
-    seen = read_coco(options.observations) if options.observations else None
-    drawn = {"observations": seen, "side_views": options.side_views, "overwrite": options.overwrite}
+    observations = read_coco(options.observations) if options.observations else None
+    drawn = {"observations": observations, "side_views": options.side_views, "overwrite": options.overwrite}
     if options.frame is not None:
         overlay_frame(solution, bird, options.video, options.frame, options.out, **drawn)
         show(f"frame {options.frame} → {options.out}")

@@ -1,4 +1,4 @@
-"""Import, inspect and show bird models."""
+"""Commands that import, describe and draw bird models, and learn pose priors."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ __all__ = ["model_import", "model_info", "model_view", "prior_learn"]
 
 
 def model_import(options: argparse.Namespace) -> None:
+    """Import a published model and write a model file."""
     from jaxfit.model.importers.import_model import import_model
 
     bird = import_model(options.kind, options.sources)
@@ -21,6 +22,7 @@ def model_import(options: argparse.Namespace) -> None:
 
 
 def model_info(options: argparse.Namespace) -> None:
+    """Print a description of a model."""
     from jaxfit.model.describe import describe_bird
 
     facts = describe_bird(find_bird(options.file))
@@ -31,38 +33,40 @@ def model_info(options: argparse.Namespace) -> None:
 
 
 def model_view(options: argparse.Namespace) -> None:
+    """Draw a model from six sides."""
     from jaxfit.model.murre import POSTURES
     from jaxfit.view.six_views import six_views
 
     if options.posture and options.posture not in POSTURES:
-        raise InputError("model view: posture", f"{options.posture!r} is none", f"known are {', '.join(POSTURES)}")
+        raise InputError("--posture", f"{options.posture!r} is not a known posture", f"known: {', '.join(POSTURES)}")
     six_views(find_bird(options.file), options.out, options.posture)
     show(f"six views → {options.out}")
 
 
 def prior_learn(options: argparse.Namespace) -> None:
+    """Learn a pose prior from results, write a model with this prior and print how the prior changed."""
     import numpy as np
 
     from jaxfit.data.solution import load_solution
     from jaxfit.fitting.learn import learn_prior
     from jaxfit.storage.files import check_writable
 
-    check_writable(options.out)  # before the work, not after it
+    check_writable(options.out)  # before the long work
     learnt = learn_prior([(folder, *load_solution(folder)) for folder in options.results])
     counts = {"poses": learnt.poses, "birds": learnt.birds, "effective_poses": learnt.effective_poses}
     notes = {f"prior_{name}": value for name, value in counts.items()} | {"prior_shrinkage": learnt.shrinkage}
     save_bird(learnt.bird, options.out, notes)
-    title = "how far each joint's mean moved from the model's, and its standard deviation (mean of three axes)"
-    table = right_aligned("moved °", "spread °", title=title)
+    title = "change of each joint's mean from the model's prior, and standard deviation (mean of three axes)"
+    table = right_aligned("change °", "std. dev. °", title=title)
     table.add_column("joint")
-    spread = np.sqrt(np.diag(learnt.bird.pose_covariance).reshape(-1, 3).mean(axis=1))
+    deviation_rad = np.sqrt(np.diag(learnt.bird.pose_covariance).reshape(-1, 3).mean(axis=1))
     for joint in np.argsort(-learnt.mean_change_rad):
-        figures = np.rad2deg([learnt.mean_change_rad[joint], spread[joint]])
-        table.add_row(*(f"{figure:.1f}" for figure in figures), learnt.bird.joint_names[joint + 1])
+        degrees = np.rad2deg([learnt.mean_change_rad[joint], deviation_rad[joint]])
+        table.add_row(*(f"{value:.1f}" for value in degrees), learnt.bird.joint_names[joint + 1])
     show(table)
-    left_out = f" ({learnt.diverged} diverged, left out)" if learnt.diverged else ""
+    skipped = f" ({counted(learnt.diverged, 'diverged bird')} skipped)" if learnt.diverged else ""
     poses, birds = counted(learnt.poses, "pose"), counted(learnt.birds, "bird")
-    show(f"{poses} of {birds}{left_out}, which tell as much as {learnt.effective_poses:.0f} independent ones")
-    bones = "learnt too" if learnt.bones_learnt else "the model's, as they do not differ here"
-    show(f"correlations shrunk by {100 * learnt.shrinkage:.0f} % (100 % leaves none); bone lengths: {bones}")
-    show(f"{learnt.bird.name} with this prior → {options.out}; fit with `--model {options.out}`")
+    show(f"{poses} of {birds}{skipped}, equivalent to {learnt.effective_poses:.0f} independent poses")
+    bones = "learnt" if learnt.bones_learnt else "from the model, because the results have equal bone lengths"
+    show(f"correlations shrunk by {100 * learnt.shrinkage:.0f} % (100 %: no correlations); bone lengths: {bones}")
+    show(f"{learnt.bird.name} with this prior → {options.out}; use the model with `--model {options.out}`")

@@ -1,4 +1,4 @@
-"""What `evaluate` prints of observations, and of whose track is whose."""
+"""Tables and lines that `evaluate` prints for observations and for matched tracks."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _TRACKING = {
 
 
 def observation_tables(result: ObservationsEvaluation) -> list[Table]:
-    """Birds, keypoints and tracks; no keypoints where the files share none."""
-    birds = right_aligned("frames", "birds", "found", *_DETECTION.values())
+    """Return tables of detection, keypoint and tracking metrics; no keypoint table if the files share no keypoint."""
+    birds = right_aligned("frames", "birds", "detected", *_DETECTION.values())
     counts = (str(result.counts[name]) for name in ("frames", "true", "detected"))
-    birds.add_row(*counts, *(_share(result.detection[name]) for name in _DETECTION))
+    birds.add_row(*counts, *(_fraction(result.detection[name]) for name in _DETECTION))
     birds.caption = (
-        f"{result.compared} match from an IoU of 0.5 on; AP by score, the others of every bird in the file; mean IoU: "
-        "of the matches"
+        f"{result.compared} match if their IoU is at least 0.5; AP ranks detections by score; the other metrics use "
+        "all detections in the file; mean IoU: over the matches"
     )
     tables = [birds]
     if result.keypoints:
@@ -49,43 +49,43 @@ def observation_tables(result: ObservationsEvaluation) -> list[Table]:
         for name, row in result.keypoints.items():
             if name == "all":
                 points.add_section()
-            cells = (str(cell) if isinstance(cell, int) else _share(cell) for cell in row)
+            cells = (str(cell) if isinstance(cell, int) else _fraction(cell) for cell in row)
             points.add_row(name, *cells)
         points.caption = (
-            "of the matched birds' keypoints, those that nothing hides and all: share within 5 or 10 % of the longer "
-            "side of the annotated box; one that is not found is wrong"
+            "PCK: fraction of the matched birds' keypoints within 5 or 10 % of the longer side of the annotated box, "
+            "for visible and for all keypoints; a missing keypoint counts as wrong"
         )
         tables.append(points)
     tracks = right_aligned(*_TRACKING.values())
-    figures = (result.tracking[name] for name in _TRACKING)
-    tracks.add_row(*(str(figure) if isinstance(figure, int) else _share(figure) for figure in figures))
-    tracks.caption = "HOTA, DetA, AssA: means over IoUs of 0.05 to 0.95; the others at 0.5"
+    metrics = (result.tracking[name] for name in _TRACKING)
+    tracks.add_row(*(str(metric) if isinstance(metric, int) else _fraction(metric) for metric in metrics))
+    tracks.caption = "HOTA, DetA, AssA: means over IoU thresholds from 0.05 to 0.95; the other metrics: threshold 0.5"
     return [*tables, tracks]
 
 
 def uncounted_lines(result: ObservationsEvaluation) -> list[str]:
-    """What no figure counts, and why."""
+    """Return lines that say which birds the metrics ignore, and why."""
     counts, lines = result.counts, []
     if counts["ignored"]:
-        excused = f"; {counted(counts['excused'], 'found one')} on them" if counts["excused"] else ""
-        lines.append(f"no figure counts {counted(counts['ignored'], 'bird')} hardly to be seen{excused}")
-    for name, whose in (("true_elsewhere", "the observations lack"), ("detected_elsewhere", "the truth lacks")):
+        excused = f" and {counted(counts['excused'], 'detection')} of these birds" if counts["excused"] else ""
+        lines.append(f"not counted: {counted(counts['ignored'], 'hardly visible bird')}{excused}")
+    for name, missing in (("true_elsewhere", "the observations lack"), ("detected_elsewhere", "the truth lacks")):
         if counts[name]:
-            lines.append(f"no figure counts {counted(counts[name], 'bird')} in frames that {whose}")
+            lines.append(f"not counted: {counted(counts[name], 'bird')} in frames that {missing}")
     return lines
 
 
 def matching_line(matching: Matching) -> str:
-    """Whose track is whose, by overlap."""
+    """Return a line that says which annotated bird each track follows, for tracks that were matched by overlap."""
     pairs = ", ".join(f"{track} → {bird}" for track, bird in matching.follows.items()) or "none"
-    strays = f"; tracks that follow nobody: {_listed(matching.unmatched)}" if matching.unmatched else ""
+    strays = f"; tracks that follow no bird: {_listed(matching.unmatched)}" if matching.unmatched else ""
     lost = f"; birds that no track follows: {_listed(matching.missed)}" if matching.missed else ""
-    return f"tracks matched by overlap, named as the truth's birds: {pairs}{strays}{lost}"
+    return f"tracks matched by overlap and renamed to the ids of the truth: {pairs}{strays}{lost}"
 
 
 def _listed(numbers: list[int]) -> str:
     return ", ".join(map(str, numbers))
 
 
-def _share(value: float) -> str:
+def _fraction(value: float) -> str:
     return "–" if math.isnan(value) else f"{value:.4f}"

@@ -1,4 +1,4 @@
-"""Simulated scenes, and the demo of everything on one."""
+"""Commands for simulated scenes."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ __all__ = ["demo", "simulate"]
 
 
 def simulate(options: argparse.Namespace) -> None:
+    """Simulate a scene and write its footage and ground truth."""
     from jaxfit.simulation.scene import simulate
 
-    began = time.perf_counter()
+    start = time.perf_counter()
     scene = simulate(
         find_bird("murre"),
         options.out,
@@ -29,21 +30,23 @@ def simulate(options: argparse.Namespace) -> None:
         overwrite=options.overwrite,
         progress=terminal,
     )
-    boxes, found = int(scene.truth.present.sum()), int(scene.detections.present.sum())
+    poses, detections = int(scene.truth.present.sum()), int(scene.detections.present.sum())
     show(
-        f"{counted(options.birds, 'bird')} over {counted(options.frames, 'frame')}: {counted(boxes, 'true pose')}, "
-        f"{counted(found, 'detection')}, in {time.perf_counter() - began:.0f} s → {options.out}"
+        f"{counted(options.birds, 'bird')} over {counted(options.frames, 'frame')}: {counted(poses, 'true pose')}, "
+        f"{counted(detections, 'detection')}, in {time.perf_counter() - start:.0f} s → {options.out}"
     )
 
 
 def demo(options: argparse.Namespace) -> None:
+    """Run the demo."""
     from jaxfit.cli.demo import run_demo
 
     run_demo(options.out)
 
 
 def _size(text: str) -> tuple[int, int]:
+    """Return width and height in pixels from a text such as `2592x1520`."""
     sides = text.lower().replace("×", "x").split("x")
     if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
-        raise InputError("simulate: size", f"{text!r} is none", "give width and height as in 2592x1520")
+        raise InputError("--size", f"{text!r} is not a picture size", "give width and height as in 2592x1520")
     return int(sides[0]), int(sides[1])

@@ -1,4 +1,4 @@
-"""What people read on the terminal: tables that align, and JSON for programs."""
+"""Text output of commands: tables, lines and JSON."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = [
     "track_table",
 ]
 
-_IN_SPACE = {
+_COLUMNS_3D = {
     "mpjpe": "MPJPE",
     "mpjpe/length": "% length",
     "pa_mpjpe": "PA-MPJPE",
@@ -35,23 +35,24 @@ _IN_SPACE = {
     "acceleration": "accel.",
     "size_error": "size %",
 }
-"""Figures in space that the table shows, and their headings."""
-_INTERVAL = "from, to: 95 % bootstrap interval over birds (none for one bird)"
+"""Metrics in 3D → their column headings."""
+_INTERVAL = "from, to: 95 % bootstrap interval over birds (none for a single bird)"
 _PERCENT = ("mpjpe/length", "pa_mpjpe/length", "size_error")
+"""Metrics that the table shows in per cent."""
 
 
-def show(what: Any) -> None:
+def show(output: Any) -> None:
     """Print a table or a line of text."""
-    Console(soft_wrap=not isinstance(what, Table), highlight=False).print(what)
+    Console(soft_wrap=not isinstance(output, Table), highlight=False).print(output)
 
 
 def counted(count: int, noun: str) -> str:
-    """`1 bird`, `2 birds`."""
+    """Return a count with its noun: `1 bird`, `2 birds`."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def right_aligned(*columns: str, **options: Any) -> Table:
-    """A table whose columns are all numbers."""
+    """Return an empty table with right-aligned columns."""
     table = Table(**options)
     for column in columns:
         table.add_column(column, justify="right")
@@ -59,7 +60,7 @@ def right_aligned(*columns: str, **options: Any) -> Table:
 
 
 def evaluation_tables(result: Evaluation) -> list[Table]:
-    """What `evaluate` found, a row for every track: in the picture, and in space where that was measured."""
+    """Return the table of metrics in 2D, and the table of metrics in 3D if there are any; one row per track."""
     from jaxfit.evaluation.aggregation import COLUMNS
 
     def frames(row: dict[str, float]) -> str:
@@ -67,62 +68,62 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
 
     tables = [right_aligned("track", "frames", *COLUMNS)]
     for track, row in result.tracks.items():
-        tables[0].add_row(str(track), frames(row), *_in_picture(row, COLUMNS))
+        tables[0].add_row(str(track), frames(row), *_cells_2d(row, COLUMNS))
     tables[0].add_section()
-    tables[0].add_row("all", str(result.frames), *_in_picture(result.overall, COLUMNS))
+    tables[0].add_row("all", str(result.frames), *_cells_2d(result.overall, COLUMNS))
     for name, bounds in _bounds(result):
-        tables[0].add_row(name, "", *_in_picture(bounds, COLUMNS))
+        tables[0].add_row(name, "", *_cells_2d(bounds, COLUMNS))
     tables[0].caption = (
-        "PCK: share of keypoints within 5 or 10 % of the annotated mask's longer side; IoU: mesh against mask; "
-        "me_p, me_v: RMS position and velocity error over the mesh mask's longer side; "
-        f"all of annotated keypoints, hidden ones included; {_INTERVAL}"
+        "PCK: fraction of keypoints within 5 or 10 % of the longer side of the annotated mask; IoU: of mesh and mask; "
+        "me_p, me_v: RMS position and velocity error divided by the longer side of the mesh's mask; "
+        f"keypoint metrics use all annotated keypoints, also hidden keypoints; {_INTERVAL}"
     )
     if result.points_3d:
-        space = right_aligned("track", *_IN_SPACE.values())
+        table_3d = right_aligned("track", *_COLUMNS_3D.values())
         for track, row in result.tracks.items():
-            space.add_row(str(track), *_in_space(row))
-        space.add_section()
-        space.add_row("all", *_in_space(result.overall))
+            table_3d.add_row(str(track), *_cells_3d(row))
+        table_3d.add_section()
+        table_3d.add_row("all", *_cells_3d(result.overall))
         for name, bounds in _bounds(result):
-            space.add_row(name, *_in_space(bounds))
-        space.caption = (
-            f"in space, over {result.points_3d}: mean error in model units and per cent of body length, about the root "
-            "and up to one size a track; PA: after aligning every frame; orientation in degrees; acceleration error in "
-            "units per frame²; error of the apparent size"
+            table_3d.add_row(name, *_cells_3d(bounds))
+        table_3d.caption = (
+            f"3D metrics over {result.points_3d}: mean error in model units and in per cent of body length, relative "
+            "to the root and after scaling each track by one factor; PA: after alignment of every frame; orientation "
+            "error in degrees; acceleration error in units per frame²; size: error of the apparent size"
         )
-        tables.append(space)
+        tables.append(table_3d)
     return tables
 
 
 def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -> list[Table]:
-    """What `evaluate` found, a row for every behaviour or keypoint."""
+    """Return tables of metrics with one row per behaviour or per keypoint."""
     from jaxfit.evaluation.aggregation import COLUMNS, COLUMNS_KEYPOINT
 
     if by == "keypoint":
         table = right_aligned("keypoint", "frames", *COLUMNS_KEYPOINT)
         for name, row in result.keypoints.items():
-            table.add_row(name, f"{row['count']:.0f}", *_in_picture(row, COLUMNS_KEYPOINT))
+            table.add_row(name, f"{row['count']:.0f}", *_cells_2d(row, COLUMNS_KEYPOINT))
         tables = [table]
     else:
         tables = [right_aligned("behaviour", "birds", "frames", *COLUMNS)]
         if result.points_3d:
-            tables.append(right_aligned("behaviour", *_IN_SPACE.values(), padding=(0, 0, 0, 1)))
+            tables.append(right_aligned("behaviour", *_COLUMNS_3D.values(), padding=(0, 0, 0, 1)))
         for name, row in result.behaviours.items():
-            counts = [f"{row[what]:.0f}" for what in ("birds", "frames")]
-            for table, cells in zip(tables, ([*counts, *_in_picture(row, COLUMNS)], _in_space(row)), strict=False):
+            counts = [f"{row[name]:.0f}" for name in ("birds", "frames")]
+            for table, cells in zip(tables, ([*counts, *_cells_2d(row, COLUMNS)], _cells_3d(row)), strict=False):
                 table.add_row(name, *cells)
-        tables[0].caption = "me_v counts a pair of frames for what the bird does in the earlier one"
+        tables[0].caption = "me_v assigns a pair of frames to the behaviour in the earlier frame"
     for table in tables:
         table.columns[0].justify = "left"
     return tables
 
 
 def track_table(observations: Observations, solution: Solution | None = None) -> Table:
-    """What is known of every track: how much was seen of it, how well, and how its fit ended."""
+    """Return a table with the quality of every track, and with the status of its fit if there is a solution."""
     table = right_aligned("bird", "frames", "coverage", "confidence", "jitter")
     table.caption = (
-        "coverage: share of the frames from a bird's first to its last in which it was seen; confidence: mean over all "
-        "keypoints; jitter: median second difference of keypoints over the longer side of the box"
+        "coverage: fraction of the frames between a bird's first and last detection that have a detection; confidence: "
+        "mean over all keypoints; jitter: median second difference of keypoints divided by the longer side of the box"
     )
     status = None
     if solution is not None:
@@ -136,24 +137,24 @@ def track_table(observations: Observations, solution: Solution | None = None) ->
 
 
 def _bounds(result: Evaluation) -> list[tuple[str, dict[str, float]]]:
-    """Both ends of the intervals; nothing where there are none."""
+    """Return the lower and the upper ends of the bootstrap intervals; nothing for a single bird."""
     if len(result.sums.birds) < 2:
         return []
     lows, highs = ({name: interval[end] for name, interval in result.intervals.items()} for end in (0, 1))
     return [("from", lows), ("to", highs)]
 
 
-def _in_picture(row: dict[str, float], columns: Sequence[str]) -> list[str]:
-    return [_figure(row[name]) for name in columns]
+def _cells_2d(row: dict[str, float], columns: Sequence[str]) -> list[str]:
+    return [_metric(row[name]) for name in columns]
 
 
-def _in_space(row: dict[str, float]) -> list[str]:
-    shown = []
-    for name in _IN_SPACE:
+def _cells_3d(row: dict[str, float]) -> list[str]:
+    cells = []
+    for name in _COLUMNS_3D:
         value = row[name] * (100 if name in _PERCENT else 1)
-        places = 1 if name in (*_PERCENT, "orientation_deg") else 3
-        shown.append("–" if math.isnan(value) else f"{value:.{places}f}")
-    return shown
+        decimals = 1 if name in (*_PERCENT, "orientation_deg") else 3
+        cells.append("–" if math.isnan(value) else f"{value:.{decimals}f}")
+    return cells
 
 
 def show_facts(facts: dict[str, Any]) -> None:
@@ -166,7 +167,7 @@ def show_facts(facts: dict[str, Any]) -> None:
     show(table)
 
 
-def _figure(value: float) -> str:
+def _metric(value: float) -> str:
     return "–" if math.isnan(value) else f"{value:.4f}"
 
 

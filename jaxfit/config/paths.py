@@ -1,4 +1,4 @@
-"""Single values of a config by their path, such as ``terms.velocity`` or ``stages.mask.steps``."""
+"""Access to single values of a config by their path, such as ``terms.velocity`` or ``stages.mask.steps``."""
 
 from __future__ import annotations
 
@@ -6,82 +6,88 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from jaxfit.config.yaml_file import Config, ConfigKeyError, build_config, plain_config
+from jaxfit.config.build import Config, build_config, plain_config
+from jaxfit.config.checks import ConfigKeyError, first_key
 
 __all__ = ["get_value", "with_values"]
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
-    """The config with other values at some paths.
+    """Return the config with other values at some paths.
 
-    A part of a path is a key, or the name or number of a stage (``stages.mask.steps``, ``stages[1].steps``). A number
-    for a term is its weight and leaves its settings alone. A text that begins with ``=`` stands for the value at the
-    path behind it, after all others have been set.
+    A part of a path is a key, or the name or the number of a stage (``stages.mask.steps``, ``stages[1].steps``). A
+    number for a term replaces the term's weight and keeps the term's settings. A text that begins with ``=`` stands for
+    the value at the path after the ``=``, after all other values are set.
+
+    Args:
+        config: a config dataclass, which is not changed.
+        values: path → new value.
 
     Raises:
-        ConfigKeyError: a path that leads nowhere, or a config that makes no sense.
+        ConfigKeyError: an unknown path, or a value that the config does not allow.
     """
     plain = plain_config(config)
-    later = {path: value for path, value in values.items() if isinstance(value, str) and value.startswith("=")}
-    for path in (*(path for path in values if path not in later), *later):
-        value = _get(plain, later[path][1:], path) if path in later else values[path]
-        holder, key, of_terms = _find(plain, path, path)
-        if of_terms and isinstance(holder.get(key), dict) and not isinstance(value, dict):
-            holder, key = holder[key], "weight"  # a term with settings
-        holder[key] = value
+    references = {path: value[1:] for path, value in values.items() if isinstance(value, str) and value[:1] == "="}
+    for path in sorted(values, key=lambda path: path in references):  # references last
+        value = _get(plain, references[path], path) if path in references else values[path]
+        parent, key, is_term = _locate(plain, path, path)
+        if is_term and isinstance(parent.get(key), dict) and not isinstance(value, dict):
+            parent, key = parent[key], "weight"  # a term with settings
+        parent[key] = value
     return build_config(type(config), plain)
 
 
 def get_value(config: Any, path: str) -> Any:
-    """The value at a path; of a term with settings its weight.
+    """Return the value at a path; for a term with settings, the term's weight.
 
     Raises:
-        ConfigKeyError: a path that leads nowhere.
+        ConfigKeyError: an unknown path.
     """
     return _get(plain_config(config), path, path)
 
 
-def _get(plain: Any, path: str, asked: str) -> Any:
-    holder, key, of_terms = _find(plain, path, asked)
-    if isinstance(holder, dict) and key not in holder:
-        raise ConfigKeyError(asked, f"`{asked}` asks for `{path}`, which is not set", _known(holder))
-    value = holder[key]
-    return value.get("weight", 1.0) if of_terms and isinstance(value, dict) else value
+def _get(plain: Any, path: str, requested: str) -> Any:
+    parent, key, is_term = _locate(plain, path, requested)
+    if isinstance(parent, dict) and key not in parent:
+        raise ConfigKeyError(requested, f"refers to `{path}`, which is not set", _known(parent))
+    value = parent[key]
+    return value.get("weight", 1.0) if is_term and isinstance(value, dict) else value
 
 
-def _find(plain: Any, path: str, asked: str) -> tuple[Any, Any, bool]:
-    """What holds the last part of a path, that part, and whether it names a term; terms' own names may hold dots."""
-    holder: Any = plain
-    rest, of_terms = re.sub(r"\[(\d+)\]", r".\1", path), False
+def _locate(plain: Any, path: str, requested: str) -> tuple[Any, Any, bool]:
+    """Return the mapping or list that holds the last part of a path, that part, and whether the part names a term.
+
+    Args:
+        plain: the config as plain values.
+        path: the path to follow; a term's name may contain dots.
+        requested: the path to name in errors; differs from `path` for a reference (``=path``).
+    """
+    parent: Any = plain
+    rest, is_term = re.sub(r"\[(\d+)\]", r".\1", path), False
     while True:
         key: Any
-        key, rest = _step(holder, rest)
-        if isinstance(holder, list):
-            key = _position(holder, key, asked)
+        key, rest = first_key(parent, rest)
+        if isinstance(parent, list):
+            key = _stage_index(parent, key, requested)
         if not rest:
-            return holder, key, of_terms
-        below = holder[key] if isinstance(holder, list) else holder.get(key)
-        if of_terms and isinstance(below, int | float):
-            below = holder[key] = {"weight": below}  # a setting comes to stand beside it
-        if not isinstance(below, dict | list):
-            raise ConfigKeyError(asked, f"`{path}` leads nowhere: there is no `{key}`", _known(holder))
-        holder, of_terms = below, key in ("terms", "override") and isinstance(below, dict)
+            return parent, key, is_term
+        value = parent[key] if isinstance(parent, list) else parent.get(key)
+        if is_term and isinstance(value, int | float):
+            value = parent[key] = {"weight": value}  # the term gets a setting beside its weight
+        if not isinstance(value, dict | list):
+            detail = "" if path == requested else f"`{path}`: "
+            raise ConfigKeyError(requested, f"is an unknown path: {detail}there is no `{key}`", _known(parent))
+        parent, is_term = value, key in ("terms", "override") and isinstance(value, dict)
 
 
-def _step(holder: Any, rest: str) -> tuple[str, str]:
-    held = [key for key in holder if rest == key or rest.startswith(f"{key}.")] if isinstance(holder, dict) else []
-    key = max(held, key=len) if held else rest.partition(".")[0]
-    return key, rest[len(key) + 1 :]
-
-
-def _position(stages: list[Any], key: str, asked: str) -> int:
-    names = [each.get("name") for each in stages if isinstance(each, dict)]
+def _stage_index(stages: list[Any], key: str, requested: str) -> int:
+    names = [stage.get("name") for stage in stages if isinstance(stage, dict)]
     if key in names:
         return names.index(key)
     if key.isdigit() and int(key) < len(stages):
         return int(key)
-    raise ConfigKeyError(asked, f"`{asked}` names {key!r}", f"known: {', '.join(map(str, names))}")
+    raise ConfigKeyError(requested, f"names the unknown stage {key!r}", f"known: {', '.join(map(str, names))}")
 
 
-def _known(holder: Any) -> str:
-    return f"known here: {', '.join(map(str, holder))}" if isinstance(holder, dict) else ""
+def _known(parent: Any) -> str:
+    return f"known: {', '.join(map(str, parent))}" if isinstance(parent, dict) else ""

@@ -1,120 +1,119 @@
-"""What tracking can be told, from frames to tracks of keypoints and masks."""
+"""Settings of tracking: from the frames of a video to tracks of keypoints and masks."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxfit.config.yaml_file import require
+from jaxfit.config.checks import require, require_at_least, require_fraction
 
 __all__ = ["FramesConfig", "KeypointsConfig", "SegmenterConfig", "TrackConfig", "TrackerConfig"]
 
 
-def _require_share(key: str, value: float | None, remedy: str) -> None:
-    require(value is None or 0 <= value <= 1, key, f"is {value}", remedy)
-
-
 @dataclass(frozen=True)
 class FramesConfig:
-    """Which frames of a video are looked at, counted from 0."""
+    """The frames of a video that are processed; frames count from 0."""
 
     start: int = 0
-    """The first one."""
+    """First frame, counted from 0."""
     stop: int | None = None
-    """The one to stop before; null goes on to the end."""
+    """Frame to stop before; null processes all frames to the end."""
     step: int = 1
-    """Every how many-th."""
+    """Process every N-th frame."""
 
     def __post_init__(self):
-        require(self.start >= 0, "start", f"is {self.start}", "0 or more")
-        require(self.step >= 1, "step", f"is {self.step}", "1 or more")
-        ends = self.stop is None or self.stop > self.start
-        require(ends, "stop", f"is {self.stop}, and `start` {self.start}", "a frame after the first one, or null")
+        require_at_least(self, 0, "start")
+        require_at_least(self, 1, "step")
+        problem = f"is {self.stop}, and `start` is {self.start}"
+        require(self.stop is None or self.stop > self.start, "stop", problem, "expected a frame after `start`, or null")
 
 
 @dataclass(frozen=True)
 class SegmenterConfig:
-    """The network that finds birds in a frame."""
+    """The network that detects birds in a frame."""
 
     file: str = "builtin"
-    """`builtin` (murres, trained on simulated footage), an ONNX file, or `detector.onnx+saliency.onnx`."""
+    """Network that detects birds: `builtin` (for murres, trained on simulated footage), an ONNX file, or
+    `detector.onnx+saliency.onnx`."""
     kind: str = "auto"
-    """Layout of its output (bottom_up, rf_detr, mask_rcnn, yolo, yolox+saliency); `auto` tells it from the file."""
+    """Layout of the network's output: bottom_up, rf_detr, mask_rcnn, yolo, yolox+saliency; `auto` infers the layout
+    from the file."""
     names: tuple[str, ...] = ()
-    """All its classes in their order, where the file does not say them."""
+    """Names of all classes in the order of the output, for a file that does not contain the names."""
     classes: tuple[str, ...] = ()
-    """Classes to look for, by name; none stands for `bird`, or the only class there is."""
+    """Names of the classes to detect; an empty list selects `bird`, or the only class of the network."""
     min_score: float | None = None
-    """Instances that the network trusts less are left out, within [0, 1]; null takes what suits its layout."""
+    """Smallest score of a detection, within 0 and 1; null uses the default of the layout."""
     tile_px: int | None = None
-    """Side of the tiles that large frames are cut into, so that birds stay large enough; null takes frames whole."""
+    """Side of the square tiles that large frames are cut into, for birds that are small in the frame, in pixels; null
+    uses no tiles."""
     tile_overlap: float = 0.25
-    """Share of a tile that it has in common with the next one; wider than a bird is best."""
+    """Overlap of neighbouring tiles as a fraction of the tile's side; an overlap wider than a bird works best."""
 
     def __post_init__(self):
-        _require_share("min_score", self.min_score, "a number within 0 and 1, or null")
-        require(self.tile_px is None or self.tile_px >= 32, "tile_px", f"is {self.tile_px}", "32 or more, or null")
-        require(0 <= self.tile_overlap < 1, "tile_overlap", f"is {self.tile_overlap}", "0 or more and below 1")
+        require_fraction(self, "min_score")
+        require_at_least(self, 32, "tile_px")
+        fits = 0 <= self.tile_overlap < 1
+        require(fits, "tile_overlap", f"is {self.tile_overlap}", "expected 0 or more and less than 1")
 
 
 @dataclass(frozen=True)
 class KeypointsConfig:
-    """The network that finds the keypoints of each bird."""
+    """The network that detects the keypoints of each bird."""
 
     file: str = "builtin"
-    """`builtin` (the murre's, trained on simulated footage) or an ONNX file."""
+    """Network that detects keypoints: `builtin` (for murres, trained on simulated footage) or an ONNX file."""
     kind: str = "auto"
-    """Layout of its output (heatmap, deeplabcut, simcc); `auto` tells it from the file's inputs and outputs."""
+    """Layout of the network's output: heatmap, deeplabcut, simcc; `auto` infers the layout from the file's inputs and
+    outputs."""
     names: str | tuple[str, ...] = ()
-    """Its keypoints in the order of its output, or `murre`, `aves`, `avian-mesh`; none takes those the file says."""
+    """Names of the keypoints in the order of the output, or `murre`, `aves`, `avian-mesh` for the names of that model;
+    an empty list uses the names in the file."""
     pad_px: int | None = None
-    """Margin around a bird's mask that its crop shows, image pixels; null takes the file's, or the paper's 40."""
+    """Margin of a bird's crop around the bird's mask, in image pixels; null uses the value in the file, or the paper's
+    40."""
     dilate_px: int | None = None
-    """Side of the square that the mask is dilated by before all else is blanked, image pixels; null takes the file's,
-    or the paper's 70."""
+    """Side of the square that dilates the mask before the pixels outside the mask are blanked, in image pixels; null
+    uses the value in the file, or the paper's 70."""
     batch: int = 16
-    """Crops that the network is given at once, where it leaves that open."""
+    """Number of crops per network call, for a network that does not fix the number."""
 
     def __post_init__(self):
-        for name in ("pad_px", "dilate_px"):
-            value = getattr(self, name)
-            require(value is None or value >= 0, name, f"is {value}", "0 or more, or null")
-        require(self.batch >= 1, "batch", f"is {self.batch}", "1 or more")
+        require_at_least(self, 0, "pad_px", "dilate_px")
+        require_at_least(self, 1, "batch")
 
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """What tells which bird of one frame is which of the next."""
+    """The tracker, which links the detections of consecutive frames into tracks."""
 
     name: str = "iou"
-    """`iou` (the paper's); `bytetrack`, `ocsort` or `botsort` of the optional `trackers` package."""
+    """Tracker: `iou` (the paper's), or `bytetrack`, `ocsort`, `botsort` of the optional package `trackers`."""
     memory: int = 5
-    """Frames for which a bird may be missed without losing its identity."""
+    """Number of consecutive frames without a detection that a track survives; the paper uses 5."""
     min_iou: float = 0.1
-    """Boxes of the same bird overlap by more than this from frame to frame."""
+    """Two boxes in consecutive frames belong to one bird only if their IoU is above this value."""
     min_score: float = 0.6
-    """Instances that the network trusts less begin no track; `iou` takes all."""
+    """Smallest score of a detection that starts a track; `iou` ignores this setting."""
 
     def __post_init__(self):
-        require(self.memory >= 0, "memory", f"is {self.memory}", "0 or more frames")
-        for name in ("min_iou", "min_score"):
-            _require_share(name, getattr(self, name), "a number within 0 and 1")
+        require_at_least(self, 0, "memory")
+        require_fraction(self, "min_iou", "min_score")
 
 
 @dataclass(frozen=True)
 class TrackConfig:
-    """Everything about tracking; the defaults are the paper's setting with the built-in networks."""
+    """All settings of tracking; the defaults are the paper's settings with the built-in networks."""
 
     frames: FramesConfig = FramesConfig()
     segmenter: SegmenterConfig = SegmenterConfig()
     keypoints: KeypointsConfig = KeypointsConfig()
     tracker: TrackerConfig = TrackerConfig()
     min_track_frames: int = 10
-    """Birds seen in fewer frames are left out."""
+    """Tracks with fewer frames are skipped."""
     repair_left_right_flips: bool = False
-    """Exchange left and right keypoints back where a network mixed them up for some frames."""
+    """Exchange left and right keypoints in frames where the network confuses the two sides; the paper does not."""
     threads: int | None = None
-    """Cores that the networks use; null takes all."""
+    """Number of CPU cores for the networks; null uses all cores."""
 
     def __post_init__(self):
-        require(self.min_track_frames >= 1, "min_track_frames", f"is {self.min_track_frames}", "1 or more")
-        require(self.threads is None or self.threads >= 1, "threads", f"is {self.threads}", "1 or more, or null")
+        require_at_least(self, 1, "min_track_frames", "threads")

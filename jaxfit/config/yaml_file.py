@@ -1,52 +1,88 @@
-"""Configs as YAML files that hold overrides only: read into frozen dataclasses, every key and value checked."""
+"""Configs as YAML files: a file holds only the values that differ from its base."""
 
 from __future__ import annotations
 
 import dataclasses
-import types
+import textwrap
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from functools import reduce
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any
 
 import yaml
 
+from jaxfit.config.build import Config, build_config, plain_config
+from jaxfit.config.checks import ConfigKeyError, first_key
+from jaxfit.config.help import field_help
 from jaxfit.errors import InputError
 
-__all__ = [
-    "OWN_FILE",
-    "ConfigKeyError",
-    "build_config",
-    "config_to_yaml",
-    "plain_config",
-    "read_config",
-    "require",
-    "shipped_files",
-]
-
-Config = TypeVar("Config")
+__all__ = ["OWN_FILE", "config_to_yaml", "documented_yaml", "read_config", "shipped_configs"]
 
 OWN_FILE = {"own_file": True}
-"""Metadata of a dataclass field that is a config by itself: its value may be a file's name, or hold a `base`."""
+"""Metadata of a dataclass field that is a config with its own file: its value may be a name, or hold a `base`."""
 
 
-class ConfigKeyError(InputError):
-    """An InputError about one key, by its path such as ``stages[0].steps``; reading a file adds the file's name."""
-
-    def __init__(self, key: str, problem: str, remedy: str = ""):
-        self.key = key
-        super().__init__("config", problem, remedy)
-
-
-def require(holds: bool, key: str, problem: str, remedy: str = "") -> None:
-    """Raise the ConfigKeyError "`key` problem (remedy)" unless something holds."""
-    if not holds:
-        raise ConfigKeyError(key, f"`{key}` {problem}", remedy)
-
-
-def shipped_files() -> list[str]:
-    """Names of the configs that come with jaxfit, of whatever kind."""
+def shipped_configs() -> list[str]:
+    """Return the names of all configs that are part of jaxfit."""
     return sorted(file.stem for file in _shipped_folder().glob("*.yaml"))
+
+
+def read_config(kind: type[Config], source: str | Path) -> Config:
+    """Read a config from a YAML file.
+
+    A file may name another file or a shipped config as its `base`. The file's values replace the base's values key by
+    key. A field with the metadata `OWN_FILE` takes the name of a file, or a mapping with a `base` of its own; both
+    replace the value in the file's base.
+
+    Args:
+        kind: the frozen dataclass to read.
+        source: the name of a shipped config or the path of a YAML file.
+
+    Raises:
+        InputError: an unreadable file, an unknown key, a value of the wrong type or outside its range; the error names
+            the file that holds the key, which may be a base.
+    """
+    layers = _layers(str(source), kind)
+    try:
+        return build_config(kind, reduce(_merge, (content for _, content in layers)))
+    except ConfigKeyError as error:
+        raise InputError(_origin(layers, error.key), error.problem, error.remedy) from None
+
+
+def config_to_yaml(config: Any) -> str:
+    """Return a config with all its values, defaults included, as YAML text that can be read back."""
+    return yaml.safe_dump(plain_config(config), sort_keys=False, allow_unicode=True)
+
+
+def documented_yaml(config: Any) -> str:
+    """Return a config as `config_to_yaml` does, with the description of each key as a comment above the key."""
+    return "\n".join(_documented_lines(config)) + "\n"
+
+
+def _documented_lines(config: Any, comments: bool = True) -> Iterator[str]:
+    """Yield the lines of a config as YAML, with the description of each key above the key if `comments`."""
+    texts = field_help(type(config))
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if comments:
+            text = texts.get(field.name) or (type(value).__doc__ or "")
+            yield from textwrap.wrap(text, 110, initial_indent="# ", subsequent_indent="# ")
+        parts = value if isinstance(value, tuple) else [value]
+        if not (parts and all(map(dataclasses.is_dataclass, parts))):
+            plain = plain_config(value)
+            style = None if isinstance(plain, dict | list) else False  # None: short lists and mappings on one line
+            text = yaml.safe_dump({field.name: plain}, sort_keys=False, allow_unicode=True, default_flow_style=style)
+            yield from text.splitlines()
+            continue
+        yield f"{field.name}:"
+        is_list = isinstance(value, tuple)
+        for i, part in enumerate(parts):
+            if is_list:
+                yield "  -"
+            # only the first item of a list gets comments
+            lines = _documented_lines(part, comments and i == 0)
+            yield from textwrap.indent("\n".join(lines), "    " if is_list else "  ").splitlines()
 
 
 def _shipped_folder() -> Path:
@@ -56,83 +92,35 @@ def _shipped_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "configs"
 
 
-def read_config(kind: type[Config], source: str | Path, base: str) -> Config:
-    """Read a config by the name of a shipped one or the path of a YAML file.
-
-    A file may name another as its `base`; what it then says is laid over it, key by key. A field marked
-    `OWN_FILE` takes such a name alone, or a mapping with a `base` of its own; either replaces what the file's
-    own base says there.
-
-    Args:
-        kind: the frozen dataclass that is to come of it.
-        source: name or path.
-        base: the shipped config that a file without a needed key may start from, for the message.
-
-    Raises:
-        InputError: an unreadable file, an unknown key, a value of the wrong kind or that makes no sense; it names
-            the file that holds the key, which may be a base.
-    """
-    values, origins = _read(str(source), kind, seen=())
-    try:
-        return _build(kind, values, "", base)
-    except ConfigKeyError as error:
-        raise InputError(_origin(origins, error.key, str(source)), error.problem, error.remedy) from None
-
-
-def build_config(kind: type[Config], values: dict[str, Any]) -> Config:
-    """A config from plain values, as `plain_config` gives them.
-
-    Raises:
-        ConfigKeyError: an unknown key, a value of the wrong kind or that makes no sense.
-    """
-    return _build(kind, values, "", "paper")
-
-
-def config_to_yaml(config: Any) -> str:
-    """The whole config, defaults included, as a YAML text that reads back."""
-    return yaml.safe_dump(plain_config(config), sort_keys=False, allow_unicode=True)
-
-
-def _read(source: str, kind: type, seen: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str]]:
-    """A file laid over its bases, and for each key's path the file that it comes from."""
+def _layers(source: str, kind: type, seen: tuple[str, ...] = ()) -> list[tuple[str, dict[str, Any]]]:
+    """Return the files that make up a config, each with its values; later files replace values of earlier files."""
     if source in seen:
-        raise InputError(source, "`base` goes in a circle", " → ".join((*seen, source)))
+        raise InputError(source, "the `base` keys form a circle", " → ".join((*seen, source)))
     seen = (*seen, source)
     content = _parse(source)
-    values, origins = {}, {}
-    base = content.pop("base", None)
+    base, layers = content.pop("base", None), []
     if base is not None:
-        values, origins = _read(_beside(base, source), kind, seen)
-    below: dict[str, str] = {}
-    for name, part in _own_files(kind):
-        if isinstance(content.get(name), str):
-            content[name] = {"base": content[name]}
-        if isinstance(content.get(name), dict) and "base" in content[name]:
-            base = content[name].pop("base")
-            values[name], part_origins = _read(_beside(base, source), part, seen)
-            origins = _without(origins, name)
-            below |= {f"{name}.{key}": origin for key, origin in part_origins.items()}
-    origins |= below
-    for path, is_mapping in _paths(content):
-        if not is_mapping:  # it replaces whatever stood there
-            origins = _without(origins, path)
-        origins[path] = source
-    return _merge(values, content), origins
+        layers = _layers(_resolve(base, source), kind, seen)
+    for field in dataclasses.fields(typing.cast(Any, kind)):
+        part = content.get(field.name)
+        if "own_file" in field.metadata and (isinstance(part, str) or (isinstance(part, dict) and "base" in part)):
+            base = part if isinstance(part, str) else part.pop("base")
+            content[field.name] = {} if isinstance(part, str) else part
+            nested = _layers(_resolve(base, source), typing.get_type_hints(kind)[field.name], seen)
+            layers.append((source, {field.name: None}))  # the value in the file's own base does not count
+            layers += [(file, {field.name: values}) for file, values in nested]
+    return [*layers, (source, content)]
 
 
 def _parse(source: str) -> dict[str, Any]:
-    shipped = shipped_files()
+    """Return the mapping that a YAML file or a shipped config holds."""
+    shipped = shipped_configs()
+    path = _shipped_folder() / f"{source}.yaml" if source in shipped else Path(source)
     try:
-        if source in shipped:
-            text = (_shipped_folder() / f"{source}.yaml").read_text(encoding="utf-8")
-        else:
-            text = Path(source).read_text(encoding="utf-8")
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            source, f"cannot read this config: {error}", f"give a YAML file or one of {', '.join(shipped)}"
-        ) from None
-    try:
-        content = yaml.safe_load(text)
+        remedy = f"give a YAML file or one of {', '.join(shipped)}"
+        raise InputError(source, f"cannot read this config: {error}", remedy) from None
     except yaml.YAMLError as error:
         raise InputError(source, f"is not valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, dict):
@@ -140,111 +128,29 @@ def _parse(source: str) -> dict[str, Any]:
     return content
 
 
-def _beside(base: object, source: str) -> str:
-    """A base that lies beside the file that names it wins over a shipped one."""
+def _resolve(base: object, source: str) -> str:
+    """Return the path of a base beside the file that names the base; otherwise the base is a shipped name."""
     path = Path(source).parent / f"{base}"
     return str(path) if path.is_file() else str(base)
 
 
-def _own_files(kind: type) -> list[tuple[str, type]]:
-    hints = typing.get_type_hints(kind)
-    return [(f.name, hints[f.name]) for f in dataclasses.fields(kind) if "own_file" in f.metadata]
-
-
-def _without(origins: dict[str, str], path: str) -> dict[str, str]:
-    return {key: origin for key, origin in origins.items() if not key.startswith(f"{path}.")}
-
-
-def _paths(content: dict[str, Any], where: str = "") -> Iterator[tuple[str, bool]]:
-    """Path of every key, and whether a mapping stands there; lists are taken whole."""
-    for key, value in content.items():
-        yield f"{where}{key}", isinstance(value, dict)
-        if isinstance(value, dict):
-            yield from _paths(value, f"{where}{key}.")
-
-
-def _origin(origins: Mapping[str, str], key: str, top: str) -> str:
-    """The file that says `key`; of a key that no file says, the one that says what it should stand in."""
-    while key and key not in origins:
-        key = key[: max(key.rfind("."), key.rfind("["), 0)]
-    return origins.get(key, top)
+def _origin(layers: list[tuple[str, dict[str, Any]]], path: str) -> str:
+    """Return the last file that sets the value at a path, or that adds to the nearest enclosing mapping."""
+    merged, found, origin = {}, None, layers[-1][0]
+    for source, content in layers:
+        merged, before = _merge(merged, content), found
+        found, rest = merged, path.replace("[", ".")
+        while isinstance(found, dict) and (split := first_key(found, rest))[0] in found:
+            found, rest = found[split[0]], split[1]
+        if found is not before:  # merging keeps a value that the file does not set
+            origin = source
+    return origin
 
 
 def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of `below`, replaced key by key by the values of `above`."""
     merged = dict(below)
     for key, value in above.items():
         both = isinstance(value, dict) and isinstance(merged.get(key), dict)
         merged[key] = _merge(merged[key], value) if both else value
     return merged
-
-
-def _build(kind: type, values: Any, where: str, base: str) -> Any:
-    """A dataclass from plain values; every key and value is checked against its fields."""
-    if not isinstance(values, dict):
-        raise ConfigKeyError(
-            where.rstrip("."), f"{where or 'the config'} must be a mapping, not {type(values).__name__}"
-        )
-    hints = typing.get_type_hints(kind)
-    names = [f.name for f in dataclasses.fields(kind)]
-    for key in values:
-        if key not in names:
-            raise ConfigKeyError(f"{where}{key}", f"unknown key `{where}{key}`", f"known here: {', '.join(names)}")
-    for f in dataclasses.fields(kind):
-        required = f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-        if required and f.name not in values:
-            raise ConfigKeyError(
-                f"{where}{f.name}", f"`{where}{f.name}` is missing", f"add it, or start from `base: {base}`"
-            )
-    built = {key: _value(hints[key], value, f"{where}{key}", base) for key, value in values.items()}
-    try:
-        return kind(**built)
-    except ConfigKeyError as error:  # a check of the dataclass itself, which does not know where it stands
-        problem = error.problem.replace(f"`{error.key}`", f"`{where}{error.key}`", 1)
-        raise ConfigKeyError(f"{where}{error.key}", problem, error.remedy) from None
-
-
-def _value(hint: Any, value: Any, where: str, base: str) -> Any:
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
-        return _build(typing.cast(type, hint), value, f"{where}.", base)
-    if origin is Literal:
-        if value not in arguments:
-            raise ConfigKeyError(where, f"`{where}` is {value!r}", f"one of {', '.join(arguments)}")
-        return value
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise ConfigKeyError(where, f"`{where}` must be a list, not {value!r}")
-        return tuple(_value(arguments[0], v, f"{where}[{i}]", base) for i, v in enumerate(value))
-    if origin is types.UnionType:
-        return _one_of(arguments, value, where, base)
-    if origin is Mapping:
-        if not isinstance(value, dict):
-            raise ConfigKeyError(where, f"`{where}` must be a mapping, not {value!r}")
-        return {k: _value(arguments[1], v, f"{where}.{k}", base) for k, v in value.items()}
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if hint is Any:
-        return value
-    if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigKeyError(where, f"`{where}` is {value!r}", f"a value of type {hint.__name__} is expected")
-    return value
-
-
-def _one_of(kinds: tuple[Any, ...], value: Any, where: str, base: str) -> Any:
-    if value is None and type(None) in kinds:
-        return None
-    for kind in kinds:
-        if (typing.get_origin(kind) is tuple) == isinstance(value, list) and kind is not type(None):
-            return _value(kind, value, where, base)
-    raise ConfigKeyError(where, f"`{where}` is {value!r}")
-
-
-def plain_config(value: Any) -> Any:
-    """A config, or a part of one, as dicts, lists and plain values."""
-    if dataclasses.is_dataclass(value):
-        return {f.name: plain_config(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {k: plain_config(v) for k, v in value.items()}
-    if isinstance(value, tuple | list):
-        return [plain_config(v) for v in value]
-    return value

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from jaxfit.config.schema import FitConfig, StageConfig
+from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.diagnose import name_failures
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program
 from jaxfit.fitting.solve import Report, StageState, advance, begin, report

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit.config.schema import CropConfig
+from jaxfit.config.fit import CropConfig
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Int
 
-from jaxfit.config.schema import FitConfig
+from jaxfit.config.fit import FitConfig
 from jaxfit.errors import InputError
 from jaxfit.fitting.problem import Problem, Program, problem_window
 from jaxfit.fitting.stages import FitModel, needs_mask, stage_hyperparameters, stage_program

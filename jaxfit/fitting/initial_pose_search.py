@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxfit.config.schema import InitialiseConfig
+from jaxfit.config.fit import InitialiseConfig
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig, joint_transforms, posed_keypoints

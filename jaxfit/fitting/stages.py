@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxfit.config.schema import FitConfig, InitialiseConfig, StageConfig
+from jaxfit.config.fit import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.fitting.adam import ADAM
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import Hyperparameters, Program, Solver

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit.config.schema import FitConfig
+from jaxfit.config.fit import FitConfig
 from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.masks import decode_mask
 from jaxfit.data.observations import Observations

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import cv2
 
 from jaxfit.clock import Clock
+from jaxfit.config.checks import require
 from jaxfit.config.perception import TrackConfig
-from jaxfit.config.yaml_file import require
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import mirror_pairs, skeleton_pairs

@@ -12,7 +12,7 @@ import time
 from importlib import import_module
 
 import pytest
-from support.cli_files import refused
+from support.cli_files import rejected
 
 from jaxfit.cli.main import main
 from jaxfit.errors import InputError
@@ -141,13 +141,13 @@ def test_a_kill_between_two_moves(done, inputs, grid, tmp_path):
 def test_another_grid_or_other_inputs_are_refused(done, inputs, grid, tmp_path, capsys):
     other = tmp_path / "other.yaml"
     other.write_text(grid.read_text().replace("5]", "6]"))
-    refused(capsys, command(inputs, other, done), str(done), "another grid", "another --out")
+    rejected(capsys, command(inputs, other, done), str(done), "another grid", "another --out")
     moved = tmp_path / "moved.json"
     moved.write_text((inputs / "birds.json").read_text() + " ")
-    refused(capsys, command(inputs, grid, done, obs=moved), "another observations")
+    rejected(capsys, command(inputs, grid, done, obs=moved), "another observations")
     (done.parent / "full").mkdir()
     (done.parent / "full" / "file").touch()
-    refused(capsys, command(inputs, grid, done.parent / "full"), "no ablation.json")
+    rejected(capsys, command(inputs, grid, done.parent / "full"), "no ablation.json")
 
 
 def test_a_truth_of_other_tracks_is_refused_before_the_work(inputs, grid, tmp_path, capsys):
@@ -157,7 +157,7 @@ def test_a_truth_of_other_tracks_is_refused_before_the_work(inputs, grid, tmp_pa
     path = tmp_path / "truth.json"
     path.write_text(json.dumps(content))
     words = ("shares no track", "104, 107, 109", "4, 7, 9", "--match overlap")
-    refused(capsys, command(inputs, grid, tmp_path / "out", truth=path), str(path), *words)
+    rejected(capsys, command(inputs, grid, tmp_path / "out", truth=path), str(path), *words)
     assert not (tmp_path / "out").exists()
 
 
@@ -176,4 +176,4 @@ def test_a_missing_extra_is_one_input_error(inputs, monkeypatch, tmp_path):
 def test_an_unknown_key_is_refused(inputs, tmp_path, capsys):
     path = tmp_path / "grid.yaml"
     path.write_text("crosses: [{cross: {terms.velocty: [1, 2]}}]")
-    refused(capsys, command(inputs, path, tmp_path / "out"), str(path), "velocty", "velocity")
+    rejected(capsys, command(inputs, path, tmp_path / "out"), str(path), "velocty", "velocity")

@@ -5,7 +5,7 @@ from support.cli_files import CONFIG
 
 from jaxfit.ablation.grid import load_grid, short
 from jaxfit.errors import InputError
-from jaxfit.fitting.stages import program
+from jaxfit.fitting.stages import compiled_part
 
 
 def grid_file(folder, text):
@@ -29,7 +29,7 @@ def test_the_shipped_grid_is_the_papers():
         points.add((velocity, acceleration > 0, config.filter_window, config.common_size))
     assert points == {(v, a, f, c) for v in (1e2, 1e3, 1e4, 1e5) for a in (0, 1) for f in (1, 5) for c in (0, 1)}
     # what needs another program: the window, and one scale or many
-    assert len({repr(program(run.config)) for run in runs}) == 3
+    assert len({repr(compiled_part(run.config)) for run in runs}) == 3
 
 
 def test_the_shipped_claims_find_their_pairs():

@@ -1,4 +1,4 @@
-"""The command line given what it cannot use: one clear line, exit code 2, and nothing written."""
+"""Unusable input of the command line: one line of explanation, exit code 2, no written files."""
 
 import json
 import os
@@ -6,7 +6,11 @@ import pickle
 
 import numpy as np
 import pytest
-from support.cli_files import arguments, refused
+from support.cli_files import arguments, rejected
+
+from jaxfit.cli.main import main
+from jaxfit.config.fit import shipped_fit_configs
+from jaxfit.config.reconstruct import load_reconstruct_config
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -73,17 +77,17 @@ BAD_OBSERVATIONS = {
 
 
 @pytest.mark.parametrize("name", BAD_OBSERVATIONS)
-def test_observations_that_cannot_be_used(inputs, tmp_path, capsys, name):
+def test_unusable_observations(inputs, tmp_path, capsys, name):
     change, words = BAD_OBSERVATIONS[name]
     content = change(json.loads((inputs / "birds.json").read_text()))
     path = tmp_path / "bad.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
-    refused(capsys, arguments(inputs, tmp_path / "out", obs=path), str(path), *words)
+    rejected(capsys, arguments(inputs, tmp_path / "out", obs=path), str(path), *words)
     assert not (tmp_path / "out").exists()
 
 
 class Evil:
-    """Unpickled, it would leave a file behind."""
+    """An object that makes a folder when it is unpickled."""
 
     def __init__(self, mark):
         self.mark = mark
@@ -92,7 +96,7 @@ class Evil:
         return os.mkdir, (str(self.mark),)
 
 
-def test_models_that_cannot_be_used(inputs, tmp_path, capsys):
+def test_unusable_models(inputs, tmp_path, capsys):
     whole = (inputs / "toy.npz").read_bytes()
     mark = tmp_path / "it ran"
     with np.load(inputs / "toy.npz") as arrays:
@@ -112,19 +116,31 @@ def test_models_that_cannot_be_used(inputs, tmp_path, capsys):
         ("absent", []),
     ):
         path = tmp_path / f"{name}.npz"
-        refused(capsys, arguments(inputs, tmp_path / "out", model=path), str(path), *words)
-        refused(capsys, ["model", "info", str(path)], str(path), *words)
-    refused(capsys, ["model", "import", "aves", str(tmp_path / "evil.pt"), "--out", str(tmp_path / "m.npz")], "evil.pt")
-    assert not mark.exists(), "code from the file was run"
+        rejected(capsys, arguments(inputs, tmp_path / "out", model=path), str(path), *words)
+        rejected(capsys, ["model", "info", str(path)], str(path), *words)
+    rejected(
+        capsys, ["model", "import", "aves", str(tmp_path / "evil.pt"), "--out", str(tmp_path / "m.npz")], "evil.pt"
+    )
+    assert not mark.exists(), "code from the file has run"
     assert not (tmp_path / "m.npz").exists()
     assert not (tmp_path / "out").exists()
 
 
-def test_configs_and_starts_that_cannot_be_used(inputs, tmp_path, capsys):
+def test_unusable_configs_and_starting_poses(inputs, tmp_path, capsys):
     bad = tmp_path / "bad.yaml"
     bad.write_text("base: paper\nwindows: 3\n")
-    refused(capsys, arguments(inputs, tmp_path / "out", config=bad), str(bad), "`windows`", "window")
+    rejected(capsys, arguments(inputs, tmp_path / "out", config=bad), str(bad), "`windows`", "window")
     (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04")
     command = [*arguments(inputs, tmp_path / "out"), "--init", str(tmp_path / "cut.npz")]
-    refused(capsys, command, "cut.npz")
+    rejected(capsys, command, "cut.npz")
     assert not (tmp_path / "out").exists()
+
+
+def test_config_show(tmp_path, capsys):
+    assert main(["config", "show", "reconstruct"]) == 0
+    (tmp_path / "all.yaml").write_text(capsys.readouterr().out, encoding="utf-8")
+    assert load_reconstruct_config(tmp_path / "all.yaml") == load_reconstruct_config()
+    for name in (*shipped_fit_configs(), "ablation"):
+        assert main(["config", "show", name]) == 0
+        assert "# " in capsys.readouterr().out
+    rejected(capsys, ["config", "show", "papr"], "papr", "paper")

@@ -1,4 +1,4 @@
-"""The command line from end to end, and one clear line for every input that cannot be used."""
+"""The command line from end to end: fit, evaluate, models, interrupts and the cache."""
 
 import errno
 import json
@@ -13,7 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from support.cli_files import BIRD, T, arguments, refused
+from support.cli_files import BIRD, T, arguments, rejected
 
 from jaxfit.cli import fitting
 from jaxfit.cli import main as cli
@@ -46,7 +46,7 @@ def test_fit_writes_a_whole_result(fitted, inputs, capsys):
     assert "only" in (fitted / "config.yaml").read_text()
 
 
-def test_what_fit_says(inputs, tmp_path, capsys):
+def test_the_output_of_fit(inputs, tmp_path, capsys):
     assert main(arguments(inputs, tmp_path / "out")) == 0
     said = capsys.readouterr().out
     assert "no usable frame" in said
@@ -54,7 +54,7 @@ def test_what_fit_says(inputs, tmp_path, capsys):
     assert str(tmp_path / "out") in said.replace("\n", "")
 
 
-def test_the_config_as_run_gives_the_same_again(fitted, inputs, tmp_path):
+def test_the_stored_config_reproduces_the_result(fitted, inputs, tmp_path):
     command = arguments(inputs, tmp_path / "again")
     command[command.index("--config") + 1] = str(fitted / "config.yaml")
     assert main(command) == 0
@@ -86,11 +86,11 @@ def test_evaluate(fitted, inputs, tmp_path, capsys):
     assert f"{T} poses of tracks or frames that the truth lacks" in capsys.readouterr().out
 
 
-def test_fit_goes_on_from_an_earlier_result(fitted, inputs, tmp_path):
+def test_fit_starts_from_an_earlier_result(fitted, inputs, tmp_path):
     command = [*arguments(inputs, tmp_path / "out"), "--init", str(fitted / "poses.npz")]
     content = (inputs / "birds.json").read_text()
     kept = json.loads(content)
-    kept["annotations"] = [a for a in kept["annotations"] if a["track_id"] != 9]  # it has no start
+    kept["annotations"] = [a for a in kept["annotations"] if a["track_id"] != 9]  # bird 9 has no starting pose
     command[1] = str(tmp_path / "two.json")
     Path(command[1]).write_text(json.dumps(kept))
     assert main(command) == 0
@@ -108,9 +108,9 @@ def test_import_and_info(reference_dir, tmp_path, capsys):
         assert "vertices" in json.loads(capsys.readouterr().out)
         assert main(["model", "info", str(out)]) == 0
         assert "vertices" in capsys.readouterr().out
-    refused(capsys, ["model", "info", str(tmp_path / "absent.npz")], "absent.npz")
+    rejected(capsys, ["model", "info", str(tmp_path / "absent.npz")], "absent.npz")
     sources = str(reference_dir / "models" / "avian_mesh")
-    refused(capsys, ["model", "import", "aves", sources, "--out", str(tmp_path / "x.npz")], "aves.pt")
+    rejected(capsys, ["model", "import", "aves", sources, "--out", str(tmp_path / "x.npz")], "aves.pt")
     assert not (tmp_path / "x.npz").exists()
 
 
@@ -118,18 +118,18 @@ def contents(folder):
     return {p.name: p.read_bytes() for p in folder.iterdir()}
 
 
-def test_results_are_not_overwritten_unasked(fitted, inputs, tmp_path, capsys, monkeypatch):
+def test_results_are_overwritten_only_on_request(fitted, inputs, tmp_path, capsys, monkeypatch):
     before = contents(fitted)
 
     def no_work(*_, **__):
-        raise AssertionError("refused before the work, not after it")
+        raise AssertionError("the command must reject the folder before it fits")
 
     with monkeypatch.context() as patch:
         patch.setattr("jaxfit.fitting.fit.fit", no_work)
-        refused(capsys, arguments(inputs, fitted), str(fitted), "overwrite")
+        rejected(capsys, arguments(inputs, fitted), str(fitted), "overwrite")
         (tmp_path / "thesis").mkdir()
         (tmp_path / "thesis" / "thesis.tex").write_text("precious")
-        refused(capsys, [*arguments(inputs, tmp_path / "thesis"), "--overwrite"], "thesis")
+        rejected(capsys, [*arguments(inputs, tmp_path / "thesis"), "--overwrite"], "thesis")
     assert contents(fitted) == before
     assert (tmp_path / "thesis" / "thesis.tex").read_text() == "precious"
 
@@ -142,58 +142,59 @@ def test_a_full_disk_loses_nothing(fitted, inputs, tmp_path, capsys, monkeypatch
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        refused(capsys, arguments(inputs, tmp_path / "new" / "out"), "No space left", "free some space", alone=False)
-        refused(capsys, [*arguments(inputs, fitted), "--overwrite"], "No space left", alone=False)
+        rejected(capsys, arguments(inputs, tmp_path / "new" / "out"), "No space left", "free some space", alone=False)
+        rejected(capsys, [*arguments(inputs, fitted), "--overwrite"], "No space left", alone=False)
     assert contents(fitted) == before
     assert not (tmp_path / "new").exists()
     assert [p.name for p in fitted.parent.iterdir()] == [fitted.name]
     assert main([*arguments(inputs, fitted), "--overwrite"]) == 0
 
 
-def test_ctrl_c_leaves_nothing_behind(fitted, inputs, tmp_path, capsys, monkeypatch):
+def test_ctrl_c_leaves_no_files(fitted, inputs, tmp_path, capsys, monkeypatch):
     @contextmanager
     def impatient(_name, _total):
-        ticks = []
+        calls = []
 
         def report_progress(_done, _note):
-            ticks.append(None)
-            if len(ticks) == 3:
+            calls.append(None)
+            if len(calls) == 3:
                 raise KeyboardInterrupt
 
         yield report_progress
 
     monkeypatch.setattr(fitting, "terminal", impatient)
     before = contents(fitted)
-    refused(capsys, arguments(inputs, tmp_path / "out"), "stopped", code=130, alone=False)
-    refused(capsys, [*arguments(inputs, fitted), "--overwrite"], "stopped", code=130, alone=False)
+    rejected(capsys, arguments(inputs, tmp_path / "out"), "stopped", code=130, alone=False)
+    rejected(capsys, [*arguments(inputs, fitted), "--overwrite"], "stopped", code=130, alone=False)
     assert [p.name for p in tmp_path.iterdir() if p.name != "cache"] == []
     assert contents(fitted) == before
 
 
-# shells start background jobs, and so perhaps these tests, with signals ignored
-HEED = "import os, signal, sys; signal.signal(int(sys.argv[1]), signal.SIG_DFL); os.execv(sys.argv[2], sys.argv[2:])"
+# shells ignore these signals for background jobs, which the tests may be
+ENABLE = "import os, signal, sys; signal.signal(int(sys.argv[1]), signal.SIG_DFL); os.execv(sys.argv[2], sys.argv[2:])"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stopped_process_ends_in_order(number, tmp_path):
-    """A real one, stopped while it works."""
+def test_an_interrupted_process_removes_its_files(number, tmp_path):
+    """A real process is interrupted during its work."""
     script = Path(sys.executable).with_name("jaxfit")
-    command = [sys.executable, "-c", HEED, str(int(number)), script, "simulate", "--frames", "1000", "--out", "scene"]
+    simulate = [script, "simulate", "--frames", "1000", "--out", "scene"]
+    command = [sys.executable, "-c", ENABLE, str(int(number)), *simulate]
 
     with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
-        patience = time.monotonic() + 120
+        deadline = time.monotonic() + 120
         while not list(tmp_path.glob(".scene.*.part")):
             assert process.poll() is None
-            assert time.monotonic() < patience
+            assert time.monotonic() < deadline
             time.sleep(0.1)
         process.send_signal(number)
-        said = process.communicate(timeout=60)[1]
-    assert process.returncode == 130, said
-    assert said.endswith("jaxfit: stopped; nothing half-written is left\n")
+        errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 130, errors
+    assert errors.endswith("jaxfit: stopped; no incomplete files are left\n")
     assert not list(tmp_path.glob("*scene*"))
 
 
-def test_an_interrupt_that_compiled_code_turns_into_an_error():
+def test_compiled_code_may_replace_an_interrupt_by_an_error():
     code = """
 import os, signal, time
 from jaxfit.cli import main as cli
@@ -210,10 +211,10 @@ cli.run()
 """
     code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{code}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; nothing half-written is left\n")
+    assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; no incomplete files are left\n")
 
 
-def test_an_interrupt_that_the_garbage_collector_loses():
+def test_an_interrupt_that_the_garbage_collector_swallows_comes_again():
     code = """
 import gc, os, signal, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -236,31 +237,31 @@ cli.main = main
 cli.run()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=50)
-    assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; nothing half-written is left\n")
+    assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; no incomplete files are left\n")
 
 
-def test_results_that_cannot_be_evaluated(fitted, inputs, tmp_path, capsys):
+def test_unusable_results_of_evaluate(fitted, inputs, tmp_path, capsys):
     truth = str(inputs / "birds.json")
-    refused(capsys, ["evaluate", str(tmp_path / "absent"), "--truth", truth], "absent")
-    refused(capsys, ["evaluate", str(inputs), "--truth", truth], "poses.npz")
-    refused(capsys, ["evaluate", str(fitted), "--truth", str(tmp_path / "no.json")], "no.json")
+    rejected(capsys, ["evaluate", str(tmp_path / "absent"), "--truth", truth], "absent")
+    rejected(capsys, ["evaluate", str(inputs), "--truth", truth], "poses.npz")
+    rejected(capsys, ["evaluate", str(fitted), "--truth", str(tmp_path / "no.json")], "no.json")
     content = json.loads((inputs / "birds.json").read_text())
     for annotation in content["annotations"]:
         annotation["track_id"] += 100
     (tmp_path / "others.json").write_text(json.dumps(content))
     others = ["--truth", str(tmp_path / "others.json")]
-    refused(capsys, ["evaluate", str(fitted), *others, "--match", "ids"], "shares no bird")
+    rejected(capsys, ["evaluate", str(fitted), *others, "--match", "ids"], "shares no bird")
     assert main(["evaluate", str(fitted), *others]) == 0  # the same birds by other names, in the same places
     assert "4 → 104" in capsys.readouterr().out
 
 
-def test_compiled_programs_are_kept_for_the_next_run(tmp_path):
+def test_compiled_programs_are_stored_for_later_runs(tmp_path):
     cli.use_cache()
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "jaxfit")
 
 
 def test_the_installed_command_works_anywhere(inputs, tmp_path):
-    """Shipped configs go by name from any folder; the observations' fault is found after the config's."""
+    """Shipped configs are known by name in every folder; the config is checked before the observations."""
     script = Path(sys.executable).with_name("jaxfit")
     (tmp_path / "bad.json").write_text("{")
     tail = ["--model", str(inputs / "toy.npz"), "--out", "out"]

@@ -1,4 +1,4 @@
-"""`jaxfit evaluate` of observations, and what it says of matched tracks."""
+"""`jaxfit evaluate` of observations, and its line about matched tracks."""
 
 import json
 
@@ -13,7 +13,7 @@ LEFT, RIGHT = (0, 0, 30, 20), (60, 0, 30, 20)
 
 
 def files(folder):
-    """Two birds over four frames, one of them found in three; it is hidden in the last frame of the truth."""
+    """Two birds over four frames; bird 1 is detected in two frames and hidden in the last frame of the truth."""
     truth = {1: steady(LEFT, range(4)), 2: steady(RIGHT, range(4))}
     write_coco(birds(truth, range(4), visible={(1, 3): (0, 0, 2, 2)}), folder / "truth.json")
     found = {5: steady(LEFT, range(2)), 9: steady(RIGHT, range(4))}
@@ -32,19 +32,19 @@ def test_tables(tmp_path, capsys):
         # 6 matches of 7 birds; association: 4 matches of 4 frames, 2 of 3
         ["0.8729", "0.8571", "0.8889", "0.8571", "0.9231", "0", "0"],
     ]
-    assert "no figure counts 1 bird hardly to be seen\n" in printed
+    assert "not counted: 1 hardly visible bird\n" in printed
 
 
 def test_json(tmp_path, capsys):
     assert cli.main([*files(tmp_path), "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert figures["counts"]["ignored"] == 1
-    assert figures["keypoints"]["bill"]["visible"] == 6
-    assert figures["tracking"]["switches"] == 0
-    assert figures["detection"]["recall"] == 6 / 7
+    metrics = json.loads(capsys.readouterr().out)
+    assert metrics["counts"]["ignored"] == 1
+    assert metrics["keypoints"]["bill"]["visible"] == 6
+    assert metrics["tracking"]["switches"] == 0
+    assert metrics["detection"]["recall"] == 6 / 7
 
 
-def test_whose_track_is_whose():
+def test_the_line_of_matched_tracks():
     line = matching_line(Matching("overlap", {3: 1, 8: 2}, [4, 5], [6]))
-    assert "3 → 1, 8 → 2; tracks that follow nobody: 4, 5; birds that no track follows: 6" in line
+    assert "3 → 1, 8 → 2; tracks that follow no bird: 4, 5; birds that no track follows: 6" in line
     assert matching_line(Matching("overlap", {}, [], [])).endswith(": none")

@@ -1,11 +1,11 @@
-"""The commands around simulated scenes, from end to end."""
+"""The commands for simulated scenes from end to end."""
 
 import json
 from pathlib import Path
 
 import cv2
 import pytest
-from support.cli_files import refused
+from support.cli_files import rejected
 
 from jaxfit import Observations, load_reconstruct_config, pipeline, read_coco
 from jaxfit.cli import demo
@@ -26,7 +26,7 @@ def scene(tmp_path_factory):
     return folder
 
 
-def test_a_scene_measured_against_itself(scene, capsys):
+def test_a_scene_evaluated_against_its_own_truth(scene, capsys):
     assert main(["evaluate", str(scene / "truth"), "--truth", str(scene), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["me_p"] == 0
@@ -42,7 +42,7 @@ def test_a_scene_measured_against_itself(scene, capsys):
     assert sum(row["frames"] for row in result["behaviours"].values()) == result["frames"]
 
 
-def test_figures_by_behaviour_and_keypoint(scene, capsys):
+def test_metrics_by_behaviour_and_keypoint(scene, capsys):
     command = ["evaluate", str(scene / "truth"), "--truth", str(scene), "--by"]
     assert main([*command, "keypoint"]) == 0
     tables = capsys.readouterr().out
@@ -50,9 +50,9 @@ def test_figures_by_behaviour_and_keypoint(scene, capsys):
     assert main([*command, "behaviour"]) == 0
     assert "stand" in capsys.readouterr().out
     command[3] = str(scene / "truth.json")
-    refused(capsys, [*command, "behaviour"], "truth.json", "does not say what the birds do", "--by behaviour")
+    rejected(capsys, [*command, "behaviour"], "truth.json", "holds no behaviours of the birds", "--by behaviour")
     command[1] = str(scene / "detections.json")
-    refused(capsys, [*command, "keypoint"], "detections.json", "holds observations")
+    rejected(capsys, [*command, "keypoint"], "detections.json", "holds observations")
 
 
 def test_an_overlay_of_the_truth(scene, tmp_path, capsys):
@@ -62,50 +62,50 @@ def test_an_overlay_of_the_truth(scene, tmp_path, capsys):
     assert probe_video(out).frames == 5
     assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr().out.replace("\n", "")
-    refused(capsys, command, "overlay.mp4", "exists already", "--overwrite")
+    rejected(capsys, command, "overlay.mp4", "exists already", "--overwrite")
     assert main([*command, "--overwrite"]) == 0
     assert str(out) in said
     assert str(out.with_suffix(".png")) in said
 
 
-def test_a_frame_of_the_overlay(scene, tmp_path, capsys):
+def test_one_frame_of_the_overlay(scene, tmp_path, capsys):
     out = tmp_path / "frame.png"
     command = ["overlay", str(scene / "truth"), "--video", str(scene / "footage.mp4"), "--out", str(out), "--frame"]
     assert main([*command, "3"]) == 0
     picture = cv2.imread(str(out))
     assert picture.shape[1] == 480
-    refused(capsys, [*command, "3"], "frame.png", "--overwrite")
-    refused(capsys, [*command, "5", "--overwrite"], "no frame 5")
+    rejected(capsys, [*command, "3"], "frame.png", "--overwrite")
+    rejected(capsys, [*command, "5", "--overwrite"], "no frame 5")
     command[command.index(str(out))] = str(tmp_path / "frame.tiff")
-    refused(capsys, [*command, "3"], "frame.tiff", ".png")
+    rejected(capsys, [*command, "3"], "frame.tiff", ".png")
 
 
-def test_overlays_that_cannot_be_drawn(scene, tmp_path, capsys):
+def test_unusable_videos_of_overlay(scene, tmp_path, capsys):
     def command(video: Path) -> list[str]:
         return ["overlay", str(scene / "truth"), "--video", str(video), "--out", str(tmp_path / "o.mp4")]
 
-    refused(capsys, command(tmp_path / "none.mp4"), "none.mp4", alone=False)
-    refused(capsys, command(scene / "truth.json"), "truth.json", alone=False)
+    rejected(capsys, command(tmp_path / "none.mp4"), "none.mp4", alone=False)
+    rejected(capsys, command(scene / "truth.json"), "truth.json", alone=False)
     assert main(["simulate", *SMALL[:2], "--frames", "3", "--size", "480x280", "--out", str(tmp_path / "short")]) == 0
-    refused(capsys, command(tmp_path / "short" / "footage.mp4"), "footage.mp4", alone=False)
+    rejected(capsys, command(tmp_path / "short" / "footage.mp4"), "footage.mp4", alone=False)
     assert not (tmp_path / "o.mp4").exists()
 
 
-def test_a_scene_is_not_overwritten_unasked(scene, tmp_path, capsys):
+def test_a_scene_is_overwritten_only_on_request(scene, tmp_path, capsys):
     before = (scene / "truth.json").read_bytes()
-    refused(capsys, ["simulate", *SMALL, "--seed", "8", "--out", str(scene)], "overwrite", alone=False)
+    rejected(capsys, ["simulate", *SMALL, "--seed", "8", "--out", str(scene)], "overwrite", alone=False)
     assert (scene / "truth.json").read_bytes() == before
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.tex").write_text("precious")
-    refused(capsys, ["simulate", *SMALL, "--out", str(tmp_path / "thesis"), "--overwrite"], "thesis", alone=False)
+    rejected(capsys, ["simulate", *SMALL, "--out", str(tmp_path / "thesis"), "--overwrite"], "thesis", alone=False)
 
 
 @pytest.mark.parametrize(
     ("option", "value", "word"),
     [("--birds", "0", "birds"), ("--size", "wide", "size"), ("--size", "12x8", "size"), ("--seed", "-3", "seed")],
 )
-def test_scenes_that_make_no_sense(option, value, word, tmp_path, capsys):
-    refused(capsys, ["simulate", "--out", str(tmp_path / "s"), option, value], word)
+def test_unusable_options_of_simulate(option, value, word, tmp_path, capsys):
+    rejected(capsys, ["simulate", "--out", str(tmp_path / "s"), option, value], word)
     assert not (tmp_path / "s").exists()
 
 
@@ -113,14 +113,14 @@ def test_the_murre_has_six_sides(tmp_path, capsys):
     out = tmp_path / "views.png"
     assert main(["model", "view", "murre", "--posture", "standing", "--out", str(out)]) == 0
     assert out.read_bytes().startswith(b"\x89PNG")
-    refused(capsys, ["model", "view", "murre", "--posture", "dancing", "--out", str(out)], "dancing", "standing")
+    rejected(capsys, ["model", "view", "murre", "--posture", "dancing", "--out", str(out)], "dancing", "standing")
     assert main(["model", "info", "murre"]) == 0
 
 
-def test_the_demo_leaves_other_folders_alone(tmp_path, capsys):
+def test_the_demo_keeps_other_folders(tmp_path, capsys):
     (tmp_path / "overlay.mp4").write_text("precious")
-    refused(capsys, ["demo", "--out", str(tmp_path)], "no earlier demo")
-    refused(capsys, ["demo", "--out", str(tmp_path / "overlay.mp4")], "is a file")
+    rejected(capsys, ["demo", "--out", str(tmp_path)], "not an earlier demo")
+    rejected(capsys, ["demo", "--out", str(tmp_path / "overlay.mp4")], "is a file")
     assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == ["overlay.mp4"]
 
 
@@ -130,8 +130,8 @@ def test_one_bird_is_singular(tmp_path, capsys):
     assert "1 bird over 2 frames: " in capsys.readouterr().out
 
 
-class TrueToTheScene:
-    """Stands in for both networks: the truth of a demo's scene, frame after frame."""
+class TruthOfTheScene:
+    """Replaces both networks by the truth of a demo's scene, frame after frame."""
 
     class_names, keypoint_names = ("bird",), MURRE_KEYPOINTS
 
@@ -149,14 +149,14 @@ class TrueToTheScene:
         return self.truth.keypoints_px[rows, self.t], self.truth.confidence[rows, self.t]
 
 
-def test_the_demo_leaves_what_it_names(tmp_path, monkeypatch, capsys):
+def test_the_demo_writes_the_files_that_it_names(tmp_path, monkeypatch, capsys):
     (tmp_path / "quick.yaml").write_text(
         "base: reconstruct\ntrack: {min_track_frames: 2}\nfit:\n  base: paper\n  stages:\n"
         "    - {name: only, steps: 200, terms: [keypoints, pose_prior], step_scale: {transl: [1, 1, 0]}}\n"
     )
 
     def open_one(_):
-        opened.append(TrueToTheScene(tmp_path / "demo"))
+        opened.append(TruthOfTheScene(tmp_path / "demo"))
         return opened[-1]
 
     opened = []

@@ -1,10 +1,10 @@
-"""`track` and `reconstruct` from end to end, with stand-ins for the networks, and what they refuse."""
+"""`track` and `reconstruct` from end to end, with replaced networks, and their unusable inputs."""
 
 import json
 
 import numpy as np
 import pytest
-from support.cli_files import refused
+from support.cli_files import rejected
 from support.onnx_graphs import write_constant
 from support.toy_footage import BIRD, BIRDS, FRAMES, QUICK, SIDE, Footage, TrueKeypoints, TrueSegmenter
 
@@ -32,7 +32,7 @@ def inputs(tmp_path_factory):
 
 @pytest.fixture
 def networks(monkeypatch):
-    """The networks that a config names are stand-ins; returns the birds that they miss."""
+    """Replace the networks of a config; return the list of (frame, bird) pairs that the segmenter misses."""
     missed = []
     monkeypatch.setattr(track, "open_segmenter", lambda *_: TrueSegmenter(FOOTAGE, missed))
     for module in (track, pipeline):
@@ -47,7 +47,7 @@ def command(inputs, name, out, *more):
 
 
 @pytest.mark.usefixtures("networks")
-def test_track_writes_what_was_there(inputs, tmp_path, capsys):
+def test_track_writes_the_truth(inputs, tmp_path, capsys):
     out = tmp_path / "deep" / "obs.json"
     assert main(command(inputs, "track", out, "--start", "2", "--stop", "11", "--step", "2")) == 0
     found = read_coco(out)
@@ -63,24 +63,24 @@ def test_track_writes_what_was_there(inputs, tmp_path, capsys):
 
 
 @pytest.mark.usefixtures("networks")
-def test_track_replaces_nothing_unasked(inputs, tmp_path, capsys):
+def test_track_replaces_a_file_only_on_request(inputs, tmp_path, capsys):
     out = tmp_path / "obs.json"
     out.write_text("precious")
-    refused(capsys, command(inputs, "track", out), "obs.json", "exists already", "--overwrite")
-    refused(capsys, command(inputs, "track", inputs / "frames" / "o.json"), "among the video's images")
+    rejected(capsys, command(inputs, "track", out), "obs.json", "exists already", "--overwrite")
+    rejected(capsys, command(inputs, "track", inputs / "frames" / "o.json"), "among the video's images")
     assert out.read_text() == "precious"
     assert main(command(inputs, "track", out, "--overwrite")) == 0
     assert read_coco(out).num_tracks == BIRDS
 
 
-def test_short_tracks_are_told(inputs, tmp_path, networks, capsys):
+def test_short_tracks_are_reported(inputs, tmp_path, networks, capsys):
     networks += [(t, 2) for t in range(2, FRAMES)]
     assert main(command(inputs, "track", tmp_path / "obs.json")) == 0
-    assert "left out: 1 track of fewer than 3 frames: 1 (2)" in capsys.readouterr().out
+    assert "1 track with fewer than 3 frames skipped: 1 (2)" in capsys.readouterr().out
 
 
 def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
-    """Tracking leaves an empty, valid file and says why; there is nothing to reconstruct."""
+    """Without a bird, `track` writes a valid file without tracks and explains; `reconstruct` fails."""
     networks += EVERYONE
     out = tmp_path / "obs.json"
     assert main(command(inputs, "track", out)) == 0
@@ -91,12 +91,12 @@ def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
     assert (len(content["images"]), content["annotations"]) == (FRAMES, [])
     assert "0 birds over 12 frames" in capsys.readouterr().out.replace("\n", "")
     words = "no bird was detected in 12 frames", "min_score"
-    refused(capsys, command(inputs, "reconstruct", tmp_path / "result"), *words, alone=False)
+    rejected(capsys, command(inputs, "reconstruct", tmp_path / "result"), *words, alone=False)
     assert not (tmp_path / "result").exists()
 
 
 def test_a_reconstruction(inputs, tmp_path, networks, capsys):
-    """Every file is there and reads back; a bird that was hardly seen is told."""
+    """All files exist and can be read; a short track is reported."""
     networks += [(t, 2) for t in range(2, FRAMES)]
     out = tmp_path / "result"
     assert main(command(inputs, "reconstruct", out, "--stop", "10", "--classes", "bird,duck")) == 0
@@ -119,61 +119,61 @@ def test_a_reconstruction(inputs, tmp_path, networks, capsys):
     assert summary["video"]["frames"] == FRAMES
     assert "onnxruntime" in summary["versions"]
     said = capsys.readouterr().out
-    assert "left out: 1 track" in said
+    assert "1 track with fewer than 3 frames skipped" in said
     for name in ("overlay.mp4", "overlay.png", "observations.json", "poses.npz"):
         assert str(out / name) in said.replace("\n", "")
     again = command(inputs, "reconstruct", out)
-    refused(capsys, again, "holds results already", "--overwrite")
+    rejected(capsys, again, "holds results already", "--overwrite")
     assert main(["evaluate", str(out), "--truth", str(out / "observations.json")]) == 0
 
 
 @pytest.mark.usefixtures("networks")
-def test_an_interrupt_leaves_nothing(inputs, tmp_path, monkeypatch, capsys):
+def test_an_interrupt_leaves_no_files(inputs, tmp_path, monkeypatch, capsys):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(pipeline, "overlay", stopped)
     assert main(command(inputs, "reconstruct", tmp_path / "result")) == 130
-    assert "nothing half-written" in capsys.readouterr().err
+    assert "no incomplete files" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == []
 
 
 @pytest.mark.usefixtures("networks")
 def test_the_footage_is_not_replaced(inputs, capsys):
-    refused(capsys, command(inputs, "reconstruct", inputs, "--overwrite"), "holds the video", "another --out")
+    rejected(capsys, command(inputs, "reconstruct", inputs, "--overwrite"), "holds the video", "another --out")
     assert (inputs / "frames" / "0.png").is_file()
 
 
 @pytest.mark.usefixtures("networks")
 def test_keypoints_of_another_model(inputs, tmp_path, capsys):
     wrong = command(inputs, "reconstruct", tmp_path / "result")[:-2]  # the murre, not the toy
-    refused(capsys, wrong, "keypoints lack", "another model")
+    rejected(capsys, wrong, "keypoints lack", "another model")
     assert not (tmp_path / "result").exists()
 
 
 @pytest.mark.parametrize("name", ["track", "reconstruct"])
-def test_what_cannot_be_tracked(name, inputs, tmp_path, monkeypatch, capsys):
+def test_unusable_inputs_of_track_and_reconstruct(name, inputs, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
 
-    def told(*words, video="frames", more=()):
-        refused(capsys, [name, str(inputs / video), "--out", str(out), *map(str, more)], *words)
+    def expect(*words, video="frames", more=()):
+        rejected(capsys, [name, str(inputs / video), "--out", str(out), *map(str, more)], *words)
 
-    told("none.mp4: does not exist", video="none.mp4")
-    told("notes.txt: is not a readable video", video="notes.txt")
-    told("`stop` is 3", more=["--start", 4, "--stop", 3])
-    told("none.yaml", "cannot read", more=["--config", tmp_path / "none.yaml"])
+    expect("none.mp4: does not exist", video="none.mp4")
+    expect("notes.txt: is not a readable video", video="notes.txt")
+    expect("`track.frames.stop` is 3, and `start` is 4", more=["--start", 4, "--stop", 3])
+    expect("none.yaml", "cannot read", more=["--config", tmp_path / "none.yaml"])
     (tmp_path / "bad.yaml").write_text("base: reconstruct\ntrack: {segmentor: x}\n")
-    told("bad.yaml", "`track.segmentor`", more=["--config", tmp_path / "bad.yaml"])
-    told("paper", "says how to fit", more=["--config", "paper"])
-    told("notes.txt", "ONNX", more=["--keypoints", inputs / "notes.txt"])
+    expect("bad.yaml", "`track.segmentor`", more=["--config", tmp_path / "bad.yaml"])
+    expect("paper", "is the config of a fit", more=["--config", "paper"])
+    expect("notes.txt", "ONNX", more=["--keypoints", inputs / "notes.txt"])
     keypoints = TrueKeypoints(FOOTAGE)
     keypoints.keypoint_names = MURRE_KEYPOINTS
     for module in (track, pipeline):
         monkeypatch.setattr(module, "open_keypoint_detector", lambda _: keypoints)
-    told("notes.txt", "ONNX", more=["--segmenter", inputs / "notes.txt"])
+    expect("notes.txt", "ONNX", more=["--segmenter", inputs / "notes.txt"])
     strange = write_constant(tmp_path / "strange.onnx", (1, 3, 8, 8), {"logits": np.zeros(9)})
-    told("strange.onnx: has an unknown layout", "logits (1, 9)", "yolo:", more=["--segmenter", strange])
+    expect("strange.onnx: has an unknown layout", "logits (1, 9)", "yolo:", more=["--segmenter", strange])
     layout = {"output0": np.zeros((116, 84)), "output1": np.zeros((32, 16, 16))}
     coco = write_constant(tmp_path / "coco.onnx", (1, 3, 64, 64), layout)
-    told("lacks duck", "its classes are person", more=["--segmenter", coco, "--classes", "bird,duck"])
+    expect("lacks duck", "its classes are person", more=["--segmenter", coco, "--classes", "bird,duck"])
     assert not out.exists()

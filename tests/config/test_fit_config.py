@@ -1,10 +1,12 @@
-"""Configs: what ships loads, what is written is read, and every mistake is named with its key and file."""
+"""Configs of fits: shipped configs, bases, and errors that name the key and the file."""
 
 import dataclasses
 
 import pytest
+import yaml
 
-from jaxfit.config.schema import FitConfig, StageConfig, config_to_yaml, load_config, shipped_configs
+from jaxfit.config.fit import FitConfig, StageConfig, load_config, shipped_fit_configs
+from jaxfit.config.yaml_file import _parse, config_to_yaml
 from jaxfit.errors import InputError
 from jaxfit.objective.registry import find_term, known_terms
 
@@ -15,8 +17,8 @@ def written(tmp_path, text, name="mine.yaml"):
     return path
 
 
-def test_the_shipped_ones():
-    assert {"paper", "baseline", "aves"} <= set(shipped_configs())
+def test_the_shipped_configs():
+    assert {"paper", "baseline", "aves"} <= set(shipped_fit_configs())
     paper, baseline = load_config("paper"), load_config("baseline")
     assert (paper.window, paper.common_size, paper.filter_window) == (100, True, 5)
     assert [(s.steps, s.learning_rate) for s in paper.stages] == [(600, 0.01), (400, 0.01)]
@@ -32,12 +34,12 @@ def test_the_shipped_ones():
     }
     assert settings["keypoints"]["sigma_px"] == 50
     assert (settings["velocity"]["beta_global"], settings["velocity"]["beta_pose"]) == (10, 1)
-    # the single-frame baseline differs in these alone
+    # the single-frame baseline differs only in these values
     assert dataclasses.replace(baseline, window=100, common_size=True, filter_window=5) == paper
     assert (baseline.window, baseline.common_size, baseline.filter_window) == (1, False, 1)
 
 
-@pytest.mark.parametrize("name", shipped_configs())
+@pytest.mark.parametrize("name", shipped_fit_configs())
 def test_round_trip(tmp_path, name):
     config = load_config(name)
     path = written(tmp_path, config_to_yaml(config))
@@ -45,7 +47,30 @@ def test_round_trip(tmp_path, name):
     assert load_config(str(path)) == config
 
 
-def test_overrides_are_laid_over_the_base(tmp_path):
+def without_one_key(value):
+    """Yield copies of nested mappings and lists that lack one key each."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield {other: kept for other, kept in value.items() if other != key}
+            yield from ({**value, key: changed} for changed in without_one_key(inner))
+    elif isinstance(value, list):
+        for i, inner in enumerate(value):
+            yield from ([*value[:i], changed, *value[i + 1 :]] for changed in without_one_key(inner))
+
+
+@pytest.mark.parametrize("name", shipped_fit_configs())
+def test_shipped_files_hold_only_overrides(tmp_path, name):
+    """Every key of a shipped file changes a default or a value of the base."""
+    for reduced in without_one_key(_parse(name)):
+        path = written(tmp_path, yaml.safe_dump(reduced))
+        try:
+            same = load_config(path) == load_config(name)
+        except InputError:  # the key is required
+            same = False
+        assert not same, reduced
+
+
+def test_a_file_overrides_its_base_key_by_key(tmp_path):
     written(tmp_path, "base: paper\nwindow: 20\nterms: {velocity: 7}\n", "below.yaml")
     path = written(tmp_path, "base: below.yaml\ncrop: {padding: 1}\nterms: {keypoints: {sigma_px: 9}}\n")
     config, paper = load_config(path), load_config("paper")
@@ -53,7 +78,7 @@ def test_overrides_are_laid_over_the_base(tmp_path):
     assert config.crop == dataclasses.replace(paper.crop, padding=1.0)
     assert isinstance(config.crop.padding, float)
     assert config.terms["velocity"] == 7
-    assert config.terms["keypoints"] == {"weight": 1, "sigma_px": 9}  # key by key, to the bottom
+    assert config.terms["keypoints"] == {"weight": 1, "sigma_px": 9}  # also below the first level
     assert config.terms["acceleration"] == 100
     assert config.stages == paper.stages
 
@@ -132,7 +157,7 @@ LEAST_SQUARES = STAGE.replace("steps: 1", "steps: 1, solver: levenberg_marquardt
         (STAGE % ", learning_rate: 0", ["`stages[0].learning_rate`", "0"]),
         (STAGE % ", solver: newton", ["`stages[0].solver`", "newton", "levenberg_marquardt"]),
         (LEAST_SQUARES.replace("keypoints", "mask") % "", ["`stages[0].solver`", "'mask'", "adam", "velocity"]),
-        (LEAST_SQUARES % ", optimised: [transl, betas]", ["`stages[0].solver`", "betas", "`free`"]),
+        (LEAST_SQUARES % ", optimised: [transl, betas]", ["`stages[0].solver`", "betas", "`optimised`"]),
         (LEAST_SQUARES % ", carry_moments: true", ["`stages[0].carry_moments`", "Adam"]),
         (STAGE % ", blur: 0", ["`stages[0].blur`", "0"]),
         ("window: 3\n", ["`stages`", "missing", "base: paper"]),
@@ -145,12 +170,12 @@ LEAST_SQUARES = STAGE.replace("steps: 1", "steps: 1, solver: levenberg_marquardt
     ],
     ids=lambda value: value[0].strip("`") if isinstance(value, list) else "",
 )
-def test_mistakes_are_named(tmp_path, text, names):
+def test_errors_name_the_key(tmp_path, text, names):
     path = written(tmp_path, text)
     with pytest.raises(InputError) as caught:
         load_config(path)
     message = str(caught.value)
-    if "papr" not in text:  # there it is the base that cannot be read
+    if "papr" not in text:  # there the base is the unreadable file
         assert message.startswith(f"{path}: ")
     assert "\n" not in message
     for name in names:
@@ -158,7 +183,7 @@ def test_mistakes_are_named(tmp_path, text, names):
 
 
 @pytest.mark.parametrize(
-    ("base", "top", "guilty"),
+    ("base", "top", "expected_file"),
     [
         ("windws: 3", "window: 5", "base"),
         ("window: ten", "filter_window: 1", "base"),
@@ -179,22 +204,22 @@ def test_mistakes_are_named(tmp_path, text, names):
         ("window: [1,", "window: 3", "base"),
     ],
 )
-def test_mistakes_in_a_base_name_the_base(tmp_path, base, top, guilty):
-    """Two files and a shipped one below them; the key is blamed on the file that says it."""
+def test_errors_in_a_base_name_the_base(tmp_path, base, top, expected_file):
+    """Two files over a shipped config; the error names the file that sets the key."""
     files = {"base": written(tmp_path, f"base: paper\n{base}\n", "base.yaml")}
     files["top"] = written(tmp_path, f"base: base.yaml\n{top}\n", "top.yaml")
     with pytest.raises(InputError) as caught:
         load_config(files["top"])
-    assert str(caught.value).startswith(f"{files[guilty]}: ")
+    assert str(caught.value).startswith(f"{files[expected_file]}: ")
 
 
-def test_what_no_file_says_is_missing_in_the_top_one(tmp_path):
+def test_a_missing_key_is_reported_for_the_top_file(tmp_path):
     written(tmp_path, "window: 3\n", "base.yaml")
     with pytest.raises(InputError, match=r"top\.yaml: `stages` is missing"):
         load_config(written(tmp_path, "base: base.yaml\n", "top.yaml"))
 
 
-def test_a_config_in_code_is_checked_too():
+def test_a_config_made_in_code_is_checked():
     with pytest.raises(InputError, match="`window` is 0"):
         dataclasses.replace(load_config("paper"), window=0)
 
@@ -206,7 +231,7 @@ def test_bases_in_a_circle(tmp_path):
         load_config(a)
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_unreadable_files(tmp_path):
     with pytest.raises(InputError, match=r"absent\.yaml.*(paper.*)+"):
         load_config(tmp_path / "absent.yaml")
     with pytest.raises(InputError, match="cannot read"):
@@ -216,7 +241,7 @@ def test_files_that_cannot_be_read(tmp_path):
         load_config(tmp_path / "latin.yaml")
 
 
-def test_every_term_explains_itself():
+def test_every_term_has_a_docstring():
     for name in known_terms():
         documented = find_term(name).function.__doc__
         assert documented, name

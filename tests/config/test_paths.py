@@ -1,12 +1,12 @@
-"""Values of a config by their paths: what is set, what is left alone, and what leads nowhere."""
+"""Access to config values by path: changed values, unchanged values and unknown paths."""
 
 import dataclasses
 
 import pytest
 
+from jaxfit.config.checks import ConfigKeyError
+from jaxfit.config.fit import load_config
 from jaxfit.config.paths import get_value, with_values
-from jaxfit.config.schema import load_config
-from jaxfit.config.yaml_file import ConfigKeyError
 
 PAPER = load_config("paper")
 
@@ -21,7 +21,7 @@ def test_no_value_changes_nothing():
         ("window", 50, dataclasses.replace(PAPER, window=50)),
         ("crop.padding", 0.5, dataclasses.replace(PAPER, crop=dataclasses.replace(PAPER.crop, padding=0.5))),
         ("terms.velocity", 7, dataclasses.replace(PAPER, terms={**PAPER.terms, "velocity": 7})),
-        # a weight leaves a term's settings alone, and a setting its weight
+        # a new weight keeps the term's settings, and a new setting keeps the weight
         (
             "terms.keypoints",
             3,
@@ -32,7 +32,7 @@ def test_no_value_changes_nothing():
             4.0,
             dataclasses.replace(PAPER, terms={**PAPER.terms, "velocity": {"weight": 100, "beta_global": 4.0}}),
         ),
-        # a term that the config does not weigh yet
+        # a term without a weight in the config
         ("terms.bone_prior", 2, dataclasses.replace(PAPER, terms={**PAPER.terms, "bone_prior": 2})),
     ],
 )
@@ -47,7 +47,7 @@ def test_a_stage_by_name_or_number(path):
     assert get_value(changed, path) == 9
 
 
-def test_a_value_may_follow_another_whatever_the_order():
+def test_a_reference_to_another_value_does_not_depend_on_the_order():
     for order in (1, -1):
         values = dict([("terms.acceleration", "=terms.velocity"), ("terms.velocity", 5)][::order])
         changed = with_values(PAPER, values)
@@ -76,8 +76,8 @@ def test_the_value_of_a_term_is_its_weight():
         ({"terms.velocity.no_such": 1}, ("no_such",)),
     ],
 )
-def test_what_leads_nowhere(values, words):
-    with pytest.raises(ConfigKeyError) as refusal:
+def test_unknown_paths_and_values(values, words):
+    with pytest.raises(ConfigKeyError) as caught:
         with_values(PAPER, values)
     for word in words:
-        assert word in str(refusal.value)
+        assert word in str(caught.value)

@@ -1,13 +1,16 @@
-"""The config of a reconstruction: what ships names every knob, parts have bases of their own, mistakes are named."""
+"""The config of a reconstruction: shipped values, descriptions, the base of the fit, and errors that name the key."""
 
 import dataclasses
-from importlib import resources
+import typing
 
 import pytest
-import yaml
 
+from jaxfit.config.fit import load_config
+from jaxfit.config.grid import GridConfig
+from jaxfit.config.help import field_help
 from jaxfit.config.perception import TrackConfig
-from jaxfit.config.schema import OverlayConfig, config_to_yaml, load_config, load_reconstruct_config
+from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
+from jaxfit.config.yaml_file import _parse, config_to_yaml, documented_yaml
 from jaxfit.errors import InputError
 
 
@@ -17,20 +20,36 @@ def written(tmp_path, text, name="mine.yaml"):
     return path
 
 
-def keys(values, where=""):
-    for key, value in values.items():
-        yield f"{where}{key}"
-        if isinstance(value, dict):
-            yield from keys(value, f"{where}{key}.")
-
-
-def test_the_shipped_file_names_every_knob_at_its_default():
-    shipped = yaml.safe_load((resources.files("jaxfit") / "configs" / "reconstruct.yaml").read_text(encoding="utf-8"))
+def test_the_shipped_file_holds_no_defaults():
     config = load_reconstruct_config()
-    every = {key for key in keys(yaml.safe_load(config_to_yaml(config))) if not key.startswith("fit.")}
-    assert set(keys(shipped)) == every
     assert (config.track, config.overlay, config.fit) == (TrackConfig(), OverlayConfig(), load_config("paper"))
+    assert set(_parse("reconstruct")) == {"fit"}
     assert not config.track.repair_left_right_flips  # the paper's setting
+
+
+def fields_of(kind):
+    """Yield the class and the field of every setting below a config class."""
+    hints = typing.get_type_hints(kind)
+    for field in dataclasses.fields(kind):
+        yield kind, field
+        for inner in (hints[field.name], *typing.get_args(hints[field.name])):
+            if dataclasses.is_dataclass(inner):
+                yield from fields_of(inner)
+
+
+@pytest.mark.parametrize("kind", [ReconstructConfig, GridConfig])
+def test_every_setting_has_a_description(kind):
+    for owner, field in fields_of(kind):
+        own_config = dataclasses.is_dataclass(typing.get_type_hints(owner)[field.name])
+        assert own_config or field_help(owner).get(field.name), f"{owner.__name__}.{field.name}"
+
+
+def test_the_documented_text_describes_every_setting_and_reads_back(tmp_path):
+    text = documented_yaml(load_reconstruct_config())
+    assert load_reconstruct_config(written(tmp_path, text)) == load_reconstruct_config()
+    lines = [line.strip() for line in text.splitlines()]
+    assert lines[lines.index("tile_overlap: 0.25") - 1].startswith("# Overlap of neighbouring tiles")
+    assert lines.count("# Number of steps of the solver.") == 1  # only in the first stage
 
 
 def test_round_trip(tmp_path):
@@ -39,7 +58,7 @@ def test_round_trip(tmp_path):
     assert load_reconstruct_config(written(tmp_path, config_to_yaml(config), "again.yaml")) == config
     assert config.track.frames.stop == 7
     assert config.track.segmenter.classes == ("bird",)
-    assert config.fit == load_config("aves")  # nothing of the paper's shines through
+    assert config.fit == load_config("aves")  # no value of the paper's config is left
 
 
 @pytest.mark.parametrize(
@@ -52,7 +71,7 @@ def test_round_trip(tmp_path):
         ("base: middle.yaml\nfit: {common_size: true}", "baseline", {"window": 4, "common_size": True}),
     ],
 )
-def test_a_fit_has_bases_of_its_own(tmp_path, text, of, changes):
+def test_the_fit_has_a_base_of_its_own(tmp_path, text, of, changes):
     written(tmp_path, "base: baseline\nwindow: 4\n", "own.yaml")
     written(tmp_path, "fit: {base: own.yaml}\n", "middle.yaml")
     fit = load_reconstruct_config(written(tmp_path, text)).fit
@@ -88,7 +107,7 @@ def test_a_fit_has_bases_of_its_own(tmp_path, text, of, changes):
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_mistakes_are_named(tmp_path, text, names):
+def test_errors_name_the_key(tmp_path, text, names):
     path = written(tmp_path, f"base: reconstruct\n{text}\n")
     with pytest.raises(InputError) as caught:
         load_reconstruct_config(path)
@@ -99,21 +118,21 @@ def test_mistakes_are_named(tmp_path, text, names):
         assert name in message, f"{name!r} is not in {message!r}"
 
 
-def test_mistakes_in_a_file_of_the_fit_name_that_file(tmp_path):
+def test_errors_in_the_file_of_the_fit_name_that_file(tmp_path):
     fit = written(tmp_path, "base: paper\nwindow: 0\n", "fit.yaml")
     with pytest.raises(InputError) as caught:
         load_reconstruct_config(written(tmp_path, "base: reconstruct\nfit: fit.yaml\n"))
     assert str(caught.value).startswith(f"{fit}: `fit.window` is 0")
 
 
-def test_files_that_do_not_fit():
-    with pytest.raises(InputError, match=r"paper: says how to fit.*fit: paper"):
+def test_configs_of_the_wrong_kind():
+    with pytest.raises(InputError, match=r"paper: is the config of a fit.*fit: paper"):
         load_reconstruct_config("paper")
-    with pytest.raises(InputError, match=r"reconstruct: unknown key `track`"):
+    with pytest.raises(InputError, match=r"reconstruct: `fit` is not a known key"):
         load_config("reconstruct")
 
 
-def test_what_is_missing_and_circles(tmp_path):
+def test_a_missing_fit_and_a_circle_of_bases(tmp_path):
     with pytest.raises(InputError, match=r"`fit` is missing.*base: reconstruct"):
         load_reconstruct_config(written(tmp_path, "track: {threads: 2}\n"))
     written(tmp_path, "base: below.yaml\n", "below.yaml")

@@ -9,7 +9,7 @@ import pickle
 import cv2
 import numpy as np
 import pytest
-from support.cli_files import refused
+from support.cli_files import rejected
 
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import read_coco
@@ -241,7 +241,7 @@ def test_the_command(data_set, tmp_path, capsys):
     assert info["license"] == "CC-BY-NC-4.0"
     assert "inferred, not published" in info["description"]
     assert "third number: a flag" in info["description"]
-    refused(capsys, command, "murres.json", "exists already", "--overwrite")
+    rejected(capsys, command, "murres.json", "exists already", "--overwrite")
     assert main([*command, "--overwrite", "--keypoints", "murre"]) == 0
     assert read_coco(out).keypoint_names == MURRE_KEYPOINTS
     assert "on your word" in capsys.readouterr().out
@@ -249,4 +249,4 @@ def test_the_command(data_set, tmp_path, capsys):
     assert main([*command, "--overwrite", "--keypoints", ",".join(mine)]) == 0
     assert read_coco(out).keypoint_names == tuple(mine)
     for names in (mine[:19], [*mine[:19], "p0"], [*mine[:19], ""]):
-        refused(capsys, [*command, "--overwrite", "--keypoints", ",".join(names)], "names of keypoints", "give 20")
+        rejected(capsys, [*command, "--overwrite", "--keypoints", ",".join(names)], "names of keypoints", "give 20")

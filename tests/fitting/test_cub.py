@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from jaxfit.config.schema import load_config
+from jaxfit.config.fit import load_config
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit

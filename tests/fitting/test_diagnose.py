@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.cli_files import SIZE, T, arguments, refused
+from support.cli_files import SIZE, T, arguments, rejected
 
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import read_coco
@@ -105,7 +105,7 @@ def test_a_term_by_its_path(inputs, tmp_path):
     ],
 )
 def test_terms_that_cannot_be_used(inputs, tmp_path, capsys, name, words):
-    refused(capsys, command(inputs, tmp_path, name, steps=1000), name, *words)
+    rejected(capsys, command(inputs, tmp_path, name, steps=1000), name, *words)
     assert not (tmp_path / "out").exists()
 
 

@@ -10,7 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.birds import exp_map, pose_window, toy_bird
 
-from jaxfit.config.schema import config_to_yaml, load_config
+from jaxfit.config.fit import load_config
+from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.solution import save_solution
 from jaxfit.errors import InputError

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support.birds import toy_bird
 
+from jaxfit.config.fit import load_config
 from jaxfit.config.paths import with_values
-from jaxfit.config.schema import load_config
 from jaxfit.fitting import batch
 from jaxfit.fitting import fit as fit_module
 from jaxfit.fitting.fit import fit, fit_runs

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.birds import toy_bird
 
-from jaxfit.config.schema import load_config
+from jaxfit.config.fit import load_config
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.fitting.initial_pose_file import load_initial_poses

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.birds import exp_map, toy_bird
 
-from jaxfit.config.schema import InitialiseConfig
+from jaxfit.config.fit import InitialiseConfig
 from jaxfit.fitting.initial_pose_search import (
     BLOCKED_RADIUS,
     candidate_orientations,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.stages import BIRD, FIRST, B, T, case, problems, program, solve, total
 
-from jaxfit.config.schema import load_config
+from jaxfit.config.fit import load_config
 from jaxfit.fitting import levenberg_marquardt
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.levenberg_marquardt import EASE, FIRST_DAMPING, LEVENBERG_MARQUARDT, TIGHTEN

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.birds import pose_window
 
-from jaxfit.config.schema import load_config
+from jaxfit.config.fit import load_config
 from jaxfit.evaluation.metrics import me_p, me_v, mpjpe, pa_mpjpe
 from jaxfit.fitting.fit import fit
 from jaxfit.model.camera import Camera, project

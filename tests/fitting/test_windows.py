@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from jaxfit.config.schema import CropConfig, load_config
+from jaxfit.config.fit import CropConfig, load_config
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError

@@ -1,4 +1,4 @@
-"""Files that the command line takes, for the tests to use and to break."""
+"""Input files of the command line, and a check of its error messages."""
 
 import dataclasses
 
@@ -24,7 +24,7 @@ stages:
 
 
 def write_inputs(folder):
-    """A model, observations of three birds (the last hardly seen) and a config, as files."""
+    """A model, observations of three birds (the last is hardly visible) and a config, as files."""
     save_bird(BIRD, folder / "toy.npz")
     observed = detect(BIRD, [smooth_motion(BIRD, T, seed) for seed in range(3)], camera=Camera(541.75, 32, SIZE))
     confidence = observed.confidence.copy()
@@ -40,12 +40,12 @@ def arguments(inputs, out, **changes):
     return ["fit", at["obs"], "--model", at["model"], "--config", at["config"], "--out", str(out)]
 
 
-def refused(capsys, command, *words, code=2, alone=True):
-    """The command ends with `code` and one line on stderr that holds all words."""
+def rejected(capsys, command, *words, code=2, alone=True):
+    """Check that a command ends with an exit code and prints one line on stderr that holds all words."""
     capsys.readouterr()
     assert main(command) == code
     lines = capsys.readouterr().err.strip().splitlines()
-    assert len(lines) == 1 or (not alone and lines), "a progress bar may stand before it"
+    assert len(lines) == 1 or (not alone and lines), "only a progress bar may precede the line"
     assert lines[-1].startswith("jaxfit: ")
     assert not any("Traceback" in line for line in lines)
     for word in words:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfit.config.schema import FitConfig, StageConfig
+from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.problem import Problem
 from jaxfit.fitting.solve import advance, begin
 from jaxfit.fitting.stages import FitModel, stage_hyperparameters, stage_program

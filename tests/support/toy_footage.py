@@ -17,7 +17,7 @@ track: {min_track_frames: 3}
 fit:
   base: paper
   window: 12
-  crop: {size_px: 64, focal_px: 541.75}
+  crop: {size_px: 64}
   terms: {keypoints: 100, pose_prior: 0.1, velocity: 0.1}
   stages:
     - {name: only, steps: 30, terms: [keypoints, pose_prior, velocity], step_scale: {transl: [1, 1, 0]}}

@@ -1,0 +1,222 @@
+"""The arguments of every command.
+
+A command names its function as `module.function` of `jaxfit.cli`. The module is imported when the command runs, so that
+`--help` and wrong arguments need no other library.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from jaxfit import __version__
+from jaxfit.config.help import option_help
+from jaxfit.config.perception import TrackConfig
+from jaxfit.video.codecs import CODECS
+
+__all__ = ["build_parser"]
+
+MODEL = "`murre`, or a model file (.npz) that `jaxfit model import` writes"
+OBSERVATIONS = "COCO file of keypoints and masks"
+
+
+def _names(text: str) -> list[str]:
+    return [name for name in text.split(",") if name]
+
+
+TRACK_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
+    "--segmenter": ("segmenter.file", {"metavar": "S.onnx"}),
+    "--keypoints": ("keypoints.file", {"metavar": "K.onnx"}),
+    "--classes": ("segmenter.classes", {"metavar": "NAME,NAME", "type": _names}),
+    "--start": ("frames.start", {"metavar": "FRAME", "type": int}),
+    "--stop": ("frames.stop", {"metavar": "FRAME", "type": int}),
+    "--step": ("frames.step", {"metavar": "N", "type": int}),
+}
+"""Option of `track` and `reconstruct` → the path of its setting in `TrackConfig`, which holds its description."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole command line."""
+    parser = argparse.ArgumentParser(prog="jaxfit", description="3D pose and shape of birds from video, on a CPU.")
+    parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
+    parser.add_argument("-v", "--verbose", action="store_true", help="print more messages")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for add_commands in (_perception, _fitting, _simulation, _training, _datasets, _models, _configs, _bench):
+        add_commands(commands)
+    return parser
+
+
+def _command(commands: Any, name: str, run: str, text: str) -> argparse.ArgumentParser:
+    """Add a command that calls the function `run` (`module.function` of `jaxfit.cli`)."""
+    command = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+    command.set_defaults(run=run)
+    return command
+
+
+def _add_model(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--model", default="murre", help=f"{MODEL} (default %(default)s)")
+
+
+def _add_truth(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--truth", type=Path, required=True, help="COCO file of annotations, or a simulated scene")
+    text = "match tracks with annotated birds by track id (ids) or by overlap; auto matches by overlap only if a track "
+    text += "follows another bird than its id says (default %(default)s)"
+    command.add_argument("--match", choices=("auto", "ids", "overlap"), default="auto", help=text)
+
+
+def _add_out(command: argparse.ArgumentParser, metavar: str, text: str, overwrite: str = "") -> None:
+    """Add `--out`, and `--overwrite` if the command can replace what is there."""
+    command.add_argument("--out", type=Path, required=True, metavar=metavar, help=text)
+    if overwrite:
+        command.add_argument("--overwrite", action="store_true", help=f"replace {overwrite}")
+
+
+def _add_codec(command: argparse.ArgumentParser) -> None:
+    text = "codec of the video (default auto: the first that is installed)"
+    command.add_argument("--codec", default="auto", choices=("auto", *CODECS), help=text)
+
+
+def _perception(commands: Any) -> None:
+    track = _command(commands, "track", "perception.track", "detect and track the birds of a video and their keypoints")
+    text = "track the birds of a video, fit their poses and draw them"
+    reconstruct = _command(commands, "reconstruct", "perception.reconstruct", text)
+    for command in (track, reconstruct):
+        command.add_argument("video", type=Path, metavar="VIDEO", help="a video, or a folder of frames")
+        text = (
+            "YAML file with `base: reconstruct` and changed settings; `jaxfit config show reconstruct` lists them all"
+        )
+        command.add_argument("--config", default="reconstruct", help=text)
+        for option, (path, details) in TRACK_OPTIONS.items():
+            text = option_help(TrackConfig, path)
+            command.add_argument(option, dest=f"track.{path}", help=text[0].lower() + text[1:], **details)
+    _add_out(track, "OBS.json", "COCO file to write", overwrite="an existing file")
+    _add_model(reconstruct)
+    _add_out(reconstruct, "DIR", "folder for the result", overwrite="an earlier result in the folder")
+
+
+def _fitting(commands: Any) -> None:
+    fit = _command(commands, "fit", "fitting.fit", "fit the poses of birds to a COCO file of keypoints and masks")
+    fit.add_argument("observations", type=Path, metavar="OBS.json", help=OBSERVATIONS)
+    _add_model(fit)
+    text = "name of a shipped config (paper, baseline, …) or a YAML file (default %(default)s)"
+    fit.add_argument("--config", default="paper", help=text)
+    text = "starting poses: the output of a pose regressor, or an earlier poses.npz"
+    fit.add_argument("--init", type=Path, metavar="POSES.npz", help=text)
+    _add_out(fit, "DIR", "folder for the result", overwrite="an earlier result in the folder")
+
+    text = "compare a result, or observations, with annotations or with the ground truth of a simulated scene"
+    evaluate = _command(commands, "evaluate", "fitting.evaluate", text)
+    evaluate.add_argument("result", type=Path, metavar="DIR|OBS.json", help="folder of a result, or a COCO file")
+    _add_truth(evaluate)
+    text = "also print the metrics by behaviour (of a simulated scene) or by keypoint"
+    evaluate.add_argument("--by", choices=("behaviour", "keypoint"), help=text)
+    text = "print JSON instead of tables, with the metrics by behaviour and keypoint"
+    evaluate.add_argument("--json", action="store_true", help=text)
+
+    text = "fit the same birds with a grid of configs and compare the results (needs the extra `report`)"
+    ablate = _command(commands, "ablate", "ablation.ablate", text)
+    ablate.add_argument("observations", type=Path, metavar="OBS.json", help=OBSERVATIONS)
+    _add_truth(ablate)
+    text = "`ablation` (34 runs, after the paper) or a YAML file (default %(default)s)"
+    ablate.add_argument("--grid", default="ablation", help=text)
+    _add_model(ablate)
+    _add_out(ablate, "DIR", "folder for runs, tables and report; an interrupted ablation continues")
+
+    overlay = _command(commands, "overlay", "fitting.overlay", "draw a result on its video")
+    overlay.add_argument("result", type=Path, metavar="DIR", help="folder of a result")
+    overlay.add_argument("--video", type=Path, required=True, help="the video (or folder of frames) of the result")
+    _add_out(overlay, "FILE", "video to write; a contact sheet (.png) is written beside it", overwrite="existing files")
+    overlay.add_argument("--observations", type=Path, metavar="OBS.json", help="also draw the detected keypoints")
+    overlay.add_argument("--side-views", action="store_true", help="also show every bird from its side")
+    overlay.add_argument("--frame", type=int, help="draw only this frame, as a picture (.png or .jpg)")
+    _add_codec(overlay)
+
+
+def _simulation(commands: Any) -> None:
+    text = "film simulated murres on a ledge and store the ground truth"
+    simulate = _command(commands, "simulate", "simulation.simulate", text)
+    _add_out(simulate, "SCENE", "folder for the scene", overwrite="an earlier scene in the folder")
+    simulate.add_argument("--birds", type=int, default=7, help="number of birds (default %(default)s)")
+    simulate.add_argument("--frames", type=int, default=100, help="number of frames (default %(default)s)")
+    simulate.add_argument("--size", default="2592x1520", help="picture size in pixels (default %(default)s)")
+    simulate.add_argument("--fps", type=float, default=25, help="frames per second (default %(default)s)")
+    text = "random seed; every seed gives another scene (default %(default)s)"
+    simulate.add_argument("--seed", type=int, default=0, help=text)
+    _add_codec(simulate)
+
+    text = "simulate a short scene, reconstruct the scene from its footage, and measure the result"
+    demo = _command(commands, "demo", "simulation.demo", text)
+    text = "folder for all files (default %(default)s)"
+    demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help=text)
+
+
+def _training(commands: Any) -> None:
+    text = "train a built-in network on simulated footage (needs the extra `train`)"
+    train = _command(commands, "train", "training.train", text)
+    train.add_argument("network", choices=("segmenter", "keypoints"), help="network to train")
+    _add_out(train, "N.onnx", "network file to write", overwrite="an existing file")
+    text = "folder of the footage; absent footage is simulated first (5 GB, default %(default)s)"
+    train.add_argument("--frames", type=Path, default=Path("training_frames"), metavar="DIR", help=text)
+    text = "number of scenes, of 10 frames each (default %(default)s)"
+    train.add_argument("--scenes", type=int, default=160, help=text)
+    train.add_argument("--steps", type=int, help="number of training steps (default: as for the built-in network)")
+    text = "random seed of the initial weights and of the sampling (default %(default)s)"
+    train.add_argument("--seed", type=int, default=0, help=text)
+
+
+def _datasets(commands: Any) -> None:
+    dataset = commands.add_parser("dataset", help="convert published data sets")
+    actions = dataset.add_subparsers(required=True, metavar="NAME")
+    text = "convert common_murre_temporal, with an inferred layout, to a COCO file"
+    murre = _command(actions, "murre", "datasets.murre", text)
+    murre.add_argument("folder", type=Path, metavar="DIR", help="folder with annotations.npy and images/")
+    text = (
+        "names of the 20 keypoints in order, separated by commas; or `murre` if the keypoints are known to be those of "
+    )
+    text += "the murre model; or `none` for numbers as names (default %(default)s)"
+    murre.add_argument("--keypoints", default="none", metavar="NAMES", help=text)
+    _add_out(murre, "OBS.json", "COCO file to write", overwrite="an existing file")
+
+
+def _models(commands: Any) -> None:
+    model = commands.add_parser("model", help="import, describe and draw bird models")
+    actions = model.add_subparsers(required=True, metavar="ACTION")
+    importer = _command(actions, "import", "models.model_import", "import a published model")
+    importer.add_argument("kind", choices=("avian-mesh", "aves"), help="kind of model")
+    importer.add_argument("sources", type=Path, nargs="+", help="files of the model, or the folder that holds them")
+    _add_out(importer, "M.npz", "model file to write")
+    info = _command(actions, "info", "models.model_info", "describe a model")
+    info.add_argument("file", metavar="MODEL", help=MODEL)
+    info.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    view = _command(actions, "view", "models.model_view", "draw a model from six sides")
+    view.add_argument("file", metavar="MODEL", help=MODEL)
+    _add_out(view, "PNG", "picture to write")
+    text = "posture of the murre: standing, incubating, … (default standing; other models have only the rest pose)"
+    view.add_argument("--posture", help=text)
+
+    prior = commands.add_parser("prior", help="learn a pose prior from results")
+    actions = prior.add_subparsers(required=True, metavar="ACTION")
+    text = "learn a pose prior from the poses of results and write a model with this prior"
+    learn = _command(actions, "learn", "models.prior_learn", text)
+    learn.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="result folders of fits of one model")
+    _add_out(learn, "P.npz", "model file to write, for `--model`")
+
+
+def _configs(commands: Any) -> None:
+    config = commands.add_parser("config", help="print the settings of configs")
+    actions = config.add_subparsers(required=True, metavar="ACTION")
+    show = _command(actions, "show", "configs.show_config", "print all settings of a config with their descriptions")
+    show.add_argument("name", metavar="NAME", help="name of a shipped config: reconstruct, paper, ablation, …")
+
+
+def _bench(commands: Any) -> None:
+    bench = _command(commands, "bench", "bench.bench", "measure speed on this machine")
+    bench.add_argument("what", choices=("silhouette", "render", "fit", "solvers"), help="part to measure")
+    bench.add_argument("--model", help=f"model to measure with, instead of the default: {MODEL}")
+    bench.add_argument("--birds", type=int, default=9, help="fit, solvers: number of birds (default %(default)s)")
+    bench.add_argument("--frames", type=int, default=100, help="fit, solvers: frames per bird (default %(default)s)")
+    text = "solvers: fit this COCO file instead of a simulation"
+    bench.add_argument("--observations", type=Path, metavar="OBS.json", help=text)
+    bench.add_argument("--plot", type=Path, metavar="PNG", help="solvers: plot the loss over time (extra `report`)")
+    bench.add_argument("--json", action="store_true", help="print JSON instead of a table")

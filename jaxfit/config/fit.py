@@ -1,0 +1,194 @@
+"""Settings of a fit: crops, starting poses, stages, terms and batches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from jaxfit.config.checks import is_number, require, require_at_least, require_positive
+from jaxfit.config.terms import check_terms, require_term, term_settings
+from jaxfit.config.yaml_file import read_config, shipped_configs
+from jaxfit.objective.registry import find_term, known_terms
+
+__all__ = ["CropConfig", "FitConfig", "InitialiseConfig", "StageConfig", "load_config", "shipped_fit_configs"]
+
+PARAMETERS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
+"""Parameters of a pose that a stage can optimise."""
+
+
+@dataclass(frozen=True)
+class CropConfig:
+    """The square crops of a bird that the fit works on."""
+
+    mode: Literal["box", "image"] = "box"
+    """`box`: a square around the bird; its size is constant in a window and its centre follows the bird.
+    `image`: the whole image, which must be square."""
+    padding: float = 0.15
+    """Margin on each side of the window's largest box, as a fraction of the box's longer side."""
+    size_px: int = 256
+    """Side of the crops in which silhouettes and masks are compared, in pixels. All other quantities in pixels refer to
+    a 256-pixel crop, so that this setting does not change the objective."""
+    focal_px: float = 2167.0
+    """Focal length of the crop camera, in pixels of a 256-pixel crop; the principal point is the middle of the crop."""
+
+    def __post_init__(self):
+        require_at_least(self, 16, "size_px")
+        require_positive(self, "focal_px")
+        require_at_least(self, 0, "padding")
+
+
+@dataclass(frozen=True)
+class InitialiseConfig:
+    """The search for starting poses, for a fit without given starting poses."""
+
+    method: Literal["viewing_axis", "so3"] = "viewing_axis"
+    """`viewing_axis`: the bird is seen from above and is rotated about the viewing axis (the paper's method).
+    `so3`: all orientations, for cameras that do not look down."""
+    turns: int = 30
+    """Number of equal rotations about the viewing axis (30 rotations of 12°)."""
+    directions: int = 100
+    """Number of viewing directions on the sphere; only for `so3`."""
+    candidates: int = 64
+    """Number of best orientations per frame from which the sequence of the window is chosen."""
+    smoothness: float = 400.0
+    """Cost of a rotation of 1 radian between consecutive frames in the choice of the sequence, in squared pixels of a
+    256-pixel crop."""
+    hypotheses: int = 1
+    """Number of distinct starting poses that are fitted side by side until a stage with `keep_best` ends."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "turns", "directions", "candidates", "hypotheses")
+        require_at_least(self, 0, "smoothness")
+
+
+@dataclass(frozen=True)
+class StageConfig:
+    """One stage of the fit: the optimised parameters, the active terms and the number of steps."""
+
+    name: str
+    """Name in progress messages and results."""
+    steps: int
+    """Number of steps of the solver."""
+    terms: tuple[str, ...]
+    """Names of the active terms; the key `terms` of the whole config holds their weights and settings."""
+    optimised: tuple[str, ...] = ("global_orient", "body_pose", "transl", "scale")
+    """Optimised parameters: global_orient, body_pose, transl, scale, bone_length, betas."""
+    solver: Literal["adam", "levenberg_marquardt"] = "adam"
+    """`adam`: for all terms. `levenberg_marquardt`: needs 10 to 20 steps instead of hundreds, but only for terms with a
+    known curvature (keypoints, pose_prior, velocity, acceleration) and with fixed bone lengths and shape."""
+    learning_rate: float = 0.01
+    """Adam's step size, in each parameter's own unit."""
+    step_scale: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+    """Parameter → factor on its step size; `transl` may have three factors (x, y, z). 0 keeps a parameter fixed, for
+    both solvers."""
+    blur: float = 1.0
+    """Blur of the silhouette's edge relative to the paper's blur; a value below 1 is sharper."""
+    keypoints_off: tuple[str, ...] = ()
+    """Names of keypoints that this stage ignores; names that the model lacks are allowed."""
+    override: Mapping[str, Any] = field(default_factory=dict)
+    """Weights and settings of terms that differ in this stage, in the form of `terms` of the whole config."""
+    carry_moments: bool = False
+    """Whether Adam starts with the moments of the previous stage instead of zeros."""
+    keep_best: bool = False
+    """Whether only the best hypothesis of each bird continues after this stage."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "steps")
+        require_positive(self, "learning_rate", "blur")
+        require(len(self.terms) > 0, "terms", "is empty", f"known: {', '.join(known_terms())}")
+        for name in self.terms:
+            require_term("terms", name)
+        for key in ("optimised", "step_scale"):
+            for name in getattr(self, key):
+                require(name in PARAMETERS, key, f"names {name!r}", f"known: {', '.join(PARAMETERS)}")
+        for name, factor in self.step_scale.items():
+            factors = factor if isinstance(factor, tuple) else (factor,)
+            valid = len(factors) == 1 or (len(factors) == 3 and name == "transl")
+            expected = "expected a number, 0 or more; `transl` may have three"
+            require(valid and all(map(is_number, factors)), f"step_scale.{name}", f"is {factor!r}", expected)
+        check_terms("override", self.override)
+        if self.solver == "levenberg_marquardt":
+            self._check_curvature()
+
+    def _check_curvature(self) -> None:
+        for name in self.terms:
+            problem = f"is levenberg_marquardt, but the curvature of the term {name!r} is unknown"
+            remedy = "use adam, or only terms with a curvature such as keypoints, pose_prior, velocity, acceleration"
+            require(find_term(name).curvature is not None, "solver", problem, remedy)
+        fixed = [name for name in self.optimised if name in ("bone_length", "betas")]
+        problem = f"is levenberg_marquardt, which cannot optimise {' and '.join(fixed)}"
+        require(not fixed, "solver", problem, "use adam, or remove them from `optimised`")
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """All settings of a fit; the defaults are the paper's best setting."""
+
+    shipped: ClassVar[str] = "paper"
+
+    stages: tuple[StageConfig, ...]
+    """The stages of the fit, in their order."""
+    terms: Mapping[str, Any]
+    """Weight of each term, as a number, or as `{weight: …, setting: …}` with settings such as sigma_px (in pixels of
+    a 256-pixel crop)."""
+    window: int = 100
+    """Number of frames that are fitted together; longer tracks are cut into windows, and 1 fits every frame alone."""
+    common_size: bool = True
+    """Whether one scale holds for the whole window, instead of one scale per frame."""
+    filter_window: int = 5
+    """Number of frames of the weighted median filter over detected keypoints; 1 switches the filter off."""
+    min_keypoints: int = 4
+    """Number of confident keypoints that a frame needs to be fitted."""
+    crop: CropConfig = CropConfig()
+    initialise: InitialiseConfig = InitialiseConfig()
+    backend: Literal["auto", "native", "reference"] = "auto"
+    """Implementation of the silhouette: the compiled kernel (`native`), the pure-JAX `reference`, or the kernel if
+    available (`auto`)."""
+    memory_gb: float = 3.0
+    """Memory that one batch may use, in GB; larger inputs are fitted in several batches."""
+
+    def __post_init__(self):
+        require_at_least(self, 1, "window", "min_keypoints")
+        odd = self.filter_window >= 1 and self.filter_window % 2 == 1
+        remedy = "expected an odd number of frames; 1 switches the filter off"
+        require(odd, "filter_window", f"is {self.filter_window}", remedy)
+        require_positive(self, "memory_gb")
+        require(len(self.stages) > 0, "stages", "is empty", "a fit needs at least one stage")
+        check_terms("terms", self.terms)
+        for i, stage in enumerate(self.stages):
+            if stage.carry_moments:
+                adam = stage.solver == self.stages[max(i - 1, 0)].solver == "adam"
+                remedy = "this stage and the previous stage must both use Adam"
+                require(adam, f"stages[{i}].carry_moments", "is true", remedy)
+
+    def stage_settings(self, stage: StageConfig) -> dict[str, dict[str, float]]:
+        """Return the weight and settings of each term of a stage: defaults, `terms`, then the stage's `override`."""
+        settings = {}
+        for name in stage.terms:
+            values = {"weight": 1.0, **find_term(name).settings}
+            for source in (self.terms, stage.override):
+                values |= term_settings(source.get(name, {}))
+            settings[name] = values
+        return settings
+
+
+def load_config(source: str | Path) -> FitConfig:
+    """Read the config of a fit.
+
+    A file may name another file or a shipped config as its `base`; the file's values replace the base's values key by
+    key.
+
+    Args:
+        source: the name of a shipped config (`paper`) or the path of a YAML file.
+
+    Raises:
+        InputError: see `read_config`.
+    """
+    return read_config(FitConfig, source)
+
+
+def shipped_fit_configs() -> list[str]:
+    """Return the names of the shipped configs of fits."""
+    return [name for name in shipped_configs() if name not in ("ablation", "reconstruct")]
