@@ -18,7 +18,7 @@ fit:
   base: paper
   window: 12
   crop: {size_px: 64}
-  terms: {keypoints: 100, pose_prior: 0.1, velocity: 0.1}
+  terms: {keypoints: 6.25, pose_prior: 0.1, velocity: 0.1}
   stages:
     - {name: only, steps: 30, terms: [keypoints, pose_prior, velocity], step_scale: {transl: [1, 1, 0]}}
 """
