@@ -275,7 +275,7 @@ def test_what_is_no_file(tmp_path):
         load_npz(tmp_path, {})
 
 
-def test_conform_names_what_disagrees():
+def test_validate_arrays_names_the_array_that_disagrees():
     layout = {"a": ("N 3", np.float32), "b": ("N", np.int64)}
     arrays = validate_arrays({"a": np.ones((2, 3), int), "b": [1, 2]}, layout)
     assert arrays["a"].dtype == np.float32
