@@ -1,4 +1,4 @@
-"""Masks as run lengths, which pycocotools keeps and COCO files hold."""
+"""Masks as run lengths, the format of pycocotools and of COCO files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["box_of_mask", "decode_mask", "encode_mask", "encode_patch"]
 
 
 def box_of_mask(mask: np.ndarray) -> tuple[int, int, int, int] | None:
-    """The tight box of an (H, W) mask: x, y of its first pixel, width, height; None of an empty mask."""
+    """Return the tight box of an (H, W) mask: x, y of the first pixel, width, height; None for an empty mask."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     if not len(rows):
         return None
@@ -20,20 +20,20 @@ def box_of_mask(mask: np.ndarray) -> tuple[int, int, int, int] | None:
 
 
 def decode_mask(rle: Mapping[str, Any]) -> np.ndarray:
-    """The mask that run lengths stand for: (H, W) bool."""
+    """Return the mask of run lengths: (H, W) bool."""
     from pycocotools import mask as coco_mask
 
     return coco_mask.decode(cast(Any, rle)).view(bool)
 
 
 def encode_mask(mask: Any) -> dict[str, Any]:
-    """Run lengths of a mask, as ``Observations.masks`` holds them.
+    """Return the run lengths of a mask, in the format of ``Observations.masks``.
 
     Args:
         mask: (H, W) bool, pixels of the image.
 
     Raises:
-        ValueError: ``mask`` has not two dimensions.
+        ValueError: ``mask`` does not have two dimensions.
     """
     from pycocotools import mask as coco_mask
 
@@ -44,19 +44,20 @@ def encode_mask(mask: Any) -> dict[str, Any]:
 
 
 def encode_patch(mask: Any, x0: int, y0: int, width: int, height: int) -> dict[str, Any]:
-    """Run lengths over a whole image of a mask that is given as a part of it; the rest is background.
+    """Return the run lengths, over a whole image, of a mask that is given for a part of the image.
 
-    They are the bytes that ``encode_mask`` gives of the whole image, without visiting it.
+    The rest of the image is background. The bytes equal the result of ``encode_mask`` for the whole image, but the
+    function reads only the part.
 
     Args:
         mask: (h, w) bool.
-        x0: column of the image in which the part begins.
-        y0: row of the image in which the part begins.
-        width: of the image.
-        height: of the image.
+        x0: first column of the part, in the image.
+        y0: first row of the part, in the image.
+        width: width of the image.
+        height: height of the image.
 
     Raises:
-        ValueError: ``mask`` has not two dimensions, or reaches out of the image.
+        ValueError: ``mask`` does not have two dimensions, or reaches beyond the image.
     """
     from pycocotools import mask as coco_mask
 
@@ -65,14 +66,14 @@ def encode_patch(mask: Any, x0: int, y0: int, width: int, height: int) -> dict[s
         raise ValueError(f"mask must have shape (h, w), not {mask.shape}")
     h, w = mask.shape
     if min(x0, y0) < 0 or x0 + w > width or y0 + h > height:
-        raise ValueError(f"a mask of {w}×{h} pixels at ({x0}, {y0}) reaches out of an image of {width}×{height}")
-    edges = np.zeros((w, h + 2), np.int8)  # column by column, as run lengths go
+        raise ValueError(f"a mask of {w}×{h} pixels at ({x0}, {y0}) reaches beyond an image of {width}×{height}")
+    edges = np.zeros((w, h + 2), np.int8)  # run lengths go column by column
     edges[:, 1:-1] = mask.T
     column, row = np.nonzero(np.diff(edges, axis=1))
     ends = (x0 + column) * height + y0 + row
-    # a run that fills a column to the bottom goes on at the top of the next: such an end and start fall away
-    goes_on = np.diff(ends, append=-1) == 0
-    ends = ends[~(goes_on | np.roll(goes_on, 1))]
+    # a run at the bottom of a column and a run at the top of the next column are one run: remove the end and start
+    continued = np.diff(ends, append=-1) == 0
+    ends = ends[~(continued | np.roll(continued, 1))]
     runs = np.diff(ends, prepend=0, append=width * height)
     if len(ends) and not runs[-1]:
         runs = runs[:-1]

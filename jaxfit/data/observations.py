@@ -1,4 +1,4 @@
-"""What was seen of the birds of one video: the container where perception and fitting meet."""
+"""Observations of the birds of one video: the container that perception writes and fitting reads."""
 
 from __future__ import annotations
 
@@ -31,49 +31,49 @@ _LAYOUT = {
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Keypoints, boxes and masks of N tracks over T frames; K keypoints a bird.
+    """Keypoints, boxes and masks of N tracks over T frames, with K keypoints per bird.
 
-    NumPy arrays, read-only and never traced. All positions are image pixels: x right, y down, the centre of
-    pixel (i, j) at (i + 0.5, j + 0.5).
+    The arrays are read-only NumPy arrays and are never traced. All positions are in image pixels: x right, y down;
+    the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
 
     Raises:
-        ValueError: shapes that contradict each other, a ``track_id`` twice, a ``frame_index`` that does not
-            increase, a confidence or score outside [0, 1], a confidence where nothing is present, a position that
-            is not finite, a mask that is not of its image's size.
+        ValueError: the shapes do not agree, a ``track_id`` occurs twice, ``frame_index`` does not increase, a
+            confidence or score is outside [0, 1], a confidence is above 0 where the bird is not present, a position is
+            not finite, or a mask does not have the size of its image.
     """
 
     track_id: np.ndarray
-    """(N,) int64: the tracks' names, each once."""
+    """(N,) int64: unique ids of the tracks."""
     frame_index: np.ndarray
-    """(T,) int64: the frames' numbers in the video, increasing; gaps are frames that the file lacks."""
+    """(T,) int64: numbers of the frames in the video, increasing; the file lacks the frames in the gaps."""
     present: np.ndarray
     """(N, T) bool: the bird has an annotation in this frame."""
     keypoints_px: np.ndarray
     """(N, T, K, 2) float32: x, y in image pixels; 0 where the confidence is 0."""
     confidence: np.ndarray
-    """(N, T, K) float32 in [0, 1]: trust in each keypoint; 0 means missing."""
+    """(N, T, K) float32 in [0, 1]: confidence of each keypoint; 0 means missing."""
     box_px: np.ndarray
     """(N, T, 4) float32: x, y of the upper left corner, width, height, image pixels; 0 where not present."""
     image_size_px: np.ndarray
-    """(T, 2) int64: width, height of the frame's image; see ``own_images``."""
+    """(T, 2) int64: width, height of the image of the frame; see ``own_images``."""
     file_name: np.ndarray
-    """(T,) str: the frame's image; see ``own_images``."""
+    """(T,) str: file name of the image of the frame; see ``own_images``."""
     keypoint_names: tuple[str, ...]
     """K names in the order of the arrays."""
     skeleton: tuple[tuple[int, int], ...] = ()
-    """Pairs of keypoints, counted from 0, that a drawing connects."""
+    """Pairs of keypoints, counted from 0, that drawings connect by a line."""
     masks: Mapping[tuple[int, int], Mapping[str, Any]] = field(default_factory=dict)
-    """(n, t) → run lengths of that bird's mask as pycocotools keeps them; use ``mask`` to read one."""
+    """(n, t) → run lengths of the mask of the bird, in the format of pycocotools; ``mask`` decodes a mask."""
     own_images: Mapping[tuple[int, int], tuple[str, int, int]] = field(default_factory=dict)
-    """(n, t) → file name, width, height, where a bird stands in another image than the frame's first: sets of
-    photographs, in which every bird is frame 0 of an image of its own. Empty for video."""
+    """(n, t) → file name, width, height, where the image of a bird is not the image of the frame: in sets of
+    photographs, every bird has frame 0 of an image of its own. Empty for video."""
     occluded: np.ndarray | None = None
-    """(N, T, K) bool: the keypoint's place is known although something hides it. None stands for nowhere."""
+    """(N, T, K) bool: the keypoint is hidden, but its position is known. None means that no keypoint is hidden."""
     amodal_masks: Mapping[tuple[int, int], Mapping[str, Any]] = field(default_factory=dict)
-    """(n, t) → run lengths of the whole bird, hidden parts included, where that is known: in simulated truth."""
+    """(n, t) → run lengths of the whole bird including hidden parts, where they are known (simulated truth)."""
     score: np.ndarray | None = None
-    """(N, T) float32 in [0, 1]: a detector's trust in the bird as a whole; 0 where not present. None stands for 1
-    where present."""
+    """(N, T) float32 in [0, 1]: score of the detection of the bird; 0 where not present. None means 1 where
+    present."""
 
     def __post_init__(self):
         occluded = np.zeros(np.shape(self.confidence), bool) if self.occluded is None else self.occluded
@@ -95,7 +95,7 @@ class Observations:
         arrays["occluded"].flags.writeable = False
         needed = {"keypoints_px": confidence[..., None] > 0, "box_px": present[..., None], "score": present}
         for name, there in needed.items():
-            # absent values are 0, so that no NaN of theirs can reach a sum
+            # absent values become 0, so that a NaN among them cannot reach a sum
             values = np.where(there, arrays[name], np.float32(0))
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite where it is not missing")
@@ -126,44 +126,46 @@ class Observations:
         return len(self.keypoint_names)
 
     def _position(self, n: int, t: int) -> tuple[int, int]:
-        return range(self.num_tracks)[n], range(self.num_frames)[t]  # counts from the end too; IndexError outside
+        return range(self.num_tracks)[n], range(self.num_frames)[
+            t
+        ]  # negative positions count from the end; IndexError outside
 
     def mask(self, n: int, t: int) -> np.ndarray | None:
-        """The bird's mask, decoded at each call.
+        """Return the mask of a bird; each call decodes the mask.
 
         Args:
             n: position of the track.
             t: position of the frame.
 
         Returns:
-            (H, W) bool in the pixels of its image, or None where there is no mask.
+            (H, W) bool, pixels of the image of the bird; None where there is no mask.
         """
         rle = self.masks.get(self._position(n, t))
         return None if rle is None else decode_mask(rle)
 
     def whole_mask(self, n: int, t: int) -> np.ndarray | None:
-        """The mask of the bird with its hidden parts, where that is known; else ``mask``."""
+        """Return the mask of the whole bird including hidden parts where it is known, else ``mask``."""
         rle = self.amodal_masks.get(self._position(n, t))
         return self.mask(n, t) if rle is None else decode_mask(rle)
 
     def image_size(self, n: int, t: int) -> tuple[int, int]:
-        """Width and height in pixels of the image that track ``n`` stands in at frame ``t``."""
+        """Return the width and height in pixels of the image of track ``n`` at frame ``t``."""
         n, t = self._position(n, t)
         own = self.own_images.get((n, t))
         return own[1:] if own else (int(self.image_size_px[t, 0]), int(self.image_size_px[t, 1]))
 
     def image_file(self, n: int, t: int) -> str:
-        """File name of the image that track ``n`` stands in at frame ``t``."""
+        """Return the file name of the image of track ``n`` at frame ``t``."""
         n, t = self._position(n, t)
         own = self.own_images.get((n, t))
         return own[0] if own else str(self.file_name[t])
 
     def usable(self, min_keypoints: int = 3, min_confidence: float = 0.0) -> np.ndarray:
-        """Where there is enough to fit.
+        """Return where a bird has enough keypoints for a fit.
 
         Args:
-            min_keypoints: fewest confident keypoints; fewer than three leave the orientation undetermined.
-            min_confidence: a keypoint is confident above this.
+            min_keypoints: fewest confident keypoints; fewer than three do not determine the orientation.
+            min_confidence: keypoints with a greater confidence are confident.
 
         Returns:
             (N, T) bool: present and with at least ``min_keypoints`` confident keypoints.
@@ -171,14 +173,11 @@ class Observations:
         return self.present & ((self.confidence > min_confidence).sum(-1) >= min_keypoints)
 
     def select(self, tracks: Any = None, frames: Any = None) -> Observations:
-        """Some tracks and frames.
+        """Return the observations of some tracks and frames.
 
         Args:
-            tracks: positions along N: a slice, integers or bools as NumPy indexes; None keeps all.
-            frames: the same along T, in increasing order.
-
-        Returns:
-            Observations of those alone.
+            tracks: positions along N as a NumPy index: a slice, integers or bools; None keeps all.
+            frames: positions along T as a NumPy index, in increasing order; None keeps all.
         """
         rows = np.arange(self.num_tracks)[slice(None) if tracks is None else tracks].reshape(-1)
         columns = np.arange(self.num_frames)[slice(None) if frames is None else frames].reshape(-1)
@@ -201,20 +200,20 @@ class Observations:
         return replace(self, **picked, **mappings)
 
     def with_keypoints(self, keypoints_px: Any, confidence: Any) -> Observations:
-        """The same birds with other keypoints, such as filtered ones.
+        """Return the same birds with other keypoints, for example filtered keypoints.
 
         Args:
             keypoints_px: (N, T, K, 2) image pixels.
             confidence: (N, T, K) in [0, 1].
 
         Raises:
-            ValueError: as the class does.
+            ValueError: as for the class.
         """
         return replace(self, keypoints_px=np.asarray(keypoints_px), confidence=np.asarray(confidence))
 
 
 def reorder_keypoints(observations: Observations, names: Sequence[str]) -> Observations:
-    """The same keypoints in the order of ``names``.
+    """Return the observations with the keypoints in the order of ``names``.
 
     Raises:
         ValueError: ``names`` is not a permutation of the observations' names.
@@ -235,15 +234,15 @@ def reorder_keypoints(observations: Observations, names: Sequence[str]) -> Obser
 
 
 def check_keypoints(observations: Observations, names: Sequence[str], source: object) -> Observations:
-    """Observations whose keypoints are the model's, in the model's order.
+    """Return the observations with the keypoints in the order of the model, after a check that the names agree.
 
     Args:
-        observations: as read.
-        names: the model's K keypoint names.
-        source: the file, for the message.
+        observations: observations with any order of keypoints.
+        names: the K keypoint names of the model.
+        source: the file, for the error message.
 
     Raises:
-        InputError: a name is missing or there is one that the model does not know.
+        InputError: a keypoint of the model is missing, or the model lacks a keypoint of the observations.
     """
     missing = [name for name in names if name not in observations.keypoint_names]
     extra = [name for name in observations.keypoint_names if name not in names]
@@ -251,5 +250,5 @@ def check_keypoints(observations: Observations, names: Sequence[str], source: ob
         parts = [f"lack {', '.join(missing)}"] if missing else []
         parts += [f"have {', '.join(extra)}, unknown to the model"] if extra else []
         problem = f"keypoints {' and '.join(parts)}"
-        raise InputError(source, problem, "rename the keypoints as the model has them, or choose another model")
+        raise InputError(source, problem, "rename the keypoints as in the model, or choose another model")
     return reorder_keypoints(observations, names)

@@ -1,4 +1,4 @@
-"""The meshes of a solution, posed again in the image."""
+"""Posed meshes of a solution, in the camera frame and in the image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["PosedBirds"]
 
 
 class PosedBirds:
-    """A solution's mesh, track by track and frame by frame (positions, not numbers)."""
+    """The posed meshes of a solution; n and t are positions of tracks and frames, not their numbers."""
 
     def __init__(self, solution: Solution, bird: Bird):
         self.solution = solution
@@ -27,32 +27,32 @@ class PosedBirds:
         return self._rig.faces
 
     def vertices_screen(self, n: int, t: int) -> Float[np.ndarray, "V 3"]:
-        """Vertices as x, y in image pixels and depth in model units."""
+        """Return the vertices of one frame: x, y in image pixels, depth in model units."""
         return self.vertices_screen_window(n, slice(t, t + 1))[0]
 
     def vertices_cam_window(self, n: int, frames: slice = slice(None)) -> Float[np.ndarray, "T V 3"]:
-        """Vertices in the camera frame of the crop, model units, of many frames in one compiled call.
+        """Return the vertices of many frames in the camera frame of the crop, model units, by one compiled call.
 
         Args:
             n: position of the track.
-            frames: positions of the frames. Slices of one length share one program.
+            frames: positions of the frames. Slices of equal length share one compiled program.
 
         Returns:
-            One mesh a frame; what stands where the solution is not valid means nothing, and may be NaN.
+            One mesh per frame; arbitrary, and possibly NaN, where the solution is not valid.
         """
         pose = jax.tree.map(lambda values: values[n, frames], self.solution.pose)
         return np.asarray(_window_cam(self._rig, pose))
 
     def vertices_screen_window(self, n: int, frames: slice = slice(None)) -> Float[np.ndarray, "T V 3"]:
-        """`vertices_screen` of many frames in one compiled call; arguments as `vertices_cam_window`."""
+        """Return `vertices_screen` of many frames, by one compiled call; arguments as for `vertices_cam_window`."""
         return self.to_image(self.vertices_cam_window(n, frames), n, frames)
 
     def to_image(
         self, vertices_cam: Float[np.ndarray, "T V 3"], n: int, frames: slice = slice(None)
     ) -> Float[np.ndarray, "T V 3"]:
-        """From the camera frame of the track's crops (model units) to image pixels and depth.
+        """Project vertices from the camera frame of the crops (model units) to image pixels and depth.
 
-        Depths of 1e-3 and less are divided by as 1e-3.
+        The divisor is at least 1e-3, also for smaller depths.
         """
         s, crop = self.solution, self.solution.crop[n, frames][:, None]
         size = crop[..., 2:]
@@ -63,5 +63,5 @@ class PosedBirds:
 
 @jax.jit
 def _window_cam(rig: Rig, pose: Pose) -> Float[Array, "T V 3"]:
-    # bone lengths and shape may differ from frame to frame here: windows of a track have their own
+    # bone lengths and shape differ between the windows of a track, so the rig cannot be folded for the whole track
     return jax.vmap(lambda frame: posed_vertices(rig, joint_transforms(rig, frame), frame))(pose)

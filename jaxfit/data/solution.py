@@ -1,4 +1,4 @@
-"""What a fit returns, and the folder of results it is kept in."""
+"""The result of a fit, and the result folder that stores it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jaxfit.storage.npz import load_npz
 __all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution", "write_solution"]
 
 FORMAT_VERSION = 1
-"""Version of ``poses.npz``; raised where an older reader would misread the file."""
+"""Version of ``poses.npz``; increased when an older reader would misread the file."""
 
 _POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
 
@@ -50,18 +50,18 @@ LAYOUT = {
 class Solution:
     """Poses of N tracks over T frames; J joints, K keypoints, S shape coefficients.
 
-    NumPy arrays, read-only. What stands where ``valid`` is False means nothing, and may be NaN.
+    The arrays are read-only NumPy arrays. Values are arbitrary, and possibly NaN, where ``valid`` is False.
 
     Raises:
-        ValueError: shapes that contradict each other, naming the array.
+        ValueError: the shapes do not agree; the message names the array.
     """
 
     track_id: np.ndarray
     """(N,) int64."""
     frame_index: np.ndarray
-    """(T,) int64: the frames' numbers in the video."""
+    """(T,) int64: numbers of the frames in the video."""
     valid: np.ndarray
-    """(N, T) bool: this bird was fitted in this frame."""
+    """(N, T) bool: the bird was fitted in this frame."""
     global_orient: np.ndarray
     """(N, T, 3) float32: axis-angle in radians, camera frame."""
     body_pose: np.ndarray
@@ -81,7 +81,7 @@ class Solution:
     crop: np.ndarray
     """(N, T, 3) float32: x0, y0, size of the square crop in image pixels."""
     image_size_px: np.ndarray
-    """(N, T, 2) int64: width, height of the picture that the bird stands in; 0 where not valid."""
+    """(N, T, 2) int64: width, height of the image of the bird; 0 where not valid."""
     focal_px: float
     """Focal length in pixels of the crop the fit works on."""
     keypoint_names: tuple[str, ...]
@@ -89,7 +89,7 @@ class Solution:
     joint_names: tuple[str, ...]
     """J names, the root first."""
     crop_px: int
-    """Side in pixels of the crop the fit works on; the camera's centre is its middle."""
+    """Side in pixels of the crop the fit works on; the principal point is the centre of the crop."""
     loss: Mapping[str, np.ndarray]
     """Term → (N,) float64: its weighted share of the final objective, summed over the track's windows that did not
     diverge; NaN where there is none."""
@@ -121,7 +121,7 @@ class Solution:
 
     @property
     def pose(self) -> Pose:
-        """The poses as the model takes them: every field (N, T, …)."""
+        """The poses as a `Pose` of the model, every field (N, T, …)."""
         return Pose(**{each.name: getattr(self, each.name) for each in fields(Pose)})
 
 
@@ -133,26 +133,26 @@ def save_solution(
     folder: str | Path,
     overwrite: bool = False,
 ) -> None:
-    """Write a folder of results, whole or not at all: ``poses.npz``, ``config.yaml``, ``summary.json``, ``model.npz``.
+    """Write a result folder, completely or not at all: ``poses.npz``, ``config.yaml``, ``summary.json``, ``model.npz``.
 
     Args:
-        solution: what to write.
-        bird: the model it was fitted with, kept with it: poses mean nothing without.
-        config_yaml: the configuration as run.
-        summary: metrics, timings, versions; NumPy values are taken, and NaN and infinities become null.
-        folder: where.
-        overwrite: replace an older folder of results, once the new one is complete.
+        solution: the result.
+        bird: the model of the fit, stored with the result, since poses have no meaning without their model.
+        config_yaml: the config of the fit.
+        summary: metrics, timings, versions; see `jaxfit.storage.json_values.json_values`.
+        folder: the folder to write.
+        overwrite: replace an older result folder, as soon as the new folder is complete.
 
     Raises:
-        InputError: the folder holds results already, or something else, or cannot be written.
-        TypeError: ``summary`` holds what JSON has no form for.
+        InputError: the folder holds results already or something else, or cannot be written.
+        TypeError: ``summary`` holds a value that JSON cannot represent.
     """
     with new_folder(folder, overwrite, marker=_POSES) as part:
         write_solution(solution, bird, config_yaml, summary, part)
 
 
 def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Mapping[str, Any], folder: Path) -> None:
-    """The files that `save_solution` writes, into a folder that exists: one that is still being made."""
+    """Write the files of `save_solution` into an existing folder, such as a temporary folder of `new_folder`."""
     summary_json = json_text(summary)
     arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in LAYOUT}
     terms = list(solution.loss)
@@ -168,14 +168,14 @@ def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Ma
 
 
 def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
-    """Read the poses of a folder of results, and the model they belong to.
+    """Read the poses of a result folder, and their model.
 
     Args:
-        folder: as ``save_solution`` wrote it.
+        folder: a folder that ``save_solution`` wrote.
 
     Raises:
-        InputError: no such folder, a file that is missing, damaged or of a newer version, or arrays whose
-            shapes contradict each other.
+        InputError: the folder does not exist; a file is missing, damaged or of a newer version; or the shapes of the
+            arrays do not agree.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -198,5 +198,5 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         raise InputError(path, str(error), "run the fit again") from error
     bird = load_bird(folder / _MODEL)
     if (bird.joint_names, bird.keypoint_names) != (solution.joint_names, solution.keypoint_names):
-        raise InputError(folder / _MODEL, f"is another model than that of {_POSES}", "run the fit again")
+        raise InputError(folder / _MODEL, f"is not the model of {_POSES}", "run the fit again")
     return solution, bird

@@ -1,4 +1,4 @@
-"""Which tracks to trust: figures that need no truth."""
+"""Quality metrics of tracks, computed from the observations alone."""
 
 from __future__ import annotations
 
@@ -14,46 +14,47 @@ __all__ = ["TrackQuality", "track_quality"]
 
 
 class TrackQuality(NamedTuple):
-    """What the observations themselves say about one track: how much of it there is, and how steady it is."""
+    """Quality of one track: completeness, confidence and steadiness."""
 
     track_id: int
     first_frame: int
     """Number of the first frame in which the bird was detected."""
     last_frame: int
-    """Number of the last one."""
+    """Number of the last frame in which the bird was detected."""
     frames: int
-    """In how many it was detected."""
+    """How many frames have a detection of the bird."""
     gaps: int
-    """How often it was missed for a time, between the first and the last."""
+    """Number of interruptions of the detections between the first and the last frame."""
     coverage: float
-    """Share of the frames from the first to the last in which it was detected; those that the file lacks count too."""
+    """Fraction of the frames from the first to the last with a detection; frames missing in the file count too."""
     mean_confidence: float
-    """Of all keypoints over the frames with a detection; 0 for a keypoint that was missed."""
+    """Mean confidence of all keypoints over the frames with a detection; a missing keypoint counts as 0."""
     jitter: float | None
-    """Median of |p(t−1) − 2 p(t) + p(t+1)| over the longer side of the box at t, where a keypoint's position p is known
-    in three consecutive frames with confidence of ½ or more; None where there is no such place. White noise of
-    standard deviation σ in x and y gives 2.88 σ; steady motion gives nothing."""
+    """Median of |p(t−1) − 2 p(t) + p(t+1)| / (longer side of the box at t), where the position p of a keypoint has a
+    confidence of at least ½ in three consecutive frames; None without three such frames. White noise of standard
+    deviation σ in x and y gives 2.88 σ; motion of constant velocity gives 0."""
 
 
 CONFIDENT = 0.5
+"""Least confidence of a keypoint that counts for the jitter."""
 
 
 def track_quality(observations: Observations) -> list[TrackQuality]:
-    """Quality figures of every track that is present somewhere, in the order of the tracks.
+    """Return the quality of every track with a detection, in the order of the tracks.
 
-    Frames are consecutive where their numbers differ by the file's own step, the greatest that divides all differences.
+    Frames are consecutive where their numbers differ by the step of the file (`frame_step`).
     """
     numbers = observations.frame_index
     step = frame_step(numbers)
     jitter = _second_differences(observations)
-    found = []
+    qualities = []
     for n in range(observations.num_tracks):
         at = np.flatnonzero(observations.present[n])
         if not len(at):
             continue
         first, last = int(numbers[at[0]]), int(numbers[at[-1]])
         own = jitter[n][np.isfinite(jitter[n])]
-        found.append(
+        qualities.append(
             TrackQuality(
                 track_id=int(observations.track_id[n]),
                 first_frame=first,
@@ -65,16 +66,15 @@ def track_quality(observations: Observations) -> list[TrackQuality]:
                 jitter=float(np.median(own)) if len(own) else None,
             )
         )
-    return found
+    return qualities
 
 
 def _second_differences(observations: Observations) -> Float[np.ndarray, "N M K"]:
-    """Length of the second difference at each of the M = T − 2 inner frames, in longer sides of the box; NaN where it
-    is not known."""
+    """Return |p(t−1) − 2 p(t) + p(t+1)| / (longer side of the box) at the M = T − 2 inner frames; NaN where unknown."""
     points = observations.keypoints_px.astype(np.float64)
     known = observations.confidence >= CONFIDENT
     side = observations.box_px[:, 1:-1, 2:].max(-1)
-    beside = consecutive(observations.frame_index)[None, :, None]
-    known = known[:, :-2] & known[:, 1:-1] & known[:, 2:] & beside[:, :-1] & beside[:, 1:] & (side > 0)[..., None]
-    bent = np.linalg.norm(points[:, :-2] - 2 * points[:, 1:-1] + points[:, 2:], axis=-1)
-    return np.where(known, bent / np.where(side > 0, side, 1)[..., None], np.nan)
+    next_to = consecutive(observations.frame_index)[None, :, None]
+    known = known[:, :-2] & known[:, 1:-1] & known[:, 2:] & next_to[:, :-1] & next_to[:, 1:] & (side > 0)[..., None]
+    difference = np.linalg.norm(points[:, :-2] - 2 * points[:, 1:-1] + points[:, 2:], axis=-1)
+    return np.where(known, difference / np.where(side > 0, side, 1)[..., None], np.nan)

@@ -1,1 +1,1 @@
-"""Pictures for people."""
+"""Drawings of results: overlays, contact sheets, views of a model."""

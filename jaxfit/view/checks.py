@@ -1,4 +1,4 @@
-"""Whether a video is the one that a result belongs to, and whether an overlay may take the names it asks for."""
+"""Checks of an overlay: video, result and observations agree, and the output files may be written."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _REMEDY = "give the video that the result was fitted to"
 
 
 def check_belongs(solution: Solution, observations: Observations | None, video: Path, info: VideoInfo) -> None:
-    """Raise InputError where the result, the video or the observations are not of the same pictures."""
+    """Raise InputError where the result, the video and the observations do not have the same frames and image sizes."""
     if not solution.valid.any():
-        raise InputError("result", "holds no valid pose: there is nothing to draw", "see its status by track")
+        raise InputError("result", "holds no valid pose, so there is nothing to draw", "see the status of each track")
     if info.frames is not None and int(solution.frame_index[-1]) >= info.frames:
         raise too_short(video, solution, info.frames)
     width, height = info.size_px
     sizes = solution.image_size_px[solution.valid]
     other = sizes[(sizes != info.size_px).any(1)]
     if len(other):
-        problem = f"is {width}×{height}, but the result was fitted to pictures of {other[0, 0]}×{other[0, 1]}"
+        problem = f"is {width}×{height}, but the result was fitted to images of {other[0, 0]}×{other[0, 1]}"
         raise InputError(video, problem, _REMEDY)
     if observations is None:
         return
@@ -36,21 +36,21 @@ def check_belongs(solution: Solution, observations: Observations | None, video: 
         np.isin(solution.track_id, observations.track_id).any()
         and np.isin(solution.frame_index, observations.frame_index).any()
     ):
-        problem = "hold none of the result's birds: no track or no frame has the same number"
+        problem = "hold no bird of the result: they share no track id or no frame number"
         raise InputError("observations", problem, remedy)
     seen = tuple(int(side) for side in observations.image_size_px[0])
     if seen != info.size_px:
-        problem = f"are of {seen[0]}×{seen[1]} pictures, but the video is {width}×{height}"
+        problem = f"are of {seen[0]}×{seen[1]} images, but the video is {width}×{height}"
         raise InputError("observations", problem, remedy)
 
 
 def check_outputs(outputs: list[Path], video: Path, overwrite: bool) -> None:
-    """Raise InputError where writing would destroy the footage, or something else unasked.
+    """Raise InputError where an output file would replace the footage, or another file without `overwrite`.
 
     Args:
         outputs: the files to write.
-        video: the footage, which exists: nothing may take its place, nor join its images.
-        overwrite: other files of these names may be replaced.
+        video: the footage, a file or a folder of images; outputs must not replace it or lie in the folder.
+        overwrite: whether other files may be replaced.
     """
     for out in outputs:
         if out.exists() and out.samefile(video):
@@ -61,7 +61,7 @@ def check_outputs(outputs: list[Path], video: Path, overwrite: bool) -> None:
 
 
 def too_short(video: Path, solution: Solution, frames: int) -> InputError:
-    """The error of a video of so many frames, which are fewer than the result's."""
+    """Return the error about a video with fewer frames than the result."""
     first, last = int(solution.frame_index[0]), int(solution.frame_index[-1])
     problem = f"has {frames} frames, but the result has frames {first} to {last}, counted from 0"
     return InputError(video, problem, _REMEDY)

@@ -1,4 +1,4 @@
-"""What was detected of a result's birds, found by the numbers of track and frame."""
+"""Observations of the birds of a result, matched by track id and frame number."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ __all__ = ["Detected"]
 
 
 class Detected:
-    """The observations of a result's birds; nothing where there are none.
+    """Access to the observations by positions of tracks and frames in a result.
 
     Args:
         solution: the result.
-        observations: what it was fitted to, or others of the same video; None for none.
+        observations: the observations of the fit, or others of the same video; None for no observations.
 
     Raises:
         InputError: the observations have other keypoints than the result.
@@ -34,14 +34,14 @@ class Detected:
         self._columns = {t: columns[int(f)] for t, f in enumerate(solution.frame_index) if int(f) in columns}
 
     def keypoints(self, n: int, t: int) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, "K"]]:
-        """Keypoints in image pixels and their confidence, of the result's positions; 0 where nothing is known."""
+        """Return keypoints (image pixels) and confidence at positions of the result; 0 without an observation."""
         if n not in self._rows or t not in self._columns:
             return np.zeros((self._count, 2), np.float32), np.zeros(self._count, np.float32)
         at = self._rows[n], self._columns[t]
         return self._observations.keypoints_px[at], self._observations.confidence[at]
 
     def mask(self, n: int, t: int) -> Bool[np.ndarray, "H W"] | None:
-        """The bird's mask, or None where there is none."""
+        """Return the mask of the bird, or None without a mask."""
         if n not in self._rows or t not in self._columns:
             return None
         return self._observations.mask(self._rows[n], self._columns[t])

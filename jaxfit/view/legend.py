@@ -1,4 +1,4 @@
-"""The line below an overlay's picture: which frame it is and what the signs mean."""
+"""The legend below the image of an overlay: number of the frame and meaning of the symbols."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from jaxfit.view.marks import DETECTED, FITTED, PAPER, dot, line, ring, tag, tex
 
 __all__ = ["Legend"]
 
-_Sign = Callable[[np.ndarray, float, float, float], None]
+_Symbol = Callable[[np.ndarray, float, float, float], None]
 
 
 class Legend:
-    """Laid out once, in as many lines as the width needs; drawn with each frame's number.
+    """A legend with a fixed layout, in as many lines as the width requires; the frame number changes.
 
     Args:
-        width: pixels.
-        style: of the overlay.
-        detected: say what rings are.
-        side_views: say how the side views stand.
+        width: width in pixels.
+        style: style of the overlay.
+        detected: explain the rings of detected keypoints.
+        side_views: explain the side views.
     """
 
     def __init__(self, width: int, style: Style, detected: bool, side_views: bool):
         self._style, size = style, style.text_px
-        entries: list[tuple[_Sign, str]] = [(self._number, "bird (track)"), (self._mesh, "fitted bird")]
+        entries: list[tuple[_Symbol, str]] = [(self._number, "bird (track)"), (self._mesh, "fitted bird")]
         entries.append((self._fitted, "fitted keypoint"))
         if detected:
             entries.append((self._detected, "detected keypoint"))
@@ -37,22 +37,22 @@ class Legend:
         gap, left, right, row = 1.2 * size, 0.8 * size, width - 0.8 * size, 0
         x = left + text_width("frame 000000   00:00:00.00", size) + 2 * gap
         places = []
-        for sign, words in entries:
+        for symbol, words in entries:
             wide = 2.6 * size + text_width(words, size)
             if x + wide > right and x > left:
                 x, row = left, row + 1
-            places.append((sign, words, x, row))
+            places.append((symbol, words, x, row))
             x += wide + 1.5 * gap
         self._line = 2.2 * size
         self.height = round((row + 1) * self._line)
         self._ground = np.full((self.height, width, 3), PAPER, np.uint8)
-        for sign, words, x, row in places:
+        for symbol, words, x, row in places:
             middle = (row + 0.5) * self._line
-            sign(self._ground, x, middle, size)
+            symbol(self._ground, x, middle, size)
             text(self._ground, words, x + (2.1 * size if words[:5] != "below" else 0), middle, size)
 
     def draw(self, number: int, seconds: float) -> UInt8[np.ndarray, "H W 3"]:
-        """The line for the frame of this number and time from the video's start."""
+        """Return the legend for the frame with this number and time since the start of the video."""
         image, size = self._ground.copy(), self._style.text_px
         minutes, rest = divmod(seconds, 60)
         hours, minutes = divmod(int(minutes), 60)

@@ -1,4 +1,4 @@
-"""What the pictures are drawn with: colours of the tracks, text, dots, rings and lines."""
+"""Drawing primitives: colours of tracks, text, dots, rings and lines."""
 
 from __future__ import annotations
 
@@ -49,34 +49,35 @@ TRACK_COLOURS: tuple[Colour, ...] = (
     (230, 110, 150),  # violet
     (210, 245, 190),  # mint
 )
-"""One a track, then again from the first. The first seven are Okabe and Ito's, the dark ones made lighter, which
-people with any colour vision tell apart; all stand out from dark and from white plumage."""
+"""Colours of the tracks in order, repeated after the last. The first seven are the colours of Okabe and Ito with the
+dark colours made lighter; people with any colour vision can distinguish them. All contrast with dark and with white
+plumage."""
 
 PLUMAGE_SHARE = 0.4
-"""Share of its own colour that a drawn bird keeps; the rest is the track's."""
+"""Weight of the model's colours in the colours of a drawn bird; the rest is the colour of the track."""
 
-SHIFT = 4  # OpenCV draws at sixteenths of a pixel; its pixel centres are whole numbers, ours are halves
+SHIFT = 4  # OpenCV draws in units of 1/16 pixel; pixel centres are whole numbers in OpenCV, halves in jaxfit
 
 
 def track_colour(n: int) -> Colour:
-    """Colour of the track at position `n`."""
+    """Return the colour of the track at position `n`."""
     return TRACK_COLOURS[n % len(TRACK_COLOURS)]
 
 
 def tinted(vertex_colours: Float[np.ndarray, "V 3"], n: int, share: float = PLUMAGE_SHARE) -> Float[np.ndarray, "V 3"]:
-    """A model's colours (red, green, blue) with the track's among them: blue, green, red in [0, 1]."""
+    """Mix a model's colours (red, green, blue) with the colour of a track: blue, green, red in [0, 1]."""
     own = np.asarray(vertex_colours, np.float32)[:, ::-1]
     return share * own + (1 - share) * np.array(track_colour(n), np.float32) / 255
 
 
 def fixed(point_px: Float[np.ndarray, "2"] | tuple[float, float]) -> tuple[int, int]:
-    """A position in image pixels as OpenCV takes it with `SHIFT`."""
+    """Convert a position in image pixels to OpenCV's fixed-point numbers with `SHIFT`."""
     x, y = np.clip(np.round((np.asarray(point_px, np.float64) - 0.5) * (1 << SHIFT)), -(2**19), 2**19)
     return int(x), int(y)
 
 
 def dot(image: UInt8[np.ndarray, "H W 3"], point_px, radius: float, colour: Colour, edge: Colour | None = INK) -> None:
-    """A filled circle with a thin edge."""
+    """Draw a filled circle with a thin edge."""
     at = fixed(point_px)
     if edge is not None:
         cv2.circle(image, at, round((radius + 0.8) * (1 << SHIFT)), edge, -1, cv2.LINE_AA, SHIFT)
@@ -91,7 +92,7 @@ def ring(
     width: int = 1,
     edge: Colour | None = INK,
 ) -> None:
-    """A circle, with an edge on both sides of it so that it shows on any ground."""
+    """Draw a circle with an edge on both sides, so that it contrasts with any background."""
     at = fixed(point_px)
     if edge is not None:
         cv2.circle(image, at, round(radius * (1 << SHIFT)), edge, width + 1, cv2.LINE_AA, SHIFT)
@@ -99,12 +100,12 @@ def ring(
 
 
 def line(image: UInt8[np.ndarray, "H W 3"], a_px, b_px, colour: Colour, width: int = 1) -> None:
-    """A straight line between two positions in pixels."""
+    """Draw a straight line between two positions in pixels."""
     cv2.line(image, fixed(a_px), fixed(b_px), colour, width, cv2.LINE_AA, SHIFT)
 
 
 def text(image: UInt8[np.ndarray, "H W 3"], words: str, left: float, middle: float, size: float, colour=INK) -> None:
-    """Words from `left` on, as high as `size` pixels, centred about the row `middle`."""
+    """Draw text from column `left` on, `size` pixels high, vertically centred on row `middle`."""
     cv2.putText(
         image,
         words,
@@ -118,12 +119,12 @@ def text(image: UInt8[np.ndarray, "H W 3"], words: str, left: float, middle: flo
 
 
 def text_width(words: str, size: float) -> int:
-    """Pixels that `text` takes from left to right."""
+    """Return the width in pixels of a `text`."""
     return cv2.getTextSize(words, cv2.FONT_HERSHEY_SIMPLEX, size / 26, max(1, round(size / 13)))[0][0]
 
 
 def tag(image: UInt8[np.ndarray, "H W 3"], words: str, left: float, middle: float, size: float, colour: Colour) -> int:
-    """Words on a coloured plate; returns its width in pixels."""
+    """Draw text on a coloured plate, and return the width of the plate in pixels."""
     width = text_width(words, size) + round(0.9 * size)
     low, high = (round(left), round(middle - 0.85 * size)), (round(left) + width, round(middle + 0.85 * size))
     cv2.rectangle(image, low, high, colour, -1)
@@ -134,7 +135,7 @@ def tag(image: UInt8[np.ndarray, "H W 3"], words: str, left: float, middle: floa
 
 
 def write_png(path: str | Path, image: UInt8[np.ndarray, "H W 3"]) -> None:
-    """Write a picture (blue, green, red) as a PNG, whole or not at all."""
+    """Write an image (blue, green, red) as a PNG, completely or not at all."""
     written, png = cv2.imencode(".png", image)
     if not written:
         raise RuntimeError("OpenCV could not encode a PNG")

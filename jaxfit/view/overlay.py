@@ -1,4 +1,4 @@
-"""A result drawn over its video: what `jaxfit overlay` writes."""
+"""Overlay of a result on its video."""
 
 from __future__ import annotations
 
@@ -31,12 +31,13 @@ from jaxfit.view.side import SideViews
 
 __all__ = ["Overlay", "overlay", "overlay_frame"]
 
-CHUNK = 32  # frames whose meshes are posed in one call: memory stays small, however long the video
+CHUNK = 32  # frames posed in one call, so that the memory does not depend on the length of the video
 FOLDER_FPS = 25.0
+"""Frame rate of the overlay of a folder of images, which has no frame rate of its own."""
 
 
 class Overlay(NamedTuple):
-    """What was written."""
+    """The files of an overlay and their properties."""
 
     video: Path
     sheet: Path
@@ -48,7 +49,7 @@ class Overlay(NamedTuple):
     codec: str
     """Name of `jaxfit.video.codecs.CODECS`."""
     fallback: bool
-    """Whether the codec is another than the one asked for; a warning says so."""
+    """Whether the codec differs from the requested codec; a warning reports this."""
 
 
 def overlay(
@@ -64,35 +65,35 @@ def overlay(
     overwrite: bool = False,
     progress: ProgressTask = silent,
 ) -> Overlay:
-    """Draw the birds of a result over its video, and a contact sheet beside it.
+    """Draw the birds of a result over its video, and write a contact sheet beside the video.
 
-    From the first frame of the result to its last: meshes, see-through and outlined in the track's colour, fitted
-    keypoints as dots, detected ones as rings, the track's number at the head. Where birds overlap, see `draw_birds`
-    for which hides the other. Below the picture stand the frame's number and what the signs mean and, if asked for,
-    every bird from its left (`SideViews`). A result of every n-th frame gives a video of those alone, n times slower
-    in frames a second; frames that the result lacks in between show the footage.
+    The overlay shows the frames from the first to the last frame of the result. It shows the meshes, transparent and
+    outlined in the colour of the track; fitted keypoints as dots, detected keypoints as rings; and the track number at
+    the head. `draw_birds` defines the order of overlapping birds. Below the image are a legend and, with `side_views`,
+    every bird from its left (`SideViews`). The overlay of a result of every n-th frame has these frames only, at 1/n of
+    the frame rate; frames that the result lacks between them show the footage.
 
     Args:
         solution: the result.
-        bird: its model.
-        video: the file, or folder of images, that the result belongs to.
-        out: ``.mp4`` or ``.webm`` to write; the contact sheet has the same name and ends in ``.png``.
+        bird: the model of the result.
+        video: the video of the result, a file or a folder of images.
+        out: the ``.mp4`` or ``.webm`` to write; the contact sheet has the same name with the suffix ``.png``.
         observations: detected keypoints to draw.
         side_views: add the strip of side views.
-        max_width: wider video is made smaller to this many pixels; None keeps its size.
-        codec: of `VideoWriter`.
-        overwrite: replace files of these names; never the footage.
-        progress: told of every frame.
+        max_width: greatest width in pixels; a wider video is scaled down. None keeps the size.
+        codec: codec of `VideoWriter`.
+        overwrite: replace existing output files, but never the footage.
+        progress: shows the progress over frames.
 
     Returns:
-        What was written.
+        The written files and their properties.
 
     Raises:
         ValueError: `max_width` below 16.
-        InputError: no such video; the result does not belong to it (its frames are not in the video, or it was
-            fitted to pictures of another size, or `observations` are of such or of other birds); a result without a
-            single valid pose; files of these names that `overwrite` does not give away, or that are the footage; a
-            codec that `out` cannot hold; the system refuses the write. Nothing is written then.
+        InputError: the video does not exist; the video lacks frames of the result or has another image size; the
+            observations have another image size or share no bird with the result; the result has no valid pose; an
+            output file exists without `overwrite`, or is the footage; `out` cannot hold the codec; or the system
+            rejects the write. Nothing is written then.
     """
     video, out = Path(video), Path(out)
     if max_width is not None and max_width < 16:
@@ -144,25 +145,25 @@ def overlay_frame(
     max_width: int | None = 1920,
     overwrite: bool = False,
 ) -> None:
-    """Draw one frame as `overlay` does, and write it as a picture.
+    """Draw one frame as `overlay` does, and write the image.
 
     Args:
-        frame_index: its number in the video.
-        out: ``.png`` or ``.jpg``.
+        frame_index: number of the frame in the video.
+        out: the ``.png`` or ``.jpg`` to write.
         solution, bird, video, observations, side_views, max_width, overwrite: as for `overlay`.
 
     Raises:
-        InputError: as `overlay` does; the result lacks the frame; `out` is neither kind of picture.
+        InputError: as for `overlay`; or the result lacks the frame, or `out` has another suffix.
     """
     video, out = Path(video), Path(out)
     info = probe_video(video)
     check_outputs([out], video, overwrite)
     check_belongs(solution, observations, video, info)
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise InputError(out, f"a picture cannot end in {out.suffix!r}", "give a name that ends in .png or .jpg")
+        raise InputError(out, f"an image cannot end in {out.suffix!r}", "give a name that ends in .png or .jpg")
     if frame_index not in solution.frame_index:
         problem = f"has no frame {frame_index}: its frames are {solution.frame_index[0]} to {solution.frame_index[-1]}"
-        raise InputError("result", problem, "give one of them")
+        raise InputError("result", problem, "give one of these frames")
     drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
     for number, picture, _ in read_frames(video, frame_index, frame_index + 1):
         t, seconds = int(np.searchsorted(solution.frame_index, number)), number / (info.fps or FOLDER_FPS)
@@ -173,7 +174,7 @@ def overlay_frame(
 
 
 class _Drawing:
-    """Draws frame after frame, in increasing order."""
+    """Draws the frames of an overlay, in increasing order."""
 
     def __init__(
         self,
@@ -187,7 +188,7 @@ class _Drawing:
         width, height = info.size_px
         self.zoom = 1.0 if max_width is None else min(1.0, max_width / width)
         self.picture_px = round(width * self.zoom), max(1, round(height * self.zoom))
-        # far faster, and as good where every pixel still counts
+        # linear interpolation is much faster, and as good while it still reads every pixel
         self._shrink = cv2.INTER_LINEAR if self.zoom > 0.6 else cv2.INTER_AREA
         self.solution, self.posed = solution, PosedBirds(solution, bird)
         extent = np.ptp(solution.keypoints_px[solution.valid], axis=1).max(-1)
@@ -207,7 +208,7 @@ class _Drawing:
     def frame(
         self, picture: UInt8[np.ndarray, "H W 3"], number: int, t: int | None, seconds: float
     ) -> UInt8[np.ndarray, "H2 W2 3"]:
-        """The picture of a frame with everything drawn; `t` is its position in the result, if it is in it."""
+        """Return the drawn image of a frame; `t` is the position in the result, None if the result lacks the frame."""
         image = picture.copy() if self.zoom == 1 else cv2.resize(picture, self.picture_px, interpolation=self._shrink)
         shown = np.zeros(len(self.solution.track_id), bool) if t is None else self.solution.valid[:, t]
         birds = [] if t is None else [self._bird(n, t) for n in np.flatnonzero(shown).tolist()]
@@ -236,9 +237,9 @@ class _Drawing:
         )
 
     def _vertices_cam(self, n: int, t: int) -> Float[np.ndarray, "V 3"]:
-        """Of the chunk of frames that holds `t`, which is posed when its first frame comes."""
+        """Return the mesh of a bird; all meshes of a chunk of frames are posed together, when the chunk begins."""
         if not self._start <= t < self._start + self._cam.shape[1]:
-            # the last chunk reaches back instead of being shorter: one length, one compilation
+            # the last chunk starts earlier instead of being shorter: all chunks have one length and one compilation
             self._start = max(0, min(t, len(self.solution.frame_index) - CHUNK))
             span = slice(self._start, self._start + CHUNK)
             self._cam = np.stack([self.posed.vertices_cam_window(i, span) for i in range(len(self.solution.track_id))])

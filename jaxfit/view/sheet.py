@@ -1,4 +1,4 @@
-"""A contact sheet: every bird of a result beside what was seen of it."""
+"""Contact sheet: birds of a result beside their observations."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ SEEN, OUTLINE = (205, 205, 205), (60, 140, 30)
 ON_PAPER_FITTED, ON_PAPER_DETECTED = (40, 40, 220), (30, 30, 30)
 """Colours, BGR: annotated mask, outline of the mesh, its keypoints, annotated keypoints."""
 PALE = (0.85, 0.9, 0.95)
-"""What the mesh's own colours are lightened with, BGR in [0, 1]: on dark plumage no light shows the form."""
+"""Colour that is mixed with the colours of the model, BGR in [0, 1], since shading is invisible on dark plumage."""
 
 
 def sheet_pairs(solution: Solution, frames: int = 4, most: int = 24) -> list[list[tuple[int, int]]]:
-    """Which birds a sheet of a video shows: a row for each track, evenly spaced among the frames it is fitted in.
+    """Select the birds and frames of the sheet of a video: one row per track, with evenly spaced valid frames.
 
     Args:
         solution: the result.
-        frames: in a row.
-        most: rows at most, taken evenly over the tracks that have a valid frame.
+        frames: number of frames in a row.
+        most: greatest number of rows; tracks with a valid frame are selected evenly.
 
     Returns:
         Rows of positions (n, t).
@@ -51,12 +51,12 @@ def sheet_pairs(solution: Solution, frames: int = 4, most: int = 24) -> list[lis
 def cut_tiles(
     posed: PosedBirds, picture: UInt8[np.ndarray, "H W 3"], pairs: list[tuple[int, int]]
 ) -> dict[tuple[int, int], UInt8[np.ndarray, "S S 3"]]:
-    """The places of birds in the picture of their frame, as `contact_sheet` takes them; black beyond its edges."""
+    """Cut the tiles of birds out of the image of their frame, for `contact_sheet`; black beyond the edges."""
     tiles = {}
     for n, t in pairs:
         x0, y0, size = _window(posed, n, t)
         zoom = TILE_PX / size
-        # pixel centres lie at halves here and at whole numbers in OpenCV
+        # pixel centres are halves in jaxfit and whole numbers in OpenCV
         place = np.array([[zoom, 0, (0.5 - x0) * zoom - 0.5], [0, zoom, (0.5 - y0) * zoom - 0.5]])
         tiles[n, t] = cv2.warpAffine(picture, place, (TILE_PX, TILE_PX), flags=cv2.INTER_LINEAR)
     return tiles
@@ -71,24 +71,24 @@ def contact_sheet(
     most: int = 24,
     footage: Mapping[tuple[int, int], UInt8[np.ndarray, "S S 3"]] | None = None,
 ) -> None:
-    """Draw birds of a result as pairs of tiles and write them as one PNG.
+    """Draw birds of a result as pairs of tiles, and write one PNG.
 
-    Left tile: the annotated mask (grey) and keypoints (black rings), the fitted mesh's outline (green) and
-    keypoints (red), joined to the annotated ones. With footage: its picture, with the mesh's outline in the
-    track's colour, fitted keypoints as white dots and annotated ones as yellow rings. Right tile: the mesh as
-    the camera sees it, lit from above.
+    Left tile: the annotated mask (grey) and keypoints (black rings), the outline of the fitted mesh (green) and the
+    fitted keypoints (red), with lines to the annotated keypoints. With footage, the left tile shows the footage, the
+    outline of the mesh in the colour of the track, fitted keypoints as white dots and annotated keypoints as yellow
+    rings. Right tile: the mesh as the camera sees it, lit from above.
 
     Args:
         solution, bird: a result and its model.
-        observations: what it was fitted to; tracks and frames are found by their numbers.
+        observations: the observations of the fit; tracks and frames are matched by their numbers.
         path: PNG file to write.
-        columns: pairs in a row.
-        most: pairs at most, taken evenly over birds and frames; with footage, rows at most.
-        footage: (n, t) → tile of the footage, of `cut_tiles`; the sheet then has a row for each track
+        columns: number of pairs in a row.
+        most: greatest number of pairs, selected evenly over birds and frames; with footage, greatest number of rows.
+        footage: (n, t) → tile of the footage, from `cut_tiles`; the sheet then has one row per track
             (`sheet_pairs`).
 
     Raises:
-        InputError: the system refuses the write.
+        InputError: the system rejects the write.
     """
     posed = PosedBirds(solution, bird)
     if footage is not None:
@@ -105,13 +105,13 @@ def contact_sheet(
         tiles = []
         for n, t in row:
             ground = None if footage is None else footage.get((n, t))
-            tiles.append(np.hstack([_evidence(posed, detected, n, t, ground), _mesh(posed, n, t, colours)]))
+            tiles.append(np.hstack([_observed_tile(posed, detected, n, t, ground), _mesh_tile(posed, n, t, colours)]))
         drawn.append(np.hstack(tiles + [blank] * (columns - len(row))))
     write_png(path, np.vstack(drawn))
 
 
 def _window(posed: PosedBirds, n: int, t: int) -> Float[np.ndarray, "3"]:
-    """x0, y0 and size of the square that a tile shows: the crop, unless the bird is lost in it."""
+    """Return x0, y0, size of the square of a tile: the crop, or a smaller square if the bird is small in the crop."""
     crop = posed.solution.crop[n, t]
     points = posed.solution.keypoints_px[n, t]
     low, high = points.min(0), points.max(0)
@@ -123,7 +123,7 @@ def _to_tile(points_px: np.ndarray, window: np.ndarray) -> np.ndarray:
     return (points_px - window[:2]) * (TILE_PX / window[2])
 
 
-def _evidence(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np.ndarray | None) -> np.ndarray:
+def _observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np.ndarray | None) -> np.ndarray:
     solution, window = posed.solution, _window(posed, n, t)
     tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8) if footage is None else footage.copy()
     mask = detected.mask(n, t) if footage is None else None
@@ -157,8 +157,8 @@ def _evidence(posed: PosedBirds, detected: Detected, n: int, t: int, footage: np
     return tile
 
 
-def _mesh(posed: PosedBirds, n: int, t: int, colours: Float[np.ndarray, "V 3"]) -> np.ndarray:
-    """The mesh from the camera, lit."""
+def _mesh_tile(posed: PosedBirds, n: int, t: int, colours: Float[np.ndarray, "V 3"]) -> np.ndarray:
+    """Return the tile of the mesh as the camera sees it, after shading."""
     here, faces, window = slice(t, t + 1), np.asarray(posed.faces), _window(posed, n, t)
     cam = posed.vertices_cam_window(n, here)
     screen, lit = posed.to_image(cam, n, here)[0], shade(cam[0], faces, colours)

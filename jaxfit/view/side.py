@@ -1,4 +1,4 @@
-"""Birds seen from their left: the strip below an overlay, a tile for each track."""
+"""Side views: the strip below an overlay with every bird seen from its left, one tile per track."""
 
 from __future__ import annotations
 
@@ -17,39 +17,40 @@ from jaxfit.view.marks import PAPER, tag, text, tinted, track_colour
 __all__ = ["SideViews", "up_direction"]
 
 LIGHT = (-0.35, -0.6, -0.7)
-"""From the bird towards the light: above the camera's left shoulder."""
+"""Direction from the bird to the light, which is above and to the left of the camera."""
 FOOT_WORDS = ("foot", "toe", "shin", "ankle")
 
 
 def up_direction(solution: Solution) -> Float[np.ndarray, "3"]:
-    """Which way is up, in the camera frame: a unit vector.
+    """Estimate the upward direction in the camera frame: a unit vector.
 
-    Nothing in a video says so; birds do. One that stands carries its weight above its feet, so up is the mean
-    over all birds and frames of the way from the feet to the other keypoints, in which the ways that they lean
-    cancel as they face about. A model without feet gives the image's up.
+    A standing bird has its body above its feet. So up is the mean over all birds and frames of the direction from the
+    feet to the other keypoints; the leans of birds that face different directions cancel. Without keypoints on the
+    feet, up is the upward direction of the image.
     """
     names, valid = solution.keypoint_names, solution.valid
     feet = np.array([any(word in name for word in FOOT_WORDS) for name in names], bool)
     if not feet.any() or feet.all() or not valid.any():
         return np.array([0.0, -1.0, 0.0])
     points = solution.keypoints_cam[valid].astype(np.float64)
-    ways = points[:, ~feet].mean(1) - points[:, feet].mean(1)
-    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
-    total = ways.mean(0)
+    directions = points[:, ~feet].mean(1) - points[:, feet].mean(1)
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
+    total = directions.mean(0)
     length = np.linalg.norm(total)
     return total / length if length > 0.1 else np.array([0.0, -1.0, 0.0])
 
 
 class SideViews:
-    """Draws a strip with every track's bird alone, seen level from its left, so facing left; one layout for all frames.
+    """Draws a strip with one tile per track; each tile shows the bird from its left at eye level, so it faces left.
 
-    All birds have one size, whatever the fit's scale; the camera is so far away that lines stay parallel.
+    The layout is the same in all frames. All birds are drawn at one size, independent of the scale of the fit, in
+    parallel projection.
 
     Args:
         solution: the result.
-        bird: its model.
-        width: of the strip, pixels.
-        text_px: height of its words.
+        bird: the model of the result.
+        width: width of the strip, pixels.
+        text_px: height of the text, pixels.
     """
 
     def __init__(self, solution: Solution, bird: Bird, width: int, text_px: float):
@@ -71,18 +72,18 @@ class SideViews:
         self._centre_cam = points.mean(2)
         spread = np.einsum("ntij,ntkj->ntki", self._R_view_cam, points - self._centre_cam[:, :, None])
         reach = np.abs(spread[..., :2]).max((2, 3)) / np.where(valid, solution.scale, 1)
-        # a few frames may be wild: they do not make all others small
+        # a percentile, so that a few failed frames do not make all other birds small
         self._zoom = 0.5 * self.tile_px / max(1.12 * float(np.percentile(reach[valid], 98)), 1e-6) if valid.any() else 1
 
     def draw(
         self, t: int, shown: Bool[np.ndarray, "N"], vertices_cam: Sequence[Float[np.ndarray, "V 3"]]
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """The strip of the frame at position `t`.
+        """Return the strip of the frame at position `t`.
 
         Args:
             t: position of the frame.
-            shown: whether each track has a bird in it.
-            vertices_cam: each track's mesh in the camera frame of its crop, model units.
+            shown: whether each track has a pose in this frame.
+            vertices_cam: mesh of each track in the camera frame of its crop, model units.
         """
         strip = np.full((self.height, self.width, 3), PAPER, np.uint8)
         for n, track in enumerate(self.solution.track_id):
@@ -111,12 +112,12 @@ def draw_parallel(
     samples: int = 2,
     light: tuple[float, float, float] = LIGHT,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A lit mesh in parallel projection over a copy of the picture.
+    """Draw a shaded mesh in parallel projection over a copy of an image.
 
     Args:
-        image: the ground.
-        points_px: right of, below and behind the picture's middle, pixels.
-        faces, colours: of the mesh; the colours' channels are in the picture's order.
+        image: the background.
+        points_px: x right, y down, z away from the viewer, relative to the centre of the image, pixels.
+        faces, colours: faces and vertex colours of the mesh; the channels are in the order of the image.
         samples: as for `jaxfit.raster.zbuffer.draw`.
         light: as for `jaxfit.raster.zbuffer.shade`.
     """
@@ -126,10 +127,10 @@ def draw_parallel(
 
 
 def _left(bird: Bird) -> Float[np.ndarray, "3"]:
-    """The bird's left in its rest pose, a unit vector: by its pairs of joints or keypoints, else −x."""
+    """Return the bird's left in the rest pose, a unit vector: from pairs of joints or keypoints, else −x."""
     for places, pairs in ((bird.joints, bird.joint_pairs), (bird.keypoints, bird.keypoint_pairs)):
         if pairs:
-            way = np.mean([np.asarray(places)[a] - np.asarray(places)[b] for a, b in pairs], axis=0)
-            if np.linalg.norm(way) > 1e-6:
-                return way / np.linalg.norm(way)
+            direction = np.mean([np.asarray(places)[a] - np.asarray(places)[b] for a, b in pairs], axis=0)
+            if np.linalg.norm(direction) > 1e-6:
+                return direction / np.linalg.norm(direction)
     return np.array([-1.0, 0.0, 0.0])

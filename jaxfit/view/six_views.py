@@ -1,4 +1,4 @@
-"""A bird from six sides, with a scale."""
+"""Six views of a bird model, with a scale bar."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["six_views"]
 
 TILE_PX, MARGIN_PX, TITLE_PX, FOOT_PX, TEXT_PX = 400, 26, 44, 64, 17
 LIGHT = (-0.3, -0.4, -0.85)
-"""Direction of the light, as `raster.zbuffer.shade` takes it: from the viewer, so that all views are equally bright."""
+"""Direction to the light for `raster.zbuffer.shade`: towards the viewer, so that all views are equally bright."""
 GREY, DARK = (120, 120, 120), (60, 60, 60)
 
-VIEWS = {  # name → the picture's right and down, in the bird's axes: x right, y forwards, z up
+VIEWS = {  # name → right and down of the view, in the axes of the bird: x right, y forward, z up
     "left": ((0, -1, 0), (0, 0, -1)),
     "front": ((-1, 0, 0), (0, 0, -1)),
     "above": ((1, 0, 0), (0, -1, 0)),
@@ -34,20 +34,20 @@ VIEWS = {  # name → the picture's right and down, in the bird's axes: x right,
 
 
 def six_views(bird: Bird, path: str | Path, posture: Posture | str | None = None) -> None:
-    """Draw a bird from its left, right, front, back, above and below at one scale, and write it as a PNG.
+    """Draw a bird from left, right, front, back, above and below at one scale, and write a PNG.
 
-    Parallel projection, lit from the viewer's side; the bird looks along +y with +z up, as the published models do.
-    Above and below, its head is at the top.
+    The projection is parallel, and the light comes from the viewer. The bird looks along +y and +z is up, as in the
+    published models. In the views from above and below, the head is at the top.
 
     Args:
-        bird: the model. The murre's scale is in centimetres, that of others in model units.
+        bird: the model. The scale bar of the murre is in centimetres, of other models in model units.
         path: PNG file to write, 1200 pixels wide.
-        posture: a body pose and the pitch it is held at, or its name in `jaxfit.model.murre.POSTURES`. None: the
-            murre stands, and others are at rest, as all are whose joints are not the murre's.
+        posture: a body pose and its pitch, or a name in `jaxfit.model.murre.POSTURES`. None: the murre stands, other
+            models have the rest pose.
 
     Raises:
-        ValueError: an unknown posture, or one of another number of joints.
-        InputError: the system refuses the write.
+        ValueError: the posture is unknown, or has another number of joints.
+        InputError: the system rejects the write.
     """
     if posture is None:
         posture = POSTURES["standing"] if bird.name == "murre" else None
@@ -55,11 +55,11 @@ def six_views(bird: Bird, path: str | Path, posture: Posture | str | None = None
         if posture not in POSTURES:
             raise ValueError(f"posture must be one of {', '.join(POSTURES)}, not {posture!r}")
         posture = POSTURES[posture]
-    vertices = _held(bird, posture)
+    vertices = _posed(bird, posture)
     vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
     zoom = (TILE_PX - 2 * MARGIN_PX) / np.ptp(vertices, axis=0).max()
     colours, faces = np.asarray(bird.vertex_colours)[:, ::-1], np.asarray(bird.faces)
-    # a little lighter than in nature: on dark plumage no light shows the form
+    # lighter than in nature, since shading is invisible on dark plumage
     colours = np.clip(0.1 + 0.9 * colours**0.75, 0, 1)
     spans = {name: np.ptp(vertices @ np.array(axes, float).T, axis=0) * zoom for name, axes in VIEWS.items()}
     names = list(VIEWS)
@@ -77,8 +77,8 @@ def six_views(bird: Bird, path: str | Path, posture: Posture | str | None = None
     write_png(path, sheet)
 
 
-def _held(bird: Bird, posture: Posture | None) -> Float[np.ndarray, "V 3"]:
-    """The mesh in a posture, pitched as it is held, in the bird's axes."""
+def _posed(bird: Bird, posture: Posture | None) -> Float[np.ndarray, "V 3"]:
+    """Return the mesh in a posture, with the pitch of the posture, in the axes of the bird."""
     if posture is None:
         return np.asarray(bird.vertices, np.float64)
     bones = bird.num_joints - 1
@@ -97,7 +97,7 @@ def _held(bird: Bird, posture: Posture | None) -> Float[np.ndarray, "V 3"]:
 
 
 def _scale(bird: Bird, zoom: float) -> np.ndarray:
-    """The foot of the sheet: the model's name and a bar of a round length."""
+    """Return the bottom strip of the sheet: name of the model and a scale bar of a round length."""
     per_unit, unit = (CM_PER_UNIT, "cm") if bird.name == "murre" else (1.0, "model units")
     longest = 0.6 * TILE_PX / zoom * per_unit
     power = 10.0 ** np.floor(np.log10(longest))

@@ -107,7 +107,7 @@ def test_other_categories_are_left_out_and_said(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         seen = read_coco(saved(tmp_path, data))
     assert seen.present.tolist() == [[True, True, False], [True, True, False]]
-    assert "left out 1 annotations" in caplog.text
+    assert "skipped 1 annotations" in caplog.text
 
 
 def test_images_that_share_a_frame(tmp_path):

@@ -74,7 +74,7 @@ def test_the_expected_layout(data_set):
     assert found.file_name[-1] == "images/img12.png"
     assert found.keypoint_names[0] == "keypoint_00"
     assert found.skeleton == ()
-    assert readings["axes"].startswith(f"frames, birds: ({T}, {N}, 20, 3), told by the {T} pictures")
+    assert readings["axes"].startswith(f"frames, birds: ({T}, {N}, 20, 3), inferred from the {T} images")
     assert readings["third number"].startswith("a flag")
     assert readings["position"].startswith("x, y in pixels of 64×40 (0.0% outside; y, x would not fit")
     # by hand: 12 + 20 flags, of which none lacks a position; one keypoint of zeros, one NaN that is flagged
@@ -94,7 +94,7 @@ def test_birds_first(data_set):
 def test_shares_of_the_picture(data_set):
     found, readings = read_common_murre(data_set(array(positions() / [WIDTH, HEIGHT])))
     np.testing.assert_allclose(found.keypoints_px[0, 5], positions()[5, 0], rtol=1e-6)
-    assert readings["position"].startswith("x, y as shares of 64×40")
+    assert readings["position"].startswith("x, y as fractions of 64×40")
 
 
 def test_y_before_x(data_set):
@@ -107,7 +107,7 @@ def test_an_order_that_cannot_be_told_is_called_assumed(data_set):
     """All keypoints in the square that both readings share."""
     found, readings = read_common_murre(data_set(array(np.minimum(positions(), HEIGHT))))
     assert found.keypoints_px.max() == HEIGHT
-    assert "that x comes first is assumed, y, x would fit too" in readings["position"]
+    assert "x first is assumed; y, x would fit too" in readings["position"]
 
 
 @pytest.mark.parametrize(
@@ -153,23 +153,23 @@ def spoilt(**changes):
         (array().reshape(T, N, 60), r"has shape \(12, 3, 60\)"),
         (array()[:, :, :18], r"has shape \(12, 3, 18, 3\)"),
         (array().swapaxes(1, 2), r"has shape \(12, 20, 3, 3\)"),
-        (np.tile(array()[:, :1], (1, T, 1, 1)), "does not tell frames from birds"),
-        (array()[:10], r"has shape \(10, 3, 20, 3\), but images/ holds 12 pictures"),
+        (np.tile(array()[:, :1], (1, T, 1, 1)), "frames and birds cannot be distinguished"),
+        (array()[:10], r"has shape \(10, 3, 20, 3\), but images/ holds 12 images"),
         (np.zeros((T, 0, K, 3)), r"has shape \(12, 0, 20, 3\)"),
         (array() > 0, "holds bool, not numbers"),
         (array().astype(complex), "holds complex128"),
         (array().astype(str), "holds <U"),
-        (np.full_like(array(), np.nan), "calls no keypoint visible"),
-        (array(third=0 * flags()), "calls no keypoint visible"),
-        (array(third=3 * flags()), "third numbers of 0 to 3: neither flags of 0, 1, 2 nor shares"),
+        (np.full_like(array(), np.nan), "has no visible keypoint"),
+        (array(third=0 * flags()), "has no visible keypoint"),
+        (array(third=3 * flags()), "third numbers of 0 to 3: neither flags of 0, 1, 2 nor fractions"),
         (array(third=flags() - 0.5), "third numbers of -0.5 to 0.5"),
         (array(third=40.7 * flags()), "third numbers of 0 to 40.7"),
         (array(third=np.inf * (flags() + 1)), "third numbers of inf"),
         (array(xy=0 * positions()), "holds no keypoint with a position"),
         (spoilt(x=((3, 1, 2, 0), np.inf)), "infinite"),
-        (spoilt(x=((3, 1, 2, 0), np.nan)), "one number is NaN and the other is not"),
+        (spoilt(x=((3, 1, 2, 0), np.nan)), "one number NaN and the other finite"),
         (array(xy=positions() - [0, 20]), r"has positions of 1 to 64 and -19 to 19, neither pixels of .* 64×40"),
-        (array(xy=10 * positions()), r"neither pixels of the pictures of 64×40 nor shares of 1"),
+        (array(xy=10 * positions()), r"neither pixels of the images of 64×40 nor fractions"),
     ],
 )
 def test_what_no_reading_explains_is_refused(data_set, content, message):
@@ -244,7 +244,7 @@ def test_the_command(data_set, tmp_path, capsys):
     rejected(capsys, command, "murres.json", "exists already", "--overwrite")
     assert main([*command, "--overwrite", "--keypoints", "murre"]) == 0
     assert read_coco(out).keypoint_names == MURRE_KEYPOINTS
-    assert "on your word" in capsys.readouterr().out
+    assert "as given" in capsys.readouterr().out
     mine = [f"p{k}" for k in range(K)]
     assert main([*command, "--overwrite", "--keypoints", ",".join(mine)]) == 0
     assert read_coco(out).keypoint_names == tuple(mine)

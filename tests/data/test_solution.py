@@ -189,7 +189,7 @@ def test_damaged_folders_are_refused_by_name(tmp_path, changes, message):
 def test_a_model_that_is_not_the_poses_is_refused(tmp_path):
     save_solution(make(), BIRD, "", {}, tmp_path / "out")
     save_bird(toy_bird(), tmp_path / "out" / "model.npz")
-    with pytest.raises(InputError, match=r"model\.npz: is another model than that of poses\.npz"):
+    with pytest.raises(InputError, match=r"model\.npz: is not the model of poses\.npz"):
         load_solution(tmp_path / "out")
     (tmp_path / "out" / "model.npz").unlink()
     with pytest.raises(InputError, match=r"model\.npz"):

@@ -49,7 +49,7 @@ def test_run_lengths_of_a_patch_are_those_of_the_whole_image():
         whole = np.zeros((height, width), bool)
         whole[y0 : y0 + h, x0 : x0 + w] = patch
         assert encode_patch(patch, x0, y0, width, height) == encode_mask(whole)
-    with pytest.raises(ValueError, match=r"4×3 pixels at \(-1, 0\) reaches out of an image of 9×9"):
+    with pytest.raises(ValueError, match=r"4×3 pixels at \(-1, 0\) reaches beyond an image of 9×9"):
         encode_patch(np.ones((3, 4)), -1, 0, 9, 9)
 
 

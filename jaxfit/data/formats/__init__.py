@@ -1,1 +1,1 @@
-"""Files of observations: readers and writers."""
+"""File formats of observations: readers and writers."""

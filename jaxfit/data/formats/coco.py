@@ -10,18 +10,17 @@ The file is an object with
   ``keypoint_scores`` (K numbers in [0, 1]), ``score`` (of the bird as a whole, in [0, 1]), ``iscrowd``, ``id``.
 
 A written file also has ``tracks``, for people who open the file: ``id``, ``category_id`` and the fields of
-``jaxfit.data.track_quality.TrackQuality``. They follow from the annotations, so the reader ignores ``tracks``.
+``jaxfit.data.track_quality.TrackQuality``. The reader ignores ``tracks``, which follow from the annotations.
 
-What a reader has to decide:
+Conventions of the reader:
 
-- Confidence is the score where ``v > 0`` and 0 where ``v = 0``: COCO puts a keypoint that is not there at
-  (0, 0), whatever its score. Without scores it is 1 where ``v > 0``. An annotation without ``score`` has 1.
-- The first category that has keypoints is the bird. Categories with the same keypoints in the same order,
-  such as several species, are read with it; annotations of all others are left out, and one warning says how
-  many.
-- A file without any annotation is a video without a bird; one whose annotations are all of other categories is
-  refused.
-- A crowd (``iscrowd`` 1) has no mask: its region covers several birds.
+- The confidence of a keypoint is its score where ``v > 0``, and 0 where ``v = 0``, since COCO writes a missing keypoint
+  at (0, 0) with any score. Without scores, the confidence is 1 where ``v > 0``. Without ``score``, the score of an
+  annotation is 1.
+- The first category with keypoints is the bird. Categories with the same keypoints in the same order, such as several
+  species, are birds too. Annotations of other categories are skipped, and one warning reports their number.
+- A file without annotations is a video without birds. A file with annotations of other categories only is rejected.
+- A crowd (``iscrowd`` 1) has no mask, since its region covers several birds.
 - Several images may share a ``frame_index`` (photographs, several videos); each track keeps its own image.
 - Unknown keys are ignored.
 """
@@ -58,40 +57,39 @@ _LARGEST_TABLE = 2**28  # entries of (N, T, K): a GiB of float32
 
 
 def read_coco(path: str | Path) -> Observations:
-    """Read observations from a COCO json; the module says which one.
+    """Read observations from a COCO json, in the format that the module describes.
 
     Args:
         path: the file.
 
     Returns:
-        Observations with tracks in the order of ``track_id`` and frames in that of ``frame_index``,
-        also those without a bird; perhaps no track at all.
+        Observations with the tracks in the order of ``track_id`` and the frames in the order of ``frame_index``,
+        including frames without a bird. There may be no track.
 
     Raises:
-        InputError: a file that cannot be read or whose content contradicts itself, naming file, field and
-            remedy.
+        InputError: the file cannot be read, or its content is invalid; the message names file, field and remedy.
     """
     root = read_json(Path(path))
     if not isinstance(root.value, dict):
         root.fail("must hold an object with images, categories and annotations", "give a COCO json")
     images = read_images(root["images"])
     categories = read_categories(root["categories"])
-    found: list[Annotation] = []
-    left_out = 0
+    annotations: list[Annotation] = []
+    skipped = 0
     for annotation in root["annotations"]:
         category = annotation["category_id"].identifier()
         if category in categories.others:
-            left_out += 1
+            skipped += 1
         elif category in categories.birds:
-            found.append(read_annotation(annotation, images, categories.names))
+            annotations.append(read_annotation(annotation, images, categories.names))
         else:
             annotation["category_id"].fail(f"is {category!r}, which no category has", "add the category")
-    if left_out:
-        _log.warning("%s: left out %d annotations of categories without the bird's keypoints", path, left_out)
-        if not found:
-            problem = f"hold no bird ({left_out} of other categories)"
+    if skipped:
+        _log.warning("%s: skipped %d annotations of categories without the keypoints of the bird", path, skipped)
+        if not annotations:
+            problem = f"hold no bird ({skipped} of other categories)"
             root["annotations"].fail(problem, "run detection on footage with a bird in it, or choose another file")
-    return _assemble(root, list(images.values()), categories, found)
+    return _assemble(root, list(images.values()), categories, annotations)
 
 
 def _assemble(root: Field, images: list[Image], categories: Categories, found: list[Annotation]) -> Observations:
@@ -148,15 +146,15 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
 
 
 def write_coco(observations: Observations, path: str | Path, info: Mapping[str, str] | None = None) -> None:
-    """Write observations as COCO json, the whole file or none.
+    """Write observations as COCO json, completely or not at all.
 
-    ``read_coco`` reads the same back, except that tracks come in the order of ``track_id`` and a track that
-    is present nowhere is gone.
+    ``read_coco`` reads the same observations, except that the tracks are sorted by ``track_id`` and tracks without a
+    detection are missing.
 
     Args:
-        observations: what to write.
-        path: the file; an existing one is replaced.
-        info: what the file says of itself, as COCO's ``info``: ``description``, ``license``, …
+        observations: the observations.
+        path: the file; an existing file is replaced.
+        info: COCO's ``info`` about the file: ``description``, ``license``, …
 
     Raises:
         InputError: the file cannot be written.
@@ -169,7 +167,9 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         return images.setdefault((t, file_name, width, height), image)["id"]
 
     for t, (width, height) in enumerate(observations.image_size_px.tolist()):
-        image_id(t, str(observations.file_name[t]), width, height)  # the frame's own image before the others
+        image_id(
+            t, str(observations.file_name[t]), width, height
+        )  # the image of the frame comes before other images of the same frame
     annotations = []
     scores = cast(np.ndarray, observations.score)
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
@@ -202,9 +202,9 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
     category = {"id": 1, "name": "bird", "keypoints": list(observations.keypoint_names), "skeleton": skeleton}
     tracks = []
     for quality in track_quality(observations):
-        figures = quality._asdict()
-        track = {"id": figures.pop("track_id"), "category_id": 1}
-        tracks.append(track | {key: round(v, 6) if isinstance(v, float) else v for key, v in figures.items()})
+        values = quality._asdict()
+        track = {"id": values.pop("track_id"), "category_id": 1}
+        tracks.append(track | {key: round(v, 6) if isinstance(v, float) else v for key, v in values.items()})
     content: dict[str, Any] = {
         "images": list(images.values()),
         "categories": [category],
@@ -217,5 +217,5 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
 
 
 def _shortest(values: np.ndarray) -> np.ndarray:
-    """float64 with the fewest digits that read back as the same float32."""
+    """Return float64 values with the fewest digits that still give the same float32."""
     return values.astype(str).astype(np.float64)

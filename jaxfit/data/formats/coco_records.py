@@ -1,4 +1,4 @@
-"""The images, categories and annotations of a COCO json, each checked as it is read."""
+"""Images, categories and annotations of a COCO json, checked while they are read."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from jaxfit.data.formats.rle import read_segmentation
 
 __all__ = ["Annotation", "Categories", "Image", "read_annotation", "read_categories", "read_images"]
 
-_LARGEST_SIDE_PX = 16384  # larger masks' run lengths outgrow what pycocotools reserves for them
-_TRACK_REMEDY = "give every annotation its bird's track_id; for photographs, a number of its own"
-_FRAME_REMEDY = "give every image its frame's number in the video; for photographs, 0"
+_LARGEST_SIDE_PX = 16384  # the run lengths of larger masks overflow the buffers of pycocotools
+_TRACK_REMEDY = "give every annotation the track_id of its bird; for photographs, a unique number"
+_FRAME_REMEDY = "give every image the number of its frame in the video; for photographs, 0"
 
 
 @dataclass(frozen=True)
@@ -33,23 +33,27 @@ class Annotation:
     """An entry of ``annotations``: one bird in one image."""
 
     label: str
-    """What messages call it."""
+    """Name in messages."""
     track_id: int
     image: Image
     keypoints: np.ndarray
-    """(K, 4): x, y in image pixels, confidence, 1 where something hides the keypoint."""
+    """(K, 4): x, y in image pixels, confidence, 1 where the keypoint is hidden."""
     box: list[float]
     """x, y, width, height in image pixels."""
     rle: dict[str, Any] | None
-    """The mask's run lengths."""
+    """Run lengths of the mask."""
     amodal_rle: dict[str, Any] | None
-    """Run lengths of the whole bird, hidden parts included."""
+    """Run lengths of the mask of the whole bird, including hidden parts."""
     score: float
-    """Trust in the bird as a whole."""
+    """Score of the detection of the bird."""
 
 
 def read_images(images: Field) -> dict[int | str, Image]:
-    """The images under their ids; InputError where an entry is wrong or an id stands twice."""
+    """Return image id → image.
+
+    Raises:
+        InputError: an entry is invalid, or an id occurs twice.
+    """
     found: dict[int | str, Image] = {}
     where: dict[int | str, str] = {}
     for image in images:
@@ -66,25 +70,29 @@ def read_images(images: Field) -> dict[int | str, Image]:
             file_name=image["file_name"].text(),
         )
     if not found:
-        images.fail("is empty", "add the images that the annotations stand in")
+        images.fail("is empty", "add the images of the annotations")
     return found
 
 
 @dataclass(frozen=True)
 class Categories:
-    """Which categories are the bird, and its keypoints."""
+    """The categories of birds, and their keypoints."""
 
     names: tuple[str, ...]
     skeleton: tuple[tuple[int, int], ...]
     """Pairs counted from 0."""
     birds: frozenset[int | str]
-    """Ids that mean the bird."""
+    """Ids of the categories of birds."""
     others: frozenset[int | str]
-    """Ids that mean something else."""
+    """Ids of other categories."""
 
 
 def read_categories(categories: Field) -> Categories:
-    """The bird's categories; InputError where an entry is wrong or none has keypoints."""
+    """Return the categories.
+
+    Raises:
+        InputError: an entry is invalid, or no category has keypoints.
+    """
     names: tuple[str, ...] = ()
     skeleton: tuple[tuple[int, int], ...] = ()
     birds: set[int | str] = set()
@@ -101,7 +109,7 @@ def read_categories(categories: Field) -> Categories:
             skeleton = _read_skeleton(category, len(names))
         (birds if names and its_names == names else others).add(name)
     if not names:
-        categories.fail("hold none with keypoints", "add the keypoints' names to the bird's category")
+        categories.fail("hold none with keypoints", "add the names of the keypoints to the category of the bird")
     return Categories(names, skeleton, frozenset(birds), frozenset(others))
 
 
@@ -113,22 +121,26 @@ def _read_skeleton(category: Field, num_keypoints: int) -> tuple[tuple[int, int]
     for edge, pair in pairs:
         if any(k != int(k) or not first <= k < num_keypoints + first for k in pair):
             problem = f"is {list(pair)}, but the keypoints count from {first} to {num_keypoints - 1 + first}"
-            edge.fail(problem, "correct it or leave skeleton out")
+            edge.fail(problem, "correct the pair or remove skeleton")
     return tuple((int(a) - first, int(b) - first) for _, (a, b) in pairs)
 
 
 def read_annotation(annotation: Field, images: Mapping[int | str, Image], names: Sequence[str]) -> Annotation:
-    """One annotation of the bird; InputError where it is wrong."""
+    """Return one annotation of a bird.
+
+    Raises:
+        InputError: the annotation is invalid.
+    """
     image_id = annotation["image_id"].identifier()
     if image_id not in images:
-        annotation["image_id"].fail(f"is {image_id!r}, which no image has", "add the image or remove this")
+        annotation["image_id"].fail(f"is {image_id!r}, which no image has", "add the image or remove the annotation")
     if "track_id" not in annotation:
         annotation.fail("lacks the key track_id", _TRACK_REMEDY)
     image = images[image_id]
     box = annotation["bbox"].positions(4, " (x, y, width, height)")
     if min(box[2:]) <= 0:
         problem = f"has width {box[2]} and height {box[3]}, which must be above 0"
-        annotation["bbox"].fail(problem, "give the bird's box, or remove the annotation")
+        annotation["bbox"].fail(problem, "give the box of the bird, or remove the annotation")
     rle, amodal_rle = (
         read_segmentation(annotation[key], image.height, image.width) if annotation.has(key) else None
         for key in ("segmentation", "amodal_segmentation")

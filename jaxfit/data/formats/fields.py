@@ -1,4 +1,4 @@
-"""A value of a JSON file that knows where it stands, so that every complaint names file, field and remedy."""
+"""Values of a JSON file with their addresses, so that every error names file, field and remedy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jaxfit.errors import InputError
 __all__ = ["Field", "read_json"]
 
 LARGEST_POSITION_PX = 1e6
-"""No image position lies further out; beyond it lie overflow and mistaken units."""
+"""Largest absolute image position; greater numbers overflow or have a wrong unit."""
 
 
 def _shown(value: Any) -> str:
@@ -30,9 +30,9 @@ def _kind(value: Any) -> str:
 
 @dataclass(frozen=True)
 class Field:
-    """One value with its address, such as ``annotations[3].keypoints``.
+    """A value with its address, such as ``annotations[3].keypoints``.
 
-    Every method that checks raises InputError, naming file, field and what came.
+    Methods that check the value raise InputError, which names the file, the field and the value.
     """
 
     source: Path
@@ -40,7 +40,7 @@ class Field:
     value: Any
 
     def fail(self, problem: str, remedy: str = "write the file again with correct values") -> NoReturn:
-        """Raises InputError about this field."""
+        """Raise InputError about this field."""
         raise InputError(self.source, f"{self.path or 'the file'} {problem}", remedy)
 
     def _expect(self, kind: type | tuple[type, ...], name: str) -> Any:
@@ -52,31 +52,31 @@ class Field:
         return key in self._expect(dict, "an object")
 
     def __getitem__(self, key: str) -> Field:
-        """The value under ``key``, which must be there."""
+        """Return the value of ``key``, or raise InputError where it is missing."""
         if key not in self:
             self.fail(f"lacks the key {key}", f"add {key}: see the description of the format")
         return Field(self.source, f"{self.path}.{key}" if self.path else key, self.value[key])
 
     def has(self, key: str) -> bool:
-        """Whether ``key`` is there and not null."""
+        """Return whether ``key`` exists and is not null."""
         return key in self and self.value[key] is not None
 
     def entries(self) -> Iterator[tuple[str, Field]]:
-        """The keys and values of an object."""
+        """Yield the keys and values of an object."""
         for key in self._expect(dict, "an object"):
             yield key, self[key]
 
     def __iter__(self) -> Iterator[Field]:
-        """The entries of a list."""
+        """Yield the entries of a list."""
         for i, value in enumerate(self._expect(list, "a list")):
             yield Field(self.source, f"{self.path}[{i}]", value)
 
     def text(self) -> str:
-        """A string."""
+        """Return the value as text."""
         return self._expect(str, "text")
 
     def integer(self, lowest: int = -(2**62), highest: int = 2**62) -> int:
-        """A whole number within bounds; 3.0 counts as 3."""
+        """Return the value as a whole number within bounds; 3.0 counts as 3."""
         value = self._expect((int, float), "a whole number")
         if value != value or value in (math.inf, -math.inf) or value != int(value):
             self.fail(f"must be a whole number, not {_shown(value)}")
@@ -85,22 +85,22 @@ class Field:
         return int(value)
 
     def number(self, lowest: float, highest: float, remedy: str) -> float:
-        """A number within bounds."""
+        """Return the value as a number within bounds."""
         value = self._expect((int, float), "a number")
-        if not lowest <= value <= highest:  # nor NaN
+        if not lowest <= value <= highest:  # also rejects NaN
             self.fail(f"is {_shown(value)}, outside {lowest:g} to {highest:g}", remedy)
         return float(value)
 
     def identifier(self) -> int | str:
-        """A whole number or a string that names something."""
+        """Return an id: a whole number or text."""
         return self.value if isinstance(self.value, str) else self.integer()
 
     def numbers(self, count: int | None = None, why: str = "") -> Sequence[float]:
-        """A list of finite numbers.
+        """Return the value as a list of finite numbers.
 
         Args:
-            count: how many there must be.
-            why: said after a wrong count.
+            count: expected number of entries; None for any.
+            why: end of the message about a wrong count.
         """
         values = self._expect(list, "a list of numbers")
         if count is not None and len(values) != count:
@@ -109,11 +109,11 @@ class Field:
             if type(value) not in (int, float):
                 Field(self.source, f"{self.path}[{i}]", value)._expect((int, float), "a number")
             if not -math.inf < value < math.inf:
-                self.fail(f"holds {value} at [{i}]", "leave out what is not known: v = 0, or no annotation")
+                self.fail(f"holds {value} at [{i}]", "mark unknown keypoints by v = 0, or remove the annotation")
         return values
 
     def positions(self, count: int | None = None, why: str = "") -> Sequence[float]:
-        """A list of numbers that can be positions or lengths in pixels."""
+        """Return the value as a list of positions or lengths in pixels."""
         values = self.numbers(count, why)
         for i, value in enumerate(values):
             if abs(value) > LARGEST_POSITION_PX:
@@ -122,13 +122,13 @@ class Field:
 
 
 def read_json(path: Path) -> Field:
-    """The content of a JSON file.
+    """Return the content of a JSON file.
 
     Raises:
-        InputError: no such file, not text in UTF-8, or not JSON (with line and column).
+        InputError: the file does not exist, is not UTF-8 text, or is not JSON (with line and column).
     """
     try:
-        text = path.read_bytes().decode("utf-8-sig")  # some editors put a byte order mark first
+        text = path.read_bytes().decode("utf-8-sig")  # some editors write a byte order mark
     except FileNotFoundError as error:
         raise InputError(path, "does not exist", "check the path") from error
     except IsADirectoryError as error:
@@ -143,11 +143,11 @@ def read_json(path: Path) -> Field:
     try:
         return Field(path, "", json.loads(text))
     except json.JSONDecodeError as error:
-        # a file cut off midway breaks where it ends, or at the string or list that the cut left open
+        # a truncated file has its error at its end, or at the string or list that is not closed
         cut = not text.rstrip().endswith(("}", "]"))
         remedy = "the file ends midway: copy or write it again" if cut else "correct the file or write it again"
         problem = f"is not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
         raise InputError(path, problem, remedy) from error
-    except (RecursionError, ValueError) as error:  # nested, or digits, without end
+    except (RecursionError, ValueError) as error:  # too many levels, or too many digits
         problem = "is not usable JSON: nested too deeply or with a number of too many digits"
         raise InputError(path, problem, "write it again") from error

@@ -1,7 +1,7 @@
 """Masks in COCO files: run lengths, compressed or not, and polygons.
 
-pycocotools trusts what it is given and reads or writes past its buffers where run lengths are corrupt, so
-every mask is checked here before pycocotools sees it.
+pycocotools does not check its input: corrupt run lengths make it read or write beyond its buffers. So every mask is
+checked here before pycocotools reads it.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ _REMEDY = "write the mask again with pycocotools, or leave segmentation out"
 
 
 def read_segmentation(segmentation: Field, height: int, width: int) -> dict[str, Any] | None:
-    """One bird's mask as compressed run lengths.
+    """Return the mask of a bird as compressed run lengths.
 
     Args:
         segmentation: the field: an object with ``size`` [height, width] and ``counts`` (text or a list), or a
             list of polygons [x0, y0, x1, y1, …] in image pixels.
-        height: of the image.
-        width: of the image.
+        height: height of the image.
+        width: width of the image.
 
     Returns:
-        ``size`` and ``counts`` as pycocotools keeps them; None for null or an empty list.
+        ``size`` and ``counts`` in the format of pycocotools; None for null or an empty list.
 
     Raises:
-        InputError: a mask of another size than its image, corrupt run lengths, a polygon that is none.
+        InputError: the mask does not have the size of its image, or run lengths or a polygon are invalid.
     """
     from pycocotools import mask as coco_mask
 
@@ -51,7 +51,7 @@ def read_segmentation(segmentation: Field, height: int, width: int) -> dict[str,
     if sum(runs) != height * width:
         problem = f"is corrupt: its runs cover {sum(runs)} pixels of the image's {height * width}"
         segmentation["counts"].fail(problem, _REMEDY)
-    # written anew from the checked numbers, so that pycocotools never reads the file's own text
+    # encoded again from the checked numbers, so that pycocotools never reads text of the file
     return cast(Any, coco_mask.frPyObjects(cast(Any, {"size": [height, width], "counts": runs}), height, width))
 
 
@@ -65,7 +65,7 @@ def _polygon(polygon: Field, height: int, width: int) -> list[float]:
     points = np.array(values, dtype=np.float64).reshape(-1, 2)
     size = np.array([width, height])
     if ((points < -size) | (points > 2 * size)).any():
-        # the rasteriser walks every pixel of an edge, however far out
+        # pycocotools visits every pixel of an edge, also outside the image
         polygon.fail(f"lies far outside its image of {width}×{height} pixels", "give image pixels")
     return points.reshape(-1).tolist()
 
@@ -82,11 +82,11 @@ def _runs(counts: Field) -> list[int]:
 
 
 def run_lengths(text: str) -> list[int]:
-    """The run lengths in COCO's compressed text, empty where the text is corrupt.
+    """Return the run lengths of COCO's compressed text; empty where the text is corrupt.
 
-    Each number is written in characters of 5 bits, lowest first, from "0" on; bit 6 says that more follow,
-    and the highest bit of the last one is the sign. From the fourth number on each is the difference to the
-    one two before.
+    A number is a sequence of characters with 5 bits each, the lowest bits first, offset by the character "0". Bit 6
+    means that another character follows; the highest bit of the last character is the sign. From the fourth number on,
+    the text holds the difference to the number two places before.
 
     Args:
         text: ``counts`` of a compressed mask.

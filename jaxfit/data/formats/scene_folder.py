@@ -1,4 +1,4 @@
-"""What the files in the folder of a simulated scene are called, for those who write it and those who read it."""
+"""File names in the folder of a simulated scene."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ FOOTAGE = "footage.mp4"
 TRUTH = "truth.json"
 """Exact annotations, a COCO file."""
 TRUE_POSES = "truth"
-"""Exact poses, a folder of results."""
+"""Exact poses, a result folder."""
 DETECTIONS = "detections.json"
-"""What detectors would report, a COCO file."""
+"""Simulated output of detectors, a COCO file."""
 MARKER = "scene.json"
-"""How the scene was made; a folder that holds it is a scene."""
+"""Description of the scene: arguments, camera, behaviours. Every folder of a scene holds this file."""
