@@ -17,7 +17,7 @@ from jaxfit.objective.registry import Term
 __all__ = ["evaluate_curvature", "evaluate_terms", "weighted_sum"]
 
 Settings = Mapping[str, Mapping[str, Float[Array | np.ndarray, ""] | float]]
-"""For each active term its `weight` and its own settings; all may be traced."""
+"""The `weight` and the other settings of each active term; all values may be traced."""
 
 
 def evaluate_terms(window: PosedWindow, terms: Mapping[str, Term], settings: Settings) -> dict[str, Float[Array, ""]]:
@@ -25,13 +25,16 @@ def evaluate_terms(window: PosedWindow, terms: Mapping[str, Term], settings: Set
 
     Args:
         window: one bird in one window.
-        terms: the terms by name, at least those of `settings`, as `registry.find_terms` returns them.
+        terms: name → term, as `registry.find_terms` returns them, for every name in `settings`.
         settings: weight and settings of each active term.
 
     Raises:
-        InputError: a term returns something else than one real number; the error names the term.
+        InputError: a term does not return one real number; the error names the term.
     """
-    return {name: _scalar(name, terms[name].function(window, **_own(values))) for name, values in settings.items()}
+    return {
+        name: _checked_scalar(name, terms[name].function(window, **_without_weight(values)))
+        for name, values in settings.items()
+    }
 
 
 def weighted_sum(window: PosedWindow, terms: Mapping[str, Term], settings: Settings) -> Float[Array, ""]:
@@ -44,7 +47,7 @@ def weighted_sum(window: PosedWindow, terms: Mapping[str, Term], settings: Setti
 
 
 def evaluate_curvature(window: PosedWindow, terms: Mapping[str, Term], settings: Settings) -> Curvature:
-    """Return Σ λ · H_term over the active terms, each of which must have a curvature.
+    """Return Σ λ · H_term over the active terms. All active terms must have a curvature.
 
     Args:
         window: one bird in one window.
@@ -52,23 +55,25 @@ def evaluate_curvature(window: PosedWindow, terms: Mapping[str, Term], settings:
     """
     weights, curvatures = [], []
     for name, values in settings.items():
-        find = terms[name].curvature
-        assert find is not None, name  # the config was checked
+        curvature = terms[name].curvature
+        assert curvature is not None, name  # `StageConfig` checks this
         weights.append(jnp.asarray(values["weight"]))
-        curvatures.append(find(window, **_own(values)))
+        curvatures.append(curvature(window, **_without_weight(values)))
     return weighted_curvature(weights, curvatures)
 
 
-def _own(values: Mapping[str, Any]) -> dict[str, Any]:
+def _without_weight(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name != "weight"}
 
 
-def _scalar(name: str, value: Any) -> Float[Array, ""]:
+def _checked_scalar(name: str, value: Any) -> Float[Array, ""]:
+    """Return the value of a term as an array after a check that the value is one real number."""
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError):
         array = None
     if array is not None and array.shape == () and jnp.issubdtype(array.dtype, jnp.floating):
         return array
-    what = type(value).__name__ if array is None else f"{array.dtype} of shape {array.shape}"
-    raise InputError(f"term {name!r}", f"returned {what}, not one real number", "sum it over frames and joints")
+    returned = type(value).__name__ if array is None else f"{array.dtype} of shape {array.shape}"
+    remedy = "sum the values over frames and joints"
+    raise InputError(f"term {name!r}", f"returned {returned}, not one real number", remedy)

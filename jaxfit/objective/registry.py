@@ -17,7 +17,7 @@ __all__ = ["ENTRY_POINTS", "Term", "find_term", "find_terms", "known_terms", "te
 
 ENTRY_POINTS = "jaxfit.terms"
 """The entry-point group with which an installed package provides terms."""
-FORM = "a term is `def name(window, *, setting=1.0): …`, with one window and settings that are numbers"
+FORM = "a term has the form `def name(window, *, setting=1.0): …`, and the default of each setting is a number"
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -41,7 +41,7 @@ class Term:
 
 
 _terms: dict[str, Term] = {}
-"""Registered terms by name, and imported terms by path."""
+"""Registered terms by name, and imported terms by name or path."""
 
 
 @overload
@@ -75,12 +75,12 @@ def term(function=None, /, *, name=None, positive=(), compares_masks=False, curv
     """
 
     def register(function):
-        own = replace(_read(name or function.__name__, function, positive, compares_masks), curvature=curvature)
-        before = _terms.get(own.name)
-        if before is not None and before.function.__module__ != function.__module__:
-            problem = f"is the name of a term of {before.function.__module__}"
-            raise InputError(f"term {own.name!r}", problem, "choose another name")
-        _terms[own.name] = own
+        new = _term_of(name or function.__name__, function, positive, compares_masks)
+        existing = _terms.get(new.name)
+        if existing is not None and existing.function.__module__ != function.__module__:
+            problem = f"is already the name of a term of {existing.function.__module__}"
+            raise InputError(f"term {new.name!r}", problem, "choose another name")
+        _terms[new.name] = replace(new, curvature=curvature)
         return function
 
     return register if function is None else register(function)
@@ -101,28 +101,27 @@ def find_term(name: str) -> Term:
         return _terms[name]
     if ":" in name:
         path = name
-    elif name in (offered := _offered()):
-        path = offered[name]
+    elif name in (paths := _paths_of_packages()):
+        path = paths[name]
     else:
         raise KeyError(name)
     function = _import(name, path)
     registered = next((known for known in _terms.values() if known.function is function), None)
-    found = registered or _read(name, function)
-    _terms[name] = found
-    return found
+    _terms[name] = registered or _term_of(name, function)
+    return _terms[name]
 
 
 def find_terms(names: Iterable[str]) -> dict[str, Term]:
-    """Return terms by their names, as `find_term` finds each of them."""
+    """Return name → term, with every term as `find_term` returns it."""
     return {name: find_term(name) for name in names}
 
 
 def known_terms() -> list[str]:
     """Return the names of all terms that are registered or provided by installed packages; paths are not included."""
-    return [name for name in dict.fromkeys([*_terms, *_offered()]) if ":" not in name]
+    return [name for name in dict.fromkeys([*_terms, *_paths_of_packages()]) if ":" not in name]
 
 
-def _offered() -> dict[str, str]:
+def _paths_of_packages() -> dict[str, str]:
     """Return name → path of the terms that installed packages provide."""
     return {point.name: point.value for point in metadata.entry_points(group=ENTRY_POINTS)}
 
@@ -142,28 +141,32 @@ def _import(name: str, path: str) -> Any:
         raise InputError(f"term {name!r}", f"{module_name} has no function {attribute!r}", "check the name") from None
 
 
-def _read(name: str, function: Any, positive: Collection[str] = (), compares_masks: bool = False) -> Term:
-    """Return a term after a check that its function has the right form."""
+def _term_of(name: str, function: Any, positive: Collection[str] = (), compares_masks: bool = False) -> Term:
+    """Return the term of a function, without a curvature.
+
+    Raises:
+        InputError: the function does not have the form of a term.
+    """
 
     def require(holds: bool, problem: str) -> None:
         if not holds:
             raise InputError(f"term {name!r}", problem, FORM)
 
-    require(callable(function), f"is no function, but of type {type(function).__name__}")
+    require(callable(function), f"is not a function but a {type(function).__name__}")
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except ValueError:  # some built-in functions have no signature
         parameters = []
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    require(bool(parameters) and parameters[0].kind in positional, "takes no window")
+    require(bool(parameters) and parameters[0].kind in positional, "does not take the window as its first argument")
     settings = parameters[1:]
     for setting in settings:
-        require(setting.kind is setting.KEYWORD_ONLY, f"takes {setting.name!r} beside the window, not after a `*`")
+        require(setting.kind is setting.KEYWORD_ONLY, f"takes {setting.name!r}, which is not keyword-only")
         default = setting.default
-        number = isinstance(default, int | float) and not isinstance(default, bool) and math.isfinite(default)
-        require(number, f"has a setting {setting.name!r} whose default is no number")
-        require(setting.name != "weight", "has a setting 'weight', which every term has already")
+        is_number = isinstance(default, int | float) and not isinstance(default, bool) and math.isfinite(default)
+        require(is_number, f"has a setting {setting.name!r}, but the default of the setting is not a finite number")
+        require(setting.name != "weight", "has a setting named 'weight', a name that is reserved for the weight")
     unknown = sorted(set(positive) - {setting.name for setting in settings})
-    require(not unknown, f"has no setting {', '.join(map(repr, unknown))} that could be positive")
+    require(not unknown, f"has no setting {', '.join(map(repr, unknown))}, which `positive` names")
     defaults = {setting.name: float(setting.default) for setting in settings}
     return Term(name, function, defaults, frozenset(positive), compares_masks)
