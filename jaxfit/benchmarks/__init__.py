@@ -1,1 +1,1 @@
-"""Measurements of speed and quality on the machine at hand, for `jaxfit bench` and `make bench`."""
+"""Benchmarks of speed and quality on the current machine, for `jaxfit bench` and `make bench`."""

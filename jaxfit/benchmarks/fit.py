@@ -1,4 +1,4 @@
-"""How long the paper's fit takes for a scene of several birds, and how close it comes to the truth."""
+"""Benchmark of the fit: time and errors for a simulated scene of several birds."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from jaxfit.simulation.motion import smooth_motion
 __all__ = ["bench_fit", "keypoints_error", "noisy_scene"]
 
 NOISE_PX, OUTLIERS = 2.0, 0.05
+"""Standard deviation of the detected keypoints in pixels, and fraction of outliers."""
 
 
 def bench_fit(
@@ -36,31 +37,39 @@ def bench_fit(
     seed: int = 0,
     progress: ProgressTask = silent,
 ) -> dict[str, Any]:
-    """Fit a simulated scene with a whole config (default: the paper's) and measure it.
+    """Measure the time and the errors of a fit of a simulated scene.
 
-    The scene: smooth random motion of `bird`, keypoints with 2 px of noise and 5 % outliers, whole masks.
-    A first run with one step a stage compiles (or finds the compiled programs of an earlier run); the second
-    is timed.
+    The scene has smooth random motion, keypoints with 2 px of noise and 5 % outliers, and complete masks. A first fit
+    with one step per stage compiles the programs (or loads them from the cache of an earlier run). The second fit is
+    measured.
+
+    Args:
+        bird: the model.
+        birds: number of birds.
+        frames: number of frames.
+        config: config of the fit. The default is the paper's config.
+        seed: seed of motion and noise.
+        progress: shows the progress of the second fit.
 
     Returns:
-        `minutes` of the timed fit and `compile_s` of the first; `ms_per_frame_step` (time per bird, frame and
-        step over all stages); `birds`, `frames`, `faces`, `steps`; `peak_memory_gb` of the process; and the
-        quality against truth: `pck@0.05`, `iou`, `me_p`, `me_v`, `pa_mpjpe` (keypoints, model units).
+        `minutes` (duration of the second fit), `compile_s` (duration of the first fit), `ms_per_frame_step` (time per
+        bird, frame and step over all stages), `birds`, `frames`, `faces`, `steps`, `peak_memory_gb` of the process, and
+        the errors against the truth: `pck@0.05`, `iou`, `me_p`, `me_v`, `pa_mpjpe` (keypoints, model units).
     """
     config = load_config("paper") if config is None else config
     poses, observations = noisy_scene(bird, birds, frames, seed)
     short = dataclasses.replace(config, stages=tuple(dataclasses.replace(stage, steps=1) for stage in config.stages))
-    began = time.perf_counter()
+    start = time.perf_counter()
     fit(observations, bird, short)
     compiled = time.perf_counter()
     solution = fit(observations, bird, config, progress=progress)
     seconds = time.perf_counter() - compiled
     quality = evaluate(solution, bird, detect(bird, poses)).overall
     steps = [stage.steps for stage in config.stages]
-    unit = 1e9 if sys.platform == "darwin" else 1e6  # macOS counts bytes, Linux kilobytes
+    unit = 1e9 if sys.platform == "darwin" else 1e6  # ru_maxrss is in bytes on macOS, and in kilobytes on Linux
     return {
         "minutes": seconds / 60,
-        "compile_s": compiled - began,
+        "compile_s": compiled - start,
         "ms_per_frame_step": 1e3 * seconds / (birds * frames * sum(steps)),
         "birds": birds,
         "frames": frames,
@@ -73,13 +82,13 @@ def bench_fit(
 
 
 def noisy_scene(bird: Bird, birds: int, frames: int, seed: int = 0) -> tuple[list[Pose], Observations]:
-    """Smooth random motion of several birds, one after the other's seed, and what is detected of it."""
+    """Return smooth random motion of several birds (seeds `seed`, `seed` + 1, …) and noisy detections of the birds."""
     poses = [smooth_motion(bird, frames, seed + n) for n in range(birds)]
     return poses, detect(bird, poses, NOISE_PX, OUTLIERS, seed)
 
 
 def keypoints_error(solution: Solution, bird: Bird, truth: list[Pose]) -> float:
-    """Mean 3D distance of keypoints after aligning every frame (Procrustes), model units."""
+    """Return the mean 3D error of keypoints after Procrustes alignment of every frame, in model units."""
     rig = fold_bird(bird)
     true_cam = np.stack([window_keypoints(rig, window_transforms(rig, pose), pose) for pose in truth])
     return pa_mpjpe(solution.keypoints_cam, true_cam, np.isfinite(solution.keypoints_cam).all(-1))

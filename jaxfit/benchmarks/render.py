@@ -6,10 +6,10 @@ import numpy as np
 
 from jaxfit.benchmarks.silhouette import bird_like_mesh, jittered_frames, median_seconds
 from jaxfit.model.bird import Bird
-from jaxfit.raster import kernels as native
-from jaxfit.raster import zbuffer as render
+from jaxfit.raster import kernels, zbuffer
 
 CROP_PX, FRAME_PX, BIRD_PX = 256, (2592, 1520), 350
+"""Side of a crop, width and height of a full frame, and length of a bird in a full frame, in pixels."""
 
 
 def _view(vertices: np.ndarray, longest_px: float) -> np.ndarray:
@@ -25,14 +25,14 @@ def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, rep
 
     Args:
         bird: a model, rendered at rest along its shortest side. The default is a generated mesh of 5,712 faces.
-        crops: number of images of 256 pixels in a batch. The bird is about 180 pixels long and moves a little.
-        birds: number of birds in a frame of 2592×1520 pixels. Each is 350 pixels long and has half the faces.
-        repeats: number of runs. The median is returned.
+        crops: number of 256-pixel crops in a batch. The bird is about 180 pixels long and moves slightly.
+        birds: number of birds in a frame of 2592×1520 pixels. Each bird is 350 pixels long and has half the faces.
+        repeats: number of runs. The results are medians.
 
     Returns:
         `crops_per_s`, `interpolated_crops_per_s` (three channels, 4 samples per pixel), `mask_ms` (hard mask of a bird
         in a full frame), `full_frames_per_s` and `full_frame_ms` (`draw`, 4 samples per pixel), `faces` of a crop,
-        `frame_faces`, `crops`, `birds`, `threads`, `isa` (None if the reference ran).
+        `frame_faces`, `crops`, `birds`, `threads`, `isa` (None if the NumPy reference ran).
 
     Raises:
         ValueError: a count is not positive.
@@ -48,8 +48,8 @@ def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, rep
 
     middle = np.array([CROP_PX / 2, CROP_PX / 2, 0], np.float32)
     batch = jittered_frames(_view(vertices, 0.7 * CROP_PX) + middle, crops, CROP_PX)
-    zbuffer_s = median_seconds(lambda: render.zbuffer(batch, faces, CROP_PX, CROP_PX), repeats)
-    interpolate_s = median_seconds(lambda: render.interpolate(batch, faces, colours, CROP_PX, CROP_PX), repeats)
+    zbuffer_s = median_seconds(lambda: zbuffer.zbuffer(batch, faces, CROP_PX, CROP_PX), repeats)
+    interpolate_s = median_seconds(lambda: zbuffer.interpolate(batch, faces, colours, CROP_PX, CROP_PX), repeats)
 
     width, height = FRAME_PX
     columns = int(np.ceil(np.sqrt(birds)))
@@ -58,12 +58,12 @@ def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, rep
     flock = (_view(vertices, BIRD_PX) + places).reshape(-1, 3)
     flock_faces = np.concatenate([faces[::2] + i * len(vertices) for i in range(birds)])
     flock_colours, frame = np.tile(colours, (birds, 1)), np.full((height, width, 3), 128, np.uint8)
-    frame_s = median_seconds(lambda: render.draw(frame, flock, flock_faces, flock_colours), repeats)
+    frame_s = median_seconds(lambda: zbuffer.draw(frame, flock, flock_faces, flock_colours), repeats)
     one = flock[: len(vertices)]
     return {
         "crops_per_s": crops / zbuffer_s,
         "interpolated_crops_per_s": crops / interpolate_s,
-        "mask_ms": 1e3 * median_seconds(lambda: render.hard_mask(one, faces, width, height), repeats),
+        "mask_ms": 1e3 * median_seconds(lambda: zbuffer.hard_mask(one, faces, width, height), repeats),
         "full_frames_per_s": 1 / frame_s,
         "full_frame_ms": 1e3 * frame_s,
         "faces": len(faces),
@@ -71,5 +71,5 @@ def bench_render(bird: Bird | None = None, crops: int = 100, birds: int = 9, rep
         "crops": crops,
         "birds": birds,
         "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "isa": native.current_isa(),
+        "isa": kernels.current_isa(),
     }

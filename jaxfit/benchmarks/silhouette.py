@@ -94,12 +94,12 @@ def bench_silhouette(
 
     Args:
         frames: number of images in a batch.
-        repeats: number of runs. The median is returned.
+        repeats: number of runs. The results are medians.
         size: width and height of the images in pixels.
         vertices: a mesh in any unit. The frames are jittered views along its shortest side.
         faces: the faces of the mesh.
-        reference_frames: number of frames whose gradient is compared with the plain JAX reference. Each takes about ten
-            seconds. With 0, `gradient_error` is None.
+        reference_frames: number of frames in which the gradient is compared with the plain JAX reference. A frame takes
+            about ten seconds. With 0, `gradient_error` is None.
 
     Returns:
         `ms_per_frame`, `loss_ms_per_frame` (without gradient), `frames`, `faces`, `size`, `threads`, `isa` (None if the

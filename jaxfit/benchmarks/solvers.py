@@ -1,4 +1,4 @@
-"""How fast different solvers lower the objective of a stage without masks: loss over time, side by side."""
+"""Benchmark of the solvers: loss over time in a stage without masks."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ __all__ = ["LBFGS", "bench_solvers", "plot_solvers"]
 
 
 def _pose(z: Pose, problem: Problem) -> Pose:
-    """Return the pose of L-BFGS' variable z: the change since the anchor, in units of Adam's step.
+    """Return the pose for the variable z of L-BFGS: the change from the anchor in units of Adam's step size.
 
-    All parameters are then of one scale.
+    In these units, all parameters have a similar scale.
     """
     step_size = problem.hyperparameters.step_size
     return jax.tree.map(lambda anchor, step, z: anchor + step * z, problem.anchor, step_size, z)
@@ -49,7 +49,7 @@ def _loss_of(program: Program):
 
 
 def _minimiser() -> optx.OptaxMinimiser:
-    # the default, a zoom line search, takes longer for the same loss
+    # the default, a zoom line search, needs more time for the same loss
     search = optax.scale_by_backtracking_linesearch(max_backtracking_steps=15)
     return optx.OptaxMinimiser(optax.lbfgs(linesearch=search), rtol=0.0, atol=0.0)
 
@@ -71,10 +71,10 @@ def _outcome(state: Any) -> tuple[Float[Array, ""], Int[Array, ""]]:
 
 
 LBFGS = Solver(_init, _step, _outcome)
-"""For this comparison only: it does not earn a place among `stages.SOLVERS`."""
+"""L-BFGS, only for this comparison: it is not fast enough for `stages.SOLVERS`."""
 
-RACE = {"adam": (ADAM, 600, 25), "lbfgs": (LBFGS, 400, 25), "levenberg_marquardt": (LEVENBERG_MARQUARDT, 25, 1)}
-"""What runs, how many steps at most, and after how many the loss is looked at."""
+SCHEDULES = {"adam": (ADAM, 600, 25), "lbfgs": (LBFGS, 400, 25), "levenberg_marquardt": (LEVENBERG_MARQUARDT, 25, 1)}
+"""Solver, largest number of steps, and number of steps between two reports of the loss."""
 
 
 def bench_solvers(
@@ -86,19 +86,20 @@ def bench_solvers(
 ) -> dict[str, Any]:
     """Minimise the keypoint stage of the paper's config with each solver, all windows as one batch.
 
-    Solvers take turns, and times are medians. Compilation and the reports of the loss are not counted.
+    The solvers run alternately, and times are medians. Times exclude compilation and the reports of the loss.
 
     Args:
-        observations: what is fitted.
+        observations: the birds of the fit.
         bird: the model.
-        limit: at most this many steps of any solver; None for as many as it needs.
-        repeats: how often each runs.
-        progress: told of every step.
+        limit: largest number of steps of a solver. None: the number in `SCHEDULES`.
+        repeats: number of runs of each solver.
+        progress: shows the progress of all runs.
 
     Returns:
-        For each solver `steps`, `seconds` and `loss`, its curve: the objective summed over all windows after that many
-        steps. `birds`, `windows`; `adam_s`: Adam's whole stage; for the others `…_s`: seconds until their loss is
-        no higher than Adam's last (None: never), and `…_ratio`: those over Adam's seconds; `…_loss`: the last.
+        For each solver, a dictionary with its curve: `steps`, `seconds` and `loss` (the objective, summed over all
+        windows). Also `birds` and `windows`; `adam_s`, the seconds of Adam's whole stage; for each other solver `…_s`,
+        the seconds until its loss is at most Adam's final loss (None: never), and `…_ratio`, these seconds over
+        `adam_s`; for every solver `…_loss`, its final loss.
     """
     config = load_config("paper")
     stage = config.stages[0]
@@ -114,45 +115,45 @@ def bench_solvers(
         model.camera,
         config.common_size,
     )
-    one = stage_hyperparameters(config, stage, bird.keypoint_names)
+    hyperparameters = stage_hyperparameters(config, stage, bird.keypoint_names)
     problems = Problem(
-        hyperparameters=jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * count), one),
+        hyperparameters=jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * count), hyperparameters),
         anchor=jax.tree.map(lambda x: x[:, 0], initial_pose),
         targets=jax.tree.map(jnp.asarray, load_targets(windows, mask_px=0)),
     )
     program = stage_program(config, stage, model)
     result: dict[str, Any] = {"birds": len(np.unique(windows.track)), "windows": count}
-    most = {name: min(steps, limit or steps) for name, (_, steps, _) in RACE.items()}
+    step_counts = {name: min(steps, limit or steps) for name, (_, steps, _) in SCHEDULES.items()}
 
     def run(name: str, report_progress: ReportProgress) -> tuple[list[int], list[float], list[float]]:
-        solver, _, portion = RACE[name]
-        own = program._replace(solver=solver)
-        state = begin(own, problems, None)
-        steps, seconds, loss = [0], [0.0], [_total(report(own, problems, problems.anchor))]
-        while steps[-1] < most[name]:
-            take = min(portion, most[name] - steps[-1])
-            began = time.perf_counter()
-            state, _, rejected = advance((own, problems, jnp.int32(take)), state)
+        solver, _, interval = SCHEDULES[name]
+        solver_program = program._replace(solver=solver)
+        state = begin(solver_program, problems, None)
+        steps, seconds, loss = [0], [0.0], [_total_loss(report(solver_program, problems, problems.anchor))]
+        while steps[-1] < step_counts[name]:
+            take = min(interval, step_counts[name] - steps[-1])
+            start = time.perf_counter()
+            state, _, rejected = advance((solver_program, problems, jnp.int32(take)), state)
             jax.block_until_ready(rejected)
-            seconds.append(seconds[-1] + time.perf_counter() - began)
+            seconds.append(seconds[-1] + time.perf_counter() - start)
             steps.append(steps[-1] + take)
-            loss.append(_total(report(own, problems, state.pose)))
+            loss.append(_total_loss(report(solver_program, problems, state.pose)))
             report_progress(take, f"{name}: loss {loss[-1]:.5g}")
         return steps, seconds, loss
 
-    turns: dict[str, list[list[float]]] = {name: [] for name in RACE}
-    with progress("Minimising", (repeats + 1) * sum(most.values())) as report_progress:
-        for turn in range(repeats + 1):
-            for name in RACE:
+    seconds_of_runs: dict[str, list[list[float]]] = {name: [] for name in SCHEDULES}
+    with progress("Minimising", (repeats + 1) * sum(step_counts.values())) as report_progress:
+        for repeat in range(repeats + 1):
+            for name in SCHEDULES:
                 steps, seconds, loss = run(name, report_progress)
-                if turn:  # the first compiles
-                    turns[name].append(seconds)
+                if repeat:  # the first run compiles
+                    seconds_of_runs[name].append(seconds)
                 result[name] = {"steps": steps, "loss": loss}
-    for name, seconds in turns.items():
+    for name, seconds in seconds_of_runs.items():
         result[name]["seconds"] = np.median(seconds, axis=0).tolist()
     target, adam_s = result["adam"]["loss"][-1], result["adam"]["seconds"][-1]
     result |= {"adam_s": adam_s, "adam_loss": target}
-    for name in list(RACE)[1:]:
+    for name in list(SCHEDULES)[1:]:
         result[f"{name}_loss"] = result[name]["loss"][-1]
         reached = [s for s, loss in zip(result[name]["seconds"], result[name]["loss"], strict=True) if loss <= target]
         result[f"{name}_s"] = reached[0] if reached else None
@@ -160,25 +161,26 @@ def bench_solvers(
     return result
 
 
-def _total(final: Report) -> float:
+def _total_loss(final: Report) -> float:
+    """Return the objective, summed over all windows."""
     return float(sum(share.sum() for share in final.loss.values()))
 
 
 def plot_solvers(result: dict[str, Any], path: Path) -> None:
-    """Draw the curves of `bench_solvers` as a PNG: loss over seconds (needs the extra `report`)."""
+    """Plot the curves of `bench_solvers` as a PNG: loss over time (needs the extra `report`)."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     panel = figure.subplots()
-    for name in RACE:
+    for name in SCHEDULES:
         curve = result[name]
         marker = "o" if len(curve["steps"]) <= 30 else None
         label = f"{name.replace('_', '-')}, {curve['steps'][-1]} steps"
         panel.plot(curve["seconds"], curve["loss"], marker=marker, markersize=3, label=label)
-    panel.axhline(result["adam_loss"], color="grey", linewidth=0.8, linestyle=":", label="Adam's last")
+    panel.axhline(result["adam_loss"], color="grey", linewidth=0.8, linestyle=":", label="final loss of Adam")
     panel.set(
-        xlabel="seconds (medians)",
-        ylabel="objective, all windows",
+        xlabel="time in s (median)",
+        ylabel="objective, sum over all windows",
         yscale="log",
         title="Keypoint stage: loss over time",
     )

@@ -72,17 +72,18 @@ def renderer() -> Iterator[Metric]:
 
 
 def photographs(bird: Bird, reference: Path) -> Iterator[Metric]:
-    """Measure fits of photographs of five species, with and without starting poses from a regressor."""
+    """Measure fits of photographs of five species, with and without initial poses from a regressor."""
     for name in ("aves", "photo"):
         config, rows, seconds = load_config(name), [], 0.0
         for path in sorted((reference / "cub").glob("*.json")):
             observations = read_coco(path)
-            start = load_initial_poses(path.with_suffix(".init.npz"), observations, bird) if name == "aves" else None
+            initial_file = path.with_suffix(".init.npz")
+            initial_poses = load_initial_poses(initial_file, observations, bird) if name == "aves" else None
             one_step = tuple(dataclasses.replace(stage, steps=1) for stage in config.stages)
-            fit(observations, bird, dataclasses.replace(config, stages=one_step), start)  # compiles
-            began = time.perf_counter()
-            solution = fit(observations, bird, config, start, terminal)
-            seconds += time.perf_counter() - began
+            fit(observations, bird, dataclasses.replace(config, stages=one_step), initial_poses)  # compiles
+            start = time.perf_counter()
+            solution = fit(observations, bird, config, initial_poses, terminal)
+            seconds += time.perf_counter() - start
             overall = evaluate(solution, bird, observations).overall
             rows.append([overall["pck@0.05"], overall["pck@0.10"], overall["iou"]])
         pck05, pck10, iou = np.mean(rows, axis=0)

@@ -15,10 +15,10 @@ def test_the_benchmark_reports_its_settings_and_rates(monkeypatch):
         return next(seconds)
 
     monkeypatch.setattr(benchmark, "median_seconds", run_in_known_time)
-    found = benchmark.bench_render(crops=2, birds=2, repeats=1)
-    assert (found["crops"], found["birds"], found["isa"]) == (2, 2, native.current_isa())
-    assert (found["faces"], found["frame_faces"]) == (5712, 5712)
-    assert (found["crops_per_s"], found["interpolated_crops_per_s"]) == (4, 8)
-    assert (found["full_frames_per_s"], found["full_frame_ms"], found["mask_ms"]) == (0.5, 2e3, 4e3)
+    result = benchmark.bench_render(crops=2, birds=2, repeats=1)
+    assert (result["crops"], result["birds"], result["isa"]) == (2, 2, native.current_isa())
+    assert (result["faces"], result["frame_faces"]) == (5712, 5712)
+    assert (result["crops_per_s"], result["interpolated_crops_per_s"]) == (4, 8)
+    assert (result["full_frames_per_s"], result["full_frame_ms"], result["mask_ms"]) == (0.5, 2e3, 4e3)
     with pytest.raises(ValueError, match="birds: expected at least 1, got 0"):
         benchmark.bench_render(birds=0)

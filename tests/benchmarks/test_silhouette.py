@@ -45,14 +45,14 @@ def test_report(monkeypatch):
 
     monkeypatch.setattr(benchmark, "median_seconds", run_in_known_time)
     vertices, faces = bird_like_mesh()
-    found = bench_silhouette(frames=4, repeats=1, size=64, vertices=vertices, faces=faces[::50])
-    assert (found["frames"], found["faces"], found["size"]) == (4, len(faces[::50]), 64)
-    assert found["isa"] == raster.current_isa()
-    assert found["threads"] >= 1
-    assert 0 <= found["gradient_error"] < 1e-3
-    assert (found["ms_per_frame"], found["matmul_ms"], found["loss_ms_per_frame"]) == (1e3 / 4, 2e3, 7e3 / 4)
-    assert found["matmul_ratio"] == pytest.approx(1 / 8)
-    rows = [(row["frames"], row["faces"], row["ms_per_frame"]) for row in found["scaling"]]
+    result = bench_silhouette(frames=4, repeats=1, size=64, vertices=vertices, faces=faces[::50])
+    assert (result["frames"], result["faces"], result["size"]) == (4, len(faces[::50]), 64)
+    assert result["isa"] == raster.current_isa()
+    assert result["threads"] >= 1
+    assert 0 <= result["gradient_error"] < 1e-3
+    assert (result["ms_per_frame"], result["matmul_ms"], result["loss_ms_per_frame"]) == (1e3 / 4, 2e3, 7e3 / 4)
+    assert result["matmul_ratio"] == pytest.approx(1 / 8)
+    rows = [(row["frames"], row["faces"], row["ms_per_frame"]) for row in result["scaling"]]
     assert rows == [(1, 115, 3e3), (2, 115, 4e3 / 2), (4, 29, 5e3 / 4), (4, 58, 6e3 / 4), (4, 115, 1e3 / 4)]
 
 

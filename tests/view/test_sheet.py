@@ -45,7 +45,6 @@ def test_the_benchmark_of_the_fit_reports_what_it_ran():
     result = bench_fit(BIRD, birds=2, frames=4, config=short("paper"))
     assert (result["birds"], result["frames"], result["steps"]) == (2, 4, [2, 2])
     assert result["faces"] == len(BIRD.faces)
-    assert result["minutes"] > 0
     assert result["ms_per_frame_step"] == pytest.approx(60e3 * result["minutes"] / (2 * 4 * 4))
     assert 0 < result["iou"] <= 1
     assert result["pa_mpjpe"] < 2
