@@ -1,4 +1,4 @@
-"""Shared fixtures: the reference data, a private cache, input files for the command line. And the rule about skips."""
+"""Shared fixtures (reference data, a private cache, input files of the command line), and the rule about skips."""
 
 import os
 import re
@@ -19,7 +19,7 @@ ACCEPTED_SKIPS = (
 
 
 def pytest_sessionfinish(session):
-    """Fails the run because of skipped tests, if JAXFIT_FAIL_ON_SKIP is set."""
+    """Fail a run with JAXFIT_FAIL_ON_SKIP if tests were skipped for other than accepted reasons."""
     terminal = session.config.pluginmanager.get_plugin("terminalreporter")
     if not os.environ.get("JAXFIT_FAIL_ON_SKIP") or terminal is None or hasattr(session.config, "workerinput"):
         return
@@ -46,14 +46,14 @@ def reference_dir() -> Path:
 
 @pytest.fixture(autouse=True, scope="module")
 def _programs_of_one_module():
-    """Frees the compiled programs of a module, because the number of memory maps of a process is limited."""
+    """Free the compiled programs after each module, because the number of memory maps of a process is limited."""
     yield
     jax.clear_caches()
 
 
 @pytest.fixture
 def own_cache(tmp_path, monkeypatch):
-    """Gives the test a private cache of compiled programs in place of the user's cache."""
+    """Give the test a private cache of compiled programs instead of the user's cache."""
     before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     yield

@@ -1,4 +1,4 @@
-"""Annotations hold: the library runs under jaxtyping's import hook, with every shape and type enforced."""
+"""The library runs under jaxtyping's import hook, which checks all annotated shapes and types."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ import sys
 import warnings
 warnings.filterwarnings("ignore")
 from jaxtyping import install_import_hook
-# as for every type checker, an int is a float too
+# an int is a valid float, as for static type checkers
 install_import_hook("jaxfit", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 sys.path.insert(0, {tests!r})
 """
@@ -90,7 +90,8 @@ assert main(["model", "view", "murre", "--out", str(folder / "views.png")]) == 0
 """
 
 
-def enforced(program, **environment):
+def run_with_checks(program, **environment):
+    """Run a program in a new process with the import hook."""
     head = HOOK.format(tests=str(Path(__file__).parent))
     command = [sys.executable, "-c", head + program]
     return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
@@ -98,14 +99,14 @@ def enforced(program, **environment):
 
 def test_the_hook_catches_a_wrong_shape():
     wrong = "import jax.numpy as jnp\nfrom jaxfit.model.rotation import *\naxis_angle_to_matrix(jnp.ones((2, 4)))"
-    done = enforced(wrong)
+    done = run_with_checks(wrong)
     assert done.returncode != 0
     assert "parameter 'axis_angle'" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["objective", "fit", "scene"])
-def test_annotations_hold(name, tmp_path):
+def test_annotations_are_satisfied(name, tmp_path):
     program = {"objective": POSE + OBJECTIVE, "fit": FIT, "scene": SCENE}[name]
     program = program if name == "objective" else program.format(folder=str(tmp_path))
-    done = enforced(program, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    done = run_with_checks(program, XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert done.returncode == 0, done.stderr[-3000:]

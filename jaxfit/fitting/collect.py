@@ -1,4 +1,4 @@
-"""From fitted windows to the solution of the whole video."""
+"""Collect the fitted windows into the solution of the whole video."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ class FittedWindow(NamedTuple):
 
     pose: Pose
     loss: dict[str, float]
-    """Each term's weighted share of the objective."""
+    """Weighted value of each term in the objective."""
     keypoints_cam: np.ndarray
     """(T, K, 3) camera frame of the crop, model units."""
     keypoints_px: np.ndarray
     """(T, K, 2) crop pixels."""
     failure: str
-    """Why the fit diverged; empty where it did not."""
+    """Reason why the fit diverged; empty if the fit did not diverge."""
 
 
 def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
@@ -48,14 +48,14 @@ def collect_windows(
 ) -> Solution:
     """Return the solution of one run.
 
-    Every window has a status of its own: only the poses of windows that did not diverge are valid and enter the loss.
-    The status of a track summarises its windows: `ok`, `partly diverged`, `diverged` (all of them) or `no usable frame`
-    (no window).
+    A window diverges or does not diverge by itself. Only windows that did not diverge have valid poses and contribute
+    to the loss. The status of a track summarises its windows: `ok` (no window diverged), `partly diverged`, `diverged`
+    (all windows diverged) or `no usable frame` (the track has no window).
 
     Args:
         observations: the observations that the windows were cut from.
         windows: W windows.
-        results: the result of each of them.
+        results: the result of each window.
         bird: the model.
         camera: the crop camera.
     """
@@ -114,9 +114,9 @@ def collect_windows(
 def _frame_values(
     result: FittedWindow, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: Camera
 ) -> dict[str, Any]:
-    """The arrays of a solution at the present frames of one window."""
+    """Return the arrays of a solution at the present frames of one window."""
     pose, crop = result.pose, crop[present].astype(np.float32)
-    betas = np.zeros(bird.num_shapes, np.float32)  # a fit without shape has none
+    betas = np.zeros(bird.num_shapes, np.float32)  # for a fit without shape coefficients
     betas[: len(pose.betas)] = pose.betas
     return {
         "global_orient": pose.global_orient[present],
@@ -132,6 +132,7 @@ def _frame_values(
 
 
 def _status(fitted: int, diverged: int) -> str:
+    """Return the status of a track from its numbers of fitted and diverged windows."""
     if fitted and diverged:
         return "partly diverged"
     return "ok" if fitted else "diverged" if diverged else "no usable frame"

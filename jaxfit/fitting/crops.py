@@ -13,7 +13,7 @@ from jaxfit.errors import InputError
 __all__ = ["crop_squares", "cut_mask"]
 
 LEAST_SIZE_PX = 16.0
-"""No crop is smaller than this, image pixels."""
+"""Smallest side of a crop, in image pixels."""
 
 
 def crop_squares(
@@ -36,6 +36,7 @@ def crop_squares(
 
 
 def _whole_image(observations: Observations, n: int, frame, present, config: CropConfig) -> Float[np.ndarray, "3"]:
+    """Return the whole image as the crop of all frames of one window."""
     sizes = {observations.image_size(n, int(t)) for t in frame[present]}
     if len(sizes) > 1 or any(width != height for width, height in sizes):
         raise InputError(
@@ -49,24 +50,28 @@ def _whole_image(observations: Observations, n: int, frame, present, config: Cro
 def _around_the_bird(
     observations: Observations, n: int, frame, present, config: CropConfig
 ) -> Float[np.ndarray, "T 3"]:
-    corner = np.zeros((len(frame), 4))
+    """Return the crops of one window: the size of the largest box, with the centres of the boxes.
+
+    A frame without the bird has the crop of the nearest frame with the bird.
+    """
+    corners = np.zeros((len(frame), 4))  # x0, y0, x1, y1 of the box of each frame
     for i in np.flatnonzero(present):
         box, confident = observations.box_px[n, frame[i]], observations.confidence[n, frame[i]] > 0
         points = observations.keypoints_px[n, frame[i]][confident]
-        if min(box[2:]) > 0:  # the box is the bird; single keypoints may be far off
-            corner[i] = [*box[:2], *(box[:2] + box[2:])]
+        if min(box[2:]) > 0:  # the box is more reliable: a single keypoint may be an outlier
+            corners[i] = [*box[:2], *(box[:2] + box[2:])]
         else:
-            corner[i] = [*points.min(0), *points.max(0)]
-    longest = (corner[:, 2:] - corner[:, :2]).max()
+            corners[i] = [*points.min(0), *points.max(0)]
+    longest = (corners[:, 2:] - corners[:, :2]).max()
     size = max(np.ceil(longest * (1 + 2 * config.padding)), LEAST_SIZE_PX)
-    centre = (corner[:, :2] + corner[:, 2:]) / 2
+    centre = (corners[:, :2] + corners[:, 2:]) / 2
     nearest = np.abs(np.arange(len(frame))[:, None] - np.flatnonzero(present)).argmin(1)
-    centre = centre[np.flatnonzero(present)[nearest]]  # a missing frame takes the crop of its nearest neighbour
+    centre = centre[np.flatnonzero(present)[nearest]]
     return np.concatenate([np.round(centre - size / 2), np.full((len(frame), 1), size)], axis=1)
 
 
 def cut_mask(mask: Bool[np.ndarray, "H W"], crop: Float[np.ndarray, "3"], mask_px: int) -> np.ndarray:
-    """Return a mask's crop as (mask_px, mask_px) of 0 and 1: a pixel is 1 where at least half of it is covered."""
+    """Return the crop of a mask, (mask_px, mask_px): 1 where the mask covers at least half of the pixel, else 0."""
     x0, y0, size = (int(v) for v in crop)
     cut = np.zeros((size, size), np.uint8)
     rows, columns = mask.shape

@@ -1,4 +1,4 @@
-"""Terms that cannot be fitted: detected by tracing before the fit, and named where the fit of a bird diverges."""
+"""Check the terms before a fit, and name the terms that make a fit diverge."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ __all__ = ["check_terms", "name_failures"]
 
 
 def check_terms(config: FitConfig, model: FitModel) -> None:
-    """Trace every term of every stage, and its gradient, without computing anything.
+    """Trace every term of every stage, and the gradient of the term, without computing values.
 
     Raises:
-        InputError: a term that returns no scalar, needs what the model lacks, or raises. The error names the term.
+        InputError: a term does not return a scalar, needs data that the model lacks, or raises. The error names the
+            term.
     """
     T, K = config.window, model.bird.num_keypoints
     pose = rest_pose(model.bird, T, config.common_size)
@@ -48,19 +49,20 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
 
 
 def _trace(term: Term, function: Callable[..., object], *arguments: object) -> None:
+    """Trace a function of a term, and convert all errors to InputErrors that name the term."""
     try:
         jax.eval_shape(function, *arguments)
     except InputError as error:
         if error.source.startswith("term "):
             raise
         raise InputError(f"term {term.name!r}", f"{error.source} {error.problem}", error.remedy) from error
-    except Exception as error:  # a user's term may raise anything
+    except Exception as error:  # a user's term may raise any exception
         file = getattr(getattr(term.function, "__code__", None), "co_filename", None)
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         where = f" at {file}:{lines[-1]}" if lines else ""
         message = f"{type(error).__name__}: {error}".split("\n")[0].strip()
         problem = f"cannot be traced or differentiated{where}: {message}"
-        raise InputError(f"term {term.name!r}", problem, "it must run under jax.jit and jax.grad") from error
+        raise InputError(f"term {term.name!r}", problem, "the term must run under jax.jit and jax.grad") from error
 
 
 def name_failures(
@@ -68,14 +70,14 @@ def name_failures(
 ) -> np.ndarray:
     """Name the terms that made problems fail.
 
-    A step whose loss or gradient is not finite is rejected and leaves the pose as it is. The pose after the stage is
-    therefore the pose of the failure: each term is evaluated there by itself.
+    A step is rejected if the loss or its gradient is not finite, and a rejected step does not change the pose. The pose
+    after the stage is therefore the pose of the failure. Each term is evaluated separately at this pose.
 
     Args:
-        known: (B,) text of the failure of each problem so far, empty without failure. A first failure stays.
+        known: (B,) text of the earlier failure of each problem, empty without failure. An earlier failure is kept.
         step: the step of the stage at which each problem failed, from 1; 0 without failure.
         stage: name of the stage.
-        program: what the problems share.
+        program: the program of the stage.
         problems, pose: of all problems, with leading axis B.
 
     Returns:
@@ -89,12 +91,11 @@ def name_failures(
     for i, b in enumerate(new):
         values = [name for name in value if value[name][i]]
         gradients = [name for name in gradient if gradient[name][i] and name not in values]
-        parts = [
-            f"the {what} of {', '.join(names)}" for what, names in (("value", values), ("gradient", gradients)) if names
-        ]
-        # every term may be finite where their sum is not
-        what = " and ".join(parts) or "the sum of all terms"
-        failure[b] = f"{what} was not finite at step {step[b]} of stage {stage}"
+        parts = [f"the value of {', '.join(values)}"] if values else []
+        parts += [f"the gradient of {', '.join(gradients)}"] if gradients else []
+        # the sum of finite terms may exceed the range of float32
+        subject = " and ".join(parts) or "the sum of all terms"
+        failure[b] = f"{subject} was not finite at step {step[b]} of stage {stage}"
     return failure
 
 
@@ -102,19 +103,20 @@ def name_failures(
 def _not_finite(
     program: Program, problems: Problem, pose: Pose
 ) -> tuple[dict[str, Bool[Array, "B"]], dict[str, Bool[Array, "B"]]]:
-    """Whether the value of each weighted term is not finite, and whether its gradient is not, for each problem."""
+    """Return, for each term and problem, whether the weighted value is not finite, and the same for the gradient."""
 
     def one(problem: Problem, pose: Pose):
-        found = {name: jax.value_and_grad(_share_of(program, name))(pose, problem) for name in program.terms}
-        bad = jax.tree.map(lambda x: ~jnp.all(jnp.isfinite(x)), found)
-        gradient = {name: jnp.any(jnp.stack(jax.tree.leaves(pull))) for name, (_, pull) in bad.items()}
-        return {name: value for name, (value, _) in bad.items()}, gradient
+        results = {name: jax.value_and_grad(_share_of(program, name))(pose, problem) for name in program.terms}
+        bad = jax.tree.map(lambda x: ~jnp.all(jnp.isfinite(x)), results)
+        bad_value = {name: value for name, (value, _) in bad.items()}
+        bad_gradient = {name: jnp.any(jnp.stack(jax.tree.leaves(gradient))) for name, (_, gradient) in bad.items()}
+        return bad_value, bad_gradient
 
     return jax.vmap(one)(problems, pose)
 
 
 def _share_of(program: Program, name: str) -> Callable[[Pose, Problem], Array]:
-    """One term's share of the objective, as a function of pose and problem."""
+    """Return the weighted value of one term as a function of pose and problem."""
 
     def share(pose: Pose, problem: Problem) -> Array:
         settings = {name: problem.hyperparameters.settings[name]}

@@ -1,4 +1,4 @@
-"""Smoothing of detected keypoints along time, before the fit sees them."""
+"""Smoothing of detected keypoints over time, before the fit."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ def weighted_median_filter(
     confidence: Float[Array | np.ndarray, "T K"],
     window: int = 5,
 ) -> Float[Array, "T K 2"]:
-    """Weighted median of each keypoint over the frames around it, x and y apart.
+    """Return the weighted median of each keypoint over a window of frames, separately for x and y.
 
-    With the values of the window sorted, x_1 ≤ x_2 ≤ …, and their confidences c_1, c_2, …, frame t becomes
-    x_k with the smallest k for which c_1 + … + c_k ≥ ½ Σ c.
+    Let x_1 ≤ x_2 ≤ … be the sorted values of the window, and c_1, c_2, … their confidences. The filtered value is x_k
+    with the smallest k for which c_1 + … + c_k ≥ ½ Σ c.
 
-    The window is centred on the frame and cut off at the ends; its frames are neighbours in the array. What
-    is missing has confidence 0 and contributes nothing, so a missing keypoint receives its neighbours' median
-    while its confidence, which the caller keeps, stays 0: it does not become a detection. Where the whole
-    window is missing, the input is returned.
+    The window is centred on the frame and is shorter at both ends of the array. A missing keypoint has confidence 0
+    and does not contribute. Its filtered value is the median of its neighbours, but the caller keeps its confidence
+    of 0, so the keypoint does not become a detection. If a keypoint is missing in all frames of the window, its input
+    is returned.
 
     Args:
-        keypoints_px: x, y in image pixels; where the confidence is 0, anything.
+        keypoints_px: x, y in image pixels; any value where the confidence is 0.
         confidence: weight of each keypoint, 0 or more.
-        window: number of frames, odd.
+        window: number of consecutive frames, odd.
 
     Returns:
         Filtered x, y in image pixels.
 
     Raises:
-        ValueError: ``window`` is not odd and positive.
+        ValueError: `window` is not odd and positive.
 
     Source: Hägerlind et al. 2024, the filter over detected keypoints.
     """
@@ -52,7 +52,7 @@ def weighted_median_filter(
     weights = jnp.take_along_axis(jnp.broadcast_to(weights, values.shape), order, axis=1)
     cumulative = jnp.cumsum(weights, axis=1)
     total = cumulative[:, -1:]
-    # a sum that is exactly half must pass whatever the rounding of the sums
+    # a sum of exactly half must pass in spite of rounding errors
     half = total * (0.5 - 4 * jnp.finfo(total.dtype).eps)
     first = jnp.argmax(cumulative >= half, axis=1, keepdims=True)
     median = jnp.take_along_axis(values, first, axis=1)[:, 0]

@@ -1,18 +1,20 @@
-"""The whole fit: from observations and a bird to posed birds.
+"""The whole fit, from observations and a bird model to poses.
 
-Data goes forward once: observations → windows → targets and initial poses → stages → solution.
+The data passes each step once: observations → windows → targets and initial poses → stages → solution.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Hashable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.observations import Observations, check_keypoints
@@ -33,8 +35,6 @@ __all__ = ["check_observations", "fit", "fit_runs", "windows_of"]
 
 _logger = logging.getLogger(__name__)
 
-T = TypeVar("T")
-
 
 def fit(
     observations: Observations,
@@ -44,22 +44,22 @@ def fit(
     progress: ProgressTask = silent,
     source: object = "observations",
 ) -> Solution:
-    """Pose every bird of a video (or of a set of photographs).
+    """Fit the poses of all birds of a video (or of a set of photographs).
 
     Args:
-        observations: keypoints and masks; the keypoints must be those of the bird, in any order.
+        observations: keypoints and masks. The keypoints must have the names of the model's keypoints, in any order.
         bird: the model.
         config: the config of the fit.
-        initial_poses: initial poses from a file; None: a search, as `config.initialise` says.
+        initial_poses: initial poses from a file. None: a search with the settings `config.initialise`.
         progress: shows progress.
         source: name of the observations in error messages.
 
     Returns:
-        The poses, and a status of every track: `ok`, `partly diverged`, `diverged` or `no usable frame`.
+        The poses, and the status of every track: `ok`, `partly diverged`, `diverged` or `no usable frame`.
 
     Raises:
-        InputError: no bird, keypoints that are not those of the model, no track with a usable frame, crops that cannot
-            be made, a term that cannot be used.
+        InputError: no bird, other keypoints than the model's, no track with a usable frame, unusable crop settings, an
+            unusable term, or initial poses that do not match the windows.
     """
     return fit_runs(observations, bird, [config], initial_poses, progress, source)[0]
 
@@ -72,7 +72,7 @@ def fit_runs(
     progress: ProgressTask = silent,
     source: object = "observations",
 ) -> list[Solution]:
-    """Fit the same birds under several configs at once, as one compiled program.
+    """Fit the same birds under several configs at once, with one compiled program.
 
     Args:
         configs: configs with an equal `stages.compiled_part`.
@@ -82,28 +82,30 @@ def fit_runs(
         The solution of every config.
 
     Raises:
-        InputError: as `fit`.
-        ValueError: configs that need different programs.
+        InputError: as for `fit`.
+        ValueError: the configs need different programs.
     """
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
-        raise ValueError("configs must share one compiled program: they may differ in weights, settings, step sizes, …")
+        allowed = "weights, settings, step sizes and the preparation of the data"
+        raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
     observations = check_observations(observations, bird, source)
     model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
     check_terms(configs[0], model)
-    runs = _runs(observations, configs, model, initial_poses, source)
-    # every problem is one window of one run
+    runs = _cut_runs(observations, configs, initial_poses, source)
+    prepare_poses = partial(_initial_poses, model, initial_poses)
+    # each problem is one window of one run
     problems = [(r, w) for r, run in enumerate(runs) for w in range(len(run.windows))]
     size = min(max(frames_per_batch(bird, configs[0]) // configs[0].window, 1), len(problems))
     batches = [problems[first : first + size] for first in range(0, len(problems), size)]
     birds = len(np.unique(runs[0].windows.track))
-    what = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
-    _logger.info("%s, %d windows of %d frames, %d batches", what, len(problems), configs[0].window, len(batches))
+    subject = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
+    _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), configs[0].window, len(batches))
     steps = sum(stage.steps for stage in configs[0].stages)
     results: list[list[FittedWindow]] = [[] for _ in runs]
-    with progress(f"Fitting {what}", steps * len(batches)) as report_progress:
+    with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
         for batch in batches:
             report_progress(0, "initial poses")
-            fitted = fit_batch(model, configs, _gather(runs, batch, size), report_progress)
+            fitted = fit_batch(model, configs, _gather(runs, batch, size, prepare_poses), report_progress)
             for i, (r, _) in enumerate(batch):
                 results[r].append(window_of_batch(fitted, i))
     return [
@@ -116,10 +118,10 @@ def check_observations(observations: Observations, bird: Bird, source: object) -
     """Return the observations with their keypoints in the order of the model.
 
     Raises:
-        InputError: no bird, or keypoints that are not those of the model.
+        InputError: no bird, or other keypoints than the model's.
     """
     if not observations.num_tracks:
-        raise InputError(source, "holds no bird", "look for birds in other footage, or with another network")
+        raise InputError(source, "holds no bird", "use other footage, or another network")
     return check_keypoints(observations, bird.keypoint_names, source)
 
 
@@ -127,7 +129,7 @@ def windows_of(observations: Observations, config: FitConfig, source: object) ->
     """Return the windows of a fit.
 
     Raises:
-        InputError: no track with a usable frame, or crops that cannot be made.
+        InputError: no track with a usable frame, or unusable crop settings.
     """
     windows = cut_windows(observations, config)
     if len(windows) == 0:
@@ -140,92 +142,109 @@ def windows_of(observations: Observations, config: FitConfig, source: object) ->
 
 
 class _Run(NamedTuple):
-    """One config, with all windows of the video. Runs with equal keys share windows, targets and initial poses."""
+    """One config, with all windows of the video."""
 
+    config: FitConfig
     windows: Windows
-    windows_key: Hashable
-    initial_pose: Callable[[Windows], Pose]
-    """Some of the windows → their initial poses, with leading axes W, H (hypotheses)."""
-    pose_key: Hashable
-    mask_px: int
 
 
-def _runs(
-    observations: Observations,
-    configs: Sequence[FitConfig],
-    model: FitModel,
-    initial_poses: InitialPoses | None,
-    source: object,
+def _cut_runs(
+    observations: Observations, configs: Sequence[FitConfig], initial_poses: InitialPoses | None, source: object
 ) -> list[_Run]:
+    """Return the run of each config. Runs with an equal `windows_key` share their windows."""
     windows: dict[Hashable, Windows] = {}
-    runs = []
     for config in configs:
         key = windows_key(config)
         if key not in windows:
             windows[key] = windows_of(observations, config, source)
             if initial_poses is not None:
                 initial_poses.check_crops(windows[key])
-
-        def initial_pose(some: Windows, config: FitConfig = config) -> Pose:
-            if initial_poses is not None:
-                return initial_poses.window_poses(model.bird, some, config.common_size)
-            return search_initial_poses(
-                model.bird,
-                model.rig,
-                jnp.asarray(some.keypoints_px),
-                jnp.asarray(some.confidence),
-                config.initialise,
-                model.camera,
-                config.common_size,
-            )
-
-        pose_key = (*key, config.initialise, config.common_size)
-        runs.append(_Run(windows[key], key, initial_pose, pose_key, config.crop.size_px))
-    return runs
+    return [_Run(config, windows[windows_key(config)]) for config in configs]
 
 
-def _gather(runs: Sequence[_Run], problems: Sequence[tuple[int, int]], size: int) -> Batch:
-    """Return a batch of some problems (run, window). What runs share is loaded and computed once.
-
-    Every batch has `size` problems, so that one compiled program serves all. A short batch is filled with copies, whose
-    initial poses have rows of their own so that they are computed and not merged.
-    """
-    loaded: list[Any] = []
-    poses: list[Pose] = []
-    targets_row: dict[Hashable, int] = {}
-    pose_row: dict[Hashable, int] = {}
-    config, to_targets, to_pose = [], [], []
-    for r in dict.fromkeys(r for r, _ in problems):
-        run, rows = runs[r], [w for other, w in problems if other == r]
-        if new := _new_rows(targets_row, run.windows_key, rows):
-            loaded.append(load_targets(run.windows[np.array(new)], run.mask_px))
-        if new := _new_rows(pose_row, run.pose_key, rows):
-            poses.append(run.initial_pose(run.windows[np.array(new)]))
-        config += [r] * len(rows)
-        to_targets += [targets_row[run.windows_key, w] for w in rows]
-        to_pose += [pose_row[run.pose_key, w] for w in rows]
-    copied = np.arange(size - len(config)) % len(config)
-    initial_pose = jax.tree.map(lambda *x: jnp.concatenate(x), *poses)
-    source_rows = np.concatenate([np.arange(len(pose_row)), np.array(to_pose)[copied]]).astype(int)
-    all_rows = np.concatenate([np.arange(len(config)), copied]).astype(int)
-    return Batch(
-        targets=jax.tree.map(lambda *x: np.concatenate(x), *loaded),
-        initial_pose=jax.tree.map(lambda x: x[source_rows], initial_pose),
-        config=np.array(config)[all_rows],
-        targets_row=np.array(to_targets)[all_rows],
-        pose_row=np.concatenate([to_pose, len(pose_row) + np.arange(len(copied))]).astype(int),
+def _initial_poses(model: FitModel, initial_poses: InitialPoses | None, run: _Run, windows: Windows) -> Pose:
+    """Return the initial poses of some windows of a run, with leading axes W, H (hypotheses)."""
+    config = run.config
+    if initial_poses is not None:
+        return initial_poses.window_poses(model.bird, windows, config.common_size)
+    return search_initial_poses(
+        model.bird,
+        model.rig,
+        jnp.asarray(windows.keypoints_px),
+        jnp.asarray(windows.confidence),
+        config.initialise,
+        model.camera,
+        config.common_size,
     )
 
 
-def _new_rows(rows: dict[Hashable, int], key: Hashable, windows: Sequence[int]) -> list[int]:
-    """Give the next rows to those windows that have none; return these windows."""
-    new = [w for w in windows if (key, w) not in rows]
-    rows |= {(key, w): len(rows) + i for i, w in enumerate(new)}
-    return new
+def _pose_key(config: FitConfig) -> Hashable:
+    """Return the part of the config that determines the windows and their initial poses."""
+    return *windows_key(config), config.initialise, config.common_size
+
+
+def _gather(
+    runs: Sequence[_Run],
+    problems: Sequence[tuple[int, int]],
+    size: int,
+    prepare_poses: Callable[[_Run, Windows], Pose],
+) -> Batch:
+    """Return a batch of some problems (run, window).
+
+    Every batch has `size` problems, so that all batches share one compiled program. A shorter batch is filled with
+    copies of its problems. The copies have rows of initial poses of their own, because problems with the same row would
+    be merged into one problem.
+    """
+    targets, targets_row = _prepare_rows(
+        runs, problems, windows_key, lambda run, windows: load_targets(windows, run.config.crop.size_px)
+    )
+    poses, pose_row = _prepare_rows(runs, problems, _pose_key, prepare_poses)
+    rows = pose_row.max() + 1
+    copied = np.arange(size - len(problems)) % len(problems)
+    filled = np.concatenate([np.arange(len(problems)), copied])
+    rows_with_copies = np.concatenate([np.arange(rows), pose_row[copied]])
+    return Batch(
+        targets=jax.tree.map(lambda *x: np.concatenate(x), *targets),
+        initial_pose=jax.tree.map(lambda *x: jnp.concatenate(x)[rows_with_copies], *poses),
+        config=np.array([r for r, _ in problems])[filled],
+        targets_row=targets_row[filled],
+        pose_row=np.concatenate([pose_row, rows + np.arange(len(copied))]),
+    )
+
+
+def _prepare_rows(
+    runs: Sequence[_Run],
+    problems: Sequence[tuple[int, int]],
+    key_of: Callable[[FitConfig], Hashable],
+    prepare: Callable[[_Run, Windows], Any],
+) -> tuple[list[Any], Int[np.ndarray, "B"]]:
+    """Prepare the windows of some problems (run, window). Runs with an equal key share the rows of their windows.
+
+    Args:
+        runs: all runs.
+        problems: B pairs of run and window.
+        key_of: returns the part of a config that determines the result of `prepare`.
+        prepare: takes a run and some of its windows, and returns a pytree with one row for each window.
+
+    Returns:
+        The pytree of every key, and the row of each problem in their concatenation.
+    """
+    pairs = [(key_of(runs[r].config), w) for r, w in problems]
+    run_of = {key: runs[r] for (key, _), (r, _) in zip(pairs, problems, strict=True)}
+    prepared: list[Any] = []
+    row: dict[tuple[Hashable, int], int] = {}
+    for key, run in run_of.items():
+        windows = list(dict.fromkeys(w for other, w in pairs if other == key))
+        row |= {(key, w): len(row) + i for i, w in enumerate(windows)}
+        prepared.append(prepare(run, run.windows[np.array(windows)]))
+    return prepared, np.array([row[pair] for pair in pairs])
 
 
 def _fitted_bird(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None) -> Bird:
-    """The bird without its shape directions where no stage and no initial pose uses them: they would only cost time."""
+    """Return the bird, without its shape directions if no stage and no initial pose uses the directions.
+
+    Unused shape directions only cost time.
+    """
     if any("betas" in stage.optimised for stage in config.stages):
         return bird
     if initial_poses is not None and initial_poses.has_shape:

@@ -1,4 +1,4 @@
-"""Initial poses from a file: from a pose regressor, or from an earlier result."""
+"""Initial poses from a file: the output of a pose regressor, or the poses of an earlier fit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jaxfit.fitting.windows import Windows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
 from jaxfit.storage.arrays import validate_arrays
-from jaxfit.storage.npz import load_npz
+from jaxfit.storage.npz import load_npz, npz_names
 
 __all__ = ["InitialPoses", "load_initial_poses"]
 
@@ -27,7 +27,7 @@ _LAYOUT = {name: LAYOUT[name] for name in ("track_id", "frame_index", *_FIELDS)}
 
 @dataclass(frozen=True)
 class InitialPoses:
-    """Initial poses of the birds of one observations file, in the crop's camera frame; NaN where there is none."""
+    """Initial poses of the birds of one observations file, in the crop's camera frame; NaN in frames without a pose."""
 
     source: str
     """Name of the file, for error messages."""
@@ -38,7 +38,7 @@ class InitialPoses:
     bone_length: Float[np.ndarray, "N T bones"]
     betas: Float[np.ndarray, "N T S"]
     crop: Float[np.ndarray, "N T 3"] | None = None
-    """The crops of the poses, (x0, y0, size) in image pixels; None where the file does not contain them."""
+    """The crops of the poses, (x0, y0, size) in image pixels; None if the file does not contain crops."""
 
     @property
     def has_shape(self) -> bool:
@@ -46,25 +46,25 @@ class InitialPoses:
         return bool(np.any(np.nan_to_num(self.betas)))
 
     def check_crops(self, windows: Windows) -> None:
-        """Check that every window has an initial pose, in the crop of the window.
+        """Check that every window has an initial pose, and that the poses refer to the crops of the window.
 
         Raises:
-            InputError: a window without any initial pose, or poses in other crops.
+            InputError: a window has no initial pose, or the poses refer to other crops.
         """
         for n, track, frame, present, crop in zip(
             windows.track, windows.track_id, windows.frame, windows.present, windows.crop, strict=True
         ):
-            at = frame[present]
-            have = np.isfinite(self.global_orient[n, at]).all(-1)
-            if not have.any():
-                raise InputError(self.source, f"has no pose for track {track}", "add one")
+            has_pose = np.isfinite(self.global_orient[n, frame[present]]).all(-1)
+            if not has_pose.any():
+                problem = f"has no pose for track {track} in one of the windows of the track"
+                raise InputError(self.source, problem, "every window needs the pose of at least one frame")
             if self.crop is not None:
-                apart = np.abs(self.crop[n, at] - crop[present])[have].max()
-                if apart > 1:
+                difference = np.abs(self.crop[n, frame[present]] - crop[present])[has_pose].max()
+                if difference > 1:
                     raise InputError(
                         self.source,
-                        f"`crop` of track {track} differs by {apart:.0f} pixels from the crop of this config",
-                        "use the window and crop settings that made the file",
+                        f"`crop` of track {track} differs by {difference:.0f} pixels from the crop of this config",
+                        "use the window and crop settings with which the file was written",
                     )
 
     def window_poses(self, bird: Bird, windows: Windows, common_size: bool) -> Pose:
@@ -78,10 +78,9 @@ class InitialPoses:
     def _window_pose(
         self, bird: Bird, n: int, frame: Int[np.ndarray, "T"], present: Bool[np.ndarray, "T"], common_size: bool
     ) -> Pose:
-        """The initial pose of one window. A frame without a pose takes that of its nearest neighbour."""
-        known = present & np.isfinite(self.global_orient[n, frame]).all(-1)
-        have = np.flatnonzero(known)
-        at = frame[have[np.abs(np.arange(len(frame))[:, None] - have).argmin(1)]]
+        """Return the initial pose of one window. A frame without a pose has the pose of the nearest other frame."""
+        has_pose = np.flatnonzero(present & np.isfinite(self.global_orient[n, frame]).all(-1))
+        at = frame[has_pose[np.abs(np.arange(len(frame))[:, None] - has_pose).argmin(1)]]
         scale = self.scale[n, at]
         betas = np.median(self.betas[n, at], axis=0)[: bird.num_shapes]
         return Pose(
@@ -97,29 +96,25 @@ class InitialPoses:
 def load_initial_poses(path: str | Path, observations: Observations, bird: Bird) -> InitialPoses:
     """Read initial poses for the birds of `observations`.
 
-    Two layouts are known: the arrays of a result's `poses.npz` (matched by `track_id` and `frame_index`), and
-    a regressor's rows `init_pose` (N, J, 3), `init_bone_length` (N, J−1), `init_translation` (N, 3), one
-    for each annotation in the order of tracks, then frames.
+    The file has one of two layouts:
+
+    - the arrays of the `poses.npz` of a result, matched by `track_id` and `frame_index`;
+    - the output of a regressor, one row for each annotation, sorted by track and then by frame: `init_pose` (A, J, 3),
+      `init_bone_length` (A, J−1), `init_translation` (A, 3).
 
     Raises:
-        InputError: a broken file, another layout, rows that do not match the observations or the bird.
+        InputError: a damaged file, another layout, or poses that do not match the observations or the bird.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            names = set(file.files)
-    except (OSError, ValueError, EOFError, AttributeError):
-        names = {"init_pose"}  # load_npz tells what is wrong
-    except Exception:  # zipfile's own errors
-        names = {"init_pose"}
-    poses = _from_result(path, observations) if "global_orient" in names else _from_rows(path, observations)
+    is_result = "global_orient" in npz_names(path)
+    poses = _from_result(path, observations) if is_result else _from_regressor(path, observations)
     joints = poses.body_pose.shape[2] + 1
     if joints != bird.num_joints:
-        raise InputError(path, f"has poses of {joints} joints", f"this bird has {bird.num_joints}")
+        raise InputError(path, f"has poses of {joints} joints", f"the model has {bird.num_joints} joints")
     if poses.betas.shape[2] not in (0, bird.num_shapes):
-        raise InputError(path, f"has {poses.betas.shape[2]} shape coefficients", f"this bird has {bird.num_shapes}")
+        problem = f"has {poses.betas.shape[2]} shape coefficients"
+        raise InputError(path, problem, f"the model has {bird.num_shapes} shape coefficients")
     if poses.betas.shape[2] == 0:
-        empty = np.zeros((*poses.betas.shape[:2], bird.num_shapes), np.float32)
-        poses = replace(poses, betas=empty)
+        poses = replace(poses, betas=np.zeros((*poses.betas.shape[:2], bird.num_shapes), np.float32))
     return poses
 
 
@@ -128,55 +123,54 @@ def _from_result(path: str | Path, observations: Observations) -> InitialPoses:
     try:
         content = validate_arrays(content, _LAYOUT)
     except ValueError as error:
-        raise InputError(path, str(error), "give the poses.npz of a fit") from None
+        raise InputError(path, str(error), "use the poses.npz of a fit") from None
     fitted = np.isfinite(content["global_orient"]).all(-1)
     for name in _FIELDS:
         if not np.isfinite(content[name][fitted]).all():
-            raise InputError(path, f"`{name}` holds NaN or infinite numbers", "give the poses.npz of a fit")
+            raise InputError(path, f"`{name}` holds NaN or infinite numbers", "use the poses.npz of a fit")
     rows = _positions(observations.track_id, content["track_id"])
     columns = _positions(observations.frame_index, content["frame_index"])
     missing = (rows < 0)[:, None] | (columns < 0)[None]
     if missing.all():
-        raise InputError(path, "has no pose for any of these birds", "give the start of the same video")
-    picked = {}
+        raise InputError(path, "has no pose for any of these birds", "use initial poses of the same video")
+    fields = {}
     for name in _FIELDS:
-        picked[name] = content[name][rows][:, columns]
-        picked[name][missing] = np.nan
-    return InitialPoses(str(path), **picked)
+        fields[name] = content[name][rows][:, columns]
+        fields[name][missing] = np.nan
+    return InitialPoses(str(path), **fields)
 
 
-def _from_rows(path: str | Path, observations: Observations) -> InitialPoses:
+def _from_regressor(path: str | Path, observations: Observations) -> InitialPoses:
     content = load_npz(path, {"init_pose": 3, "init_bone_length": 2, "init_translation": 2})
     pose, bone, transl = content["init_pose"], content["init_bone_length"], content["init_translation"]
     rows = int(observations.present.sum())
     if not len(pose) == len(bone) == len(transl) == rows:
-        raise InputError(
-            path,
-            f"has {len(pose)}, {len(bone)}, {len(transl)} rows",
-            f"the observations have {rows} annotations",
-        )
+        names = "`init_pose`, `init_bone_length`, `init_translation`"
+        problem = f"has {len(pose)}, {len(bone)}, {len(transl)} rows in {names}"
+        raise InputError(path, problem, f"the observations have {rows} annotations")
     if pose.shape[2] != 3 or transl.shape[1] != 3 or bone.shape[1] != pose.shape[1] - 1:
-        raise InputError(path, f"`init_pose` is {pose.shape}, `init_bone_length` {bone.shape}", "(N, J, 3), (N, J−1)")
+        problem = f"`init_pose`, `init_bone_length`, `init_translation` are {pose.shape}, {bone.shape}, {transl.shape}"
+        raise InputError(path, problem, "expected (A, J, 3), (A, J−1), (A, 3)")
     if not all(np.isfinite(a).all() for a in (pose, bone, transl)):
-        raise InputError(path, "holds NaN or infinite numbers", "remove those rows")
+        raise InputError(path, "holds NaN or infinite numbers", "write finite numbers for all annotations")
 
-    def spread(values):
+    def by_track_and_frame(values):
         full = np.full((*observations.present.shape, *values.shape[1:]), np.nan, np.float32)
         full[observations.present] = values
         return full
 
     return InitialPoses(
         str(path),
-        global_orient=spread(pose[:, 0]),
-        body_pose=spread(pose[:, 1:]),
-        transl=spread(transl),
-        scale=spread(np.ones(rows)),
-        bone_length=spread(bone),
-        betas=spread(np.zeros((rows, 0))),
+        global_orient=by_track_and_frame(pose[:, 0]),
+        body_pose=by_track_and_frame(pose[:, 1:]),
+        transl=by_track_and_frame(transl),
+        scale=by_track_and_frame(np.ones(rows)),
+        bone_length=by_track_and_frame(bone),
+        betas=by_track_and_frame(np.zeros((rows, 0))),
     )
 
 
-def _positions(wanted: Int[np.ndarray, "A"], having: Int[np.ndarray, "B"]) -> Int[np.ndarray, "A"]:
-    """Position of each wanted number in `having`; −1 where it is not."""
-    where = {int(number): i for i, number in enumerate(having)}
-    return np.array([where.get(int(number), -1) for number in wanted], int)
+def _positions(numbers: Int[np.ndarray, "A"], sequence: Int[np.ndarray, "B"]) -> Int[np.ndarray, "A"]:
+    """Return the position of each number in the sequence, or −1 if the sequence lacks the number."""
+    position = {int(number): i for i, number in enumerate(sequence)}
+    return np.array([position.get(int(number), -1) for number in numbers], int)

@@ -1,9 +1,10 @@
-"""Where a fit starts: an orientation for every frame, chosen for the window as a whole.
+"""Search for initial poses: the orientations of all frames of a window are chosen together.
 
-Each candidate orientation of each frame is scored by how well the mean-pose keypoints match under a scaled
-orthographic camera (closed form, robust). Dynamic programming then picks, among the best candidates of all
-frames, the sequence of least matching cost plus turning: chosen frame by frame, some frame would start
-flipped against its neighbour, and no weight of the temporal terms turns it back.
+Each candidate orientation of each frame has a matching cost: the robust distance between the detected keypoints and
+the keypoints of the mean pose under a scaled orthographic camera (closed form). Dynamic programming then chooses one
+of the best candidates in each frame, such that the sum of matching costs and rotations between frames is smallest. If
+the frames were chosen independently, some frames would be flipped against their neighbours, and no weight of the
+temporal terms corrects such a flip.
 """
 
 from __future__ import annotations
@@ -27,25 +28,28 @@ from jaxfit.model.rotation import matrix_to_axis_angle, unwrap_axis_angle, view_
 __all__ = ["candidate_orientations", "choose_sequence", "match_candidates", "search_initial_poses"]
 
 SIGMA_PX = 30.0
-"""Scale of the robust match: mean-pose keypoints lie this far off on a posed bird of 200 pixels."""
-BLOCKED_RADIUS = np.pi / 4
-"""Another hypothesis must differ by more than this angle."""
+"""Scale of the robust matching cost, in pixels of a 256-pixel crop. On a bird of 200 pixels, the keypoints of the mean
+pose are about this far from the keypoints of the true pose."""
+LEAST_SEPARATION_RAD = np.pi / 4
+"""In every frame, the orientations of two hypotheses differ by more than this angle."""
+EXCLUDED_COST = 1e9
+"""Cost of a candidate that is too close to an earlier hypothesis, in squared pixels of a 256-pixel crop."""
 
 
-class Match(NamedTuple):
-    """A candidate's scaled-orthographic fit to one frame's keypoints."""
+class OrthographicMatch(NamedTuple):
+    """The match between candidates and the keypoints of one frame under a scaled orthographic camera."""
 
     cost: Float[Array, "*B"]
-    """Σ_i c_i · Geman-McClure of x and y, squared pixels."""
+    """Σ_i c_i · σ²e_i²/(σ² + e_i²), with e_i the distance of keypoint i; squared pixels of a 256-pixel crop."""
     scale_px: Float[Array, "*B"]
-    """Pixels per model unit."""
+    """Pixels of a 256-pixel crop per model unit."""
 
 
 def candidate_orientations(config: InitialiseConfig) -> Float[np.ndarray, "C 3 3"]:
-    """Rotations model → camera to start from.
+    """Return the candidate rotations model → camera.
 
-    Bird models have x to their side, y towards the bill and z up (dorsal). Seen from above, z points at
-    the camera; the paper's candidates turn that view about the viewing axis in steps of 12°.
+    In bird models, x points sideways, y towards the bill and z up (dorsal). If the bird is seen from above, z points to
+    the camera. The paper's candidates are this view, rotated about the viewing axis in steps of 12°.
     """
     if config.method == "so3":
         return view_grid(config.directions, config.turns)
@@ -58,11 +62,19 @@ def match_candidates(
     model_keypoints: Float[Array, "K 3"],
     keypoints_px: Float[Array, "K 2"],
     confidence: Float[Array, "K"],
-) -> Match:
-    """Match every candidate orientation to one frame by scale and shift, robustly (4 reweightings).
+) -> OrthographicMatch:
+    """Match every candidate orientation to one frame by scale and shift.
+
+    The match is robust: least squares with 4 reweightings.
+
+    Args:
+        candidates: rotations model → camera.
+        model_keypoints: keypoints of the mean pose, model units.
+        keypoints_px: crop pixels.
+        confidence: 0 where a keypoint is missing.
 
     Returns:
-        Costs and scales, (C,). Without any confident keypoint the costs are 0.
+        Costs and scales, (C,). If all confidences are 0, the costs are 0.
     """
     flat = jnp.einsum("cij,kj->cki", candidates[:, :2], model_keypoints)  # (C, K, 2)
     weight = jnp.broadcast_to(confidence, flat.shape[:2])
@@ -71,39 +83,39 @@ def match_candidates(
         squared = jnp.sum((scale[:, None, None] * flat + shift[:, None] - keypoints_px) ** 2, -1)
         weight = confidence * (SIGMA_PX**2 / (SIGMA_PX**2 + squared)) ** 2
     cost = jnp.sum(confidence * SIGMA_PX**2 * squared / (SIGMA_PX**2 + squared), axis=1)
-    return Match(cost, scale)
+    return OrthographicMatch(cost, scale)
 
 
 def _similarity(flat, keypoints_px, weight):
-    """Weighted least-squares scale (C,) and shift (C, 2) of orthographic points (C, K, 2) onto pixels."""
+    """Return the least-squares scale (C,) and shift (C, 2) from orthographic points (C, K, 2) to pixels."""
     total = jnp.maximum(jnp.sum(weight, axis=1), 1e-6)[:, None]
     mean_flat = jnp.sum(weight[..., None] * flat, axis=1) / total
     mean_px = jnp.sum(weight[..., None] * keypoints_px, axis=1) / total
     centred, target = flat - mean_flat[:, None], keypoints_px - mean_px[:, None]
     spread = jnp.maximum(jnp.sum(weight[..., None] * centred**2, axis=(1, 2)), 1e-6)
-    # A bird is never a mirrored point: a candidate that wants a negative scale keeps a poor match.
+    # A negative scale means a rotation by 180°, which is another candidate. The lower bound keeps its cost high here.
     scale = jnp.maximum(jnp.sum(weight[..., None] * centred * target, axis=(1, 2)) / spread, 1e-2)
     return scale, mean_px - scale[:, None] * mean_flat
 
 
 def choose_sequence(cost: Float[Array, "T M"], rotation: Float[Array, "T M 3 3"], smoothness: float) -> Int[Array, "T"]:
-    """The candidate of each frame that minimises Σ_t cost + smoothness · Σ_t angle between neighbours.
+    """Return the candidate of each frame, such that Σ_t cost_t + smoothness · Σ_t angle_t,t+1 is smallest.
 
-    Exact, by dynamic programming (Viterbi); angles in radians.
+    The minimum is exact, by dynamic programming (Viterbi). Angles between consecutive frames are in radians.
     """
 
     def forward(best, current):
         cost_t, angle = current
-        through = best[:, None] + smoothness * angle
-        return cost_t + jnp.min(through, axis=0), jnp.argmin(through, axis=0)
+        transition = best[:, None] + smoothness * angle
+        return cost_t + jnp.min(transition, axis=0), jnp.argmin(transition, axis=0)
 
-    # cos θ = (tr(RaᵀRb) − 1) / 2: all pairs of neighbours in one product
+    # cos θ = (tr(RaᵀRb) − 1) / 2, for all pairs of candidates of consecutive frames
     trace = jnp.einsum("tmij,tnij->tmn", rotation[:-1], rotation[1:])
     angles = jnp.arccos(jnp.clip((trace - 1) / 2, -1, 1))
-    total, back = jax.lax.scan(forward, cost[0], (cost[1:], angles))
+    total, predecessors = jax.lax.scan(forward, cost[0], (cost[1:], angles))
     last = jnp.argmin(total)
-    _, before = jax.lax.scan(lambda at, pointers: (pointers[at], pointers[at]), last, back, reverse=True)
-    return jnp.concatenate([before, last[None]])
+    _, earlier = jax.lax.scan(lambda i, of_frame: (of_frame[i], of_frame[i]), last, predecessors, reverse=True)
+    return jnp.concatenate([earlier, last[None]])
 
 
 def _orientations(
@@ -113,24 +125,25 @@ def _orientations(
     confidence: Float[Array, "T K"],
     config: InitialiseConfig,
 ) -> tuple[Float[Array, "H T 3 3"], Float[Array, "H T"]]:
-    """Orientations and scales (pixels per model unit) of the H best distinct sequences of one window."""
-    seen = jnp.any(confidence > 0, axis=1)
-    frames = jnp.arange(len(seen))
-    # a frame without keypoints takes the candidates of its nearest neighbour, at no cost
-    nearest = jnp.argmin(jnp.abs(frames[:, None] - frames) + jnp.where(seen, 0, len(seen)), axis=1)
+    """Return orientations and scales (pixels per model unit) of the H best distinct sequences of one window."""
+    has_keypoints = jnp.any(confidence > 0, axis=1)
+    frames = jnp.arange(len(has_keypoints))
+    # a frame without keypoints has the candidates of the nearest frame with keypoints, with a matching cost of 0
+    distance = jnp.abs(frames[:, None] - frames) + jnp.where(has_keypoints, 0, len(frames))
+    nearest = jnp.argmin(distance, axis=1)
     match = jax.lax.map(lambda frame: match_candidates(candidates, model_keypoints, *frame), (keypoints_px, confidence))
     cost = match.cost[nearest]
-    blocked = jnp.zeros_like(cost)
+    exclusion = jnp.zeros_like(cost)
     orientations, scales = [], []
     for _ in range(config.hypotheses):
-        _, index = jax.lax.top_k(-(cost + blocked), min(config.candidates, cost.shape[1]))
-        unary = jnp.take_along_axis(cost + blocked, index, axis=1) * seen[:, None]
-        path = choose_sequence(unary, candidates[index], config.smoothness)
+        _, index = jax.lax.top_k(-(cost + exclusion), min(config.candidates, cost.shape[1]))
+        frame_cost = jnp.take_along_axis(cost + exclusion, index, axis=1) * has_keypoints[:, None]
+        path = choose_sequence(frame_cost, candidates[index], config.smoothness)
         chosen = index[frames, path]
         orientations.append(candidates[chosen])
         scales.append(match.scale_px[nearest, chosen])
         trace = jnp.einsum("tij,cij->tc", candidates[chosen], candidates)
-        blocked = jnp.where((trace - 1) / 2 > np.cos(BLOCKED_RADIUS), 1e9, blocked)
+        exclusion = jnp.where((trace - 1) / 2 > np.cos(LEAST_SEPARATION_RAD), EXCLUDED_COST, exclusion)
     return jnp.stack(orientations), jnp.stack(scales)
 
 
@@ -144,48 +157,49 @@ def search_initial_poses(
     camera: Camera,
     common_size: bool,
 ) -> Pose:
-    """Starting poses of W windows: H hypotheses each, with the mean body pose, at a depth where scale ≈ 1.
+    """Return initial poses of W windows: H hypotheses with the mean body pose, at a depth with scale ≈ 1.
 
     Args:
-        bird, rig: the model, and the same folded.
+        bird: the model.
+        rig: the model, folded.
         keypoints_px: crop pixels.
-        confidence: 0 where a keypoint is missing; a frame without any follows its neighbour.
+        confidence: 0 where a keypoint is missing. A frame without keypoints has an orientation close to its neighbours.
         config: candidates and hypotheses.
         camera: the crop camera.
-        common_size: one scale for the window.
+        common_size: whether the window has one scale, instead of one scale per frame.
 
     Returns:
         A Pose with leading axes W, H, then T.
 
-    Source: Hägerlind et al. 2024, initialisation, for the candidates; the choice over the window is ours.
+    Source: Hägerlind et al. 2024, initialisation, for the candidates. The choice over the whole window is jaxfit's.
     """
     frames = keypoints_px.shape[1]
     rest = rest_pose(bird)
     model_keypoints, root = posed_keypoints(rig, joint_transforms(rig, rest), rest), rig.joints[0]
     candidates = jnp.asarray(candidate_orientations(config), jnp.float32)
 
-    def start(R, scale_px, keypoints_px, confidence) -> tuple[Array, Array, Array]:
+    def initial_pose(R, scale_px, keypoints_px, confidence) -> tuple[Array, Array, Array]:
         window_scale_px = jnp.median(scale_px)
         depth = camera.focal_px / window_scale_px
         scale = jnp.ones(1) if common_size else jnp.clip(scale_px / window_scale_px, 0.5, 2.0)
-        # the bird turns about its root joint, as in `joint_transforms`
-        turned = jnp.einsum("tij,kj->tki", R, model_keypoints - root) + root
-        rotated = turned * scale[:, None, None]
-        # the shift that brings the confident keypoints' mean onto the observed mean, at that depth
+        # the bird rotates about its root joint, as in `joint_transforms`
+        rotated = jnp.einsum("tij,kj->tki", R, model_keypoints - root) + root
+        scaled = rotated * scale[:, None, None]
+        # at this depth, the shift aligns the mean of the model's keypoints with the mean of the detected keypoints
         weight = confidence[..., None] / jnp.maximum(jnp.sum(confidence, axis=1), 1e-6)[:, None, None]
         offset_px = jnp.sum(weight * (keypoints_px - camera.centre_px), axis=1)
-        xy = offset_px * depth / camera.focal_px - jnp.sum(weight * rotated, axis=1)[:, :2]
-        z = jnp.broadcast_to(depth - scale * root[2], (frames,))  # the root joint at this depth
+        xy = offset_px * depth / camera.focal_px - jnp.sum(weight * scaled, axis=1)[:, :2]
+        z = jnp.broadcast_to(depth - scale * root[2], (frames,))  # the root joint is at this depth
         transl = jnp.concatenate([xy, z[:, None]], axis=-1)
         return unwrap_axis_angle(matrix_to_axis_angle(R)), transl, scale
 
-    def window(seen: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-        R, scale_px = _orientations(candidates, model_keypoints, *seen, config)
-        return jax.vmap(start, (0, 0, None, None))(R, scale_px, *seen)
+    def search_window(detections: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+        R, scale_px = _orientations(candidates, model_keypoints, *detections, config)
+        return jax.vmap(initial_pose, (0, 0, None, None))(R, scale_px, *detections)
 
-    at_once = max(1, 100 // frames)  # a window of 100 frames × 2,400 candidates takes some 100 MB
-    orient, transl, scale = jax.lax.map(window, (keypoints_px, confidence), batch_size=at_once)
-    whole = jax.tree.map(
+    batch_size = max(1, 100 // frames)  # a window of 100 frames × 2,400 candidates needs about 100 MB
+    orient, transl, scale = jax.lax.map(search_window, (keypoints_px, confidence), batch_size=batch_size)
+    rest_poses = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*orient.shape[:2], *x.shape)), rest_pose(bird, frames, common_size)
     )
-    return dataclasses.replace(whole, global_orient=orient, transl=transl, scale=scale)
+    return dataclasses.replace(rest_poses, global_orient=orient, transl=transl, scale=scale)

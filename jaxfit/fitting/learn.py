@@ -1,7 +1,8 @@
-"""A pose prior learnt from results: mean and covariance of the poses that birds were found in.
+"""Learn a pose prior from results: mean and covariance of the fitted poses.
 
-Frames of one bird are much alike, so that a thousand of them tell far less than a thousand birds would. The covariance
-is therefore shrunk by the number of poses that would tell as much if each came by itself.
+The frames of one bird are correlated, so 1000 frames contain much less information than 1000 birds. The shrinkage of
+the covariance therefore depends on the effective number of poses: the number of independent poses with the same
+information.
 """
 
 from __future__ import annotations
@@ -21,52 +22,56 @@ from jaxfit.model.bird import Bird
 __all__ = ["LearntPrior", "effective_count", "learn_prior", "oas_shrinkage"]
 
 LEAST_SD_RAD = 0.02
-"""A component that hardly moved in these results is still given this much room."""
+"""Smallest standard deviation of a component of the pose, for components that hardly move in the results."""
 LEAST_BONE_SD = 0.01
-"""The same of a bone's relative length."""
+"""Smallest standard deviation of a bone's relative length."""
 
 
 @dataclass(frozen=True, eq=False)
 class LearntPrior:
-    """A bird with a prior learnt from results, and what that rests on."""
+    """A bird model with a learnt prior, and the amount of data behind the prior."""
 
     bird: Bird
+    """The model of the results, with the learnt prior."""
     poses: int
+    """Number of valid poses."""
     birds: int
+    """Number of birds with a valid pose."""
     diverged: int
-    """Birds left out because their fit diverged."""
+    """Number of skipped birds: all windows of the bird diverged. A bird with status `partly diverged` contributes its
+    valid poses."""
     effective_poses: float
-    """How many poses that have nothing to do with each other tell as much."""
+    """Number of independent poses with the same information, see `effective_count`."""
     shrinkage: float
-    """From 0, the correlations as they were counted, to 1, none."""
+    """Factor ρ between 0 (the sample correlations) and 1 (no correlations)."""
     bones_learnt: bool
-    """Whether bone lengths differed between birds; else their prior is the model's."""
+    """Whether the prior of bone lengths is learnt. If all birds have equal bone lengths, the model's prior is kept."""
     mean_change_rad: Float[np.ndarray, "bones"]
-    """How far each joint's mean moved from the model's: length of the change of its axis-angle."""
+    """Norm of the difference between the learnt and the model's mean axis-angle of each joint, in radians."""
 
 
 def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior:
-    """The model of some results, with a pose prior learnt from them.
+    """Learn a pose prior from results, and return the model with the learnt prior.
 
-    Mean and variances are those of all valid poses of birds whose fit did not diverge. Correlations are shrunk towards
-    none: C ← (1 − ρ) C + ρ I with the ρ of `oas_shrinkage` at the `effective_count` of poses, and no standard
-    deviation is below 0.02 rad, so that the covariance is positive definite however few there are. Bone lengths are
-    learnt likewise, one sample a bird, where they differ between birds.
+    The mean and the variances are those of all valid poses. The correlation matrix C is shrunk towards the identity:
+    C ← (1 − ρ) C + ρ I, where ρ is the `oas_shrinkage` for the `effective_count` of the poses. No standard deviation is
+    below 0.02 rad. The covariance is therefore positive definite, also for few poses. The prior of bone lengths is
+    learnt in the same way, with one sample per bird, if the bone lengths differ between birds.
 
-    The results' own prior is in them: what is learnt lies nearer to it, and is narrower, than what birds do. Fit with
-    a small weight of `pose_prior` to learn from.
+    The results depend on the prior of their own fit: the learnt prior is closer to that prior, and narrower, than the
+    true distribution of poses. Use results that were fitted with a small weight of `pose_prior`.
 
     Args:
-        results: each with its name for errors, its poses and the model it was fitted with.
+        results: for each result its name in error messages, its poses and its model.
 
     Raises:
-        InputError: results of models with other joints, or no valid pose.
+        InputError: the results have different models, or no valid pose.
     """
     first_source, _, bird = results[0]
     tracks, bones, diverged = [], [], 0
-    for source, solution, own in results:
-        if (own.name, own.joint_names) != (bird.name, bird.joint_names):
-            problem = f"is of the model {own.name}, but {first_source} of {bird.name}, or its joints differ"
+    for source, solution, model in results:
+        if (model.name, model.joint_names) != (bird.name, bird.joint_names):
+            problem = f"has the model {model.name}, but {first_source} has the model {bird.name}, or the joints differ"
             raise InputError(source, problem, "learn from results of one model")
         for n, status in enumerate(solution.status):
             valid = solution.valid[n]
@@ -76,8 +81,8 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
                 tracks.append((pose.reshape(len(valid), -1), valid))
                 bones.append(solution.bone_length[n, valid].mean(axis=0, dtype=np.float64))
     if not tracks:
-        left = f"; {diverged} diverged" if diverged else ""
-        raise InputError(first_source, f"holds no pose to learn from{left}", "give results with fitted birds")
+        skipped = f"; diverged birds: {diverged}" if diverged else ""
+        raise InputError(first_source, f"holds no valid pose{skipped}", "use results with fitted birds")
     poses = np.concatenate([pose[valid] for pose, valid in tracks])
     effective = effective_count(tracks)
     mean, covariance, shrinkage = _gaussian(poses, effective, LEAST_SD_RAD)
@@ -93,58 +98,62 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
             bone_covariance=jnp.asarray(bone_covariance, jnp.float32),
         )
     change = (mean - np.asarray(bird.pose_mean, np.float64)).reshape(-1, 3)
-    moved = np.linalg.norm(change, axis=1)
-    return LearntPrior(learnt, len(poses), len(tracks), diverged, effective, shrinkage, bones_learnt, moved)
+    mean_change_rad = np.linalg.norm(change, axis=1)
+    return LearntPrior(learnt, len(poses), len(tracks), diverged, effective, shrinkage, bones_learnt, mean_change_rad)
 
 
 def effective_count(tracks: Sequence[tuple[Float[np.ndarray, "T D"], Bool[np.ndarray, "T"]]]) -> float:
-    """How many independent poses tell as much as all valid frames: n (1 − r)/(1 + r), but at least one a track.
+    """Return the number of independent poses with the same information: n (1 − r)/(1 + r), at least one per track.
 
-    r is the correlation of consecutive valid frames, over all tracks and components of standardised poses: a track
-    is taken for an autoregressive process of order 1.
+    n is the number of valid poses, and r the correlation of consecutive valid frames over all tracks and components of
+    the standardised poses. The equation holds for an autoregressive process of order 1.
 
     Args:
-        tracks: poses of each, and which of them are valid.
+        tracks: for each track its poses, and whether each pose is valid.
 
     Source: Bayley and Hammersley 1946, *The "Effective" Number of Independent Observations in an Autocorrelated Time
     Series*.
     """
     poses = np.concatenate([pose[valid] for pose, valid in tracks])
     spread = np.maximum(poses.std(axis=0), 1e-9)
-    together = apart = 0.0
-    neighbours = 0
+    covariance = variance = 0.0
+    pair_count = 0
     for pose, valid in tracks:
         pairs = valid[:-1] & valid[1:]
-        before, after = ((pose[at][pairs] - poses.mean(axis=0)) / spread for at in (slice(-1), slice(1, None)))
-        together += (before * after).sum()
-        apart += ((before**2 + after**2) / 2).sum()
-        neighbours += pairs.sum()
-    # birds that do not move at all are as alike as can be; frames without a neighbour are taken for independent
-    r = np.clip(together / apart, 0.0, 1.0) if apart else float(neighbours > 0)
+        before, after = ((frames[pairs] - poses.mean(axis=0)) / spread for frames in (pose[:-1], pose[1:]))
+        covariance += (before * after).sum()
+        variance += ((before**2 + after**2) / 2).sum()
+        pair_count += pairs.sum()
+    # without variance: r = 1 for birds that never move, r = 0 (independent frames) without consecutive frames
+    r = np.clip(covariance / variance, 0.0, 1.0) if variance else float(pair_count > 0)
     return max(float(len(poses) * (1 - r) / (1 + r)), float(len(tracks)))
 
 
 def oas_shrinkage(matrix: Float[np.ndarray, "D D"], count: float) -> float:
-    """How far to shrink a sample covariance S of `count` samples towards (tr S/D) I, by oracle approximation.
+    """Return the shrinkage ρ of a sample covariance S of n samples towards (tr S/D) I, by oracle approximation.
 
     ρ = min(1, ((1 − 2/D) tr S² + tr² S) / ((n + 1 − 2/D) (tr S² − tr² S/D))).
+
+    Args:
+        matrix: the sample covariance S.
+        count: the number of samples n.
 
     Source: Chen, Wiesel, Eldar and Hero 2010, *Shrinkage Algorithms for MMSE Covariance Estimation*, eq. 23.
     """
     size, trace, squared = len(matrix), float(np.trace(matrix)), float((matrix**2).sum())
-    above = (1 - 2 / size) * squared + trace**2
-    below = (count + 1 - 2 / size) * (squared - trace**2 / size)
-    return min(1.0, above / below) if below > 0 and math.isfinite(below) else 1.0
+    numerator = (1 - 2 / size) * squared + trace**2
+    denominator = (count + 1 - 2 / size) * (squared - trace**2 / size)
+    return min(1.0, numerator / denominator) if denominator > 0 and math.isfinite(denominator) else 1.0
 
 
 def _gaussian(
     samples: Float[np.ndarray, "n D"], count: float, least_sd: float
 ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"], float]:
-    """Mean, covariance with shrunk correlations, and the shrinkage."""
+    """Return mean, covariance with shrunk correlations, and the shrinkage."""
     mean = samples.mean(axis=0)
     deviation = samples - mean
     sd = np.sqrt((deviation**2).mean(axis=0) + least_sd**2)
-    # the floor is noise of every component's own, which correlates with nothing
+    # `least_sd` acts as independent noise: it increases the variances, not the covariances
     correlation = (deviation / sd).T @ (deviation / sd) / len(samples)
     np.fill_diagonal(correlation, 1.0)
     shrinkage = oas_shrinkage(correlation, count)

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt: a few steps that use the curvature, instead of hundreds that do not."""
+"""Levenberg-Marquardt: a solver that uses the curvature of the objective and needs few steps."""
 
 from __future__ import annotations
 
@@ -18,46 +18,48 @@ from jaxfit.objective.objective import evaluate_curvature
 __all__ = ["LEVENBERG_MARQUARDT"]
 
 CG_STEPS, CG_TOLERANCE = 100, 0.01
-"""Largest number of conjugate-gradient steps within a step, and the relative residual at which they end. The first
-steps need few; far below 1e-6 single precision underflows to 0/0."""
+"""Largest number of conjugate-gradient steps within one step, and the relative residual at which they end. The
+first steps need few of them. A tolerance far below 1e-6 makes single precision underflow to 0/0."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-5, 1e8
-EASE, TIGHTEN = 0.2, 5.0
-"""Factors on the damping after a step that lowered the loss, and after a step that did not."""
+"""The damping μ of the first step, and the bounds of μ."""
+DAMPING_DECREASE, DAMPING_INCREASE = 0.2, 5.0
+"""Factors on the damping after a step that lowered the loss, and after a step that did not lower the loss."""
 
 
 class _State(NamedTuple):
     loss: Float[Array, ""]
     gradient: Pose
     curvature: Curvature
-    """At the present pose, unless `moved`."""
+    """The curvature at the current pose, except if `moved` is set."""
     moved: Bool[Array, ""]
     """Whether the pose changed since the curvature was computed."""
     damping: Float[Array, ""]
     rejected: Int[Array, ""]
-    """Steps at a pose whose loss or gradient is not finite."""
+    """Number of steps from a pose whose loss or gradient is not finite."""
 
 
 _loss_and_gradient = jax.value_and_grad(problem_loss, argnums=2)
 
 
 def _init(program: Program, problem: Problem, carried: Any) -> _State:
-    assert carried is None  # the config was checked: no other solver has anything for this one
+    assert carried is None  # `FitConfig` checks this: only Adam has moments
     loss, gradient = _loss_and_gradient(program, problem, problem.anchor)
     shapes = jax.eval_shape(lambda: _curvature(program, problem, problem.anchor))
-    nothing_yet = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return _State(loss, gradient, nothing_yet, jnp.bool_(True), jnp.float32(FIRST_DAMPING), jnp.int32(0))
+    not_computed = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return _State(loss, gradient, not_computed, jnp.bool_(True), jnp.float32(FIRST_DAMPING), jnp.int32(0))
 
 
 def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tuple[Pose, _State]:
-    """x ← x + d with (H + μ·diag H)·d = −g where that lowers the objective; then μ falls, else μ rises.
+    """Return x + d with (H + μ·diag H)·d = −g if this lowers the objective, else x.
 
-    H is the curvature of the terms' quadratic bounds. H is never formed: within a frame it is JᵀJ, between frames one
-    band, and conjugate gradients need only its products. After a step that lowered nothing, H is still that of the
-    present pose and is not computed again.
+    The damping μ decreases after a step that lowered the objective, and increases otherwise. H is the curvature of
+    the terms' quadratic bounds: JᵀJ within a frame, and one band between frames. Conjugate gradients need only products
+    with H, so that the matrix itself is not computed. If the last step did not change the pose, H is not computed
+    again.
 
     Source: Marquardt 1963, An algorithm for least-squares estimation of nonlinear parameters.
     """
-    # over the whole batch: a condition of each problem by itself would become a selection, which computes both sides
+    # one condition for the whole batch: under `vmap`, a condition per problem would compute both branches
     curvature = jax.lax.cond(
         jax.lax.psum(state.moved.astype(jnp.int32), BATCH_AXIS) > 0,
         lambda: _curvature(program, problem, pose),
@@ -68,14 +70,14 @@ def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tupl
     frames, scales = len(optimised), pose.scale.shape[0]
 
     def allowed(rows: Rows) -> Rows:
-        """The part of a change that fixed parameters and a common scale allow."""
+        """Set the change of fixed parameters to 0, and the change of a common scale to its mean."""
         rows = jnp.where(optimised, rows, 0.0)
         return rows.at[:, -1].set(rows[:, -1].mean()) if scales < frames else rows
 
     gradient = frame_rows(state.gradient)
-    gradient = gradient.at[:, -1].divide(frames // scales)  # each frame has its share of a common scale
+    gradient = gradient.at[:, -1].divide(frames // scales)  # the gradient of a common scale is split between the frames
     diagonal = allowed(curvature.diagonal)
-    # a parameter that no term pulls has no gradient either, and stays
+    # a parameter without curvature has no gradient and does not change
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
     change, _ = cg(
         lambda d: allowed(curvature.product(d)) + state.damping * diagonal * d,
@@ -84,17 +86,18 @@ def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tupl
         tol=CG_TOLERANCE,
         maxiter=CG_STEPS,
     )
-    moved = _moved(pose, change)
-    loss, new_gradient = _loss_and_gradient(program, problem, moved)
+    new_pose = _add_rows(pose, change)
+    loss, new_gradient = _loss_and_gradient(program, problem, new_pose)
     lower = (loss < state.loss) & _finite(new_gradient)
 
-    def better(new: Any, old: Any) -> Any:
+    def choose(new: Any, old: Any) -> Any:
         return jax.tree.map(lambda a, b: jnp.where(lower, a, b), new, old)
 
-    damping = jnp.clip(state.damping * jnp.where(lower, EASE, TIGHTEN), LEAST_DAMPING, MOST_DAMPING)
-    stuck = ~(jnp.isfinite(state.loss) & _finite(state.gradient))
-    loss, gradient = better((loss, new_gradient), (state.loss, state.gradient))
-    return better(moved, pose), _State(loss, gradient, curvature, lower, damping, state.rejected + stuck)
+    factor = jnp.where(lower, DAMPING_DECREASE, DAMPING_INCREASE)
+    damping = jnp.clip(state.damping * factor, LEAST_DAMPING, MOST_DAMPING)
+    not_finite = ~(jnp.isfinite(state.loss) & _finite(state.gradient))
+    loss, gradient = choose((loss, new_gradient), (state.loss, state.gradient))
+    return choose(new_pose, pose), _State(loss, gradient, curvature, lower, damping, state.rejected + not_finite)
 
 
 def _curvature(program: Program, problem: Problem, pose: Pose) -> Curvature:
@@ -106,7 +109,8 @@ def _outcome(state: _State) -> tuple[Float[Array, ""], Int[Array, ""]]:
     return state.loss, state.rejected
 
 
-def _moved(pose: Pose, rows: Rows) -> Pose:
+def _add_rows(pose: Pose, rows: Rows) -> Pose:
+    """Return the pose plus a change, which has one row per frame in the layout of `frame_rows`."""
     return replace(
         pose,
         global_orient=pose.global_orient + rows[:, :3],

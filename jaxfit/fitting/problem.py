@@ -1,4 +1,4 @@
-"""One problem of a batch: one window of one bird under one config, as a solver sees the problem."""
+"""The problem that a solver solves: one window of one bird under one config."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from jaxfit.objective.registry import Term
 __all__ = ["BATCH_AXIS", "Hyperparameters", "Problem", "Program", "Solver", "problem_loss", "problem_window"]
 
 BATCH_AXIS = "problems"
-"""Name of the axis along which a solver is mapped over the problems of a batch."""
+"""Name of the axis of the problems of a batch, over which a solver is mapped."""
 
 
 class Program(NamedTuple):
-    """What all problems of a stage share. `rig` and `priors` are traced, the rest is part of the compiled program."""
+    """The data that all problems of a stage share. `rig` and `priors` are traced; the other fields are static."""
 
     rig: Rig
     priors: Priors
@@ -37,19 +37,19 @@ class Program(NamedTuple):
 
 
 class Hyperparameters(NamedTuple):
-    """What may differ between the problems of a batch. All values are traced; a batch puts an axis B in front."""
+    """The values that may differ between the problems of a batch. All values are traced. A batch adds an axis B."""
 
     settings: dict[str, dict[str, Float[Array | np.ndarray, "*B"]]]
     """Weight and settings of the active terms."""
     step_size: Pose
-    """Adam's step for every parameter, of a shape that broadcasts against the pose. 0 fixes a parameter, for every
+    """Adam's step size for every parameter, in shapes that broadcast against the pose. 0 fixes a parameter, for every
     solver."""
     keypoints_on: Float[Array | np.ndarray, "*B K"]
-    """1 for the keypoints that this stage uses, else 0."""
+    """1 for the keypoints that the stage uses, else 0."""
 
 
 class Problem(NamedTuple):
-    """What a solver knows of one problem besides the pose; a batch puts an axis B in front of every array."""
+    """The data of one problem, without the optimised pose. A batch adds a leading axis B to every array."""
 
     hyperparameters: Hyperparameters
     anchor: Pose
@@ -58,23 +58,23 @@ class Problem(NamedTuple):
 
 
 class Solver(NamedTuple):
-    """How the pose of one problem is improved. All three functions are pure.
+    """A method that improves the pose of one problem. All three functions are pure.
 
-    They are mapped over the problems of a batch along the axis `BATCH_AXIS`.
+    A batch maps the functions over its problems along the axis `BATCH_AXIS`.
     """
 
     init: Callable[[Program, Problem, Any], Any]
-    """The state before the first step, at the anchor. The third argument is the state at the end of the stage before,
-    whose moments the solver continues; None: no such state."""
+    """Return the state before the first step, at the anchor. The third argument is the state after the previous stage,
+    whose moments the solver continues. None: the solver starts without moments."""
     step: Callable[[Program, Problem, Pose, Any], tuple[Pose, Any]]
-    """One step: the next pose and state."""
+    """Take one step. Return the next pose and state."""
     outcome: Callable[[Any], tuple[Float[Array, ""], Int[Array, ""]]]
-    """From a state: the last loss that the solver computed, and the number of steps of this stage that were rejected
-    because the loss or its gradient was not finite. After the first such step the pose does not change any more."""
+    """Return, from a state, the last loss that the solver computed, and the number of steps of this stage that were
+    rejected because the loss or its gradient was not finite. After the first rejected step, the pose is constant."""
 
 
 def problem_window(program: Program, problem: Problem, pose: Pose) -> PosedWindow:
-    """Return the posed window that the terms see."""
+    """Return the posed window that the terms evaluate."""
     targets = problem.targets
     active = targets.confidence * problem.hyperparameters.keypoints_on
     targets = eqx.tree_at(lambda t: t.confidence, targets, active)
@@ -82,7 +82,7 @@ def problem_window(program: Program, problem: Problem, pose: Pose) -> PosedWindo
 
 
 def problem_loss(program: Program, problem: Problem, pose: Pose) -> Float[Array, ""]:
-    """Return the objective. Fixed parameters have no gradient, so that their moments stay zero."""
+    """Return the objective. The gradient of fixed parameters is 0, so their moments stay 0."""
     optimised = jax.tree.map(
         lambda x, step: jnp.where(step > 0, x, jax.lax.stop_gradient(x)), pose, problem.hyperparameters.step_size
     )

@@ -1,4 +1,4 @@
-"""One stage of the fit: a solver's steps on a batch of problems, as one compiled program."""
+"""One stage of a fit: steps of a solver on a batch of problems, as one compiled program."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["Report", "StageState", "advance", "begin", "report"]
 
 
 class StageState(NamedTuple):
-    """The progress of a batch of B problems in one stage."""
+    """The current poses and solver states of a batch of B problems in one stage."""
 
     pose: Pose
     solver: Any
-    """The state of the solver, for each problem."""
+    """The state of the solver, with leading axis B."""
 
 
 @eqx.filter_jit
@@ -29,16 +29,16 @@ def begin(program: Program, problems: Problem, carried: Any) -> StageState:
     """Return the state at the beginning of a stage, at the anchor poses.
 
     Args:
-        program: what the problems share.
-        problems: with leading axis B.
-        carried: solver state at the end of the stage before, whose moments continue; None: fresh moments.
+        program: the program of the stage.
+        problems: the problems, with leading axis B.
+        carried: the solver state after the previous stage, whose moments continue. None: the moments start at 0.
     """
 
     def one(problem: Problem, carried: Any) -> Any:
         return program.solver.init(program, problem, carried)
 
     solver = jax.vmap(one, axis_name=BATCH_AXIS)(problems, carried)
-    # copies: `advance` reuses the memory of its state
+    # `advance` reuses the memory of its state, so the state must not share memory with the anchor
     return StageState(*jax.tree.map(jnp.copy, (problems.anchor, solver)))
 
 
@@ -49,8 +49,8 @@ def advance(
     """Take some steps.
 
     Args:
-        fixed: the program, the problems (B, …) and the number of steps, which is traced.
-        state: its memory is reused; use the returned state instead.
+        fixed: the program, the problems (B, …) and the number of steps (traced).
+        state: the current state. Its memory is reused, so the caller must use the returned state instead.
 
     Returns:
         The new state, and `Solver.outcome` of each problem: loss (B,) and rejected steps (B,).
@@ -71,7 +71,7 @@ class Report(NamedTuple):
     """The objective and the keypoints at a batch of poses."""
 
     loss: dict[str, Float[Array, "B"]]
-    """Each term's weighted share of the objective."""
+    """Weighted value of each term in the objective."""
     keypoints_cam: Float[Array, "B T K 3"]
     keypoints_px: Float[Array, "B T K 2"]
     """Crop pixels."""
@@ -79,7 +79,7 @@ class Report(NamedTuple):
 
 @eqx.filter_jit
 def report(program: Program, problems: Problem, pose: Pose) -> Report:
-    """Evaluate a batch of poses (a solver's state only knows the loss before its last step)."""
+    """Evaluate the objective at a batch of poses. A solver's state has only the loss before its last step."""
 
     def one(problem: Problem, pose: Pose) -> Report:
         window, settings = problem_window(program, problem, pose), problem.hyperparameters.settings

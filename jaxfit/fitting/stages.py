@@ -1,4 +1,4 @@
-"""Stages of a config, turned into programs and hyperparameters for the solvers."""
+"""Programs and hyperparameters of the stages of a config."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 SOLVERS: Mapping[str, Solver] = {"adam": ADAM, "levenberg_marquardt": LEVENBERG_MARQUARDT}
-"""By the name in a stage's `solver`."""
+"""Solvers by their name in `StageConfig.solver`."""
 STEP_SHAPES = {
     "global_orient": (3,),
     "body_pose": (1, 3),
@@ -40,11 +40,11 @@ STEP_SHAPES = {
     "bone_length": (1,),
     "betas": (1,),
 }
-"""Step sizes are the same for all frames, bones and shape coefficients."""
+"""Shapes of the step sizes: all frames, bones and shape coefficients have the same step size."""
 
 
 class FitModel(NamedTuple):
-    """A bird and the crop camera, as all stages of a fit use them."""
+    """The bird, its folded arrays, its priors and the crop camera, for all stages of a fit."""
 
     bird: Bird
     rig: Rig
@@ -53,7 +53,7 @@ class FitModel(NamedTuple):
 
 
 def fit_model(bird: Bird, config: FitConfig) -> FitModel:
-    """Fold a bird for a fit."""
+    """Return the model of a fit: the bird, folded, and the crop camera of the config."""
     return FitModel(bird, fold_bird(bird), priors_of(bird), crop_camera(config))
 
 
@@ -63,20 +63,20 @@ def crop_camera(config: FitConfig) -> Camera:
 
 
 def needs_mask(stage: StageConfig) -> bool:
-    """Whether any term of a stage compares masks."""
+    """Return whether any term of a stage compares masks."""
     return any(term.compares_masks for term in find_terms(stage.terms).values())
 
 
 def stage_program(config: FitConfig, stage: StageConfig, model: FitModel) -> Program:
-    """Return what the problems of one stage share. The terms are looked up here, before anything is compiled."""
-    usual = Blur.for_size(config.crop.size_px)
-    blur = Blur(usual.sigma * stage.blur**2, usual.radius * stage.blur)
+    """Return the program of one stage. The functions of the terms are part of the program."""
+    paper_blur = Blur.for_size(config.crop.size_px)
+    blur = Blur(paper_blur.sigma * stage.blur**2, paper_blur.radius * stage.blur)
     raster = Raster(blur, config.crop.size_px, config.backend)
     return Program(model.rig, model.priors, model.camera, raster, find_terms(stage.terms), SOLVERS[stage.solver])
 
 
 def stage_hyperparameters(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[str]) -> Hyperparameters:
-    """Return the hyperparameters of one stage of one config, as NumPy arrays of a single problem."""
+    """Return the hyperparameters of one stage of one config, as NumPy arrays for one problem."""
 
     def step_size(name: str, shape: tuple[int, ...]) -> np.ndarray:
         scale = np.asarray(stage.step_scale.get(name, 1.0), np.float32)
@@ -96,13 +96,13 @@ def stage_hyperparameters(config: FitConfig, stage: StageConfig, keypoint_names:
 def compiled_part(config: FitConfig) -> FitConfig:
     """Return the part of the config that determines the compiled program.
 
-    Configs with an equal part differ only in hyperparameters and in the preparation of the data. They share one
-    compiled program.
+    Configs with an equal compiled part differ only in hyperparameters and in the preparation of the data.
     """
     stages = tuple(
         replace(
             stage,
-            optimised=tuple(name for name in stage.optimised if name == "betas"),  # decides whether there are any
+            # `betas` sets the number of shape coefficients; the other names only set step sizes
+            optimised=tuple(name for name in stage.optimised if name == "betas"),
             learning_rate=1.0,
             step_scale={},
             keypoints_off=(),

@@ -1,4 +1,4 @@
-"""What a result folder says about itself: what was found, how it was made, how long it took."""
+"""The summary of a result folder: counts, status, timings and versions."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ LIBRARIES = ("jaxfit", "jax", "jaxlib", "equinox", "optimistix", "optax", "numpy
 
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
-    """What `summary.json` says: counts, every track's status, failure and objective, timings, versions, model.
+    """Return the content of `summary.json`: counts, status, failures and loss of every track, timings, model, versions.
 
     Args:
         solution: the result.
-        bird: the model it was fitted with.
-        seconds: how long each part took.
+        bird: the model of the fit.
+        seconds: duration of each part of the command.
     """
     return {
         "tracks": len(solution.track_id),

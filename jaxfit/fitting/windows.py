@@ -24,18 +24,18 @@ __all__ = ["Windows", "cut_windows", "filter_observations", "load_targets", "win
 
 @dataclass(frozen=True)
 class Windows:
-    """W windows of T frames, each of one track, with K keypoints."""
+    """W windows of T frames and K keypoints; a window belongs to one track."""
 
     track: Int[np.ndarray, "W"]
     """Position of the window's track in the observations."""
     track_id: Int[np.ndarray, "W"]
-    """Number of the same track."""
+    """Id of the window's track."""
     frame: Int[np.ndarray, "W T"]
-    """Position of each frame in the observations; −1 where the video has no such frame (a gap, or past its end)."""
+    """Position of each frame in the observations; −1 for frame numbers without a frame (a gap, or after the end)."""
     present: Bool[np.ndarray, "W T"]
-    """Whether the bird has enough confident keypoints in that frame to be fitted."""
+    """Whether the bird has enough confident keypoints in the frame for a fit."""
     crop: Float[np.ndarray, "W T 3"]
-    """(x0, y0, size) in image pixels; whole numbers, one size for each window."""
+    """(x0, y0, size) in image pixels; integers, with one size per window."""
     keypoints_px: Float[np.ndarray, "W T K 2"]
     """Crop pixels; 0 where the confidence is 0."""
     confidence: Float[np.ndarray, "W T K"]
@@ -58,8 +58,9 @@ def windows_key(config: FitConfig) -> tuple:
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     """Cut every track into consecutive windows of `config.window` frames, from its first usable frame on.
 
-    Keypoints are filtered first. Frames are consecutive by their numbers: where the file skips numbers, the window has
-    missing frames, so that no term takes distant frames for neighbours. Tracks without a usable frame get no window.
+    The keypoints are filtered first. The frames of a window have consecutive frame numbers: if the file skips frame
+    numbers, the window has missing frames, so that distant frames are not neighbours in the temporal terms. A track
+    without a usable frame has no window.
     """
     observations = filter_observations(observations, config.filter_window)
     usable = observations.usable(config.min_keypoints)
@@ -99,7 +100,7 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
 
 
 def filter_observations(observations: Observations, window: int) -> Observations:
-    """Smooth every track with the weighted median filter, over frame numbers (a gap stays a gap)."""
+    """Smooth every track with the weighted median filter. Missing frame numbers count as frames without keypoints."""
     if window == 1 or observations.num_frames == 1:
         return observations
     line = _timeline(observations)
@@ -112,11 +113,11 @@ def filter_observations(observations: Observations, window: int) -> Observations
 
 
 def load_targets(windows: Windows, mask_px: int) -> Targets:
-    """Return the targets of some windows as NumPy arrays with a leading axis W. Masks are decoded here.
+    """Decode the masks of some windows, and return the targets as NumPy arrays with a leading axis W.
 
     Args:
-        windows: the windows; their masks are all in memory afterwards.
-        mask_px: side of the masks; 0: no masks.
+        windows: the windows. All their masks must fit into memory.
+        mask_px: side of the masks in pixels. 0: no masks.
     """
     mask = np.zeros((*windows.frame.shape, mask_px, mask_px), np.uint8)
     has_mask = windows.mask_rle != np.array(None)
@@ -136,13 +137,13 @@ def load_targets(windows: Windows, mask_px: int) -> Targets:
 
 
 def _timeline(observations: Observations) -> Int[np.ndarray, "L"]:
-    """Position of every frame number from first to last, in the file's own step; −1 where it has none."""
+    """Return the positions of all frame numbers from first to last, in the file's step; −1 for missing numbers."""
     numbers = observations.frame_index
     step = frame_step(numbers)
     if len(numbers) and (numbers[-1] - numbers[0]) // step > 100 * len(numbers):
         raise InputError(
             "observations",
-            f"frame_index runs to {numbers[-1]} but holds {len(numbers)} frames",
+            f"frame_index ends at {numbers[-1]}, but the file has only {len(numbers)} frames",
             "number the frames consecutively",
         )
     at = (numbers - numbers[0]) // step if len(numbers) else np.zeros(0, int)

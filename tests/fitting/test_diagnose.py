@@ -1,4 +1,4 @@
-"""A term that cannot be used is named before the fit; one that breaks a bird down is named with bird and step."""
+"""Unusable terms are rejected before the fit. Terms that make a fit diverge are named with track and step."""
 
 import importlib
 import json
@@ -24,10 +24,10 @@ import jax
 import jax.numpy as jnp
 
 def symmetry(window, *, power=2.0):
-    "Left and right wing alike."
+    "The symmetry of the left and the right wing."
     left, right = window.joint_indices("left_wing", "right_wing")
-    apart = window.pose.body_pose[:, left - 1] - window.pose.body_pose[:, right - 1]
-    return jnp.sum(jnp.where(window.present[:, None], jnp.abs(apart) ** power, 0.0))
+    difference = window.pose.body_pose[:, left - 1] - window.pose.body_pose[:, right - 1]
+    return jnp.sum(jnp.where(window.present[:, None], jnp.abs(difference) ** power, 0.0))
 
 def vector(window):
     return window.pose.body_pose[:, 0]
@@ -50,7 +50,7 @@ def nan_value(window):
     return jnp.where(left, jnp.nan, 0.0) * jnp.sum(window.pose.scale)
 
 def nan_value_later(window):
-    "Not finite as soon as the bird has moved, with a gradient of zero."
+    "NaN after the bird has moved, with a gradient of zero."
     moved = jnp.abs(window.pose.transl - window.anchor.transl).max() > 0.005
     return jnp.where(moved, jnp.nan, 0.0)
 
@@ -80,14 +80,14 @@ def command(inputs, tmp_path, *names, steps=3, weight=1):
 
 
 def test_a_term_by_its_path(inputs, tmp_path):
-    apart = []
+    asymmetry = []
     for weight in (0, 1e4):
         assert main([*command(inputs, tmp_path, "own_terms:symmetry", steps=30, weight=weight), "--overwrite"]) == 0
         solution, _ = load_solution(tmp_path / "out")
         assert set(solution.loss) == {"keypoints", "own_terms:symmetry"}
         left, right = (solution.joint_names.index(f"{side}_wing") - 1 for side in ("left", "right"))
-        apart.append(np.abs(solution.body_pose[:2, :, left] - solution.body_pose[:2, :, right]).mean())
-    assert apart[1] < 0.3 * apart[0]
+        asymmetry.append(np.abs(solution.body_pose[:2, :, left] - solution.body_pose[:2, :, right]).mean())
+    assert asymmetry[1] < 0.3 * asymmetry[0]
     assert "own_terms:symmetry" in (tmp_path / "out" / "config.yaml").read_text()
 
 
@@ -104,37 +104,37 @@ def test_a_term_by_its_path(inputs, tmp_path):
         ("nonsense", ("velocity", "package.module:function", "own.yaml")),
     ],
 )
-def test_terms_that_cannot_be_used(inputs, tmp_path, capsys, name, words):
+def test_unusable_terms_are_rejected(inputs, tmp_path, capsys, name, words):
     rejected(capsys, command(inputs, tmp_path, name, steps=1000), name, *words)
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("name", "what"), [("nan_value", "value"), ("nan_gradient", "gradient")])
-def test_what_breaks_a_bird_down_is_named(inputs, tmp_path, caplog, name, what):
+@pytest.mark.parametrize(("name", "part"), [("nan_value", "value"), ("nan_gradient", "gradient")])
+def test_the_term_that_makes_a_fit_diverge_is_named(inputs, tmp_path, caplog, name, part):
     bill_px = read_coco(inputs / "birds.json").keypoints_px[:2, 0, 0, 0]  # of tracks 4 and 7
     importlib.import_module("own_terms").SPLIT_PX = bill_px.mean() * CROP_PX / SIZE
-    broken = {"nan_value": {("4", "7")[bill_px.argmin()]}, "nan_gradient": {"4", "7"}}[name]
+    diverged = {"nan_value": {("4", "7")[bill_px.argmin()]}, "nan_gradient": {"4", "7"}}[name]
     with caplog.at_level(logging.WARNING):
         assert main(command(inputs, tmp_path, f"own_terms:{name}")) == 0
     solution, _ = load_solution(tmp_path / "out")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert set(summary["failures"]) == broken
-    assert {str(track) for track in solution.track_id[solution.status == "diverged"]} == broken
-    for track, said in summary["failures"].items():
-        failure = f"frames 0 to {T - 1}: the {what} of own_terms:{name} was not finite at step 1 of stage second"
-        assert said == [failure]
+    assert set(summary["failures"]) == diverged
+    assert {str(track) for track in solution.track_id[solution.status == "diverged"]} == diverged
+    for track, reported in summary["failures"].items():
+        failure = f"frames 0 to {T - 1}: the {part} of own_terms:{name} was not finite at step 1 of stage second"
+        assert reported == [failure]
         assert f"track {track}, {failure}" in caplog.text
 
 
-def test_a_value_that_stops_being_finite_is_dated(inputs, tmp_path):
-    """Adam's first step moves every translation by 0.01, so that the value at the second step is not finite."""
+def test_the_step_of_a_failure_is_reported(inputs, tmp_path):
+    """The first step of Adam moves every translation by 0.01, so the value is not finite at the second step."""
     assert main(command(inputs, tmp_path, "own_terms:nan_value_later", steps=20)) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     expected = "the value of own_terms:nan_value_later was not finite at step 2 of stage second"
-    assert [said[0].split(": ", 1)[1] for said in summary["failures"].values()] == [expected] * 2
+    assert [reported[0].split(": ", 1)[1] for reported in summary["failures"].values()] == [expected] * 2
 
 
-def test_a_first_failure_stays():
+def test_the_first_failure_is_kept():
     known = np.array(["", "known"], object)
-    nothing: Any = None  # nothing is evaluated
-    assert name_failures(known, np.array([0, 3]), "stage", nothing, nothing, nothing).tolist() == ["", "known"]
+    unused: Any = None  # no term is evaluated
+    assert name_failures(known, np.array([0, 3]), "stage", unused, unused, unused).tolist() == ["", "known"]

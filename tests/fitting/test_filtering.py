@@ -10,7 +10,7 @@ from jaxfit.fitting.filtering import weighted_median_filter
 
 
 def slow_filter(keypoints, confidence, window):
-    """The definition, one frame, keypoint and coordinate at a time."""
+    """The definition of the filter as a loop over frames, keypoints and coordinates."""
     out = keypoints.copy()
     T, K = confidence.shape
     for t in range(T):
@@ -19,66 +19,67 @@ def slow_filter(keypoints, confidence, window):
             for axis in range(2):
                 pairs = sorted((keypoints[i, k, axis], confidence[i, k]) for i in frames if confidence[i, k] > 0)
                 total = sum(c for _, c in pairs)
-                passed = 0.0
+                cumulative = 0.0
                 for value, c in pairs:
-                    passed += c
-                    if passed >= total / 2:
+                    cumulative += c
+                    if cumulative >= total / 2:
                         out[t, k, axis] = value
                         break
     return out
 
 
-# one length for each parameter, so that hypothesis does not compile anew for every example
+# fixed lengths, so that hypothesis does not compile a new program for every example
 @pytest.mark.parametrize(("T", "window"), [(1, 5), (3, 5), (7, 3), (8, 5), (4, 1)])
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_agrees_with_the_plain_loop(T, window, data):
     seed = data.draw(st.integers(0, 2**32 - 1))
     rng = np.random.default_rng(seed)
-    # few distinct values and confidences in sixteenths: ties, exact halves and missing keypoints all occur
+    # few distinct values, and confidences in sixteenths: equal values, exact halves and missing keypoints occur
     keypoints = rng.integers(-4, 5, (T, 3, 2)).astype(np.float32)
     confidence = (rng.integers(0, 17, (T, 3)) / 16 * (rng.random((T, 3)) < 0.7)).astype(np.float32)
     filtered = jax.jit(weighted_median_filter, static_argnums=2)(keypoints, confidence, window)
     np.testing.assert_array_equal(filtered, slow_filter(keypoints, confidence, window))
 
 
-def one(values, confidence, window):
+def filter_signal(values, confidence, window):
+    """Return the filtered signal in x, and the negated signal in y."""
     keypoints = np.stack([values, -np.asarray(values, float)], -1)[:, None].astype(np.float32)
     return np.asarray(weighted_median_filter(keypoints, np.asarray(confidence, np.float32)[:, None], window))[:, 0]
 
 
 def test_hand_computed():
-    # the middle frame sees 1, 2, 9 with weights 0.2, 0.3, 0.9: half is 0.7, passed at 9
-    assert one([1, 2, 9], [0.2, 0.3, 0.9], 3)[1, 0] == 9
-    assert one([1, 2, 9], [1, 1, 1], 3)[1, 0] == 2
-    # exactly half passes, so the lower of two equal weights: 1 in x, and −2 in the mirrored y
-    np.testing.assert_array_equal(one([1, 2], [0.3, 0.3], 3), [[1, -2], [1, -2]])
+    # the window of the middle frame has 1, 2, 9 with weights 0.2, 0.3, 0.9: half of the sum, 0.7, is exceeded at 9
+    assert filter_signal([1, 2, 9], [0.2, 0.3, 0.9], 3)[1, 0] == 9
+    assert filter_signal([1, 2, 9], [1, 1, 1], 3)[1, 0] == 2
+    # exactly half is enough, so the lower of two values with equal weights is the median: 1 in x, and −2 in y
+    np.testing.assert_array_equal(filter_signal([1, 2], [0.3, 0.3], 3), [[1, -2], [1, -2]])
 
 
-def test_exact_half_passes_whatever_the_rounding():
-    # the first three are half of each total, and a little less than half as float32 adds them up
+def test_an_exact_half_is_enough_in_spite_of_rounding():
+    # the first three confidences are half of the sum, but their float32 sum is slightly less than half
     for confidence in ([0.1, 0.1, 0.2, 0.3, 0.1], [0.1, 0.1, 0.5, 0.1, 0.6], [0.1, 0.1, 0.7, 0.3, 0.6]):
-        assert one([1, 2, 3, 4, 5], confidence, 5)[2, 0] == 3
+        assert filter_signal([1, 2, 3, 4, 5], confidence, 5)[2, 0] == 3
 
 
-def test_cut_off_at_the_ends():
-    values = one([10, 20, 30, 40, 50], [1] * 5, 3)
+def test_the_window_is_shorter_at_the_ends():
+    values = filter_signal([10, 20, 30, 40, 50], [1] * 5, 3)
     np.testing.assert_array_equal(values[:, 0], [10, 20, 30, 40, 40])
 
 
-def test_outlier_is_removed_and_missing_ones_do_not_count():
+def test_outliers_are_removed_and_missing_keypoints_are_ignored():
     values = [10, 11, 900, 13, 14]
-    assert one(values, [1] * 5, 5)[2, 0] == 13
-    assert one(values, [1, 1, 0, 0, 0], 5)[2, 0] == 10  # a missing frame takes its neighbours' median
-    assert np.isfinite(one([np.nan, 5, 6], [0, 1, 1], 3)).all()
+    assert filter_signal(values, [1] * 5, 5)[2, 0] == 13
+    assert filter_signal(values, [1, 1, 0, 0, 0], 5)[2, 0] == 10  # a missing keypoint has the median of its neighbours
+    assert np.isfinite(filter_signal([np.nan, 5, 6], [0, 1, 1], 3)).all()
 
 
-def test_input_is_returned_where_nothing_is_near():
-    values = one([7, 8, 9, 10, 11], [0, 0, 0, 0, 1], 3)
+def test_the_input_is_returned_if_all_neighbours_are_missing():
+    values = filter_signal([7, 8, 9, 10, 11], [0, 0, 0, 0, 1], 3)
     np.testing.assert_array_equal(values[:, 0], [7, 8, 9, 11, 11])
 
 
-def test_window_of_one_and_constant_signals_change_nothing():
+def test_a_window_of_one_frame_and_constant_signals_are_unchanged():
     rng = np.random.default_rng(0)
     keypoints, confidence = (
         rng.normal(size=(9, 4, 2)).astype(np.float32),
@@ -89,7 +90,7 @@ def test_window_of_one_and_constant_signals_change_nothing():
     np.testing.assert_array_equal(weighted_median_filter(constant, confidence, 5), constant)
 
 
-def test_moves_with_the_signal_and_with_the_scale_of_the_confidence():
+def test_the_filter_is_equivariant_to_shift_and_reversal_and_invariant_to_the_scale_of_the_confidence():
     rng = np.random.default_rng(1)
     keypoints = rng.integers(0, 1000, (12, 3, 2)).astype(np.float32)
     confidence = rng.integers(0, 9, (12, 3)).astype(np.float32) / 8

@@ -1,4 +1,4 @@
-"""The fit as a whole: known truth comes back, birds do not touch each other, and batches do not matter."""
+"""The whole fit: it recovers a known truth, birds are independent, and the batch size does not change the result."""
 
 import dataclasses
 import logging
@@ -32,11 +32,11 @@ from jaxfit.simulation.motion import smooth_motion
 BIRD = toy_bird(shapes=0)
 T, SIZE = 6, 64
 CAMERA = Camera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
-ONE = 0.002
-"""GB in which one window of six frames fits: most tests share one program a stage."""
+ONE_WINDOW_GB = 0.002
+"""Memory in GB for one window of six frames. Most tests use it, so that they share the compiled programs."""
 
 
-def config(window=T, steps=(600, 25), memory_gb=ONE, mode="image", **changes):
+def config(window=T, steps=(600, 25), memory_gb=ONE_WINDOW_GB, mode="image", **changes):
     paper = load_config("paper")
     stages = tuple(dataclasses.replace(s, steps=n) for s, n in zip(paper.stages, steps, strict=True))
     crop = dataclasses.replace(paper.crop, mode=mode, size_px=SIZE)
@@ -64,11 +64,11 @@ def solution(observed):
 
 
 def replaced(observations, n, keypoints_px=None, confidence=None):
-    """The same observations, with other keypoints for track `n`."""
-    points, trust = observations.keypoints_px.copy(), observations.confidence.copy()
+    """Return the observations with other keypoints or confidences for track `n`."""
+    points, confidences = observations.keypoints_px.copy(), observations.confidence.copy()
     points[n] = points[n] if keypoints_px is None else keypoints_px
-    trust[n] = trust[n] if confidence is None else confidence
-    return observations.with_keypoints(points, trust)
+    confidences[n] = confidences[n] if confidence is None else confidence
+    return observations.with_keypoints(points, confidences)
 
 
 ARRAYS = [name for name in Pose.__dataclass_fields__] + ["keypoints_cam", "keypoints_px", "crop", "valid"]
@@ -76,23 +76,23 @@ ARRAYS = [name for name in Pose.__dataclass_fields__] + ["keypoints_cam", "keypo
 
 def assert_same(a, b, tracks, exact=True):
     for name in ARRAYS:
-        got, expected = getattr(a, name)[tracks], getattr(b, name)[tracks]
+        actual, expected = getattr(a, name)[tracks], getattr(b, name)[tracks]
         if exact:
-            np.testing.assert_array_equal(got, expected, err_msg=name)
+            np.testing.assert_array_equal(actual, expected, err_msg=name)
         else:
-            np.testing.assert_allclose(got, expected, rtol=1e-3, atol=5e-3, err_msg=name)
+            np.testing.assert_allclose(actual, expected, rtol=1e-3, atol=5e-3, err_msg=name)
 
 
-def test_known_truth_comes_back(solution, observed):
+def test_the_fit_recovers_a_known_truth(solution, observed):
     assert solution.status.tolist() == ["ok"] * 3
     assert solution.valid.all()
-    apart = np.linalg.norm(solution.keypoints_px - keypoints_of(truths()), axis=-1)
-    assert apart.max() < 1 * SIZE / 256  # a pixel of the usual crop
+    error_px = np.linalg.norm(solution.keypoints_px - keypoints_of(truths()), axis=-1)
+    assert error_px.max() < 1 * SIZE / 256  # one pixel of a 256-pixel crop
     for n, truth in enumerate(truths()):
         R, R_true = exp_map(solution.global_orient[n]), exp_map(np.asarray(truth.global_orient))
-        turned = Rotation.from_matrix(R.transpose(0, 2, 1) @ R_true).magnitude()
-        assert np.rad2deg(turned).max() < 12
-        # depth and size go together; the size in the image is what can be known
+        angle = Rotation.from_matrix(R.transpose(0, 2, 1) @ R_true).magnitude()
+        assert np.rad2deg(angle).max() < 12
+        # only the ratio of scale and depth is observable
         size = solution.scale[n] / solution.transl[n, :, 2]
         np.testing.assert_allclose(size, float(truth.scale[0]) / 200, rtol=0.03)
     result = evaluate(solution, BIRD, observed).overall
@@ -101,28 +101,28 @@ def test_known_truth_comes_back(solution, observed):
     assert result["me_p"] < 0.005
 
 
-def test_what_the_solution_says_fits_together(solution):
+def test_the_arrays_of_the_solution_are_consistent(solution):
     for n in range(3):
         pose = jax.tree.map(lambda values, n=n: values[n], solution.pose)
         pose = dataclasses.replace(pose, bone_length=solution.bone_length[n, 0], betas=solution.betas[n, 0])
         keypoints, _ = pose_window(BIRD, pose)
         np.testing.assert_allclose(solution.keypoints_cam[n], keypoints, atol=1e-3)
         np.testing.assert_allclose(solution.keypoints_px[n], project(keypoints, CAMERA), atol=0.02)
-        assert np.ptp(solution.transl[n, :, 2]) == 0  # depth is fixed, for the window as a whole
+        assert np.ptp(solution.transl[n, :, 2]) == 0  # the depth is fixed and constant in the window
         np.testing.assert_array_equal(solution.bone_length[n], np.ones((T, BIRD.num_joints - 1)))
     assert set(solution.loss) == {"keypoints", "mask", "pose_prior", "velocity", "acceleration"}
 
 
-def test_one_size_a_window(solution, observed):
+def test_the_common_size_is_constant_in_a_window(solution, observed):
     assert (np.ptp(solution.scale, axis=1) == 0).all()
     keypoints_only = dataclasses.replace(config(common_size=False), stages=config(steps=(30, 1)).stages[:1])
-    each = fit(observed.select(tracks=[0]), BIRD, keypoints_only)
-    assert np.ptp(each.scale[0]) > 1e-4
+    size_per_frame = fit(observed.select(tracks=[0]), BIRD, keypoints_only)
+    assert np.ptp(size_per_frame.scale[0]) > 1e-4
 
 
-@pytest.mark.parametrize("windows_a_batch", [1, 2])
-def test_a_broken_bird_leaves_the_others_alone(observed, windows_a_batch):
-    settings = config(steps=(20, 2), memory_gb=windows_a_batch * ONE)
+@pytest.mark.parametrize("windows_per_batch", [1, 2])
+def test_a_diverged_bird_does_not_change_the_other_birds(observed, windows_per_batch):
+    settings = config(steps=(20, 2), memory_gb=windows_per_batch * ONE_WINDOW_GB)
     broken = replaced(observed, 1, np.full((T, BIRD.num_keypoints, 2), 1e30))
     result = fit(broken, BIRD, settings)
     assert result.status.tolist() == ["ok", "diverged", "ok"]
@@ -133,8 +133,8 @@ def test_a_broken_bird_leaves_the_others_alone(observed, windows_a_batch):
 
 
 @pytest.mark.parametrize("first_diverges", [True, False])
-def test_one_diverged_window_leaves_the_other_windows_of_the_track_alone(first_diverges):
-    """Only the poses of the other windows are valid, and the loss is theirs, in whatever order the windows come."""
+def test_a_diverged_window_does_not_change_the_other_windows_of_the_track(first_diverges):
+    """Only the other windows have valid poses and contribute to the loss, in either order of the windows."""
     observations, settings = detect(BIRD, truths(2 * T, 2), camera=CAMERA), config(steps=(20, 2))
     points = observations.keypoints_px.copy()
     bad, good = (slice(T), slice(T, None)) if first_diverges else (slice(T, None), slice(T))
@@ -156,8 +156,8 @@ def test_one_diverged_window_leaves_the_other_windows_of_the_track_alone(first_d
 
 
 def test_the_size_of_the_silhouette_does_not_change_the_objective(observed):
-    """Pixel quantities are those of a 256-pixel crop, also where silhouettes and masks are smaller."""
-    model, poses = {}, jax.tree.map(lambda *x: np.stack(x), *truths())
+    """Quantities in pixels refer to a 256-pixel crop, also if silhouettes and masks are smaller."""
+    losses, poses = {}, jax.tree.map(lambda *x: np.stack(x), *truths())
     moved = dataclasses.replace(poses, transl=poses.transl + np.array([1.0, -0.5, 0], np.float32))
     large = in_a_large_image(observed)
     for size_px in (64, 128, 256):
@@ -167,15 +167,15 @@ def test_the_size_of_the_silhouette_does_not_change_the_objective(observed):
         one = stage_hyperparameters(settings, stage, BIRD.keypoint_names)
         windows = cut_windows(large, settings)
         problems = Problem(jax.tree.map(lambda x: np.stack([x] * 3), one), moved, load_targets(windows, size_px))
-        model[size_px] = report(stage_program(settings, stage, fitted), problems, moved).loss
+        losses[size_px] = report(stage_program(settings, stage, fitted), problems, moved).loss
     for term in ("keypoints", "pose_prior", "velocity", "acceleration"):
-        np.testing.assert_allclose(model[64][term], model[256][term], rtol=1e-5, err_msg=term)
-    # the outline of a smaller silhouette is coarser
-    np.testing.assert_allclose(model[128]["mask"], model[256]["mask"], rtol=0.02)
-    np.testing.assert_allclose(model[64]["mask"], model[256]["mask"], rtol=0.08)
+        np.testing.assert_allclose(losses[64][term], losses[256][term], rtol=1e-5, err_msg=term)
+    # a smaller silhouette has a coarser outline
+    np.testing.assert_allclose(losses[128]["mask"], losses[256]["mask"], rtol=0.02)
+    np.testing.assert_allclose(losses[64]["mask"], losses[256]["mask"], rtol=0.08)
 
 
-def test_a_bird_that_was_hardly_seen(solution, observed):
+def test_a_bird_without_keypoints_has_no_usable_frame(solution, observed):
     hidden = replaced(observed, 1, confidence=np.zeros((T, BIRD.num_keypoints)))
     result = fit(hidden, BIRD, config())
     assert result.status.tolist() == ["ok", "no usable frame", "ok"]
@@ -186,34 +186,34 @@ def test_a_bird_that_was_hardly_seen(solution, observed):
         fit(hidden.select(tracks=[1]), BIRD, config(), source="birds.json")
 
 
-def test_missing_frames_are_left_out(observed):
+def test_missing_frames_have_no_valid_pose(observed):
     confidence = np.ones((T, BIRD.num_keypoints))
     confidence[[0, 3]] = 0
     gaps = replaced(observed, 0, confidence=confidence).select(tracks=[0])
     result = fit(gaps, BIRD, config())
     assert result.valid[0].tolist() == [False, True, True, False, True, True]
-    apart = np.linalg.norm(result.keypoints_px - keypoints_of(truths()[:1]), axis=-1)
-    assert apart[result.valid].max() < SIZE / 256
+    error_px = np.linalg.norm(result.keypoints_px - keypoints_of(truths()[:1]), axis=-1)
+    assert error_px[result.valid].max() < SIZE / 256
     assert np.isnan(result.global_orient[0, [0, 3]]).all()
 
 
-def test_batches_do_not_matter(observed, caplog):
-    """One batch or several, the last of them filled up: the same result, and nothing is compiled again."""
-    settings = [config(steps=(20, 2), memory_gb=gb * ONE) for gb in (1, 2)]
+def test_the_batch_size_does_not_change_the_result(observed, caplog):
+    """One batch or several batches (the last batch is filled) give the same result, and no program is recompiled."""
+    settings = [config(steps=(20, 2), memory_gb=windows * ONE_WINDOW_GB) for windows in (1, 2)]
     assert [frames_per_batch(BIRD, c) // T for c in settings] == [1, 2]
     for birds in (2, 3):
         some = observed.select(tracks=slice(birds))
-        apart, together = (fit(some, BIRD, c) for c in settings)
-        assert_same(apart, together, slice(None), exact=False)
-        for term, loss in together.loss.items():
-            np.testing.assert_allclose(apart.loss[term], loss, rtol=2e-3, err_msg=term)
+        small, large = (fit(some, BIRD, c) for c in settings)
+        assert_same(small, large, slice(None), exact=False)
+        for term, loss in large.loss.items():
+            np.testing.assert_allclose(small.loss[term], loss, rtol=2e-3, err_msg=term)
     with caplog.at_level(logging.WARNING), jax.log_compiles():
         fit(observed, BIRD, settings[1])
     compiled = [r.getMessage() for r in caplog.records if r.getMessage().startswith("Compiling")]
     assert not [m for m in compiled if any(name in m for name in ("advance", "begin", "report", "initial"))]
 
 
-def test_long_tracks_are_fitted_window_by_window():
+def test_the_windows_of_a_long_track_are_independent():
     observations = detect(BIRD, truths(2 * T - 2, 1), camera=CAMERA)
     result = fit(observations, BIRD, config(steps=(30, 2)))
     assert result.valid.all()
@@ -226,7 +226,7 @@ def test_long_tracks_are_fitted_window_by_window():
 
 
 def in_a_large_image(observations, corner=(210, 90), size=(400, 300)):
-    """The same birds, in an image of `size` where the crop's image lies at `corner`."""
+    """Return the same birds in an image of `size`, shifted by `corner`."""
     masks = {}
     for at in observations.masks:
         full = np.zeros(size[::-1], bool)
@@ -242,27 +242,27 @@ def in_a_large_image(observations, corner=(210, 90), size=(400, 300)):
 
 
 def test_boxes_in_a_large_image(observed, tmp_path):
-    """Results are image pixels, the mesh lies where the mask is, and a fit goes on from them."""
+    """The results are in image pixels, the mesh covers the mask, and a second fit can start from the result."""
     large = in_a_large_image(observed)
     result = fit(large, BIRD, config(mode="box"))
-    assert (result.crop[..., 2] != SIZE).all(), "the crop is scaled, or this tests nothing"
+    assert (result.crop[..., 2] != SIZE).all(), "the test needs a scaled crop"
     np.testing.assert_array_equal(result.image_size_px[result.valid], np.tile([400, 300], (result.valid.sum(), 1)))
     assert not result.image_size_px[~result.valid].any()
-    apart = np.linalg.norm(result.keypoints_px - keypoints_of(truths()) - np.array([210, 90]), axis=-1)
-    assert apart.max() < 0.5
+    error_px = np.linalg.norm(result.keypoints_px - keypoints_of(truths()) - np.array([210, 90]), axis=-1)
+    assert error_px.max() < 0.5
     assert evaluate(result, BIRD, large).overall["iou"] > 0.9
     save_solution(result, BIRD, config_to_yaml(config()), {}, tmp_path / "out")
-    start = load_initial_poses(tmp_path / "out" / "poses.npz", large, BIRD)
-    again = fit(large, BIRD, config(mode="box", steps=(1, 1)), start)
+    initial_poses = load_initial_poses(tmp_path / "out" / "poses.npz", large, BIRD)
+    again = fit(large, BIRD, config(mode="box", steps=(1, 1)), initial_poses)
     for name in ("global_orient", "body_pose", "transl", "scale"):
         np.testing.assert_allclose(getattr(again, name), getattr(result, name), atol=0.05, err_msg=name)
     shifted = config(mode="box", steps=(1, 1))
     shifted = dataclasses.replace(shifted, crop=dataclasses.replace(shifted.crop, padding=0.5))
     with pytest.raises(InputError, match=r"poses\.npz: `crop` of track 0"):
-        fit(large, BIRD, shifted, start)
+        fit(large, BIRD, shifted, initial_poses)
 
 
-def test_keypoints_in_any_order_but_of_the_model(solution, observed):
+def test_keypoints_may_have_any_order_but_need_the_names_of_the_model(solution, observed):
     order = np.random.default_rng(0).permutation(BIRD.num_keypoints)
     names = tuple(BIRD.keypoint_names[i] for i in order)
     mixed = dataclasses.replace(
@@ -277,23 +277,23 @@ def test_keypoints_in_any_order_but_of_the_model(solution, observed):
         fit(other, BIRD, config(), source="birds")
 
 
-def test_progress_adds_up(observed):
-    seen = []
+def test_reported_progress_sums_to_the_total(observed):
+    reports = []
 
     @contextmanager
     def watch(name, total):
-        seen.append((name, total))
-        yield lambda done, note: seen.append((done, note))
+        reports.append((name, total))
+        yield lambda done, note: reports.append((done, note))
 
     fit(observed, BIRD, config(steps=(5, 2)), progress=watch)
-    assert seen[0] == ("Fitting 3 birds", 21)
-    assert sum(done for done, _ in seen[1:]) == 21
-    assert any(note.startswith("mask: loss ") for _, note in seen[1:])
+    assert reports[0] == ("Fitting 3 birds", 21)
+    assert sum(done for done, _ in reports[1:]) == 21
+    assert any(note.startswith("mask: loss ") for _, note in reports[1:])
 
 
 @pytest.mark.parametrize("after_first", [True, False])
-def test_the_better_hypothesis_goes_on(observed, after_first):
-    """One start is right, the other reversed: the right one wins, wherever it stands."""
+def test_the_better_hypothesis_is_kept(observed, after_first):
+    """One initial pose is correct, the other is reversed: the fit keeps the correct pose, in either order."""
     keypoints_only = config(steps=(30, 5))
     first = dataclasses.replace(keypoints_only.stages[0], keep_best=after_first)
     second = dataclasses.replace(first, name="on", steps=5, keep_best=False, carry_moments=True)
@@ -308,5 +308,5 @@ def test_the_better_hypothesis_goes_on(observed, after_first):
         fitted = fit_batch(fit_model(BIRD, settings), [settings], batch, lambda *_: None)
         assert fitted.pose.global_orient.shape == (1, T, 3)
         assert not any(fitted.failure)
-        apart = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of([truth]), axis=-1)
-        assert apart.mean() < 0.25
+        error_px = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of([truth]), axis=-1)
+        assert error_px.mean() < 0.25

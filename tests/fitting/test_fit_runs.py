@@ -1,4 +1,4 @@
-"""Many configs as one batch: each as if it were alone, what they share done once, and one program for all."""
+"""Fits of several configs in one batch: equal to separate fits, with shared work done once and one program."""
 
 import dataclasses
 import logging
@@ -19,8 +19,8 @@ from jaxfit.simulation.motion import smooth_motion
 
 BIRD, T, SIZE, BIRDS = toy_bird(shapes=0), 6, 64, 2
 CAMERA = Camera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
-ONE = 0.002
-"""GB in which one window of six frames fits."""
+ONE_WINDOW_GB = 0.002
+"""Memory in GB for one window of six frames."""
 
 
 def config(steps=(12, 2), **values):
@@ -60,37 +60,37 @@ def test_a_sweep_compiles_once(observed, caplog):
             fit_runs(observed, BIRD, [config((3, 1), terms__velocity=v) for v in (a, b)])
     messages = [record.getMessage() for record in caplog.records]
     compiled = [m for m in messages if m.startswith("Compiling") and "advance" in m.split("with")[0]]
-    assert len(compiled) == 2  # a stage each
+    assert len(compiled) == 2  # one program for each stage
 
 
-def test_every_run_is_as_if_alone(observed, swept):
+def test_runs_of_a_sweep_equal_separate_fits(observed, swept):
     for each, solution in zip(SWEEP, swept, strict=True):
         alone = fit(observed, BIRD, each)
         assert solution.status.tolist() == ["ok"] * BIRDS
-        # batches of other sizes round otherwise, and Adam's steps do not shrink
+        # rounding depends on the batch size, and the steps of Adam do not become smaller
         np.testing.assert_allclose(solution.keypoints_px, alone.keypoints_px, atol=0.05)
         for term, loss in alone.loss.items():
             np.testing.assert_allclose(solution.loss[term], loss, rtol=0.02, err_msg=term)
-    # and they are not all the same
+    # the configs have different results
     assert np.abs(swept[0].keypoints_px - swept[1].keypoints_px).max() > 0.1
     assert np.abs(swept[1].keypoints_px - swept[2].keypoints_px).max() > 0.1
 
 
-def test_the_place_in_a_batch_does_not_matter(observed, swept):
-    turned = fit_runs(observed, BIRD, SWEEP[::-1])[::-1]
-    for a, b in zip(swept, turned, strict=True):
+def test_the_order_of_the_runs_does_not_change_the_results(observed, swept):
+    reordered = fit_runs(observed, BIRD, SWEEP[::-1])[::-1]
+    for a, b in zip(swept, reordered, strict=True):
         assert_equal(a, b)
 
 
-def test_batches_of_one_window_give_the_same(observed):
-    small = [dataclasses.replace(each, memory_gb=ONE) for each in SWEEP]
+def test_batches_of_one_window_equal_separate_fits(observed):
+    small = [dataclasses.replace(each, memory_gb=ONE_WINDOW_GB) for each in SWEEP]
     together = fit_runs(observed, BIRD, small)
     for each, solution in zip(small, together, strict=True):
         assert_equal(solution, fit(observed, BIRD, each))
 
 
 def test_a_short_batch_is_filled_up(observed):
-    """Three runs of two windows in batches of four: the last is filled with counts that count nothing."""
+    """Three runs of two windows in batches of four: the last batch is filled with copies, which change no result."""
     some = [dataclasses.replace(each, memory_gb=0.0066) for each in SWEEP]
     assert batch.frames_per_batch(BIRD, some[0]) // T == 4
     together = fit_runs(observed, BIRD, some)
@@ -110,7 +110,7 @@ def count_problems(monkeypatch):
     return counts
 
 
-def test_equal_first_stages_are_done_once(observed, monkeypatch):
+def test_equal_first_stages_are_computed_once(observed, monkeypatch):
     counts = count_problems(monkeypatch)
     sweep = [config(stages__mask__override={"mask": weight / 16}) for weight in (0.5, 1, 2)]
     shared = fit_runs(observed, BIRD, sweep)
@@ -120,13 +120,13 @@ def test_equal_first_stages_are_done_once(observed, monkeypatch):
     assert np.abs(shared[0].keypoints_px - shared[2].keypoints_px).max() > 0.01
 
 
-def test_runs_that_start_alike_but_pull_otherwise_share_nothing(observed, monkeypatch):
+def test_runs_with_equal_initial_poses_but_other_weights_are_computed_separately(observed, monkeypatch):
     counts = count_problems(monkeypatch)
     fit_runs(observed, BIRD, SWEEP[:2])
     assert counts == [2 * BIRDS, 2 * BIRDS]
 
 
-def test_hypotheses_stay_with_their_run(observed, monkeypatch):
+def test_hypotheses_of_different_runs_are_not_mixed(observed, monkeypatch):
     two = {"initialise": dataclasses.replace(SWEEP[0].initialise, hypotheses=2)}
     sweep = [dataclasses.replace(each, **two) for each in SWEEP[:2]]
     counts = count_problems(monkeypatch)
@@ -136,7 +136,7 @@ def test_hypotheses_stay_with_their_run(observed, monkeypatch):
         np.testing.assert_allclose(solution.keypoints_px, fit(observed, BIRD, each).keypoints_px, atol=0.05)
 
 
-def test_what_runs_share_is_prepared_once(observed, monkeypatch):
+def test_shared_data_is_prepared_once(observed, monkeypatch):
     counts = {}
     for name in ("cut_windows", "load_targets", "search_initial_poses"):
         original = getattr(fit_module, name)
@@ -147,11 +147,11 @@ def test_what_runs_share_is_prepared_once(observed, monkeypatch):
 
         monkeypatch.setattr(fit_module, name, counting)
     fit_runs(observed, BIRD, SWEEP)
-    # without and with the filter
+    # once without the filter, and once with the filter
     assert counts == {"cut_windows": 2, "load_targets": 2, "search_initial_poses": 2}
 
 
-def test_other_programs_are_refused(observed):
+def test_configs_with_different_programs_are_rejected(observed):
     for other in (config(common_size=False), config(window=3), config((12, 3))):
         with pytest.raises(ValueError, match="one compiled program"):
             fit_runs(observed, BIRD, [SWEEP[0], other])

@@ -1,4 +1,4 @@
-"""Starting points from files: both layouts are matched to the birds, and what does not fit is refused."""
+"""Initial poses from files: both layouts are matched to the birds, and unsuitable files are rejected."""
 
 import dataclasses
 
@@ -37,7 +37,7 @@ def observed(absent=((1, 2),)):
 
 
 def result(seed=1, tracks=(9, 4), frames=(10, 11, 12, 13, 14), **changes):
-    """The arrays of a result's poses.npz, its tracks in another order than the observations'."""
+    """Return the arrays of a result's poses.npz. The order of the tracks differs from the observations."""
     rng = np.random.default_rng(seed)
     lead = (len(tracks), len(frames))
     arrays = {
@@ -55,7 +55,7 @@ def result(seed=1, tracks=(9, 4), frames=(10, 11, 12, 13, 14), **changes):
 
 
 def rows(count, **changes):
-    """A regressor's rows."""
+    """Return the arrays of a regressor's output."""
     rng = np.random.default_rng(2)
     arrays = {
         "init_pose": rng.normal(size=(count, J, 3)),
@@ -65,51 +65,53 @@ def rows(count, **changes):
     return {name: value for name, value in (arrays | changes).items() if value is not None}
 
 
-def saved(tmp_path, arrays, name="start.npz"):
+def saved(tmp_path, arrays, name="initial.npz"):
     np.savez(tmp_path / name, **arrays)
     return tmp_path / name
 
 
-def poses(start, common_size=False, observations=None):
+def poses(initial, common_size=False, observations=None):
     observations = observed() if observations is None else observations
     windows = cut_windows(observations, CONFIG)
-    start.check_crops(windows)
-    windowed = start.window_poses(BIRD, windows, common_size)
+    initial.check_crops(windows)
+    windowed = initial.window_poses(BIRD, windows, common_size)
     return [jax.tree.map(lambda x, w=w: np.asarray(x)[w, 0], windowed) for w in range(len(windows))]
 
 
-def test_an_earlier_result(tmp_path):
+def test_initial_poses_from_an_earlier_result(tmp_path):
     arrays = result()
-    start = load_initial_poses(saved(tmp_path, arrays), observed(), BIRD)
-    assert start.has_shape
-    first, second = poses(start)
-    np.testing.assert_allclose(first.global_orient, arrays["global_orient"][1], rtol=1e-6)  # track 4 is its second
+    initial = load_initial_poses(saved(tmp_path, arrays), observed(), BIRD)
+    assert initial.has_shape
+    first, second = poses(initial)
+    np.testing.assert_allclose(
+        first.global_orient, arrays["global_orient"][1], rtol=1e-6
+    )  # track 4 is the second track of the file
     np.testing.assert_allclose(second.body_pose[3], arrays["body_pose"][0, 3], rtol=1e-6)
     np.testing.assert_allclose(first.transl, arrays["transl"][1], rtol=1e-6)
     np.testing.assert_allclose(first.scale, arrays["scale"][1], rtol=1e-6)
     np.testing.assert_allclose(first.bone_length, np.median(arrays["bone_length"][1], 0), rtol=1e-6)
     np.testing.assert_allclose(first.betas, np.median(arrays["betas"][1], 0), rtol=1e-6)
-    common = poses(start, common_size=True)[0]
+    common = poses(initial, common_size=True)[0]
     np.testing.assert_allclose(common.scale, [np.median(arrays["scale"][1])], rtol=1e-6)
 
 
-def test_frames_without_a_start_take_their_neighbours(tmp_path):
+def test_a_frame_without_a_pose_has_the_pose_of_its_neighbour(tmp_path):
     arrays = result()
-    arrays["global_orient"][1, 0] = np.nan  # track 4 was not fitted there
+    arrays["global_orient"][1, 0] = np.nan  # track 4 has no pose in this frame
     first, second = poses(load_initial_poses(saved(tmp_path, arrays), observed(), BIRD))
     np.testing.assert_allclose(first.global_orient[0], arrays["global_orient"][1, 1], rtol=1e-6)
-    np.testing.assert_allclose(second.transl[2], arrays["transl"][0, 1], rtol=1e-6)  # the bird itself was away
+    np.testing.assert_allclose(second.transl[2], arrays["transl"][0, 1], rtol=1e-6)  # the bird is absent in this frame
     fewer = result(frames=(11, 14))
     first, _ = poses(load_initial_poses(saved(tmp_path, fewer), observed(), BIRD))
     np.testing.assert_allclose(first.transl, fewer["transl"][1, [0, 0, 0, 1, 1]], rtol=1e-6)
 
 
-def test_a_regressors_rows(tmp_path):
+def test_initial_poses_from_a_regressor(tmp_path):
     observations = observed()
     arrays = rows(N * T - 1)
-    start = load_initial_poses(saved(tmp_path, arrays), observations, BIRD)
-    assert not start.has_shape
-    first, second = poses(start)
+    initial = load_initial_poses(saved(tmp_path, arrays), observations, BIRD)
+    assert not initial.has_shape
+    first, second = poses(initial)
     np.testing.assert_allclose(first.global_orient, arrays["init_pose"][:5, 0], rtol=1e-6)
     np.testing.assert_allclose(second.body_pose[[0, 1, 3, 4]], arrays["init_pose"][5:, 1:], rtol=1e-6)
     np.testing.assert_allclose(second.transl[[0, 1, 3, 4]], arrays["init_translation"][5:], rtol=1e-6)
@@ -148,14 +150,14 @@ def nan_at(array, *at):
         ({"something": np.ones(3)}, "init_pose"),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path, arrays, message):
+def test_unsuitable_files_are_rejected(tmp_path, arrays, message):
     path = saved(tmp_path, arrays)
     with pytest.raises(InputError, match=message) as caught:
         load_initial_poses(path, observed(), BIRD)
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_files_that_cannot_be_read(tmp_path):
+def test_damaged_files_are_rejected(tmp_path):
     with pytest.raises(InputError, match=r"absent\.npz"):
         load_initial_poses(tmp_path / "absent.npz", observed(), BIRD)
     whole = saved(tmp_path, result()).read_bytes()
@@ -168,15 +170,15 @@ def test_files_that_cannot_be_read(tmp_path):
         load_initial_poses(tmp_path / "objects.npz", observed(), BIRD)
 
 
-def test_poses_of_other_crops_are_refused(tmp_path):
+def test_poses_of_other_crops_are_rejected(tmp_path):
     arrays = result()
     arrays["crop"] = arrays["crop"] + np.array([30, 0, 0])
-    start = load_initial_poses(saved(tmp_path, arrays), observed(), BIRD)
-    with pytest.raises(InputError, match=r"start\.npz: `crop` of track 4 differs by 30 pixels"):
-        poses(start)
+    initial = load_initial_poses(saved(tmp_path, arrays), observed(), BIRD)
+    with pytest.raises(InputError, match=r"initial\.npz: `crop` of track 4 differs by 30 pixels"):
+        poses(initial)
 
 
-def test_a_bird_without_any_start(tmp_path):
-    start = load_initial_poses(saved(tmp_path, result(tracks=(4,))), observed(), BIRD)
+def test_a_bird_without_initial_poses_is_rejected(tmp_path):
+    initial = load_initial_poses(saved(tmp_path, result(tracks=(4,))), observed(), BIRD)
     with pytest.raises(InputError, match="has no pose for track 9"):
-        poses(start)
+        poses(initial)

@@ -1,4 +1,4 @@
-"""Starts: planted orientations are found, and a window's frames are chosen together."""
+"""Search for initial poses: it recovers known orientations, and chooses all frames of a window together."""
 
 import dataclasses
 import itertools
@@ -14,7 +14,7 @@ from support.birds import exp_map, toy_bird
 
 from jaxfit.config.fit import InitialiseConfig
 from jaxfit.fitting.initial_pose_search import (
-    BLOCKED_RADIUS,
+    LEAST_SEPARATION_RAD,
     candidate_orientations,
     choose_sequence,
     match_candidates,
@@ -34,14 +34,14 @@ def angle(Ra, Rb):
     return Rotation.from_matrix(np.swapaxes(Ra, -1, -2) @ Rb).magnitude()
 
 
-def pictured(R, scale=1.0, depth=200.0, shift=(1.0, -2.0)):
-    """Keypoints of the resting bird turned by R (…, 3, 3), in pixels."""
+def projected(R, scale=1.0, depth=200.0, shift=(1.0, -2.0)):
+    """Return the keypoints of the resting bird after rotation by R (…, 3, 3), in pixels."""
     keypoints = np.asarray(BIRD.keypoints, np.float64)
     return np.array(project(scale * keypoints @ np.swapaxes(R, -1, -2) + [*shift, depth], CAMERA))
 
 
-def start(keypoints_px, config, confidence=None, common_size=True):
-    """One window's start: its pose with leading H, T."""
+def search(keypoints_px, config, confidence=None, common_size=True):
+    """Return the initial poses of one window, with leading axes H, T."""
     keypoints_px = np.asarray(keypoints_px, np.float32)
     confidence = np.ones(keypoints_px.shape[:2]) if confidence is None else confidence
     one = (jnp.asarray(keypoints_px)[None], jnp.asarray(confidence, jnp.float32)[None])
@@ -49,7 +49,7 @@ def start(keypoints_px, config, confidence=None, common_size=True):
 
 
 def turns(rng, frames):
-    """Orientations of a bird seen from above that turns by some 10° a frame."""
+    """Return orientations of a bird, seen from above, that rotates by about 10° per frame."""
     heading = rng.uniform(-np.pi, np.pi) + np.cumsum(rng.normal(scale=0.17, size=frames))
     return exp_map(heading[:, None] * [0, 0, 1]) @ FROM_ABOVE
 
@@ -58,59 +58,61 @@ def test_the_papers_candidates():
     R = candidate_orientations(ABOVE)
     assert R.shape == (30, 3, 3)
     np.testing.assert_allclose(R, viewing_axis_rotations(30) @ FROM_ABOVE)
-    np.testing.assert_allclose(R @ [0, 0, 1], np.broadcast_to([0, 0, -1], (30, 3)), atol=1e-12)  # back to the camera
+    np.testing.assert_allclose(
+        R @ [0, 0, 1], np.broadcast_to([0, 0, -1], (30, 3)), atol=1e-12
+    )  # the back points to the camera
 
 
-def test_the_match_finds_scale_and_shift():
-    """A candidate that is right costs nothing, at the right scale; an outlier does not change that."""
+def test_the_match_recovers_scale_and_shift():
+    """The true candidate has cost 0 and the true scale. With an outlier, it still has the lowest cost and the scale."""
     candidates = candidate_orientations(ABOVE)
     flat = np.asarray(BIRD.keypoints, np.float64) @ candidates[7, :2].T
     points = 9.5 * flat + [100, 140]
     confidence = np.linspace(0.5, 1, len(points))
-    astray = points.copy()
-    astray[3] += [90, -70]
-    for points_seen in (points, astray):
-        match = match_candidates(*map(jnp.asarray, (candidates, BIRD.keypoints, points_seen, confidence)))
+    with_outlier = points.copy()
+    with_outlier[3] += [90, -70]
+    for detected in (points, with_outlier):
+        match = match_candidates(*map(jnp.asarray, (candidates, BIRD.keypoints, detected, confidence)))
         assert int(np.argmin(match.cost)) == 7
         assert float(match.scale_px[7]) == pytest.approx(9.5, rel=0.01)
         assert (np.asarray(match.scale_px) > 0).all()
     clean = match_candidates(*map(jnp.asarray, (candidates, BIRD.keypoints, points, confidence)))
     assert float(clean.cost[7]) == pytest.approx(0, abs=1e-3)
-    nothing = match_candidates(*map(jnp.asarray, (candidates, BIRD.keypoints, points, 0 * confidence)))
-    np.testing.assert_array_equal(nothing.cost, 0)
+    missing = match_candidates(*map(jnp.asarray, (candidates, BIRD.keypoints, points, 0 * confidence)))
+    np.testing.assert_array_equal(missing.cost, 0)
 
 
-def test_planted_orientations_seen_from_above():
+def test_orientations_seen_from_above_are_recovered():
     planted = turns(np.random.default_rng(0), 6)
-    pose = start(pictured(planted), ABOVE)
-    found = exp_map(pose.global_orient[0].astype(np.float64))
-    assert angle(found, planted).max() < np.deg2rad(6.5)  # half a step of 12°
+    pose = search(projected(planted), ABOVE)
+    recovered = exp_map(pose.global_orient[0].astype(np.float64))
+    assert angle(recovered, planted).max() < np.deg2rad(6.5)  # half a step of 12°
 
 
-def test_planted_orientations_from_anywhere():
+def test_orientations_seen_from_any_direction_are_recovered():
     rng = np.random.default_rng(1)
     resolution = 1.5 * np.sqrt(4 * np.pi / 60 / 2) + np.pi / 16  # as in the grid's own test
     planted = Rotation.random(6, rng=rng).as_matrix()
     for R in planted:
         turned = exp_map(np.cumsum(rng.normal(scale=0.05, size=(6, 3)), axis=0)) @ R
-        pose = start(pictured(turned), AROUND)
-        found = exp_map(pose.global_orient[0].astype(np.float64))
-        assert angle(found, turned).max() < resolution
+        pose = search(projected(turned), AROUND)
+        recovered = exp_map(pose.global_orient[0].astype(np.float64))
+        assert angle(recovered, turned).max() < resolution
 
 
 @pytest.mark.parametrize("common_size", [True, False])
-def test_the_start_lies_on_the_keypoints(common_size):
+def test_the_initial_pose_matches_the_keypoints(common_size):
     sizes = np.array([0.9, 1.0, 1.2, 1.0, 1.0, 1.0])
     planted = np.broadcast_to(FROM_ABOVE, (6, 3, 3))
-    points = np.stack([pictured(R, s, 150.0) for R, s in zip(planted, sizes, strict=True)])
-    pose = start(points, ABOVE, common_size=common_size)
+    points = np.stack([projected(R, s, 150.0) for R, s in zip(planted, sizes, strict=True)])
+    pose = search(points, ABOVE, common_size=common_size)
     assert pose.scale.shape == ((1, 1) if common_size else (1, 6))
     assert pose.body_pose.shape == (1, 6, 7, 3)
     np.testing.assert_array_equal(pose.body_pose[0, 0], np.asarray(BIRD.pose_mean).reshape(7, 3))
     window = jax.tree.map(lambda x: jnp.asarray(x)[0], pose)
     posed = project(window_keypoints(RIG, window_transforms(RIG, window), window), CAMERA)
     apart = np.linalg.norm(np.asarray(posed) - points, axis=-1)
-    # the mean is met; perspective and the one size leave a few pixels of a bird of 200
+    # the means agree; perspective and the common size leave errors of a few pixels on a bird of 200 pixels
     np.testing.assert_allclose(np.asarray(posed).mean(1), points.mean(1), atol=3)
     assert apart[3:].max() < 5
     np.testing.assert_allclose(pose.transl[0, :, 2], 150, rtol=0.03)
@@ -118,11 +120,11 @@ def test_the_start_lies_on_the_keypoints(common_size):
         np.testing.assert_allclose(pose.scale[0], sizes, rtol=0.03)
 
 
-def test_the_bird_turns_about_its_root():
-    """A model whose root is far from the origin starts on its keypoints all the same."""
+def test_the_bird_rotates_about_its_root():
+    """The initial pose also matches the keypoints if the root of the model is far from the origin."""
     shift = jnp.array([4.0, -7.0, 3.0])
     far = dataclasses.replace(BIRD, vertices=BIRD.vertices + shift, joints=BIRD.joints + shift)
-    points = pictured(np.broadcast_to(FROM_ABOVE, (6, 3, 3)), depth=150.0).astype(np.float32)
+    points = projected(np.broadcast_to(FROM_ABOVE, (6, 3, 3)), depth=150.0).astype(np.float32)
     one = (jnp.asarray(points)[None], jnp.ones((1, 6, BIRD.num_keypoints)))
     posed = []
     for bird in (BIRD, far):
@@ -151,43 +153,43 @@ def test_dynamic_programming_is_exact(seed, size, smoothness):
 
 
 def flipping_window():
-    """A bird that turns steadily; in some frames only a few keypoints are seen, moved so that they look reversed."""
+    """Return a bird that rotates steadily. Two frames have few keypoints, from a bird that is rotated by 180°."""
     heading = np.linspace(0, 1.5, 6)
     planted = exp_map(heading[:, None] * [0, 0, 1]) @ FROM_ABOVE
-    points, confidence = pictured(planted), np.ones((6, BIRD.num_keypoints))
+    points, confidence = projected(planted), np.ones((6, BIRD.num_keypoints))
     for t in (2, 4):
         few = [BIRD.keypoint_names.index(name) for name in ("breast", "nape", "left_foot", "right_foot")]
         confidence[t] = 0
         confidence[t, few] = 0.1
-        points[t] = pictured(exp_map([0, 0, np.pi]) @ planted[t])
+        points[t] = projected(exp_map([0, 0, np.pi]) @ planted[t])
     return planted, points, confidence
 
 
-def test_no_frame_starts_flipped():
+def test_no_frame_is_flipped_against_its_neighbours():
     planted, points, confidence = flipping_window()
-    alone = [start(points[[t] * 6], ABOVE, confidence[[t] * 6]).global_orient[0, 0] for t in range(6)]
+    alone = [search(points[[t] * 6], ABOVE, confidence[[t] * 6]).global_orient[0, 0] for t in range(6)]
     apart = angle(exp_map(np.array(alone, np.float64)), planted)
-    assert (apart[[2, 4]] > np.deg2rad(150)).all(), "chosen one by one, these frames flip"
+    assert (apart[[2, 4]] > np.deg2rad(150)).all(), "frames that are chosen independently are flipped"
     assert (apart[[0, 1, 3, 5]] < np.deg2rad(7)).all()
-    together = start(points, ABOVE, confidence).global_orient[0]
-    # at worst where the frame before stands: it turns by 17° a frame, and 6° are the grid's
+    together = search(points, ABOVE, confidence).global_orient[0]
+    # the worst case is the orientation of the previous frame: 17° per frame, and 6° from the grid
     assert angle(exp_map(together.astype(np.float64)), planted).max() < np.deg2rad(24)
-    assert np.linalg.norm(np.diff(together, axis=0), axis=1).max() < 1, "axis-angles run on without a jump"
+    assert np.linalg.norm(np.diff(together, axis=0), axis=1).max() < 1, "the axis-angles must be continuous"
 
 
 def test_frames_without_keypoints_follow_their_neighbours():
     planted = turns(np.random.default_rng(3), 6)
-    points, confidence = pictured(planted), np.ones((6, BIRD.num_keypoints))
+    points, confidence = projected(planted), np.ones((6, BIRD.num_keypoints))
     confidence[[0, 3, 4]] = 0
     points[[0, 3, 4]] = 0
-    pose = start(points, ABOVE, confidence)
-    found = exp_map(pose.global_orient[0].astype(np.float64))
-    seen = [1, 2, 5]
-    assert angle(found[seen], planted[seen]).max() < np.deg2rad(6.5)
-    assert angle(found[0], found[1]) < 1e-3
-    # between two that are seen, nothing but turning costs: they lie on the way
-    way = angle(found[2], found[3]) + angle(found[3], found[4]) + angle(found[4], found[5])
-    assert way < angle(found[2], found[5]) + np.deg2rad(1)
+    pose = search(points, ABOVE, confidence)
+    recovered = exp_map(pose.global_orient[0].astype(np.float64))
+    detected = [1, 2, 5]
+    assert angle(recovered[detected], planted[detected]).max() < np.deg2rad(6.5)
+    assert angle(recovered[0], recovered[1]) < 1e-3
+    # between two frames with keypoints, only rotation has a cost, so the sequence takes the shortest way
+    way = angle(recovered[2], recovered[3]) + angle(recovered[3], recovered[4]) + angle(recovered[4], recovered[5])
+    assert way < angle(recovered[2], recovered[5]) + np.deg2rad(1)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(pose))
 
 
@@ -196,20 +198,20 @@ def test_hypotheses_differ(method):
     base = ABOVE if method == "viewing_axis" else AROUND
     config = InitialiseConfig(**{**vars(base), "hypotheses": 3})
     planted = turns(np.random.default_rng(4), 6)
-    pose = start(pictured(planted), config)
+    pose = search(projected(planted), config)
     assert pose.global_orient.shape == (3, 6, 3)
     R = exp_map(pose.global_orient.reshape(-1, 3).astype(np.float64)).reshape(3, 6, 3, 3)
     for a, b in itertools.combinations(range(3), 2):
-        assert angle(R[a], R[b]).min() > BLOCKED_RADIUS - 1e-3
-    best = start(pictured(planted), base)
+        assert angle(R[a], R[b]).min() > LEAST_SEPARATION_RAD - 1e-3
+    best = search(projected(planted), base)
     np.testing.assert_allclose(pose.global_orient[0], best.global_orient[0], atol=1e-5)
 
 
-def test_windows_are_searched_by_themselves():
+def test_windows_are_independent():
     rng = np.random.default_rng(5)
-    points = np.stack([pictured(turns(rng, 6)) for _ in range(3)]).astype(np.float32)
+    points = np.stack([projected(turns(rng, 6)) for _ in range(3)]).astype(np.float32)
     ones = jnp.ones(points.shape[:3])
     together = search_initial_poses(BIRD, RIG, jnp.asarray(points), ones, ABOVE, CAMERA, True)
     for w in range(3):
-        np.testing.assert_allclose(together.global_orient[w], start(points[w], ABOVE).global_orient, atol=1e-5)
-        np.testing.assert_allclose(together.transl[w], start(points[w], ABOVE).transl, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(together.global_orient[w], search(points[w], ABOVE).global_orient, atol=1e-5)
+        np.testing.assert_allclose(together.transl[w], search(points[w], ABOVE).transl, rtol=1e-4, atol=1e-4)

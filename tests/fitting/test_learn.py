@@ -1,4 +1,4 @@
-"""A prior learnt from results: its figures by hand, its honesty about how little it rests on."""
+"""A prior learnt from results: statistics by hand, shrinkage for few data, and the command."""
 
 import dataclasses
 
@@ -20,7 +20,7 @@ BIRD, T = toy_bird(), 12
 
 
 def posed(seeds, spread=0.3):
-    """A result of one bird a seed, every frame of it drawn anew."""
+    """Return a result with one bird per seed. All frames are independent random poses."""
     windows = []
     for seed in seeds:
         frames = [random_pose(BIRD, 100 * seed + t, spread) for t in range(T)]
@@ -36,11 +36,11 @@ def test_oas_by_hand():
     assert oas_shrinkage(np.diag([3.0, 1.0]), 20) == pytest.approx(0.4)
     # D = 3, S = diag(4, 1, 1): tr S² = 18, tr² S = 36; (18/3 + 36) / ((n + 1/3)(18 − 12))
     assert oas_shrinkage(np.diag([4.0, 1.0, 1.0]), 9) == pytest.approx(42 / (28 / 3 * 6))
-    assert oas_shrinkage(np.eye(3), 100) == 1  # nothing to lose
+    assert oas_shrinkage(np.eye(3), 100) == 1  # the target of the shrinkage
 
 
 def test_oas_is_near_the_best_shrinkage():
-    """Over many samples of known covariance it errs little more than the best fixed shrinkage."""
+    """For samples of a known covariance, the error is at most 10 % above that of the best fixed shrinkage."""
     rng, n, D = np.random.default_rng(0), 30, 20
     truth = 0.5 ** np.abs(np.subtract.outer(np.arange(D), np.arange(D)))
 
@@ -61,7 +61,7 @@ def test_effective_count_of_autoregressive_poses():
     everywhere = np.ones(n, bool)
     assert effective_count([(x, everywhere)]) == pytest.approx(n * 0.2 / 1.8, rel=0.1)
     assert effective_count([(rng.normal(size=(n, 3)), everywhere)]) == pytest.approx(n, rel=0.1)
-    # birds that never move are one pose each
+    # a bird that never moves counts as one pose
     still = [(np.broadcast_to(rng.normal(size=3), (50, 3)), np.ones(50, bool)) for _ in range(4)]
     assert effective_count(still) == pytest.approx(4)
     holes = everywhere & (np.arange(n) % 2 == 0)  # no two valid frames follow each other
@@ -91,7 +91,7 @@ def test_mean_and_covariance():
     assert learn_prior([("a", solution, BIRD), ("b", posed([3]), BIRD)]).poses == 3 * T - 2
 
 
-def test_one_still_bird_makes_a_positive_definite_prior():
+def test_the_prior_of_one_motionless_bird_is_positive_definite():
     solution = posed([1])
     still = dataclasses.replace(
         solution, body_pose=np.broadcast_to(solution.body_pose[:, :1], solution.body_pose.shape)
@@ -103,7 +103,7 @@ def test_one_still_bird_makes_a_positive_definite_prior():
     check_bird(learnt.bird, "learnt")
 
 
-def test_bone_lengths_are_learnt_where_they_differ():
+def test_bone_lengths_are_learnt_if_they_differ():
     solution = posed([1, 2, 3])
     lengths = np.broadcast_to(np.array([0.9, 1.0, 1.2])[:, None, None], (3, T, 7))
     learnt = learn_prior([("a", dataclasses.replace(solution, bone_length=lengths), BIRD)])
@@ -113,16 +113,16 @@ def test_bone_lengths_are_learnt_where_they_differ():
     check_bird(learnt.bird, "learnt")
 
 
-def test_what_cannot_be_learnt_from():
+def test_diverged_birds_are_skipped_and_unsuitable_results_are_rejected():
     solution = posed([1, 2])
     first = np.array([True, False])[:, None] & solution.valid
     half = dataclasses.replace(solution, status=np.array(["ok", "diverged"]), valid=first)
     assert (learn_prior([("a", half, BIRD)]).birds, learn_prior([("a", half, BIRD)]).diverged) == (1, 1)
     none = dataclasses.replace(half, status=np.array(["diverged", "diverged"]), valid=np.zeros_like(first))
-    with pytest.raises(InputError, match=r"a: holds no pose.*2 diverged"):
+    with pytest.raises(InputError, match=r"a: holds no valid pose; diverged birds: 2 "):
         learn_prior([("a", none, BIRD)])
     other = dataclasses.replace(BIRD, joint_names=(*BIRD.joint_names[:-1], "hoof"))
-    with pytest.raises(InputError, match="b: is of the model"):
+    with pytest.raises(InputError, match="b: has the model"):
         learn_prior([("a", solution, BIRD), ("b", solution, other)])
 
 
@@ -131,9 +131,9 @@ def test_the_command(tmp_path, capsys):
     save_solution(posed([3]), BIRD, "", {}, tmp_path / "two")
     out = tmp_path / "learnt.npz"
     assert main(["prior", "learn", str(tmp_path / "one"), str(tmp_path / "two"), "--out", str(out)]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     for words in ("36 poses of 3 birds", "left_wing", "independent", f"--model {out}"):
-        assert words in said.replace("\n", "") or words in said
+        assert words in output.replace("\n", "") or words in output
     learnt = load_bird(out)
     assert not np.allclose(learnt.pose_mean, BIRD.pose_mean)
     with np.load(out) as stored:

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt takes the step that its equation says, and reaches in few steps what Adam needs hundreds for."""
+"""Levenberg-Marquardt: its steps solve its equation, and few steps reach the loss of hundreds of Adam's steps."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from support.stages import BIRD, FIRST, B, T, case, problems, program, solve, to
 from jaxfit.config.fit import load_config
 from jaxfit.fitting import levenberg_marquardt
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.levenberg_marquardt import EASE, FIRST_DAMPING, LEVENBERG_MARQUARDT, TIGHTEN
+from jaxfit.fitting.levenberg_marquardt import DAMPING_DECREASE, DAMPING_INCREASE, FIRST_DAMPING, LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import BATCH_AXIS, problem_window
 from jaxfit.objective.curvature import frame_rows
 from jaxfit.objective.objective import evaluate_curvature
@@ -22,20 +22,19 @@ NEWTON = dataclasses.replace(
     FIRST, solver="levenberg_marquardt", terms=("keypoints", "pose_prior", "velocity", "acceleration")
 )
 FEW = ("global_orient", "transl", "scale")
-"""Few enough unknowns for conjugate gradients to end at the solution."""
-
+"""Few enough parameters for conjugate gradients to converge."""
 
 DAMPING = 1.0
-"""With less, the first step of this case leads too far and is not taken."""
+"""With less damping, the first step of this case would increase the loss."""
 
 
 def first_problem(stage):
-    """The problem of the first bird."""
+    """Return the problem of the first bird."""
     return jax.tree.map(lambda x: x[0], problems(*case(), stage))
 
 
 def take_steps(stage, problem, count=1, **changes):
-    """The state before the first step, and pose and state after each step; `changes` are made to the first state."""
+    """Return the first state (with `changes`), and pose and state after each step."""
     own = program(stage)
 
     def run(problem):
@@ -52,7 +51,7 @@ def take_steps(stage, problem, count=1, **changes):
 
 
 def dense_step(stage, problem, damping):
-    """(H + μ·diag H)·d = −g with H written out, over the optimised parameters: orientation, x, y, common size."""
+    """Solve (H + μ·diag H)·d = −g with a dense H, over the optimised parameters: orientation, x, y, common size."""
     own, anchor = program(stage), problem.anchor
     zero = frame_rows(anchor)
 
@@ -65,9 +64,9 @@ def dense_step(stage, problem, damping):
     product, gradient = derivatives()
     dense, g = np.asarray(product, np.float64).reshape(zero.size, -1), np.array(frame_rows(gradient), np.float64)
     g[:, -1] /= T
-    free, size = np.zeros(zero.shape), np.zeros(zero.shape)
-    free[:, :3] = free[:, -4:-2] = size[:, -1] = 1
-    basis = np.column_stack([np.diag(free.ravel())[:, free.ravel() > 0], size.ravel()])
+    per_frame, size = np.zeros(zero.shape), np.zeros(zero.shape)
+    per_frame[:, :3] = per_frame[:, -4:-2] = size[:, -1] = 1
+    basis = np.column_stack([np.diag(per_frame.ravel())[:, per_frame.ravel() > 0], size.ravel()])
     reduced = basis.T @ dense @ basis
     d = np.linalg.solve(reduced + damping * np.diag(np.diag(reduced)), -basis.T @ g.ravel())
     return (basis @ d).reshape(zero.shape)
@@ -77,34 +76,34 @@ def total_of(stage, pose, problem):
     return total(pose, problem.anchor, problem.targets, stage)
 
 
-def test_a_step_is_that_of_the_equation(monkeypatch):
+def test_a_step_solves_the_equation(monkeypatch):
     monkeypatch.setattr(levenberg_marquardt, "CG_TOLERANCE", 1e-6)
     stage = dataclasses.replace(NEWTON, optimised=FEW)
     problem = first_problem(stage)
     before, [(pose, after)] = take_steps(stage, problem, damping=jnp.float32(DAMPING))
     expected = dense_step(stage, problem, DAMPING)
-    found = np.asarray(frame_rows(pose) - frame_rows(problem.anchor))
+    change = np.asarray(frame_rows(pose) - frame_rows(problem.anchor))
     assert np.abs(expected).max() > 0.05
-    np.testing.assert_allclose(found, expected, atol=2e-3 * np.abs(expected).max())
+    np.testing.assert_allclose(change, expected, atol=2e-3 * np.abs(expected).max())
     assert after.loss < before.loss
-    assert after.damping == pytest.approx(DAMPING * EASE)
+    assert after.damping == pytest.approx(DAMPING * DAMPING_DECREASE)
     np.testing.assert_allclose(after.loss, total_of(stage, pose, problem), rtol=1e-5)
 
 
-def test_a_step_that_raises_the_loss_is_not_taken():
-    """The recorded loss is lower than any that a step can reach."""
+def test_a_step_that_increases_the_loss_is_not_taken():
+    """The loss in the state is 0, so that every step increases the loss."""
     problem = first_problem(NEWTON)
     _, [(pose, after)] = take_steps(NEWTON, problem, loss=jnp.float32(0.0))
     for name in vars(pose):
         np.testing.assert_array_equal(getattr(pose, name), getattr(problem.anchor, name), err_msg=name)
     assert after.loss == 0
-    assert after.damping == pytest.approx(FIRST_DAMPING * TIGHTEN)
+    assert after.damping == pytest.approx(FIRST_DAMPING * DAMPING_INCREASE)
     assert after.rejected == 0
     assert not after.moved
 
 
 def test_the_curvature_is_computed_once_for_each_pose(monkeypatch):
-    """After a step that was not taken, the pose is the same, and so is its curvature."""
+    """A step that is not taken changes neither the pose nor the curvature."""
     computed = []
     evaluate = levenberg_marquardt.evaluate_curvature
 
@@ -124,7 +123,7 @@ def test_the_curvature_is_computed_once_for_each_pose(monkeypatch):
     assert len(computed) == 1 + sum(bool(state.moved) for _, state in steps[:2]) > 1
 
 
-def test_few_steps_beat_many_of_adams():
+def test_few_steps_reach_a_lower_loss_than_many_steps_of_adam():
     start, targets = case()
     adam = dataclasses.replace(NEWTON, solver="adam")
     slow, fast = solve([adam], start, targets, (300,))[1], solve([NEWTON], start, targets, (15,))[1]
@@ -133,7 +132,7 @@ def test_few_steps_beat_many_of_adams():
     assert (slow < 0.1 * before).all()
 
 
-def test_the_loss_is_that_of_the_poses():
+def test_the_reported_loss_is_the_loss_of_the_poses():
     start, targets = case()
     pose, loss, _ = solve([NEWTON], start, targets, (7,))
     for n in range(B):
@@ -141,7 +140,7 @@ def test_the_loss_is_that_of_the_poses():
         np.testing.assert_allclose(loss[n], total(one, at, seen, NEWTON), rtol=1e-5)
 
 
-def test_a_common_size_moves_as_one():
+def test_a_common_size_stays_common():
     start, targets = case()
     pose, _, _ = solve([NEWTON], start, targets, (10,))
     assert pose.scale.shape == (B, 1)
@@ -152,8 +151,8 @@ def test_a_common_size_moves_as_one():
     assert np.isfinite(loss).all()
 
 
-def test_single_frames_by_the_fit_itself():
-    """With few unknowns conjugate gradients end before their steps do."""
+def test_a_fit_of_single_frames():
+    """With few parameters, conjugate gradients converge before their largest number of steps."""
     paper, loss = load_config("paper"), {}
     observed = detect(BIRD, [smooth_motion(BIRD, 3, 3)], 1.0, 0.05)
     for solver, steps in (("adam", 600), ("levenberg_marquardt", 12)):

@@ -1,4 +1,4 @@
-"""The solver is Adam, step by step: against a plain loop, with some parameters fixed and some birds broken."""
+"""Stages of a fit: Adam against a plain loop, fixed parameters, diverged birds, reports and compiled programs."""
 
 import dataclasses
 import logging
@@ -29,9 +29,8 @@ from jaxfit.model.camera import project
 from jaxfit.model.kinematics import window_keypoints, window_transforms
 from jaxfit.model.pose import Pose
 
-# what the oracle multiplies Adam's direction by; nothing for what is not free
 STEP = {"global_orient": 0.02, "body_pose": 0.02, "transl": np.array([0.02, 0.01, 0]), "scale": 0.005}
-
+"""Step size of each optimised parameter in the stage `FIRST`."""
 
 SOLVERS = pytest.mark.parametrize("solver", ["adam", "levenberg_marquardt"])
 
@@ -42,7 +41,7 @@ def loss_and_gradient(pose, targets):
 
 
 def adam(start, targets, rates, carry):
-    """Kingma and Ba's algorithm 1, written out; `rates` scales each stage's step."""
+    """Algorithm 1 of Kingma and Ba as a plain loop. `rates` has a factor on the step size of each stage."""
     pose = {name: np.asarray(getattr(start, name), np.float64) for name in vars(start)}
     losses = []
     for stage, rate in enumerate(rates):
@@ -63,7 +62,7 @@ def adam(start, targets, rates, carry):
     return pose, np.array(losses)
 
 
-def test_a_stage_is_adam():
+def test_a_stage_equals_a_plain_loop_of_adam():
     start, targets = case()
     pose, loss, rejected = solve([FIRST], start, targets)
     expected, losses = adam(start, targets, [1.0], carry=False)
@@ -75,7 +74,7 @@ def test_a_stage_is_adam():
 
 
 @pytest.mark.parametrize("carry", [True, False])
-def test_moments_go_on_or_start_anew(carry):
+def test_moments_are_carried_or_reset(carry):
     start, targets = case()
     second = dataclasses.replace(SECOND, carry_moments=carry)
     pose, loss, _ = solve([FIRST, second], start, targets)
@@ -83,12 +82,12 @@ def test_moments_go_on_or_start_anew(carry):
     np.testing.assert_allclose(loss, runs[carry][1][-1], rtol=1e-5)
     for name in STEP:
         np.testing.assert_allclose(getattr(pose, name), runs[carry][0][name], atol=2e-5, err_msg=name)
-    apart = np.abs(runs[True][0]["body_pose"] - runs[False][0]["body_pose"]).max()
-    assert apart > 1e-3, "the two must differ for this test to tell them apart"
+    difference = np.abs(runs[True][0]["body_pose"] - runs[False][0]["body_pose"]).max()
+    assert difference > 1e-3, "the test needs a case in which the moments matter"
 
 
 @SOLVERS
-def test_steps_may_be_taken_in_any_portions(solver):
+def test_the_number_of_steps_per_call_does_not_change_the_result(solver):
     start, targets = case()
     stage = dataclasses.replace(FIRST, solver=solver)
     whole, loss, _ = solve([stage], start, targets)
@@ -99,20 +98,20 @@ def test_steps_may_be_taken_in_any_portions(solver):
 
 
 @SOLVERS
-def test_what_is_fixed_does_not_move(solver):
+def test_fixed_parameters_do_not_change(solver):
     start, targets = case()
     first = dataclasses.replace(FIRST, solver=solver)
     pose, _, _ = solve([first], start, targets)
     for name in ("bone_length", "betas"):
         np.testing.assert_array_equal(getattr(pose, name), getattr(start, name))
     np.testing.assert_array_equal(pose.transl[..., 2], start.transl[..., 2])
-    for moved, still in (
+    for after, before in (
         (pose.transl[..., :2], start.transl[..., :2]),
         (pose.scale, start.scale),
         (pose.global_orient, start.global_orient),
         (pose.body_pose, start.body_pose),
     ):
-        assert (np.abs(moved - still) > 1e-4).mean() > 0.9
+        assert (np.abs(after - before) > 1e-4).mean() > 0.9
     assert pose.scale.shape == (B, 1)  # one size for the window
     only = dataclasses.replace(first, optimised=("global_orient",))
     pose, _, _ = solve([only], start, targets)
@@ -121,10 +120,10 @@ def test_what_is_fixed_does_not_move(solver):
 
 
 @SOLVERS
-def test_a_broken_bird_stands_still_and_leaves_the_other_alone(solver):
+def test_a_diverged_bird_does_not_move_and_does_not_change_the_other_bird(solver):
     start, healthy = case()
     stages = [dataclasses.replace(s, solver=solver, carry_moments=solver == "adam") for s in (FIRST, SECOND)]
-    pose, _, rejected = solve(stages, start, case(broken=1)[1])
+    pose, _, rejected = solve(stages, start, case(diverging=1)[1])
     expected, _, _ = solve(stages, start, healthy)
     assert rejected.tolist() == [0, STEPS]
     for name in vars(pose):
@@ -132,7 +131,7 @@ def test_a_broken_bird_stands_still_and_leaves_the_other_alone(solver):
         np.testing.assert_array_equal(getattr(pose, name)[1], getattr(start, name)[1], err_msg=name)
 
 
-def test_keypoints_that_are_off():
+def test_keypoints_off_are_ignored():
     start, targets = case()
     stage = dataclasses.replace(FIRST, keypoints_off=("crown", "no such keypoint"))
     crown = BIRD.keypoint_names.index("crown")
@@ -142,12 +141,12 @@ def test_keypoints_that_are_off():
     assert np.abs(results[2].body_pose - results[3].body_pose).max() > 1e-3
 
 
-def test_the_report_is_weighted_and_of_the_poses_given():
+def test_the_report_has_the_weighted_terms_and_the_keypoints_of_the_poses():
     start, targets = case()
     result = report(program(), problems(start, targets), start)
     assert set(result.loss) == set(FIRST.terms)
     np.testing.assert_allclose(sum(result.loss.values()), loss_and_gradient(start, targets)[0], rtol=1e-5)
-    prior = (np.asarray(start.body_pose).reshape(B, -1) ** 2).sum(1) / 0.1  # the toy bird's own
+    prior = (np.asarray(start.body_pose).reshape(B, -1) ** 2).sum(1) / 0.1  # the variance of the toy bird's prior
     np.testing.assert_allclose(result.loss["pose_prior"], 10 * prior, rtol=1e-5, atol=1e-5)
     first = jax.tree.map(lambda x: x[0], start)
     keypoints = window_keypoints(MODEL.rig, window_transforms(MODEL.rig, first), first)
@@ -155,7 +154,7 @@ def test_the_report_is_weighted_and_of_the_poses_given():
     np.testing.assert_allclose(result.keypoints_px[0], project(keypoints, CAMERA), atol=1e-2)
 
 
-def test_one_program_for_any_steps_weights_and_rates(caplog):
+def test_steps_weights_and_learning_rates_share_one_program(caplog):
     start, targets = case()
     solve([FIRST], start, targets)
     others = [
@@ -171,7 +170,7 @@ def test_one_program_for_any_steps_weights_and_rates(caplog):
         assert not compiled(caplog, "begin")
         shorter = jax.tree.map(lambda x: x[:1], (start, targets))
         solve([FIRST], *shorter)
-        assert len(compiled(caplog, "advance")) == 1  # so that the count can fail
+        assert len(compiled(caplog, "advance")) == 1  # another batch size compiles: the count works
 
 
 def compiled(caplog, name):

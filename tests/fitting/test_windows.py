@@ -1,4 +1,4 @@
-"""Windows: what is fitted together, cut out how, and that nothing is lost between image and crop."""
+"""Windows: frames, crops, targets, and the conversion between image and crop."""
 
 import dataclasses
 
@@ -22,7 +22,7 @@ def config(window=4, **changes):
 
 
 def walk(numbers, birds=2, seed=0):
-    """Birds that walk to the right, some 4 px a frame number; frame t carries the number `numbers[t]`."""
+    """Return birds that walk to the right by about 4 px per frame number. Frame t has the number `numbers[t]`."""
     rng = np.random.default_rng(seed)
     T = len(numbers)
     centre = np.stack([np.array([60 + 50 * n, 90 + 60 * n]) + np.outer(numbers, [4, 1]) for n in range(birds)])
@@ -49,10 +49,10 @@ def walk(numbers, birds=2, seed=0):
     )
 
 
-def changed(observations, unseen=(), **changes):
-    """The same without the birds × frames `unseen`."""
+def changed(observations, absent=(), **changes):
+    """Return the observations without the (bird, frame) pairs in `absent`."""
     present, confidence = observations.present.copy(), observations.confidence.copy()
-    for at in unseen:
+    for at in absent:
         present[at], confidence[at] = False, 0
     return dataclasses.replace(observations, present=present, confidence=confidence, **changes)
 
@@ -66,15 +66,15 @@ def test_tracks_are_cut_into_windows():
     assert windows[np.array([5, 0])].track.tolist() == [1, 0]
 
 
-def test_windows_begin_where_the_bird_does():
-    seen_late = changed(walk(range(10)), [(0, 0), (0, 1), (0, 5), (0, 9), *((1, t) for t in range(10))])
-    windows = cut_windows(seen_late, config())
+def test_windows_begin_at_the_first_usable_frame():
+    observations = changed(walk(range(10)), [(0, 0), (0, 1), (0, 5), (0, 9), *((1, t) for t in range(10))])
+    windows = cut_windows(observations, config())
     assert windows.track.tolist() == [0, 0]  # the second bird has no usable frame: no window
     assert windows.frame.tolist() == [[2, 3, 4, 5], [6, 7, 8, -1]]
     assert windows.present.tolist() == [[True, True, True, False], [True, True, True, False]]
 
 
-def test_too_few_keypoints_are_no_frame():
+def test_a_frame_with_too_few_keypoints_is_not_usable():
     observations = walk(range(4))
     confidence = observations.confidence.copy()
     confidence[0, 2, :2] = 0
@@ -84,12 +84,12 @@ def test_too_few_keypoints_are_no_frame():
 
 
 def test_missing_numbers_are_missing_frames():
-    """Frames 0, 1, 4, 5 are not neighbours; frames 0, 2, 4 of a file that has every second are."""
+    """Frames 1 and 4 are not neighbours. Frames 0, 2, 4 are neighbours in a file with every second frame."""
     windows = cut_windows(walk([0, 1, 4, 5, 15]), config())
     assert windows.frame[:3].tolist() == [[0, 1, -1, -1], [2, 3, -1, -1], [-1, -1, -1, 4]]
     assert windows.present[:3].tolist() == (windows.frame[:3] >= 0).tolist()
     assert cut_windows(walk([10, 12, 14, 18]), config()).frame[:2].tolist() == [[0, 1, 2, -1], [3, -1, -1, -1]]
-    with pytest.raises(InputError, match=r"frame_index runs to 1000000000 .*number the frames"):
+    with pytest.raises(InputError, match=r"frame_index ends at 1000000000, .*number the frames"):
         cut_windows(walk([0, 1, 10**9]), config())
 
 
@@ -104,12 +104,11 @@ def test_the_crop_keeps_its_size_and_follows_the_bird():
         centre = boxes[:, :2] + boxes[:, 2:] / 2
         apart = crop[windows.present[n], :2] + crop[windows.present[n], 2:] / 2 - centre
         assert np.abs(apart).max() <= 0.51  # whole pixels
-    assert (
-        windows.crop[0, 2].tolist() in windows.crop[0, [1, 3]].tolist()
-    )  # a missing frame looks where one beside does
+    # a missing frame has the crop of a neighbour
+    assert windows.crop[0, 2].tolist() in windows.crop[0, [1, 3]].tolist()
 
 
-def test_without_boxes_the_keypoints_make_the_crop():
+def test_crops_without_boxes_contain_all_keypoints():
     observations = walk(range(4))
     windows = cut_windows(dataclasses.replace(observations, box_px=np.zeros((2, 4, 4))), config())
     inside = observations.keypoints_px[windows.track[:, None], windows.frame] - windows.crop[:, :, None, :2]
@@ -117,13 +116,13 @@ def test_without_boxes_the_keypoints_make_the_crop():
     assert (inside < windows.crop[:, :, None, 2:]).all()
 
 
-def test_keypoints_go_to_the_crop_and_back():
+def test_keypoints_are_converted_to_the_crop_and_back():
     observations = changed(walk([0, 1, 3, 4, 5]), [(1, 0), (0, 3)])
     windows = cut_windows(observations, config())
     targets = load_targets(windows, 64)
     assert targets.keypoints_px.shape == (len(windows), 4, K, 2)
     back = crop_to_image(targets.keypoints_px, windows.crop)
-    measured = 0
+    compared = 0
     for w, t in zip(*np.nonzero(windows.present), strict=True):
         n, at = windows.track[w], windows.frame[w, t]
         np.testing.assert_allclose(back[w, t], observations.keypoints_px[n, at], atol=1e-3)
@@ -133,8 +132,8 @@ def test_keypoints_go_to_the_crop_and_back():
         assert targets.has_mask[w, t]
         expected = cut_mask(observations.mask(n, at), windows.crop[w, t], 64)
         np.testing.assert_array_equal(targets.mask[w, t], expected)
-        measured += 1
-    assert measured == 8
+        compared += 1
+    assert compared == 8
     absent = ~windows.present
     assert not targets.confidence[absent].any()
     assert not targets.has_mask[absent].any()
@@ -143,7 +142,7 @@ def test_keypoints_go_to_the_crop_and_back():
     np.testing.assert_array_equal(targets.present, windows.present)
 
 
-def test_a_bird_without_mask_keeps_its_keypoints():
+def test_a_frame_without_a_mask_keeps_its_keypoints():
     observations = walk(range(4))
     masks = {at: rle for at, rle in observations.masks.items() if at != (0, 1)}
     targets = load_targets(cut_windows(dataclasses.replace(observations, masks=masks), config()), 64)
@@ -156,7 +155,7 @@ def test_a_bird_without_mask_keeps_its_keypoints():
     "crop", [(10, 20, 96), (-13, 5, 64), (350, 250, 100), (0, 0, 32), (37, 41, 75), (500, 400, 80)]
 )
 def test_masks_shrink_by_area(crop):
-    """A crop's pixel counts where the mask covers half of it: by adding up covered areas exactly."""
+    """A pixel of the crop is 1 if the mask covers at least half of the pixel: compared with exact covered areas."""
     rng = np.random.default_rng(0)
     mask = np.kron(rng.random((30, 40)) < 0.5, np.ones((10, 10))).astype(bool)  # 300 × 400, blocks of ten
     x0, y0, size = crop
@@ -177,8 +176,8 @@ def test_masks_shrink_by_area(crop):
 
 
 @pytest.mark.parametrize("size", [40, 64, 100])
-def test_masks_stay_under_the_keypoints(size):
-    """A disc cut from the image is the disc at the crop's scale, whether it grows or shrinks."""
+def test_masks_have_the_scale_of_the_crop(size):
+    """A disc in the image is a disc at the scale of the crop, for enlarged and for reduced crops."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     crop, centre, radius = np.array([80.0, 60, size]), np.array([80 + 0.55 * size, 60 + 0.4 * size]), 0.25 * size
     disc = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2
@@ -200,7 +199,7 @@ def test_whole_images():
 
 @pytest.mark.parametrize("numbers", [range(9), [0, 1, 2, 5, 6, 11, 12, 13, 14], [0, 2, 4, 6, 10, 12]])
 def test_the_filter_runs_over_frame_numbers(numbers):
-    """What stands far apart in the video is not smoothed together."""
+    """Frames with distant frame numbers are not in the same window of the filter."""
     observations = changed(walk(numbers), [(0, 2), (1, 3)])
     step = 1 if 1 in numbers else 2
     line = np.arange(max(numbers) // step + 1) * step
@@ -210,8 +209,8 @@ def test_the_filter_runs_over_frame_numbers(numbers):
         at = np.searchsorted(line, numbers)
         points[at], weight[at] = observations.keypoints_px[n], observations.confidence[n]
         expected = np.asarray(weighted_median_filter(points, weight, 5))[at]
-        seen = observations.present[n]
-        np.testing.assert_array_equal(filtered.keypoints_px[n][seen], expected[seen])
+        present = observations.present[n]
+        np.testing.assert_array_equal(filtered.keypoints_px[n][present], expected[present])
     np.testing.assert_array_equal(filtered.confidence, observations.confidence)
     assert np.abs(filtered.keypoints_px - observations.keypoints_px).max() > 1
     assert filter_observations(observations, 1) is observations

@@ -24,7 +24,7 @@ stages:
 
 
 def write_inputs(folder):
-    """A model, observations of three birds (the last is hardly visible) and a config, as files."""
+    """Write a model, observations of three birds (the last bird has three keypoints) and a config."""
     save_bird(BIRD, folder / "toy.npz")
     observed = detect(BIRD, [smooth_motion(BIRD, T, seed) for seed in range(3)], camera=Camera(541.75, 32, SIZE))
     confidence = observed.confidence.copy()
@@ -35,13 +35,14 @@ def write_inputs(folder):
 
 
 def arguments(inputs, out, **changes):
-    given = {"obs": "birds.json", "model": "toy.npz", "config": "quick.yaml"} | changes
-    at = {name: str(inputs / value) for name, value in given.items()}
-    return ["fit", at["obs"], "--model", at["model"], "--config", at["config"], "--out", str(out)]
+    """Return the arguments of `jaxfit fit`, with other files for the names in `changes`."""
+    names = {"obs": "birds.json", "model": "toy.npz", "config": "quick.yaml"} | changes
+    paths = {name: str(inputs / value) for name, value in names.items()}
+    return ["fit", paths["obs"], "--model", paths["model"], "--config", paths["config"], "--out", str(out)]
 
 
 def rejected(capsys, command, *words, code=2, alone=True):
-    """Check that a command ends with an exit code and prints one line on stderr that holds all words."""
+    """Check that a command returns `code` and prints one line on stderr that contains all words."""
     capsys.readouterr()
     assert main(command) == code
     lines = capsys.readouterr().err.strip().splitlines()

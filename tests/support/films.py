@@ -46,7 +46,7 @@ def number_in(picture):
 
 
 def encode(path, codec="libx264", count=100, gop=20, ticks=None, options=None, b_frames=None):
-    """Write a video of `numbered` pictures at 25 frames per second, or at the given times in ticks of 1/100 s."""
+    """Write a video of `numbered` pictures at 25 frames per second, or at times `ticks` in units of 1/100 s."""
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25 if ticks is None else 100, options=options or {})
         stream.width, stream.height, stream.pix_fmt = BITS * CELL_PX, 64 + CELL_PX, "yuv420p"

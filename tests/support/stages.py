@@ -1,4 +1,4 @@
-"""A stage of a fit on two toy birds, and its solution by the library's solvers."""
+"""Stages of a fit on two toy birds, and a loop over the stages with the library's solvers."""
 
 import dataclasses
 
@@ -36,7 +36,7 @@ def program(stage=FIRST, config=CONFIG):
 
 
 def problems(anchor, targets, stage=FIRST, config=CONFIG):
-    """The problems of all birds, at these poses."""
+    """Return the problems of all birds, at the poses `anchor`."""
     one = stage_hyperparameters(config, stage, BIRD.keypoint_names)
     return Problem(stacked([one] * len(targets.present)), anchor, targets)
 
@@ -45,15 +45,15 @@ def stacked(values):
     return jax.tree.map(lambda *x: jnp.stack(x), *values)
 
 
-def case(broken=None):
-    """Poses a little off the truth, and targets; the keypoints of bird `broken` exceed the range of float32."""
+def case(diverging=None):
+    """Return poses near the truth, and targets. The squared keypoints of bird `diverging` exceed float32."""
     truths = [smooth_motion(BIRD, T, seed) for seed in range(B)]
     targets = []
     for n, truth in enumerate(truths):
         points = project(window_keypoints(MODEL.rig, window_transforms(MODEL.rig, truth), truth), CAMERA)
         targets.append(
             Targets(
-                keypoints_px=jnp.full_like(points, 1e30) if n == broken else points,
+                keypoints_px=jnp.full_like(points, 1e30) if n == diverging else points,
                 confidence=jnp.ones(points.shape[:2]),
                 mask=jnp.zeros((T, 0, 0), jnp.uint8),
                 has_mask=jnp.zeros(T, bool),
@@ -74,7 +74,7 @@ def case(broken=None):
 
 
 def solve(stages, start, targets, chunks=(STEPS,)):
-    """Run stages as the fit does; final poses, losses before the last step, rejected steps."""
+    """Run the stages. Return the final poses, the losses before the last step, and the numbers of rejected steps."""
     pose, solver = start, None
     for stage in stages:
         own = program(stage), problems(pose, targets, stage)
@@ -86,7 +86,7 @@ def solve(stages, start, targets, chunks=(STEPS,)):
 
 
 def total(pose, start, targets, stage=FIRST):
-    """The objective of one bird."""
+    """Return the objective of one bird."""
     own = program(stage)
     window = PosedWindow(pose, start, targets, own.rig, own.priors, own.camera, own.raster)
     return weighted_sum(window, own.terms, CONFIG.stage_settings(stage))
