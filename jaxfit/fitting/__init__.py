@@ -1,1 +1,1 @@
-"""From observations to poses: windows, starting poses, stages, the solver, results."""
+"""The fit, from observations to poses: windows, initial poses, stages, solvers, and the solution."""
