@@ -1,7 +1,8 @@
 """The layout of the code: docs/architecture.md is true, and the rules that it states hold.
 
 After a module is added, renamed or removed, `python tests/test_architecture.py` rewrites the tree of the document. The
-tree keeps the descriptions; a new module gets the first line of its docstring, to be shortened by hand.
+tree keeps the descriptions; a new module gets the first line of its docstring, to be shortened by hand, without a
+full stop.
 """
 
 import ast
@@ -105,6 +106,7 @@ def test_the_tree_of_the_document_is_the_tree_of_the_package():
     documented, present = paths_in_document(), paths_on_disk()
     wrong = [(entry.line, f"remove {path}") for path, entry in documented.items() if path not in present]
     wrong += [(entry.line, f"describe {path}") for path, entry in documented.items() if not entry.description]
+    wrong += [(entry.line, f"shorten {path}") for path, entry in documented.items() if entry.description.endswith(".")]
     line = 0
     for path in present:
         if path not in documented:

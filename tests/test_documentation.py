@@ -1,14 +1,19 @@
-"""The documents: their links lead somewhere, their commands parse, their configs are valid, the README is short."""
+"""The documents: links lead to files, commands parse, configs and Python examples are valid, the README is short."""
 
 import argparse
+import ast
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax
+import numpy as np
 import pytest
 
 import jaxfit
 from jaxfit.cli.main import main
+from jaxfit.objective import registry
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -61,6 +66,41 @@ def test_commands_parse(path, monkeypatch):
     for arguments in commands(path.read_text(encoding="utf-8")):
         with pytest.raises(Parsed):  # SystemExit where the parser rejects the command
             main(arguments)
+
+
+@documents
+def test_python_examples_import_what_exists(path):
+    """Every import of a Python example succeeds, and `jaxfit` has every name that an example takes from it."""
+    for language, block in BLOCK.findall(path.read_text(encoding="utf-8")):
+        for node in ast.walk(ast.parse(block if language == "python" else "")):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                exec(ast.unparse(node), {})
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "jaxfit":
+                assert hasattr(jaxfit, node.attr), f"jaxfit.{node.attr}"
+
+
+def test_the_example_of_a_curvature_is_exact(monkeypatch):
+    """E(θ + d) = E(θ) + g·d + ½ d·H·d, because the term of the example is quadratic."""
+    text = (ROOT / "docs" / "terms.md").read_text(encoding="utf-8")
+    (example,) = [block for _, block in BLOCK.findall(text) if "Curvature(" in block]
+    names = {"__name__": "curvature_example"}
+    monkeypatch.setattr(registry, "_terms", dict(registry._terms))
+    exec(example, names)
+    frames, bones = 3, 5
+    body_pose, change = np.random.default_rng(0).normal(size=(2, frames, bones, 3)).astype(np.float32)
+
+    def window(body_pose):
+        return SimpleNamespace(pose=SimpleNamespace(body_pose=body_pose), present=np.array([True, False, True]))
+
+    def energy(body_pose):
+        return names["small_angles"](window(body_pose))
+
+    rows = np.pad(change.reshape(frames, -1), ((0, 0), (3, 4)))
+    H = names["_curvature"](window(body_pose))
+    quadratic = energy(body_pose) + np.sum(jax.grad(energy)(body_pose) * change) + 0.5 * np.sum(rows * H.product(rows))
+    assert H.diagonal.shape == rows.shape == (frames, 3 * (bones + 1) + 4)
+    assert np.isclose(energy(body_pose + change), quadratic, rtol=1e-5)
+    np.testing.assert_array_equal(H.product(np.ones_like(rows)), H.diagonal)
 
 
 def test_configs_are_valid(tmp_path):

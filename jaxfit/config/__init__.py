@@ -1,1 +1,1 @@
-"""What may be set: the schema of every config, its checks, and the YAML files that hold overrides."""
+"""Configs: keys, defaults, descriptions and checks of every config, and the YAML files that hold overrides."""

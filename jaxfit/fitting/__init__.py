@@ -1,1 +1,1 @@
-"""The fit, from observations to poses: windows, initial poses, stages, solvers, results."""
+"""The fit, from observations to poses: windows, initial poses, stages, solvers, and the solution."""

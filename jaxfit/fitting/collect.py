@@ -106,7 +106,7 @@ def collect_windows(
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
         loss=loss,
-        status=np.array([_status(*counts) for counts in zip(fitted, diverged, strict=True)], "<U32"),
+        status=np.array([_status(*counts) for counts in zip(fitted.tolist(), diverged.tolist(), strict=True)], "<U32"),
         failures=failures,
     )
 

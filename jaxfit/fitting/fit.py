@@ -85,10 +85,10 @@ def fit_runs(
         InputError: as for `fit`.
         ValueError: the configs need different programs.
     """
+    observations = check_observations(observations, bird, source)
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
-    observations = check_observations(observations, bird, source)
     model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
     check_terms(configs[0], model)
     runs = _cut_runs(observations, configs, initial_poses, source)

@@ -118,11 +118,11 @@ def _pose_prior_curvature(window: PosedWindow) -> Curvature:
     return Curvature(Partial(_pose_prior_product, precision, present), _body_rows(present, diagonal))
 
 
-def _pose_prior_product(precision: Float[Array, "D D"], present: Bool[Array, "T"], d: Rows) -> Rows:
+def _pose_prior_product(precision: Float[Array, "angles angles"], present: Bool[Array, "T"], d: Rows) -> Rows:
     return _body_rows(present, d[:, 3:-4] @ precision)
 
 
-def _body_rows(present: Bool[Array, "T"], rows: Float[Array, "T D"]) -> Rows:
+def _body_rows(present: Bool[Array, "T"], rows: Float[Array, "T angles"]) -> Rows:
     return jnp.pad(2 * jnp.where(present[:, None], rows, 0.0), ((0, 0), (3, 4)))
 
 

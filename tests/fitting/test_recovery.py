@@ -14,6 +14,8 @@ from jaxfit.model.importers.import_model import import_model
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
 
+pytestmark = pytest.mark.extended
+
 BIRDS, FRAMES = 2, 50
 MASK_STEPS = 20
 """Steps of the mask stage in both configs (in the shipped configs 400). The keypoint stage has all its steps."""
