@@ -86,13 +86,13 @@ def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tupl
     )
     moved = _moved(pose, change)
     loss, new_gradient = _loss_and_gradient(program, problem, moved)
-    lower = (loss < state.loss) & _finite(new_gradient)
+    stuck = ~(jnp.isfinite(state.loss) & _finite(state.gradient))
+    lower = ~stuck & (loss < state.loss) & _finite(new_gradient)
 
     def better(new: Any, old: Any) -> Any:
         return jax.tree.map(lambda a, b: jnp.where(lower, a, b), new, old)
 
     damping = jnp.clip(state.damping * jnp.where(lower, EASE, TIGHTEN), LEAST_DAMPING, MOST_DAMPING)
-    stuck = ~(jnp.isfinite(state.loss) & _finite(state.gradient))
     loss, gradient = better((loss, new_gradient), (state.loss, state.gradient))
     return better(moved, pose), _State(loss, gradient, curvature, lower, damping, state.rejected + stuck)
 
