@@ -27,10 +27,13 @@ def frame_step(frame_index: Any) -> int:
     return max(int(np.gcd.reduce(np.diff(numbers))), 1) if len(numbers) > 1 else 1
 
 
-def consecutive(frame_index: Any) -> Bool[np.ndarray, "T-1"]:
+def consecutive(frame_index: Any) -> Bool[np.ndarray, "pairs"]:
     """Return whether frame t + 1 is the next frame of the file after frame t: their numbers differ by `frame_step`.
 
     Args:
         frame_index: (T,) increasing frame numbers.
+
+    Returns:
+        (T − 1,), one value for each pair of neighbours.
     """
     return np.diff(np.asarray(frame_index)) == frame_step(frame_index)

@@ -85,9 +85,9 @@ def fit_runs(
         InputError: as `fit`.
         ValueError: configs that need different programs.
     """
+    observations = check_observations(observations, bird, source)
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
         raise ValueError("configs must share one compiled program: they may differ in weights, settings, step sizes, …")
-    observations = check_observations(observations, bird, source)
     model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
     check_terms(configs[0], model)
     runs = _runs(observations, configs, model, initial_poses, source)

@@ -64,7 +64,7 @@ def test_a_key_that_a_cross_leaves_alone_has_the_bases_level(tmp_path):
 
 
 def test_equal_runs_are_one(tmp_path, caplog):
-    text = "crosses:\n  - cross: {terms.velocity: [0, 2], terms.keypoints: [100, =terms.velocity]}\n"
+    text = "crosses:\n  - cross: {terms.velocity: [0, 2], terms.keypoints: [6.25, =terms.velocity]}\n"
     text += "  - cross: {terms.velocity: [2]}"
     assert len(load_grid(grid_file(tmp_path, text)).runs) == 4
     assert "one run is kept" in caplog.text

@@ -7,6 +7,8 @@ from support.birds import toy_bird
 from jaxfit.benchmarks.fit import noisy_scene
 from jaxfit.benchmarks.solvers import RACE, bench_solvers, plot_solvers
 
+pytestmark = pytest.mark.extended
+
 
 @pytest.fixture(scope="module")
 def found():

@@ -220,7 +220,7 @@ def test_files_that_are_missing_or_broken(data_set, tmp_path):
         read_common_murre(folder)
     for file in (folder / "images").iterdir():
         file.unlink()
-    with pytest.raises(InputError, match="images: holds no image"):
+    with pytest.raises(InputError, match="images: has no images"):
         read_common_murre(folder)
     (folder / "images").rmdir()
     with pytest.raises(InputError, match="images: does not exist"):

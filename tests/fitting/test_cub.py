@@ -11,6 +11,8 @@ from jaxfit.fitting.fit import fit
 from jaxfit.fitting.initial_pose_file import load_initial_poses
 from jaxfit.model.importers.import_model import import_model
 
+pytestmark = pytest.mark.extended
+
 SPECIES = "106.Horned_Puffin"
 
 

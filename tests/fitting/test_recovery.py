@@ -14,6 +14,8 @@ from jaxfit.model.importers.import_model import import_model
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
 
+pytestmark = pytest.mark.extended
+
 BIRDS, FRAMES = 2, 50
 MASK_STEPS = 20
 """Of 400, in both configs alike: the keypoint stage, run in full, is where the temporal terms count most."""

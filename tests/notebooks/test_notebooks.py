@@ -17,6 +17,8 @@ from support.notebook_runs import (
     without_run_metadata,
 )
 
+pytestmark = pytest.mark.extended
+
 SMALL_SCENE = {"BIRDS": 1, "FRAMES": 10, "SIZE": (640, 376), "KEYPOINT_STEPS": 3, "MASK_STEPS": 2}
 SMALL = {
     "01_fit_a_window": SMALL_SCENE,

@@ -241,7 +241,7 @@ def test_a_video_that_is_not_the_results(tmp_path):
     refused("hold no bird of the result", observations=dataclasses.replace(detections(), track_id=np.array([5])))
     refused("nothing.mp4", "does not exist", video=tmp_path / "nothing.mp4")
     (tmp_path / "text.mp4").write_text("no video")
-    refused("text.mp4", "no video", video=tmp_path / "text.mp4")
+    refused("text.mp4", "not a readable video", video=tmp_path / "text.mp4")
     empty = dataclasses.replace(solution(), valid=np.zeros((N, T), bool))
     refused("no valid pose", result=empty)
     other = dataclasses.replace(detections(), keypoint_names=("horn", *BIRD.keypoint_names[1:]))
