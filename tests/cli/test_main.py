@@ -41,7 +41,7 @@ def test_fit_writes_a_whole_result(fitted, inputs, capsys):
     assert summary["status"] == {"ok": 2, "no usable frame": 1}
     assert summary["track_status"]["9"] == "no usable frame"
     assert (summary["tracks"], summary["poses"], summary["model"]["name"]) == (3, 2 * T, "toy")
-    assert summary["seconds"]["fit"] > 0
+    assert set(summary["seconds"]) == {"read", "fit"}
     assert {"jaxfit", "jax", "python"} <= set(summary["versions"])
     assert "only" in (fitted / "config.yaml").read_text()
 
