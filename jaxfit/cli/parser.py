@@ -101,7 +101,7 @@ def _fitting(commands: Any) -> None:
     _add_model(fit)
     text = "name of a shipped config (paper, baseline, …) or a YAML file (default %(default)s)"
     fit.add_argument("--config", default="paper", help=text)
-    text = "starting poses: the output of a pose regressor, or an earlier poses.npz"
+    text = "initial poses: the output of a pose regressor, or an earlier poses.npz"
     fit.add_argument("--init", type=Path, metavar="POSES.npz", help=text)
     _add_out(fit, "DIR", "folder for the result", overwrite="an earlier result in the folder")
 

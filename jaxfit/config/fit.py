@@ -1,4 +1,4 @@
-"""Settings of a fit: crops, starting poses, stages, terms and batches."""
+"""Settings of a fit: crops, initial poses, stages, terms and batches."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class CropConfig:
 
 @dataclass(frozen=True)
 class InitialiseConfig:
-    """The search for starting poses, for a fit without given starting poses."""
+    """The search for initial poses, for a fit without given initial poses."""
 
     method: Literal["viewing_axis", "so3"] = "viewing_axis"
     """`viewing_axis`: the bird is seen from above and is rotated about the viewing axis (the paper's method).
@@ -56,7 +56,7 @@ class InitialiseConfig:
     """Cost of a rotation of 1 radian between consecutive frames in the choice of the sequence, in squared pixels of a
     256-pixel crop."""
     hypotheses: int = 1
-    """Number of distinct starting poses that are fitted side by side until a stage with `keep_best` ends."""
+    """Number of distinct initial poses that are fitted side by side until a stage with `keep_best` ends."""
 
     def __post_init__(self):
         require_at_least(self, 1, "turns", "directions", "candidates", "hypotheses")

@@ -16,7 +16,7 @@ class FramesConfig:
     start: int = 0
     """First frame, counted from 0."""
     stop: int | None = None
-    """Frame to stop before; null processes all frames to the end."""
+    """Frame to stop before; by default (null), all frames to the end are processed."""
     step: int = 1
     """Process every N-th frame."""
 

@@ -21,8 +21,8 @@ from jaxfit.storage.npz import load_npz
 
 __all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution", "write_solution"]
 
-FORMAT_VERSION = 1
-"""Version of ``poses.npz``; increased when an older reader would misread the file."""
+FORMAT_VERSION = 2
+"""Version of ``poses.npz``; increased when names or meaning of its arrays change. Other versions are not read."""
 
 _POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
 
@@ -174,7 +174,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         folder: a folder that ``save_solution`` wrote.
 
     Raises:
-        InputError: the folder does not exist; a file is missing, damaged or of a newer version; or the shapes of the
+        InputError: the folder does not exist; a file is missing, damaged or of another version; or the shapes of the
             arrays do not agree.
     """
     folder = Path(folder)
@@ -183,7 +183,8 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         raise InputError(folder, problem, "give the folder that a fit wrote")
     path = folder / _POSES
     ndim = {name: len(shape.split()) for name, (shape, _) in LAYOUT.items()}
-    arrays = load_npz(path, ndim | {"loss": 2, "loss_terms": 1, "focal_px": 0, "crop_px": 0}, FORMAT_VERSION)
+    ndim |= {"loss": 2, "loss_terms": 1, "focal_px": 0, "crop_px": 0}
+    arrays = load_npz(path, ndim, FORMAT_VERSION, oldest=FORMAT_VERSION)
     values: dict[str, Any] = {name: arrays[name] for name in LAYOUT}
     values |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays["loss_terms"], arrays["loss"]

@@ -88,14 +88,14 @@ def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tupl
     )
     new_pose = _add_rows(pose, change)
     loss, new_gradient = _loss_and_gradient(program, problem, new_pose)
-    lower = (loss < state.loss) & _finite(new_gradient)
+    not_finite = ~(jnp.isfinite(state.loss) & _finite(state.gradient))
+    lower = ~not_finite & (loss < state.loss) & _finite(new_gradient)
 
     def choose(new: Any, old: Any) -> Any:
         return jax.tree.map(lambda a, b: jnp.where(lower, a, b), new, old)
 
     factor = jnp.where(lower, DAMPING_DECREASE, DAMPING_INCREASE)
     damping = jnp.clip(state.damping * factor, LEAST_DAMPING, MOST_DAMPING)
-    not_finite = ~(jnp.isfinite(state.loss) & _finite(state.gradient))
     loss, gradient = choose((loss, new_gradient), (state.loss, state.gradient))
     return choose(new_pose, pose), _State(loss, gradient, curvature, lower, damping, state.rejected + not_finite)
 

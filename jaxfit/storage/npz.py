@@ -15,21 +15,24 @@ from jaxfit.errors import InputError
 __all__ = ["load_npy", "load_npz", "npz_names"]
 
 
-def load_npz(path: str | Path, required: Mapping[str, int], version: int | None = None) -> dict[str, np.ndarray]:
+def load_npz(
+    path: str | Path, required: Mapping[str, int], version: int | None = None, oldest: int = 1
+) -> dict[str, np.ndarray]:
     """Read all arrays of an ``.npz`` without running pickled code.
 
     Args:
         path: the file.
         required: name → number of dimensions of each required array.
         version: the newest ``format_version`` that the caller supports; the file must then contain its version as an
-            integer from 1. The version is checked first, because a newer file may have other arrays. None: no check.
+            integer from 1. The version is checked first, because another version may have other arrays. None: no check.
+        oldest: the oldest ``format_version`` that the caller supports.
 
     Returns:
         Name → array, including arrays that are not required.
 
     Raises:
-        InputError: the file does not exist, is not an ``.npz``, is truncated, contains Python objects or has a newer
-            version; or a required array is missing or has another number of dimensions.
+        InputError: the file does not exist, is not an ``.npz``, is truncated, contains Python objects or has an
+            unsupported version; or a required array is missing or has another number of dimensions.
     """
     path = Path(path)
     with _open(path, ".npz") as loaded:
@@ -37,7 +40,7 @@ def load_npz(path: str | Path, required: Mapping[str, int], version: int | None 
     if content is None:
         raise _bare_array(path)
     if version is not None:
-        _check_version(path, content.get("format_version"), version)
+        _check_version(path, content.get("format_version"), version, oldest)
     for name, ndim in required.items():
         if not isinstance(content.get(name), np.ndarray):
             raise InputError(path, f"lacks the array {name}", "write the file again with this version")
@@ -93,8 +96,8 @@ def _open(path: Path, kind: str) -> Iterator[np.ndarray | NpzFile]:
         raise InputError(path, "cannot be read: permission denied", "change its permissions") from error
     except Exception as error:  # zip, zlib, header and memory errors all mean that the file is damaged
         if "allow_pickle" in str(error):
-            problem = "is a pickle or holds Python objects, which jaxfit does not load"
-            raise InputError(path, problem, "save plain arrays with numpy.save or numpy.savez") from error
+            problem = f"is not an {kind} of plain arrays; jaxfit loads no pickles and no Python objects"
+            raise InputError(path, problem, "check the path, or save plain arrays with numpy") from error
         problem = f"is not a readable {kind}: {str(error) or type(error).__name__}"
         raise InputError(path, problem, "the file may be truncated: copy or write it again") from error
 
@@ -103,7 +106,7 @@ def _bare_array(path: Path) -> InputError:
     return InputError(path, "holds one bare array, not an .npz", "check the path")
 
 
-def _check_version(path: Path, version: Any, newest: int) -> None:
+def _check_version(path: Path, version: Any, newest: int, oldest: int) -> None:
     if not isinstance(version, np.ndarray):
         raise InputError(path, "lacks the array format_version", "write the file again with this version")
     if version.ndim or version.dtype.kind not in "iu" or version < 1:
@@ -112,3 +115,6 @@ def _check_version(path: Path, version: Any, newest: int) -> None:
     if version > newest:
         problem = f"format_version is {version}, newer than this jaxfit reads ({newest})"
         raise InputError(path, problem, "it needs a newer jaxfit")
+    if version < oldest:
+        problem = f"format_version is {version}, older than this jaxfit reads ({oldest})"
+        raise InputError(path, problem, "write the file again with this jaxfit")

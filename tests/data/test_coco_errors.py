@@ -167,6 +167,10 @@ def test_broken_text_says_where(tmp_path):
         assert "is empty" in str(caught.value) or "not valid JSON at line" in str(caught.value)
     with pytest.raises(InputError, match=r"not valid JSON at line 2, column 1: .*correct the file"):
         read_coco(saved(tmp_path, '{"images": [],\n}'))
+    with pytest.raises(InputError, match=r"not valid JSON at line 1, column 1: .*correct the file"):
+        read_coco(saved(tmp_path, "not json"))
+    with pytest.raises(InputError, match="ends midway"):
+        read_coco(saved(tmp_path, '{"images": ['))
     with pytest.raises(InputError, match="nested too deeply"):
         read_coco(saved(tmp_path, "[" * 200_000))
     with pytest.raises(InputError, match="too many digits"):

@@ -175,7 +175,7 @@ def rewrite(folder, **changes):
         ({"loss_terms": np.array(["a"])}, "loss has shape .* 1 loss_terms"),
         ({"loss": np.ones((5, 2))}, "loss.* must have shape"),
         ({"focal_px": np.array("x")}, "focal|float"),
-        ({"status": np.array([None, {}], dtype=object)}, "holds Python objects"),
+        ({"status": np.array([None, {}], dtype=object)}, "loads no .* Python objects"),
     ],
 )
 def test_damaged_folders_are_refused_by_name(tmp_path, changes, message):
@@ -184,6 +184,17 @@ def test_damaged_folders_are_refused_by_name(tmp_path, changes, message):
     with pytest.raises(InputError, match=message) as caught:
         load_solution(tmp_path / "out")
     assert str(caught.value).startswith(str(tmp_path / "out" / "poses.npz"))
+
+
+def test_a_folder_of_an_older_version_is_rejected_by_its_version(tmp_path):
+    """Version 1 has other names; the message names the version and not one of the missing arrays."""
+    save_solution(make(), BIRD, "", {}, tmp_path / "out")
+    with np.load(tmp_path / "out" / "poses.npz") as arrays:
+        older = {"keypoints_3d": arrays["keypoints_cam"], "keypoints_2d": arrays["keypoints_px"]}
+    newer = {"keypoints_cam": None, "keypoints_px": None, "focal_px": None}
+    rewrite(tmp_path / "out", format_version=np.int64(1), focal=np.float64(2167), **older, **newer)
+    with pytest.raises(InputError, match=r"poses\.npz: format_version is 1, older than this jaxfit reads \(2\)"):
+        load_solution(tmp_path / "out")
 
 
 def test_a_model_that_is_not_the_poses_is_refused(tmp_path):

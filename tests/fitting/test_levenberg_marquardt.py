@@ -102,6 +102,16 @@ def test_a_step_that_increases_the_loss_is_not_taken():
     assert not after.moved
 
 
+@pytest.mark.parametrize("loss", [np.inf, np.nan])
+def test_a_loss_that_is_not_finite_stops_the_bird(loss):
+    """All steps from then on are rejected, so that their number dates the failure."""
+    problem = first_problem(NEWTON)
+    _, steps = take_steps(NEWTON, problem, 3, loss=jnp.float32(loss))
+    assert [int(state.rejected) for _, state in steps] == [1, 2, 3]
+    for name in vars(problem.anchor):
+        np.testing.assert_array_equal(getattr(steps[-1][0], name), getattr(problem.anchor, name), err_msg=name)
+
+
 def test_the_curvature_is_computed_once_for_each_pose(monkeypatch):
     """A step that is not taken changes neither the pose nor the curvature."""
     computed = []

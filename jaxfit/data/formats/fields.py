@@ -144,7 +144,7 @@ def read_json(path: Path) -> Field:
         return Field(path, "", json.loads(text))
     except json.JSONDecodeError as error:
         # a truncated file has its error at its end, or at the string or list that is not closed
-        cut = not text.rstrip().endswith(("}", "]"))
+        cut = text.lstrip().startswith(("{", "[")) and not text.rstrip().endswith(("}", "]"))
         remedy = "the file ends midway: copy or write it again" if cut else "correct the file or write it again"
         problem = f"is not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
         raise InputError(path, problem, remedy) from error

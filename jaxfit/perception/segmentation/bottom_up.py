@@ -52,19 +52,12 @@ class BottomUp(SegmentationNetwork):
     layout = "outputs foreground, centre, offset"
     default_min_score = 0.4
 
-    def __init__(
-        self,
-        model: OnnxModel,
-        classes: Sequence[str] | None = None,
-        min_score: float | None = None,
-        names: Sequence[str] | None = None,
-    ):
-        super().__init__(model, classes, min_score, names)
+    def _set_up(self) -> None:
         (self._label,) = self.class_names
-        text = model.metadata.get("longer_side", str(LONGER_SIDE_PX))
+        text = self._model.metadata.get("longer_side", str(LONGER_SIDE_PX))
         if not (text.isdecimal() and 1 <= int(text) <= LARGEST_SIDE_PX and int(text) % MULTIPLE == 0):
             remedy = f"export it with a multiple of {MULTIPLE} pixels, at most {LARGEST_SIDE_PX}"
-            raise InputError(model.path, f"its metadata `longer_side` is {text[:40]!r}", remedy)
+            raise InputError(self._model.path, f"its metadata `longer_side` is {text[:40]!r}", remedy)
         self._longer_side_px = int(text)
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:

@@ -44,6 +44,10 @@ class SegmentationNetwork:
         self._min_score = self.default_min_score if min_score is None else min_score
         self._classes = choose_classes(model.path, self._all_classes(names), classes)
         self.class_names = tuple(self._classes.values())
+        self._set_up()
+
+    def _set_up(self) -> None:
+        """Prepare what a layout needs besides the classes; the last part of `__init__`."""
 
     @staticmethod
     def fits(model: OnnxModel) -> bool:

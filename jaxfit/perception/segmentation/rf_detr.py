@@ -38,16 +38,9 @@ class RfDetrSeg(SegmentationNetwork):
     layout = "outputs dets (1, queries, 4), labels (1, queries, slots), masks (1, queries, h, w)"
     default_min_score = 0.5  # as in RF-DETR
 
-    def __init__(
-        self,
-        model: OnnxModel,
-        classes: Sequence[str] | None = None,
-        min_score: float | None = None,
-        names: Sequence[str] | None = None,
-    ):
-        super().__init__(model, classes, min_score, names)
+    def _set_up(self) -> None:
         if self._input.size_px is None:
-            raise InputError(model.path, "has an input of variable size", "export it with a fixed size")
+            raise InputError(self._model.path, "has an input of variable size", "export it with a fixed size")
         self._size_px = self._input.size_px
 
     @staticmethod

@@ -39,20 +39,13 @@ class YoloSeg(SegmentationNetwork):
     default_min_score = 0.25  # as in Ultralytics
     max_iou = 0.7
 
-    def __init__(
-        self,
-        model: OnnxModel,
-        classes: Sequence[str] | None = None,
-        min_score: float | None = None,
-        names: Sequence[str] | None = None,
-    ):
-        self._is_final = _is_final(model)
-        super().__init__(model, classes, min_score, names)
-        self._size_px = self._input.size_px or _variable_size_px(model)
+    def _set_up(self) -> None:
+        self._is_final = _is_final(self._model)
+        self._size_px = self._input.size_px or _variable_size_px(self._model)
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
         head, protos = (port.shape for port in self._model.outputs)
-        return names_of(self._model, names, None if self._is_final else (head[1] or 0) - 4 - (protos[1] or 0))
+        return names_of(self._model, names, None if _is_final(self._model) else (head[1] or 0) - 4 - (protos[1] or 0))
 
     @staticmethod
     def fits(model: OnnxModel) -> bool:

@@ -44,14 +44,7 @@ class Yolox(SegmentationNetwork):
     default_min_score = 0.3  # as in YOLOX' demo
     max_iou = 0.45
 
-    def __init__(
-        self,
-        model: OnnxModel,
-        classes: Sequence[str] | None = None,
-        min_score: float | None = None,
-        names: Sequence[str] | None = None,
-    ):
-        super().__init__(model, classes, min_score, names)
+    def _set_up(self) -> None:
         self._size_px = self._input.size_px or _DEFAULT_INPUT_PX
         self._cells, self._strides = _grid(self._size_px)
 
