@@ -14,6 +14,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.truth import Truth
+from jaxfit.fitting.fit import check_observations
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 
@@ -55,6 +56,7 @@ def sweep(
     """
     points = [dict(zip(values, point, strict=True)) for point in itertools.product(*values.values())]
     runs = cross(config, points, "sweep")
+    observations = check_observations(observations, bird, "observations")
     solutions: dict[int, Solution] = {}
     results: dict[int, Result] = {}
     for batch in fit_batches(observations, bird, runs, progress):

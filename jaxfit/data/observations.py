@@ -126,9 +126,8 @@ class Observations:
         return len(self.keypoint_names)
 
     def _position(self, n: int, t: int) -> tuple[int, int]:
-        return range(self.num_tracks)[n], range(self.num_frames)[
-            t
-        ]  # negative positions count from the end; IndexError outside
+        # negative positions count from the end; IndexError outside
+        return range(self.num_tracks)[n], range(self.num_frames)[t]
 
     def mask(self, n: int, t: int) -> np.ndarray | None:
         """Return the mask of a bird; each call decodes the mask.

@@ -25,7 +25,7 @@ from jaxfit.fitting.collect import FittedWindow, collect_windows, window_of_batc
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.initial_pose_file import InitialPoses
 from jaxfit.fitting.initial_pose_search import search_initial_poses
-from jaxfit.fitting.stages import FitModel, compiled_part, fit_model
+from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask
 from jaxfit.fitting.windows import Windows, cut_windows, load_targets, windows_key
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
@@ -195,9 +195,9 @@ def _gather(
     copies of its problems. The copies have rows of initial poses of their own, because problems with the same row would
     be merged into one problem.
     """
-    targets, targets_row = _prepare_rows(
-        runs, problems, windows_key, lambda run, windows: load_targets(windows, run.config.crop.size_px)
-    )
+    config = runs[0].config
+    mask_px = config.crop.size_px if any(needs_mask(stage) for stage in config.stages) else 0
+    targets, targets_row = _prepare_rows(runs, problems, windows_key, lambda _, windows: load_targets(windows, mask_px))
     poses, pose_row = _prepare_rows(runs, problems, _pose_key, prepare_poses)
     rows = pose_row.max() + 1
     copied = np.arange(size - len(problems)) % len(problems)

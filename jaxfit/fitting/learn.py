@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.data.frame_numbers import consecutive
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
@@ -73,17 +74,18 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
         if (model.name, model.joint_names) != (bird.name, bird.joint_names):
             problem = f"has the model {model.name}, but {first_source} has the model {bird.name}, or the joints differ"
             raise InputError(source, problem, "learn from results of one model")
+        next_frame = consecutive(solution.frame_index)
         for n, status in enumerate(solution.status):
             valid = solution.valid[n]
             diverged += status == "diverged"
             if valid.any():
                 pose = solution.body_pose[n].astype(np.float64)
-                tracks.append((pose.reshape(len(valid), -1), valid))
+                tracks.append((pose.reshape(len(valid), -1), valid, next_frame))
                 bones.append(solution.bone_length[n, valid].mean(axis=0, dtype=np.float64))
     if not tracks:
         skipped = f"; diverged birds: {diverged}" if diverged else ""
         raise InputError(first_source, f"holds no valid pose{skipped}", "use results with fitted birds")
-    poses = np.concatenate([pose[valid] for pose, valid in tracks])
+    poses = np.concatenate([pose[valid] for pose, valid, _ in tracks])
     effective = effective_count(tracks)
     mean, covariance, shrinkage = _gaussian(poses, effective, LEAST_SD_RAD)
     learnt = replace(
@@ -102,24 +104,27 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
     return LearntPrior(learnt, len(poses), len(tracks), diverged, effective, shrinkage, bones_learnt, mean_change_rad)
 
 
-def effective_count(tracks: Sequence[tuple[Float[np.ndarray, "T D"], Bool[np.ndarray, "T"]]]) -> float:
+def effective_count(
+    tracks: Sequence[tuple[Float[np.ndarray, "T D"], Bool[np.ndarray, "T"], Bool[np.ndarray, "pairs"]]],
+) -> float:
     """Return the number of independent poses with the same information: n (1 − r)/(1 + r), at least one per track.
 
     n is the number of valid poses, and r the correlation of consecutive valid frames over all tracks and components of
     the standardised poses. The equation holds for an autoregressive process of order 1.
 
     Args:
-        tracks: for each track its poses, and whether each pose is valid.
+        tracks: for each track its poses, whether each pose is valid, and whether each of the T − 1 pairs of neighbours
+            are consecutive frames.
 
     Source: Bayley and Hammersley 1946, *The "Effective" Number of Independent Observations in an Autocorrelated Time
     Series*.
     """
-    poses = np.concatenate([pose[valid] for pose, valid in tracks])
+    poses = np.concatenate([pose[valid] for pose, valid, _ in tracks])
     spread = np.maximum(poses.std(axis=0), 1e-9)
     covariance = variance = 0.0
     pair_count = 0
-    for pose, valid in tracks:
-        pairs = valid[:-1] & valid[1:]
+    for pose, valid, next_frame in tracks:
+        pairs = valid[:-1] & valid[1:] & next_frame
         before, after = ((frames[pairs] - poses.mean(axis=0)) / spread for frames in (pose[:-1], pose[1:]))
         covariance += (before * after).sum()
         variance += ((before**2 + after**2) / 2).sum()

@@ -117,13 +117,11 @@ def load_targets(windows: Windows, mask_px: int) -> Targets:
 
     Args:
         windows: the windows. All their masks must fit into memory.
-        mask_px: side of the masks in pixels. 0: no masks.
+        mask_px: side of the masks in pixels. 0: the masks are empty and nothing is decoded.
     """
     mask = np.zeros((*windows.frame.shape, mask_px, mask_px), np.uint8)
     has_mask = windows.mask_rle != np.array(None)
-    if mask_px == 0:
-        has_mask = np.zeros_like(has_mask)
-    for w, t in zip(*np.nonzero(has_mask), strict=True):
+    for w, t in zip(*np.nonzero(has_mask & (mask_px > 0)), strict=True):
         full = decode_mask(cast(Any, windows.mask_rle[w, t]))
         mask[w, t] = cut_mask(full, windows.crop[w, t], mask_px)
     return Targets(

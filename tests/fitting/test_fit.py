@@ -8,9 +8,9 @@ import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.birds import exp_map, pose_window, toy_bird
+from support.birds import exp_map, pose_window
+from support.fits import BIRD, CAMERA, ONE_WINDOW_GB, SIZE, T, config, keypoints_of, replaced, truths
 
-from jaxfit.config.fit import load_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.solution import save_solution
@@ -24,33 +24,9 @@ from jaxfit.fitting.problem import Problem
 from jaxfit.fitting.solve import report
 from jaxfit.fitting.stages import fit_model, stage_hyperparameters, stage_program
 from jaxfit.fitting.windows import cut_windows, load_targets
-from jaxfit.model.camera import CROP_PX, Camera, project
+from jaxfit.model.camera import CROP_PX, project
 from jaxfit.model.pose import Pose
 from jaxfit.simulation.detections import detect
-from jaxfit.simulation.motion import smooth_motion
-
-BIRD = toy_bird(shapes=0)
-T, SIZE = 6, 64
-CAMERA = Camera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
-ONE_WINDOW_GB = 0.002
-"""Memory in GB for one window of six frames. Most tests use it, so that they share the compiled programs."""
-
-
-def config(window=T, steps=(600, 25), memory_gb=ONE_WINDOW_GB, mode="image", **changes):
-    paper = load_config("paper")
-    stages = tuple(dataclasses.replace(s, steps=n) for s, n in zip(paper.stages, steps, strict=True))
-    crop = dataclasses.replace(paper.crop, mode=mode, size_px=SIZE)
-    terms = {"keypoints": 6.25, "mask": 0.0625, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0.1}
-    plain = dataclasses.replace(paper, window=window, stages=stages, crop=crop, terms=terms, memory_gb=memory_gb)
-    return dataclasses.replace(plain, filter_window=1, **changes)
-
-
-def truths(frames=T, birds=3):
-    return [smooth_motion(BIRD, frames, seed) for seed in range(birds)]
-
-
-def keypoints_of(poses):
-    return np.stack([np.asarray(project(pose_window(BIRD, pose)[0], CAMERA)) for pose in poses])
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +37,6 @@ def observed():
 @pytest.fixture(scope="module")
 def solution(observed):
     return fit(observed, BIRD, config())
-
-
-def replaced(observations, n, keypoints_px=None, confidence=None):
-    """Return the observations with other keypoints or confidences for track `n`."""
-    points, confidences = observations.keypoints_px.copy(), observations.confidence.copy()
-    points[n] = points[n] if keypoints_px is None else keypoints_px
-    confidences[n] = confidences[n] if confidence is None else confidence
-    return observations.with_keypoints(points, confidences)
 
 
 ARRAYS = [name for name in Pose.__dataclass_fields__] + ["keypoints_cam", "keypoints_px", "crop", "valid"]

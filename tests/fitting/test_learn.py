@@ -58,14 +58,16 @@ def test_effective_count_of_autoregressive_poses():
     x = np.zeros((n, 3))
     for t in range(1, n):
         x[t] = r * x[t - 1] + rng.normal(size=3)
-    everywhere = np.ones(n, bool)
-    assert effective_count([(x, everywhere)]) == pytest.approx(n * 0.2 / 1.8, rel=0.1)
-    assert effective_count([(rng.normal(size=(n, 3)), everywhere)]) == pytest.approx(n, rel=0.1)
+    everywhere, every_pair = np.ones(n, bool), np.ones(n - 1, bool)
+    assert effective_count([(x, everywhere, every_pair)]) == pytest.approx(n * 0.2 / 1.8, rel=0.1)
+    assert effective_count([(rng.normal(size=(n, 3)), everywhere, every_pair)]) == pytest.approx(n, rel=0.1)
     # a bird that never moves counts as one pose
-    still = [(np.broadcast_to(rng.normal(size=3), (50, 3)), np.ones(50, bool)) for _ in range(4)]
+    still = [(np.broadcast_to(rng.normal(size=3), (50, 3)), np.ones(50, bool), np.ones(49, bool)) for _ in range(4)]
     assert effective_count(still) == pytest.approx(4)
     holes = everywhere & (np.arange(n) % 2 == 0)  # no two valid frames follow each other
-    assert effective_count([(x, holes)]) == n / 2
+    assert effective_count([(x, holes, every_pair)]) == n / 2
+    # neighbours that are not consecutive frames are independent
+    assert effective_count([(x, everywhere, ~every_pair)]) == n
 
 
 def test_mean_and_covariance():

@@ -1,5 +1,6 @@
 """Small videos, and damage to their files."""
 
+import threading
 from fractions import Fraction
 
 import av
@@ -74,3 +75,8 @@ def overwrite(path, at, length):
     assert 0 < at < at + length < len(content)
     content[at : at + length] = np.random.default_rng(1).integers(0, 256, length, dtype=np.uint8).tobytes()
     path.write_bytes(content)
+
+
+def reader_threads():
+    """The threads that decode frames ahead."""
+    return [thread for thread in threading.enumerate() if thread.name == "frames"]

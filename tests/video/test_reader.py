@@ -1,20 +1,16 @@
 """Reading videos: frame numbers are stable, damage is reported and skipped, and the thread ends."""
 
-import collections
-import gc
 import logging
-import signal
-import threading
 
 import av
 import cv2
 import numpy as np
 import pytest
-from support.films import COUNT, SIZE, encode, frames, number_in, numbered, overwrite, packets, write
+from support.films import COUNT, SIZE, encode, frames, number_in, numbered, overwrite, packets, reader_threads, write
 
 from jaxfit.errors import InputError
 from jaxfit.video import decoding
-from jaxfit.video.reader import _AHEAD, Frame, VideoInfo, _ahead, probe_video, read_frames
+from jaxfit.video.reader import Frame, VideoInfo, probe_video, read_frames
 
 KINDS = {
     "b_frames.mp4": {"options": {"bf": "3", "x264-params": "b-pyramid=normal"}},
@@ -53,10 +49,6 @@ def told(caplog):
     """The messages of the warnings so far."""
     caplog.set_level(logging.WARNING, "jaxfit")
     return lambda: [record.getMessage() for record in caplog.records]
-
-
-def threads():
-    return [thread for thread in threading.enumerate() if thread.name == "frames"]
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -170,7 +162,7 @@ def test_a_file_truncated_before_its_frames(tmp_path):
         (tmp_path / "c.mp4").write_bytes(whole[:size])
         with pytest.raises(InputError, match=rf"c\.mp4: .*{problem}"):
             list(read_frames(tmp_path / "c.mp4"))
-    assert not threads()
+    assert not reader_threads()
 
 
 def test_some_frames(tmp_path):
@@ -252,81 +244,6 @@ def test_a_playlist_opens_no_network_address(tmp_path):
     (tmp_path / "a.m3u8").write_text(text)
     with pytest.raises(InputError):
         list(read_frames(tmp_path / "a.m3u8"))
-
-
-def test_the_thread_ends_with_the_reading(films):
-    path = films["b_frames.mp4"]
-
-    def stop_at(index, error=None):
-        for frame in read_frames(path):
-            if frame.index == index:
-                assert len(threads()) <= 1
-                if error is not None:
-                    raise error
-                break
-
-    stop_at(3)
-    assert not threads()
-    with pytest.raises(ZeroDivisionError):
-        stop_at(3, ZeroDivisionError())
-    gc.collect()
-    assert not threads()
-    reader = read_frames(path)
-    for _ in range(2):  # it can be read again
-        assert len(list(reader)) == 100
-    assert not threads()
-
-
-def test_an_interrupt():
-    main, ended = threading.main_thread(), []
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
-
-    def source(stopped):
-        try:
-            for i in range(10**6):
-                if i == 10:
-                    signal.pthread_kill(main.ident, signal.SIGINT)
-                yield i
-        finally:
-            ended.append(True)
-
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            collections.deque(_ahead(source), maxlen=1)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    gc.collect()
-    assert ended
-    assert not threads()
-
-
-def test_the_thread_decodes_only_a_few_frames_ahead():
-    made, taken, most = 0, 0, 0
-
-    def source(stopped):
-        nonlocal made, most
-        for i in range(200):
-            made += 1
-            most = max(most, made - taken)
-            yield i
-
-    for i in _ahead(source):
-        assert i == taken
-        taken += 1
-    assert taken == 200
-    assert most <= _AHEAD + 2  # one in the reader's hands, one that waits for its turn
-
-
-def test_errors_of_the_thread_are_raised():
-    def source(stopped):
-        yield 1
-        raise InputError("a", "broken")
-
-    items = _ahead(source)
-    assert next(items) == 1
-    with pytest.raises(InputError, match="a: broken"):
-        next(items)
-    assert not threads()
 
 
 def test_number_in_reads_the_number_of_a_picture():

@@ -167,9 +167,8 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         return images.setdefault((t, file_name, width, height), image)["id"]
 
     for t, (width, height) in enumerate(observations.image_size_px.tolist()):
-        image_id(
-            t, str(observations.file_name[t]), width, height
-        )  # the image of the frame comes before other images of the same frame
+        # the image of the frame comes before other images of the same frame
+        image_id(t, str(observations.file_name[t]), width, height)
     annotations = []
     scores = cast(np.ndarray, observations.score)
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):

@@ -95,9 +95,8 @@ def read_common_murre(
         file_name=np.array([f"{IMAGES}/{file.name}" for file in files]),
         keypoint_names=names,
         skeleton=skeleton_pairs(names),
-        occluded=known
-        & (table[..., 2] == 1)
-        & (np.nanmax(table[..., 2]) == 2),  # where the third number is COCO's visibility
+        # where the third number is COCO's visibility
+        occluded=known & (table[..., 2] == 1) & (np.nanmax(table[..., 2]) == 2),
     )
     return CommonMurre(observations, readings)
 
