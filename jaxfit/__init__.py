@@ -29,8 +29,8 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.perception.track import track_video
     from jaxfit.pipeline import Reconstruction, reconstruct
     from jaxfit.simulation.scene import Scene, simulate, stage_scene
+    from jaxfit.view.contact_sheet import contact_sheet
     from jaxfit.view.overlay import overlay, overlay_frame
-    from jaxfit.view.sheet import contact_sheet
 
 __version__ = metadata.version("jaxfit")
 
@@ -101,7 +101,7 @@ _HOMES = {
     "pipeline": ("Reconstruction", "reconstruct"),
     "simulation.scene": ("Scene", "simulate", "stage_scene"),
     "view.overlay": ("overlay", "overlay_frame"),
-    "view.sheet": ("contact_sheet",),
+    "view.contact_sheet": ("contact_sheet",),
 }
 """Module → its public names. A module is imported at the first use of a name: all modules together take seconds."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from jaxfit.config.checks import is_number, require, require_at_least, require_positive
-from jaxfit.config.terms import check_terms, require_term, term_settings
+from jaxfit.config.term_checks import check_terms, require_term, term_settings
 from jaxfit.config.yaml_file import read_config, shipped_configs
 from jaxfit.objective.registry import find_term, known_terms
 

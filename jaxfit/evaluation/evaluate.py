@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit.data.observations import Observations, check_keypoints
-from jaxfit.data.posed import PosedBirds
+from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics

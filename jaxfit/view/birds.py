@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from jaxfit.raster.zbuffer import interpolate
-from jaxfit.view.marks import DETECTED, FITTED, dot, line, ring, tag, text_width, track_colour
+from jaxfit.view.colours import DETECTED, FITTED, track_colour
+from jaxfit.view.drawing import dot, line, ring, tag, text_width
 
 __all__ = ["DrawnBird", "Numbers", "Style", "draw_birds", "draw_keypoints"]
 

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxfit.view.birds import Style
-from jaxfit.view.marks import DETECTED, FITTED, PAPER, dot, line, ring, tag, text, text_width, track_colour
+from jaxfit.view.colours import DETECTED, FITTED, PAPER, track_colour
+from jaxfit.view.drawing import dot, line, ring, tag, text, text_width
 
 __all__ = ["Legend"]
 

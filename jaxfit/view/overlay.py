@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 
 from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.observations import Observations
-from jaxfit.data.posed import PosedBirds
+from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import skeleton_pairs
@@ -23,11 +23,11 @@ from jaxfit.video.reader import VideoInfo, probe_video, read_frames
 from jaxfit.video.writer import VideoWriter
 from jaxfit.view.birds import DrawnBird, Numbers, Style, draw_birds, draw_keypoints
 from jaxfit.view.checks import check_belongs, check_outputs, too_short
+from jaxfit.view.colours import tinted
+from jaxfit.view.contact_sheet import contact_sheet, cut_tiles, sheet_pairs
 from jaxfit.view.detected import Detected
 from jaxfit.view.legend import Legend
-from jaxfit.view.marks import tinted
-from jaxfit.view.sheet import contact_sheet, cut_tiles, sheet_pairs
-from jaxfit.view.side import SideViews
+from jaxfit.view.side_views import SideViews
 
 __all__ = ["Overlay", "overlay", "overlay_frame"]
 

@@ -13,15 +13,15 @@ from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_vertices
 from jaxfit.model.murre import POSTURES, Posture
 from jaxfit.model.murre.skeleton import CM_PER_UNIT
 from jaxfit.model.pose import Pose
-from jaxfit.view.marks import PAPER, text, text_width, write_png
-from jaxfit.view.side import draw_parallel
+from jaxfit.view.colours import DARK, GREY, PAPER
+from jaxfit.view.drawing import text, text_width, write_png
+from jaxfit.view.side_views import draw_parallel
 
 __all__ = ["six_views"]
 
 TILE_PX, MARGIN_PX, TITLE_PX, FOOT_PX, TEXT_PX = 400, 26, 44, 64, 17
 LIGHT = (-0.3, -0.4, -0.85)
 """Direction to the light for `raster.zbuffer.shade`: towards the viewer, so that all views are equally bright."""
-GREY, DARK = (120, 120, 120), (60, 60, 60)
 
 VIEWS = {  # name → right and down of the view, in the axes of the bird: x right, y forward, z up
     "left": ((0, -1, 0), (0, 0, -1)),

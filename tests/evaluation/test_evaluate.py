@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, sides, solution, truth
 
-from jaxfit.data.posed import PosedBirds
+from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import COLUMNS, evaluate
 from jaxfit.evaluation.matching import match_tracks

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit import load_murre
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.data.posed import PosedBirds
+from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.truth import Truth, read_truth

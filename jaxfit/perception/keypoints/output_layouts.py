@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit.errors import InputError
-from jaxfit.perception.keypoints.decode import apply_activation, heatmap_peaks, simcc_peaks, subcell_offsets
+from jaxfit.perception.keypoints.heatmaps import apply_activation, heatmap_peaks, simcc_peaks, subcell_offsets
 from jaxfit.perception.keypoints.inputs import KeypointInput
 from jaxfit.perception.keypoints.metadata import KeypointMetadata
 from jaxfit.perception.onnx_model import OnnxModel

@@ -10,18 +10,27 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfit.data.observations import Observations
-from jaxfit.data.posed import PosedBirds
+from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.raster.zbuffer import draw, hard_mask, shade
+from jaxfit.view.colours import (
+    DETECTED,
+    FITTED,
+    INK,
+    ON_PAPER_DETECTED,
+    ON_PAPER_FITTED,
+    OUTLINE,
+    PAPER,
+    SEEN,
+    track_colour,
+)
 from jaxfit.view.detected import Detected
-from jaxfit.view.marks import DETECTED, FITTED, INK, PAPER, dot, line, ring, tag, text, track_colour, write_png
+from jaxfit.view.drawing import dot, line, ring, tag, text, write_png
 
 __all__ = ["contact_sheet", "cut_tiles", "sheet_pairs"]
 
 TILE_PX = 256
-SEEN, OUTLINE = (205, 205, 205), (60, 140, 30)
-ON_PAPER_FITTED, ON_PAPER_DETECTED = (40, 40, 220), (30, 30, 30)
 """Colours, BGR: annotated mask, outline of the mesh, its keypoints, annotated keypoints."""
 PALE = (0.85, 0.9, 0.95)
 """Colour that is mixed with the colours of the model, BGR in [0, 1], since shading is invisible on dark plumage."""

@@ -12,7 +12,8 @@ from jaxfit.benchmarks.fit import bench_fit
 from jaxfit.fitting.fit import fit
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
-from jaxfit.view.sheet import ON_PAPER_FITTED, OUTLINE, SEEN, TILE_PX, contact_sheet
+from jaxfit.view.colours import ON_PAPER_FITTED, OUTLINE, SEEN
+from jaxfit.view.contact_sheet import TILE_PX, contact_sheet
 
 BIRD = toy_bird(shapes=0)
 

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.raster.zbuffer import draw, shade
-from jaxfit.view.marks import PAPER, tag, text, tinted, track_colour
+from jaxfit.view.colours import PAPER, tinted, track_colour
+from jaxfit.view.drawing import tag, text
 
 __all__ = ["SideViews", "up_direction"]
 

@@ -1,4 +1,4 @@
-"""Drawing primitives: colours of tracks, text, dots, rings and lines."""
+"""Drawing primitives: text, dots, rings and lines."""
 
 from __future__ import annotations
 
@@ -9,65 +9,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfit.storage.files import write_whole
+from jaxfit.view.colours import INK, Colour
 
 __all__ = [
-    "DETECTED",
-    "FITTED",
-    "INK",
-    "PAPER",
-    "PLUMAGE_SHARE",
     "dot",
     "line",
     "ring",
     "tag",
     "text",
     "text_width",
-    "tinted",
-    "track_colour",
     "write_png",
 ]
 
-Colour = tuple[int, int, int]
-
-PAPER: Colour = (250, 250, 250)
-INK: Colour = (40, 40, 40)
-FITTED: Colour = (255, 255, 255)
-DETECTED: Colour = (60, 235, 255)
-"""Colours here and below: blue, green, red."""
-
-TRACK_COLOURS: tuple[Colour, ...] = (
-    (0, 159, 230),  # orange
-    (233, 180, 86),  # sky blue
-    (136, 204, 60),  # green
-    (191, 121, 224),  # pink
-    (66, 228, 240),  # yellow
-    (0, 84, 213),  # vermilion
-    (214, 134, 30),  # blue
-    (153, 136, 17),  # teal
-    (204, 170, 255),  # rose
-    (51, 153, 153),  # olive
-    (230, 110, 150),  # violet
-    (210, 245, 190),  # mint
-)
-"""Colours of the tracks in order, repeated after the last. The first seven are the colours of Okabe and Ito with the
-dark colours made lighter; people with any colour vision can distinguish them. All contrast with dark and with white
-plumage."""
-
-PLUMAGE_SHARE = 0.4
-"""Weight of the model's colours in the colours of a drawn bird; the rest is the colour of the track."""
-
 SHIFT = 4  # OpenCV draws in units of 1/16 pixel; pixel centres are whole numbers in OpenCV, halves in jaxfit
-
-
-def track_colour(n: int) -> Colour:
-    """Return the colour of the track at position `n`."""
-    return TRACK_COLOURS[n % len(TRACK_COLOURS)]
-
-
-def tinted(vertex_colours: Float[np.ndarray, "V 3"], n: int, share: float = PLUMAGE_SHARE) -> Float[np.ndarray, "V 3"]:
-    """Mix a model's colours (red, green, blue) with the colour of a track: blue, green, red in [0, 1]."""
-    own = np.asarray(vertex_colours, np.float32)[:, ::-1]
-    return share * own + (1 - share) * np.array(track_colour(n), np.float32) / 255
 
 
 def fixed(point_px: Float[np.ndarray, "2"] | tuple[float, float]) -> tuple[int, int]:
