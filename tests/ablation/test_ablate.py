@@ -108,6 +108,7 @@ def test_the_same_again_does_nothing(done, inputs, grid):
     assert (done / "table.csv").read_bytes() == table
 
 
+@pytest.mark.extended
 def test_a_kill_loses_nothing_and_changes_nothing(done, inputs, grid, tmp_path):
     out = tmp_path / "out"
     call = [sys.executable, "-c", "from jaxfit.cli.main import run; run()", *command(inputs, grid, out)]

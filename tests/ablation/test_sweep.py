@@ -37,6 +37,7 @@ def config():
     return dataclasses.replace(paper, window=T, stages=stages, crop=crop, terms=terms)
 
 
+@pytest.mark.extended
 def test_every_run_is_the_fit_of_its_config_in_the_order_of_the_values(observed):
     """Two programs, whose runs take turns: one scale a window, and one a frame."""
     values = {"terms.velocity": [0.1, 5], "common_size": [True, False]}

@@ -33,19 +33,33 @@ def first_problem(stage):
     return jax.tree.map(lambda x: x[0], problems(*case(), stage))
 
 
+compiled: dict[tuple, tuple] = {}
+
+
+def solver_of(stage):
+    """Return the compiled `init` and `step` of a stage, compiled again only where a test has changed the solver."""
+    key = (id(stage), levenberg_marquardt.evaluate_curvature, levenberg_marquardt.CG_TOLERANCE)
+    if key not in compiled:
+        own = program(stage)
+
+        def init(problem):
+            return LEVENBERG_MARQUARDT.init(own, problem, None)
+
+        def step(problem, pose, state):
+            return LEVENBERG_MARQUARDT.step(own, problem, pose, state)
+
+        compiled[key] = tuple(jax.jit(jax.vmap(f, axis_name=BATCH_AXIS)) for f in (init, step))
+    return compiled[key]
+
+
 def take_steps(stage, problem, count=1, **changes):
     """Return the first state (with `changes`), and pose and state after each step."""
-    own = program(stage)
-
-    def run(problem):
-        pose, state = problem.anchor, LEVENBERG_MARQUARDT.init(own, problem, None)._replace(**changes)
-        states = [(pose, state)]
-        for _ in range(count):
-            states.append(LEVENBERG_MARQUARDT.step(own, problem, *states[-1]))
-        return states
-
+    init, step = solver_of(stage)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], problem)
-    states = jax.jit(jax.vmap(run, axis_name=BATCH_AXIS))(batch)
+    first = init(batch)._replace(**{name: value[None] for name, value in changes.items()})
+    states = [(batch.anchor, first)]
+    for _ in range(count):
+        states.append(step(batch, *states[-1]))
     (_, before), *after = jax.tree.map(lambda x: x[0], states)
     return before, after
 
@@ -161,6 +175,7 @@ def test_a_common_size_stays_common():
     assert np.isfinite(loss).all()
 
 
+@pytest.mark.extended
 def test_a_fit_of_single_frames():
     """With few parameters, conjugate gradients converge before their largest number of steps."""
     paper, loss = load_config("paper"), {}

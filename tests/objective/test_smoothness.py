@@ -207,15 +207,20 @@ def test_feet_on_ground():
     targets = random_targets()
     targets = replace(targets, corner_px=corner)
     feet = list(make_window(bird, still, targets).keypoint_indices("left_foot", "right_foot"))
-    z = np.asarray(make_window(bird, still, targets).keypoints_cam[0, feet, 2])
+    z = np.asarray(jax.jit(lambda: make_window(bird, still, targets).keypoints_cam)()[0, feet, 2])
+
+    @jax.jit
+    def slip(pose, targets):
+        return feet_on_ground(make_window(bird, pose, targets))
+
     # displacement in the world of a bird at rest in the crop, if the crop moves by these pixels
     d = np.hypot([3.0, 3.0], [1.0, 1.0])[:, None] * z / CAMERA.focal_px
     expected = (0.25 * d**2 / (0.25 + d**2)).sum()
-    assert float(feet_on_ground(make_window(bird, still, targets))) == pytest.approx(expected, rel=1e-3)
+    assert float(slip(still, targets)) == pytest.approx(expected, rel=1e-3)
     fixed = replace(targets, corner_px=jnp.zeros((3, 2)) + 7.0)
-    assert float(feet_on_ground(make_window(bird, still, fixed))) == 0
+    assert float(slip(still, fixed)) == 0
     far = replace(still, transl=still.transl + jnp.array([[0, 0, 0], [40.0, 0, 0], [80.0, 0, 0]]))
-    slope = jax.grad(lambda pose: feet_on_ground(make_window(bird, pose, fixed)))(far).transl
+    slope = jax.jit(jax.grad(slip))(far, fixed).transl
     assert np.abs(slope).max() < 1e-4, "long steps must have hardly any gradient"
     names = tuple("foot" if "foot" in name else name for name in bird.keypoint_names)
     footless = replace(bird, keypoint_names=names)

@@ -160,6 +160,7 @@ def test_pyramid_strides():
     assert {name: tuple(map_.shape) for name, map_ in maps.items()} == {"a": (1, 2, 16, 24), "b": (1, 1, 16, 24)}
 
 
+@pytest.mark.extended
 def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
     losses = train_network("segmenter", tmp_path / "s.onnx", folder, scenes=1, schedule=QUICK)
     assert set(losses) == {"foreground", "centre", "offset"}
@@ -172,6 +173,7 @@ def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
     assert (tmp_path / "s.onnx").stat().st_size < 3.5e6
 
 
+@pytest.mark.extended
 def test_trained_keypoint_network_is_read_back(folder, tmp_path):
     train_network("keypoints", tmp_path / "k.onnx", folder, scenes=1, schedule=QUICK)
     detector = load_keypoint_detector(tmp_path / "k.onnx")

@@ -42,6 +42,7 @@ def test_every_pair_of_tiles_is_drawn(tmp_path):
     assert (tiles[4:] == tiles[4, 0, 0, 0]).all()
 
 
+@pytest.mark.extended
 def test_the_benchmark_of_the_fit_reports_what_it_ran():
     result = bench_fit(BIRD, birds=2, frames=4, config=short("paper"))
     assert (result["birds"], result["frames"], result["steps"]) == (2, 4, [2, 2])
