@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import closing
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +21,7 @@ from jaxfit.simulation.scene import LEDGE_DEPTH
 from jaxfit.simulation.viewpoint import Viewpoint, camera_axes
 from jaxfit.simulation.visibility import mesh_keypoints, render_visibility
 from jaxfit.storage.files import new_folder
+from jaxfit.storage.npz import load_npz
 
 __all__ = ["FRAMES_PER_SCENE", "LabelledFrames", "film_scenes", "load_frames"]
 
@@ -31,6 +31,8 @@ FRAMES_PER_SCENE = 10
 FPS, EVERY = 12.0, 4
 """Every fourth frame at 12 frames/s: the frames of a scene are 1/3 s apart, so that postures differ."""
 _MARKER = "frames.npz"
+_LABELS = {"keypoints_px": 4, "visibility": 3, "pixels_per_unit": 1}
+"""The arrays of the labels, and their numbers of dimensions."""
 
 
 class LabelledFrames(NamedTuple):
@@ -80,15 +82,19 @@ def film_scenes(
                 report_progress(1, "")
         pictures.flush()
         owner.flush()
-        np.savez(part / _MARKER, keypoints_px=points, seen=visibility, pixels_per_unit=scale)
+        np.savez(part / _MARKER, keypoints_px=points, visibility=visibility, pixels_per_unit=scale)
     return load_frames(folder)
 
 
 def load_frames(folder: str | Path) -> LabelledFrames:
-    """Load the frames that `film_scenes` wrote."""
+    """Load the frames that `film_scenes` wrote.
+
+    Raises:
+        InputError: the labels cannot be read, or an earlier version wrote them.
+    """
     folder = Path(folder)
-    with closing(np.load(folder / _MARKER, allow_pickle=False)) as labels:
-        points, visibility, scale = (labels[name] for name in ("keypoints_px", "seen", "pixels_per_unit"))
+    labels = load_npz(folder / _MARKER, _LABELS)
+    points, visibility, scale = (labels[name] for name in _LABELS)
     large = (np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("pictures", "owner"))
     pictures, owner = large
     return LabelledFrames(pictures, owner, points, visibility, scale)

@@ -181,6 +181,13 @@ def test_trained_keypoint_network_is_read_back(folder, tmp_path):
     assert (tmp_path / "k.onnx").stat().st_size < 4.8e6
 
 
+def test_frames_of_an_earlier_version_are_rejected(frames, tmp_path):
+    labels = {"keypoints_px": frames.keypoints_px, "seen": frames.visibility, "pixels_a_unit": frames.pixels_per_unit}
+    np.savez(tmp_path / "frames.npz", **labels)
+    with pytest.raises(InputError, match=r"frames\.npz: lacks the array visibility"):
+        load_frames(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
