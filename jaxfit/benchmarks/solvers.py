@@ -16,8 +16,7 @@ from jaxtyping import Array, Float, Int
 from jaxfit.config.fit import load_config
 from jaxfit.data.observations import Observations
 from jaxfit.fitting.adam import ADAM
-from jaxfit.fitting.fit import check_observations, windows_of
-from jaxfit.fitting.initial_pose_search import search_initial_poses
+from jaxfit.fitting.fit import check_observations, initial_poses_of, windows_of
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import Problem, Program, Solver, problem_loss
 from jaxfit.fitting.solve import Report, advance, begin, report
@@ -106,15 +105,7 @@ def bench_solvers(
     observations = check_observations(observations, bird, "observations")
     windows, model = windows_of(observations, config, "observations"), fit_model(bird, config)
     count = len(windows)
-    initial_pose = search_initial_poses(
-        bird,
-        model.rig,
-        jnp.asarray(windows.keypoints_px),
-        jnp.asarray(windows.confidence),
-        config.initialise,
-        model.camera,
-        config.common_size,
-    )
+    initial_pose = initial_poses_of(windows, config, model)
     hyperparameters = stage_hyperparameters(config, stage, bird.keypoint_names)
     problems = Problem(
         hyperparameters=jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * count), hyperparameters),

@@ -126,7 +126,9 @@ def _fitting(commands: Any) -> None:
     overlay = _command(commands, "overlay", "fitting.overlay", "draw a result on its video")
     overlay.add_argument("result", type=Path, metavar="DIR", help="folder of a result")
     overlay.add_argument("--video", type=Path, required=True, help="the video (or folder of frames) of the result")
-    _add_out(overlay, "FILE", "video to write; a contact sheet (.png) is written beside it", overwrite="existing files")
+    _add_out(
+        overlay, "FILE", "video to write; the same folder receives a contact sheet (.png)", overwrite="existing files"
+    )
     overlay.add_argument("--observations", type=Path, metavar="OBS.json", help="also draw the detected keypoints")
     overlay.add_argument("--side-views", action="store_true", help="also show every bird from its side")
     overlay.add_argument("--frame", type=int, help="draw only this frame, as a picture (.png or .jpg)")

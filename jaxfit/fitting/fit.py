@@ -31,7 +31,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
 from jaxfit.progress import ProgressTask, silent
 
-__all__ = ["check_observations", "fit", "fit_runs", "windows_of"]
+__all__ = ["check_observations", "fit", "fit_runs", "initial_poses_of", "windows_of"]
 
 _logger = logging.getLogger(__name__)
 
@@ -164,9 +164,13 @@ def _cut_runs(
 
 def _initial_poses(model: FitModel, initial_poses: InitialPoses | None, run: _Run, windows: Windows) -> Pose:
     """Return the initial poses of some windows of a run, with leading axes W, H (hypotheses)."""
-    config = run.config
     if initial_poses is not None:
-        return initial_poses.window_poses(model.bird, windows, config.common_size)
+        return initial_poses.window_poses(model.bird, windows, run.config.common_size)
+    return initial_poses_of(windows, run.config, model)
+
+
+def initial_poses_of(windows: Windows, config: FitConfig, model: FitModel) -> Pose:
+    """Search the initial poses of some windows as `config.initialise` says; leading axes W, H (hypotheses)."""
     return search_initial_poses(
         model.bird,
         model.rig,

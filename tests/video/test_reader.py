@@ -45,14 +45,14 @@ def shown(monkeypatch):
 
 
 @pytest.fixture
-def told(caplog):
+def warnings_so_far(caplog):
     """The messages of the warnings so far."""
     caplog.set_level(logging.WARNING, "jaxfit")
     return lambda: [record.getMessage() for record in caplog.records]
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_frame_numbers_do_not_depend_on_the_start(films, shown, told, name):
+def test_frame_numbers_do_not_depend_on_the_start(films, shown, warnings_so_far, name):
     reader = read_frames(films[name])
     every = list(reader)
     assert [number_in(frame.picture) for frame in every] == [frame.index for frame in every] == list(range(100))
@@ -67,7 +67,7 @@ def test_frame_numbers_do_not_depend_on_the_start(films, shown, told, name):
             assert frame.time_s == every[frame.index].time_s
         if start > 75 and not name.endswith("avi"):  # AVI has no time stamps to seek by
             assert 0 < len(shown) < 75
-    assert told() == []
+    assert warnings_so_far() == []
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
@@ -86,7 +86,7 @@ def test_a_variable_frame_rate(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["b_frames.mp4", "open.mp4", "b_frames.mkv", "plain.avi", "b_frames.avi", "h264.avi"])
 @pytest.mark.parametrize("hit", [40, 47, 53])
-def test_a_damaged_packet(tmp_path, films, told, name, hit):
+def test_a_damaged_packet(tmp_path, films, warnings_so_far, name, hit):
     """Every returned frame is exact, every other frame is reported, and all frames from the next keyframe on return."""
     (tmp_path / name).write_bytes(films[name].read_bytes())
     position, size, _ = packets(films[name])[hit]
@@ -96,13 +96,13 @@ def test_a_damaged_packet(tmp_path, films, told, name, hit):
     given = {frame.index: frame.picture for frame in reader}
     assert sorted([*given, *reader.damaged]) == list(range(100))
     wrong = [i for i, picture in given.items() if (picture != whole[i]).any()]
-    if name == "h264.avi":  # without time stamps pictures reordered about the damage cannot be told
+    if name == "h264.avi":  # without time stamps pictures reordered about the damage cannot be warnings_so_far
         assert set(wrong) <= set(range(hit - 4, hit + 5))
     else:
         assert wrong == []
     assert any(abs(i - hit) <= 4 for i in reader.damaged)
     assert all(36 <= i < 60 for i in reader.damaged)
-    (warning,) = told()
+    (warning,) = warnings_so_far()
     assert f"{name}: {len(reader.damaged)} damaged frames are skipped (" in warning
     late = read_frames(tmp_path / name, 45, 70, 5)
     assert sorted([*(frame.index for frame in late), *late.damaged]) == [45, 50, 55, 60, 65]
@@ -110,7 +110,7 @@ def test_a_damaged_packet(tmp_path, films, told, name, hit):
 
 
 @pytest.mark.parametrize("name", ["plain.avi", "b_frames.avi", "h264.avi", "b_frames.mkv", "vp9.webm"])
-def test_lost_packets(tmp_path, films, told, name):
+def test_lost_packets(tmp_path, films, warnings_so_far, name):
     """Damage hides packets from the container. Later numbers are those of the undamaged file."""
     (tmp_path / name).write_bytes(films[name].read_bytes())
     known = packets(films[name])
@@ -121,7 +121,7 @@ def test_lost_packets(tmp_path, films, told, name):
     assert [number_in(frame.picture) for frame in given] == [frame.index for frame in given]
     assert {*range(begin - 4), *range(60, 100)} <= {frame.index for frame in given}
     assert set(reader.damaged) >= set(range(begin + 1, begin + 17))
-    assert len(told()) == 1
+    assert len(warnings_so_far()) == 1
 
 
 def test_lost_packets_of_uneven_time(tmp_path):
@@ -137,7 +137,7 @@ def test_lost_packets_of_uneven_time(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["b_frames.mp4", "plain.avi", "vp9.webm"])
-def test_a_truncated_file(tmp_path, films, told, name):
+def test_a_truncated_file(tmp_path, films, warnings_so_far, name):
     position, size, _ = packets(films[name])[70]
     content = films[name].read_bytes()
     if name.endswith("mp4"):  # its index stands at the end unless asked for otherwise
@@ -149,7 +149,7 @@ def test_a_truncated_file(tmp_path, films, told, name):
     read = [frame.index for frame in reader]
     assert read == list(range(len(read)))
     assert 60 < len(read) <= 71
-    assert sum("ends after" in text for text in told()) == 1
+    assert sum("ends after" in text for text in warnings_so_far()) == 1
 
 
 def test_a_file_truncated_before_its_frames(tmp_path):
@@ -182,7 +182,7 @@ def test_some_frames(tmp_path):
         read_frames(tmp_path / "a.mp4", fps=25)
 
 
-def test_a_folder_of_images(tmp_path, told):
+def test_a_folder_of_images(tmp_path, warnings_so_far):
     for i, frame in enumerate(frames(count=12)):
         cv2.imwrite(str(tmp_path / f"frame{i}.png"), frame)  # 10 stands before 2 in plain order
     (tmp_path / "notes.txt").write_text("none of these")
@@ -194,10 +194,10 @@ def test_a_folder_of_images(tmp_path, told):
         np.testing.assert_array_equal(frame.picture, sent)
     assert [frame.time_s for frame in read_frames(tmp_path, 4, fps=4)] == [1 + i / 4 for i in range(8)]
     assert list(read_frames(tmp_path, 50)) == []
-    assert told() == []
+    assert warnings_so_far() == []
 
 
-def test_images_that_cannot_be_read(tmp_path, told):
+def test_images_that_cannot_be_read(tmp_path, warnings_so_far):
     for i, frame in enumerate(frames(count=12)):
         cv2.imwrite(str(tmp_path / f"{i}.png"), frame)
     for i, content in ((0, b""), (3, b"no image"), (4, (tmp_path / "4.png").read_bytes()[:40])):
@@ -206,7 +206,7 @@ def test_images_that_cannot_be_read(tmp_path, told):
     assert reader.info == VideoInfo(12, 2, SIZE)
     assert [(frame.index, frame.time_s) for frame in reader] == [(i, i / 2) for i in (1, 2, *range(5, 12))]
     assert reader.damaged == [0, 3, 4]
-    assert told() == [f"{tmp_path}: 3 damaged frames are skipped (0, 3–4)"]
+    assert warnings_so_far() == [f"{tmp_path}: 3 damaged frames are skipped (0, 3–4)"]
     cv2.imwrite(str(tmp_path / "7.png"), np.zeros((10, 20, 3), np.uint8))
     with pytest.raises(InputError, match=r"7\.png: is 20×10, but the images before are 64×48"):
         list(reader)

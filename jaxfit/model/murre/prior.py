@@ -56,7 +56,7 @@ def joint_noise() -> Float[np.ndarray, "B"]:
 def joint_limits() -> Float[np.ndarray, "B 3 2"]:
     """Return minimum and maximum of each component over the rest pose, all postures and their mirror images.
 
-    The limits include a margin: `MARGIN`, or three standard deviations of the joint noise, whichever is larger.
+    The limits include a margin: the larger of `MARGIN` and three standard deviations of the joint noise.
     """
     poses = np.stack([np.zeros((len(JOINT_NAMES) - 1, 3)), *(posture.body_pose for posture in POSTURES.values())])
     poses = np.concatenate([poses, mirrored_pose(poses)])
