@@ -40,7 +40,7 @@ class Outcome:
     """`success`, `InputError`, the name of another exception, `signal N` or `timeout`."""
     message: str
     peak_mb: float
-    """Largest resident memory beyond the memory of the server."""
+    """Largest resident memory beyond the memory at the start of the call."""
     seconds: float
 
     memory_mb: float
@@ -97,6 +97,7 @@ def _in_child(function: Any, arguments: list, memory_mb: float, seconds: float) 
     child = os.fork()
     if child == 0:
         os.close(reading)
+        os.write(writing, f"{_resident_bytes()}\n".encode())
         _limit(memory_mb, seconds)
         try:
             function(*arguments)
@@ -107,15 +108,18 @@ def _in_child(function: Any, arguments: list, memory_mb: float, seconds: float) 
         os._exit(0)
     os.close(writing)
     with os.fdopen(reading, "rb") as file:
-        answer = file.read()
+        own, answer = int(file.readline()), file.read()
     _, status, usage = os.wait4(child, 0)
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
         kind = "timeout" if number in (signal.SIGALRM, signal.SIGXCPU) else f"signal {number}"
         answer = json.dumps({"kind": kind, "message": ""}).encode()
-    own = int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     peak_mb = max(usage.ru_maxrss * 1024 - own, 0) / 1e6
     return json.loads(answer) | {"peak_mb": peak_mb, "seconds": time.monotonic() - began}
+
+
+def _resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def _limit(memory_mb: float, seconds: float) -> None:
