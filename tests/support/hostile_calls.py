@@ -15,7 +15,7 @@ for _name in ("ablation.ablate", "data.formats.coco", "evaluation.evaluate", "fi
     importlib.import_module(f"jaxfit.{_name}")
 
 
-class WrongEnding(Exception):
+class WrongEndingError(Exception):
     """A command did not end as the command line promises."""
 
 
@@ -24,7 +24,7 @@ def run_command(*arguments: str) -> None:
 
     Raises:
         InputError: the command ended with exit code 2 and one line; the message is this line without `jaxfit: `.
-        WrongEnding: the command ended in another way, or printed more than one line.
+        WrongEndingError: the command ended in another way, or printed more than one line.
     """
     errors = io.StringIO()
     with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
@@ -36,7 +36,7 @@ def run_command(*arguments: str) -> None:
     if code == 0:
         return
     if code != 2 or len(lines) != 1 or not lines[0].startswith("jaxfit: ") or len(lines[0]) > 300:
-        raise WrongEnding(f"code {code}: {errors.getvalue()}")
+        raise WrongEndingError(f"code {code}: {errors.getvalue()}")
     raise InputError.__new__(InputError, lines[0].removeprefix("jaxfit: "))
 
 

@@ -60,11 +60,13 @@ def npz_bomb(folder: Path, megabytes: int = 1500) -> Path:
         header, {"descr": "<f8", "fortran_order": False, "shape": (megabytes * 125_000,)}
     )
     path = folder / "bomb.npz"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        with archive.open("surplus.npy", "w", force_zip64=True) as member:
-            member.write(header.getvalue())
-            for _ in range(megabytes):
-                member.write(bytes(1_000_000))
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open("surplus.npy", "w", force_zip64=True) as member,
+    ):
+        member.write(header.getvalue())
+        for _ in range(megabytes):
+            member.write(bytes(1_000_000))
     return path
 
 
