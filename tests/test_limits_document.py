@@ -2,6 +2,7 @@
 
 import ast
 import re
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -15,7 +16,7 @@ def tables():
     headings = {text[: match.start()].count("\n"): match[1] for match in re.finditer(r"# --- (.*)", text)}
     body = ast.parse(text).body
     lines = []
-    for assignment, docstring in zip(body, body[1:], strict=False):
+    for assignment, docstring in pairwise(body):
         if not isinstance(assignment, ast.Assign):
             continue
         for line in sorted(line for line in headings if line < assignment.lineno):
