@@ -10,3 +10,10 @@ MESSAGE_CHARACTERS = 300
 # --- images and masks
 IMAGE_SIDE_PX = 16_384
 """Longest side of an image or a mask. The run lengths of larger masks overflow the buffers of pycocotools."""
+
+# --- birds far outside their image, and crops
+DISTANCE_IMAGE_SIDES = 1.0
+"""Largest distance of a box or a keypoint outside its image, as a multiple of the image's longer side. A fit skips and
+reports frames with a larger distance."""
+CROP_IMAGE_SIDES = 2
+"""Largest side of a crop, as a multiple of the longer side of its image."""
