@@ -17,3 +17,9 @@ DISTANCE_IMAGE_SIDES = 1.0
 reports frames with a larger distance."""
 CROP_IMAGE_SIDES = 2
 """Largest side of a crop, as a multiple of the longer side of its image."""
+
+# --- polygons of masks
+POLYGONS = 256
+"""Largest number of polygons of one mask."""
+POLYGON_LENGTH_PX = 1_000_000
+"""Largest length of the outlines of one mask. pycocotools takes time and memory for every pixel of an edge."""
