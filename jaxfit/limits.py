@@ -71,3 +71,6 @@ TILE_OVERLAP = 0.9
 """Largest overlap of neighbouring tiles, as a fraction of a tile's side."""
 THREADS = 1024
 """Largest number of CPU cores."""
+# --- text files
+JSON_LEVELS = 100
+"""Largest depth of lists and objects inside each other in a JSON file."""
