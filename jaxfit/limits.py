@@ -10,3 +10,67 @@ MESSAGE_CHARACTERS = 300
 # --- images and masks
 IMAGE_SIDE_PX = 16_384
 """Longest side of an image or a mask. The run lengths of larger masks overflow the buffers of pycocotools."""
+
+# --- birds far outside their image, and crops
+DISTANCE_IMAGE_SIDES = 1.0
+"""Largest distance of a box or a keypoint outside its image, as a multiple of the image's longer side. A fit skips and
+reports frames with a larger distance."""
+CROP_IMAGE_SIDES = 2
+"""Largest side of a crop, as a multiple of the longer side of its image."""
+
+# --- polygons of masks
+POLYGONS = 256
+"""Largest number of polygons of one mask."""
+POLYGON_LENGTH_PX = 1_000_000
+"""Largest length of the outlines of one mask. pycocotools takes time and memory for every pixel of an edge."""
+
+# --- configs: memory and time of a fit
+WINDOW_FRAMES = 10_000
+"""Largest number of frames of a window."""
+FILTER_FRAMES = 1001
+"""Largest window of the median filter, in frames."""
+CROP_SIZE_PX = 1024
+"""Largest side of the crops in which silhouettes are compared."""
+CROP_PADDING = 10.0
+"""Largest margin of a crop, as a fraction of the box."""
+FOCAL_PX = 1e6
+"""Largest focal length of the crop camera."""
+STAGES = 50
+"""Largest number of stages of a fit; each stage compiles a program."""
+STEPS = 100_000
+"""Largest number of steps of a stage."""
+LEARNING_RATE = 1e3
+"""Largest step size of Adam."""
+BLUR = 10.0
+"""Largest blur of a silhouette; the time of a silhouette grows with the square of the blur."""
+CONFIG_NUMBER = 1e30
+"""Largest weight, setting or factor of a config; a product with a step size must not overflow."""
+TURNS, DIRECTIONS, CANDIDATES, ORIENTATIONS = 3600, 10_000, 1000, 100_000
+"""Largest numbers of the search for initial poses; orientations are turns × directions."""
+SMOOTHNESS = 1e12
+"""Largest cost of a rotation in the search for initial poses."""
+HYPOTHESES = 100
+"""Largest number of initial poses that are fitted side by side."""
+KEYPOINTS = 1000
+"""Largest number of keypoints of a bird."""
+MEMORY_GB = 1000.0
+"""Largest `memory_gb` of a config."""
+WINDOW_GB = 8.0
+"""Largest memory of one window, by estimate, unless `memory_gb` is larger."""
+
+# --- configs: tracking and overlay
+FRAME_NUMBER = 10**9
+"""Largest frame number of a config."""
+TRACKER_MEMORY = 100_000
+"""Largest number of frames that a tracker remembers a bird."""
+CROPS_PER_CALL = 1024
+"""Largest number of crops of one call of a keypoint network."""
+CROP_MARGIN_PX = 4096
+"""Largest margin of a crop for the keypoint network, and largest side of the square that dilates a mask."""
+TILE_OVERLAP = 0.9
+"""Largest overlap of neighbouring tiles, as a fraction of a tile's side."""
+THREADS = 1024
+"""Largest number of CPU cores."""
+# --- text files
+JSON_LEVELS = 100
+"""Largest depth of lists and objects inside each other in a JSON file."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any
 
 from jaxfit.errors import InputError
+from jaxfit.limits import CONFIG_NUMBER
 
 __all__ = [
     "ConfigKeyError",
@@ -15,9 +15,9 @@ __all__ = [
     "is_number",
     "join_keys",
     "require",
-    "require_at_least",
     "require_fraction",
     "require_positive",
+    "require_within",
 ]
 
 
@@ -58,14 +58,14 @@ def require(holds: bool, key: str, problem: str, remedy: str = "") -> None:
         raise ConfigKeyError(key, problem, remedy)
 
 
-def require_at_least(config: Any, least: float, *keys: str) -> None:
-    """Raise a ConfigKeyError unless the values of some fields are finite and not below `least`; None is allowed."""
-    _require_each(config, keys, lambda value: least <= value < math.inf, f"{least} or more")
+def require_within(config: Any, least: float, most: float, *keys: str) -> None:
+    """Raise a ConfigKeyError unless the values of some fields are within `least` and `most`; None is allowed."""
+    _require_each(config, keys, lambda value: least <= value <= most, f"{least} to {_shown(most)}")
 
 
-def require_positive(config: Any, *keys: str) -> None:
-    """Raise a ConfigKeyError unless the values of some fields are finite and above 0; None is allowed."""
-    _require_each(config, keys, lambda value: 0 < value < math.inf, "a number above 0")
+def require_positive(config: Any, most: float, *keys: str) -> None:
+    """Raise a ConfigKeyError unless the values of some fields are above 0 and at most `most`; None is allowed."""
+    _require_each(config, keys, lambda value: 0 < value <= most, f"a number above 0, at most {_shown(most)}")
 
 
 def require_fraction(config: Any, *keys: str) -> None:
@@ -74,8 +74,12 @@ def require_fraction(config: Any, *keys: str) -> None:
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value is a finite number, 0 or more; true and false are not numbers."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < math.inf
+    """Return whether a value is a number within 0 and `limits.CONFIG_NUMBER`; true and false are not numbers."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= CONFIG_NUMBER
+
+
+def _shown(number: float) -> str:
+    return f"{number:,}" if isinstance(number, int) else f"{number:g}"
 
 
 def _require_each(config: Any, keys: tuple[str, ...], fits: Callable[[Any], bool], expected: str) -> None:

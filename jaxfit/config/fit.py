@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from jaxfit.config.checks import is_number, require, require_at_least, require_positive
+from jaxfit import limits
+from jaxfit.config.checks import is_number, require, require_positive, require_within
 from jaxfit.config.term_checks import check_terms, require_term, term_settings
 from jaxfit.config.yaml_file import read_config, shipped_configs
 from jaxfit.objective.registry import find_term, known_terms
@@ -29,14 +30,14 @@ class CropConfig:
     """Margin on each side of the window's largest box, as a fraction of the box's longer side."""
     size_px: int = 256
     """Side of the crops in which silhouettes and masks are compared, in pixels. All other quantities in pixels refer to
-    a 256-pixel crop, so that this setting does not change the objective."""
+    a 256-pixel crop, so that this setting does not change the objective. At most 1,024."""
     focal_px: float = 2167.0
     """Focal length of the crop camera, in pixels of a 256-pixel crop; the principal point is the middle of the crop."""
 
     def __post_init__(self):
-        require_at_least(self, 16, "size_px")
-        require_positive(self, "focal_px")
-        require_at_least(self, 0, "padding")
+        require_within(self, 16, limits.CROP_SIZE_PX, "size_px")
+        require_positive(self, limits.FOCAL_PX, "focal_px")
+        require_within(self, 0, limits.CROP_PADDING, "padding")
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,14 @@ class InitialiseConfig:
     """Number of distinct initial poses that are fitted side by side until a stage with `keep_best` ends."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "turns", "directions", "candidates", "hypotheses")
-        require_at_least(self, 0, "smoothness")
+        require_within(self, 1, limits.TURNS, "turns")
+        require_within(self, 1, limits.DIRECTIONS, "directions")
+        require_within(self, 1, limits.CANDIDATES, "candidates")
+        require_within(self, 1, limits.HYPOTHESES, "hypotheses")
+        require_within(self, 0, limits.SMOOTHNESS, "smoothness")
+        orientations = self.turns * self.directions if self.method == "so3" else self.turns
+        problem = f"is {self.directions}, with {self.turns} turns {orientations:,} orientations"
+        require(orientations <= limits.ORIENTATIONS, "directions", problem, f"expected at most {limits.ORIENTATIONS:,}")
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ class StageConfig:
     name: str
     """Name in progress messages and results."""
     steps: int
-    """Number of steps of the solver."""
+    """Number of steps of the solver, at most 100,000."""
     terms: tuple[str, ...]
     """Names of the active terms; the key `terms` of the whole config holds their weights and settings."""
     optimised: tuple[str, ...] = ("global_orient", "body_pose", "transl", "scale")
@@ -95,8 +102,9 @@ class StageConfig:
     """Whether only the best hypothesis of each bird continues after this stage."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "steps")
-        require_positive(self, "learning_rate", "blur")
+        require_within(self, 1, limits.STEPS, "steps")
+        require_positive(self, limits.LEARNING_RATE, "learning_rate")
+        require_positive(self, limits.BLUR, "blur")
         require(len(self.terms) > 0, "terms", "is empty", f"known: {', '.join(known_terms())}")
         for name in self.terms:
             require_term("terms", name)
@@ -134,7 +142,8 @@ class FitConfig:
     """Weight of each term, as a number, or as `{weight: …, setting: …}` with settings such as sigma_px (in pixels of
     a 256-pixel crop)."""
     window: int = 100
-    """Number of frames that are fitted together; longer tracks are cut into windows, and 1 fits every frame alone."""
+    """Number of frames that are fitted together; longer tracks are cut into windows, and 1 fits every frame alone;
+    at most 10,000."""
     common_size: bool = True
     """Whether one scale holds for the whole window, instead of one scale per frame."""
     filter_window: int = 5
@@ -147,15 +156,20 @@ class FitConfig:
     """Implementation of the silhouette: the compiled kernel (`native`), the pure-JAX `reference`, or the kernel if
     available (`auto`)."""
     memory_gb: float = 3.0
-    """Memory that one batch may use, in GB; larger inputs are fitted in several batches."""
+    """Memory that one batch may use, in GB; larger inputs are fitted in several batches. Tables of the whole fit that
+    need more memory by estimate are rejected."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "window", "min_keypoints")
-        odd = self.filter_window >= 1 and self.filter_window % 2 == 1
+        require_within(self, 1, limits.WINDOW_FRAMES, "window")
+        require_within(self, 1, limits.KEYPOINTS, "min_keypoints")
+        require_within(self, 1, limits.FILTER_FRAMES, "filter_window")
+        odd = self.filter_window % 2 == 1
         remedy = "expected an odd number of frames; 1 switches the filter off"
         require(odd, "filter_window", f"is {self.filter_window}", remedy)
-        require_positive(self, "memory_gb")
+        require_positive(self, limits.MEMORY_GB, "memory_gb")
         require(len(self.stages) > 0, "stages", "is empty", "a fit needs at least one stage")
+        problem, remedy = f"holds {len(self.stages)} stages", f"expected at most {limits.STAGES}"
+        require(len(self.stages) <= limits.STAGES, "stages", problem, remedy)
         check_terms("terms", self.terms)
         for i, stage in enumerate(self.stages):
             if stage.carry_moments:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxfit.config.checks import require, require_at_least, require_fraction
+from jaxfit import limits
+from jaxfit.config.checks import require, require_fraction, require_within
 
 __all__ = ["FramesConfig", "KeypointsConfig", "SegmenterConfig", "TrackConfig", "TrackerConfig"]
 
@@ -21,8 +22,8 @@ class FramesConfig:
     """Process every N-th frame."""
 
     def __post_init__(self):
-        require_at_least(self, 0, "start")
-        require_at_least(self, 1, "step")
+        require_within(self, 0, limits.FRAME_NUMBER, "start", "stop")
+        require_within(self, 1, limits.FRAME_NUMBER, "step")
         problem = f"is {self.stop}, and `start` is {self.start}"
         require(self.stop is None or self.stop > self.start, "stop", problem, "expected a frame after `start`, or null")
 
@@ -51,9 +52,8 @@ class SegmenterConfig:
 
     def __post_init__(self):
         require_fraction(self, "min_score")
-        require_at_least(self, 32, "tile_px")
-        fits = 0 <= self.tile_overlap < 1
-        require(fits, "tile_overlap", f"is {self.tile_overlap}", "expected 0 or more and less than 1")
+        require_within(self, 32, limits.IMAGE_SIDE_PX, "tile_px")
+        require_within(self, 0, limits.TILE_OVERLAP, "tile_overlap")
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ class KeypointsConfig:
     """Number of crops per network call, for a network that does not fix the number."""
 
     def __post_init__(self):
-        require_at_least(self, 0, "pad_px", "dilate_px")
-        require_at_least(self, 1, "batch")
+        require_within(self, 0, limits.CROP_MARGIN_PX, "pad_px", "dilate_px")
+        require_within(self, 1, limits.CROPS_PER_CALL, "batch")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class TrackerConfig:
     """Smallest score of a detection that starts a track; `iou` ignores this setting."""
 
     def __post_init__(self):
-        require_at_least(self, 0, "memory")
+        require_within(self, 0, limits.TRACKER_MEMORY, "memory")
         require_fraction(self, "min_iou", "min_score")
 
 
@@ -116,4 +116,5 @@ class TrackConfig:
     """Number of CPU cores for the networks; null uses all cores."""
 
     def __post_init__(self):
-        require_at_least(self, 1, "min_track_frames", "threads")
+        require_within(self, 1, limits.FRAME_NUMBER, "min_track_frames")
+        require_within(self, 1, limits.THREADS, "threads")

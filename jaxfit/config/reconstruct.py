@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from jaxfit.config.checks import require_at_least
+from jaxfit.config.checks import require_within
 from jaxfit.config.fit import FitConfig, shipped_fit_configs
 from jaxfit.config.perception import TrackConfig
 from jaxfit.config.yaml_file import OWN_FILE, read_config
 from jaxfit.errors import InputError
+from jaxfit.limits import IMAGE_SIDE_PX
 
 __all__ = ["OverlayConfig", "ReconstructConfig", "load_reconstruct_config"]
 
@@ -31,7 +32,7 @@ class OverlayConfig:
     """Codec of the overlay; `auto` uses H.264 where an H.264 encoder is installed."""
 
     def __post_init__(self):
-        require_at_least(self, 16, "max_width_px")
+        require_within(self, 16, IMAGE_SIDE_PX, "max_width_px")
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,8 @@ class Solution:
     """(N,) str: summary of the track's windows. ``ok``: all fitted; ``partly diverged``: only the poses of the other
     windows are valid; ``diverged``: no window fitted; ``no usable frame``: no window."""
     failures: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
-    """Track → for each of its windows that diverged: frames, term and step. ``summary.json`` holds them."""
+    """Track → its skipped frames, and for each of its windows that diverged: frames, term and step. ``summary.json``
+    holds them."""
 
     def __post_init__(self):
         arrays = validate_arrays(vars(self), LAYOUT)

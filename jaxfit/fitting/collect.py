@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -44,7 +44,12 @@ def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
 
 
 def collect_windows(
-    observations: Observations, windows: Windows, results: Sequence[FittedWindow], bird: Bird, camera: Camera
+    observations: Observations,
+    windows: Windows,
+    results: Sequence[FittedWindow],
+    bird: Bird,
+    camera: Camera,
+    skipped: Mapping[int, tuple[str, ...]],
 ) -> Solution:
     """Return the solution of one run.
 
@@ -58,6 +63,7 @@ def collect_windows(
         results: the result of each window.
         bird: the model.
         camera: the crop camera.
+        skipped: track → text about its skipped frames, for `Solution.failures`.
     """
     birds, frames = observations.num_tracks, observations.num_frames
     bones, keypoints = bird.num_joints - 1, bird.num_keypoints
@@ -77,7 +83,7 @@ def collect_windows(
     image_size_px = np.zeros((birds, frames, 2), np.int64)
     fitted, diverged = np.zeros(birds, int), np.zeros(birds, int)
     loss = {name: np.full(birds, np.nan) for name in results[0].loss}
-    failures: dict[int, tuple[str, ...]] = {}
+    failures = dict(skipped)
     for w, result in enumerate(results):
         n, present = int(windows.track[w]), windows.present[w]
         at = windows.frame[w][present]

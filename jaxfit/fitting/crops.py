@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
+from jaxfit.limits import CROP_IMAGE_SIDES, IMAGE_SIDE_PX
 
 __all__ = ["crop_squares", "cut_mask"]
 
@@ -24,6 +25,8 @@ def crop_squares(
     config: CropConfig,
 ) -> Float[np.ndarray, "W T 3"]:
     """Return (x0, y0, size) in image pixels for every frame of some windows: whole numbers, one size for each window.
+
+    The size is at most `limits.CROP_IMAGE_SIDES` times the longer side of the window's largest image.
 
     Raises:
         InputError: `mode: image` with images that are not square or not of one size.
@@ -63,7 +66,8 @@ def _around_the_bird(
         else:
             corners[i] = [*points.min(0), *points.max(0)]
     longest = (corners[:, 2:] - corners[:, :2]).max()
-    size = max(np.ceil(longest * (1 + 2 * config.padding)), LEAST_SIZE_PX)
+    largest = CROP_IMAGE_SIDES * max(max(observations.image_size(n, int(t))) for t in frame[present])
+    size = max(min(np.ceil(longest * (1 + 2 * config.padding)), largest), LEAST_SIZE_PX)
     centre = (corners[:, :2] + corners[:, 2:]) / 2
     nearest = np.abs(np.arange(len(frame))[:, None] - np.flatnonzero(present)).argmin(1)
     centre = centre[np.flatnonzero(present)[nearest]]
@@ -71,15 +75,21 @@ def _around_the_bird(
 
 
 def cut_mask(mask: Bool[np.ndarray, "H W"], crop: Float[np.ndarray, "3"], mask_px: int) -> np.ndarray:
-    """Return the crop of a mask, (mask_px, mask_px): 1 where the mask covers at least half of the pixel, else 0."""
+    """Return the crop of a mask, (mask_px, mask_px): 1 where the mask covers at least half of the pixel, else 0.
+
+    Raises:
+        ValueError: the crop is larger than `crop_squares` allows.
+    """
     x0, y0, size = (int(v) for v in crop)
-    cut = np.zeros((size, size), np.uint8)
+    if size > CROP_IMAGE_SIDES * IMAGE_SIDE_PX:
+        raise ValueError(f"crop must have a side of at most {CROP_IMAGE_SIDES * IMAGE_SIDE_PX} pixels, not {size}")
     rows, columns = mask.shape
     top, left, bottom, right = max(y0, 0), max(x0, 0), min(y0 + size, rows), min(x0 + size, columns)
-    if top < bottom and left < right:
-        cut[top - y0 : bottom - y0, left - x0 : right - x0] = mask[top:bottom, left:right]
-    if size == mask_px:
-        return cut
-    method = cv2.INTER_AREA if size > mask_px else cv2.INTER_LINEAR
-    covered = cv2.resize(cut * np.uint8(255), (mask_px, mask_px), interpolation=method)
-    return (covered >= 128).astype(np.uint8)
+    if top >= bottom or left >= right:
+        return np.zeros((mask_px, mask_px), np.uint8)
+    cut = np.zeros((size, size), np.uint8)  # only pages that are written take memory
+    np.multiply(mask[top:bottom, left:right], np.uint8(255), out=cut[top - y0 : bottom - y0, left - x0 : right - x0])
+    if size != mask_px:
+        method = cv2.INTER_AREA if size > mask_px else cv2.INTER_LINEAR
+        cut = cv2.resize(cut, (mask_px, mask_px), interpolation=method)
+    return (cut >= 128).astype(np.uint8)

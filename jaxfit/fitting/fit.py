@@ -23,6 +23,7 @@ from jaxfit.errors import InputError
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
 from jaxfit.fitting.collect import FittedWindow, collect_windows, window_of_batch
 from jaxfit.fitting.diagnose import check_terms
+from jaxfit.fitting.distant import distant_birds, report_distant_birds
 from jaxfit.fitting.initial_pose_file import InitialPoses
 from jaxfit.fitting.initial_pose_search import search_initial_poses
 from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask
@@ -86,6 +87,7 @@ def fit_runs(
         ValueError: the configs need different programs.
     """
     observations = check_observations(observations, bird, source)
+    skipped = report_distant_birds(observations, source)
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
@@ -109,7 +111,7 @@ def fit_runs(
             for i, (r, _) in enumerate(batch):
                 results[r].append(window_of_batch(fitted, i))
     return [
-        collect_windows(observations, run.windows, result, bird, model.camera)
+        collect_windows(observations, run.windows, result, bird, model.camera, skipped)
         for run, result in zip(runs, results, strict=True)
     ]
 
@@ -132,6 +134,9 @@ def windows_of(observations: Observations, config: FitConfig, source: object) ->
         InputError: no track with a usable frame, or unusable crop settings.
     """
     windows = cut_windows(observations, config)
+    if len(windows) == 0 and distant_birds(observations).any():
+        problem = "no track has a usable frame: boxes or keypoints lie far outside their images"
+        raise InputError(source, problem, "give positions in image pixels")
     if len(windows) == 0:
         raise InputError(
             source,

@@ -15,6 +15,7 @@ from jaxfit.data.masks import decode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.fitting.crops import crop_squares, cut_mask
+from jaxfit.fitting.distant import without_distant_birds
 from jaxfit.fitting.filtering import weighted_median_filter
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets
@@ -58,11 +59,12 @@ def windows_key(config: FitConfig) -> tuple:
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     """Cut every track into consecutive windows of `config.window` frames, from its first usable frame on.
 
-    The keypoints are filtered first. The frames of a window have consecutive frame numbers: if the file skips frame
+    Frames with a box or a keypoint far outside the image (`distant_birds`) are not usable. Then the keypoints are
+    filtered. The frames of a window have consecutive frame numbers: if the file skips frame
     numbers, the window has missing frames, so that distant frames are not neighbours in the temporal terms. A track
     without a usable frame has no window.
     """
-    observations = filter_observations(observations, config.filter_window)
+    observations = filter_observations(without_distant_birds(observations), config.filter_window)
     usable = observations.usable(config.min_keypoints)
     line = _timeline(observations)
     tracks, frames = [], []
@@ -70,13 +72,13 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
         at = np.flatnonzero((line >= 0) & usable[n, np.maximum(line, 0)])
         if len(at) == 0:
             continue
-        for first in range(at[0], at[-1] + 1, config.window):
+        # only windows with a usable frame
+        for first in at[0] + np.unique((at - at[0]) // config.window) * config.window:
             window = np.full(config.window, -1)
             piece = line[first : min(first + config.window, at[-1] + 1)]
             window[: len(piece)] = piece
-            if ((window >= 0) & usable[n, np.maximum(window, 0)]).any():
-                tracks.append(n)
-                frames.append(window)
+            tracks.append(n)
+            frames.append(window)
     track = np.array(tracks, int)
     frame = np.array(frames, int).reshape(len(tracks), config.window)
     rows, columns = track[:, None], np.maximum(frame, 0)

@@ -71,7 +71,7 @@ def test_the_value_of_a_term_is_its_weight():
         ({"stages[2].steps": 1}, ("'2'", "keypoints, mask")),
         ({"window": "=no.such"}, ("no.such",)),
         ({"window": "=terms.no_such"}, ("terms.no_such", "not set")),
-        ({"window": 0}, ("window", "1 or more")),
+        ({"window": 0}, ("window", "1 to 10,000")),
         ({"terms.no_such": 1}, ("no_such",)),
         ({"terms.velocity.no_such": 1}, ("no_such",)),
     ],

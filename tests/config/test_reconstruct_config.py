@@ -49,7 +49,7 @@ def test_the_documented_text_describes_every_setting_and_reads_back(tmp_path):
     assert load_reconstruct_config(written(tmp_path, text)) == load_reconstruct_config()
     lines = [line.strip() for line in text.splitlines()]
     assert lines[lines.index("tile_overlap: 0.25") - 1].startswith("# Overlap of neighbouring tiles")
-    assert lines.count("# Number of steps of the solver.") == 1  # only in the first stage
+    assert lines.count("# Number of steps of the solver, at most 100,000.") == 1  # only in the first stage
 
 
 def test_round_trip(tmp_path):
@@ -98,6 +98,18 @@ def test_the_fit_has_a_base_of_its_own(tmp_path, text, of, changes):
         ("track: {frames: {step: 0}}", ["`track.frames.step`", "0"]),
         ("track: {min_track_frames: 0}", ["`track.min_track_frames`", "0"]),
         ("track: {threads: 0}", ["`track.threads`", "0"]),
+        ("track: {threads: 1000000}", ["`track.threads`", "1,024, or null"]),
+        ("track: {min_track_frames: 10000000000}", ["`track.min_track_frames`"]),
+        ("track: {frames: {start: 10000000000}}", ["`track.frames.start`"]),
+        ("track: {frames: {stop: 10000000000}}", ["`track.frames.stop`"]),
+        ("track: {frames: {step: 10000000000}}", ["`track.frames.step`"]),
+        ("track: {tracker: {memory: 1000000000}}", ["`track.tracker.memory`"]),
+        ("track: {keypoints: {batch: 1000000}}", ["`track.keypoints.batch`"]),
+        ("track: {keypoints: {pad_px: 1000000}}", ["`track.keypoints.pad_px`"]),
+        ("track: {keypoints: {dilate_px: 1000000}}", ["`track.keypoints.dilate_px`"]),
+        ("track: {segmenter: {tile_px: 1000000}}", ["`track.segmenter.tile_px`"]),
+        ("track: {segmenter: {tile_overlap: 0.99999}}", ["`track.segmenter.tile_overlap`", "0.9"]),
+        ("overlay: {max_width_px: 1000000}", ["`overlay.max_width_px`"]),
         ("track: 7", ["track", "mapping"]),
         ("overlay: {max_width_px: 3}", ["`overlay.max_width_px`", "3"]),
         ("overlay: {codec: gif}", ["`overlay.codec`", "gif", "h264"]),

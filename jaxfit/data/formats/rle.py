@@ -1,7 +1,8 @@
 """Masks in COCO files: run lengths, compressed or not, and polygons.
 
 pycocotools does not check its input: corrupt run lengths make it read or write beyond its buffers. So every mask is
-checked here before pycocotools reads it.
+checked here before pycocotools reads it. pycocotools visits every pixel of the edge of a polygon, also outside the
+image, so the length of polygons is bounded.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from jaxfit.data.formats.fields import Field
+from jaxfit.limits import POLYGON_LENGTH_PX, POLYGONS
 
 __all__ = ["read_segmentation", "run_lengths"]
 
@@ -37,7 +39,7 @@ def read_segmentation(segmentation: Field, height: int, width: int) -> dict[str,
     if segmentation.value is None or segmentation.value == []:
         return None
     if isinstance(segmentation.value, list):
-        polygons = [_polygon(polygon, height, width) for polygon in segmentation]
+        polygons = _polygons(segmentation, height, width)
         return cast(Any, coco_mask.merge(coco_mask.frPyObjects(cast(Any, polygons), height, width)))
     if not isinstance(segmentation.value, dict):
         segmentation.fail("must be run lengths (an object) or a list of polygons", _REMEDY)
@@ -47,7 +49,7 @@ def read_segmentation(segmentation: Field, height: int, width: int) -> dict[str,
             f"is {list(size)}, but its image is [{height}, {width}] (height, width)",
             "write the masks again at the images' size",
         )
-    runs = _runs(segmentation["counts"])
+    runs = _runs(segmentation["counts"], height * width)
     if sum(runs) != height * width:
         problem = f"is corrupt: its runs cover {sum(runs)} pixels of the image's {height * width}"
         segmentation["counts"].fail(problem, _REMEDY)
@@ -55,7 +57,20 @@ def read_segmentation(segmentation: Field, height: int, width: int) -> dict[str,
     return cast(Any, coco_mask.frPyObjects(cast(Any, {"size": [height, width], "counts": runs}), height, width))
 
 
-def _polygon(polygon: Field, height: int, width: int) -> list[float]:
+def _polygons(segmentation: Field, height: int, width: int) -> list[list[float]]:
+    remedy = "simplify the outline, or write run lengths"
+    if len(segmentation.value) > POLYGONS:
+        segmentation.fail(f"has {len(segmentation.value)} polygons, more than {POLYGONS}", remedy)
+    polygons = [_polygon(polygon, height, width) for polygon in segmentation]
+    length_px = sum(np.abs(points - np.roll(points, 1, axis=0)).max(1).sum() for points in polygons)
+    if length_px > POLYGON_LENGTH_PX:
+        problem = f"has outlines of {length_px:.3g} pixels in length, more than {POLYGON_LENGTH_PX:,}"
+        segmentation.fail(problem, remedy)
+    return [points.reshape(-1).tolist() for points in polygons]
+
+
+def _polygon(polygon: Field, height: int, width: int) -> np.ndarray:
+    """Return the points (P, 2) of a polygon."""
     if not isinstance(polygon.value, list):
         polygon.fail("must be a list of x, y pairs", "write [[x0, y0, x1, y1, …], …], one list a polygon")
     values = polygon.positions()
@@ -65,12 +80,11 @@ def _polygon(polygon: Field, height: int, width: int) -> list[float]:
     points = np.array(values, dtype=np.float64).reshape(-1, 2)
     size = np.array([width, height])
     if ((points < -size) | (points > 2 * size)).any():
-        # pycocotools visits every pixel of an edge, also outside the image
         polygon.fail(f"lies far outside its image of {width}×{height} pixels", "give image pixels")
-    return points.reshape(-1).tolist()
+    return points
 
 
-def _runs(counts: Field) -> list[int]:
+def _runs(counts: Field, pixels: int) -> list[int]:
     if isinstance(counts.value, str):
         runs = run_lengths(counts.value)
         if not runs:
@@ -78,6 +92,10 @@ def _runs(counts: Field) -> list[int]:
         return runs
     if not isinstance(counts.value, list):
         counts.fail("must be text or a list of run lengths", _REMEDY)
+    if len(counts.value) > pixels + 2:  # the first and the last run may be empty
+        counts.fail(f"has {len(counts.value)} runs, more than the {pixels} pixels of its image", _REMEDY)
+    if all(type(run) is int and 0 <= run <= pixels for run in counts.value):
+        return counts.value
     return [run.integer(0, 2**31) for run in counts]
 
 
