@@ -10,3 +10,7 @@ MESSAGE_CHARACTERS = 300
 # --- images and masks
 IMAGE_SIDE_PX = 16_384
 """Longest side of an image or a mask. The run lengths of larger masks overflow the buffers of pycocotools."""
+
+# --- text files
+JSON_LEVELS = 100
+"""Largest depth of lists and objects inside each other in a JSON file."""
