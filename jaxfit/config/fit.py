@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 from jaxfit.config.checks import is_number, require, require_at_least, require_positive
 from jaxfit.config.term_checks import check_terms, require_term, term_settings
 from jaxfit.config.yaml_file import read_config, shipped_configs
-from jaxfit.objective.registry import find_term, known_terms
+from jaxfit.objective.registry import find_term
 
 __all__ = ["CropConfig", "FitConfig", "InitialiseConfig", "StageConfig", "load_config", "shipped_fit_configs"]
 
@@ -97,7 +97,7 @@ class StageConfig:
     def __post_init__(self):
         require_at_least(self, 1, "steps")
         require_positive(self, "learning_rate", "blur")
-        require(len(self.terms) > 0, "terms", "is empty", f"known: {', '.join(known_terms())}")
+        require(len(self.terms) > 0, "terms", "is empty", "name at least one term")
         for name in self.terms:
             require_term("terms", name)
         for key in ("optimised", "step_scale"):
