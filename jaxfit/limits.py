@@ -71,6 +71,27 @@ TILE_OVERLAP = 0.9
 """Largest overlap of neighbouring tiles, as a fraction of a tile's side."""
 THREADS = 1024
 """Largest number of CPU cores."""
+
 # --- text files
 JSON_LEVELS = 100
 """Largest depth of lists and objects inside each other in a JSON file."""
+
+# --- configs and grids
+CONFIG_BYTES = 1_000_000
+"""Largest size of a config or grid file. The shipped configs have about 3,000 bytes."""
+CONFIG_LEVELS = 50
+"""Largest depth of lists and mappings inside each other in a config. The shipped configs have up to 6 levels."""
+CONFIG_VALUES = 100_000
+"""Largest number of keys, values, lists and mappings in a config; an alias counts with all values of its anchor."""
+CONFIG_DIGITS = 100
+"""Most characters of a number in a config."""
+CONFIG_KEY_CHARACTERS = 1_000
+"""Longest key in a config."""
+CONFIG_BASES = 20
+"""Most files in a chain of bases of one config."""
+GRID_RUNS = 10_000
+"""Most runs of a grid or a sweep. The grid of the paper has 34 runs."""
+ABLATION_BYTES = 200_000_000
+"""Largest size of a file that describes the runs of an ablation (ablation.json), or their metrics."""
+TERM_NUMBER = 1e30
+"""Largest weight or setting of a term; larger values overflow in 32-bit numbers."""

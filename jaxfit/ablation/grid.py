@@ -5,17 +5,19 @@ from __future__ import annotations
 import itertools
 import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jaxfit.config.build import plain_config
 from jaxfit.config.checks import ConfigKeyError
 from jaxfit.config.fit import FitConfig, load_config
 from jaxfit.config.grid import ClaimConfig, GridConfig
-from jaxfit.config.paths import get_value, with_values
+from jaxfit.config.messages import known_names
+from jaxfit.config.paths import get_value, get_values, with_values
 from jaxfit.config.yaml_file import read_config
-from jaxfit.errors import InputError
+from jaxfit.errors import InputError, one_line, shortened
 
 __all__ = ["Grid", "Run", "cross", "load_grid", "short"]
 
@@ -69,7 +71,7 @@ def load_grid(source: str | Path) -> Grid:
         for path in (*claim.better, *claim.worse):
             if path not in runs[0].levels:
                 problem = f"`claims[{i}]` is about `{path}`, which does not vary"
-                raise InputError(source, problem, f"these do: {', '.join(runs[0].levels)}")
+                raise InputError(source, problem, known_names(path, runs[0].levels))
     return Grid(runs, grid.claims)
 
 
@@ -84,26 +86,29 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
     Raises:
         InputError: a key is unknown, or a value is invalid.
     """
-    configs: list[FitConfig] = []
-    kept: list[Mapping[str, Any]] = []
+    kept: dict[Hashable, tuple[FitConfig, Mapping[str, Any]]] = {}
+    repeated = []
     for point in points:
         try:
             config = with_values(base, point)
         except ConfigKeyError as error:
             raise InputError(source, error.problem, error.remedy) from None
-        if config in configs:
-            _logger.warning("%s: two runs have the same config, one run is kept: %s", source, point)
-        else:
-            configs.append(config)
-            kept.append(point)
-    paths = dict.fromkeys(path for point in kept for path in point)
-    values = {path: [get_value(config, path) for config in configs] for path in paths}
-    varied = [path for path, each in values.items() if any(value != each[0] for value in each)]
+        if kept.setdefault(_hashable(plain_config(config)), (config, point))[0] is not config:
+            repeated.append(point)
+    if repeated:
+        text = shortened(one_line(dict(repeated[0])), 100)
+        times = f"{len(repeated)} times, " if len(repeated) > 1 else ""
+        _logger.warning("%s: %stwo runs have the same config, one run is kept: %s", source, times, text)
+    configs = [config for config, _ in kept.values()]
+    written = [point for _, point in kept.values()]
+    paths = dict.fromkeys(path for point in written for path in point)
+    values = [get_values(config, paths) for config in configs]
+    varied = [path for path in paths if any(each[path] != values[0][path] for each in values)]
     digits = len(str(len(configs)))
     return tuple(
         Run(
-            f"{r + 1:0{digits}d}_{_name({path: values[path][r] for path in varied})}",
-            {path: kept[r].get(path, values[path][r]) for path in varied},
+            f"{r + 1:0{digits}d}_{_name({path: values[r][path] for path in varied})}",
+            {path: written[r].get(path, values[r][path]) for path in varied},
             config,
         )
         for r, config in enumerate(configs)
@@ -112,7 +117,15 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
 
 def _name(values: Mapping[str, Any]) -> str:
     parts = [f"{path.rpartition('.')[2]}={short(value)}" for path, value in values.items()]
-    return re.sub(r"[^\w.,=+-]", "-", ",".join(parts))[:120] or "only"
+    # ASCII only: a file name has at most 255 bytes
+    return re.sub(r"[^\w.,=+-]", "-", ",".join(parts), flags=re.ASCII)[:120] or "only"
+
+
+def _hashable(plain: Any) -> Hashable:
+    """Return a value that is equal for equal plain configs."""
+    if isinstance(plain, dict):
+        return frozenset((key, _hashable(value)) for key, value in plain.items())
+    return tuple(map(_hashable, plain)) if isinstance(plain, list) else plain
 
 
 def short(value: Any) -> str:

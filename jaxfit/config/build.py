@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeVar
 
 from jaxfit.config.checks import ConfigKeyError, join_keys
+from jaxfit.config.messages import known_names, shown
 
 __all__ = ["Config", "build_config", "plain_config"]
 
@@ -27,23 +29,26 @@ def build_config(kind: type[Config], values: Any, where: str = "") -> Config:
         ConfigKeyError: an unknown key, a missing key, a value of the wrong type or outside its range.
     """
     if not isinstance(values, dict):
-        raise ConfigKeyError(where, f"must be a mapping, not {type(values).__name__}")
+        raise ConfigKeyError(where, f"must be a mapping, not {shown(values)}")
     fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, kind))}
     for key in values:
         if key not in fields:
-            raise ConfigKeyError(join_keys(where, key), "is not a known key", f"known: {', '.join(fields)}")
+            raise ConfigKeyError(join_keys(where, key), "is not a known key", known_names(key, fields))
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in values:
             shipped = getattr(kind, "shipped", None)
             remedy = f"add the key, or start from `base: {shipped}`" if shipped else "add the key"
             raise ConfigKeyError(join_keys(where, name), "is missing", remedy)
-    hints = typing.get_type_hints(kind)
+    hints = _type_hints(kind)
     built = {key: _build_value(hints[key], value, join_keys(where, key)) for key, value in values.items()}
     try:
         return kind(**built)
     except ConfigKeyError as error:
         raise error.within(where) from None
+
+
+_type_hints = functools.cache(typing.get_type_hints)
 
 
 def plain_config(value: Any) -> Any:
@@ -63,8 +68,8 @@ def _build_value(hint: Any, value: Any, where: str) -> Any:
     if dataclasses.is_dataclass(hint):
         return build_config(typing.cast(type, hint), value, where)
     if origin is Literal:
-        if value not in arguments:
-            raise ConfigKeyError(where, f"is {value!r}", f"expected one of {', '.join(arguments)}")
+        if not isinstance(value, str) or value not in arguments:
+            raise ConfigKeyError(where, f"is {shown(value)}", f"expected one of {', '.join(arguments)}")
         return value
     if origin is types.UnionType:
         options = [option for option in arguments if option is not types.NoneType]
@@ -75,16 +80,21 @@ def _build_value(hint: Any, value: Any, where: str) -> Any:
         return _build_value(next(matches, options[0]), value, where)
     if origin is tuple:
         if not isinstance(value, list):
-            raise ConfigKeyError(where, f"must be a list, not {value!r}")
+            raise ConfigKeyError(where, f"must be a list, not {shown(value)}")
         return tuple(_build_value(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(value))
     if origin is Mapping:
         if not isinstance(value, dict):
-            raise ConfigKeyError(where, f"must be a mapping, not {value!r}")
+            raise ConfigKeyError(where, f"must be a mapping, not {shown(value)}")
+        for key in value:
+            if not isinstance(key, str):
+                raise ConfigKeyError(where, f"has the key {shown(key)}", "expected text as key: use quotes")
         return {key: _build_value(arguments[1], item, join_keys(where, key)) for key, item in value.items()}
+    if isinstance(value, int) and abs(value) >= 2**63:
+        raise ConfigKeyError(where, f"is {shown(value)}", "expected a number within 64 bits")
     if hint is Any:
         return value
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigKeyError(where, f"is {value!r}", f"expected a value of type {hint.__name__}")
+        raise ConfigKeyError(where, f"is {shown(value)}", f"expected a value of type {hint.__name__}")
     return value

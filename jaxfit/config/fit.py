@@ -11,7 +11,7 @@ from jaxfit import limits
 from jaxfit.config.checks import is_number, require, require_positive, require_within
 from jaxfit.config.term_checks import check_terms, require_term, term_settings
 from jaxfit.config.yaml_file import read_config, shipped_configs
-from jaxfit.objective.registry import find_term, known_terms
+from jaxfit.objective.registry import find_term
 
 __all__ = ["CropConfig", "FitConfig", "InitialiseConfig", "StageConfig", "load_config", "shipped_fit_configs"]
 
@@ -105,7 +105,7 @@ class StageConfig:
         require_within(self, 1, limits.STEPS, "steps")
         require_positive(self, limits.LEARNING_RATE, "learning_rate")
         require_positive(self, limits.BLUR, "blur")
-        require(len(self.terms) > 0, "terms", "is empty", f"known: {', '.join(known_terms())}")
+        require(len(self.terms) > 0, "terms", "is empty", "name at least one term")
         for name in self.terms:
             require_term("terms", name)
         for key in ("optimised", "step_scale"):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from jaxfit.config.checks import require
+from jaxfit.config.messages import shown
+from jaxfit.limits import GRID_RUNS
 
-__all__ = ["ClaimConfig", "CrossConfig", "GridConfig"]
+__all__ = ["ClaimConfig", "CrossConfig", "GridConfig", "require_runs"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class CrossConfig:
         require(len(self.cross) > 0, "cross", "is empty", "name a config key and its values")
         for path, values in self.cross.items():
             where = f"cross.{path}"
-            require(isinstance(values, list), where, f"is {values!r}", "expected a list of values")
+            require(isinstance(values, list), where, f"is {shown(values)}", "expected a list of values")
             require(len(values) > 0, where, "is empty, so the cross has no runs", "add a value")
             require(path not in self.set, where, "is also a key of `set`", "remove one of the two")
 
@@ -59,3 +62,19 @@ class GridConfig:
 
     def __post_init__(self):
         require(len(self.crosses) > 0, "crosses", "is empty", "an ablation needs at least one cross")
+        require_runs("crosses", [list(each.cross.values()) for each in self.crosses])
+
+
+def require_runs(key: str, crosses: Sequence[Sequence[Sequence[Any]]]) -> None:
+    """Check the number of runs of a grid before the runs are made.
+
+    Args:
+        key: the config key of the crosses, for messages.
+        crosses: for each cross, the values of each of its keys.
+
+    Raises:
+        ConfigKeyError: more than `GRID_RUNS` runs.
+    """
+    runs = sum(math.prod(map(len, cross)) for cross in crosses)
+    count = f"{runs:,}" if runs < 10**15 else "more than 10^15"
+    require(runs <= GRID_RUNS, key, f"makes {count} runs", f"expected at most {GRID_RUNS:,}")

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from jaxfit.config.build import Config, build_config, plain_config
 from jaxfit.config.checks import ConfigKeyError, first_key
+from jaxfit.config.messages import known_names
 
-__all__ = ["get_value", "with_values"]
+__all__ = ["get_value", "get_values", "with_values"]
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
@@ -43,13 +44,23 @@ def get_value(config: Any, path: str) -> Any:
     Raises:
         ConfigKeyError: an unknown path.
     """
-    return _get(plain_config(config), path, path)
+    return get_values(config, [path])[path]
+
+
+def get_values(config: Any, paths: Iterable[str]) -> dict[str, Any]:
+    """Return path → value at the path, as `get_value` returns it.
+
+    Raises:
+        ConfigKeyError: an unknown path.
+    """
+    plain = plain_config(config)
+    return {path: _get(plain, path, path) for path in paths}
 
 
 def _get(plain: Any, path: str, requested: str) -> Any:
     parent, key, is_term = _locate(plain, path, requested)
     if isinstance(parent, dict) and key not in parent:
-        raise ConfigKeyError(requested, f"refers to `{path}`, which is not set", _known(parent))
+        raise ConfigKeyError(requested, f"refers to `{path}`, which is not set", known_names(key, parent))
     value = parent[key]
     return value.get("weight", 1.0) if is_term and isinstance(value, dict) else value
 
@@ -76,7 +87,8 @@ def _locate(plain: Any, path: str, requested: str) -> tuple[Any, Any, bool]:
             value = parent[key] = {"weight": value}  # the term gets a setting beside its weight
         if not isinstance(value, dict | list):
             detail = "" if path == requested else f"`{path}`: "
-            raise ConfigKeyError(requested, f"is an unknown path: {detail}there is no `{key}`", _known(parent))
+            known = known_names(key, parent) if isinstance(parent, dict) else ""
+            raise ConfigKeyError(requested, f"is an unknown path: {detail}there is no `{key}`", known)
         parent, is_term = value, key in ("terms", "override") and isinstance(value, dict)
 
 
@@ -84,10 +96,7 @@ def _stage_index(stages: list[Any], key: str, requested: str) -> int:
     names = [stage.get("name") for stage in stages if isinstance(stage, dict)]
     if key in names:
         return names.index(key)
-    if key.isdigit() and int(key) < len(stages):
-        return int(key)
-    raise ConfigKeyError(requested, f"names the unknown stage {key!r}", f"known: {', '.join(map(str, names))}")
-
-
-def _known(parent: Any) -> str:
-    return f"known: {', '.join(map(str, parent))}" if isinstance(parent, dict) else ""
+    for i in range(len(stages)):
+        if key == str(i):
+            return i
+    raise ConfigKeyError(requested, f"names the unknown stage {key!r}", known_names(key, names))

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxfit.config.checks import ConfigKeyError, is_number, require
+from jaxfit.config.messages import known_names, shown
 from jaxfit.errors import InputError
+from jaxfit.limits import TERM_NUMBER
 from jaxfit.objective.registry import Term, find_term, known_terms
 
 __all__ = ["check_terms", "require_term", "term_settings"]
@@ -27,8 +29,10 @@ def check_terms(key: str, terms: Mapping[str, Any]) -> None:
         known = ("weight", *term.settings)
         for setting, number in (value if isinstance(value, dict) else {"weight": value}).items():
             path = f"{key}.{name}.{setting}"
-            require(setting in known, path, "is not a setting of this term", f"known: {', '.join(known)}")
-            require(is_number(number), path, f"is {number!r}", "expected a number, 0 or more")
+            if setting not in known:
+                raise ConfigKeyError(path, "is not a setting of this term", known_names(setting, known))
+            require(is_number(number), path, f"is {shown(number)}", "expected a number, 0 or more")
+            require(number <= TERM_NUMBER, path, f"is {shown(number)}", f"expected at most {TERM_NUMBER:g}")
             require(setting not in term.positive or number > 0, path, f"is {number!r}", "expected a number above 0")
 
 
@@ -45,7 +49,7 @@ def require_term(key: str, name: str) -> Term:
     try:
         return find_term(name)
     except KeyError:
-        remedy = f"known: {', '.join(known_terms())}, or package.module:function"
+        remedy = f"{known_names(name, known_terms())}; or package.module:function"
         raise ConfigKeyError(key, f"names an unknown term {name!r}", remedy) from None
     except InputError as error:
         raise ConfigKeyError(key, f"names an unusable term: {error.source} {error.problem}", error.remedy) from error

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import textwrap
 import typing
 from collections.abc import Iterator
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from jaxfit.config.build import Config, build_config, plain_config
 from jaxfit.config.checks import ConfigKeyError, first_key
 from jaxfit.config.help import field_help
+from jaxfit.config.messages import shown
+from jaxfit.config.yaml_values import Lines, YamlMapping, line_of, read_yaml
 from jaxfit.errors import InputError
+from jaxfit.limits import CONFIG_BASES, CONFIG_BYTES
+from jaxfit.storage.text_file import read_text
 
 __all__ = ["OWN_FILE", "config_to_yaml", "documented_yaml", "read_config", "shipped_configs"]
 
@@ -41,13 +46,17 @@ def read_config(kind: type[Config], source: str | Path) -> Config:
 
     Raises:
         InputError: an unreadable file, an unknown key, a value of the wrong type or outside its range; the error names
-            the file that holds the key, which may be a base.
+            the file that holds the key, which may be a base, and the line.
     """
-    layers = _layers(str(source), kind)
+    layers = _layers(os.fspath(source), kind)
     try:
-        return build_config(kind, reduce(_merge, (content for _, content in layers)))
+        return build_config(kind, reduce(_merge, (layer.values for layer in layers)))
     except ConfigKeyError as error:
-        raise InputError(_origin(layers, error.key), error.problem, error.remedy) from None
+        origin = _origin(layers, error.key)
+        line = line_of(origin.lines, error.key)
+        raise InputError(
+            origin.source, f"line {line}: {error.problem}" if line else error.problem, error.remedy
+        ) from None
 
 
 def config_to_yaml(config: Any) -> str:
@@ -92,58 +101,98 @@ def _shipped_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "configs"
 
 
-def _layers(source: str, kind: type, seen: tuple[str, ...] = ()) -> list[tuple[str, dict[str, Any]]]:
-    """Return the files that make up a config, each with its values; later files replace values of earlier files."""
-    if source in seen:
-        raise InputError(source, "the `base` keys form a circle", " → ".join((*seen, source)))
-    seen = (*seen, source)
-    content = _parse(source)
-    base, layers = content.pop("base", None), []
-    if base is not None:
-        layers = _layers(_resolve(base, source), kind, seen)
+class _Layer(NamedTuple):
+    """The values that one file gives to a config."""
+
+    source: str
+    values: dict[str, Any]
+    lines: Lines
+
+
+def _layers(source: str, kind: type, above: tuple[str, ...] = ()) -> list[_Layer]:
+    """Return the files that make up a config, each with its values; later files replace values of earlier files.
+
+    Args:
+        source: the name of a shipped config or the path of a file.
+        kind: the dataclass of the config.
+        above: the files whose bases lead to this file.
+    """
+    shipped = source in shipped_configs()
+    if not shipped and not _exists(source):
+        raise InputError(source, "does not exist", _choice())
+    # one file can have several paths: links, and names such as folder/../file
+    own = source if shipped else os.path.realpath(source)
+    if own in above:
+        circle = " → ".join(Path(file).name for file in (*above, own))
+        raise InputError(source, "the `base` keys form a circle", circle)
+    if len(above) >= CONFIG_BASES:
+        raise InputError(source, f"is base number {len(above)}", f"use fewer than {CONFIG_BASES} files in a chain")
+    above = (*above, own)
+    values, lines = _parse(source)
+    layers = []
+    if "base" in values:
+        layers += _base_layers(values.pop("base"), YamlMapping(values, lines), source, "base", kind, above)
     for field in dataclasses.fields(typing.cast(Any, kind)):
-        part = content.get(field.name)
+        name, part = field.name, values.get(field.name)
         if "own_file" in field.metadata and (isinstance(part, str) or (isinstance(part, dict) and "base" in part)):
-            base = part if isinstance(part, str) else part.pop("base")
-            content[field.name] = {} if isinstance(part, str) else part
-            nested = _layers(_resolve(base, source), typing.get_type_hints(kind)[field.name], seen)
-            layers.append((source, {field.name: None}))  # the value in the file's own base does not count
-            layers += [(file, {field.name: values}) for file, values in nested]
-    return [*layers, (source, content)]
+            base, path = (part, name) if isinstance(part, str) else (part.pop("base"), f"{name}.base")
+            values[name] = {} if isinstance(part, str) else part
+            own_kind = typing.get_type_hints(kind)[name]
+            nested = _base_layers(base, YamlMapping(values, lines), source, path, own_kind, above)
+            layers.append(_Layer(source, {name: None}, lines))  # the value in the file's own base does not count
+            layers += [_Layer(each.source, {name: each.values}, {name: (1, each.lines)}) for each in nested]
+    return [*layers, _Layer(source, values, lines)]
 
 
-def _parse(source: str) -> dict[str, Any]:
+def _base_layers(
+    base: Any, content: YamlMapping, source: str, path: str, kind: type, above: tuple[str, ...]
+) -> list[_Layer]:
+    """Return the layers of the base that a file names at a path."""
+    where = f"line {line_of(content.lines, path)}: `{path}`"
+    if not isinstance(base, str) or not base:
+        raise InputError(source, f"{where} is {shown(base)}", "expected the name of a config or of a file")
+    found = _resolve(base, source)
+    if found not in shipped_configs() and not _exists(found):
+        raise InputError(source, f"{where} names {base!r}, which does not exist", _choice())
+    return _layers(found, kind, above)
+
+
+def _choice() -> str:
+    return f"give a YAML file or one of {', '.join(shipped_configs())}"
+
+
+def _parse(source: str) -> YamlMapping:
     """Return the mapping that a YAML file or a shipped config holds."""
-    shipped = shipped_configs()
-    path = _shipped_folder() / f"{source}.yaml" if source in shipped else Path(source)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        remedy = f"give a YAML file or one of {', '.join(shipped)}"
-        raise InputError(source, f"cannot read this config: {error}", remedy) from None
-    except yaml.YAMLError as error:
-        raise InputError(source, f"is not valid YAML: {' '.join(str(error).split())}") from None
-    if not isinstance(content, dict):
-        raise InputError(source, "holds no mapping of keys to values", "write `key: value` lines")
-    return content
+    path = _shipped_folder() / f"{source}.yaml" if source in shipped_configs() else source
+    return read_yaml(read_text(path, CONFIG_BYTES, "a YAML file"), source)
 
 
-def _resolve(base: object, source: str) -> str:
+def _resolve(base: str, source: str) -> str:
     """Return the path of a base beside the file that names the base; otherwise the base is a shipped name."""
-    path = Path(source).parent / f"{base}"
-    return str(path) if path.is_file() else str(base)
+    if source in shipped_configs():  # its base is shipped too, whatever files the current folder holds
+        return base
+    path = str(Path(source).parent / base)
+    is_other = base in shipped_configs() and _exists(path) and not Path(path).is_file()
+    return path if _exists(path) and not is_other else base
 
 
-def _origin(layers: list[tuple[str, dict[str, Any]]], path: str) -> str:
+def _exists(path: str) -> bool:
+    try:
+        return Path(path).exists()
+    except (OSError, ValueError):  # the name is too long, or holds NUL
+        return False
+
+
+def _origin(layers: list[_Layer], path: str) -> _Layer:
     """Return the last file that sets the value at a path, or that adds to the nearest enclosing mapping."""
-    merged, found, origin = {}, None, layers[-1][0]
-    for source, content in layers:
-        merged, before = _merge(merged, content), found
+    merged, found, origin = {}, None, layers[-1]
+    for layer in layers:
+        merged, before = _merge(merged, layer.values), found
         found, rest = merged, path.replace("[", ".")
         while isinstance(found, dict) and (split := first_key(found, rest))[0] in found:
             found, rest = found[split[0]], split[1]
         if found is not before:  # merging keeps a value that the file does not set
-            origin = source
+            origin = layer
     return origin
 
 

@@ -131,13 +131,13 @@ def _import(name: str, path: str) -> Any:
     module_name, _, attribute = path.partition(":")
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:  # a foreign module may raise any exception
+    except (Exception, SystemExit) as error:  # a foreign module may raise any exception, and may end Python
         problem = f"cannot be imported from {module_name!r}: {type(error).__name__}: {error}"
         remedy = "write `package.module:function`, with its folder installed or in PYTHONPATH"
         raise InputError(f"term {name!r}", problem, remedy) from error
     try:
         return getattr(module, attribute)
-    except AttributeError:
+    except (Exception, SystemExit):  # a module can compute its attributes
         raise InputError(f"term {name!r}", f"{module_name} has no function {attribute!r}", "check the name") from None
 
 
@@ -155,7 +155,7 @@ def _term_of(name: str, function: Any, positive: Collection[str] = (), compares_
     require(callable(function), f"is not a function but a {type(function).__name__}")
     try:
         parameters = list(inspect.signature(function).parameters.values())
-    except ValueError:  # some built-in functions have no signature
+    except (TypeError, ValueError):  # some built-in functions have no signature
         parameters = []
     positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     require(bool(parameters) and parameters[0].kind in positional, "does not take the window as its first argument")

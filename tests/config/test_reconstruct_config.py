@@ -23,7 +23,7 @@ def written(tmp_path, text, name="mine.yaml"):
 def test_the_shipped_file_holds_no_defaults():
     config = load_reconstruct_config()
     assert (config.track, config.overlay, config.fit) == (TrackConfig(), OverlayConfig(), load_config("paper"))
-    assert set(_parse("reconstruct")) == {"fit"}
+    assert set(_parse("reconstruct").values) == {"fit"}
     assert not config.track.repair_left_right_flips  # the paper's setting
 
 
@@ -134,13 +134,13 @@ def test_errors_in_the_file_of_the_fit_name_that_file(tmp_path):
     fit = written(tmp_path, "base: paper\nwindow: 0\n", "fit.yaml")
     with pytest.raises(InputError) as caught:
         load_reconstruct_config(written(tmp_path, "base: reconstruct\nfit: fit.yaml\n"))
-    assert str(caught.value).startswith(f"{fit}: `fit.window` is 0")
+    assert str(caught.value).startswith(f"{fit}: line 2: `fit.window` is 0")
 
 
 def test_configs_of_the_wrong_kind():
     with pytest.raises(InputError, match=r"paper: is the config of a fit.*fit: paper"):
         load_reconstruct_config("paper")
-    with pytest.raises(InputError, match=r"reconstruct: `fit` is not a known key"):
+    with pytest.raises(InputError, match=r"reconstruct: line 4: `fit` is not a known key"):
         load_config("reconstruct")
 
 
