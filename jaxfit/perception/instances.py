@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxfit.data.masks import box_of_mask, encode_patch
+from jaxfit.errors import InputError
+from jaxfit.limits import INSTANCES, MASK_AREA
 
-__all__ = ["Instance", "KeypointDetector", "Segmenter", "instance_of"]
+__all__ = ["Instance", "KeypointDetector", "Segmenter", "collect_instances", "instance_of"]
 
 
 class Instance(NamedTuple):
@@ -43,14 +45,41 @@ def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int
 
     Args:
         mask: mask of the whole frame or of a part of the frame.
-        score, label: as in `Instance`.
+        score, label: as in `Instance`; the score is clipped to [0, 1].
         x0, y0: position of this part in the frame, pixels; 0 or more.
     """
     box = box_of_mask(mask)
     if box is None:
         return None
     left, top, width, height = box
-    return Instance(mask[top : top + height, left : left + width], x0 + left, y0 + top, float(score), label)
+    return Instance(
+        mask[top : top + height, left : left + width], x0 + left, y0 + top, min(max(float(score), 0.0), 1.0), label
+    )
+
+
+def collect_instances(
+    source: object, instances: Iterable[Instance | None], frame_px: tuple[int, int]
+) -> list[Instance]:
+    """Return the instances of a frame without None.
+
+    Args:
+        source: the network, for messages.
+        instances: instances, or None for an empty mask.
+        frame_px: width and height of the frame.
+
+    Raises:
+        InputError: the number of instances or the area of their masks shows that the network does not detect birds.
+    """
+    collected, area = [], 0
+    for instance in instances:
+        if instance is None:
+            continue
+        collected.append(instance)
+        area += instance.mask.size
+        if len(collected) > INSTANCES or area > MASK_AREA * frame_px[0] * frame_px[1]:
+            problem = f"detects more than {INSTANCES} instances in one frame, or boxes of {MASK_AREA} times its area"
+            raise InputError(source, problem, "raise min_score, or give another network")
+    return collected
 
 
 class Segmenter(Protocol):

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxfit.errors import InputError
+from jaxfit.limits import IMAGE_SIDE_PX, NETWORK_BYTES, NETWORK_INPUT_VALUES
+from jaxfit.storage.reading import open_file
 
 __all__ = ["OnnxModel", "Port"]
 
@@ -34,7 +38,8 @@ class OnnxModel:
         threads: number of cores for one run; None uses all cores.
 
     Raises:
-        InputError: the file does not exist, is not ONNX, lacks its external data, or contains an unknown operator.
+        InputError: the file does not exist, is not ONNX, lacks its external data, contains an unknown operator or text
+            that is not UTF-8, or declares an input without values or with too many values.
     """
 
     path: Path
@@ -47,8 +52,10 @@ class OnnxModel:
         import onnxruntime as ort
 
         self.path = Path(path)
-        if not self.path.is_file():
-            raise InputError(path, "does not exist", "give an ONNX file")
+        with open_file(self.path, "an ONNX file") as file:
+            size = os.fstat(file.fileno()).st_size
+        if size > NETWORK_BYTES:
+            raise InputError(path, f"has {size:,} bytes", f"the limit is {NETWORK_BYTES:,}")
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads or 0
         options.log_severity_level = 4  # the error below reports the problem
@@ -56,9 +63,14 @@ class OnnxModel:
             self._session = ort.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
         except Exception as error:  # the errors of ONNX Runtime have no common base class
             raise InputError(path, f"cannot be loaded: {_shorten(error)}", _remedy(str(error))) from error
-        self.inputs = tuple(_read_port(value) for value in self._session.get_inputs())
-        self.outputs = tuple(_read_port(value) for value in self._session.get_outputs())
-        self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+        try:
+            self.inputs = tuple(_read_port(value) for value in self._session.get_inputs())
+            self.outputs = tuple(_read_port(value) for value in self._session.get_outputs())
+            self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+        except UnicodeDecodeError as error:
+            raise InputError(path, "has names or metadata that are not UTF-8", "export it again") from error
+        for port in self.inputs:
+            self.check_input(port.shape)
 
     def __call__(self, *inputs: np.ndarray) -> dict[str, np.ndarray]:
         """Run the network once.
@@ -80,6 +92,41 @@ class OnnxModel:
             problem = f"cannot be run: {_shorten(error)}"
             raise InputError(self.path, problem, "check the layout of its inputs") from error
         return dict(zip(names, values, strict=True))
+
+    def check_input(self, shape: Sequence[int | None]) -> None:
+        """Raise InputError if an input of this shape has no values or too many values; None is a variable side."""
+        sides = [side for side in shape if side is not None]
+        if sides and (min(sides) < 1 or max(sides) > IMAGE_SIDE_PX or math.prod(sides) > NETWORK_INPUT_VALUES):
+            problem = f"has an input of {' × '.join(map(str, sides))} values"
+            remedy = f"the limits are {IMAGE_SIDE_PX} for a side and {NETWORK_INPUT_VALUES:,} values"
+            raise InputError(self.path, problem, remedy)
+
+    def check_outputs(self, outputs: Mapping[str, Any], expected: Mapping[str, Sequence[int | str | None]]) -> None:
+        """Check the outputs of a run.
+
+        Args:
+            outputs: name → value.
+            expected: name → length of each axis. A word stands for one length, which is the same in all outputs and is
+                0 only for `n`; None stands for any length.
+
+        Raises:
+            InputError: an output has another shape, or does not contain numbers.
+        """
+        lengths: dict[str, int] = {}
+        for name, sides in expected.items():
+            value = outputs[name]
+            if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+                raise InputError(self.path, f"its output {name} does not contain numbers", "export it again")
+            fits = value.ndim == len(sides)
+            for length, side in zip(value.shape, sides, strict=False):
+                if isinstance(side, str):
+                    fits &= (length >= 1 or side == "n") and lengths.setdefault(side, length) == length
+                else:
+                    fits &= side is None or length == side
+            if not fits:
+                shape = f"({', '.join('?' if side is None else str(side) for side in sides)})"
+                problem = f"a run gives {name} {value.shape} instead of {shape}"
+                raise InputError(self.path, problem, "export it again")
 
     def describe(self) -> str:
         """List the inputs and outputs with their shapes, for messages."""

@@ -225,7 +225,7 @@ def _expected_frames(reader: FrameReader, config: TrackConfig) -> int | None:
     if total is None and frames.stop is None:
         return None
     ends = [end for end in (total, frames.stop) if end is not None]
-    return len(range(frames.start, min(ends), frames.step))
+    return max(0, -((frames.start - min(ends)) // frames.step))  # `len` of a range is limited to 64 bits
 
 
 @contextmanager

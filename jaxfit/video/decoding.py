@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,14 +12,14 @@ from typing import Any, NamedTuple
 import av
 import av.error
 import numpy as np
-from av.stream import Disposition
 from av.video.reformatter import Interpolation
 from jaxtyping import UInt8
 
 from jaxfit.errors import InputError
 from jaxfit.video.numbering import Packet, Place, Timeline
+from jaxfit.video.opening import frame_rate, opened
 
-__all__ = ["EXACT", "Frame", "decode", "frame_rate", "opened"]
+__all__ = ["EXACT", "Frame", "decode"]
 
 _logger = logging.getLogger(__name__)
 
@@ -82,6 +81,7 @@ def _read(
     stopped: Callable[[], bool],
 ) -> Iterator[Frame | int]:
     rate, any_picture, problem = frame_rate(stream), False, ""
+    size = stream.width, stream.height  # the decoder changes these values if the size of the pictures changes
     decoded = _decoded(packets, stream, line, stopped)
     while True:
         try:
@@ -104,7 +104,8 @@ def _read(
                 time_s = number / rate if rate else None
                 if line.stamped and line.origin is not None:
                     time_s = float((packet.stamp - line.origin) * stream.time_base)
-                yield Frame(number, whole.to_ndarray(format="bgr24", interpolation=EXACT), time_s)
+                picture_bgr = _convert(path, number, whole, size)
+                yield number if picture_bgr is None else Frame(number, picture_bgr, time_s)
             if number >= numbers[-1]:
                 return
         if picture is None:
@@ -112,6 +113,17 @@ def _read(
     if not any_picture:
         raise InputError(path, f"no frame can be decoded{problem}", "the file may be incomplete or damaged")
     _warn_if_short(path, container, stream, line, problem)
+
+
+def _convert(path: Path, number: int, picture: Any, size: tuple[int, int]) -> np.ndarray | None:
+    """Return the pixels of a decoded picture; None if its pixel format is damaged."""
+    if (picture.width, picture.height) != size:
+        problem = f"its frame {number} is {picture.width}×{picture.height}, but the video is {size[0]}×{size[1]}"
+        raise InputError(path, problem, "convert the video to a single size")
+    try:
+        return picture.to_ndarray(format="bgr24", interpolation=EXACT)
+    except av.error.FFmpegError:
+        return None
 
 
 def _decoded(
@@ -262,34 +274,3 @@ def _warn_if_short(path: Path, container: Any, stream: Any, line: Timeline, prob
         promised, end = container.duration / av.time_base, float(line.last * stream.time_base)
         if end + 1 < promised:
             _logger.warning("%s: ends after %.1f of %.1f seconds", path, end, promised)
-
-
-def frame_rate(stream: Any) -> float | None:
-    """Return the mean frame rate in frames per second."""
-    rate = stream.average_rate or stream.guessed_rate
-    return float(rate) if rate else None
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a file. Gives its container and its first video stream.
-
-    Raises:
-        InputError: the file is not a readable video.
-    """
-    try:
-        # only files are opened, because a playlist may name network addresses
-        container = av.open(str(path), options={"protocol_whitelist": "file"})
-    except av.error.FFmpegError as error:
-        problem = f"is not a readable video: {error.strerror}"
-        raise InputError(path, problem, "the file may be incomplete or of another type") from error
-    with container:
-        # the cover picture of a music file is also a video stream
-        streams = [one for one in container.streams.video if not one.disposition & Disposition.attached_pic]
-        if not streams:
-            raise InputError(path, "has no video stream", "give a video or a folder of images")
-        stream: Any = streams[0]
-        if stream.codec_context is None:
-            raise InputError(path, "has a codec that this PyAV cannot decode", "convert the video to H.264")
-        stream.thread_type = "SLICE"  # with threads for frames, the detected damage would vary from run to run
-        yield container, stream

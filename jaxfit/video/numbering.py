@@ -8,9 +8,12 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+from jaxfit.limits import VIDEO_GAP_FRAMES
+
 __all__ = ["Packet", "Place", "Timeline"]
 
 _REORDER = 16  # the most pictures that a codec delays to change their order
+_MOST_DELAYED = 128  # a picture that is shown after so many later packets has a damaged time stamp
 
 
 class Packet(NamedTuple):
@@ -79,6 +82,8 @@ class Timeline:
         self._pending: list[Packet] = []
         self._held: deque[tuple[int, Packet, Any]] = deque()
         self._spoilt: dict[int, int] = {}
+        self._lost = False
+        """Whether the last packet was lost, and all pending packets are spoilt."""
 
     def add(
         self, stamp: int | None, starts: bool, *, lost: bool = False, corrupt: bool = False, torn: bool = False
@@ -105,10 +110,11 @@ class Timeline:
         if torn:
             self._torn = packet.order
         if lost:  # the decoder returns its pending pictures out of order, or not at all
-            for one in self._pending:
+            for one in [packet] if self._lost else self._pending:
                 self._spoil(one)
         elif corrupt or (torn and not starts):
             self._spoil(packet)
+        self._lost = lost
         return packet
 
     def settle(self, before: float) -> Iterator[tuple[int, Packet, bool]]:
@@ -150,6 +156,8 @@ class Timeline:
             self.troubled = True
             self._spoil(packet)
         self._held.append((number, packet, picture))
+        if self.stamped and any(packet.order - one.order > _MOST_DELAYED for one in self._pending):
+            self._count()  # otherwise all later pictures would wait in memory
 
     def finish(self) -> None:
         """End the pictures. Packets that still wait for a picture are missed."""
@@ -183,7 +191,8 @@ class Timeline:
         steps = (packet.stamp - self.last) / self._interval
         # time stamps are rounded to whole ticks, and an interval may have only a few ticks
         even = abs(steps - round(steps)) * self._interval <= 1 + 0.02 * self._interval
-        self._steady = even and (round(steps) == 1 or packet.order <= self._torn + _REORDER)
+        follows = round(steps) == 1 or (packet.order <= self._torn + _REORDER and steps <= VIDEO_GAP_FRAMES)
+        self._steady = even and follows
         return max(0, round(steps) - 1) if self._steady else 0
 
     def _miss(self, before: float) -> None:

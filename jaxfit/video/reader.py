@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-import re
+import os
 import sys
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
@@ -12,20 +12,17 @@ from queue import SimpleQueue
 from threading import Event, Semaphore, Thread, current_thread
 from typing import NamedTuple
 
-import cv2
-import numpy as np
-
 from jaxfit.errors import InputError
-from jaxfit.video.decoding import Frame, decode, frame_rate, opened
+from jaxfit.storage.reading import check_readable
+from jaxfit.video.decoding import Frame, decode
+from jaxfit.video.opening import frame_rate, opened
+from jaxfit.video.pictures import image_files, read_picture
 
-__all__ = ["Frame", "FrameReader", "VideoInfo", "image_files", "probe_video", "read_frames"]
+__all__ = ["Frame", "FrameReader", "VideoInfo", "probe_video", "read_frames"]
 
 _logger = logging.getLogger(__name__)
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
-
 _AHEAD = 3  # pictures; enough to even out the decoding time, and 35 MB at 2592×1520
-_NUMBERS = re.compile(r"(\d*)(\D+|$)")
 
 
 class VideoInfo(NamedTuple):
@@ -48,9 +45,9 @@ def probe_video(path: str | Path, *, fps: float | None = None) -> VideoInfo:
     path = _existing(path)
     if path.is_dir():
         files = image_files(path)
-        first = next((image for image in map(_read_image, files) if image is not None), None)
+        first = next((image for image in map(read_picture, files) if image is not None), None)
         if first is None:
-            raise InputError(path, "has no readable image", "the files may be damaged or not be images")
+            raise InputError(path, "has no readable image", "the files may be damaged, too large, or not be images")
         return VideoInfo(len(files), fps, (first.shape[1], first.shape[0]))
     if fps is not None:
         raise InputError(path, "is a video, which has its own frame rate", "give a rate only for a folder of images")
@@ -132,7 +129,7 @@ class FrameReader:
             return
         files, fps = image_files(self.path), self.info.fps
         for i in range(len(files))[self._numbers.start : self._numbers.stop : self._numbers.step]:
-            picture = _read_image(files[i])
+            picture = read_picture(files[i])
             if picture is None:
                 yield i
                 continue
@@ -192,25 +189,5 @@ def _spans(numbers: list[int], step: int) -> str:
 
 def _existing(path: str | Path) -> Path:
     path = Path(path).absolute()  # names such as "concat:…" are file names here, not protocols
-    if not path.exists():
-        raise InputError(path, "does not exist", "give a video or a folder of images")
-    return path
-
-
-def image_files(folder: Path) -> list[Path]:
-    """Return the images of a folder in the order of their names, with numbers sorted by value.
-
-    Raises:
-        InputError: the folder has no images.
-    """
-    files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
-    if not files:
-        raise InputError(folder, "has no images", f"names of images end in {', '.join(IMAGE_SUFFIXES)}")
-    return sorted(files, key=lambda file: [(int(n or 0), text) for n, text in _NUMBERS.findall(file.name)])
-
-
-def _read_image(file: Path) -> np.ndarray | None:
-    try:
-        return cv2.imread(str(file), cv2.IMREAD_COLOR)
-    except cv2.error:
-        return None
+    is_folder = os.path.isdir(path)  # noqa: PTH112 - `Path.is_dir` raises an error for names that are too long
+    return path if is_folder else check_readable(path, "a video or a folder of images")

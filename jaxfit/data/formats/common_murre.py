@@ -21,7 +21,8 @@ from jaxfit.errors import InputError
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.npz import load_npy
-from jaxfit.video.reader import image_files, read_frames
+from jaxfit.video.pictures import image_files
+from jaxfit.video.reader import read_frames
 
 __all__ = ["ANNOTATIONS", "IMAGES", "LICENSE", "NUM_KEYPOINTS", "CommonMurre", "generic_names", "read_common_murre"]
 

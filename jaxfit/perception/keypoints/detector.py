@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,11 +37,13 @@ class OnnxKeypoints:
         pad_px: int,
         dilate_px: int,
         batch: int,
+        shapes: Mapping[str, tuple[int, ...]],
     ):
         self.keypoint_names = tuple(keypoint_names)
         self._model, self._input, self._layout = model, network_input, layout
         self._pad_px, self._dilate_px = pad_px, dilate_px
         self._batch = network_input.batch or batch
+        self._shapes = shapes
 
     def __call__(
         self, frame: UInt8[np.ndarray, "H W 3"], instances: Sequence[Instance]
@@ -57,7 +59,9 @@ class OnnxKeypoints:
             for i, bird in enumerate(birds):
                 batch[i], crop = crop_bird(frame, bird, (width, height), self._pad_px, self._dilate_px)
                 crops.append(crop)
-            crop_points_px, crop_confidence = self._layout(self._model(self._input.array(batch)))
+            outputs = self._model(self._input.array(batch))
+            self._model.check_outputs(outputs, {name: (len(batch), *shape) for name, shape in self._shapes.items()})
+            crop_points_px, crop_confidence = self._layout(outputs)
             for i, crop in enumerate(crops):
                 points_px[start + i] = crop.to_image(crop_points_px[i])
                 confidence[start + i] = crop_confidence[i]
@@ -95,6 +99,7 @@ def load_keypoint_detector(
     network_input = read_input(model, metadata)
     width, height = network_input.size_px
     outputs = model(network_input.array(np.zeros((network_input.batch or 1, height, width, 3), np.uint8)))
+    outputs = {name: value for name, value in outputs.items() if np.asarray(value).dtype.kind in "fiub"}
     layout, count = detect_layout(model, outputs, kind, network_input, metadata)
     return OnnxKeypoints(
         model,
@@ -104,6 +109,7 @@ def load_keypoint_detector(
         _first_given(pad_px, metadata.pad_px, PAD_PX),
         _first_given(dilate_px, metadata.dilate_px, DILATE_PX),
         batch,
+        {name: outputs[name].shape[1:] for name in layout.outputs},
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Num, UInt8
 
 from jaxfit.errors import InputError
+from jaxfit.limits import NETWORK_ASPECT
 from jaxfit.perception.imagenet import IMAGENET_MEAN, IMAGENET_STD
 from jaxfit.perception.keypoints.metadata import KeypointMetadata
 from jaxfit.perception.onnx_model import OnnxModel
@@ -67,8 +68,13 @@ def read_input(model: OnnxModel, metadata: KeypointMetadata) -> KeypointInput:
     channels_last = port.shape[1] != 3
     height, width = port.shape[1:3] if channels_last else port.shape[2:]
     default = metadata.input_size or DEFAULT_SIZE_PX
+    width, height = width or default[0], height or default[1]
+    model.check_input((port.shape[0], height, width, 3))
+    if max(width, height) > NETWORK_ASPECT * min(width, height):
+        problem = f"has an input of {width}×{height} pixels"
+        raise InputError(model.path, problem, f"one side may be {NETWORK_ASPECT} times as long as the other")
     return KeypointInput(
-        size_px=(width or default[0], height or default[1]),
+        size_px=(width, height),
         batch=port.shape[0],
         channels_last=channels_last,
         dtype=_DTYPES[port.kind],

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 from jaxfit.errors import InputError
+from jaxfit.limits import CROP_MARGIN_PX, IMAGE_SIDE_PX
 from jaxfit.perception.onnx_model import OnnxModel
 
 __all__ = ["ACTIVATIONS", "ALIGNMENTS", "KeypointMetadata", "read_metadata"]
@@ -124,13 +125,13 @@ def _positive(numbers: tuple[float, ...]) -> tuple[float, ...]:
 
 def _size(text: str) -> tuple[int, int]:
     width, height = _numbers(text, 2)
-    if width < 1 or height < 1:
-        raise ValueError("width,height in pixels")
+    if not (1 <= width <= IMAGE_SIDE_PX and 1 <= height <= IMAGE_SIDE_PX):
+        raise ValueError(f"width,height in pixels, at most {IMAGE_SIDE_PX}")
     return int(width), int(height)
 
 
 def _pixels(text: str) -> int:
     (number,) = _numbers(text, 1)
-    if number < 0:
-        raise ValueError("0 or more pixels")
+    if not 0 <= number <= CROP_MARGIN_PX:
+        raise ValueError(f"0 to {CROP_MARGIN_PX} pixels")
     return round(number)

@@ -46,6 +46,11 @@ class HeatmapLayout:
     alignment: str
     locref_std: float
 
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs that the layout reads."""
+        return (self.heatmap,) if self.locref is None else (self.heatmap, self.locref)
+
     def __call__(self, outputs: Outputs) -> Points:
         heatmaps, finite = apply_activation(self._channels_first(outputs[self.heatmap]), self.activation)
         cells, peaks = heatmap_peaks(heatmaps)
@@ -94,6 +99,11 @@ class SimccLayout:
     size_px: tuple[int, int]
     """Width and height of the network's input."""
     activation: str
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs that the layout reads."""
+        return self.x, self.y
 
     def __call__(self, outputs: Outputs) -> Points:
         x, x_finite = apply_activation(outputs[self.x].astype(np.float32, copy=False), self.activation)
@@ -146,7 +156,7 @@ def _simcc_pair(outputs: Outputs, size_px: tuple[int, int]) -> tuple[str, str] |
         return None
     x, y = (outputs[name].shape for name in pair)
     same_ratio = x[2] * size_px[1] == y[2] * size_px[0]
-    return pair if x[:2] == y[:2] and same_ratio else None
+    return pair if x[:2] == y[:2] and same_ratio and min(*x, *y) >= 1 else None
 
 
 def _heatmaps(outputs: Outputs, size_px: tuple[int, int], channels_last: bool) -> tuple[str, str | None, bool] | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import cv2
@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.data.masks import box_of_mask
 from jaxfit.errors import InputError
-from jaxfit.perception.instances import Instance
+from jaxfit.limits import INSTANCES
+from jaxfit.perception.instances import Instance, collect_instances
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.network import SegmentationNetwork
 from jaxfit.perception.segmentation.placement import Placement
@@ -31,6 +32,8 @@ MIN_FOREGROUND = 0.1
 """Cells with a lower foreground belong to no bird. Masks are cut at 0.5, between cells."""
 MAX_DISTANCE_PX = 60.0
 """Cells whose offset ends at least this far from every centre belong to no bird; pixels of the input."""
+MOST_PEAKS = 10 * INSTANCES
+"""More peaks are the output of a network that was not trained."""
 MIN_CELLS = 12
 """Instances with fewer cells are dropped."""
 
@@ -55,7 +58,9 @@ class BottomUp(SegmentationNetwork):
     def _set_up(self) -> None:
         (self._label,) = self.class_names
         text = self._model.metadata.get("longer_side", str(LONGER_SIDE_PX))
-        if not (text.isdecimal() and 1 <= int(text) <= LARGEST_SIDE_PX and int(text) % MULTIPLE == 0):
+        if not (
+            text.isdecimal() and len(text) <= 5 and 1 <= int(text) <= LARGEST_SIDE_PX and int(text) % MULTIPLE == 0
+        ):
             remedy = f"export it with a multiple of {MULTIPLE} pixels, at most {LARGEST_SIDE_PX}"
             raise InputError(self._model.path, f"its metadata `longer_side` is {text[:40]!r}", remedy)
         self._longer_side_px = int(text)
@@ -76,16 +81,21 @@ class BottomUp(SegmentationNetwork):
         frame_px = frame.shape[1], frame.shape[0]
         placement = Placement.letterboxed(frame_px, self._input_px(frame_px), centred=False)
         outputs = self._model(self._input.array(_network_picture(frame, placement)))
-        foreground, centre = outputs["foreground"][0, 0], outputs["centre"][0, 0]
+        shape = (1, 1, "h", "w")
+        self._model.check_outputs(outputs, {"foreground": shape, "centre": shape, "offset": (1, 2, "h", "w")})
+        foreground, centre = (outputs[name][0, 0].astype(np.float32, copy=False) for name in ("foreground", "centre"))
         cell_px = placement.input_px[0] / foreground.shape[1]
         peaks = _find_peaks(centre)
+        if len(peaks) > MOST_PEAKS:
+            problem = f"gives {len(peaks)} centres of birds in one frame"
+            raise InputError(self._model.path, problem, "give another network")
         assignment = _assign_cells(foreground, outputs["offset"][0] * OFFSET_UNIT_PX, peaks, cell_px)
-        instances = [
-            instance
+        instances = (
+            self._instance(foreground, assignment == n, float(centre[row, column]), placement)
             for n, (row, column) in enumerate(peaks)
-            if (instance := self._instance(foreground, assignment == n, float(centre[row, column]), placement))
-        ]
-        return sorted(instances, key=lambda instance: -instance.score)
+        )
+        found = collect_instances(self._model.path, instances, frame_px)
+        return sorted(found, key=lambda instance: -instance.score)
 
     def _input_px(self, frame_px: tuple[int, int]) -> tuple[int, int]:
         """Return width and height of the input; a variable size has the frame's proportions, in multiples of 32."""
@@ -141,11 +151,10 @@ def _assign_cells(
     if not len(peaks) or not len(rows):
         return assignment
     ends = (np.stack([columns, rows], 1) + 0.5) * cell_px + offset_px[:, rows, columns].T
-    distance = np.stack(list(_distances(ends, (peaks[:, ::-1] + 0.5) * cell_px)))
-    assignment[rows, columns] = np.where(distance.min(0) < MAX_DISTANCE_PX, distance.argmin(0), -1)
+    nearest, best = np.full(len(rows), -1), np.full(len(rows), MAX_DISTANCE_PX)
+    for n, (x, y) in enumerate((peaks[:, ::-1] + 0.5) * cell_px):
+        distance = np.hypot(ends[:, 0] - x, ends[:, 1] - y)
+        is_nearer = distance < best
+        nearest[is_nearer], best[is_nearer] = n, distance[is_nearer]
+    assignment[rows, columns] = nearest
     return assignment
-
-
-def _distances(points: Float[np.ndarray, "P 2"], centres: Float[np.ndarray, "M 2"]) -> Iterator[np.ndarray]:
-    for x, y in centres:
-        yield np.hypot(points[:, 0] - x, points[:, 1] - y)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from jaxfit.errors import InputError
+from jaxfit.limits import CLASSES
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.inputs import literal_metadata
 
@@ -42,14 +43,16 @@ def names_of(model: OnnxModel, names: Sequence[str] | None, count: int | None) -
         count: number of classes; None if the shapes of the network do not contain it.
 
     Raises:
-        InputError: the numbers of names and classes differ, or the metadata cannot be read.
+        InputError: the numbers of names and classes differ, the metadata cannot be read, or there are too many classes.
     """
+    if count is not None and count > CLASSES:
+        raise InputError(model.path, f"has {count:,} classes", f"the limit is {CLASSES:,}")
     own = literal_metadata(model, "names") if names is None else list(names)
     if own is None:
         own = COCO if count in (None, len(COCO)) else [f"class_{i}" for i in range(count or 0)]
     try:
         by_index = {int(i): str(name) for i, name in (own.items() if isinstance(own, dict) else enumerate(own))}
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         problem = f"metadata `names` is not a list of classes: {own!r:.80}"
         raise InputError(model.path, problem, "give the names of its classes") from error
     if sorted(by_index) != list(range(len(by_index) if count is None else count)):
@@ -69,6 +72,8 @@ def choose_classes(source: object, names: Mapping[int, str], chosen: Sequence[st
     Raises:
         InputError: the network lacks a chosen class, or has several classes without `bird` and `chosen` is None.
     """
+    if not names:
+        raise InputError(source, "has no classes", "give the names of its classes")
     listing = f"its classes are {', '.join(names.values())}"
     if chosen is None:
         if "bird" not in names.values() and len(names) > 1:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import ast
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxfit.errors import InputError
+from jaxfit.limits import METADATA_CHARACTERS, METADATA_DEPTH
 from jaxfit.perception.onnx_model import OnnxModel
 
 __all__ = ["STRIDES", "ImageInput", "cell_count", "image_input", "literal_metadata"]
 
 STRIDES = (8, 16, 32)
 """Cell sizes of the grids of both YOLO families, pixels of the input."""
+_QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
+_LITERAL = re.compile(rf"(?:{_QUOTED.pattern}|[\w.\s,:\[\](){{}}]|[-+](?=\d))*", re.DOTALL)
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
@@ -83,8 +87,21 @@ def literal_metadata(model: OnnxModel, key: str) -> Any:
     """
     if key not in model.metadata:
         return None
+    text = model.metadata[key]
     try:
-        return ast.literal_eval(model.metadata[key])
+        if not _is_flat(text):
+            raise ValueError("operators or deep nesting, which need much memory")
+        return ast.literal_eval(text)
     except (ValueError, SyntaxError) as error:
-        problem = f"metadata `{key}` cannot be read: {model.metadata[key][:80]!r}"
-        raise InputError(model.path, problem, "export it again") from error
+        raise InputError(model.path, f"metadata `{key}` cannot be read: {text[:80]!r}", "export it again") from error
+
+
+def _is_flat(text: str) -> bool:
+    """Whether a text contains only names, numbers, quoted text, and brackets of at most `METADATA_DEPTH` levels."""
+    if len(text) > METADATA_CHARACTERS or not _LITERAL.fullmatch(text):
+        return False
+    depth = deepest = 0
+    for bracket in re.findall(r"[\[({})\]]", _QUOTED.sub("", text)):
+        depth += 1 if bracket in "[({" else -1
+        deepest = max(deepest, depth)
+    return deepest <= METADATA_DEPTH

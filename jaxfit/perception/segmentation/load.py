@@ -54,8 +54,8 @@ def load_segmenter(
 
     Raises:
         ValueError: unknown kind, or an invalid size of tiles, overlap or score.
-        InputError: a file does not exist, cannot be loaded, has an unknown layout (the message lists the outputs and
-            the supported layouts), has not three channels, or lacks a class.
+        InputError: a file does not exist, cannot be loaded, has an unknown layout (the message lists the outputs
+            and names the supported layouts), has not three channels, or lacks a class.
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}")
@@ -101,7 +101,9 @@ def _load(
     if Yolox.fits(model):
         problem = f"detects boxes, but no masks: {model.describe()}"
         raise InputError(model.path, problem, f"add a network for the masks: {model.path.name}+u2netp.onnx")
-    raise _unknown_layout(model, "; ".join(f"{name}: {network.layout}" for name, network in candidates.items()))
+    if kind != "auto":
+        raise _unknown_layout(model, f"{kind}: {candidates[kind].layout}")
+    raise _unknown_layout(model, f"{', '.join(_NETWORKS)}; docs/usage.md lists their outputs")
 
 
 def _unknown_layout(model: OnnxModel, supported: str) -> InputError:

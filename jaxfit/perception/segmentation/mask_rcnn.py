@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxfit.errors import InputError
-from jaxfit.perception.instances import Instance
+from jaxfit.perception.instances import Instance, collect_instances
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.classes import coco_by_category
 from jaxfit.perception.segmentation.network import SegmentationNetwork
@@ -56,11 +56,13 @@ class MaskRcnn(SegmentationNetwork):
             placement = Placement.letterboxed(frame_px, self._input.size_px, centred=False)
         else:
             zoom = min(1.0, LONGEST_SIDE_PX / max(frame_px))
-            placement = Placement.stretched(frame_px, (round(frame_px[0] * zoom), round(frame_px[1] * zoom)))
+            placement = Placement.stretched(frame_px, _reduced(frame_px, zoom))
         picture = placement.picture(frame)[..., ::-1].astype(np.float32) / 255
         outputs = self._model(self._input.array(picture))
+        shapes = {"boxes": ("n", 4), "labels": ("n",), "scores": ("n",), "masks": ("n", None, None, None)}
+        self._model.check_outputs(outputs, shapes)
         boxes, scores = (outputs[name].astype(np.float32) for name in ("boxes", "scores"))
-        labels, masks = outputs["labels"], outputs["masks"]
+        labels, masks = np.nan_to_num(outputs["labels"]), outputs["masks"]
         if len(masks) and masks.shape[1:] != (1, *placement.input_px[::-1]):
             problem = f"its masks {masks.shape} do not cover its input"
             raise InputError(self._model.path, problem, "export the whole network, with its own post-processing")
@@ -70,4 +72,8 @@ class MaskRcnn(SegmentationNetwork):
             for i in np.argsort(-scores)
             if scores[i] >= self._min_score and int(labels[i]) in self._classes
         )
-        return [instance for instance in instances if instance is not None]
+        return collect_instances(self._model.path, instances, frame_px)
+
+
+def _reduced(frame_px: tuple[int, int], zoom: float) -> tuple[int, int]:
+    return max(1, round(frame_px[0] * zoom)), max(1, round(frame_px[1] * zoom))

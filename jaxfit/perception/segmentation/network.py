@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import ClassVar
 
 from jaxfit.perception.onnx_model import OnnxModel
@@ -31,6 +32,7 @@ class SegmentationNetwork:
     accepts_unbatched: ClassVar[bool] = False
     """Whether the input may be a single picture (3, h, w)."""
     class_names: tuple[str, ...]
+    path: Path
 
     def __init__(
         self,
@@ -39,7 +41,7 @@ class SegmentationNetwork:
         min_score: float | None = None,
         names: Sequence[str] | None = None,
     ):
-        self._model = model
+        self._model, self.path = model, model.path
         self._input = image_input(model, self.accepts_unbatched)
         self._min_score = self.default_min_score if min_score is None else min_score
         self._classes = choose_classes(model.path, self._all_classes(names), classes)

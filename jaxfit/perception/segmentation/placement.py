@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from jaxfit.limits import DETECTIONS
 from jaxfit.perception.instances import Instance, instance_of
 
 __all__ = ["Placement", "non_maximum_suppression"]
@@ -94,6 +95,8 @@ class Placement(NamedTuple):
         Returns:
             The instance; None if no value exceeds the threshold.
         """
+        if not np.isfinite(corners_px).all():
+            return None
         x0, y0, x1, y1 = (int(side) for side in np.ceil(corners_px - 0.5))
         x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, self.frame_px[0]), min(y1, self.frame_px[1])
         if x0 >= x1 or y0 >= y1:
@@ -130,6 +133,9 @@ def non_maximum_suppression(
     """
     if not len(corners_px):
         return np.zeros(0, int)
+    if len(corners_px) > DETECTIONS:  # the time is quadratic
+        best = np.argsort(-scores, kind="stable")[:DETECTIONS]
+        return best[non_maximum_suppression(corners_px[best], scores[best], labels[best], max_iou)]
     xywh = np.concatenate([corners_px[:, :2], corners_px[:, 2:] - corners_px[:, :2]], 1)
     kept = cv2.dnn.NMSBoxesBatched(xywh.tolist(), scores.tolist(), labels.tolist(), 0.0, max_iou)
     return np.asarray(kept, int).reshape(-1)

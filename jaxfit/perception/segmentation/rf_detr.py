@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from jaxfit.errors import InputError
 from jaxfit.perception.imagenet import normalise
-from jaxfit.perception.instances import Instance
+from jaxfit.perception.instances import Instance, collect_instances
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.classes import coco_by_category, names_of
 from jaxfit.perception.segmentation.network import SegmentationNetwork
@@ -42,6 +42,7 @@ class RfDetrSeg(SegmentationNetwork):
         if self._input.size_px is None:
             raise InputError(self._model.path, "has an input of variable size", "export it with a fixed size")
         self._size_px = self._input.size_px
+        self._slots = _slots(self._model)
 
     @staticmethod
     def fits(model: OnnxModel) -> bool:
@@ -58,6 +59,8 @@ class RfDetrSeg(SegmentationNetwork):
         placement = Placement.stretched((frame.shape[1], frame.shape[0]), self._size_px)
         rgb = placement.picture(frame)[..., ::-1].astype(np.float32) / 255
         outputs = self._model(self._input.array(normalise(rgb)))
+        head = {"dets": (1, "queries", 4), "labels": (1, "queries", self._slots)}
+        self._model.check_outputs(outputs, head | {"masks": (1, "queries", "h", "w")})
         dets, logits = (outputs[name][0].astype(np.float32) for name in ("dets", "labels"))
         slots = np.array(list(self._classes))
         scores = 1 / (1 + np.exp(-np.clip(logits[:, slots], -80, 80)))
@@ -72,19 +75,23 @@ class RfDetrSeg(SegmentationNetwork):
             for i in np.argsort(-scores)
             if scores[i] >= self._min_score
         )
-        return [instance for instance in instances if instance is not None]
+        return collect_instances(self._model.path, instances, placement.frame_px)
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
         """Return slot → name of every slot that is a class."""
         model = self._model
-        count = next(port.shape[2] for port in model.outputs if port.name == "labels") or 0
+        count = _slots(model)
         if names is None and "rfdetr_inference" in model.metadata:
             try:
                 named = json.loads(model.metadata["rfdetr_inference"])["class_id_to_name"]
-                return {int(slot): str(name) for slot, name in named.items() if int(slot) < count}
-            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                return {int(slot): str(name) for slot, name in named.items() if 0 <= int(slot) < count}
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
                 problem = "metadata `rfdetr_inference` names no classes"
                 raise InputError(model.path, problem, "give the names of its classes") from error
         if names is None and count == 91:
             return coco_by_category()
         return names_of(model, names, count - 1)
+
+
+def _slots(model: OnnxModel) -> int:
+    return next(port.shape[2] for port in model.outputs if port.name == "labels") or 0

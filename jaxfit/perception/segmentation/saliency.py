@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.perception.imagenet import normalise
-from jaxfit.perception.instances import Instance
+from jaxfit.perception.instances import Instance, collect_instances
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.inputs import image_input
 from jaxfit.perception.segmentation.placement import Placement
@@ -49,7 +51,9 @@ class Saliency:
         """Compute the probabilities over a blue-green-red picture of `size_px`."""
         rgb = picture[..., ::-1].astype(np.float32) / max(1, int(picture.max()))
         outputs = self._model(self._input.array(normalise(rgb)))
-        return outputs[self._model.outputs[0].name][0, 0].astype(np.float32)
+        name = self._model.outputs[0].name
+        self._model.check_outputs(outputs, {name: (1, 1, "h", "w")})
+        return outputs[name][0, 0].astype(np.float32)
 
 
 class DetectorAndSaliency:
@@ -70,13 +74,17 @@ class DetectorAndSaliency:
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
         """Segment a frame, as `Segmenter` describes."""
         frame_px = (frame.shape[1], frame.shape[0])
-        instances = []
+        return collect_instances(self._detector.path, self._instances(frame, frame_px), frame_px)
+
+    def _instances(self, frame: UInt8[np.ndarray, "H W 3"], frame_px: tuple[int, int]) -> Iterator[Instance | None]:
         for corners_px, score, label in self._detector(frame):
-            placement = Placement.cropped(frame_px, self._saliency.size_px, _enlarge(corners_px, CONTEXT, frame_px))
+            crop_px = _enlarge(corners_px, CONTEXT, frame_px)
+            if (crop_px[:2] >= crop_px[2:]).any():  # a box outside the frame
+                continue
+            placement = Placement.cropped(frame_px, self._saliency.size_px, crop_px)
             probability = self._saliency(placement.picture(frame))
             enlarged_px = _enlarge(corners_px, MASK_MARGIN, frame_px)
-            instances.append(placement.instance(probability, enlarged_px, 0.5, score, label, keep=_largest_component))
-        return [instance for instance in instances if instance is not None]
+            yield placement.instance(probability, enlarged_px, 0.5, score, label, keep=_largest_component)
 
 
 def _enlarge(corners_px: Float[np.ndarray, "4"], share: float, frame_px: tuple[int, int]) -> Int[np.ndarray, "4"]:

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxfit.perception.instances import Instance
+from jaxfit.errors import InputError
+from jaxfit.perception.instances import Instance, collect_instances
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.classes import names_of
 from jaxfit.perception.segmentation.inputs import cell_count, literal_metadata
@@ -42,6 +43,9 @@ class YoloSeg(SegmentationNetwork):
     def _set_up(self) -> None:
         self._is_final = _is_final(self._model)
         self._size_px = self._input.size_px or _variable_size_px(self._model)
+        head, protos = self._model.outputs
+        channels = (1, None, head.shape[2]) if self._is_final else (1, head.shape[1], None)
+        self._shapes = {head.name: channels, protos.name: (1, protos.shape[1], "h", "w")}
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
         head, protos = (port.shape for port in self._model.outputs)
@@ -65,9 +69,11 @@ class YoloSeg(SegmentationNetwork):
         """Segment a frame, as `Segmenter` describes."""
         placement = Placement.letterboxed((frame.shape[1], frame.shape[0]), self._size_px, centred=True)
         picture = placement.picture(frame)[..., ::-1].astype(np.float32) / 255
-        head, protos = (output[0] for output in self._model(self._input.array(picture)).values())
+        outputs = self._model(self._input.array(picture))
+        self._model.check_outputs(outputs, self._shapes)
+        head, protos = (output[0] for output in outputs.values())
         boxes, scores, labels, coefficients = self._decode(head.astype(np.float32), len(protos))
-        is_kept = np.isin(labels, list(self._classes)) & (scores >= self._min_score)
+        is_kept = np.isin(labels, list(self._classes)) & (scores >= self._min_score) & np.isfinite(boxes).all(1)
         corners_px = placement.to_frame(boxes[is_kept])
         scores, labels, coefficients = scores[is_kept], labels[is_kept], coefficients[is_kept]
         if self._is_final:
@@ -81,14 +87,14 @@ class YoloSeg(SegmentationNetwork):
             )
             for i in order
         )
-        return [instance for instance in instances if instance is not None]
+        return collect_instances(self._model.path, instances, placement.frame_px)
 
     def _decode(
         self, head: Float[np.ndarray, "R C"], prototypes: int
     ) -> tuple[Float[np.ndarray, "N 4"], Float[np.ndarray, "N"], Int[np.ndarray, "N"], Float[np.ndarray, "N P"]]:
         """Return corners in pixels of the input, scores, classes and coefficients of all rows."""
         if self._is_final:
-            return head[:, :4], head[:, 4], head[:, 5].astype(int), head[:, 6:]
+            return head[:, :4], head[:, 4], np.nan_to_num(head[:, 5]).astype(int), head[:, 6:]
         rows = head.T
         centre, half, scores = rows[:, :2], rows[:, 2:4] / 2, rows[:, 4:-prototypes]
         labels = scores.argmax(1)
@@ -107,5 +113,9 @@ def _variable_size_px(model: OnnxModel) -> tuple[int, int]:
     size = literal_metadata(model, "imgsz")
     if size is None:
         return _DEFAULT_INPUT_PX
-    height, width = (size, size) if isinstance(size, int) else size
-    return int(width), int(height)
+    sides = [size, size] if isinstance(size, int) else size
+    if not (isinstance(sides, (list, tuple)) and len(sides) == 2 and all(type(side) is int for side in sides)):
+        problem = f"its metadata `imgsz` is {size!r:.80}"
+        raise InputError(model.path, problem, "export it with height and width")
+    model.check_input((1, 3, *sides))
+    return sides[1], sides[0]

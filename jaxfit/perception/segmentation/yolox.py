@@ -17,6 +17,7 @@ from jaxfit.perception.segmentation.placement import Placement, non_maximum_supp
 __all__ = ["Detection", "Yolox"]
 
 _DEFAULT_INPUT_PX = (640, 640)
+_LARGEST_VALUE = 80.0  # the exponential of larger values is not finite
 
 
 class Detection(NamedTuple):
@@ -65,12 +66,16 @@ class Yolox(SegmentationNetwork):
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Detection]:
         """Detect boxes in a blue-green-red frame; return them by falling score."""
         placement = Placement.letterboxed((frame.shape[1], frame.shape[0]), self._size_px, centred=False)
-        (head,) = self._model(self._input.array(placement.picture(frame).astype(np.float32))).values()
+        outputs = self._model(self._input.array(placement.picture(frame).astype(np.float32)))
+        port = self._model.outputs[0]
+        self._model.check_outputs(outputs, {port.name: (1, len(self._cells), port.shape[2])})
+        (head,) = outputs.values()
         rows = head[0].astype(np.float32)
         scores = rows[:, 4:5] * rows[:, 5:]
         labels = scores.argmax(1)
         scores = scores[np.arange(len(rows)), labels]
         is_kept = np.isin(labels, list(self._classes)) & (scores >= self._min_score)
+        is_kept &= np.isfinite(rows[:, :4]).all(1) & (rows[:, 2:4] < _LARGEST_VALUE).all(1)
         rows, scores, labels, strides = rows[is_kept], scores[is_kept], labels[is_kept], self._strides[is_kept]
         centre, half = (rows[:, :2] + self._cells[is_kept]) * strides, np.exp(rows[:, 2:4]) * strides / 2
         corners_px = placement.to_frame(np.concatenate([centre - half, centre + half], 1))
