@@ -86,7 +86,7 @@ CASES = {
     "number of 5,000 digits in yaml": (with_config("base: paper\nwindow: " + "1" * 5000), ["config.yaml", "line 2"]),
     "2,000 levels": (with_config("base: " + "[" * 2000 + "]" * 2000), ["config.yaml"]),
     "key that is not text": (with_config("base: paper\n1: 1\n"), ["config.yaml", "1"]),
-    "NUL in the base": (with_config('base: "a\\0b"\n'), ["config.yaml", "base"]),
+    "NUL in the base": (with_config('base: "a\\0b"\n'), ["config.yaml", "line 1"]),
     "circle of bases": (with_config_of(files.circle_through_folder), ["c.yaml", "base"]),
     "1,500 bases": (with_config_of(files.many_bases), [".yaml", "base"]),
     "anchor bomb": (with_config_of(files.anchors), ["config.yaml"]),
@@ -99,7 +99,7 @@ CASES = {
     "long --model": (lambda i, f: fit(i, f / "out", model=f / files.LONG), ["name"]),
     "long --init": (lambda i, f: [*fit(i, f / "out"), "--init", f / files.LONG], ["name"]),
     "long observations": (lambda i, f: fit(i, f / "out", obs=f / files.LONG), ["name"]),
-    "long --config": (lambda i, f: fit(i, f / "out", config=f / files.LONG), ["name"]),
+    "long --config": (lambda i, f: fit(i, f / "out", config=f / files.LONG), ["nnn"]),
     "long --truth": (lambda i, f: ["evaluate", i / "birds.json", "--truth", f / files.LONG], ["name"]),
     "long --video": (
         lambda i, f: ["overlay", f, "--video", f / files.LONG, "--out", f / "o.mp4"],
