@@ -17,6 +17,7 @@ from jaxfit.fitting.diagnose import name_failures
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program
 from jaxfit.fitting.solve import Report, StageState, advance, begin, report
 from jaxfit.fitting.stages import FitModel, needs_mask, stage_hyperparameters, stage_program
+from jaxfit.fitting.tiles import join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
 from jaxfit.objective.posed_window import Targets
@@ -25,7 +26,7 @@ from jaxfit.progress import ReportProgress
 __all__ = ["Batch", "Fitted", "fit_batch", "frames_per_batch"]
 
 SECONDS_PER_CALL = 1.0
-"""Target duration of one call of the solver. Between calls, progress is reported and Ctrl-C takes effect."""
+"""Target duration of some steps of all tiles. After these steps, progress is reported."""
 
 
 def frames_per_batch(bird: Bird, config: FitConfig) -> int:
@@ -63,7 +64,7 @@ class Fitted(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """R distinct problems with H hypotheses each, between two stages; R·H poses."""
+    """R distinct problems with H hypotheses each, between two stages; R·H poses, as NumPy arrays."""
 
     pose: Pose
     solver: Any
@@ -76,8 +77,16 @@ class _Rows(NamedTuple):
     """Number of hypotheses H."""
 
 
+class _Tile(NamedTuple):
+    """Problems of a stage that are computed together."""
+
+    problems: Problem
+    rows: Int[np.ndarray, "G"]
+    """The row of each problem, see `tile_rows`."""
+
+
 def fit_batch(model: FitModel, configs: Sequence[FitConfig], batch: Batch, report_progress: ReportProgress) -> Fitted:
-    """Run all stages on a batch of problems.
+    """Run all stages on a batch of problems. The result of a problem does not depend on the other problems.
 
     Args:
         model: the bird and the camera.
@@ -94,20 +103,25 @@ def fit_batch(model: FitModel, configs: Sequence[FitConfig], batch: Batch, repor
         program = stage_program(configs[0], stage, model)
         hyperparameters = [stage_hyperparameters(c, c.stages[i], model.bird.keypoint_names) for c in configs]
         rows, config_of_row, targets_row = _split_rows(rows, batch, hyperparameters)
-        problems = _stage_problems(rows, hyperparameters, config_of_row, batch.targets, targets_row, needs_mask(stage))
-        rows = _run_stage(program, problems, rows, stage, report_progress)
-        if rows.hypotheses > 1 and (stage.keep_best or i == last):
-            rows, problems = _keep_best(program, problems, rows)
-    final = report(program, problems, rows.pose)
-    total = np.asarray(sum(final.loss.values()))
-    step = np.where(np.isfinite(total), 0, stage.steps)
-    failure = name_failures(rows.failure, step, stage.name, program, problems, rows.pose)
-    return Fitted(*jax.tree.map(lambda x: np.asarray(x)[rows.row], (rows.pose, final, failure)))
+        tiles = _stage_tiles(rows, hyperparameters, config_of_row, batch.targets, targets_row, needs_mask(stage))
+        rows = _run_stage(program, tiles, rows, stage, report_progress)
+        if i < last and not (stage.keep_best and rows.hypotheses > 1):
+            continue
+        reports = [report(program, tile.problems, take_tile(rows.pose, tile.rows)) for tile in tiles]
+        final = join_tiles(reports, len(rows.failure))
+        if i == last:
+            step = np.where(np.isfinite(sum(final.loss.values())), 0, stage.steps)
+            rows = _name_failures(program, tiles, rows, step, stage)
+        best = _best_hypotheses(final, rows.hypotheses)
+        kept = rows.pose, rows.solver, rows.failure, final
+        pose, solver, failure, final = jax.tree.map(lambda x, best=best: x[best], kept)
+        rows = _Rows(pose, solver, failure, rows.row, 1)
+    return Fitted(*jax.tree.map(lambda x: x[rows.row], (rows.pose, final, rows.failure)))
 
 
 def _initial_rows(batch: Batch) -> _Rows:
     count, hypotheses = batch.initial_pose.global_orient.shape[:2]
-    pose = jax.tree.map(lambda x: x.reshape(count * hypotheses, *x.shape[2:]), batch.initial_pose)
+    pose = jax.tree.map(lambda x: np.asarray(x).reshape(count * hypotheses, *x.shape[2:]), batch.initial_pose)
     return _Rows(pose, None, np.full(count * hypotheses, "", object), batch.pose_row, hypotheses)
 
 
@@ -126,70 +140,94 @@ def _split_rows(
     pairs = zip(rows.row.tolist(), batch.config.tolist(), strict=True)
     row = np.array([new_rows.setdefault((old_row, content[config]), len(new_rows)) for old_row, config in pairs])
     first = np.unique(row, return_index=True)[1]  # the first problem of each row
-    source = jnp.asarray((rows.row[first][:, None] * rows.hypotheses + np.arange(rows.hypotheses)).ravel())
+    source = (rows.row[first][:, None] * rows.hypotheses + np.arange(rows.hypotheses)).ravel()
     pose, solver, failure = jax.tree.map(lambda x: x[source], (rows.pose, rows.solver, rows.failure))
     return _Rows(pose, solver, failure, row, rows.hypotheses), batch.config[first], batch.targets_row[first]
 
 
-def _stage_problems(
+def _stage_tiles(
     rows: _Rows,
     hyperparameters: Sequence[Hyperparameters],
     config: Int[np.ndarray, "R"],
     targets: Targets,
     targets_row: Int[np.ndarray, "R"],
     with_masks: bool,
-) -> Problem:
-    """Return one problem for every hypothesis of every row. Without `with_masks` the masks are empty."""
+) -> list[_Tile]:
+    """Return one problem for every hypothesis of every row, in tiles. Without `with_masks` the masks are empty."""
     if not with_masks:
         targets = replace(targets, mask=targets.mask[..., :0, :0])
-    source = np.repeat(targets_row, rows.hypotheses)
-    repeated = [hyperparameters[c] for c in np.repeat(config, rows.hypotheses)]
-    return Problem(
-        hyperparameters=jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *repeated),
-        anchor=rows.pose,
-        targets=jax.tree.map(lambda x: jnp.asarray(x[source]), targets),
-    )
+    config, targets_row = (np.repeat(each, rows.hypotheses) for each in (config, targets_row))
+    count, frames = rows.pose.global_orient.shape[:2]
+    tiles = []
+    for tile in tile_rows(count, tile_size(frames)):
+        own = take_tile(targets, targets_row[tile])
+        # without masks, the problems that fill up the last tile render no silhouettes
+        own = replace(own, has_mask=own.has_mask & (tile >= 0)[:, None])
+        repeated = [hyperparameters[c] for c in config[tile]]
+        settings = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *repeated)
+        tiles.append(_Tile(Problem(settings, take_tile(rows.pose, tile), own), tile))
+    return tiles
 
 
 def _run_stage(
-    program: Program, problems: Problem, rows: _Rows, stage: StageConfig, report_progress: ReportProgress
+    program: Program, tiles: Sequence[_Tile], rows: _Rows, stage: StageConfig, report_progress: ReportProgress
 ) -> _Rows:
     """Take all steps of a stage, and name the failures."""
-    state = begin(program, problems, rows.solver if stage.carry_moments else None)
-    state, rejected = _take_steps(program, problems, state, stage, report_progress)
+    carried = rows.solver if stage.carry_moments else None
+    states = [begin(program, tile.problems, take_tile(carried, tile.rows)) for tile in tiles]
+    states, rejected = _take_steps(program, tiles, states, stage, report_progress)
+    count = len(rows.failure)
+    state, rejected = join_tiles(states, count), join_tiles(rejected, count)
     step = np.where(rejected > 0, stage.steps + 1 - rejected, 0)  # all steps after the first failure are rejected
-    failure = name_failures(rows.failure, step, stage.name, program, problems, state.pose)
-    return rows._replace(pose=state.pose, solver=state.solver, failure=failure)
+    return _name_failures(program, tiles, rows._replace(pose=state.pose, solver=state.solver), step, stage)
 
 
 def _take_steps(
-    program: Program, problems: Problem, state: StageState, stage: StageConfig, report_progress: ReportProgress
-) -> tuple[StageState, Int[np.ndarray, "R"]]:
-    """Take all steps of a stage in several calls, each of about `SECONDS_PER_CALL`."""
-    done, chunk = 0, 1
-    rejected = np.zeros(state.pose.global_orient.shape[0], int)
+    program: Program,
+    tiles: Sequence[_Tile],
+    states: list[StageState],
+    stage: StageConfig,
+    report_progress: ReportProgress,
+) -> tuple[list[StageState], list[Int[Array, "G"]]]:
+    """Take all steps of a stage, some steps of every tile at a time, which take about `SECONDS_PER_CALL`.
+
+    Returns:
+        The state of every tile, and the number of rejected steps of every problem of the tile.
+    """
+    done, chunk, rejected = 0, 1, []
+    count = sum(int((tile.rows >= 0).sum()) for tile in tiles)
     while done < stage.steps:
         take = min(chunk, stage.steps - done)
         start = time.perf_counter()
-        state, loss, rejected = advance((program, problems, jnp.int32(take)), state)
-        mean_loss = float(jnp.mean(loss))  # waits for the result
+        advanced = [
+            advance((program, tile.problems, jnp.int32(take)), state) for tile, state in zip(tiles, states, strict=True)
+        ]
+        states, losses, rejected = (list(each) for each in zip(*advanced, strict=True))
+        mean_loss = np.mean(join_tiles(losses, count))  # waits for the result
         seconds = time.perf_counter() - start
         done += take
         report_progress(take, f"{stage.name}: loss {mean_loss:.5g} per window")
         # the first call may compile, so its duration does not show the speed of the steps
         chunk = 2 if done == take else max(1, min(4 * take, int(SECONDS_PER_CALL * take / seconds)))
-    return state, np.asarray(rejected)
+    return states, rejected
 
 
-def _keep_best(program: Program, problems: Problem, rows: _Rows) -> tuple[_Rows, Problem]:
-    """Keep the hypothesis with the smallest objective of every row."""
-    best = _best_hypotheses(report(program, problems, rows.pose), rows.hypotheses)
-    pose, solver, failure, problems = jax.tree.map(lambda x: x[best], (rows.pose, rows.solver, rows.failure, problems))
-    return _Rows(pose, solver, failure, rows.row, 1), problems
+def _name_failures(
+    program: Program, tiles: Sequence[_Tile], rows: _Rows, step: Int[np.ndarray, "R"], stage: StageConfig
+) -> _Rows:
+    """Name the failures of the problems that failed at a step of a stage; `step` is 0 without failure."""
+    failure = rows.failure.copy()
+    for problems, at in tiles:
+        real = at >= 0
+        steps = np.where(real, step[at], 0)
+        if steps.any():
+            pose = take_tile(rows.pose, at)
+            failure[at[real]] = name_failures(failure[at], steps, stage.name, program, problems, pose)[real]
+    return rows._replace(failure=failure)
 
 
-def _best_hypotheses(final: Report, hypotheses: int) -> Int[Array, "R"]:
+def _best_hypotheses(final: Report, hypotheses: int) -> Int[np.ndarray, "R"]:
     """Return the position of the best hypothesis of every row. A hypothesis that is not finite is never the best."""
-    total = jnp.stack(list(final.loss.values())).sum(axis=0).reshape(-1, hypotheses)
-    best = jnp.argmin(jnp.where(jnp.isfinite(total), total, jnp.inf), axis=1)
-    return jnp.arange(len(total)) * hypotheses + best
+    total = np.sum(list(final.loss.values()), axis=0).reshape(-1, hypotheses)
+    best = np.argmin(np.where(np.isfinite(total), total, np.inf), axis=1)
+    return np.arange(len(total)) * hypotheses + best

@@ -107,7 +107,7 @@ def fit_runs(
     with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
         for batch in batches:
             report_progress(0, "initial poses")
-            fitted = fit_batch(model, configs, _gather(runs, batch, size, prepare_poses), report_progress)
+            fitted = fit_batch(model, configs, _gather(runs, batch, prepare_poses), report_progress)
             for i, (r, _) in enumerate(batch):
                 results[r].append(window_of_batch(fitted, i))
     return [
@@ -193,31 +193,19 @@ def _pose_key(config: FitConfig) -> Hashable:
 
 
 def _gather(
-    runs: Sequence[_Run],
-    problems: Sequence[tuple[int, int]],
-    size: int,
-    prepare_poses: Callable[[_Run, Windows], Pose],
+    runs: Sequence[_Run], problems: Sequence[tuple[int, int]], prepare_poses: Callable[[_Run, Windows], Pose]
 ) -> Batch:
-    """Return a batch of some problems (run, window).
-
-    Every batch has `size` problems, so that all batches share one compiled program. A shorter batch is filled with
-    copies of its problems. The copies have rows of initial poses of their own, because problems with the same row would
-    be merged into one problem.
-    """
+    """Return a batch of some problems (run, window)."""
     config = runs[0].config
     mask_px = config.crop.size_px if any(needs_mask(stage) for stage in config.stages) else 0
     targets, targets_row = _prepare_rows(runs, problems, windows_key, lambda _, windows: load_targets(windows, mask_px))
     poses, pose_row = _prepare_rows(runs, problems, _pose_key, prepare_poses)
-    rows = pose_row.max() + 1
-    copied = np.arange(size - len(problems)) % len(problems)
-    filled = np.concatenate([np.arange(len(problems)), copied])
-    rows_with_copies = np.concatenate([np.arange(rows), pose_row[copied]])
     return Batch(
         targets=jax.tree.map(lambda *x: np.concatenate(x), *targets),
-        initial_pose=jax.tree.map(lambda *x: jnp.concatenate(x)[rows_with_copies], *poses),
-        config=np.array([r for r, _ in problems])[filled],
-        targets_row=targets_row[filled],
-        pose_row=np.concatenate([pose_row, rows + np.arange(len(copied))]),
+        initial_pose=jax.tree.map(lambda *x: jnp.concatenate(x), *poses),
+        config=np.array([r for r, _ in problems]),
+        targets_row=targets_row,
+        pose_row=pose_row,
     )
 
 

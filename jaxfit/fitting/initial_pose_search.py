@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfit.config.fit import InitialiseConfig
+from jaxfit.fitting.tiles import join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera
 from jaxfit.model.kinematics import Rig, joint_transforms, posed_keypoints
@@ -147,7 +148,6 @@ def _orientations(
     return jnp.stack(orientations), jnp.stack(scales)
 
 
-@partial(jax.jit, static_argnames=("config", "camera", "common_size"))
 def search_initial_poses(
     bird: Bird,
     rig: Rig,
@@ -173,6 +173,25 @@ def search_initial_poses(
 
     Source: Hägerlind et al. 2024, initialisation, for the candidates. The choice over the whole window is jaxfit's.
     """
+    count, frames = keypoints_px.shape[:2]
+    found = [
+        _search_tile(bird, rig, *take_tile((keypoints_px, confidence), rows), config, camera, common_size)
+        for rows in tile_rows(count, tile_size(frames))
+    ]
+    return jax.tree.map(jnp.asarray, join_tiles(found, count))
+
+
+@partial(jax.jit, static_argnames=("config", "camera", "common_size"))
+def _search_tile(
+    bird: Bird,
+    rig: Rig,
+    keypoints_px: Float[Array, "G T K 2"],
+    confidence: Float[Array, "G T K"],
+    config: InitialiseConfig,
+    camera: Camera,
+    common_size: bool,
+) -> Pose:
+    """Return the initial poses of the G windows of a tile."""
     frames = keypoints_px.shape[1]
     rest = rest_pose(bird)
     model_keypoints, root = posed_keypoints(rig, joint_transforms(rig, rest), rest), rig.joints[0]
