@@ -38,3 +38,9 @@ MODEL_KEYPOINTS = 256
 """Keypoints of a bird model."""
 MODEL_SHAPES = 256
 """Shape coefficients of a bird model."""
+
+# --- written files
+NAME_BYTES = 255
+"""Length of one name in a path."""
+LEFTOVER_DAYS = 7
+"""Age at which jaxfit removes the temporary files of a killed process of another computer on a shared disk."""
