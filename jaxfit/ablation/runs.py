@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -29,6 +28,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import new_folder, write_whole
+from jaxfit.storage.temporary import remove_leftovers
 
 __all__ = ["FRAMES_AT_ONCE", "FittedBatch", "claim_folder", "fit_batches", "fit_grid", "plan_batches", "run_folder"]
 
@@ -63,6 +63,7 @@ def claim_folder(folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bir
     }
     path = folder / _GRID
     if not path.is_file():
+        remove_leftovers(folder)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError(folder, f"holds files, but no {_GRID}", "choose another --out")
         write_whole(path, json.dumps(own, indent=1).encode())
@@ -168,8 +169,6 @@ def fit_grid(
     """
     for ready in sorted(folder.glob(f"{_READY}*")):  # an interruption between two moves leaves this folder
         _move_in(ready, folder)
-    for part in folder.glob(f".{_READY}*.part"):  # an interruption of the writes leaves this folder
-        shutil.rmtree(part)
     stored = {r for r, run in enumerate(runs) if run_folder(folder, run).is_dir()}
     for b, batch in enumerate(fit_batches(observations, bird, runs, progress, stored, source)):
         ready = folder / f"{_READY}{b}"

@@ -20,6 +20,7 @@ from jaxfit.progress import terminal
 from jaxfit.simulation.scene import simulate
 from jaxfit.storage.files import check_replaceable, write_whole
 from jaxfit.storage.json_values import json_text
+from jaxfit.storage.temporary import remove_leftovers
 
 __all__ = ["run_demo"]
 
@@ -81,6 +82,7 @@ def _check_folder(folder: Path) -> None:
         return
     if not folder.is_dir():
         raise InputError(folder, "is a file, not a folder", "choose another --out")
+    remove_leftovers(folder)
     if any(folder.iterdir()) and not (folder / "scene" / MARKER).is_file():
         problem = "holds files that are not an earlier demo"
         raise InputError(folder, problem, "choose another --out, new or empty")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from jaxfit.errors import InputError
+from jaxfit.limits import NAME_BYTES
+from jaxfit.storage.temporary import Temporary, remove_leftovers, temporary
 
 __all__ = [
     "check_new_file",
@@ -36,6 +37,11 @@ _REMEDIES = {
     errno.ENOENT: "choose another place",
     errno.ENOTDIR: "a part of its path is a file: choose another place",
     errno.EEXIST: "a part of its path is a file: choose another place",
+    errno.ELOOP: "a symbolic link of its path leads back to itself: choose another place",
+    errno.EINVAL: "choose another name",
+    errno.EILSEQ: "choose another name",
+    errno.ENXIO: "choose another place",
+    errno.ESTALE: "check the network disk or choose another place",
     errno.ENOTEMPTY: "another program has written there in the meantime: choose another place",
 }
 
@@ -53,6 +59,34 @@ def _write_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
+def _own_name(part: Path, path: Path) -> Iterator[None]:
+    """Replace a temporary name in the errors of the body by the name that the user gave."""
+    try:
+        yield
+    except InputError as error:
+        if str(part) not in error.source:
+            raise
+        source = error.source.replace(str(part), str(path))
+        raise InputError(source, error.problem.replace(str(part), str(path)), error.remedy) from error
+
+
+def _resolved(path: Path) -> Path:
+    """Return the absolute path without symbolic links; a path that cannot exist is an InputError."""
+    with _write_errors(path):
+        try:
+            names = [os.fsencode(name) for name in path.parts]
+        except UnicodeEncodeError:
+            names = [b"\0"]
+        if any(b"\0" in name for name in names):
+            raise InputError(path, "contains a character that no file name has", "choose another name")
+        if any(len(name) > NAME_BYTES for name in names):
+            raise OSError(errno.ENAMETOOLONG, "")
+        with suppress(FileNotFoundError):
+            path.stat()  # resolve() has other errors for cyclic links
+        return path.resolve()
+
+
+@contextmanager
 def _parents(path: Path) -> Iterator[None]:
     """Create the missing folders above ``path``; if the body fails, remove these folders again."""
     missing = [parent for parent in path.parents if not parent.exists()]
@@ -66,11 +100,6 @@ def _parents(path: Path) -> Iterator[None]:
             except OSError:  # the folder was not created, or another program uses the folder
                 break
         raise
-
-
-def _temporary(path: Path, suffix: str) -> Path:
-    # in the same folder, so that the rename stays within one file system
-    return path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}{suffix}")
 
 
 def _sync(path: Path) -> None:
@@ -122,17 +151,15 @@ def new_file(path: str | Path) -> Iterator[Path]:
         InputError: ``path`` is a folder or a device, or the system rejects the write (disk full, quota,
             read-only, permissions).
     """
-    path = Path(path).resolve()  # a symbolic link stays a link, and its target is replaced
+    named = Path(path)
+    path = _resolved(named)  # a symbolic link stays a link, and its target is replaced
     if path.exists() and not path.is_file():
-        raise InputError(path, "is a folder or a device, not a file", "choose another name")
-    part = _temporary(path, ".part")
-    with _write_errors(path), _parents(path):
-        try:
-            yield part
-            _sync(part)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        raise InputError(named, "is a folder or a device, not a file", "choose another name")
+    with _write_errors(named), _parents(path), temporary(path) as names:
+        with _own_name(names.part, named):
+            yield names.part
+        _sync(names.part)
+        names.part.replace(path)
         _sync(path.parent)
 
 
@@ -143,7 +170,7 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
     ``with new_folder("out") as folder:`` yields a temporary folder beside ``path``. At the end of the body, the
     temporary folder is renamed to ``path``; if the body fails, the temporary folder is removed. An existing folder is
     replaced only after the new folder is complete. (A power failure between the two renames leaves the existing folder
-    under ``.out.<hex>.old``.)
+    under ``.out.<hex>.old``; the next write beside it restores it, see `jaxfit.storage.temporary`.)
 
     Args:
         path: the folder; missing folders above are created.
@@ -155,57 +182,58 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
         InputError: the folder is not empty, is not a folder, lacks the ``marker``, is the current folder or a folder
             above it, or the system rejects the write (disk full, quota, read-only, permissions).
     """
-    path = Path(path).resolve()
-    check_replaceable(path, overwrite, marker)
-    part = _temporary(path, ".part")
-    with _write_errors(path), _parents(path):
-        try:
-            part.mkdir()
-            yield part
-            for entry in [*part.rglob("*"), part]:
-                _sync(entry)
-            check_replaceable(path, overwrite, marker)  # again, because the body may have taken hours
-            _replace_folder(part, path)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
+    named = Path(path)
+    check_replaceable(named, overwrite, marker)
+    path = _resolved(named)
+    with _write_errors(named), _parents(path), temporary(path) as names:
+        names.part.mkdir()
+        with _own_name(names.part, named):
+            yield names.part
+        for entry in [*names.part.rglob("*"), names.part]:
+            _sync(entry)
+        check_replaceable(named, overwrite, marker)  # again, because the body may have taken hours
+        _replace_folder(names, path)
         _sync(path.parent)
 
 
 def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = None) -> None:
     """Raise the InputError that `new_folder` would raise for ``path``; call this function before long work."""
-    path = Path(path).resolve()
+    named, path = Path(path), _resolved(Path(path))
     if _contains_current(path):  # a replacement would leave the shell in a removed folder
-        raise InputError(path, "is the folder you are in, or one above it", "name a folder inside it")
-    check_writable(path)
+        raise InputError(named, "is the folder you are in, or one above it", "name a folder inside it")
+    check_writable(named)
     if not path.exists():
         return
     if not path.is_dir():
-        raise InputError(path, "is a file, not a folder", "choose another --out")
-    with _write_errors(path):
+        raise InputError(named, "is a file, not a folder", "choose another --out")
+    remove_leftovers(path)
+    with _write_errors(named):
         if not any(path.iterdir()):
             return
     if not overwrite:
-        raise InputError(path, "holds results already", "choose another --out or pass --overwrite")
+        raise InputError(named, "holds results already", "choose another --out or pass --overwrite")
     if marker is not None and not (path / marker).is_file():
         problem = f"holds files, but no {marker}, so it is not a folder of results and is not replaced"
-        raise InputError(path, problem, "choose another --out")
+        raise InputError(named, problem, "choose another --out")
 
 
 def check_new_file(path: Path, overwrite: bool) -> None:
     """Raise InputError if ``path`` exists and a new file must not replace it."""
-    if path.exists() and not path.is_file():
+    target = _resolved(path)
+    if target.exists() and not target.is_file():
         raise InputError(path, "is a folder or a device, not a file", "choose another --out")
-    if path.exists() and not overwrite:
+    if target.exists() and not overwrite:
         raise InputError(path, "exists already", "choose another --out or pass --overwrite")
 
 
 def check_writable(path: str | Path) -> None:
     """Raise InputError if the folder of ``path`` is not writable; call this function before long work."""
-    path = Path(path).resolve()
+    path = Path(path)
+    target = _resolved(path)
     with _write_errors(path):  # permissions alone are not sufficient information, so try a write
-        probe = _temporary(next(parent for parent in path.parents if parent.exists()) / path.name, ".probe")
-        probe.mkdir()
-        probe.rmdir()
+        existing = next(parent for parent in target.parents if parent.exists())
+        with temporary(existing / target.name) as names:
+            names.part.mkdir()
 
 
 def _contains_current(path: Path) -> bool:
@@ -216,16 +244,15 @@ def _contains_current(path: Path) -> bool:
     return path == current or path in current.parents
 
 
-def _replace_folder(part: Path, path: Path) -> None:
-    """Rename `part` to `path`; if this fails, restore the existing folder."""
+def _replace_folder(names: Temporary, path: Path) -> None:
+    """Rename the new folder to `path`; if this fails, restore the existing folder."""
     if not path.exists():
-        part.rename(path)
+        names.part.rename(path)
         return
-    old = _temporary(path, ".old")
-    path.rename(old)
+    path.rename(names.old)
     try:
-        part.rename(path)
+        names.part.rename(path)
     except BaseException:
-        old.rename(path)
+        names.old.rename(path)
         raise
-    shutil.rmtree(old, ignore_errors=True)
+    shutil.rmtree(names.old, ignore_errors=True)

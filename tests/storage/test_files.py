@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxfit.errors import InputError
-from jaxfit.storage.files import new_folder, write_whole
+from jaxfit.storage.files import check_new_file, check_replaceable, check_writable, new_folder, write_whole
 
 
 def names(folder):
@@ -203,3 +203,52 @@ def test_a_file_at_the_place_of_a_folder(tmp_path):
         new_folder(tmp_path / "file" / "out").__enter__()
     with pytest.raises(InputError, match="a part of its path is a file"):
         write_whole(tmp_path / "file" / "out", b"")
+
+
+WRITES = [
+    lambda path: write_whole(path, b""),
+    lambda path: fill(path, lambda folder: None),
+    lambda path: check_new_file(Path(path), overwrite=True),
+    lambda path: check_replaceable(path, overwrite=True),
+    check_writable,
+]
+
+
+@pytest.mark.parametrize("write", WRITES)
+def test_paths_that_cannot_be_written(tmp_path, monkeypatch, write):
+    monkeypatch.chdir(tmp_path)
+    Path("loop").symlink_to("loop")
+    long = "n" * 256
+    cases = {
+        "loop": r"loop: cannot be written: Too many levels of symbolic links \(a symbolic link of its path",
+        "loop/out": "loop/out: cannot be written: Too many levels of symbolic links",
+        long: r"cannot be written: File name too long \(choose a shorter name\)",
+        f"absent/{long}": "cannot be written: File name too long",
+        "/".join(["deep" * 50] * 30): "cannot be written: File name too long",
+        "a\0b": r"a\\x00b: contains a character that no file name has",
+        "\ud800": "contains a character that no file name has",
+    }
+    for path, message in cases.items():
+        with pytest.raises(InputError, match=message) as caught:
+            write(path)
+        assert str(caught.value).startswith(path[:10] if path.isprintable() else "")
+    assert names(tmp_path) == ["loop"]
+
+
+def test_messages_name_the_path_of_the_user(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("link").symlink_to(tmp_path)
+    monkeypatch.setattr(os, "fsync", fail_with(errno.ENOSPC))
+    with pytest.raises(InputError, match=r"^link/out/poses\.npz: cannot be written: No space left"):
+        fill("link/out", lambda folder: write_whole(folder / "poses.npz", b""))
+    with pytest.raises(InputError, match=r"^link/out: cannot be written: No space left"):
+        fill("link/out", lambda folder: (folder / "file").write_bytes(b""))
+    with pytest.raises(InputError, match=r"^link/file: cannot be written: No space left"):
+        write_whole("link/file", b"")
+
+
+def test_a_name_of_the_greatest_length(tmp_path):
+    for name in ("n" * 255, "é" * 127):
+        write_whole(tmp_path / name, b"")
+        with new_folder(tmp_path / "folder" / name):
+            pass

@@ -20,7 +20,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.storage.npz import load_npy
+from jaxfit.storage.npy import load_npy
 from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import read_frames
 
