@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jaxfit.ablation.claims import Verdict, judge
 from jaxfit.ablation.grid import load_grid
 from jaxfit.ablation.measure import Result, check_shared, measure_grid
-from jaxfit.ablation.runs import claim_folder, fit_grid
+from jaxfit.ablation.record import claim_folder
+from jaxfit.ablation.runs import fit_grid
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.truth import read_truth
 from jaxfit.extras import require_extra
@@ -39,6 +41,7 @@ def ablate(
     bird: Bird | None = None,
     matching: Literal["auto", "ids", "overlap"] = "auto",
     progress: ProgressTask = silent,
+    allow_import: Collection[str] = (),
 ) -> Ablation:
     """Fit the same birds under every config of a grid, measure the results, and write tables, a plot and a report.
 
@@ -54,6 +57,8 @@ def ablate(
         bird: the model; None takes the murre.
         matching: how tracks and birds are matched, see `match_tracks`.
         progress: shows the progress of every part.
+        allow_import: terms `package.module:function` that the record of the folder may name, beside the terms of the
+            grid. The record is only compared with the grid; its terms are never imported.
 
     Raises:
         InputError: Matplotlib or tabulate is missing (extra `report`), a file cannot be read, the grid or a config is
@@ -69,7 +74,7 @@ def ablate(
         check_shared(observed, true)
     check_observations(observed, bird, observations)
     inputs = {"observations": observations, "truth": truth}
-    claim_folder(folder, crossed.runs, inputs, bird)
+    claim_folder(folder, crossed.runs, inputs, bird, allow_import)
     fitted = fit_grid(observed, bird, crossed.runs, folder, progress, observations)
     results = measure_grid(crossed.runs, folder, true, matching, progress)
     verdicts = judge(crossed.claims, results)

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jaxfit.ablation.grid import Run
-from jaxfit.ablation.measure import Result
+from jaxfit.ablation.grid import Run, hashable
+from jaxfit.ablation.measure import CLAIMED, Result
 from jaxfit.config.grid import ClaimConfig
 from jaxfit.evaluation.bootstrap import Ratio, paired_ratio
 
-__all__ = ["CLAIMED", "Verdict", "judge", "pairs_of"]
-
-CLAIMED = ("me_p", "me_v")
-"""The metrics of claims; lower is better."""
+__all__ = ["Verdict", "judge", "pairs_of"]
 
 
 @dataclass(frozen=True)
@@ -61,15 +58,16 @@ def judge(claims: Sequence[ClaimConfig], results: Sequence[Result]) -> list[Verd
 def pairs_of(claim: ClaimConfig, runs: Sequence[Run]) -> list[tuple[Run, Run]]:
     """Return the pairs (better, worse) of a claim: runs with equal values of all keys that the claim does not name."""
     named = {*claim.better, *claim.worse}
+    worse_runs: dict[Hashable, list[Run]] = {}
 
-    def rest(run: Run) -> dict[str, Any]:
-        return {path: level for path, level in run.levels.items() if path not in named}
+    def rest(run: Run) -> Hashable:
+        return hashable({path: level for path, level in run.levels.items() if path not in named})
 
+    for run in runs:
+        if _has(run, claim.worse):
+            worse_runs.setdefault(rest(run), []).append(run)
     return [
-        (better, worse)
-        for better in runs
-        for worse in runs
-        if _has(better, claim.better) and _has(worse, claim.worse) and rest(better) == rest(worse)
+        (better, worse) for better in runs if _has(better, claim.better) for worse in worse_runs.get(rest(better), ())
     ]
 
 

@@ -19,7 +19,7 @@ from jaxfit.config.paths import get_value, get_values, with_values
 from jaxfit.config.yaml_file import read_config
 from jaxfit.errors import InputError, one_line, shortened
 
-__all__ = ["Grid", "Run", "cross", "load_grid", "short"]
+__all__ = ["Grid", "Run", "cross", "hashable", "load_grid", "short"]
 
 _logger = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
             config = with_values(base, point)
         except ConfigKeyError as error:
             raise InputError(source, error.problem, error.remedy) from None
-        if kept.setdefault(_hashable(plain_config(config)), (config, point))[0] is not config:
+        if kept.setdefault(hashable(plain_config(config)), (config, point))[0] is not config:
             repeated.append(point)
     if repeated:
         text = shortened(one_line(dict(repeated[0])), 100)
@@ -121,11 +121,11 @@ def _name(values: Mapping[str, Any]) -> str:
     return re.sub(r"[^\w.,=+-]", "-", ",".join(parts), flags=re.ASCII)[:120] or "only"
 
 
-def _hashable(plain: Any) -> Hashable:
-    """Return a value that is equal for equal plain configs."""
+def hashable(plain: Any) -> Hashable:
+    """Return a value that can be a key and is equal for equal plain values, such as those of `plain_config`."""
     if isinstance(plain, dict):
-        return frozenset((key, _hashable(value)) for key, value in plain.items())
-    return tuple(map(_hashable, plain)) if isinstance(plain, list) else plain
+        return frozenset((key, hashable(value)) for key, value in plain.items())
+    return tuple(map(hashable, plain)) if isinstance(plain, list | tuple) else plain
 
 
 def short(value: Any) -> str:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from jaxfit.ablation.grid import Run
 from jaxfit.ablation.runs import run_folder
@@ -17,12 +16,16 @@ from jaxfit.evaluation.aggregation import Evaluation
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.truth import Truth
+from jaxfit.limits import ABLATION_BYTES
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import write_whole
+from jaxfit.storage.json_file import read_json_file
 from jaxfit.storage.json_values import json_text
 
-__all__ = ["Result", "check_shared", "measure_grid"]
+__all__ = ["CLAIMED", "Result", "check_shared", "measure_grid", "read_metrics"]
 
+CLAIMED = ("me_p", "me_v")
+"""The metrics of claims and plots; lower is better."""
 _EVALUATION = "evaluation.json"
 
 
@@ -85,12 +88,56 @@ def measure_grid(
                 solution, bird = load_solution(own)
                 solution, _ = match_tracks(solution, truth, matching)
                 write_whole(path, json_text(evaluate(solution, bird, truth).to_dict(), indent=1).encode())
-            try:
-                evaluation = Evaluation.from_dict(json.loads(path.read_text(encoding="utf-8")))
-                summary = json.loads((own / "summary.json").read_text(encoding="utf-8"))
-                results.append(Result(run, evaluation, summary["seconds"]["fit"], summary["runs_at_once"]))
-            except (OSError, ValueError, KeyError, TypeError) as error:
-                problem = f"cannot be read: {type(error).__name__}: {error}"
-                raise InputError(own, problem, "remove this folder; then the same command fits the run again") from None
+            results.append(Result(run, *read_metrics(own)))
             report_progress(1, run.name)
     return results
+
+
+def read_metrics(folder: Path) -> tuple[Evaluation, float, int]:
+    """Return the stored metrics of a run, the seconds of its fit, and the number of runs in its batch.
+
+    Raises:
+        InputError: a file cannot be read, or does not hold metrics.
+    """
+    path, remedy = folder / _EVALUATION, "remove this folder; then the same command fits the run again"
+    content = read_json_file(path, ABLATION_BYTES)
+    summary = read_json_file(folder / "summary.json", ABLATION_BYTES)
+    try:
+        evaluation = Evaluation.from_dict(content)
+        seconds, runs_at_once = summary["seconds"]["fit"], summary["runs_at_once"]
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(folder, f"holds damaged metrics: {type(error).__name__}: {error}", remedy) from None
+    if not (_is_consistent(evaluation) and _are_numbers([seconds]) and _are_counts([runs_at_once])):
+        raise InputError(path, "does not hold metrics of a run", remedy)
+    return evaluation, seconds, runs_at_once
+
+
+def _is_consistent(evaluation: Evaluation) -> bool:
+    """Return whether all metrics are numbers, and whether the sums have a number for each bird."""
+    rows = [evaluation.overall, *(evaluation.intervals[name]._asdict() for name in evaluation.intervals)]
+    for table in (evaluation.tracks, evaluation.behaviours, evaluation.keypoints):
+        rows += table.values()
+    # NaN marks a metric without a measurement
+    values = [value for row in rows for value in row.values() if value == value]
+    birds, numerators, counts = evaluation.sums.birds, evaluation.sums.numerators, evaluation.sums.counts
+    lengths = {len(each) for each in (birds, *numerators.values(), *counts.values())}
+    return (
+        _are_numbers(values)
+        and all(each.keys() >= set(CLAIMED) for each in (evaluation.overall, evaluation.intervals, counts))
+        and numerators.keys() == counts.keys()
+        and len(lengths) == 1
+        and all(isinstance(bird, str) for bird in birds)
+        and len(set(birds)) == len(birds)
+        and all(map(_are_numbers, numerators.values()))
+        and all(map(_are_counts, counts.values()))
+        and _are_counts([evaluation.frames, evaluation.missing, evaluation.unmatched, evaluation.frames_3d])
+        and evaluation.points_3d in ("", "joints", "keypoints")
+    )
+
+
+def _are_numbers(values: Iterable[Any]) -> bool:
+    return all(type(value) in (int, float) and abs(value) < 1e300 for value in values)
+
+
+def _are_counts(values: Iterable[Any]) -> bool:
+    return all(type(value) is int and 0 <= value < 2**53 for value in values)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from jaxfit.ablation.claims import CLAIMED
-from jaxfit.ablation.measure import Result
+from jaxfit.ablation.measure import CLAIMED, Result
 from jaxfit.ablation.table import format_cell, heading
+from jaxfit.errors import one_line, shortened
 
 __all__ = ["plot", "swept"]
 
 _LABELS = {"me_p": "me_p (fraction of the bird's longer side)", "me_v": "me_v (the same fraction, per frame)"}
+_LABEL_CHARACTERS, _LABELS_SHOWN = 100, 60
 _STYLES = ("-", "--", "-.", ":")
 _MARKERS = "osD^v<>Pp*"
 
@@ -41,7 +43,9 @@ def plot(results: Sequence[Result]) -> bytes:
     shift = 1.1 if logarithmic else 1.03
     for panel, metric in zip(panels, CLAIMED, strict=True):
         for i, (key, members) in enumerate(lines.items()):
-            label = ", ".join(part for part in key if part not in common) or "all"
+            text = ", ".join(part for part in key if part not in common) or "all"
+            # Matplotlib reads text between dollar signs as mathematics
+            label = shortened(one_line(text), _LABEL_CHARACTERS).replace("$", r"\$")
             style = {"color": f"C{i % 10}", "linestyle": _STYLES[i // 10 % 4], "label": label}
             value = np.array([r.evaluation.overall[metric] for r in members])
             bounds = np.array([r.evaluation.intervals[metric] for r in members]).T
@@ -64,7 +68,7 @@ def plot(results: Sequence[Result]) -> bytes:
         panel.yaxis.set_minor_formatter(NullFormatter())
         panel.grid(True, which="both", alpha=0.2)
     if len(lines) > 1:
-        handles, labels = panels[0].get_legend_handles_labels()
+        handles, labels = (each[:_LABELS_SHOWN] for each in panels[0].get_legend_handles_labels())
         figure.legend(handles, labels, loc="outside right center", fontsize=7, frameon=False)
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
@@ -75,11 +79,16 @@ def swept(results: Sequence[Result]) -> str:
     """Return the path of the varied key with the most numbers; an empty text where no key has two numbers."""
 
     def numbers(path: str) -> int:
-        levels = {result.run.levels[path] for result in results}
-        return len({level for level in levels if isinstance(level, int | float) and not isinstance(level, bool)})
+        if not all(_is_number(result.run.value(path)) for result in results):
+            return 0
+        return len({level for result in results if _is_number(level := result.run.levels[path])})
 
     best = max(results[0].run.levels, key=numbers, default="")
     return best if best and numbers(best) > 1 else ""
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _number(result: Result, path: str) -> float:

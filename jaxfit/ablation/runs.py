@@ -2,94 +2,35 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import yaml
 
 from jaxfit.ablation.grid import Run
-from jaxfit.config.build import build_config
-from jaxfit.config.fit import FitConfig
 from jaxfit.config.yaml_file import config_to_yaml
-from jaxfit.data.formats.scene_folder import TRUE_POSES, TRUTH
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution, write_solution
-from jaxfit.errors import InputError
 from jaxfit.fitting.batch import frames_per_batch
 from jaxfit.fitting.fit import fit_runs, windows_of
 from jaxfit.fitting.stages import compiled_part
 from jaxfit.fitting.summary import summarise
 from jaxfit.model.bird import Bird
-from jaxfit.model.describe import model_hash
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.storage.files import new_folder, write_whole
-from jaxfit.storage.temporary import remove_leftovers
+from jaxfit.storage.files import new_folder
 
-__all__ = ["FRAMES_AT_ONCE", "FittedBatch", "claim_folder", "fit_batches", "fit_grid", "plan_batches", "run_folder"]
+__all__ = ["FRAMES_AT_ONCE", "FittedBatch", "fit_batches", "fit_grid", "plan_batches", "run_folder"]
 
 FRAMES_AT_ONCE = 3000
 """Birds × frames of a batch. A larger batch is not faster, and an interruption loses more work."""
-FORMAT_VERSION = 1
-_GRID, _RUNS, _READY = "ablation.json", "runs", ".ready-"
+_RUNS, _READY = "runs", ".ready-"
 
 
 def run_folder(folder: Path, run: Run) -> Path:
     """Return the result folder of a run."""
     return folder / _RUNS / run.name
-
-
-def claim_folder(folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bird: Bird) -> None:
-    """Record this ablation in a new folder, or check that an existing folder belongs to this ablation.
-
-    Args:
-        folder: the folder of the ablation.
-        runs: the grid.
-        inputs: name in messages → file that the results depend on.
-        bird: the model.
-
-    Raises:
-        InputError: the folder holds something else, or another ablation; the message names the difference.
-    """
-    own = {
-        "format_version": FORMAT_VERSION,
-        "runs": {run.name: config_to_yaml(run.config) for run in runs},
-        "model": model_hash(bird),
-        **{name: _digest(path) for name, path in inputs.items()},
-    }
-    path = folder / _GRID
-    if not path.is_file():
-        remove_leftovers(folder)
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(folder, f"holds files, but no {_GRID}", "choose another --out")
-        write_whole(path, json.dumps(own, indent=1).encode())
-        return
-    try:
-        held = json.loads(path.read_text(encoding="utf-8"))
-        differs = [name for name in own if name != "runs" and held[name] != own[name]]
-        # compare configs, not text: a later version may write keys that an earlier version did not have
-        held_configs = {name: build_config(FitConfig, yaml.safe_load(text)) for name, text in held["runs"].items()}
-    except (OSError, ValueError, KeyError, AttributeError, yaml.YAMLError, InputError) as error:
-        raise InputError(path, f"cannot be read: {error}", "choose another --out") from None
-    if held_configs != {run.name: run.config for run in runs}:
-        differs.insert(0, "grid")
-    if differs:
-        raise InputError(
-            folder, f"holds an ablation of another {', '.join(differs)}", "choose another --out, or remove that folder"
-        )
-
-
-def _digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of the truth in the folder of a simulated scene."""
-    digest = hashlib.sha256()
-    for file in [path / TRUTH, *sorted((path / TRUE_POSES).glob("*.npz"))] if path.is_dir() else [path]:
-        with file.open("rb") as opened:
-            digest.update(hashlib.file_digest(opened, "sha256").digest())
-    return digest.hexdigest()
 
 
 def plan_batches(observations: Observations, bird: Bird, runs: Sequence[Run], source: object) -> list[list[int]]:

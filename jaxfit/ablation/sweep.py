@@ -10,6 +10,7 @@ from jaxfit.ablation.grid import cross
 from jaxfit.ablation.measure import Result
 from jaxfit.ablation.runs import fit_batches
 from jaxfit.config.fit import FitConfig
+from jaxfit.config.grid import require_runs
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate
@@ -52,8 +53,9 @@ def sweep(
         progress: shows the progress of every part.
 
     Raises:
-        InputError: as `fit` and `evaluate`; or a key is unknown, or a value is invalid.
+        InputError: as `fit` and `evaluate`; or a key is unknown, a value is invalid, or there are too many runs.
     """
+    require_runs("values", [list(values.values())])
     points = [dict(zip(values, point, strict=True)) for point in itertools.product(*values.values())]
     runs = cross(config, points, "sweep")
     observations = check_observations(observations, bird, "observations")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import html
 import io
 import math
 from collections.abc import Callable, Sequence
@@ -13,6 +14,7 @@ from tabulate import tabulate
 from jaxfit.ablation.claims import Verdict
 from jaxfit.ablation.grid import Run, short
 from jaxfit.ablation.measure import Result
+from jaxfit.errors import one_line
 
 __all__ = ["CAPTION", "claims_table", "format_cell", "heading", "ranked", "results_csv", "results_table"]
 
@@ -120,7 +122,12 @@ def results_csv(results: Sequence[Result]) -> str:
 
 
 def _table(head: list[str], rows: list[list[str]], form: str) -> str:
-    text = tabulate(rows, head, tablefmt=form, disable_numparse=True, colalign=_alignment(rows))
+    alignment = _alignment(rows)
+    # a cell is one line: a line break would end the row of a Markdown table
+    clean = [[one_line(" ".join(cell.split())) for cell in row] for row in (head, *rows)]
+    if form == "github":  # tabulate escapes the cells of HTML and LaTeX only
+        clean = [[html.escape(cell, quote=False).replace("|", "\\|") for cell in row] for row in clean]
+    text = tabulate(clean[1:], clean[0], tablefmt=form, disable_numparse=True, colalign=alignment)
     return text.replace("λ\\_vel", r"$\lambda_{\mathrm{vel}}$") if form.startswith("latex") else text
 
 

@@ -29,6 +29,7 @@ def ablate(options: argparse.Namespace) -> None:
         find_bird(options.model),
         options.match,
         terminal,
+        options.allow_import,
     )
     show(results_table(done.results, "simple"))
     show(CAPTION)

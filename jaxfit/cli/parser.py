@@ -122,6 +122,8 @@ def _fitting(commands: Any) -> None:
     ablate.add_argument("--grid", default="ablation", help=text)
     _add_model(ablate)
     _add_out(ablate, "DIR", "folder for runs, tables and report; an interrupted ablation continues")
+    text = "accept a record in DIR that names this term (package.module:function), although the grid does not"
+    ablate.add_argument("--allow-import", action="append", default=[], metavar="NAME", help=text)
 
     overlay = _command(commands, "overlay", "fitting.overlay", "draw a result on its video")
     overlay.add_argument("result", type=Path, metavar="DIR", help="folder of a result")

@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeVar
 from jaxfit.config.checks import ConfigKeyError, join_keys
 from jaxfit.config.messages import known_names, shown
 
-__all__ = ["Config", "build_config", "plain_config"]
+__all__ = ["Config", "build_config", "describes", "plain_config"]
 
 Config = TypeVar("Config")
 
@@ -60,6 +60,32 @@ def plain_config(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [plain_config(item) for item in value]
     return value
+
+
+def describes(plain: Any, config: Any) -> bool:
+    """Return whether plain values, as `plain_config` returns them, describe a config or a part of a config.
+
+    Absent keys have their default values. Nothing is built, so that no term is imported.
+    """
+    if dataclasses.is_dataclass(config):
+        fields = {field.name: field for field in dataclasses.fields(config)}
+        if not isinstance(plain, dict) or not plain.keys() <= fields.keys():
+            return False
+        return all(
+            describes(plain[name], value) if name in plain else value == _default(field)
+            for name, field in fields.items()
+            for value in [getattr(config, name)]
+        )
+    if isinstance(config, Mapping):
+        same_keys = isinstance(plain, dict) and plain.keys() == config.keys()
+        return same_keys and all(describes(plain[key], value) for key, value in config.items())
+    if isinstance(config, tuple | list):
+        return isinstance(plain, list) and len(plain) == len(config) and all(map(describes, plain, config))
+    return isinstance(plain, bool) == isinstance(config, bool) and plain == config
+
+
+def _default(field: dataclasses.Field[Any]) -> Any:
+    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
 
 
 def _build_value(hint: Any, value: Any, where: str) -> Any:
