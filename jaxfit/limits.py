@@ -74,3 +74,13 @@ THREADS = 1024
 # --- text files
 JSON_LEVELS = 100
 """Largest depth of lists and objects inside each other in a JSON file."""
+JSON_VALUES = 50_000_000
+"""Largest number of values in a JSON file; a value takes up to 72 bytes of memory."""
+
+# --- observations and truths
+OBSERVATIONS_BYTES = 2_000_000_000
+"""Largest COCO file."""
+TEXT_CHARACTERS = 4096
+"""Longest name in a COCO file or a scene; tables of names take the length of the longest name for every frame."""
+TABLE_GB = 2.0
+"""Largest memory of the tables of a file, by estimate: tables have a cell for every track in every frame."""
