@@ -45,8 +45,14 @@ BLUR = 10.0
 """Largest blur of a silhouette; the time of a silhouette grows with the square of the blur."""
 CONFIG_NUMBER = 1e30
 """Largest weight, setting or factor of a config; a product with a step size must not overflow."""
-TURNS, DIRECTIONS, CANDIDATES, ORIENTATIONS = 3600, 10_000, 1000, 100_000
-"""Largest numbers of the search for initial poses; orientations are turns × directions."""
+TURNS = 3600
+"""Largest number of rotations about the viewing axis in the search for initial poses."""
+DIRECTIONS = 10_000
+"""Largest number of viewing directions in the search for initial poses."""
+ORIENTATIONS = 100_000
+"""Largest number of turns × directions."""
+CANDIDATES = 1000
+"""Largest number of candidates per frame in the search for initial poses."""
 SMOOTHNESS = 1e12
 """Largest cost of a rotation in the search for initial poses."""
 HYPOTHESES = 100
@@ -71,6 +77,7 @@ TILE_OVERLAP = 0.9
 """Largest overlap of neighbouring tiles, as a fraction of a tile's side."""
 THREADS = 1024
 """Largest number of CPU cores."""
+
 # --- text files
 JSON_LEVELS = 100
 """Largest depth of lists and objects inside each other in a JSON file."""
@@ -84,3 +91,31 @@ TEXT_CHARACTERS = 4096
 """Longest name in a COCO file or a scene; tables of names take the length of the longest name for every frame."""
 TABLE_GB = 2.0
 """Largest memory of the tables of a file, by estimate: tables have a cell for every track in every frame."""
+
+# --- arrays (.npz and .npy files)
+NPZ_BYTES = 2**30
+"""Memory of all arrays that jaxfit reads from one .npz file: a result of about 1,000,000 birds × frames."""
+NPZ_ARRAYS = 1000
+"""Number of arrays in an .npz file."""
+NPZ_DIRECTORY_BYTES = 2**20
+"""Size of the table of contents of an .npz file."""
+NPY_HEADER_BYTES = 4096
+"""Size of the header of an array in an .npz or .npy file."""
+NPY_DIMENSIONS = 8
+"""Dimensions of an array in an .npz or .npy file."""
+NPZ_TEXT_CHARACTERS = 1000
+"""Length of one text in an array of texts."""
+
+# --- bird models
+MODEL_BYTES = 2**27
+"""Memory of all arrays of a bird model; the arrays of the murre have 2 MB."""
+MODEL_VERTICES = 100_000
+"""Vertices of a bird model."""
+MODEL_FACES = 200_000
+"""Faces of a bird model."""
+MODEL_JOINTS = 256
+"""Joints of a bird model."""
+MODEL_KEYPOINTS = 256
+"""Keypoints of a bird model."""
+MODEL_SHAPES = 256
+"""Shape coefficients of a bird model."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxfit.errors import InputError
+from jaxfit.limits import IMAGE_SIDE_PX
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.pose import Pose
@@ -18,13 +19,19 @@ from jaxfit.storage.arrays import validate_arrays
 from jaxfit.storage.files import new_folder, write_whole
 from jaxfit.storage.json_values import json_text
 from jaxfit.storage.npz import load_npz
+from jaxfit.storage.reading import check_folder
 
-__all__ = ["FORMAT_VERSION", "Solution", "load_solution", "save_solution", "write_solution"]
+__all__ = ["FORMAT_VERSION", "LAYOUT", "Solution", "check_poses", "load_solution", "save_solution", "write_solution"]
 
 FORMAT_VERSION = 2
 """Version of ``poses.npz``; increased when names or meaning of its arrays change. Other versions are not read."""
 
+STATUSES = ("ok", "partly diverged", "diverged", "no usable frame")
+"""The words of `Solution.status`."""
+
 _POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
+
+_CAMERA = {"focal_px": ("", np.float64), "crop_px": ("", np.int64)}
 
 LAYOUT = {
     "track_id": ("N", np.int64),
@@ -53,7 +60,8 @@ class Solution:
     The arrays are read-only NumPy arrays. Values are arbitrary, and possibly NaN, where ``valid`` is False.
 
     Raises:
-        ValueError: the shapes do not agree; the message names the array.
+        ValueError: the shapes do not agree, or a valid frame holds values that no fit gives; the message names the
+            array, and the first such track and frame.
     """
 
     track_id: np.ndarray
@@ -109,12 +117,20 @@ class Solution:
         for term, value in self.loss.items():
             layout = {"status": LAYOUT["status"], f"loss[{term}]": ("N", np.float64)}
             loss[str(term)] = validate_arrays({"status": self.status, f"loss[{term}]": value}, layout)[f"loss[{term}]"]
-        focal_px = float(self.focal_px)
+        camera = validate_arrays({"focal_px": self.focal_px, "crop_px": self.crop_px}, _CAMERA)
+        focal_px, crop_px = float(camera["focal_px"]), int(camera["crop_px"])
         if not 0 < focal_px < math.inf:
             raise ValueError(f"focal_px must be above 0 and finite, not {focal_px}")
-        crop_px = int(self.crop_px)
-        if crop_px < 1:
-            raise ValueError(f"crop_px must be 1 or more, not {crop_px}")
+        if not 1 <= crop_px <= IMAGE_SIDE_PX:
+            raise ValueError(f"crop_px must be in 1…{IMAGE_SIDE_PX}, not {crop_px}")
+        check_poses(arrays, arrays["valid"])
+        unknown = np.flatnonzero(~np.isin(arrays["status"], STATUSES))
+        if len(unknown):
+            track, status = arrays["track_id"][unknown[0]], arrays["status"][unknown[0]]
+            raise ValueError(f"status of track {track} is '{status}', expected one of: {', '.join(STATUSES)}")
+        for name in ("keypoint_names", "joint_names"):
+            if len(np.unique(arrays[name])) < len(arrays[name]):
+                raise ValueError(f"{name} must name each part once")
         for name in ("keypoint_names", "joint_names"):
             object.__setattr__(self, name, tuple(str(text) for text in arrays.pop(name)))
         for name, value in (arrays | {"loss": loss, "focal_px": focal_px, "crop_px": crop_px}).items():
@@ -124,6 +140,46 @@ class Solution:
     def pose(self) -> Pose:
         """The poses as a `Pose` of the model, every field (N, T, …)."""
         return Pose(**{each.name: getattr(self, each.name) for each in fields(Pose)})
+
+
+def check_poses(arrays: Mapping[str, np.ndarray], fitted: np.ndarray) -> None:
+    """Check the numbers of tracks and frames, and the poses of fitted frames.
+
+    Args:
+        arrays: some arrays of `LAYOUT`, among them `track_id` and `frame_index`, with shapes that agree.
+        fitted: (N, T) bool: where the poses are checked.
+
+    Raises:
+        ValueError: a track or a frame is there twice, frames are not in order, or a fitted frame holds NaN, an
+            infinite number, or a size that is not positive; the message names the array, the track and the frame.
+    """
+    tracks, frames = arrays["track_id"], arrays["frame_index"]
+    unique, count = np.unique(tracks, return_counts=True)
+    if len(unique) < len(tracks):
+        raise ValueError(f"track_id holds track {unique[count > 1][0]} twice")
+    if len(frames) and frames[0] < 0:
+        raise ValueError(f"frame_index must be 0 or more, not {frames[0]}")
+    unordered = np.flatnonzero(frames[1:] <= frames[:-1])
+    if len(unordered):
+        pair = frames[unordered[0] : unordered[0] + 2]
+        raise ValueError(f"frame_index must increase, but {pair[1]} follows {pair[0]}")
+
+    def require(name: str, holds: np.ndarray, problem: str) -> None:
+        bad = np.argwhere(fitted & ~holds.all(axis=tuple(range(2, holds.ndim))))
+        if len(bad):
+            n, t = bad[0]
+            raise ValueError(f"{name} {problem} for track {tracks[n]}, frame {frames[t]}")
+
+    for name, (shape, dtype) in LAYOUT.items():
+        if shape.startswith("N T") and dtype is np.float32 and name in arrays:
+            require(name, np.isfinite(arrays[name]), "holds NaN or infinite numbers")
+    if "scale" in arrays:
+        require("scale", arrays["scale"] > 0, "is not above 0")
+    if "crop" in arrays:
+        require("crop", arrays["crop"][..., 2] > 0, "has a size that is not above 0")
+    if "image_size_px" in arrays:
+        size = arrays["image_size_px"]
+        require("image_size_px", (size > 0) & (size <= IMAGE_SIDE_PX), f"is not in 1…{IMAGE_SIDE_PX}")
 
 
 def save_solution(
@@ -178,27 +234,22 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         InputError: the folder does not exist; a file is missing, damaged or of another version; or the shapes of the
             arrays do not agree.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        problem = "is a file, not a folder of results" if folder.exists() else "does not exist"
-        raise InputError(folder, problem, "give the folder that a fit wrote")
+    folder = check_folder(folder, "a folder of results")
     path = folder / _POSES
-    ndim = {name: len(shape.split()) for name, (shape, _) in LAYOUT.items()}
-    ndim |= {"loss": 2, "loss_terms": 1, "focal_px": 0, "crop_px": 0}
-    arrays = load_npz(path, ndim, FORMAT_VERSION, oldest=FORMAT_VERSION)
-    values: dict[str, Any] = {name: arrays[name] for name in LAYOUT}
-    values |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
-    terms, loss = arrays["loss_terms"], arrays["loss"]
-    if loss.shape[1] != len(terms):
-        problem = f"loss has shape {loss.shape}, but there are {len(terms)} loss_terms"
-        raise InputError(path, problem, "run the fit again")
+    shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
+    shapes |= {"loss": "N L", "loss_terms": "L"}
+    arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, oldest=FORMAT_VERSION)
+    terms, loss = arrays.pop("loss_terms"), arrays.pop("loss")
     try:
-        losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
-        focal_px, crop_px = float(arrays["focal_px"]), int(arrays["crop_px"])
-        solution = Solution(**values, loss=losses, focal_px=focal_px, crop_px=crop_px)
+        if terms.dtype.kind != "U" or len(np.unique(terms)) < len(terms):
+            raise ValueError("loss_terms must be different names")
+        solution = Solution(**arrays, loss={str(term): loss[:, i] for i, term in enumerate(terms)})
     except ValueError as error:
         raise InputError(path, str(error), "run the fit again") from error
     bird = load_bird(folder / _MODEL)
     if (bird.joint_names, bird.keypoint_names) != (solution.joint_names, solution.keypoint_names):
         raise InputError(folder / _MODEL, f"is not the model of {_POSES}", "run the fit again")
+    if bird.num_shapes != solution.betas.shape[2]:
+        problem = f"has {bird.num_shapes} shape coefficients, but {_POSES} has {solution.betas.shape[2]}"
+        raise InputError(folder / _MODEL, problem, "run the fit again")
     return solution, bird

@@ -40,7 +40,10 @@ def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
     """Return the result of problem `i` of a batch."""
     pose, report = jax.tree.map(lambda x: x[i], (fitted.pose, fitted.report))
     loss = {name: float(value) for name, value in report.loss.items()}
-    return FittedWindow(pose, loss, report.keypoints_cam, report.keypoints_px, str(fitted.failure[i]))
+    failure = str(fitted.failure[i])
+    if not failure and not (pose.scale > 0).all():  # a solver may step across 0
+        failure = "the size of the bird is not above 0"
+    return FittedWindow(pose, loss, report.keypoints_cam, report.keypoints_px, failure)
 
 
 def collect_windows(

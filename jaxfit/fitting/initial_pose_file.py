@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfit.data.observations import Observations
-from jaxfit.data.solution import LAYOUT
+from jaxfit.data.solution import LAYOUT, check_poses
 from jaxfit.errors import InputError
 from jaxfit.fitting.windows import Windows
 from jaxfit.model.bird import Bird
@@ -23,6 +23,11 @@ __all__ = ["InitialPoses", "load_initial_poses"]
 
 _FIELDS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "crop")
 _LAYOUT = {name: LAYOUT[name] for name in ("track_id", "frame_index", *_FIELDS)}
+_REGRESSOR_LAYOUT = {
+    "init_pose": ("A J 3", np.float32),
+    "init_bone_length": ("A J-1", np.float32),
+    "init_translation": ("A 3", np.float32),
+}
 
 
 @dataclass(frozen=True)
@@ -119,15 +124,12 @@ def load_initial_poses(path: str | Path, observations: Observations, bird: Bird)
 
 
 def _from_result(path: str | Path, observations: Observations) -> InitialPoses:
-    content = load_npz(path, {name: len(shape.split()) for name, (shape, _) in _LAYOUT.items()})
+    content = load_npz(path, {name: shape for name, (shape, _) in _LAYOUT.items()})
     try:
         content = validate_arrays(content, _LAYOUT)
+        check_poses(content, np.asarray(np.isfinite(content["global_orient"]).all(axis=-1)))
     except ValueError as error:
         raise InputError(path, str(error), "use the poses.npz of a fit") from None
-    fitted = np.isfinite(content["global_orient"]).all(-1)
-    for name in _FIELDS:
-        if not np.isfinite(content[name][fitted]).all():
-            raise InputError(path, f"`{name}` holds NaN or infinite numbers", "use the poses.npz of a fit")
     rows = _positions(observations.track_id, content["track_id"])
     columns = _positions(observations.frame_index, content["frame_index"])
     missing = (rows < 0)[:, None] | (columns < 0)[None]
@@ -135,22 +137,25 @@ def _from_result(path: str | Path, observations: Observations) -> InitialPoses:
         raise InputError(path, "has no pose for any of these birds", "use initial poses of the same video")
     fields = {}
     for name in _FIELDS:
-        fields[name] = content[name][rows][:, columns]
+        fields[name] = content[name][np.ix_(rows, columns)]
         fields[name][missing] = np.nan
     return InitialPoses(str(path), **fields)
 
 
 def _from_regressor(path: str | Path, observations: Observations) -> InitialPoses:
-    content = load_npz(path, {"init_pose": 3, "init_bone_length": 2, "init_translation": 2})
-    pose, bone, transl = content["init_pose"], content["init_bone_length"], content["init_translation"]
+    content = load_npz(path, {name: shape for name, (shape, _) in _REGRESSOR_LAYOUT.items()})
+    try:
+        content = validate_arrays(content, _REGRESSOR_LAYOUT)
+    except ValueError as error:
+        raise InputError(path, str(error), "write one row for each annotation") from None
+    pose, bone, transl = content.values()
     rows = int(observations.present.sum())
-    if not len(pose) == len(bone) == len(transl) == rows:
-        names = "`init_pose`, `init_bone_length`, `init_translation`"
-        problem = f"has {len(pose)}, {len(bone)}, {len(transl)} rows in {names}"
+    if len(pose) != rows:
+        problem = f"has {len(pose)} rows in `init_pose`, `init_bone_length`, `init_translation`"
         raise InputError(path, problem, f"the observations have {rows} annotations")
-    if pose.shape[2] != 3 or transl.shape[1] != 3 or bone.shape[1] != pose.shape[1] - 1:
-        problem = f"`init_pose`, `init_bone_length`, `init_translation` are {pose.shape}, {bone.shape}, {transl.shape}"
-        raise InputError(path, problem, "expected (A, J, 3), (A, J−1), (A, 3)")
+    if bone.shape[1] != pose.shape[1] - 1:
+        problem = f"`init_pose` has {pose.shape[1]} joints, but `init_bone_length` has {bone.shape[1]} bones"
+        raise InputError(path, problem, "expected (A, J, 3) and (A, J−1)")
     if not all(np.isfinite(a).all() for a in (pose, bone, transl)):
         raise InputError(path, "holds NaN or infinite numbers", "write finite numbers for all annotations")
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
 from jaxfit.errors import InputError
+from jaxfit.limits import MODEL_FACES, MODEL_JOINTS, MODEL_KEYPOINTS, MODEL_SHAPES, MODEL_VERTICES
 from jaxfit.model.bird import Bird
 
 __all__ = ["ARRAY_FIELDS", "MAX_INFLUENCES", "check_bird"]
@@ -33,6 +35,8 @@ ARRAY_FIELDS = {
 """Array fields of `Bird` and their axes: V vertices, F faces, J joints, K keypoints, S shapes, B = J−1 bones,
 D = 3B angles."""
 
+_LIMITS = {"V": MODEL_VERTICES, "F": MODEL_FACES, "J": MODEL_JOINTS, "K": MODEL_KEYPOINTS, "S": MODEL_SHAPES}
+
 
 def check_bird(bird: Bird, source: object) -> Bird:
     """Return the bird unchanged, if all fields are valid and agree with each other.
@@ -58,6 +62,7 @@ class _Checker:
         self.check_shapes()
         for field in ("joint_names", "keypoint_names"):
             self.check_names(field)
+        self.require("name", self.bird.name.isprintable(), "cannot be printed")
         self.check_pairs("joint_pairs", len(self.bird.parents))
         self.check_pairs("keypoint_pairs", len(self.bird.keypoint_names))
         faces, last = self.arrays["faces"], len(self.arrays["vertices"]) - 1
@@ -88,6 +93,8 @@ class _Checker:
                 problem = f"shape {array.shape}, expected ({axes}) with {axis} = {expected}"
                 self.require(field, size == expected, problem)
                 self.require(field, size > 0 or axis == "S", f"shape {array.shape} has no entries")
+                most = _LIMITS.get(axis, size)
+                self.require(field, size <= most, f"shape {array.shape}, the limit is {axis} = {most:,}")
             kind = "iu" if field == "faces" else "f"
             self.require(field, array.dtype.kind in kind, f"has values of type {array.dtype}")
             self.require(field, np.isfinite(array).all(), "holds NaN or infinite numbers")
@@ -95,6 +102,7 @@ class _Checker:
     def check_tree(self) -> None:
         parents = self.bird.parents
         self.require("parents", len(parents) >= 2, "a bird needs a root and at least one more joint")
+        self.require("parents", len(parents) <= MODEL_JOINTS, f"{len(parents)} joints, the limit is {MODEL_JOINTS}")
         self.require("parents", parents[0] == -1, f"joint 0 must be the root, −1, not {parents[0]}")
         for joint, parent in enumerate(parents[1:], start=1):
             problem = f"the parent of joint {joint} must be one of 0…{joint - 1}, not {parent}"
@@ -105,11 +113,14 @@ class _Checker:
         count = len(self.bird.parents) if field == "joint_names" else len(self.arrays["keypoint_weights"])
         self.require(field, len(names) == count, f"{len(names)} names for {count}")
         self.require(field, all(names), "an empty name")
-        repeated = {name for name in names if list(names).count(name) > 1}
+        self.require(field, all(map(str.isprintable, names)), "a name that cannot be printed")
+        repeated = [name for name, uses in Counter(names).items() if uses > 1]
         self.require(field, not repeated, f"names used twice: {', '.join(sorted(repeated))}")
 
     def check_pairs(self, field: str, count: int) -> None:
-        used = [index for pair in getattr(self.bird, field) for index in pair]
+        pairs = getattr(self.bird, field)
+        self.require(field, len(pairs) <= count, f"{len(pairs)} pairs of {count}")
+        used = [index for pair in pairs for index in pair]
         self.require(field, all(0 <= index < count for index in used), f"an index outside 0…{count - 1}")
         self.require(field, len(used) == len(set(used)), "an index is in two pairs, or in one pair twice")
 

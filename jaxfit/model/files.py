@@ -10,11 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxfit.errors import InputError
+from jaxfit.limits import MODEL_BYTES
 from jaxfit.model.bird import Bird, neutral_colours, unlimited_joints
 from jaxfit.model.checks import ARRAY_FIELDS, check_bird
 from jaxfit.storage.files import write_whole
@@ -27,14 +30,14 @@ MURRE_PATH = Path(__file__).with_name("murre.npz")
 """The model file that comes with jaxfit; `jaxfit.model.murre.build` writes this file."""
 OPTIONAL_FIELDS = ("vertex_colours", "joint_limits")
 STATIC_FIELDS = {
-    "parents": 1,
-    "joint_names": 1,
-    "keypoint_names": 1,
-    "joint_pairs": 2,
-    "keypoint_pairs": 2,
-    "name": 0,
+    "parents": "J",
+    "joint_names": "J",
+    "keypoint_names": "K",
+    "joint_pairs": "joint_pairs 2",
+    "keypoint_pairs": "keypoint_pairs 2",
+    "name": "",
 }
-"""Fields of `Bird` that are not arrays, and the number of dimensions of their arrays in the file."""
+"""Fields of `Bird` that are not arrays, and the axes of their arrays in the file."""
 TEXT_FIELDS = ("joint_names", "keypoint_names", "name")
 
 
@@ -54,10 +57,10 @@ def save_bird(bird: Bird, path: Path | str, notes: Mapping[str, float] | None = 
     arrays: dict[str, np.ndarray] = {"format_version": np.asarray(FORMAT_VERSION, np.int32)}
     for field in ARRAY_FIELDS:
         arrays[field] = np.asarray(getattr(bird, field), np.int32 if field == "faces" else np.float32)
-    for field, dimensions in STATIC_FIELDS.items():
+    for field, axes in STATIC_FIELDS.items():
         value = getattr(bird, field)
         array = np.asarray(value, np.str_ if field in TEXT_FIELDS else np.int32)
-        arrays[field] = array.reshape(-1, 2) if dimensions == 2 else array
+        arrays[field] = array.reshape(-1, 2) if axes.endswith(" 2") else array
     arrays |= {name: np.asarray(value) for name, value in (notes or {}).items()}
     write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
 
@@ -76,24 +79,17 @@ def load_bird(path: Path | str) -> Bird:
             has a newer version; or a field is missing or has a wrong shape or wrong content.
     """
     path = Path(path)
-    content = load_npz(path, {}, FORMAT_VERSION)
-    dimensions = {field: len(axes.split()) for field, axes in ARRAY_FIELDS.items()} | STATIC_FIELDS
-    for field, ndim in dimensions.items():
-        if field in OPTIONAL_FIELDS and field not in content:
-            continue
-        if field not in content:
-            raise InputError(path, f"{field}: missing", "import the model again with `jaxfit model import`")
+    layout = ARRAY_FIELDS | STATIC_FIELDS
+    optional = {field: layout.pop(field) for field in OPTIONAL_FIELDS}
+    content = load_npz(path, layout, FORMAT_VERSION, optional=optional, most_bytes=MODEL_BYTES)
+    for field, array in content.items():
         kinds = "U" if field in TEXT_FIELDS else "f" if field in ARRAY_FIELDS and field != "faces" else "iu"
-        array = content[field]
-        if array.ndim != ndim or array.dtype.kind not in kinds:
+        if array.dtype.kind not in kinds:
             kind = {"U": "text", "f": "real numbers", "iu": "integers"}[kinds]
-            problem = f"{field}: {array.dtype} array of shape {array.shape}, expected {ndim} dimensions of {kind}"
+            problem = f"{field}: {array.dtype} array of shape {array.shape}, expected {kind}"
             raise InputError(path, problem, "write the file again with save_bird")
 
     def pairs(field: str) -> tuple[tuple[int, int], ...]:
-        if content[field].shape[1] != 2:
-            problem = f"{field}: shape {content[field].shape}, expected (pairs, 2)"
-            raise InputError(path, problem, "write the file again with save_bird")
         return tuple((int(left), int(right)) for left, right in content[field])
 
     def int32(array: np.ndarray) -> np.ndarray:
@@ -102,13 +98,13 @@ def load_bird(path: Path | str) -> Bird:
 
     # a number too large for float32 becomes infinite, and check_bird reports its field
     with np.errstate(over="ignore"):
-        arrays = {
-            field: jnp.asarray(int32(content[field]) if field == "faces" else content[field].astype(np.float32))
+        arrays: dict[str, Any] = {
+            field: int32(content[field]) if field == "faces" else content[field].astype(np.float32)
             for field in ARRAY_FIELDS
             if field in content
         }
-    arrays.setdefault("vertex_colours", jnp.asarray(neutral_colours(len(content["vertices"]))))
-    arrays.setdefault("joint_limits", jnp.asarray(unlimited_joints(max(len(content["parents"]) - 1, 0))))
+    arrays.setdefault("vertex_colours", neutral_colours(len(content["vertices"])))
+    arrays.setdefault("joint_limits", unlimited_joints(max(len(content["parents"]) - 1, 0)))
     bird = Bird(
         **arrays,
         parents=tuple(int(parent) for parent in content["parents"]),
@@ -118,7 +114,7 @@ def load_bird(path: Path | str) -> Bird:
         keypoint_pairs=pairs("keypoint_pairs"),
         name=str(content["name"]),
     )
-    return check_bird(bird, path)
+    return jax.tree.map(jnp.asarray, check_bird(bird, path))
 
 
 def load_murre() -> Bird:

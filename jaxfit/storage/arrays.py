@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["validate_arrays"]
+__all__ = ["check_shapes", "validate_arrays"]
 
 
 def validate_arrays(values: Mapping[str, Any], layout: Mapping[str, tuple[str, Any]]) -> dict[str, np.ndarray]:
@@ -25,24 +25,39 @@ def validate_arrays(values: Mapping[str, Any], layout: Mapping[str, tuple[str, A
         ValueError: an array has another type or shape. The message names the array, the expected layout and the
             actual one.
     """
-    sizes: dict[str, tuple[int, str]] = {}
-    arrays = {}
-    for name, (shape, dtype) in layout.items():
-        array, dtype = np.array(values[name]), np.dtype(dtype)
+    arrays = {name: np.asarray(values[name]) for name in layout}
+    for name, (_, expected) in layout.items():
+        array, dtype = arrays[name], np.dtype(expected)
         # NumPy gives an empty list the type float64, so the type of an empty array is not checked
         if array.size and array.dtype.kind not in {"f": "fiu", "i": "iu"}.get(dtype.kind, dtype.kind):
             raise ValueError(f"{name} must be of type {dtype.name}, not {array.dtype}")
-        words = shape.split()
-        if array.ndim != len(words):
-            raise ValueError(f"{name} must have shape ({', '.join(words)}), not {array.shape}")
-        for axis, (word, size) in enumerate(zip(words, array.shape, strict=True)):
+        if dtype.kind == "i" and array.dtype.kind == "u" and array.size and array.max() > np.iinfo(dtype).max:
+            raise ValueError(f"{name} must be of type {dtype.name}, but holds {array.max()}")
+    check_shapes({name: array.shape for name, array in arrays.items()}, {name: layout[name][0] for name in layout})
+    for name, (_, dtype) in layout.items():
+        dtype = arrays[name].dtype if np.dtype(dtype).kind == "U" else dtype
+        with np.errstate(over="ignore"):  # a number too large for the type becomes infinite
+            arrays[name] = arrays[name].astype(dtype)
+        arrays[name].flags.writeable = False
+    return arrays
+
+
+def check_shapes(shapes: Mapping[str, tuple[int, ...]], layout: Mapping[str, str]) -> None:
+    """Raise ValueError if shapes do not fit a layout; the message names the array and both shapes.
+
+    Args:
+        shapes: name → shape.
+        layout: name → sizes, as the shapes of `validate_arrays`.
+    """
+    sizes: dict[str, tuple[int, str]] = {}
+    for name, sizes_text in layout.items():
+        words, shape = sizes_text.split(), shapes[name]
+        if len(shape) != len(words):
+            raise ValueError(f"{name} must have shape ({', '.join(words)}), not {shape}")
+        for axis, (word, size) in enumerate(zip(words, shape, strict=True)):
             expected, origin = (int(word), "") if word.isdigit() else sizes.setdefault(word, (size, name))
             if size != expected:
                 why = f": {word} is {expected} in {origin}" if origin else ""
                 raise ValueError(
-                    f"{name} must have shape ({', '.join(words)}), not {array.shape}: "
-                    f"axis {axis} should be {expected}{why}"
+                    f"{name} must have shape ({', '.join(words)}), not {shape}: axis {axis} should be {expected}{why}"
                 )
-        arrays[name] = array if dtype.kind == "U" else array.astype(dtype)
-        arrays[name].flags.writeable = False
-    return arrays

@@ -21,6 +21,7 @@ from jaxfit.simulation.scene import LEDGE_DEPTH
 from jaxfit.simulation.viewpoint import Viewpoint, camera_axes
 from jaxfit.simulation.visibility import mesh_keypoints, render_visibility
 from jaxfit.storage.files import new_folder
+from jaxfit.storage.npy import load_npy
 from jaxfit.storage.npz import load_npz
 
 __all__ = ["FRAMES_PER_SCENE", "LabelledFrames", "film_scenes", "load_frames"]
@@ -31,8 +32,8 @@ FRAMES_PER_SCENE = 10
 FPS, EVERY = 12.0, 4
 """Every fourth frame at 12 frames/s: the frames of a scene are 1/3 s apart, so that postures differ."""
 _MARKER = "frames.npz"
-_LABELS = {"keypoints_px": 4, "visibility": 3, "pixels_per_unit": 1}
-"""The arrays of the labels, and their numbers of dimensions."""
+_LABELS = {"keypoints_px": "S N K 2", "visibility": "S N K", "pixels_per_unit": "S"}
+"""The arrays of the labels, and their shapes."""
 
 
 class LabelledFrames(NamedTuple):
@@ -95,8 +96,9 @@ def load_frames(folder: str | Path) -> LabelledFrames:
     folder = Path(folder)
     labels = load_npz(folder / _MARKER, _LABELS)
     points, visibility, scale = (labels[name] for name in _LABELS)
-    large = (np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("pictures", "owner"))
-    pictures, owner = large
+    sizes = f"{len(scale)} {HEIGHT} {WIDTH}"
+    pictures = load_npy(folder / "pictures.npy", f"{sizes} 3", mapped=True)
+    owner = load_npy(folder / "owner.npy", sizes, mapped=True)
     return LabelledFrames(pictures, owner, points, visibility, scale)
 
 

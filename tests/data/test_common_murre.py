@@ -194,7 +194,7 @@ def test_no_pickle_is_run(data_set, tmp_path):
     for content in (None, pickle.dumps(Evil())):
         if content:
             (folder / "annotations.npy").write_bytes(content)
-        with pytest.raises(InputError, match=r"is not an \.npy of plain arrays; jaxfit loads no pickles"):
+        with pytest.raises(InputError, match="jaxfit loads no pickles"):
             read_common_murre(folder)
     assert not (tmp_path / "ran").exists()
 

@@ -14,7 +14,7 @@ from jaxfit.errors import InputError
 from jaxfit.model.files import save_bird
 
 BIRD = replace(toy_bird(), joint_names=("körper", *toy_bird().joint_names[1:]))
-N, T, J, K, S = 2, 3, BIRD.num_joints, BIRD.num_keypoints, 0
+N, T, J, K, S = 2, 3, BIRD.num_joints, BIRD.num_keypoints, BIRD.num_shapes
 
 
 def make(**changes):
@@ -30,19 +30,19 @@ def make(**changes):
         "global_orient": some(3),
         "body_pose": some(J - 1, 3),
         "transl": some(3),
-        "scale": some(),
+        "scale": np.exp(some()),
         "bone_length": some(J - 1),
         "betas": some(S),
         "keypoints_cam": some(K, 3),
         "keypoints_px": some(K, 2),
-        "crop": some(3),
+        "crop": np.exp(some(3)),
         "image_size_px": rng.integers(1, 4000, (N, T, 2)),
         "focal_px": 2167.0,
         "crop_px": 256,
         "keypoint_names": BIRD.keypoint_names,
         "joint_names": BIRD.joint_names,
         "loss": {"keypoints": [1.5, math.nan], "mask": np.array([2.5, 3])},
-        "status": ["converged", "no usable frame"],
+        "status": ["ok", "no usable frame"],
     }
     return Solution(**values | changes)
 
@@ -61,8 +61,8 @@ def assert_same(a: Solution, b: Solution):
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"loss": {}}, {"betas": np.ones((N, T, 7))}, {"global_orient": np.full((N, T, 3), np.nan)}],
-    ids=["plain", "no terms", "shapes", "failed"],
+    [{}, {"loss": {}}, {"global_orient": np.full((N, T, 3), np.nan), "valid": np.zeros((N, T), bool)}],
+    ids=["plain", "no terms", "failed"],
 )
 def test_what_is_saved_is_loaded(tmp_path, changes):
     save_solution(make(**changes), BIRD, "a: 1\n", {}, tmp_path / "out")
@@ -146,7 +146,8 @@ def test_a_summary_that_is_no_json_writes_nothing(tmp_path):
         ({"status": ["ok"]}, "status must have shape .* N is 2"),
         ({"loss": {"mask": [1.0]}}, r"loss\[mask\] must have shape"),
         ({"focal_px": 0}, "focal_px must be above 0"),
-        ({"crop_px": 0}, "crop_px must be 1 or more"),
+        ({"crop_px": 0}, "crop_px must be in 1…16384, not 0"),
+        ({"crop_px": 2**40}, "crop_px must be in 1…16384"),
         ({"scale": np.ones((N, T), complex)}, "scale must be of type float32, not complex128"),
     ],
 )
@@ -168,14 +169,14 @@ def rewrite(folder, **changes):
         ({"format_version": np.array("one")}, "format_version is one"),
         ({"format_version": None}, "lacks the array format_version"),
         ({"betas": None}, "lacks the array betas"),
-        ({"scale": np.ones(4)}, r"scale has shape \(4,\), expected 2 dimensions"),
+        ({"scale": np.ones(4)}, r"scale must have shape \(N, T\), not \(4,\)"),
         ({"scale": np.ones((N, T + 1))}, "scale must have shape .* T is 3 in frame_index"),
-        ({"joint_names": np.array(["a"])}, "joint_names must be 8"),
+        ({"joint_names": np.array(["a"])}, r"joint_names must have shape \(J\)|joint_names must be 8"),
         ({"joint_names": np.arange(J)}, "joint_names must be of type str, not int64"),
-        ({"loss_terms": np.array(["a"])}, "loss has shape .* 1 loss_terms"),
-        ({"loss": np.ones((5, 2))}, "loss.* must have shape"),
-        ({"focal_px": np.array("x")}, "focal|float"),
-        ({"status": np.array([None, {}], dtype=object)}, "loads no .* Python objects"),
+        ({"loss_terms": np.array(["a"])}, "loss_terms must have shape .* L is 2 in loss"),
+        ({"loss": np.ones((5, 2))}, "loss must have shape .* N is 2"),
+        ({"focal_px": np.array("x")}, "focal_px must be of type float64"),
+        ({"status": np.array([None, {}], dtype=object)}, "status holds Python objects; jaxfit loads no pickles"),
     ],
 )
 def test_damaged_folders_are_refused_by_name(tmp_path, changes, message):
@@ -201,6 +202,9 @@ def test_a_model_that_is_not_the_poses_is_refused(tmp_path):
     save_solution(make(), BIRD, "", {}, tmp_path / "out")
     save_bird(toy_bird(), tmp_path / "out" / "model.npz")
     with pytest.raises(InputError, match=r"model\.npz: is not the model of poses\.npz"):
+        load_solution(tmp_path / "out")
+    save_bird(replace(toy_bird(1), joint_names=BIRD.joint_names), tmp_path / "out" / "model.npz")
+    with pytest.raises(InputError, match=r"has 1 shape coefficients, but poses\.npz has 2"):
         load_solution(tmp_path / "out")
     (tmp_path / "out" / "model.npz").unlink()
     with pytest.raises(InputError, match=r"model\.npz"):

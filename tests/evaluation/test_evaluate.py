@@ -124,7 +124,7 @@ def test_pictures_of_another_size():
     larger = dataclasses.replace(truth(), image_size_px=np.full((T, 2), [640, 400]), masks={})
     with pytest.raises(InputError, match=r"truth: has track 5, frame 10 in an image of 640×400 pixels, but .* 320×280"):
         evaluate(solution(), BIRD, larger)
-    sizes = np.zeros((N, T, 2), int)
+    sizes = np.full((N, T, 2), 7)
     sizes[1] = WIDTH, HEIGHT
     one = truth().select(tracks=[1])
     assert evaluate(solution(image_size_px=sizes), BIRD, one).frames == T  # of matched birds alone

@@ -20,7 +20,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.storage.npz import load_npy
+from jaxfit.storage.npy import load_npy
 from jaxfit.video.reader import image_files, read_frames
 
 __all__ = ["ANNOTATIONS", "IMAGES", "LICENSE", "NUM_KEYPOINTS", "CommonMurre", "generic_names", "read_common_murre"]
