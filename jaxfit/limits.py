@@ -89,6 +89,8 @@ OBSERVATIONS_BYTES = 2_000_000_000
 """Largest COCO file."""
 TEXT_CHARACTERS = 4096
 """Longest name in a COCO file or a scene; tables of names take the length of the longest name for every frame."""
+MURRE_BYTES = 2**26
+"""Largest array of annotations of the data set common_murre_temporal; the published array has 336,000 bytes."""
 TABLE_GB = 2.0
 """Largest memory of the tables of a file, by estimate: tables have a cell for every track in every frame."""
 

@@ -113,7 +113,7 @@ def test_damaged_files(tmp_path):
     """Any damage of a valid file ends in observations or in InputError, within a bound on memory and time."""
     path = tmp_path / "birds.json"
     trees = damaged_tree(VALID).map(lambda tree: json.dumps(tree).encode())
-    with Isolated("support.hostile_calls:read_coco_and_masks") as reader:
+    with Isolated("support.hostile_data:read_and_write_coco") as reader:
 
         @many_examples
         @given(st.one_of(damaged_bytes(BYTES), trees))
