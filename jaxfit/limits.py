@@ -45,8 +45,14 @@ BLUR = 10.0
 """Largest blur of a silhouette; the time of a silhouette grows with the square of the blur."""
 CONFIG_NUMBER = 1e30
 """Largest weight, setting or factor of a config; a product with a step size must not overflow."""
-TURNS, DIRECTIONS, CANDIDATES, ORIENTATIONS = 3600, 10_000, 1000, 100_000
-"""Largest numbers of the search for initial poses; orientations are turns × directions."""
+TURNS = 3600
+"""Largest number of rotations about the viewing axis in the search for initial poses."""
+DIRECTIONS = 10_000
+"""Largest number of viewing directions in the search for initial poses."""
+ORIENTATIONS = 100_000
+"""Largest number of turns × directions."""
+CANDIDATES = 1000
+"""Largest number of candidates per frame in the search for initial poses."""
 SMOOTHNESS = 1e12
 """Largest cost of a rotation in the search for initial poses."""
 HYPOTHESES = 100
@@ -129,6 +135,18 @@ INSTANCES = 1000
 """Most instances of a frame."""
 MASK_AREA = 50
 """Most area of all boxes of a frame's instances, as a multiple of the frame."""
+JSON_VALUES = 50_000_000
+"""Largest number of values in a JSON file; a value takes up to 72 bytes of memory."""
+
+# --- observations and truths
+OBSERVATIONS_BYTES = 2_000_000_000
+"""Largest COCO file."""
+TEXT_CHARACTERS = 4096
+"""Longest name in a COCO file or a scene; tables of names take the length of the longest name for every frame."""
+MURRE_BYTES = 2**26
+"""Largest array of annotations of the data set common_murre_temporal; the published array has 336,000 bytes."""
+TABLE_GB = 2.0
+"""Largest memory of the tables of a file, by estimate: tables have a cell for every track in every frame."""
 
 # --- arrays (.npz and .npy files)
 NPZ_BYTES = 2**30

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ def read_truth(path: str | Path) -> Truth:
         InputError: the file does not exist, the folder holds no truth, or a file cannot be read.
     """
     path = Path(path)
-    if not path.is_dir():
+    if not os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises for names that are too long)
         return Truth(read_coco(path), source=path)
     if not (path / TRUTH).is_file():
         remedy = "give a COCO file of annotations, or the folder of a simulated scene"
@@ -84,7 +85,8 @@ def read_behaviours(path: str | Path) -> dict[int, list[tuple[int, str]]] | None
     for track, entries in read_json(path / MARKER)["behaviour"].entries():
         pairs = [(entry["from_frame"].integer(0), entry["behaviour"].text()) for entry in entries]
         starts = [start for start, _ in pairs]
-        if not track.isdecimal() or starts[:1] != [0] or starts != sorted(set(starts)):
+        number = track.isascii() and track.isdecimal() and len(track) < 19 and str(int(track)) == track
+        if not number or starts[:1] != [0] or starts != sorted(set(starts)):
             entries.fail("must be the behaviours of a track id, with from_frame increasing from 0")
         behaviours[int(track)] = pairs
     return behaviours

@@ -23,19 +23,23 @@ from jaxfit.model.pose import Pose
 from jaxfit.objective.posed_window import Targets
 from jaxfit.progress import ReportProgress
 
-__all__ = ["Batch", "Fitted", "fit_batch", "frames_per_batch"]
+__all__ = ["Batch", "Fitted", "bytes_per_frame", "fit_batch", "frames_per_batch"]
 
 SECONDS_PER_CALL = 1.0
 """Target duration of some steps of all tiles. After these steps, progress is reported."""
 
 
-def frames_per_batch(bird: Bird, config: FitConfig) -> int:
-    """Return the number of frames that fit into `config.memory_gb`.
+def bytes_per_frame(bird: Bird, config: FitConfig) -> int:
+    """Return an estimate of the memory of one frame of one bird, in bytes.
 
     A frame needs memory for about ten arrays of the mesh's size and two arrays of the silhouette's size.
     """
-    per_frame = 10 * 12 * bird.vertices.shape[0] + 2 * config.crop.size_px**2 + 100_000
-    return max(int(config.memory_gb * 1e9 / per_frame), 1)
+    return 10 * 12 * bird.vertices.shape[0] + 2 * config.crop.size_px**2 + 100_000
+
+
+def frames_per_batch(bird: Bird, config: FitConfig) -> int:
+    """Return the number of frames that fit into `config.memory_gb`."""
+    return max(int(config.memory_gb * 1e9 / bytes_per_frame(bird, config)), 1)
 
 
 class Batch(NamedTuple):

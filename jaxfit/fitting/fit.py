@@ -26,6 +26,7 @@ from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.distant import distant_birds, report_distant_birds
 from jaxfit.fitting.initial_pose_file import InitialPoses
 from jaxfit.fitting.initial_pose_search import search_initial_poses
+from jaxfit.fitting.memory import check_fit_memory
 from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask
 from jaxfit.fitting.windows import Windows, cut_windows, load_targets, windows_key
 from jaxfit.model.bird import Bird
@@ -60,7 +61,7 @@ def fit(
 
     Raises:
         InputError: no bird, other keypoints than the model's, no track with a usable frame, unusable crop settings, an
-            unusable term, or initial poses that do not match the windows.
+            unusable term, initial poses that do not match the windows, or a fit that needs too much memory.
     """
     return fit_runs(observations, bird, [config], initial_poses, progress, source)[0]
 
@@ -91,6 +92,7 @@ def fit_runs(
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
+    check_fit_memory(observations, bird, configs, source)
     model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
     check_terms(configs[0], model)
     runs = _cut_runs(observations, configs, initial_poses, source)

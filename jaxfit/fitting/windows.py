@@ -13,14 +13,19 @@ from jaxfit.config.fit import FitConfig
 from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.masks import decode_mask
 from jaxfit.data.observations import Observations
+from jaxfit.data.tables import check_memory
 from jaxfit.errors import InputError
 from jaxfit.fitting.crops import crop_squares, cut_mask
 from jaxfit.fitting.distant import without_distant_birds
 from jaxfit.fitting.filtering import weighted_median_filter
+from jaxfit.limits import TABLE_GB
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets
 
 __all__ = ["Windows", "cut_windows", "filter_observations", "load_targets", "windows_key"]
+
+FILTER_BYTES = 500_000_000
+"""Memory for the birds that are filtered at once."""
 
 
 @dataclass(frozen=True)
@@ -67,20 +72,21 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     observations = filter_observations(without_distant_birds(observations), config.filter_window)
     usable = observations.usable(config.min_keypoints)
     line = _timeline(observations)
-    tracks, frames = [], []
+    starts: list[tuple[int, int, int]] = []  # track, first and last position in the line
     for n in range(observations.num_tracks):
         at = np.flatnonzero((line >= 0) & usable[n, np.maximum(line, 0)])
         if len(at) == 0:
             continue
         # only windows with a usable frame
-        for first in at[0] + np.unique((at - at[0]) // config.window) * config.window:
-            window = np.full(config.window, -1)
-            piece = line[first : min(first + config.window, at[-1] + 1)]
-            window[: len(piece)] = piece
-            tracks.append(n)
-            frames.append(window)
-    track = np.array(tracks, int)
-    frame = np.array(frames, int).reshape(len(tracks), config.window)
+        starts += [(n, int(at[0]) + w * config.window, int(at[-1])) for w in np.unique((at - at[0]) // config.window)]
+    needed = len(starts) * config.window * (80 + 60 * observations.num_keypoints)
+    what = f"the arrays of {len(starts):,} windows of {config.window:,} frames"
+    check_memory("observations", what, needed, "lower `window` in the config", max(TABLE_GB, config.memory_gb))
+    track = np.array([n for n, _, _ in starts], int)
+    frame = np.full((len(starts), config.window), -1)
+    for w, (_, first, last) in enumerate(starts):
+        piece = line[first : min(first + config.window, last + 1)]
+        frame[w, : len(piece)] = piece
     rows, columns = track[:, None], np.maximum(frame, 0)
     present = (frame >= 0) & usable[rows, columns]
     crop = crop_squares(observations, track, frame, present, config.crop)
@@ -108,10 +114,17 @@ def filter_observations(observations: Observations, window: int) -> Observations
     line = _timeline(observations)
     at = np.maximum(line, 0)
     known = line >= 0
-    confidence = np.where(known[None, :, None], observations.confidence[:, at], 0)
+    bird_bytes = 40 * len(line) * window * observations.num_keypoints
+    what = f"the windows of the filter over {len(line):,} frame numbers"
+    check_memory("observations", what, bird_bytes, "lower `filter_window`, or number the frames consecutively")
+    at_once = max(int(FILTER_BYTES / max(bird_bytes, 1)), 1)
     smooth = jax.vmap(weighted_median_filter, (0, 0, None))
-    filtered = np.asarray(smooth(observations.keypoints_px[:, at], confidence, window))
-    return observations.with_keypoints(filtered[:, known], observations.confidence)
+    filtered = np.empty_like(observations.keypoints_px)
+    for first in range(0, observations.num_tracks, at_once):
+        some = slice(first, first + at_once)
+        confidence = np.where(known[None, :, None], observations.confidence[some, at], 0)
+        filtered[some] = np.asarray(smooth(observations.keypoints_px[some, at], confidence, window))[:, known]
+    return observations.with_keypoints(filtered, observations.confidence)
 
 
 def load_targets(windows: Windows, mask_px: int) -> Targets:

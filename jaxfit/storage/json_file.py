@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from jaxfit.errors import InputError
-from jaxfit.limits import JSON_LEVELS
+from jaxfit.limits import JSON_LEVELS, JSON_VALUES
 from jaxfit.storage.text_file import read_text
 
 __all__ = ["parse_json", "read_json_file"]
@@ -37,12 +39,17 @@ def parse_json(text: str, source: object) -> Any:
 
     Raises:
         InputError: the text is empty, is not JSON (the message names line and column), has more than `JSON_LEVELS`
-            levels, or holds a whole number that Python refuses to read (more than 4,300 digits).
+            levels or `JSON_VALUES` values, holds a whole number that Python refuses to read (more than 4,300 digits),
+            or an object that holds a key twice.
     """
     if not text.strip():
         raise InputError(source, "is empty", "write it again")
+    # every value but the first follows one of these characters
+    values = sum(map(text.count, ",[{"))
+    if values > JSON_VALUES:
+        raise InputError(source, f"holds about {values:,} values, more than {JSON_VALUES:,}", "split the file")
     try:
-        content = json.loads(text)
+        content = json.loads(text, object_pairs_hook=partial(_object, source))
     except json.JSONDecodeError as error:
         # a truncated file has its error at its end, or at the string or list that is not closed
         cut = text.lstrip().startswith(("{", "[")) and not text.rstrip().endswith(("}", "]"))
@@ -51,6 +58,8 @@ def parse_json(text: str, source: object) -> Any:
         raise InputError(source, problem, remedy) from None
     except RecursionError:
         raise _too_deep(source) from None
+    except InputError:
+        raise
     except ValueError:
         raise InputError(source, "holds a number of too many digits", "write it again") from None
     level = [content] if isinstance(content, dict | list) else []
@@ -60,6 +69,14 @@ def parse_json(text: str, source: object) -> Any:
         if not level:
             return content
     raise _too_deep(source)
+
+
+def _object(source: object, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise InputError(source, f'holds the key "{twice}" twice in one object', "remove one of the two")
+    return content
 
 
 def _too_deep(source: object) -> InputError:

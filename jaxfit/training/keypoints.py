@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS, other_side
 from jaxfit.perception.instances import Instance, instance_of
 from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX, crop_bird
@@ -39,6 +40,8 @@ OCCLUDED_WEIGHT, ABSENT_WEIGHT = 0.5, 0.3
 """Weights in the loss of occluded keypoints and of keypoints outside the crop; visible keypoints have weight 1."""
 MIN_VISIBLE = 4
 """Least number of visible keypoints of a bird in the training data."""
+MOST_DRAWS = 1000
+"""Largest number of draws of a frame without a usable bird, so that damaged frames do not block the training."""
 _OTHER_SIDE = [MURRE_KEYPOINTS.index(other_side(name)) for name in MURRE_KEYPOINTS]
 
 
@@ -82,8 +85,12 @@ class KeypointMaps(nn.Module):
 
 
 def draw_sample(rng: np.random.Generator, frames: LabelledFrames) -> KeypointSample:
-    """Draw a random bird of a random frame, with random rotation, mirroring, appearance and errors of the mask."""
-    while True:
+    """Draw a random bird of a random frame, with random rotation, mirroring, appearance and errors of the mask.
+
+    Raises:
+        InputError: none of many frames shows a bird.
+    """
+    for _ in range(MOST_DRAWS):
         s = int(rng.integers(len(frames.pictures)))
         birds = np.flatnonzero((frames.visibility[s] == 2).sum(-1) >= MIN_VISIBLE)
         if not len(birds):
@@ -91,6 +98,7 @@ def draw_sample(rng: np.random.Generator, frames: LabelledFrames) -> KeypointSam
         patch = _augmented_patch(rng, frames, s, int(rng.choice(birds)))
         if patch is not None:
             return _crop_sample(rng, *patch)
+    raise InputError("frames", f"show no bird in {MOST_DRAWS} draws", "film the frames again")
 
 
 def _augmented_patch(

@@ -12,6 +12,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.lib.format import open_memmap
 
+from jaxfit.data.formats.fields import LARGEST_POSITION_PX
+from jaxfit.errors import InputError
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.model.files import load_murre
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.simulation.flock import simulate_flock
@@ -91,7 +94,7 @@ def load_frames(folder: str | Path) -> LabelledFrames:
     """Load the frames that `film_scenes` wrote.
 
     Raises:
-        InputError: the labels cannot be read, or an earlier version wrote them.
+        InputError: the frames cannot be read, an earlier version wrote them, or the labels hold impossible values.
     """
     folder = Path(folder)
     labels = load_npz(folder / _MARKER, _LABELS)
@@ -99,7 +102,26 @@ def load_frames(folder: str | Path) -> LabelledFrames:
     sizes = f"{len(scale)} {HEIGHT} {WIDTH}"
     pictures = load_npy(folder / "pictures.npy", f"{sizes} 3", mapped=True)
     owner = load_npy(folder / "owner.npy", sizes, mapped=True)
-    return LabelledFrames(pictures, owner, points, visibility, scale)
+    frames = LabelledFrames(pictures, owner, points, visibility, scale)
+    _check_labels(frames, folder)
+    return frames
+
+
+def _check_labels(frames: LabelledFrames, folder: Path) -> None:
+    integers = all(array.dtype == np.uint8 for array in (frames.pictures, frames.owner, frames.visibility))
+    numbers = all(array.dtype == np.float32 for array in (frames.keypoints_px, frames.pixels_per_unit))
+    valid = {
+        "type of numbers": integers and numbers,
+        "number of keypoints": frames.visibility.shape[2] == len(MURRE_KEYPOINTS),
+        "number of birds": frames.visibility.shape[1] <= MAX_BIRDS,
+        "number of frames": len(frames.pictures) > 0,
+        "position of a keypoint": bool((np.abs(frames.keypoints_px) <= LARGEST_POSITION_PX).all()),
+        "visibility": bool((frames.visibility <= 2).all()),
+        "scale": bool(((frames.pixels_per_unit > 0.01) & (frames.pixels_per_unit < 1e4)).all()),
+    }
+    for name, holds in valid.items():
+        if not holds:
+            raise InputError(folder, f"holds frames with a wrong {name}", "remove the folder, to film the frames again")
 
 
 def _film_scene(seed: int) -> LabelledFrames:

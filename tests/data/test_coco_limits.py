@@ -1,11 +1,18 @@
 """COCO json: files that would take much time or memory are rejected at once, with the figure and a remedy."""
 
+import json
+import os
+
 import pytest
-from support.coco_files import content, saved
+from hypothesis import given
+from hypothesis import strategies as st
+from support.coco_files import annotation, content, saved
+from support.hostile import Isolated, many_examples
+from support.mutations import damaged_bytes, damaged_tree
 
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.errors import InputError
-from jaxfit.limits import IMAGE_SIDE_PX, POLYGON_LENGTH_PX, POLYGONS
+from jaxfit.limits import IMAGE_SIDE_PX, KEYPOINTS, POLYGON_LENGTH_PX, POLYGONS
 
 
 def rejected(tmp_path, data, message):
@@ -42,3 +49,77 @@ def test_the_number_of_runs_is_bounded(tmp_path):
     rejected(tmp_path, data, "counts has 603 runs, more than the 600 pixels")
     data["annotations"][3]["segmentation"]["counts"] = [0, 600, 0]
     assert read_coco(saved(tmp_path, data)).mask(0, 0).all()
+
+
+def tracks_and_frames(tracks, frames, keypoints=18):
+    """Return tracks of one box each over many frames."""
+    data = content()
+    data["categories"][0]["keypoints"] = [f"k{k}" for k in range(keypoints)]
+    data["images"] = [{"id": t, "width": 30, "height": 20, "file_name": "a", "frame_index": t} for t in range(frames)]
+    plain = annotation(1, 0, 0, keypoints=[1, 1, 2] * keypoints, segmentation=None)
+    data["annotations"] = [plain | {"image_id": n % frames, "track_id": n} for n in range(tracks)]
+    return data
+
+
+def test_tables_are_rejected_by_estimate(tmp_path):
+    message = "annotations of 3,600 tracks over 3,600 frames with 18 keypoints need 11.0 GB, more than 2 GB .*split"
+    rejected(tmp_path, tracks_and_frames(3600, 3600), message)
+    rejected(tmp_path, tracks_and_frames(300, 300, 999), "need 4.0 GB")
+    assert read_coco(saved(tmp_path, tracks_and_frames(100, 100))).num_tracks == 100
+
+
+def test_names_are_bounded(tmp_path):
+    """An array of names takes the length of the longest name for every frame."""
+    data = content()
+    data["images"][0]["file_name"] = "x" * 5000
+    rejected(tmp_path, data, r"images\[0\].file_name has 5,000 characters, more than 4,096")
+    for name in ("a\0", "a\ud800"):
+        data["images"][0]["file_name"] = name
+        rejected(tmp_path, data, r"images\[0\].file_name holds a character that is no text")
+    data = tracks_and_frames(2, 50_000, 3)
+    data["images"][0]["file_name"] = "x" * 4000
+    rejected(tmp_path, data, "annotations of 2 tracks over 50,000 frames with 3 keypoints need 2.4 GB")
+    names = [f"k{k}" for k in range(KEYPOINTS + 1)]
+    data = content()
+    data["categories"][0]["keypoints"] = names
+    rejected(tmp_path, data, "keypoints holds 1001 names, more than 1000")
+
+
+def test_a_key_that_occurs_twice(tmp_path):
+    text = json.dumps(content())
+    rejected(tmp_path, text[:-1] + ', "images": []}', 'holds the key "images" twice')
+
+
+def test_what_is_no_regular_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe.json")
+    (tmp_path / "loop.json").symlink_to(tmp_path / "loop.json")
+    for path in (
+        tmp_path / "pipe.json",
+        tmp_path / "loop.json",
+        "/dev/zero",
+        tmp_path / ("a" * 300),
+        tmp_path / "a\0b",
+    ):
+        with pytest.raises(InputError) as caught:
+            read_coco(path)
+        assert str(caught.value).isprintable()
+
+
+VALID = content()
+BYTES = json.dumps(VALID).encode()
+
+
+def test_damaged_files(tmp_path):
+    """Any damage of a valid file ends in observations or in InputError, within a bound on memory and time."""
+    path = tmp_path / "birds.json"
+    trees = damaged_tree(VALID).map(lambda tree: json.dumps(tree).encode())
+    with Isolated("support.hostile_data:read_and_write_coco") as reader:
+
+        @many_examples
+        @given(st.one_of(damaged_bytes(BYTES), trees))
+        def check(damaged):
+            path.write_bytes(damaged)
+            outcome = reader(path)
+            assert outcome.acceptable, outcome
+
+        check()

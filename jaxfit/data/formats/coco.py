@@ -46,14 +46,13 @@ from jaxfit.data.formats.coco_records import (
 from jaxfit.data.formats.fields import Field, read_json
 from jaxfit.data.formats.rle import run_lengths
 from jaxfit.data.observations import Observations, check_keypoints, reorder_keypoints
+from jaxfit.data.tables import check_memory, observations_bytes
 from jaxfit.data.track_quality import track_quality
 from jaxfit.storage.files import write_whole
 
 __all__ = ["check_keypoints", "read_coco", "reorder_keypoints", "write_coco"]
 
 _log = logging.getLogger(__name__)
-
-_LARGEST_TABLE = 2**28  # entries of (N, T, K): a GiB of float32
 
 
 def read_coco(path: str | Path) -> Observations:
@@ -99,9 +98,12 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
     frames = sorted(first_image)
     tracks = sorted({annotation.track_id for annotation in found})
     N, T, K = len(tracks), len(frames), len(categories.names)
-    if N * T * K > _LARGEST_TABLE:
-        problem = f"hold {N} tracks over {T} frames, too many for one table"
-        root["annotations"].fail(problem, "split the file; for photographs, give every image frame_index 0")
+    check_memory(
+        root.source,
+        f"annotations of {N:,} tracks over {T:,} frames with {K} keypoints",
+        observations_bytes(N, T, K, max(len(image.file_name) for image in images)),
+        "split the file; for photographs, give every image frame_index 0",
+    )
     row = {track: n for n, track in enumerate(tracks)}
     column = {frame: t for t, frame in enumerate(frames)}
 

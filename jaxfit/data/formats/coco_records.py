@@ -10,10 +10,10 @@ import numpy as np
 
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.rle import read_segmentation
+from jaxfit.limits import IMAGE_SIDE_PX, KEYPOINTS
 
 __all__ = ["Annotation", "Categories", "Image", "read_annotation", "read_categories", "read_images"]
 
-_LARGEST_SIDE_PX = 16384  # the run lengths of larger masks overflow the buffers of pycocotools
 _TRACK_REMEDY = "give every annotation the track_id of its bird; for photographs, a unique number"
 _FRAME_REMEDY = "give every image the number of its frame in the video; for photographs, 0"
 
@@ -65,8 +65,8 @@ def read_images(images: Field) -> dict[int | str, Image]:
         where[name] = f"{image.path}.id"
         found[name] = Image(
             frame_index=image["frame_index"].integer(0),
-            width=image["width"].integer(1, _LARGEST_SIDE_PX),
-            height=image["height"].integer(1, _LARGEST_SIDE_PX),
+            width=image["width"].integer(1, IMAGE_SIDE_PX),
+            height=image["height"].integer(1, IMAGE_SIDE_PX),
             file_name=image["file_name"].text(),
         )
     if not found:
@@ -101,6 +101,10 @@ def read_categories(categories: Field) -> Categories:
         name = category["id"].identifier()
         if name in birds | others:
             category["id"].fail(f"is {name!r} for the second time", "give every category an id of its own")
+        if category.has("keypoints") and len(category["keypoints"]) > KEYPOINTS:
+            category["keypoints"].fail(
+                f"holds {len(category['keypoints'])} names, more than {KEYPOINTS}", "remove names"
+            )
         its_names = tuple(k.text() for k in category["keypoints"]) if category.has("keypoints") else ()
         if len(set(its_names)) < len(its_names):
             category["keypoints"].fail("holds a name twice", "give every keypoint a name of its own")

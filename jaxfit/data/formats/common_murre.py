@@ -16,8 +16,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit.data.boxes import box_of_keypoints
+from jaxfit.data.formats.fields import LARGEST_POSITION_PX
 from jaxfit.data.observations import Observations
+from jaxfit.data.tables import check_memory
 from jaxfit.errors import InputError
+from jaxfit.limits import MURRE_BYTES
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.npy import load_npy
@@ -66,12 +69,14 @@ def read_common_murre(
     folder = Path(folder)
     source = folder / ANNOTATIONS
     names = _names(keypoint_names)
-    array = load_npy(source)
+    array = load_npy(source, most_bytes=MURRE_BYTES)
     if array.dtype.kind not in "fiu":
         raise InputError(source, f"holds {array.dtype}, not numbers", "save it as an array of float64")
     files, (width, height) = _images(folder / IMAGES, progress)
     readings = {}
-    table, readings["axes"] = _birds_first(array.astype(np.float64), len(files), source)
+    array, readings["axes"] = _birds_first(array, len(files), source)
+    check_memory(source, "the annotations", 100 * array.size, "give the published file")
+    table = array.astype(np.float64)
     confidence, readings["third number"] = _confidence(table[..., 2], source)
     known, readings["missing"] = _known(table[..., :2], confidence, source)
     points, readings["position"] = _pixels(np.where(known[..., None], table[..., :2], 0), known, width, height, source)
@@ -123,7 +128,7 @@ def _images(folder: Path, progress: ProgressTask) -> tuple[list[Path], tuple[int
     return files, reader.info.size_px
 
 
-def _birds_first(array: np.ndarray, frames: int, source: Path) -> tuple[Float[np.ndarray, "N T 20 3"], str]:
+def _birds_first(array: np.ndarray, frames: int, source: Path) -> tuple[np.ndarray, str]:
     if array.ndim != 4 or array.shape[2:] != (NUM_KEYPOINTS, 3) or not array.size:
         expected = f"(frames, birds, {NUM_KEYPOINTS} keypoints, 3) or (birds, frames, {NUM_KEYPOINTS} keypoints, 3)"
         raise InputError(source, f"has shape {array.shape}, expected {expected}", _REMEDY)
@@ -174,6 +179,8 @@ def _known(
     known = np.asarray(~absent & (confidence > 0))
     if not known.any():
         raise InputError(source, "holds no keypoint with a position", _REMEDY)
+    if np.abs(position[known]).max() > LARGEST_POSITION_PX:
+        raise InputError(source, f"holds a position of {np.abs(position[known]).max():.3g}, which is no pixel", _REMEDY)
     flagged, placed = int((confidence == 0).sum()), int((~absent & (confidence == 0)).sum())
     unplaced = int((absent & (confidence > 0)).sum())
     answer = f"{int((~known).sum())} of {known.size}: third number 0 ({flagged}, {placed} of them with a position)"

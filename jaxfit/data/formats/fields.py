@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-import json
 import math
+import re
+import reprlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
 from jaxfit.errors import InputError
+from jaxfit.limits import OBSERVATIONS_BYTES, TEXT_CHARACTERS
+from jaxfit.storage.json_file import read_json_file
 
 __all__ = ["Field", "read_json"]
 
+_SURROGATE = re.compile("[\ud800-\udfff]")  # half of a character, which UTF-8 cannot represent
 LARGEST_POSITION_PX = 1e6
 """Largest absolute image position; greater numbers overflow or have a wrong unit."""
 
 
 def _shown(value: Any) -> str:
-    text = value if isinstance(value, str) else repr(value)
+    text = value if isinstance(value, str) else reprlib.repr(value) if isinstance(value, list | dict) else repr(value)
     text = f'"{text}"' if isinstance(value, str) else text
     return text if len(text) <= 40 else text[:37] + "..."
 
@@ -71,9 +75,18 @@ class Field:
         for i, value in enumerate(self._expect(list, "a list")):
             yield Field(self.source, f"{self.path}[{i}]", value)
 
+    def __len__(self) -> int:
+        """Return the number of entries of a list."""
+        return len(self._expect(list, "a list"))
+
     def text(self) -> str:
-        """Return the value as text."""
-        return self._expect(str, "text")
+        """Return the value as text that files and terminals can hold."""
+        text = self._expect(str, "text")
+        if len(text) > TEXT_CHARACTERS:
+            self.fail(f"has {len(text):,} characters, more than {TEXT_CHARACTERS:,}", "shorten the text")
+        if "\0" in text or _SURROGATE.search(text):
+            self.fail(f"holds a character that is no text ({_shown(text)})", "write plain text")
+        return text
 
     def integer(self, lowest: int = -(2**62), highest: int = 2**62) -> int:
         """Return the value as a whole number within bounds; 3.0 counts as 3."""
@@ -125,29 +138,6 @@ def read_json(path: Path) -> Field:
     """Return the content of a JSON file.
 
     Raises:
-        InputError: the file does not exist, is not UTF-8 text, or is not JSON (with line and column).
+        InputError: as `read_json_file`, with at most `limits.OBSERVATIONS_BYTES`.
     """
-    try:
-        text = path.read_bytes().decode("utf-8-sig")  # some editors write a byte order mark
-    except FileNotFoundError as error:
-        raise InputError(path, "does not exist", "check the path") from error
-    except IsADirectoryError as error:
-        raise InputError(path, "is a folder, not a JSON file", "give the file inside it") from error
-    except UnicodeDecodeError as error:
-        problem = f"is not UTF-8 text (byte {error.start})"
-        raise InputError(path, problem, "give a JSON file, saved as UTF-8") from error
-    except (OSError, ValueError) as error:
-        raise InputError(path, f"cannot be read: {error}", "check the path and its permissions") from error
-    if not text.strip():
-        raise InputError(path, "is empty", "write it again")
-    try:
-        return Field(path, "", json.loads(text))
-    except json.JSONDecodeError as error:
-        # a truncated file has its error at its end, or at the string or list that is not closed
-        cut = text.lstrip().startswith(("{", "[")) and not text.rstrip().endswith(("}", "]"))
-        remedy = "the file ends midway: copy or write it again" if cut else "correct the file or write it again"
-        problem = f"is not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
-        raise InputError(path, problem, remedy) from error
-    except (RecursionError, ValueError) as error:  # too many levels, or too many digits
-        problem = "is not usable JSON: nested too deeply or with a number of too many digits"
-        raise InputError(path, problem, "write it again") from error
+    return Field(path, "", read_json_file(path, OBSERVATIONS_BYTES))
