@@ -33,11 +33,20 @@ _REMEDIES = {
     errno.EBUSY: "it is a mount point or in use: choose a folder inside it",
     errno.EIO: "check the disk or choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ELOOP: "choose a path without cyclic links",
     errno.ENOENT: "choose another place",
     errno.ENOTDIR: "a part of its path is a file: choose another place",
     errno.EEXIST: "a part of its path is a file: choose another place",
     errno.ENOTEMPTY: "another program has written there in the meantime: choose another place",
 }
+
+
+def _resolved(path: str | Path) -> Path:
+    """Follow the symbolic links of a path. `Path.resolve` raises other errors for cyclic links."""
+    resolved = Path(os.path.realpath(path))
+    if resolved.is_symlink():
+        raise InputError(path, "is a symbolic link that leads back to itself", "choose another name")
+    return resolved
 
 
 @contextmanager
@@ -122,7 +131,7 @@ def new_file(path: str | Path) -> Iterator[Path]:
         InputError: ``path`` is a folder or a device, or the system rejects the write (disk full, quota,
             read-only, permissions).
     """
-    path = Path(path).resolve()  # a symbolic link stays a link, and its target is replaced
+    path = _resolved(path)  # a symbolic link stays a link, and its target is replaced
     if path.exists() and not path.is_file():
         raise InputError(path, "is a folder or a device, not a file", "choose another name")
     part = _temporary(path, ".part")
@@ -155,7 +164,7 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
         InputError: the folder is not empty, is not a folder, lacks the ``marker``, is the current folder or a folder
             above it, or the system rejects the write (disk full, quota, read-only, permissions).
     """
-    path = Path(path).resolve()
+    path = _resolved(path)
     check_replaceable(path, overwrite, marker)
     part = _temporary(path, ".part")
     with _write_errors(path), _parents(path):
@@ -173,7 +182,7 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
 
 def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = None) -> None:
     """Raise the InputError that `new_folder` would raise for ``path``; call this function before long work."""
-    path = Path(path).resolve()
+    path = _resolved(path)
     if _contains_current(path):  # a replacement would leave the shell in a removed folder
         raise InputError(path, "is the folder you are in, or one above it", "name a folder inside it")
     check_writable(path)
@@ -201,7 +210,7 @@ def check_new_file(path: Path, overwrite: bool) -> None:
 
 def check_writable(path: str | Path) -> None:
     """Raise InputError if the folder of ``path`` is not writable; call this function before long work."""
-    path = Path(path).resolve()
+    path = _resolved(path)
     with _write_errors(path):  # permissions alone are not sufficient information, so try a write
         probe = _temporary(next(parent for parent in path.parents if parent.exists()) / path.name, ".probe")
         probe.mkdir()
