@@ -26,7 +26,7 @@ from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_replaceable, new_folder
 from jaxfit.video.reader import VideoInfo, probe_video
-from jaxfit.view.checks import check_outputs
+from jaxfit.view.checks import check_outputs, is_inside
 from jaxfit.view.overlay import overlay
 
 __all__ = ["OBSERVATIONS", "OVERLAY", "Reconstruction", "reconstruct"]
@@ -86,7 +86,7 @@ def reconstruct(
         config = config or load_reconstruct_config()
         info = probe_video(video)
         check_outputs([folder / OVERLAY], video, overwrite=True)  # before the long work
-        if folder.resolve() in video.resolve().parents:
+        if is_inside(video, folder):
             raise InputError(folder, "holds the video, which the result would replace", "choose another --out")
         check_replaceable(folder, overwrite, MARKER)
         bird = bird or load_murre()

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import signal
 import sys
+import warnings
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
 
 from jaxfit.cli.parser import build_parser
-from jaxfit.errors import InputError
+from jaxfit.errors import InputError, one_line, shortened
+from jaxfit.limits import MESSAGE_CHARACTERS
 
 __all__ = ["main", "run", "use_cache"]
 
@@ -22,6 +25,7 @@ STOPPED = 130
 
 def run() -> NoReturn:
     """Run `main` on the arguments of the terminal and end the process: the installed command."""
+    _prepare_streams(verbose=bool({"-v", "--verbose"} & set(sys.argv)))
     received: list[int] = []
 
     def interrupt(number: int, _frame: object) -> None:
@@ -62,21 +66,71 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: the command's arguments; None takes the arguments of the process.
     """
     options = build_parser().parse_args(arguments)
-    logging.basicConfig(format="%(message)s", level=logging.INFO if options.verbose else logging.WARNING)
+    _prepare_logging(options.verbose)
     try:
         use_cache()
         module, command = options.run.split(".")
         # imported here, so that help and wrong arguments do not wait for the imports of commands
         getattr(import_module(f"jaxfit.cli.{module}"), command)(options)
     except InputError as error:
-        print(f"jaxfit: {error}", file=sys.stderr)  # noqa: T201
-        return 2
+        return _rejected(error)
     except KeyboardInterrupt:
         return _stopped()
     except BrokenPipeError:  # the reader of the output closed the pipe
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a path that no earlier check rejects, such as a name that is too long
+        if error.filename is None:
+            raise
+        return _rejected(InputError(os.fsdecode(error.filename), error.strerror or str(error), "check the path"))
     return 0
+
+
+class OneLine(logging.Formatter):
+    """Formats a record as one line of at most `MESSAGE_CHARACTERS`: names in messages may come from damaged files."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the prefix of the command and the message."""
+        prefix = "jaxfit: "
+        return prefix + shortened(one_line(record.getMessage()), MESSAGE_CHARACTERS - len(prefix))
+
+
+def _prepare_logging(verbose: bool) -> None:
+    """Log messages of jaxfit on stderr, and messages of libraries only if `verbose`."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(OneLine())
+    if not verbose:
+        handler.addFilter(logging.Filter("jaxfit"))
+    logging.basicConfig(handlers=[handler], level=logging.INFO if verbose else logging.WARNING)
+
+
+def _prepare_streams(verbose: bool) -> None:
+    """Make every text printable, and discard what libraries print on stderr unless `verbose`.
+
+    Compiled libraries (libpng, OpenCV, ONNX Runtime, XLA) write their warnings to the file descriptor of stderr.
+    jaxfit reports the same problems itself, with the name of the file.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    if verbose:
+        logging.captureWarnings(True)
+        return
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")
+    if not isinstance(sys.stderr, io.TextIOWrapper):
+        return
+    descriptor, encoding = sys.stderr.fileno(), sys.stderr.encoding
+    own = os.fdopen(os.dup(descriptor), "w", buffering=1, encoding=encoding, errors="backslashreplace")
+    discarded = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(discarded, descriptor)
+    os.close(discarded)
+    sys.stderr = own
+
+
+def _rejected(error: InputError) -> int:
+    print(f"jaxfit: {error}", file=sys.stderr)  # noqa: T201
+    return 2
 
 
 def _stopped() -> int:

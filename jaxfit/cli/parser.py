@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from jaxfit import __version__
 from jaxfit.config.help import option_help
 from jaxfit.config.perception import TrackConfig
+from jaxfit.errors import InputError
 from jaxfit.video.codecs import CODECS
 
 __all__ = ["build_parser"]
@@ -36,11 +37,19 @@ TRACK_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
 """Option of `track` and `reconstruct` → the path of its setting in `TrackConfig`, which holds its description."""
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that reports wrong arguments in one line, and exits with code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        command = self.prog.partition(" ")[2] or "arguments"
+        self.exit(2, f"jaxfit: {InputError(command, message, f'see `{self.prog} --help`')}\n")
+
+
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
-    parser = argparse.ArgumentParser(prog="jaxfit", description="3D pose and shape of birds from video, on a CPU.")
+    parser = _Parser(prog="jaxfit", description="3D pose and shape of birds from video, on a CPU.")
     parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
-    parser.add_argument("-v", "--verbose", action="store_true", help="print more messages")
+    parser.add_argument("-v", "--verbose", action="store_true", help="print more messages, also of libraries")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add_commands in (_perception, _fitting, _simulation, _training, _datasets, _models, _configs, _bench):
         add_commands(commands)

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxfit.data.track_quality import track_quality
+from jaxfit.errors import one_line
 
 if TYPE_CHECKING:
     from jaxfit.data.observations import Observations
@@ -41,9 +42,12 @@ _PERCENT = ("mpjpe/length", "pa_mpjpe/length", "size_error")
 """Metrics that the table shows in per cent."""
 
 
-def show(output: Any) -> None:
-    """Print a table or a line of text."""
-    Console(soft_wrap=not isinstance(output, Table), highlight=False).print(output)
+def show(output: Table | str) -> None:
+    """Print a table or lines of text. Names from files are printed as they are: they contain no markup."""
+    if isinstance(output, str):
+        output = "\n".join(one_line(line) for line in output.split("\n"))
+    is_text = isinstance(output, str)
+    Console(soft_wrap=is_text, highlight=False, markup=False, emoji=False).print(output)
 
 
 def counted(count: int, noun: str) -> str:
@@ -51,9 +55,16 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
+class _EscapedTable(Table):
+    """A table whose cells are single lines: control characters of the data become escapes."""
+
+    def add_row(self, *cells: Any, **options: Any) -> None:
+        super().add_row(*(one_line(cell) if isinstance(cell, str) else cell for cell in cells), **options)
+
+
 def right_aligned(*columns: str, **options: Any) -> Table:
     """Return an empty table with right-aligned columns."""
-    table = Table(**options)
+    table = _EscapedTable(**options)
     for column in columns:
         table.add_column(column, justify="right")
     return table
@@ -159,7 +170,7 @@ def _cells_3d(row: dict[str, float]) -> list[str]:
 
 def show_facts(facts: dict[str, Any]) -> None:
     """Print names and values in two columns."""
-    table = Table(show_header=False)
+    table = _EscapedTable(show_header=False)
     table.add_column()
     table.add_column(overflow="fold")
     for key, value in facts.items():

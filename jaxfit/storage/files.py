@@ -34,6 +34,7 @@ _REMEDIES = {
     errno.EBUSY: "it is a mount point or in use: choose a folder inside it",
     errno.EIO: "check the disk or choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ELOOP: "choose a path without cyclic links",
     errno.ENOENT: "choose another place",
     errno.ENOTDIR: "a part of its path is a file: choose another place",
     errno.EEXIST: "a part of its path is a file: choose another place",
@@ -44,6 +45,14 @@ _REMEDIES = {
     errno.ESTALE: "check the network disk or choose another place",
     errno.ENOTEMPTY: "another program has written there in the meantime: choose another place",
 }
+
+
+def _resolved(path: str | Path) -> Path:
+    """Follow the symbolic links of a path. `Path.resolve` raises other errors for cyclic links."""
+    resolved = Path(os.path.realpath(path))
+    if resolved.is_symlink():
+        raise InputError(path, "is a symbolic link that leads back to itself", "choose another name")
+    return resolved
 
 
 @contextmanager

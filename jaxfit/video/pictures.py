@@ -70,7 +70,7 @@ def picture_size(content: bytes) -> tuple[int, int] | None:
     """
     try:
         if content.startswith(b"\x89PNG\r\n\x1a\n"):
-            return struct.unpack_from(">II", content, 16)
+            return _png_size(content)
         if content.startswith(b"\xff\xd8"):
             return _jpeg_size(content)
         if content.startswith(b"BM"):
@@ -83,6 +83,24 @@ def picture_size(content: bytes) -> tuple[int, int] | None:
     except (struct.error, IndexError):  # the header is cut off
         pass
     return None
+
+
+def _png_size(content: bytes) -> tuple[int, int] | None:
+    """Return the size; None if a chunk is longer than the file, because OpenCV takes memory for the stated length."""
+    size = width, height = struct.unpack_from(">II", content, 16)
+    at = 8
+    while at + 8 <= len(content):
+        length, kind = struct.unpack_from(">I4s", content, at)
+        if kind == b"fcTL":  # a frame of an animation lies within the picture
+            frame = struct.unpack_from(">II", content, at + 12)
+            if frame[0] > width or frame[1] > height:
+                return None
+        at += 12 + length
+        if at > len(content):
+            return None
+        if kind == b"IEND":
+            break
+    return size
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:

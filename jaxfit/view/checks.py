@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxfit.errors import InputError
 from jaxfit.storage.files import check_new_file
 from jaxfit.video.reader import VideoInfo
 
-__all__ = ["check_belongs", "check_outputs", "too_short"]
+__all__ = ["check_belongs", "check_outputs", "is_inside", "too_short"]
 
 _REMEDY = "give the video that the result was fitted to"
 
@@ -55,9 +56,15 @@ def check_outputs(outputs: list[Path], video: Path, overwrite: bool) -> None:
     for out in outputs:
         if out.exists() and out.samefile(video):
             raise InputError(out, "is the video itself, which would be lost", "choose another --out")
-        if video.is_dir() and video.resolve() in out.resolve().parents:
+        if video.is_dir() and is_inside(out, video):
             raise InputError(out, f"lies among the video's images in {video}", "choose an --out elsewhere")
         check_new_file(out, overwrite)
+
+
+def is_inside(path: Path, folder: Path) -> bool:
+    """Whether a path lies in a folder, also through symbolic links; a cyclic link lies nowhere."""
+    # `Path.resolve` raises an error for cyclic links
+    return Path(os.path.realpath(folder)) in Path(os.path.realpath(path)).parents
 
 
 def too_short(video: Path, solution: Solution, frames: int) -> InputError:

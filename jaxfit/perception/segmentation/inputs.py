@@ -18,7 +18,7 @@ __all__ = ["STRIDES", "ImageInput", "cell_count", "image_input", "literal_metada
 STRIDES = (8, 16, 32)
 """Cell sizes of the grids of both YOLO families, pixels of the input."""
 _QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
-_LITERAL = re.compile(rf"(?:{_QUOTED.pattern}|[\w.\s,:\[\](){{}}]|[-+](?=\d))*", re.DOTALL)
+_LITERAL = re.compile(rf"(?:{_QUOTED.pattern}|None|True|False|[\d.\s,:\[\](){{}}])*", re.DOTALL)
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 

@@ -1,0 +1,237 @@
+"""Damaged and hostile networks end in instances, keypoints or one InputError."""
+
+import os
+from contextlib import suppress
+from functools import partial
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from onnx import TensorProto, helper, numpy_helper
+from support.hostile import Isolated, many_examples
+from support.mutations import damaged_bytes
+
+from jaxfit.errors import InputError
+from jaxfit.limits import CLASSES, INSTANCES
+from jaxfit.perception.instances import collect_instances, instance_of
+from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.perception.segmentation import load_segmenter
+
+FRAME = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
+NOISE = np.random.default_rng(0).uniform(0, 1, 100_000).astype(np.float32)
+INPUT = (1, 3, 64, 64)
+SEGMENTERS = {
+    "yolo": {"output0": (1, 37, 84), "output1": (1, 32, 16, 16)},
+    "final": {"output0": (1, 9, 38), "output1": (1, 32, 16, 16)},
+    "rf_detr": {"dets": (1, 9, 4), "labels": (1, 9, 2), "masks": (1, 9, 16, 16)},
+    "mask_rcnn": {"boxes": (9, 4), "labels": (9,), "scores": (9,), "masks": (9, 1, 64, 64)},
+    "bottom_up": {"foreground": (1, 1, 16, 16), "centre": (1, 1, 16, 16), "offset": (1, 2, 16, 16)},
+}
+KEYPOINTS = {
+    "heatmaps": {"heatmaps": (1, 3, 16, 16)},
+    "deeplabcut": {"heatmaps": (1, 3, 16, 16), "locref": (1, 6, 16, 16)},
+    "simcc": {"simcc_x": (1, 3, 128), "simcc_y": (1, 3, 128)},
+}
+NAMES = {"keypoint_names": "a,b,c"}
+load = partial(load_segmenter, threads=1)
+
+
+def write(path, declared, actual=None, shape=INPUT, metadata=None, scale=1.0):
+    """Write a network with constant outputs, which may have other shapes than declared."""
+    actual = {name: actual.get(name, sides) for name, sides in declared.items()} if actual else declared
+    values = {
+        f"{name}_value": sides if isinstance(sides, np.ndarray) else (scale * NOISE[: np.prod(sides)]).reshape(sides)
+        for name, sides in actual.items()
+    }
+    # shapes that are computed from the input are unknown to ONNX Runtime before a run
+    nodes = [
+        helper.make_node("ReduceMax", ["input"], ["most"], keepdims=0),
+        helper.make_node("Mul", ["most", "zero"], ["nothing"]),
+        helper.make_node("Cast", ["nothing"], ["no_number"], to=TensorProto.INT64),
+    ]
+    for name in declared:
+        nodes.append(helper.make_node("Add", [f"{name}_shape", "no_number"], [f"{name}_sides"]))
+        nodes.append(helper.make_node("Reshape", [f"{name}_value", f"{name}_sides"], [name], allowzero=1))
+        values[f"{name}_shape"] = np.array(values[f"{name}_value"].shape)
+    values["zero"] = np.zeros((), np.float32)
+    graph = helper.make_graph(
+        nodes,
+        "test",
+        [helper.make_tensor_value_info("input", TensorProto.FLOAT, shape)],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, sides) for name, sides in declared.items()],
+        [numpy_helper.from_array(value, name) for name, value in values.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(model, dict(metadata or {}))
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "net.onnx"
+
+
+def test_text_that_is_not_utf8(path):
+    content = write(path, SEGMENTERS["yolo"], metadata={"names": "{0: 'zzzz'}"}).read_bytes()
+    for text in (b"zzzz", b"names"):
+        path.write_bytes(content.replace(text, b"\xc5" * len(text)))
+        with pytest.raises(InputError, match="not UTF-8"):
+            load(path)
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 10**6, 10**6), (10**6, 3, 64, 64), (1, 3, 0, 64), (1, 3, 16000, 16000)])
+def test_absurd_inputs(path, shape):
+    write(path, KEYPOINTS["heatmaps"], shape=shape, metadata=NAMES)
+    with pytest.raises(InputError, match="has an input of"):
+        load_keypoint_detector(path)
+    with pytest.raises(InputError, match="has an input of"):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        ("input_size", "1000000,1000000"),
+        ("input_size", "16384,16384"),
+        ("input_size", "16000,16"),
+        ("input_size", "1e300,1e300"),
+        ("pad_px", "1e300"),
+        ("dilate_px", "100000"),
+        ("keypoint_names", "a," * 10**5 + "a"),
+        ("mean", "9" * 10**5),
+    ],
+)
+def test_absurd_metadata_of_keypoints(path, key, text):
+    write(path, KEYPOINTS["heatmaps"], shape=("n", 3, "h", "w"), metadata=NAMES | {key: text})
+    with pytest.raises(InputError) as error:
+        load_keypoint_detector(path, threads=1)
+    assert len(str(error.value)) <= 292
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 10**5, "-" * 10**5 + "1", "{0:" * 50, "1+" * 10**5 + "1", "9" * 5000, "{}", "not " * 10**4, "'"],
+)
+@pytest.mark.parametrize("key", ["names", "imgsz"])
+def test_absurd_literals(path, key, text):
+    metadata = {"names": "{0: 'bird'}"} | {key: text}
+    write(path, SEGMENTERS["yolo"], shape=(1, 3, "h", "w"), metadata=metadata)
+    with pytest.raises(InputError):
+        load(path)
+
+
+@pytest.mark.parametrize("text", ["[0, 64]", "[1000000, 1000000]", "'ab'", "[64]", "64.5", "True", "-64"])
+def test_absurd_sizes(path, text):
+    write(path, SEGMENTERS["yolo"], shape=(1, 3, "h", "w"), metadata={"names": "{0: 'bird'}", "imgsz": text})
+    with pytest.raises(InputError):
+        load(path)
+
+
+def test_absurd_classes(path):
+    write(path, SEGMENTERS["yolo"], metadata={"names": "{0: 'a bird (\\'x\\'), [y]'}"})
+    assert load(path).class_names == ("a bird ('x'), [y]",)
+    write(path, {"output0": (1, CLASSES + 40, 84), "output1": (1, 32, 16, 16)}, SEGMENTERS["yolo"])
+    with pytest.raises(InputError, match="classes"):
+        load(path)
+    for text in ("{", "[" * 10**5, '{"class_id_to_name": {"-5": "bird"}}', '{"class_id_to_name": {}}'):
+        write(path, SEGMENTERS["rf_detr"], metadata={"rfdetr_inference": text})
+        with pytest.raises(InputError, match="classes"):
+            load(path)
+    write(path, SEGMENTERS["bottom_up"], metadata={"names": "['bird']", "longer_side": "9" * 5000})
+    with pytest.raises(InputError, match="longer_side"):
+        load(path)
+
+
+@pytest.mark.parametrize("layout", SEGMENTERS)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
+def test_values_that_are_not_finite(path, layout, value):
+    write(path, SEGMENTERS[layout], scale=value, metadata={"names": "['bird']", "longer_side": "64"})
+    for instance in load(path)(FRAME):
+        assert 0 <= instance.score <= 1
+
+
+@pytest.mark.parametrize("layout", SEGMENTERS)
+@pytest.mark.parametrize("change", ["fewer", "empty", "axis"])
+def test_outputs_of_other_shapes(path, layout, change):
+    """A wrong rank is an error; other lengths are an error or fewer instances."""
+    for name, sides in SEGMENTERS[layout].items():
+        other = {"fewer": (*sides[:-1], sides[-1] - 1), "empty": (*sides[:-1], 0), "axis": (*sides, 1)}[change]
+        write(path, SEGMENTERS[layout], {name: other}, metadata={"names": "['bird']"})
+        with pytest.raises(InputError) if change == "axis" else suppress(InputError):
+            load(path)(FRAME)
+
+
+@pytest.mark.parametrize("layout", KEYPOINTS)
+def test_keypoint_outputs_that_change(path, layout):
+    """The first run determines the layout; a later run with other shapes is an error."""
+    shapes = {name: ("n", *sides[1:]) for name, sides in KEYPOINTS[layout].items()}
+    write(path, shapes, KEYPOINTS[layout], shape=("n", 3, 64, 64), metadata=NAMES)
+    birds = [instance_of(np.ones((9, 12), bool), 1.0, "bird", x) for x in (3, 40)]
+    detector = load_keypoint_detector(path, threads=1)
+    assert detector(FRAME, birds[:1])[0].shape == (1, 3, 2)
+    with pytest.raises(InputError, match="a run gives"):
+        detector(FRAME, birds)
+
+
+def test_too_many_instances():
+    one = instance_of(np.ones((48, 64), bool), 7.0, "bird")
+    assert one.score == 1
+    with pytest.raises(InputError, match="times its area"):
+        collect_instances("net.onnx", [one] * 60, (64, 48))
+    small = instance_of(np.ones((1, 1), bool), 1.0, "bird")
+    with pytest.raises(InputError, match="more than"):
+        collect_instances("net.onnx", [None, *[small] * (INSTANCES + 1)], (64, 48))
+
+
+def test_files_that_are_not_regular(tmp_path):
+    os.mkfifo(tmp_path / "pipe.onnx")
+    (tmp_path / "loop.onnx").symlink_to("loop.onnx")
+    with (tmp_path / "large.onnx").open("wb") as file:
+        file.truncate(1 << 40)
+    for name in ("pipe.onnx", "loop.onnx", "large.onnx", ".", "x" * 300, "absent.onnx"):
+        with pytest.raises(InputError):
+            load(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("call", "layouts", "metadata"),
+    [
+        ("segment", SEGMENTERS, {"names": "{0: 'bird'}", "longer_side": "64", "imgsz": "[64, 64]"}),
+        ("detect_keypoints", KEYPOINTS, NAMES | {"mean": "1,2,3", "activation": "softmax", "pad_px": "4"}),
+    ],
+)
+def test_mutations_of_networks(tmp_path, call, layouts, metadata):
+    valid = [write(tmp_path / "valid.onnx", shapes, metadata=metadata).read_bytes() for shapes in layouts.values()]
+    path = tmp_path / "net.onnx"
+    with Isolated(f"support.hostile_networks:{call}") as reader:
+
+        @many_examples
+        @given(st.sampled_from(valid).flatmap(_damaged_graph))
+        def check(content):
+            path.write_bytes(content)
+            outcome = reader(path)
+            assert outcome.acceptable, outcome
+
+        check()
+
+
+def _damaged_graph(content):
+    """Damage the parts of a network besides its weights, which are most of its bytes."""
+    model = onnx.load_from_string(content)
+    weights = [weight.raw_data for weight in model.graph.initializer]
+    for weight in model.graph.initializer:
+        weight.raw_data = b"\0" * 4
+    return damaged_bytes(model.SerializeToString()).map(lambda damaged: _with_weights(damaged, weights, content))
+
+
+def _with_weights(damaged, weights, whole):
+    try:
+        model = onnx.load_from_string(damaged)
+    except Exception:
+        return damaged
+    for weight, raw in zip(model.graph.initializer, weights, strict=False):
+        weight.raw_data = raw
+    return model.SerializeToString()
