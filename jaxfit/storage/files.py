@@ -47,14 +47,6 @@ _REMEDIES = {
 }
 
 
-def _resolved(path: str | Path) -> Path:
-    """Follow the symbolic links of a path. `Path.resolve` raises other errors for cyclic links."""
-    resolved = Path(os.path.realpath(path))
-    if resolved.is_symlink():
-        raise InputError(path, "is a symbolic link that leads back to itself", "choose another name")
-    return resolved
-
-
 @contextmanager
 def _write_errors(path: Path) -> Iterator[None]:
     """Convert errors of the operating system in the body to an InputError that names ``path``."""
