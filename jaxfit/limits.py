@@ -175,6 +175,14 @@ MODEL_KEYPOINTS = 256
 """Keypoints of a bird model."""
 MODEL_SHAPES = 256
 """Shape coefficients of a bird model."""
+CHECKPOINT_BYTES = 2**28
+"""Size of a PyTorch checkpoint of a bird model; published models have about 2 MB."""
+CHECKPOINT_OPCODES = 200_000
+"""Length of the pickle of a PyTorch checkpoint."""
+CHECKPOINT_ENTRIES = 10_000
+"""Files in a PyTorch checkpoint."""
+MODEL_JSON_BYTES = 2**24
+"""Size of the JSON file of a bird model; the published file has about 3 MB."""
 
 # --- written files
 NAME_BYTES = 255

@@ -77,11 +77,14 @@ def read_file(path: str | Path, most_bytes: int, kind: str = "a file") -> bytes:
     with open_file(path, kind) as file:
         # the size of a file may change, and is 0 for files of the operating system
         size = os.fstat(file.fileno()).st_size
-        content = b"" if size > most_bytes else file.read(most_bytes + 1)
+        content = bytearray()
+        # in parts, because read() reserves memory for the size that it is given
+        while size <= most_bytes and len(content) <= most_bytes and (part := file.read(2**18)):
+            content += part
     if max(size, len(content)) > most_bytes:
         problem = f"has {max(size, len(content)):,} bytes; {kind} of jaxfit has at most {most_bytes:,}"
         raise InputError(path, problem, "check the path")
-    return content
+    return bytes(content)
 
 
 def _require_file(path: Path, mode: int, kind: str) -> None:

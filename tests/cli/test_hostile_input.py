@@ -130,7 +130,7 @@ CASES = {
 
 @pytest.fixture(scope="module")
 def command_line():
-    with Isolated("support.hostile_calls:run_command", memory_mb=300, seconds=10) as call:
+    with Isolated("support.hostile_commands:run_command", memory_mb=300, seconds=10) as call:
         yield call
 
 
@@ -157,7 +157,7 @@ def test_a_stored_ablation_runs_no_code(prepared, tmp_path):
     config = config_to_yaml(load_config("paper")).replace("acceleration", "spy:term")
     stored = {"format_version": 1, "runs": {"keypoints=1": config}, "model": "", "observations": "", "truth": ""}
     arguments = stored_ablation(json.dumps(stored))(prepared, tmp_path)
-    with Isolated("support.hostile_calls:run_command_beside") as command:
+    with Isolated("support.hostile_commands:run_command_beside") as command:
         outcome = command(tmp_path, *arguments)
     assert outcome.kind == "InputError", outcome
     assert not (tmp_path / "it ran").exists()

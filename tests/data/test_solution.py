@@ -7,7 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
 from support.birds import toy_bird
+from support.hostile import Isolated, many_examples
+from support.mutations import damaged_arrays, damaged_bytes
 
 from jaxfit.data.solution import FORMAT_VERSION, Solution, load_solution, save_solution
 from jaxfit.errors import InputError
@@ -222,3 +225,61 @@ def test_what_is_no_folder_of_results(tmp_path):
     (tmp_path / "poses.npz").write_bytes(b"PK\x03\x04 cut off")
     with pytest.raises(InputError, match="is not a readable"):
         load_solution(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"track_id": [3, 3]}, "track_id holds track 3 twice"),
+        ({"frame_index": [5, 9, 6]}, "frame_index must increase, but 6 follows 9"),
+        ({"frame_index": [5, 6, 6]}, "frame_index must increase, but 6 follows 6"),
+        ({"frame_index": [-1, 0, 1]}, "frame_index must be 0 or more, not -1"),
+        ({"frame_index": np.array([5, 6, 2**63], np.uint64)}, "frame_index must be of type int64, but holds"),
+        ({"scale": "negative"}, "scale is not above 0 for track 8, frame 6"),
+        ({"transl": "nan"}, "transl holds NaN or infinite numbers for track 8, frame 6"),
+        ({"keypoints_px": "nan"}, "keypoints_px holds NaN or infinite numbers for track 8, frame 6"),
+        ({"crop": "negative"}, "crop has a size that is not above 0 for track 8, frame 6"),
+        ({"image_size_px": "negative"}, "image_size_px is not in 1…16384 for track 8, frame 6"),
+        ({"image_size_px": np.full((N, T, 2), 10**6)}, "image_size_px is not in 1…16384 for track 3, frame 5"),
+        ({"status": ["ok", "lost"]}, "status of track 8 is 'lost', expected one of: ok, partly diverged"),
+        ({"keypoint_names": ("a",) * K}, "keypoint_names must name each part once"),
+        ({"focal_px": math.nan}, "focal_px must be above 0 and finite"),
+        ({"focal_px": True}, "focal_px must be of type float64, not bool"),
+        ({"crop_px": 2.5}, "crop_px must be of type int64"),
+    ],
+)
+def test_values_that_no_fit_gives(changes, message):
+    changes = {"valid": np.ones((N, T), bool)} | changes
+    (name, kind) = list(changes.items())[-1]
+    if isinstance(kind, str):
+        changes[name] = np.array(getattr(make(), name))
+        changes[name][1, 1] = -1 if kind == "negative" else math.nan
+    with pytest.raises(ValueError, match=message):
+        make(**changes)
+    if isinstance(kind, str):  # values are arbitrary where the solution is not valid
+        changes["valid"] = ~np.eye(N, T, dtype=bool)
+        make(**changes)
+
+
+def test_unasked_arrays_are_not_read(tmp_path):
+    save_solution(make(), BIRD, "", {}, tmp_path / "out")
+    rewrite(tmp_path / "out", extra=np.array([{}], dtype=object))
+    load_solution(tmp_path / "out")
+
+
+def test_any_damage_is_one_error(tmp_path):
+    save_solution(make(valid=np.ones((N, T), bool)), BIRD, "", {}, tmp_path / "out")
+    path = tmp_path / "out" / "poses.npz"
+    whole = path.read_bytes()
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    with Isolated("jaxfit.data.solution:load_solution", memory_mb=150) as reader:
+
+        @many_examples
+        @given(damaged_bytes(whole) | damaged_arrays(arrays))
+        def check(damaged):
+            path.write_bytes(damaged) if isinstance(damaged, bytes) else np.savez(path, **damaged)
+            outcome = reader(tmp_path / "out")
+            assert outcome.acceptable, outcome
+
+        check()

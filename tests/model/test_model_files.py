@@ -8,6 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from support.hostile import Isolated, many_examples
+from support.mutations import damaged_arrays, damaged_bytes
 
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
@@ -282,3 +285,20 @@ def test_description_of_an_open_mesh():
     assert facts["boundary_edges"] == 3
     assert facts["volume"] is None
     assert facts["shape_variance"] is None
+
+
+def test_any_damage_is_one_error(tmp_path):
+    path = saved(tmp_path)
+    whole = path.read_bytes()
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    with Isolated("jaxfit.model.files:load_bird", memory_mb=150) as reader:
+
+        @many_examples
+        @given(damaged_bytes(whole) | damaged_arrays(arrays))
+        def check(damaged):
+            path.write_bytes(damaged) if isinstance(damaged, bytes) else np.savez(path, **damaged)
+            outcome = reader(path)
+            assert outcome.acceptable, outcome
+
+        check()

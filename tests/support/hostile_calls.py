@@ -1,46 +1,15 @@
-"""Functions that tests call in bounded children (`support.hostile`), with arguments that JSON can carry."""
+"""Calls of readers whose arguments JSON cannot represent, for `support.hostile.Isolated`."""
 
-from __future__ import annotations
+from types import SimpleNamespace
 
-import contextlib
-import importlib
-import io
-import sys
+import numpy as np
 
-from jaxfit.cli.main import main
-from jaxfit.errors import InputError
-
-# The server imports these modules once, so that its children need neither the time nor the memory.
-for _name in ("ablation.ablate", "data.formats.coco", "evaluation.evaluate", "fitting.fit", "pipeline", "view.overlay"):
-    importlib.import_module(f"jaxfit.{_name}")
+from jaxfit.fitting.initial_pose_file import load_initial_poses
 
 
-class WrongEndingError(Exception):
-    """A command did not end as the command line promises."""
-
-
-def run_command(*arguments: str) -> None:
-    """Run one command of the command line.
-
-    Raises:
-        InputError: the command ended with exit code 2 and one line; the message is this line without `jaxfit: `.
-        WrongEndingError: the command ended in another way, or printed more than one line.
-    """
-    errors = io.StringIO()
-    with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
-        try:
-            code = main(list(arguments))
-        except SystemExit as stop:
-            code = stop.code
-    lines = errors.getvalue().splitlines()
-    if code == 0:
-        return
-    if code != 2 or len(lines) != 1 or not lines[0].startswith("jaxfit: ") or len(lines[0]) > 300:
-        raise WrongEndingError(f"code {code}: {errors.getvalue()}")
-    raise InputError.__new__(InputError, lines[0].removeprefix("jaxfit: "))
-
-
-def run_command_beside(modules: str, *arguments: str) -> None:
-    """Run one command as `run_command` does, with a folder of modules that Python can import."""
-    sys.path.insert(0, modules)
-    run_command(*arguments)
+def read_initial_poses(path: str) -> None:
+    """Read initial poses of tracks 4 and 9 in frames 10 to 14, for a bird of 8 joints and 2 shape coefficients."""
+    observations = SimpleNamespace(
+        track_id=np.array([4, 9]), frame_index=np.arange(10, 15), present=np.arange(10).reshape(2, 5) != 7
+    )
+    load_initial_poses(path, observations, SimpleNamespace(num_joints=8, num_shapes=2))

@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from jaxfit.errors import InputError
+from jaxfit.limits import MODEL_JSON_BYTES
 from jaxfit.model.anatomy import AVIAN_MESH_KEYPOINTS
 from jaxfit.model.bird import Bird
 from jaxfit.model.importers.published_bird import build_bird, read_prior
 from jaxfit.model.importers.torch_file import read_tensors
+from jaxfit.storage.reading import read_file
 
 __all__ = ["PRIOR_KEYS", "import_avian_mesh", "read_model_json"]
 
-MAX_JSON_BYTES = 64 * 2**20
 PRIOR_KEYS = ("p_m", "p_cov", "b_m", "b_cov")
 """Tensors of `pose_bone_prior.pth`: mean and covariance of the pose, then of the bone lengths."""
 
@@ -49,18 +50,13 @@ def read_model_json(path: Path | str) -> dict[str, Any]:
             contain an object.
     """
     path = Path(path)
+    text = read_file(path, MODEL_JSON_BYTES, "the JSON file of a bird model")
     try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise InputError(path, f"larger than {MAX_JSON_BYTES} bytes", "a bird model is a few MB")
-        content = json.loads(path.read_bytes())
+        content = json.loads(text)
     except json.JSONDecodeError as error:
         problem = f"not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
         raise InputError(path, problem, "the file may be truncated: download it again") from error
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}", "check the path") from error
-    except InputError:
-        raise
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # text that is not UTF-8, numbers of many digits, many levels
         raise InputError(path, f"not readable as JSON: {error}", "expected bird_eccv.json") from error
     if not isinstance(content, dict):
         raise InputError(path, "not a JSON object", "expected bird_eccv.json")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.importers.aves import import_aves
 from jaxfit.model.importers.avian_mesh import import_avian_mesh, read_model_json
 from jaxfit.model.importers.torch_file import read_tensors
+from jaxfit.storage.reading import check_readable
 
 __all__ = ["MODEL_KINDS", "import_model"]
 
@@ -65,16 +67,14 @@ def _list_files(sources: Sequence[Path | str]) -> list[tuple[Path, bool]]:
     """Return (file, whether the user named this file explicitly) for all sources."""
     files: list[tuple[Path, bool]] = []
     for source in map(Path, sources):
-        try:
-            if source.is_dir():
+        if os.path.isdir(source):  # noqa: PTH112 - False for paths that cannot exist
+            try:
                 inside = [path for path in sorted(source.iterdir()) if path.is_file()]
-                files += [(path, False) for path in inside if path.suffix.lower() in SUFFIXES]
-            elif source.is_file():
-                files.append((source, True))
-            else:
-                raise InputError(source, "no such file or folder", "check the path")
-        except OSError as error:
-            raise InputError(source, f"cannot be read: {error.strerror}", "check the permissions") from error
+            except OSError as error:
+                raise InputError(source, f"cannot be read: {error.strerror}", "check the permissions") from error
+            files += [(path, False) for path in inside if path.suffix.lower() in SUFFIXES]
+        else:
+            files.append((check_readable(source, "a file of a bird model"), True))
     return files
 
 

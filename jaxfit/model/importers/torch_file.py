@@ -17,7 +17,9 @@ from typing import Any
 import numpy as np
 
 from jaxfit.errors import InputError
-from jaxfit.model.importers.torch_pickle import MAX_FILE_BYTES, REMEDY, Storage, Tensor, run_pickle
+from jaxfit.limits import CHECKPOINT_BYTES, CHECKPOINT_ENTRIES
+from jaxfit.model.importers.torch_pickle import REMEDY, Storage, Tensor, run_pickle
+from jaxfit.storage.reading import read_file
 
 __all__ = ["read_tensors"]
 
@@ -41,14 +43,7 @@ def read_tensors(path: Path | str) -> dict[str, np.ndarray]:
             that tensors do not need; or its stated sizes exceed its content.
     """
     path = Path(path)
-    try:
-        if not path.is_file():
-            raise InputError(path, "no such file", "check the path")
-        if path.stat().st_size > MAX_FILE_BYTES:
-            raise InputError(path, f"larger than {MAX_FILE_BYTES} bytes", "a bird model is a few MB")
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, f"cannot be read: {error.strerror}", "check path and permissions") from error
+    content = read_file(path, CHECKPOINT_BYTES, "a checkpoint of a bird model")
     read = _read_zip if content.startswith(b"PK\x03\x04") else _read_legacy
     try:
         return read(content, path)
@@ -86,6 +81,8 @@ def _read_legacy(content: bytes, path: Path) -> dict[str, np.ndarray]:
 
 def _read_zip(content: bytes, path: Path) -> dict[str, np.ndarray]:
     """Read the zip layout: `<name>/data.pkl` is the object, `<name>/data/<key>` a storage, all uncompressed."""
+    if content.count(b"PK\x01\x02") > CHECKPOINT_ENTRIES:  # zipfile sets no limit on the table of contents
+        raise InputError(path, f"a zip file of more than {CHECKPOINT_ENTRIES} entries", REMEDY)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             names = archive.namelist()

@@ -15,13 +15,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxfit.errors import InputError
+from jaxfit.limits import CHECKPOINT_BYTES, CHECKPOINT_OPCODES, NPY_DIMENSIONS
 
-__all__ = ["MAX_FILE_BYTES", "REMEDY", "Storage", "Tensor", "run_pickle"]
+__all__ = ["REMEDY", "Storage", "Tensor", "run_pickle"]
 
-MAX_FILE_BYTES = 256 * 2**20
-"""A bird model has about 2 MB; a much larger file is another kind of checkpoint."""
-MAX_OPCODES = 200_000
-MAX_DIMENSIONS = 8
 
 STORAGE_DTYPES = {
     "DoubleStorage": "<f8",
@@ -95,8 +92,8 @@ def run_pickle(stream: io.BytesIO, path: Path) -> tuple[Any, dict[str, Storage]]
 
     for count, (opcode, arg, _) in enumerate(pickletools.genops(stream)):
         name = opcode.name
-        if count > MAX_OPCODES:
-            raise InputError(path, f"the pickle is longer than {MAX_OPCODES} opcodes", REMEDY)
+        if count > CHECKPOINT_OPCODES:
+            raise InputError(path, f"the pickle is longer than {CHECKPOINT_OPCODES} opcodes", REMEDY)
         if name in ("PROTO", "FRAME"):
             pass
         elif name == "STOP":
@@ -168,7 +165,7 @@ def _global(module: str, attribute: str, path: Path) -> _Name:
 
 
 def _require_size(value: Any) -> int:
-    if type(value) is not int or not 0 <= value <= MAX_FILE_BYTES:
+    if type(value) is not int or not 0 <= value <= CHECKPOINT_BYTES:
         raise ValueError("a size, offset or stride is out of range")
     return value
 
@@ -198,7 +195,7 @@ def _reduce(function: Any, arguments: tuple, path: Path) -> Any:
     shape = tuple(_require_size(size) for size in _require_type(shape, tuple))
     strides = tuple(_require_size(stride) for stride in _require_type(strides, tuple))
     offset = _require_size(offset)
-    if len(shape) != len(strides) or len(shape) > MAX_DIMENSIONS:
+    if len(shape) != len(strides) or len(shape) > NPY_DIMENSIONS:
         raise ValueError(f"a tensor of {len(shape)} dimensions with {len(strides)} strides")
     last = offset + sum((size - 1) * stride for size, stride in zip(shape, strides, strict=True))
     elements = math.prod(shape)
