@@ -102,7 +102,10 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
     configs = [config for config, _ in kept.values()]
     written = [point for _, point in kept.values()]
     paths = dict.fromkeys(path for point in written for path in point)
-    values = [get_values(config, paths) for config in configs]
+    try:
+        values = [get_values(config, paths) for config in configs]
+    except ConfigKeyError as error:  # a run renames a stage that a path of another run names
+        raise InputError(source, error.problem, error.remedy) from None
     varied = [path for path in paths if any(each[path] != values[0][path] for each in values)]
     digits = len(str(len(configs)))
     return tuple(

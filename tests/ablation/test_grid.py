@@ -4,8 +4,10 @@ import pytest
 from support.cli_files import CONFIG
 
 from jaxfit.ablation.grid import load_grid, short
+from jaxfit.config.grid import require_runs
 from jaxfit.errors import InputError
 from jaxfit.fitting.stages import compiled_part
+from jaxfit.limits import GRID_RUNS
 
 
 def grid_file(folder, text):
@@ -68,6 +70,30 @@ def test_equal_runs_are_one(tmp_path, caplog):
     text += "  - cross: {terms.velocity: [2]}"
     assert len(load_grid(grid_file(tmp_path, text)).runs) == 4
     assert "one run is kept" in caplog.text
+
+
+def test_many_equal_runs_are_one_warning(tmp_path, caplog):
+    text = "crosses:\n  - cross: {terms.velocity: [" + "1, 1.0, " * 100 + "2]}"
+    assert len(load_grid(grid_file(tmp_path, text)).runs) == 2
+    assert len(caplog.records) == 1
+    assert "199 times" in caplog.text
+
+
+def test_the_number_of_runs_is_checked_before_the_runs_are_made(tmp_path):
+    for cross in (
+        ", ".join(f"{path}: [{', '.join('1' * 1000)}]" for path in "abcd"),
+        f"a: [{', '.join('1' * (GRID_RUNS + 1))}]",
+    ):
+        with pytest.raises(InputError, match=r"line 2: `crosses` makes (1,000,000,000,000|10,001) runs .*10,000"):
+            load_grid(grid_file(tmp_path, f"crosses: [{{cross: {{{cross}}}}}]"))
+    with pytest.raises(InputError, match=r"makes more than 10\^15 runs"):
+        require_runs("values", [[range(10_000)] * 500])
+
+
+def test_names_of_runs_are_ascii_and_short(tmp_path):
+    text = f"crosses:\n  - cross: {{'stages[0].name': ['{'é' * 300}', '../a|b']}}"
+    names = [run.name for run in load_grid(grid_file(tmp_path, text)).runs]
+    assert all(len(name.encode()) < 130 and "/" not in name for name in names)
 
 
 @pytest.mark.parametrize(

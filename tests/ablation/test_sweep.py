@@ -1,6 +1,7 @@
 """A sweep in memory, and the plot of one."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -66,6 +67,27 @@ def result_of(levels, me):
     evaluation = Evaluation(overall, {}, 1, 0, intervals={"me_p": interval, "me_v": interval})
     run = Run("run", levels, jaxfit.with_values(config(), levels))
     return Result(run, evaluation, 1.0, 1)
+
+
+def test_too_many_runs_are_refused(observed):
+    with pytest.raises(InputError, match=r"`values` makes 1,000,000 runs"):
+        jaxfit.sweep(observed, BIRD, config(), {"window": range(1000), "terms.velocity": range(1000)}, observed)
+
+
+def test_any_text_is_drawn_and_stays_in_its_cell(monkeypatch):
+    names = ["$\\frac", "a|b$", "<img src=x>\n| c |", "plain"]
+    results = [result_of({"stages[0].name": name, "stages[0].terms": ["velocity"]}, 0.1) for name in names]
+    results = [
+        dataclasses.replace(result, run=dataclasses.replace(result.run, name=f"{i}_x"))
+        for i, result in enumerate(results)
+    ]
+    figure = drawn(results, monkeypatch)
+    assert len(figure.legends[0].get_texts()) == len(names)
+    lines = results_table(results, "github").splitlines()
+    assert len(lines) == 2 + len(names)
+    assert len({len(re.findall(r"(?<!\\)\|", line)) for line in lines}) == 1
+    assert "<" not in "".join(lines)
+    assert results_table(results, "simple").count("\n") == 1 + len(names)
 
 
 def drawn(results, monkeypatch):

@@ -64,7 +64,7 @@ def test_the_longest_chain(tmp_path):
         written(tmp_path, f"base: {base}\nwindow: {i + 1}\n", f"{i}.yaml")
     most = files - (CONFIG_BASES - 1)  # `paper` is the last file
     assert load_config(tmp_path / f"{most}.yaml").window == most + 1
-    with pytest.raises(InputError, match=f"is base number {CONFIG_BASES}"):
+    with pytest.raises(InputError, match=rf"is base number {CONFIG_BASES}"):
         load_config(tmp_path / f"{most - 1}.yaml")
     with pytest.raises(InputError, match=r"20\.yaml: is base number 20"):
         load_config(tmp_path / "0.yaml")
@@ -78,7 +78,7 @@ def test_the_base_of_a_shipped_config_is_shipped(tmp_path, monkeypatch):
 
 def test_names_that_no_file_can_have(tmp_path):
     for name in ("x" * 300 + ".yaml", "a\0b", "a\ud800", ""):
-    with pytest.raises(InputError, match=rf"{most - 1 + CONFIG_BASES}\.yaml|is base number {CONFIG_BASES}"):
+        with pytest.raises(InputError, match=r"does not exist|is a folder"):
             load_config(tmp_path / name if name else name)
 
 

@@ -140,7 +140,8 @@ claims:
 
 @pytest.fixture(scope="module")
 def readers():
-    with Isolated("support.hostile_configs:call") as call:
+    # a valid grid of thousands of runs takes seconds
+    with Isolated("support.hostile_configs:call", seconds=30) as call:
         yield call
 
 
