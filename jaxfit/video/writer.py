@@ -20,9 +20,12 @@ from jaxfit.storage.files import new_file
 from jaxfit.video.codecs import CODECS, CONTAINERS
 from jaxfit.video.decoding import EXACT
 
-__all__ = ["VideoWriter"]
+__all__ = ["SLOWEST_FPS", "VideoWriter"]
 
 _logger = logging.getLogger(__name__)
+
+SLOWEST_FPS = Fraction(1, 1001)
+"""Least frame rate of a written video."""
 
 # The same number on every machine, because the written bytes of some encoders depend on the number of threads.
 _THREADS = 4

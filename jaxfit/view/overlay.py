@@ -20,7 +20,7 @@ from jaxfit.progress import ProgressTask, silent
 from jaxfit.raster.zbuffer import shade
 from jaxfit.storage.files import write_whole
 from jaxfit.video.reader import VideoInfo, probe_video, read_frames
-from jaxfit.video.writer import VideoWriter
+from jaxfit.video.writer import SLOWEST_FPS, VideoWriter
 from jaxfit.view.birds import DrawnBird, Numbers, Style, draw_birds, draw_keypoints
 from jaxfit.view.checks import check_belongs, check_outputs, too_short
 from jaxfit.view.colours import tinted
@@ -109,7 +109,7 @@ def overlay(
     wanted = [pair for row in sheet_pairs(solution) for pair in row]
     tiles = {}
     with (
-        VideoWriter(out, drawing.size_px, fps, codec) as writer,
+        VideoWriter(out, drawing.size_px, max(fps, SLOWEST_FPS), codec) as writer,
         progress("overlay", (last - first) // step + 1) as report_progress,
     ):
         number = None

@@ -1,0 +1,131 @@
+"""Messages are one line of at most 300 characters, whatever the data, the arguments and the libraries print."""
+
+import logging
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rich.table import Table
+
+from jaxfit.cli import main as cli
+from jaxfit.cli.main import OneLine, main
+from jaxfit.cli.tables import right_aligned, show, show_facts
+from jaxfit.limits import MESSAGE_CHARACTERS
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+NASTY = "[bold]x[/]\x1b[31m\n\udcc5:bird:"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "COMMAND (see `jaxfit --help`)"),
+        (["frobnicate" * 99], "(see `jaxfit --help`)"),
+        (["fit"], "fit: the following arguments are required: OBS.json, --out (see `jaxfit fit --help`)"),
+        (["track", "v", "--out", "o", "--step", "9" * 5000], "--step: invalid int value: '9999"),
+        (["model", "info", "m", "\udcc5\n" * 300], "(see `jaxfit --help`)"),
+    ],
+)
+def test_wrong_arguments(capsys, arguments, expected):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    said = capsys.readouterr()
+    assert (stopped.value.code, said.out) == (2, "")
+    line = said.err.removesuffix("\n")
+    assert line.startswith("jaxfit: ")
+    assert expected in line
+    assert line.isprintable()
+    assert len(line) <= MESSAGE_CHARACTERS
+
+
+def test_logged_messages():
+    record = logging.LogRecord("jaxfit", logging.WARNING, "", 1, "%s is damaged", (NASTY * 99,), None)
+    line = OneLine().format(record)
+    assert line.isprintable()
+    assert line.startswith("jaxfit: [bold]x[/]\\x1b[31m\\n\\udcc5")
+    assert line.endswith("is damaged")
+    assert len(line) == MESSAGE_CHARACTERS
+
+
+def test_names_from_files_contain_no_markup(capsys):
+    table: Table = right_aligned("name")
+    table.add_row(NASTY)
+    for output in (NASTY, table):
+        show(output)
+    show_facts({"name": NASTY, "[/]": [NASTY]})
+    said = capsys.readouterr().out
+    assert "\x1b" not in said
+    assert said.count("[bold]x[/]") == 4
+    assert said.count(":bird:") == 4
+
+
+@pytest.mark.parametrize("path", ["x" * 300, "loop/a.mp4", "file/a.mp4"])
+def test_errors_of_the_system_are_one_line(tmp_path, capsys, path):
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "file").write_text("")
+    for command in (["track", str(tmp_path / path), "--out", "o.json"], ["model", "info", str(tmp_path / path)]):
+        assert main(command) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith("jaxfit: ")
+        assert len(line) <= MESSAGE_CHARACTERS
+
+
+def test_an_unexpected_error_of_the_system(monkeypatch, capsys):
+    def fails(_):
+        raise PermissionError(13, "Permission denied", b"\xc5" + b"x" * 999)
+
+    monkeypatch.setattr("jaxfit.cli.models.model_info", fails)
+    assert main(["model", "info", "murre"]) == 2
+    assert "Permission denied (check the path)" in capsys.readouterr().err
+    monkeypatch.setattr("jaxfit.cli.models.model_info", lambda _: (_ for _ in ()).throw(OSError("no file")))
+    with pytest.raises(OSError, match="no file"):
+        main(["model", "info", "murre"])
+
+
+def test_outputs_of_cyclic_links(tmp_path, capsys):
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "frames").mkdir()
+    assert main(["track", str(tmp_path / "frames"), "--out", str(tmp_path / "loop")]) == 2
+    assert "leads back to itself" in capsys.readouterr().err
+
+
+CODE = """
+import logging, os, sys, warnings
+from jaxfit.cli import main as cli
+
+def main():
+    cli._prepare_logging(verbose="-v" in sys.argv)
+    os.write(2, b"libpng error: text of a library\\n")
+    warnings.warn("a warning\\nof Python", stacklevel=1)
+    logging.getLogger("jax._src.compiler").warning("a warning of JAX")
+    logging.getLogger("jaxfit.video").warning("a warning of\\njaxfit")
+    print("\\udcc5", file=sys.stdout)
+    print("\\udcc5", file=sys.stderr)
+    return 0
+
+cli.main = main
+cli.run()
+"""
+
+
+def test_the_output_of_libraries_is_shown_only_on_request():
+    done = [
+        subprocess.run([sys.executable, "-c", CODE, *more], capture_output=True, text=True, check=False)
+        for more in ([], ["-v"])
+    ]
+    assert [d.returncode for d in done] == [0, 0]
+    assert (done[0].stdout, done[0].stderr) == ("\\udcc5\n", "jaxfit: a warning of\\njaxfit\n\\udcc5\n")
+    for text in ("libpng error", "a warning\\nof Python", "a warning of JAX", "a warning of\\njaxfit"):
+        assert text in done[1].stderr
+
+
+def test_a_cache_that_cannot_be_used(tmp_path, monkeypatch, capsys):
+    """Without a usable folder, programs are compiled and not stored."""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    cli.use_cache()
+    import jax
+
+    assert float(jax.jit(lambda x: np.pi * x + os.getpid())(0.0)) == os.getpid()
