@@ -99,8 +99,6 @@ GRID_RUNS = 10_000
 """Most runs of a grid or a sweep. The grid of the paper has 34 runs."""
 ABLATION_BYTES = 200_000_000
 """Largest size of a file that describes the runs of an ablation (ablation.json), or their metrics."""
-TERM_NUMBER = 1e30
-"""Largest weight or setting of a term; larger values overflow in 32-bit numbers."""
 
 # --- pictures and videos
 IMAGE_PIXELS = 100_000_000

@@ -8,7 +8,7 @@ from typing import Any
 from jaxfit.config.checks import ConfigKeyError, is_number, require
 from jaxfit.config.messages import known_names, shown
 from jaxfit.errors import InputError
-from jaxfit.limits import TERM_NUMBER
+from jaxfit.limits import CONFIG_NUMBER
 from jaxfit.objective.registry import Term, find_term, known_terms
 
 __all__ = ["check_terms", "require_term", "term_settings"]
@@ -31,8 +31,8 @@ def check_terms(key: str, terms: Mapping[str, Any]) -> None:
             path = f"{key}.{name}.{setting}"
             if setting not in known:
                 raise ConfigKeyError(path, "is not a setting of this term", known_names(setting, known))
-            require(is_number(number), path, f"is {shown(number)}", "expected a number, 0 or more")
-            require(number <= TERM_NUMBER, path, f"is {shown(number)}", f"expected at most {TERM_NUMBER:g}")
+            expected = f"expected a number from 0 to {CONFIG_NUMBER:g}"
+            require(is_number(number), path, f"is {shown(number)}", expected)
             require(setting not in term.positive or number > 0, path, f"is {number!r}", "expected a number above 0")
 
 

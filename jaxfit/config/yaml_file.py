@@ -20,7 +20,7 @@ from jaxfit.config.messages import shown
 from jaxfit.config.yaml_values import Lines, YamlMapping, line_of, read_yaml
 from jaxfit.errors import InputError
 from jaxfit.limits import CONFIG_BASES, CONFIG_BYTES
-from jaxfit.storage.text_file import read_text
+from jaxfit.storage.reading import read_text
 
 __all__ = ["OWN_FILE", "config_to_yaml", "documented_yaml", "read_config", "shipped_configs"]
 

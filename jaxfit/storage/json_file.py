@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxfit.errors import InputError
 from jaxfit.limits import JSON_LEVELS, JSON_VALUES
-from jaxfit.storage.text_file import read_text
+from jaxfit.storage.reading import read_text
 
 __all__ = ["parse_json", "read_json_file"]
 

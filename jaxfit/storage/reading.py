@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 from jaxfit.errors import InputError
 
-__all__ = ["check_folder", "check_readable", "open_file", "read_file"]
+__all__ = ["check_folder", "check_readable", "open_file", "read_file", "read_text"]
 
 # Errors of the operating system for a read: the problem, and the action that the user can take.
 _PROBLEMS = {
@@ -82,9 +82,24 @@ def read_file(path: str | Path, most_bytes: int, kind: str = "a file") -> bytes:
         while size <= most_bytes and len(content) <= most_bytes and (part := file.read(2**18)):
             content += part
     if max(size, len(content)) > most_bytes:
-        problem = f"has {max(size, len(content)):,} bytes; {kind} of jaxfit has at most {most_bytes:,}"
-        raise InputError(path, problem, "check the path")
+        problem = f"has {max(size, len(content)):,} bytes, more than {most_bytes:,}"
+        raise InputError(path, problem, f"give {kind} of at most this size")
     return bytes(content)
+
+
+def read_text(path: str | Path, most_bytes: int, kind: str) -> str:
+    """Return the text of a UTF-8 file of at most `most_bytes`, without a byte order mark.
+
+    Raises:
+        InputError: as `read_file`; or the content is not UTF-8.
+    """
+    content = read_file(path, most_bytes, kind)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        problem = f"line {line} is not UTF-8 text (byte {error.start})"
+        raise InputError(path, problem, f"give {kind}, saved as UTF-8") from None
 
 
 def _require_file(path: Path, mode: int, kind: str) -> None:

@@ -30,8 +30,8 @@ def written(folder, text, name="mine.yaml"):
         ("absent.yaml", "`base` names 'absent.yaml', which does not exist.*paper"),
         (".", "is a folder, not a YAML file"),
         ("folder", "is a folder, not a YAML file"),
-        ("pipe", "is a pipe or a device"),
-        ("/dev/zero", "is a pipe or a device"),
+        ("pipe", "is a device or a pipe"),
+        ("/dev/zero", "is a device or a pipe"),
         ("large.yaml", "1,000,001 bytes, more than 1,000,000"),
     ],
 )
@@ -95,7 +95,7 @@ def test_names_that_no_file_can_have(tmp_path):
         ("base: paper\nterms:\n  mask: 1\n  masc: 2\n", "line 4: `terms.masc` names an unknown term 'masc'.*mean mask"),
         (
             "base: paper\nterms: {mask: 1.0e+300}\n",
-            r"line 2: `terms.mask.weight` is 1e\+300 \(expected at most 1e\+30\)",
+            r"line 2: `terms.mask.weight` is 1e\+300 \(expected a number from 0 to 1e\+30\)",
         ),
         ("base: paper\nwindow: [" + "1," * 30000 + "]\n", r"`window` is \[1, 1, 1, 1, \.\.\.\]"),
         ("base: paper\nterms: null\n", "`terms` must be a mapping, not null"),

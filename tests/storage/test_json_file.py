@@ -7,7 +7,7 @@ import pytest
 from jaxfit.errors import InputError
 from jaxfit.limits import JSON_LEVELS
 from jaxfit.storage.json_file import parse_json, read_json_file
-from jaxfit.storage.text_file import read_text
+from jaxfit.storage.reading import read_text
 
 DEEPEST = "[" * JSON_LEVELS + "]" * JSON_LEVELS
 

@@ -5,7 +5,6 @@ Source: Badger et al. 2020, *3D Bird Reconstruction* (github.com/marcbadger/avia
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from jaxfit.model.anatomy import AVIAN_MESH_KEYPOINTS
 from jaxfit.model.bird import Bird
 from jaxfit.model.importers.published_bird import build_bird, read_prior
 from jaxfit.model.importers.torch_file import read_tensors
-from jaxfit.storage.reading import read_file
+from jaxfit.storage.json_file import read_json_file
 
 __all__ = ["PRIOR_KEYS", "import_avian_mesh", "read_model_json"]
 
@@ -50,14 +49,7 @@ def read_model_json(path: Path | str) -> dict[str, Any]:
             contain an object.
     """
     path = Path(path)
-    text = read_file(path, MODEL_JSON_BYTES, "the JSON file of a bird model")
-    try:
-        content = json.loads(text)
-    except json.JSONDecodeError as error:
-        problem = f"not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
-        raise InputError(path, problem, "the file may be truncated: download it again") from error
-    except (ValueError, RecursionError) as error:  # text that is not UTF-8, numbers of many digits, many levels
-        raise InputError(path, f"not readable as JSON: {error}", "expected bird_eccv.json") from error
+    content = read_json_file(path, MODEL_JSON_BYTES)
     if not isinstance(content, dict):
         raise InputError(path, "not a JSON object", "expected bird_eccv.json")
     return content
