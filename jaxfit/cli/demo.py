@@ -18,7 +18,7 @@ from jaxfit.model.files import load_murre
 from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.progress import terminal
 from jaxfit.simulation.scene import simulate
-from jaxfit.storage.files import check_replaceable, write_whole
+from jaxfit.storage.files import check_replaceable, check_writable, write_whole
 from jaxfit.storage.json_values import json_text
 from jaxfit.storage.temporary import remove_leftovers
 
@@ -78,6 +78,7 @@ def run_demo(folder: Path) -> Evaluation:
 
 def _check_folder(folder: Path) -> None:
     """Raise InputError unless the folder is absent, empty or an earlier demo."""
+    check_writable(folder)
     if not folder.exists():
         return
     if not folder.is_dir():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 
 import numpy as np
@@ -59,7 +60,7 @@ def evaluate(options: argparse.Namespace) -> None:
     from jaxfit.evaluation.matching import match_tracks
     from jaxfit.evaluation.truth import read_truth
 
-    if options.result.is_file():
+    if os.path.isfile(options.result):  # noqa: PTH113 - False for paths that cannot exist
         if options.by:
             remedy = "give the folder of a result, or remove --by"
             raise InputError(options.result, "holds observations, for which there are no tables --by", remedy)

@@ -35,10 +35,12 @@ def model_info(options: argparse.Namespace) -> None:
 def model_view(options: argparse.Namespace) -> None:
     """Draw a model from six sides."""
     from jaxfit.model.murre import POSTURES
+    from jaxfit.storage.files import check_writable
     from jaxfit.view.six_views import six_views
 
     if options.posture and options.posture not in POSTURES:
         raise InputError("--posture", f"{options.posture!r} is not a known posture", f"known: {', '.join(POSTURES)}")
+    check_writable(options.out)  # before the rendering, which takes seconds
     six_views(find_bird(options.file), options.out, options.posture)
     show(f"six views → {options.out}")
 

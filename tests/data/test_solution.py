@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from support.birds import toy_bird
-from support.hostile import Isolated, many_examples
+from support.hostile import Isolated, fewer_examples
 from support.mutations import damaged_arrays, damaged_bytes
 
 from jaxfit.data.solution import FORMAT_VERSION, Solution, load_solution, save_solution
@@ -275,7 +275,7 @@ def test_any_damage_is_one_error(tmp_path):
         arrays = {name: stored[name] for name in stored.files}
     with Isolated("jaxfit.data.solution:load_solution", memory_mb=150) as reader:
 
-        @many_examples
+        @fewer_examples
         @given(damaged_bytes(whole) | damaged_arrays(arrays))
         def check(damaged):
             path.write_bytes(damaged) if isinstance(damaged, bytes) else np.savez(path, **damaged)

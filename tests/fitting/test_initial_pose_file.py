@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from support.birds import toy_bird
-from support.hostile import Isolated, many_examples
+from support.hostile import Isolated, fewer_examples
 from support.mutations import damaged_arrays, damaged_bytes
 
 from jaxfit.config.fit import load_config
@@ -197,7 +197,7 @@ def test_any_damage_is_one_error(tmp_path, arrays):
     whole = saved(tmp_path, arrays).read_bytes()
     with Isolated("support.hostile_calls:read_initial_poses", memory_mb=60) as reader:
 
-        @many_examples
+        @fewer_examples
         @given(damaged_bytes(whole) | damaged_arrays(arrays))
         def check(damaged):
             path = tmp_path / "damaged.npz"

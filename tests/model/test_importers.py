@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from support.checkpoints import write_legacy, write_zip
-from support.hostile import Isolated, many_examples
+from support.hostile import Isolated, fewer_examples
 from support.mutations import damaged_arrays, damaged_bytes, damaged_tree
 
 from jaxfit.errors import InputError
@@ -208,7 +208,7 @@ def test_any_damage_of_the_json_is_one_error(tmp_path, avian_mesh_files):
     whole, tree = path.read_bytes(), json.loads(path.read_text())
     with Isolated("jaxfit.model.importers.avian_mesh:import_avian_mesh", memory_mb=150) as reader:
 
-        @many_examples
+        @fewer_examples
         @given(damaged_bytes(whole) | damaged_tree(tree).map(lambda value: json.dumps(value).encode()))
         def check(content):
             path.write_bytes(content)
@@ -223,7 +223,7 @@ def test_any_damage_of_the_tensors_is_one_error(tmp_path):
     write_aves(path, lambda _, content: arrays.update(content))
     with Isolated("jaxfit.model.importers.aves:import_aves", memory_mb=150) as reader:
 
-        @many_examples
+        @fewer_examples
         @given(damaged_arrays(arrays))
         def check(changed):
             try:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
-from support.hostile import Isolated, many_examples
+from support.hostile import Isolated, fewer_examples
 from support.mutations import damaged_arrays, damaged_bytes
 
 from jaxfit.errors import InputError
@@ -294,7 +294,7 @@ def test_any_damage_is_one_error(tmp_path):
         arrays = {name: stored[name] for name in stored.files}
     with Isolated("jaxfit.model.files:load_bird", memory_mb=150) as reader:
 
-        @many_examples
+        @fewer_examples
         @given(damaged_bytes(whole) | damaged_arrays(arrays))
         def check(damaged):
             path.write_bytes(damaged) if isinstance(damaged, bytes) else np.savez(path, **damaged)

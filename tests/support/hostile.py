@@ -30,6 +30,8 @@ EXAMPLES = int(os.environ.get("JAXFIT_EXAMPLES", "60"))
 
 many_examples = settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
 """Settings of the property tests of readers. The variable JAXFIT_EXAMPLES changes the number of examples."""
+fewer_examples = settings(many_examples, max_examples=max(EXAMPLES // 4, 1))
+"""The same for readers that start JAX or import a model, which takes 0.1 s."""
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def damaged_arrays(draw: Any, valid: dict[str, np.ndarray]) -> dict[str, np.ndar
             with np.errstate(all="ignore"):
                 try:
                     arrays[name] = array.astype(kind)
-                except (TypeError, ValueError):
+                except (TypeError, ValueError, OverflowError):
                     arrays[name] = np.zeros(array.shape, kind)
         elif change == "shape":
             how = draw(st.sampled_from(("flat", "axis", "first", "empty", "twice", "scalar")))
