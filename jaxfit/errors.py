@@ -9,6 +9,8 @@ from jaxfit.limits import MESSAGE_CHARACTERS
 __all__ = ["InputError", "one_line", "shortened"]
 
 _PREFIX = "jaxfit: "
+_SOURCE_CHARACTERS = 80
+"""A message that is too long first shortens its source to this length, because the problem says more than a folder."""
 
 
 class InputError(ValueError):
@@ -44,7 +46,9 @@ def shortened(text: str, longest: int) -> str:
 
 
 def _fitted(parts: Sequence[str], total: int) -> list[str]:
-    """Shorten the longest parts until all parts together have at most `total` characters."""
+    """Shorten the source, then the longest parts, until all parts together have at most `total` characters."""
+    if sum(map(len, parts)) > total:
+        parts = [shortened(parts[0], _SOURCE_CHARACTERS), *parts[1:]]
     longest = total
     while sum(min(len(part), longest) for part in parts) > total:
         longest -= 1

@@ -61,6 +61,12 @@ def own_cache(tmp_path, monkeypatch):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", before[1])
 
 
+@pytest.fixture
+def distant_birds(monkeypatch):
+    """Let a fit accept birds at any distance, whose objective overflows."""
+    monkeypatch.setattr("jaxfit.fitting.distant.DISTANCE_IMAGE_SIDES", 1e35)
+
+
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
     """A folder of input files for the command line."""

@@ -60,7 +60,8 @@ def _trace(term: Term, function: Callable[..., object], *arguments: object) -> N
         file = getattr(getattr(term.function, "__code__", None), "co_filename", None)
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         where = f" at {file}:{lines[-1]}" if lines else ""
-        message = f"{type(error).__name__}: {error}".split("\n")[0].strip()
+        # the first sentence, because JAX explains its errors on many lines
+        message = f"{type(error).__name__}: {error}".split("\n")[0].split(". ")[0].strip()
         problem = f"cannot be traced or differentiated{where}: {message}"
         raise InputError(f"term {term.name!r}", problem, "the term must run under jax.jit and jax.grad") from error
 

@@ -132,8 +132,8 @@ def _import(name: str, path: str) -> Any:
     try:
         module = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # a foreign module may raise any exception, and may end Python
-        problem = f"cannot be imported from {module_name!r}: {type(error).__name__}: {error}"
-        remedy = "write `package.module:function`, with its folder installed or in PYTHONPATH"
+        problem = f"cannot be imported: {type(error).__name__}: {error}"
+        remedy = "its folder must be in PYTHONPATH, or its package installed"
         raise InputError(f"term {name!r}", problem, remedy) from error
     try:
         return getattr(module, attribute)

@@ -82,7 +82,7 @@ def temporary(target: Path) -> Iterator[Temporary]:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files and folders in a folder that no living process owns."""
-    with suppress(OSError):  # the folder may not exist, or its names may not be readable
+    with suppress(OSError, ValueError):  # the folder may not exist or not be readable, and no folder has a NUL
         for name in os.listdir(folder):  # noqa: PTH208 - a list, because the loop removes names
             if _LOCK.fullmatch(name):
                 with suppress(OSError):  # the lock of a living process or of another user

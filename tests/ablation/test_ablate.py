@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import platform
 import re
 import shutil
 import signal
@@ -132,7 +133,8 @@ def test_a_kill_between_two_moves(done, inputs, grid, tmp_path):
     (out / ".ready-1").mkdir()
     last = sorted((out / "runs").iterdir())[-1]
     shutil.move(last, out / ".ready-1" / last.name)
-    (out / "..ready-2.0000.part").mkdir()
+    (out / "..ready-2.00000000.part").mkdir()
+    (out / "..ready-2.00000000.lock").write_bytes(f"jaxfit\n{platform.node()}\n.ready-2".encode())
     before = (out / ".ready-1" / last.name / "poses.npz").stat().st_mtime_ns
     assert main(command(inputs, grid, out)) == 0
     assert (last / "poses.npz").stat().st_mtime_ns == before

@@ -68,7 +68,7 @@ def result(make):
 
 # Name → (function of the inputs' folder and an empty folder that returns the command, words of the message).
 CASES = {
-    "3,600 tracks over 3,600 frames": (with_observations(files.sparse_tracks), ["observations.json", "3600 tracks"]),
+    "3,600 tracks over 3,600 frames": (with_observations(files.sparse_tracks), ["observations.json", "GB"]),
     "zigzag polygon": (with_observations(files.zigzag_polygon), ["observations.json", "segmentation"]),
     "deep json": (with_observations(files.deep_json), ["deep.json"]),
     "number of 5,000 digits in json": (with_observations(files.many_digits), ["digits.json"]),

@@ -161,7 +161,7 @@ def test_unusable_inputs_of_track_and_reconstruct(name, inputs, tmp_path, monkey
     expect("none.mp4: does not exist", video="none.mp4")
     expect("notes.txt: is not a readable video", video="notes.txt")
     expect("`track.frames.stop` is 3, and `start` is 4", more=["--start", 4, "--stop", 3])
-    expect("none.yaml", "cannot read", more=["--config", tmp_path / "none.yaml"])
+    expect("none.yaml", "does not exist", more=["--config", tmp_path / "none.yaml"])
     (tmp_path / "bad.yaml").write_text("base: reconstruct\ntrack: {segmentor: x}\n")
     expect("bad.yaml", "`track.segmentor`", more=["--config", tmp_path / "bad.yaml"])
     expect("paper", "is the config of a fit", more=["--config", "paper"])

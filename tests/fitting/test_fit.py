@@ -84,12 +84,6 @@ def test_the_common_size_is_constant_in_a_window(solution, observed):
     assert np.ptp(size_per_frame.scale[0]) > 1e-4
 
 
-@pytest.fixture
-def distant_birds(monkeypatch):
-    """Let a fit accept birds at any distance, whose objective overflows."""
-    monkeypatch.setattr("jaxfit.fitting.distant.DISTANCE_IMAGE_SIDES", 1e35)
-
-
 @pytest.mark.usefixtures("distant_birds")
 @pytest.mark.parametrize("windows_per_batch", [1, 2])
 def test_a_diverged_bird_does_not_change_the_other_birds(observed, windows_per_batch):

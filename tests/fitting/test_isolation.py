@@ -11,6 +11,7 @@ from jaxfit.fitting.tiles import FRAMES_PER_TILE, join_tiles, take_tile, tile_ro
 from jaxfit.model.pose import Pose
 from jaxfit.simulation.detections import detect
 
+pytestmark = pytest.mark.usefixtures("distant_birds")
 ARRAYS = [*Pose.__dataclass_fields__, "keypoints_cam", "keypoints_px", "valid"]
 BIRDS, DIVERGING = 4, 1
 

@@ -277,7 +277,7 @@ def test_unsupported_layouts(tmp_path, shape, outputs, kind, message):
         ("alignment", "left", "centres, deeplabcut, msra or udp"),
         ("input_size", "0,64", "width,height"),
         ("locref_std", "-1", "more than 0"),
-        ("pad_px", "-3", "0 to 2000 pixels"),
+        ("pad_px", "-3", "0 to 4096 pixels"),
         ("keypoint_names", "a,,c", "names, separated by commas"),
     ],
 )
