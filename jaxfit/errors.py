@@ -9,7 +9,7 @@ from jaxfit.limits import MESSAGE_CHARACTERS
 __all__ = ["InputError", "one_line", "shortened"]
 
 _PREFIX = "jaxfit: "
-_SOURCE_CHARACTERS = 80
+_SOURCE_CHARACTERS = 100
 """A message that is too long first shortens its source to this length, because the problem says more than a folder."""
 
 

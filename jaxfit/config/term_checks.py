@@ -52,7 +52,7 @@ def require_term(key: str, name: str) -> Term:
         remedy = f"{known_names(name, known_terms())}; or package.module:function"
         raise ConfigKeyError(key, f"names an unknown term {name!r}", remedy) from None
     except InputError as error:
-        raise ConfigKeyError(key, f"names an unusable term: {error.source} {error.problem}", error.remedy) from error
+        raise ConfigKeyError(key, f"names a {error.source}, which {error.problem}", error.remedy) from error
 
 
 def term_settings(value: Any) -> dict[str, float]:

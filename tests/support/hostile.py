@@ -26,7 +26,7 @@ from hypothesis import HealthCheck, settings
 
 MEMORY_MB = 400
 SECONDS = 5
-EXAMPLES = int(os.environ.get("JAXFIT_EXAMPLES", "60"))
+EXAMPLES = int(os.environ.get("JAXFIT_EXAMPLES", "40"))
 
 many_examples = settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=list(HealthCheck))
 """Settings of the property tests of readers. The variable JAXFIT_EXAMPLES changes the number of examples."""

@@ -24,6 +24,7 @@ def short(name: str):
     return dataclasses.replace(config, stages=stages, window=4)
 
 
+@pytest.mark.extended
 def test_every_pair_of_tiles_is_drawn(tmp_path):
     observations = detect(BIRD, [smooth_motion(BIRD, 4, 0)])
     solution = fit(observations, BIRD, short("paper"))
