@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ import numpy as np
 from jaxfit.data.formats.deeplabcut_columns import COORDS, keypoint_table, row_names
 from jaxfit.data.formats.keypoint_table import KeypointTable
 from jaxfit.errors import InputError
-from jaxfit.limits import CSV_BYTES
+from jaxfit.limits import CSV_BYTES, TABLE_VALUES
 from jaxfit.storage.reading import read_file
 
 __all__ = ["read_deeplabcut_csv"]
@@ -41,21 +42,23 @@ def read_deeplabcut_csv(path: Path) -> KeypointTable:
             break
         header.append(cells)
     _check_header(path, header, first)
-    # the cells of the first header row are empty above the names of the rows
-    named = next((i for i, cell in enumerate(header[0][1:], 1) if cell.strip()), len(header[0]))
+    # the cells of the header are empty above the names of the rows
+    named = next((i for i, cell in enumerate(header[-1][1:], 1) if cell.strip()), len(header[-1]))
     columns = [tuple(cell.strip() for cell in column) for column in zip(*header, strict=True)]
     used = [i for i in range(named, len(columns)) if columns[i][-1] in COORDS]
     names: list[str] = []
-    rows: list[list[float]] = []
+    numbers = array("d")  # takes less memory than a list
     for number, cells in [first, *lines] if first else ():
         if len(cells) != len(columns):
             problem = f"line {number} has {len(cells)} cells, not {len(columns)}"
             raise InputError(path, problem, "the file may end midway: copy or write it again")
-        if not (rows or any(cells[named:]) or cells[0].isdecimal() or "." in cells[named - 1]):
+        if not (names or any(cells[named:]) or cells[0].isdecimal() or "." in cells[named - 1]):
             continue  # names of the index, which some programs write
         names.append("/".join(cell.strip() for cell in cells[:named] if cell.strip()))
-        rows.append([_number(path, number, cells[i], columns[i]) for i in used])
-    values = np.array(rows, np.float64).reshape(len(rows), len(used))
+        numbers.extend(_number(path, number, cells[i], columns[i]) for i in used)
+        if len(numbers) > len(COORDS) * TABLE_VALUES:
+            raise InputError(path, f"holds more than {len(numbers):,} numbers", "split the file")
+    values = np.array(numbers, np.float64).reshape(len(names), len(used))
     return keypoint_table([columns[i] for i in used], values, path, *row_names(names, path))
 
 
