@@ -59,7 +59,7 @@ def _read_table(table: Hdf5Group) -> tuple[list[tuple[str, ...]], np.ndarray, li
     """Return columns, values and names of the rows of the layout `table`."""
     types = table.column_types("table")
     blocks = sorted(name for name in types if name.startswith("values_block_"))[:_MOST_BLOCKS]
-    read = table.columns("table", {"index": "iuS", **dict.fromkeys(blocks, "iuf")})
+    read = table.columns("table", {"index": "iuS", **dict.fromkeys(blocks, "iuf")}, ndim=None)
     columns: list[tuple[str, ...]] = []
     values = [np.zeros((len(read["index"]), 0))]
     for name in blocks:
@@ -118,6 +118,8 @@ def _axis(table: Hdf5Group, name: str) -> list[tuple[str, ...]]:
 
 
 def _row_texts(table: Hdf5Group, name: str, values: np.ndarray) -> list[str]:
+    if values.ndim != 1:
+        table.fail(name, f"has names with {values.ndim} axes, not 1")
     if values.dtype.kind == "S":
         try:
             return [value.decode("utf-8") for value in values.tolist()]

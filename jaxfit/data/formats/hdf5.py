@@ -137,12 +137,13 @@ class Hdf5Group:
                 self.fail(name, f"has {entry.ndim} axes, not {ndim}")
             return np.asarray(entry[()])
 
-    def columns(self, name: str, kinds: dict[str, str]) -> dict[str, np.ndarray]:
+    def columns(self, name: str, kinds: dict[str, str], ndim: int | None = 1) -> dict[str, np.ndarray]:
         """Return columns of a table, as a dict of arrays with one row for every row of the table.
 
         Args:
             name: the entry.
             kinds: name of a column → accepted kinds of NumPy's types. Other columns are not returned.
+            ndim: number of axes of every column, with the axis of the rows; None for any.
         """
         entry = self._dataset(name)
         with _errors(self.source, self._label(name)):
@@ -152,7 +153,9 @@ class Hdf5Group:
             for column, accepted in kinds.items():
                 if column not in fields:
                     self.fail(name, f"lacks the column {column}", "write the file again")
-                if fields[column][0].base.kind not in accepted or fields[column][0].hasobject:
+                field = fields[column][0]
+                wrong_axes = ndim is not None and 1 + field.ndim != ndim
+                if field.base.kind not in accepted or field.hasobject or wrong_axes:
                     self.fail(name, f"holds another type than expected in the column {column}")
             rows = entry[()]
         return {column: rows[column] for column in kinds}

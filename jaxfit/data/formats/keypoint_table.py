@@ -14,7 +14,7 @@ from jaxfit.data.formats.image_sizes import image_sizes
 from jaxfit.data.formats.picture_names import frame_numbers
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError, one_line, shortened
-from jaxfit.limits import CONFIDENCE, NAME_CHARACTERS, TABLE_BIRDS, TABLE_KEYPOINTS, TABLE_VALUES
+from jaxfit.limits import CONFIDENCE, NAME_CHARACTERS, TABLE_BIRDS, TABLE_KEYPOINTS, TABLE_PICTURES, TABLE_VALUES
 
 __all__ = ["KeypointTable", "check_table_size", "table_observations"]
 
@@ -139,7 +139,10 @@ def _photographs(parts: dict[str, np.ndarray], names: np.ndarray, size: np.ndarr
 
 def _check_names(table: KeypointTable, source: Path) -> None:
     names = table.keypoint_names
-    for name in (*names, *table.bird_names, *(table.pictures or ())):
+    pictures = table.pictures or ()
+    if len(pictures) > TABLE_PICTURES:
+        raise InputError(source, f"names {len(pictures):,} pictures, more than {TABLE_PICTURES:,}", "split the file")
+    for name in (*names, *table.bird_names, *pictures, _video_name(table, source)):
         if not name or len(name) > NAME_CHARACTERS:
             problem = f"holds a name of {len(name):,} characters" if name else "holds an empty name"
             raise InputError(source, problem, f"use names of 1 to {NAME_CHARACTERS} characters")
@@ -176,10 +179,14 @@ def _clean_score(score: np.ndarray) -> np.ndarray:
     return np.clip(np.where(np.isfinite(score), score, 1), 0, 1)
 
 
+def _video_name(table: KeypointTable, source: Path) -> str:
+    return (table.video or source.stem).replace("\\", "/").rsplit("/", 1)[-1]
+
+
 def _file_names(table: KeypointTable, source: Path, video: Path | None, frames: np.ndarray | None) -> np.ndarray:
     if table.pictures is not None:
         return np.array(table.pictures, str).reshape(-1)
-    name = video.name if video is not None else Path((table.video or source.stem).replace("\\", "/")).name
+    name = video.name if video is not None else _video_name(table, source)
     return np.array([f"{name}#{frame}" for frame in (frames if frames is not None else ())], str).reshape(-1)
 
 

@@ -17,8 +17,11 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.formats.coco_exports import complete_export
+from jaxfit.data.formats.coco_records import read_images
+from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.image_sizes import read_picture
+from jaxfit.data.formats.rle import read_segmentation
 from jaxfit.data.masks import decode_mask, encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
@@ -105,12 +108,18 @@ def _assigned(
 
 def _coco_masks(observations: Observations, source: Path) -> _Masks:
     """Return a function of bird and frame that returns the masks of the image in a COCO file."""
-    seen = read_coco(source)
+    root = complete_export(read_json(source))
+    images = read_images(root["images"])
     photographs = bool(observations.own_images)
-    found: dict[Any, list[dict]] = {}
-    for (n, t), rle in seen.masks.items():
-        key = Path(seen.image_file(n, t)).name if photographs else int(seen.frame_index[t])
-        found.setdefault(key, []).append(dict(rle))
+    found: dict[Any, list[dict[str, Any]]] = {}
+    for annotation in root["annotations"]:
+        image = images.get(annotation["image_id"].identifier())
+        crowd = annotation.has("iscrowd") and annotation["iscrowd"].integer(0, 1)
+        if image is None or crowd or not annotation.has("segmentation"):
+            continue
+        rle = read_segmentation(annotation["segmentation"], image.height, image.width)
+        if rle is not None:
+            found.setdefault(Path(image.file_name).name if photographs else image.frame_index, []).append(rle)
 
     def masks_of(n: int, t: int) -> list[np.ndarray]:
         key = Path(observations.image_file(n, t)).name if photographs else int(observations.frame_index[t])
