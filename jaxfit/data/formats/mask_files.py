@@ -31,8 +31,8 @@ from jaxfit.video.reader import image_files
 
 __all__ = ["add_masks"]
 
-_COVERED = 0.5
-"""Least fraction of a bird's keypoints that its mask covers, weighted by confidence."""
+_COVERED = 0.3
+"""Least fraction of a bird's keypoints that its mask covers, weighted by confidence; another bird may hide the rest."""
 _MOST_VALUES = 64
 """A picture with more grey values is no picture of labels: masks are where the grey value is 128 or more."""
 _NUMBER = re.compile(rf"\d{{1,{FRAME_DIGITS}}}", re.ASCII)
@@ -45,7 +45,7 @@ def add_masks(observations: Observations, source: Path, progress: ProgressTask =
 
     The pictures belong to the images of the same name, or else to the frames of the numbers in their names, or else to
     the frames in their order. The birds of a COCO file belong to the frames of the same number, or to photographs of
-    the same name. Birds without a mask that covers half of their keypoints keep the mask that they had.
+    the same name. Birds without a mask that covers three tenths of their keypoints keep the mask that they had.
 
     Args:
         observations: birds with keypoints.
