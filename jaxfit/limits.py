@@ -34,6 +34,8 @@ HDF5_BYTES = 1_000_000_000
 """Largest array that is read from an HDF5 file, without compression."""
 HDF5_ENTRIES = 10_000
 """Most entries of a folder inside an HDF5 file."""
+HDF5_TEXTS = 100_000
+"""Most texts of an array of texts in an HDF5 file, such as the names of tracks."""
 HDF5_TEXT_BYTES = 10_000_000
 """Largest text that is read from an HDF5 file."""
 NAME_MAP_BYTES = 100_000

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfit.errors import InputError
 from jaxfit.extras import require_extra
-from jaxfit.limits import HDF5_BYTES, HDF5_ENTRIES, HDF5_TEXT_BYTES
+from jaxfit.limits import HDF5_BYTES, HDF5_ENTRIES, HDF5_TEXT_BYTES, HDF5_TEXTS
 from jaxfit.storage.reading import check_readable
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file."""
 _FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
 """Filters that h5py itself decodes; other filters would load a plugin."""
+_COMPRESSION = 2000
+"""Largest ratio of an array and its compressed size."""
 _REMEDY = "the file may be damaged: copy or write it again"
 
 
@@ -115,6 +117,10 @@ class Hdf5Group:
             if max(size, chunk) > HDF5_BYTES:
                 self.fail(name, f"needs {max(size, chunk):,} bytes, more than {HDF5_BYTES:,}", "split the file")
             properties = entry.id.get_create_plist()
+            # gzip compresses zeros to a thousandth; other arrays are no larger than the file
+            largest = self.source.stat().st_size * (_COMPRESSION if properties.get_nfilters() else 1)
+            if size > largest:
+                self.fail(name, f"needs {size:,} bytes, more than its file of {self.source.stat().st_size:,} bytes holds")
             for i in range(properties.get_nfilters()):
                 number = properties.get_filter(i)[0]
                 if number not in _FILTERS:
@@ -178,6 +184,8 @@ class Hdf5Group:
                 if entry.size == 0:
                     return []
                 self.fail(name, "does not hold text")
+            if entry.size > HDF5_TEXTS:
+                self.fail(name, f"holds {entry.size:,} texts, more than {HDF5_TEXTS:,}", "split the file")
             values = entry[()]
         texts = [self._text(name, value) for value in np.atleast_1d(np.asarray(values, object))]
         if sum(map(len, texts)) > HDF5_TEXT_BYTES:
@@ -209,7 +217,7 @@ class Hdf5Group:
                 self.fail(label, f"has more than {HDF5_TEXT_BYTES:,} bytes", "split the file")
             value = owner.attrs[name]
         if isinstance(value, str | bytes):
-            return value.encode() if isinstance(value, str) else bytes(value)
+            return value.encode("utf-8", "surrogateescape") if isinstance(value, str) else bytes(value)
         if isinstance(value, np.number | np.bool_):
             return float(np.real(value))
         if isinstance(value, h5py.Empty):
