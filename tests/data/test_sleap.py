@@ -193,6 +193,17 @@ def test_hostile_hdf5(tmp_path, case):
         read_observations(path, size_px=SIZE)
 
 
+def test_a_damaged_heap_of_texts_ends_with_an_error(tmp_path):
+    """The HDF5 library never returns from an object without a size."""
+    path = write_analysis(tmp_path / "a.h5", ("track", "xy", "node", "frame"))
+    content = bytearray(path.read_bytes())
+    heap = content.index(b"GCOL") + 16
+    content[heap : heap + 16] = bytes(16)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"its heap of texts at byte [\d,]+ is not valid"):
+        read_observations(path)
+
+
 def test_other_hdf5_files(tmp_path):
     path = damage("a.h5", lambda file: file["df_with_missing"].attrs.pop("pandas_type"), tmp_path, write_table)
     with pytest.raises(InputError, match="is an HDF5 file of no known format: it holds df_with_missing"):

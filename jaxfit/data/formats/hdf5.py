@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from jaxfit.data.formats.hdf5_heaps import check_heaps
 from jaxfit.errors import InputError
 from jaxfit.extras import require_extra
 from jaxfit.limits import HDF5_BYTES, HDF5_ENTRIES, HDF5_TEXT_BYTES, HDF5_TEXTS
@@ -43,6 +44,7 @@ def open_hdf5(path: str | Path) -> Iterator[Hdf5Group]:
     require_extra("formats", str(path))
     import h5py
 
+    check_heaps(path)
     with _errors(path, "the file"):
         file = h5py.File(path, "r", locking=False)
     try:
@@ -120,7 +122,9 @@ class Hdf5Group:
             # gzip compresses zeros to a thousandth; other arrays are no larger than the file
             largest = self.source.stat().st_size * (_COMPRESSION if properties.get_nfilters() else 1)
             if size > largest:
-                self.fail(name, f"needs {size:,} bytes, more than its file of {self.source.stat().st_size:,} bytes holds")
+                self.fail(
+                    name, f"needs {size:,} bytes, more than its file of {self.source.stat().st_size:,} bytes holds"
+                )
             for i in range(properties.get_nfilters()):
                 number = properties.get_filter(i)[0]
                 if number not in _FILTERS:
@@ -184,7 +188,7 @@ class Hdf5Group:
                 if entry.size == 0:
                     return []
                 self.fail(name, "does not hold text")
-            if entry.size > HDF5_TEXTS:
+            if (entry.size or 0) > HDF5_TEXTS:
                 self.fail(name, f"holds {entry.size:,} texts, more than {HDF5_TEXTS:,}", "split the file")
             values = entry[()]
         texts = [self._text(name, value) for value in np.atleast_1d(np.asarray(values, object))]
