@@ -13,6 +13,8 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.config.perception import TrackConfig
     from jaxfit.config.reconstruct import ReconstructConfig, load_reconstruct_config
     from jaxfit.data.formats.coco import read_coco, write_coco
+    from jaxfit.data.formats.recognise import read_observations
+    from jaxfit.data.keypoint_names import map_keypoints, propose_names
     from jaxfit.data.observations import Observations
     from jaxfit.data.solution import Solution, load_solution, save_solution
     from jaxfit.data.track_quality import track_quality
@@ -58,10 +60,13 @@ __all__ = [
     "load_reconstruct_config",
     "load_segmenter",
     "load_solution",
+    "map_keypoints",
     "match_tracks",
     "overlay",
     "overlay_frame",
+    "propose_names",
     "read_coco",
+    "read_observations",
     "read_truth",
     "reconstruct",
     "save_bird",
@@ -84,6 +89,8 @@ _HOMES = {
     "config.perception": ("TrackConfig",),
     "config.reconstruct": ("ReconstructConfig", "load_reconstruct_config"),
     "data.formats.coco": ("read_coco", "write_coco"),
+    "data.formats.recognise": ("read_observations",),
+    "data.keypoint_names": ("map_keypoints", "propose_names"),
     "data.observations": ("Observations",),
     "data.solution": ("Solution", "load_solution", "save_solution"),
     "data.track_quality": ("track_quality",),

@@ -9,6 +9,7 @@ from jaxfit.errors import InputError
 __all__ = ["require_extra"]
 
 _EXTRAS = {
+    "formats": ("h5py", ("h5py",)),
     "report": ("Matplotlib and tabulate", ("matplotlib", "tabulate")),
     "train": ("PyTorch and ONNX", ("torch", "onnx", "onnxscript")),
 }
@@ -23,4 +24,4 @@ def require_extra(extra: str, source: str) -> None:
     """
     names, packages = _EXTRAS[extra]
     if not all(find_spec(package) for package in packages):
-        raise InputError(source, f"needs {names}, which are not installed", f'run pip install "jaxfit[{extra}]"')
+        raise InputError(source, f"needs {names}, which this installation lacks", f'run pip install "jaxfit[{extra}]"')

@@ -30,7 +30,7 @@ def test_every_public_name_comes_from_its_module():
     [
         (["--help"], 0, "COMMAND"),
         (["--version"], 0, jaxfit.__version__),
-        (["fit"], 2, "required: OBS.json"),
+        (["fit"], 2, "required: OBS"),
         (["simulate", "--out", "x", "--codec", "av1"], 2, "invalid choice: 'av1'"),
     ],
 )

@@ -5,17 +5,26 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxfit.cli.observation_files import image_size, observations_for, rename_keypoints
 from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, right_aligned, show
-from jaxfit.data.formats.coco import read_coco
 from jaxfit.errors import InputError
 from jaxfit.model.files import find_bird
 from jaxfit.progress import terminal
 from jaxfit.storage.json_values import json_text
 
+if TYPE_CHECKING:
+    from jaxfit.config.fit import FitConfig
+    from jaxfit.data.keypoint_names import NameMap
+
 __all__ = ["evaluate", "fit", "overlay"]
+
+LEAST_KEYPOINTS = 3
+"""Fewer keypoints do not determine the orientation of a bird."""
 
 
 def fit(options: argparse.Namespace) -> None:
@@ -32,7 +41,8 @@ def fit(options: argparse.Namespace) -> None:
     check_replaceable(options.out, options.overwrite, "poses.npz")  # before the long work
     config = load_config(options.config)
     bird = find_bird(options.model)
-    observations = read_coco(options.observations)
+    observations, names = observations_for(options.observations, bird.keypoint_names, options)
+    config = _fewer_keypoints(config, names, options)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
     read = time.perf_counter()
     solution = fit(observations, bird, config, initial_poses, terminal, source=options.observations)
@@ -52,6 +62,22 @@ def fit(options: argparse.Namespace) -> None:
     show(f"{poses} of {birds} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
 
 
+def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namespace) -> FitConfig:
+    """Return a config that requires no more keypoints per frame than the file has.
+
+    Raises:
+        InputError: fewer keypoints than an orientation needs.
+    """
+    count = len(names.mapped)
+    if count >= config.min_keypoints:
+        return config
+    if count < LEAST_KEYPOINTS:
+        problem = f"has {count} keypoints of the model by name; a fit needs {LEAST_KEYPOINTS}"
+        raise InputError(options.observations, problem, "map more names by --names MAP.yaml")
+    show(f"min_keypoints is {count} instead of {config.min_keypoints}, because the file has {count} keypoints")
+    return replace(config, min_keypoints=count)
+
+
 def evaluate(options: argparse.Namespace) -> None:
     """Compare a result or observations with the truth and print metrics."""
     from jaxfit.cli.observation_tables import matching_line
@@ -67,7 +93,12 @@ def evaluate(options: argparse.Namespace) -> None:
         _evaluate_observations(options)
         return
     solution, bird = load_solution(options.result)
-    truth = read_truth(options.truth)
+    truth = read_truth(options.truth, options.video, image_size(options))
+    if set(truth.observations.keypoint_names) != set(bird.keypoint_names):
+        renamed = rename_keypoints(
+            truth.observations, options.truth, bird.keypoint_names, options.names, quiet=options.json
+        )
+        truth = replace(truth, observations=renamed.observations)
     if options.by == "behaviour" and truth.behaviours is None:
         remedy = "give the folder of a simulated scene, or remove --by behaviour"
         raise InputError(options.truth, "holds no behaviours of the birds", remedy)
@@ -94,10 +125,19 @@ def _evaluate_observations(options: argparse.Namespace) -> None:
     from dataclasses import asdict
 
     from jaxfit.cli.observation_tables import observation_tables, uncounted_lines
+    from jaxfit.data.formats.recognise import read_observations
+    from jaxfit.data.keypoint_names import map_keypoints, propose_names
     from jaxfit.evaluation.observed import evaluate_observations
     from jaxfit.evaluation.truth import read_truth
 
-    result = evaluate_observations(read_coco(options.result), read_truth(options.truth))
+    truth = read_truth(options.truth, options.video, image_size(options))
+    observations = read_observations(options.result, options.video, image_size(options))
+    true_names = truth.observations.keypoint_names
+    if options.names or propose_names(observations.keypoint_names, true_names).mapped:
+        renamed = rename_keypoints(observations, options.result, true_names, options.names, quiet=options.json)
+        # keypoints that only one of the files has are not compared
+        observations = map_keypoints(observations, renamed.names, list(renamed.names.mapped.values()))
+    result = evaluate_observations(observations, truth)
     if options.json:
         keypoints = {name: row._asdict() for name, row in result.keypoints.items()}
         print(json_text(asdict(result) | {"keypoints": keypoints}))  # noqa: T201
@@ -114,7 +154,9 @@ def overlay(options: argparse.Namespace) -> None:
     from jaxfit.view.overlay import overlay, overlay_frame
 
     solution, bird = load_solution(options.result)
-    observations = read_coco(options.observations) if options.observations else None
+    observations = None
+    if options.observations:
+        observations, _ = observations_for(options.observations, solution.keypoint_names, options)
     drawn = {"observations": observations, "side_views": options.side_views, "overwrite": options.overwrite}
     if options.frame is not None:
         overlay_frame(solution, bird, options.video, options.frame, options.out, **drawn)

@@ -19,7 +19,7 @@ from jaxfit.video.codecs import CODECS
 __all__ = ["build_parser"]
 
 MODEL = "`murre`, or a model file (.npz) that `jaxfit model import` writes"
-OBSERVATIONS = "COCO file of keypoints and masks"
+OBSERVATIONS = "keypoints and masks: COCO, DeepLabCut (.h5, .csv), Lightning Pose (.csv) or SLEAP (.slp, .analysis.h5)"
 
 
 def _names(text: str) -> list[str]:
@@ -51,7 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
     parser.add_argument("-v", "--verbose", action="store_true", help="print more messages, also of libraries")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add_commands in (_perception, _fitting, _simulation, _training, _datasets, _models, _configs, _bench):
+    for add_commands in (_perception, _import, _fitting, _simulation, _training, _datasets, _models, _configs, _bench):
         add_commands(commands)
     return parser
 
@@ -68,7 +68,7 @@ def _add_model(command: argparse.ArgumentParser) -> None:
 
 
 def _add_truth(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--truth", type=Path, required=True, help="COCO file of annotations, or a simulated scene")
+    command.add_argument("--truth", type=Path, required=True, help="annotations (formats as of OBS), or a scene")
     text = "match tracks with annotated birds by track id (ids) or by overlap; auto matches by overlap only if a track "
     text += "follows another bird than its id says (default %(default)s)"
     command.add_argument("--match", choices=("auto", "ids", "overlap"), default="auto", help=text)
@@ -79,6 +79,18 @@ def _add_out(command: argparse.ArgumentParser, metavar: str, text: str, overwrit
     command.add_argument("--out", type=Path, required=True, metavar=metavar, help=text)
     if overwrite:
         command.add_argument("--overwrite", action="store_true", help=f"replace {overwrite}")
+
+
+def _add_observation_options(command: argparse.ArgumentParser, video: bool = True) -> None:
+    """Add the options that files of other tracking programs may need."""
+    text = "YAML file with lines `name in the file: name in the model` (default: names are mapped by their words)"
+    command.add_argument("--names", type=Path, metavar="MAP.yaml", help=text)
+    if video:
+        text = "video (or folder of pictures) of the keypoints, for files that do not store the size of the images"
+        command.add_argument("--video", type=Path, help=text)
+        command.add_argument("--size", metavar="WxH", help="size of the images in pixels, in place of --video")
+    else:
+        command.set_defaults(size=None)
 
 
 def _add_codec(command: argparse.ArgumentParser) -> None:
@@ -105,8 +117,9 @@ def _perception(commands: Any) -> None:
 
 
 def _fitting(commands: Any) -> None:
-    fit = _command(commands, "fit", "fitting.fit", "fit the poses of birds to a COCO file of keypoints and masks")
-    fit.add_argument("observations", type=Path, metavar="OBS.json", help=OBSERVATIONS)
+    fit = _command(commands, "fit", "fitting.fit", "fit the poses of birds to keypoints and masks")
+    fit.add_argument("observations", type=Path, metavar="OBS", help=OBSERVATIONS)
+    _add_observation_options(fit)
     _add_model(fit)
     text = "name of a shipped config (paper, baseline, …) or a YAML file (default %(default)s)"
     fit.add_argument("--config", default="paper", help=text)
@@ -116,8 +129,9 @@ def _fitting(commands: Any) -> None:
 
     text = "compare a result, or observations, with annotations or with the ground truth of a simulated scene"
     evaluate = _command(commands, "evaluate", "fitting.evaluate", text)
-    evaluate.add_argument("result", type=Path, metavar="DIR|OBS.json", help="folder of a result, or a COCO file")
+    evaluate.add_argument("result", type=Path, metavar="DIR|OBS", help=f"folder of a result, or {OBSERVATIONS}")
     _add_truth(evaluate)
+    _add_observation_options(evaluate)
     text = "also print the metrics by behaviour (of a simulated scene) or by keypoint"
     evaluate.add_argument("--by", choices=("behaviour", "keypoint"), help=text)
     text = "print JSON instead of tables, with the metrics by behaviour and keypoint"
@@ -140,7 +154,8 @@ def _fitting(commands: Any) -> None:
     _add_out(
         overlay, "FILE", "video to write; the same folder receives a contact sheet (.png)", overwrite="existing files"
     )
-    overlay.add_argument("--observations", type=Path, metavar="OBS.json", help="also draw the detected keypoints")
+    overlay.add_argument("--observations", type=Path, metavar="OBS", help="also draw the detected keypoints")
+    _add_observation_options(overlay, video=False)
     overlay.add_argument("--side-views", action="store_true", help="also show every bird from its side")
     overlay.add_argument("--frame", type=int, help="draw only this frame, as a picture (.png or .jpg)")
     _add_codec(overlay)
@@ -190,6 +205,17 @@ def _datasets(commands: Any) -> None:
     text += "the murre model; or `none` for numbers as names (default %(default)s)"
     murre.add_argument("--keypoints", default="none", metavar="NAMES", help=text)
     _add_out(murre, "OBS.json", "COCO file to write", overwrite="an existing file")
+
+
+def _import(commands: Any) -> None:
+    text = "convert keypoints of DeepLabCut, SLEAP, Lightning Pose, CVAT or Label Studio to a COCO file"
+    importer = _command(commands, "import", "importing.import_observations", text)
+    importer.add_argument("file", type=Path, metavar="FILE", help=OBSERVATIONS)
+    _add_out(importer, "OBS.json", "COCO file to write", overwrite="an existing file")
+    _add_observation_options(importer)
+    text = "masks of the birds: a folder of pictures, one for every frame, or a COCO file"
+    importer.add_argument("--masks", type=Path, metavar="DIR|OBS.json", help=text)
+    _add_model(importer)
 
 
 def _models(commands: Any) -> None:

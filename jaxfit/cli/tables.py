@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from jaxfit.evaluation.aggregation import Evaluation
 
 __all__ = [
+    "EscapedTable",
     "breakdown_tables",
     "counted",
     "evaluation_tables",
@@ -55,7 +56,7 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-class _EscapedTable(Table):
+class EscapedTable(Table):
     """A table whose cells are single lines: control characters of the data become escapes."""
 
     def add_row(self, *cells: Any, **options: Any) -> None:
@@ -64,7 +65,7 @@ class _EscapedTable(Table):
 
 def right_aligned(*columns: str, **options: Any) -> Table:
     """Return an empty table with right-aligned columns."""
-    table = _EscapedTable(**options)
+    table = EscapedTable(**options)
     for column in columns:
         table.add_column(column, justify="right")
     return table
@@ -170,7 +171,7 @@ def _cells_3d(row: dict[str, float]) -> list[str]:
 
 def show_facts(facts: dict[str, Any]) -> None:
     """Print names and values in two columns."""
-    table = _EscapedTable(show_header=False)
+    table = EscapedTable(show_header=False)
     table.add_column()
     table.add_column(overflow="fold")
     for key, value in facts.items():

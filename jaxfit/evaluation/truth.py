@@ -9,6 +9,7 @@ from pathlib import Path
 
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.fields import read_json
+from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.formats.scene_folder import MARKER, TRUE_POSES, TRUTH
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution, load_solution
@@ -40,15 +41,18 @@ class Truth:
         return truth if isinstance(truth, Truth) else cls(truth)
 
 
-def read_truth(path: str | Path) -> Truth:
-    """Read the truth from a COCO file or from the folder of a simulated scene.
+def read_truth(path: str | Path, video: str | Path | None = None, size_px: tuple[int, int] | None = None) -> Truth:
+    """Read the truth from a file of annotations or from the folder of a simulated scene.
 
     Args:
-        path: a COCO file of annotations; or the folder of a simulated scene, which holds the annotations as
-            ``truth.json``, the exact poses as the result folder ``truth/`` and the behaviours in ``scene.json``.
+        path: a file of annotations, as for `read_observations`; or the folder of a simulated scene, which holds the
+            annotations as ``truth.json``, the exact poses as the result folder ``truth/`` and the behaviours in
+            ``scene.json``.
+        video: as for `read_observations`.
+        size_px: as for `read_observations`.
 
     Returns:
-        The truth; without poses, model and behaviours for a COCO file, and without behaviours for a folder without
+        The truth; without poses, model and behaviours for a file, and without behaviours for a folder without
         ``scene.json``.
 
     Raises:
@@ -56,7 +60,7 @@ def read_truth(path: str | Path) -> Truth:
     """
     path = Path(path)
     if not os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises for names that are too long)
-        return Truth(read_coco(path), source=path)
+        return Truth(read_observations(path, video, size_px), source=path)
     if not (path / TRUTH).is_file():
         remedy = "give a COCO file of annotations, or the folder of a simulated scene"
         raise InputError(path, f"is a folder without {TRUTH}", remedy)

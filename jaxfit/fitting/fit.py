@@ -27,7 +27,7 @@ from jaxfit.fitting.distant import distant_birds, report_distant_birds
 from jaxfit.fitting.initial_pose_file import InitialPoses
 from jaxfit.fitting.initial_pose_search import search_initial_poses
 from jaxfit.fitting.memory import check_fit_memory
-from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask
+from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
 from jaxfit.fitting.windows import Windows, cut_windows, load_targets, windows_key
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
@@ -89,6 +89,8 @@ def fit_runs(
     """
     observations = check_observations(observations, bird, source)
     skipped = report_distant_birds(observations, source)
+    if not observations.masks:
+        configs = _without_mask_stages(configs, source)
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
@@ -116,6 +118,16 @@ def fit_runs(
         collect_windows(observations, run.windows, result, bird, model.camera, skipped)
         for run, result in zip(runs, results, strict=True)
     ]
+
+
+def _without_mask_stages(configs: Sequence[FitConfig], source: object) -> list[FitConfig]:
+    """Return the configs without the stages that compare masks, and report these stages once."""
+    left = [without_mask_stages(config) for config in configs]
+    skipped = [stage.name for stage in configs[0].stages if needs_mask(stage)]
+    if skipped:
+        how = "are skipped" if len(left[0].stages) < len(configs[0].stages) else "run without their mask terms"
+        _logger.warning("%s: no masks, so the stages that compare masks %s: %s", source, how, ", ".join(skipped))
+    return left
 
 
 def check_observations(observations: Observations, bird: Bird, source: object) -> Observations:

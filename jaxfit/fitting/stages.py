@@ -28,6 +28,7 @@ __all__ = [
     "needs_mask",
     "stage_hyperparameters",
     "stage_program",
+    "without_mask_stages",
 ]
 
 SOLVERS: Mapping[str, Solver] = {"adam": ADAM, "levenberg_marquardt": LEVENBERG_MARQUARDT}
@@ -65,6 +66,28 @@ def crop_camera(config: FitConfig) -> Camera:
 def needs_mask(stage: StageConfig) -> bool:
     """Return whether any term of a stage compares masks."""
     return any(term.compares_masks for term in find_terms(stage.terms).values())
+
+
+def without_mask_stages(config: FitConfig) -> FitConfig:
+    """Return a config without the stages that compare masks, for observations without masks.
+
+    A config that has no other stages keeps its stages, without the terms that compare masks. A stage after a removed
+    stage does not carry moments.
+    """
+    kept: list[StageConfig] = []
+    removed = False
+    for stage in config.stages:
+        if not needs_mask(stage):
+            kept.append(replace(stage, carry_moments=stage.carry_moments and not removed))
+        removed = needs_mask(stage)
+    if not kept:
+        kept = [replace(stage, terms=_terms_without_masks(stage)) for stage in config.stages]
+    return replace(config, stages=tuple(kept))
+
+
+def _terms_without_masks(stage: StageConfig) -> tuple[str, ...]:
+    others = (name for name, term in find_terms(stage.terms).items() if not term.compares_masks)
+    return tuple(others) or stage.terms
 
 
 def stage_program(config: FitConfig, stage: StageConfig, model: FitModel) -> Program:

@@ -40,8 +40,8 @@ def image_files(folder: Path) -> list[Path]:
     return sorted(files, key=lambda file: [(int(n or 0), text) for n, text in _NUMBERS.findall(file.name)])
 
 
-def read_picture(file: Path) -> UInt8[np.ndarray, "H W 3"] | None:
-    """Return a picture in the channel order blue, green, red, turned upright by its EXIF data.
+def read_picture(file: Path, grey: bool = False) -> UInt8[np.ndarray, "H W *channels"] | None:
+    """Return a picture in the channel order blue, green, red, or as grey values, turned upright by its EXIF data.
 
     Returns None for a file that is not a picture of a type in `IMAGE_SUFFIXES`, is damaged, or is too large.
     """
@@ -53,7 +53,7 @@ def read_picture(file: Path) -> UInt8[np.ndarray, "H W 3"] | None:
     if size is None or min(size) < 1 or is_too_large(*size):
         return None
     try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
     except cv2.error:
         return None
 

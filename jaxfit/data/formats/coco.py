@@ -23,6 +23,7 @@ Conventions of the reader:
 - A crowd (``iscrowd`` 1) has no mask, since its region covers several birds.
 - Several images may share a ``frame_index`` (photographs, several videos); each track keeps its own image.
 - Unknown keys are ignored.
+- Files of annotation programs lack ``frame_index`` and ``track_id``; ``coco_exports`` adds both.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from jaxfit.data.formats.coco_exports import complete_export
 from jaxfit.data.formats.coco_records import (
     Annotation,
     Categories,
@@ -55,11 +57,12 @@ __all__ = ["check_keypoints", "read_coco", "reorder_keypoints", "write_coco"]
 _log = logging.getLogger(__name__)
 
 
-def read_coco(path: str | Path) -> Observations:
+def read_coco(path: str | Path, video: Path | None = None) -> Observations:
     """Read observations from a COCO json, in the format that the module describes.
 
     Args:
         path: the file.
+        video: the folder of pictures of a file without frame numbers, if it is known; see ``coco_exports``.
 
     Returns:
         Observations with the tracks in the order of ``track_id`` and the frames in the order of ``frame_index``,
@@ -68,7 +71,7 @@ def read_coco(path: str | Path) -> Observations:
     Raises:
         InputError: the file cannot be read, or its content is invalid; the message names file, field and remedy.
     """
-    root = read_json(Path(path))
+    root = complete_export(read_json(Path(path)), video)
     if not isinstance(root.value, dict):
         root.fail("must hold an object with images, categories and annotations", "give a COCO json")
     images = read_images(root["images"])

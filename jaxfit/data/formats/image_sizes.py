@@ -1,0 +1,151 @@
+"""Size of the images of a file of keypoints: from a video, from the file, or from its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jaxfit.data.observations import Observations
+from jaxfit.errors import InputError
+from jaxfit.limits import IMAGE_SIDE_PX
+from jaxfit.video.pictures import read_picture
+from jaxfit.video.reader import probe_video
+
+__all__ = ["ImageSizes", "check_video", "image_sizes"]
+
+_VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".wmv")
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSizes:
+    """Sizes of the images, and the video that they come from."""
+
+    size_px: np.ndarray
+    """(2,) width and height of all images, or (T, 2) of each image."""
+    video: Path | None = None
+    frames: int | None = None
+    """Number of frames of the video, if it is known."""
+
+    def check_frames(self, last: int, source: Path) -> None:
+        """Raise InputError if the video lacks the last frame."""
+        if self.frames is not None and last >= self.frames:
+            problem = f"has keypoints for frame {last}, but {self.video} has {self.frames} frames, counted from 0"
+            raise InputError(source, problem, "give the video of these keypoints by --video")
+
+
+def image_sizes(
+    stored: tuple[int, int] | None,
+    pictures: Sequence[str] | None,
+    stored_video: str | None,
+    source: Path,
+    video: Path | None,
+    given: tuple[int, int] | None = None,
+) -> ImageSizes:
+    """Return the sizes of the images of a file of keypoints.
+
+    Args:
+        stored: width and height that the file stores.
+        pictures: file names of the labelled pictures.
+        stored_video: path of the video that the file stores.
+        source: the file.
+        video: the video or folder of pictures that the user gives.
+        given: width and height that the user gives, for files that store none.
+
+    Raises:
+        InputError: no source of the size, or two sources that contradict each other.
+    """
+    if stored is not None and not all(1 <= side <= IMAGE_SIDE_PX for side in stored):
+        raise InputError(source, f"stores images of {stored[0]}×{stored[1]} pixels", "write the file again")
+    if video is not None:
+        info = probe_video(video)
+        if stored is not None and info.size_px != stored:
+            problem = f"is {info.size_px[0]}×{info.size_px[1]}, but {source.name} was made from {stored[0]}×{stored[1]}"
+            raise InputError(video, problem, "give the video of these keypoints")
+        return ImageSizes(np.array(info.size_px), video, info.frames)
+    if pictures is not None:
+        sizes = _picture_sizes(pictures, source)
+        if sizes is not None:
+            if stored is not None and (sizes != stored).any():
+                other = sizes[(sizes != stored).any(1)][0]
+                problem = f"says {stored[0]}×{stored[1]}, but a picture beside it is {other[0]}×{other[1]}"
+                raise InputError(source, problem, "give the pictures in the size that was labelled")
+            return ImageSizes(sizes)
+    if stored is not None:
+        return ImageSizes(np.array(stored))
+    if given is not None:
+        return ImageSizes(np.array(given))
+    found = _video_beside(source, stored_video) if pictures is None else None
+    if found is not None:
+        info = probe_video(found)
+        return ImageSizes(np.array(info.size_px), found, info.frames)
+    if stored_video:
+        problem = f"was made from {Path(stored_video).name}, which is not beside it, and stores no image size"
+    else:
+        problem = "stores no image size" + (", and its pictures are not beside it" if pictures else "")
+    raise InputError(source, problem, "give --video VIDEO, or --size WIDTHxHEIGHT")
+
+
+def check_video(observations: Observations, source: Path, video: Path) -> None:
+    """Raise InputError if observations of a video are not those of this video: other image sizes, or more frames."""
+    info = probe_video(video)
+    sizes = {observations.image_size(n, t) for n, t in np.argwhere(observations.present).tolist()}
+    other = sorted(sizes - {info.size_px})
+    if other:
+        problem = f"is {info.size_px[0]}×{info.size_px[1]}, but {source.name} says {other[0][0]}×{other[0][1]}"
+        raise InputError(video, problem, "give the video or pictures in the size that was labelled")
+    if observations.num_frames and not observations.own_images:
+        sizes_of = ImageSizes(np.array(info.size_px), video, info.frames)
+        sizes_of.check_frames(int(observations.frame_index[-1]), source)
+
+
+def _picture_sizes(pictures: Sequence[str], source: Path) -> np.ndarray | None:
+    """Return the (T, 2) sizes of the pictures; None if no picture is beside the file.
+
+    The project folder of DeepLabCut holds `labeled-data/VIDEO/`, which holds the pictures and the file of labels. A
+    missing picture has the size of the others.
+    """
+    folders = [source.parent, *source.absolute().parents[1:4]]
+    sizes = np.zeros((len(pictures), 2), np.int64)
+    for t, picture in enumerate(pictures):
+        name = picture.replace("\\", "/")
+        places = [folder / name for folder in folders] + [source.parent / Path(name).name]
+        file = next((place for place in places if _is_file(place)), None)
+        image = None if file is None else read_picture(file, grey=True)
+        if image is not None:
+            sizes[t] = image.shape[1], image.shape[0]
+    known = sizes[sizes[:, 0] > 0]
+    if not len(known):
+        return None
+    missing = sizes[:, 0] == 0
+    if missing.any() and len(np.unique(known, axis=0)) > 1:
+        problem = f"lacks the picture {pictures[int(np.flatnonzero(missing)[0])]}, and its pictures have several sizes"
+        raise InputError(source, problem, "put all pictures beside the file")
+    sizes[missing] = known[0]
+    return sizes
+
+
+def _video_beside(source: Path, stored: str | None) -> Path | None:
+    """Return the video that a file names, or the video beside the file whose name begins as the file's name.
+
+    DeepLabCut writes `clipDLC_resnet50_….h5` beside `clip.mp4`, SLEAP writes `clip.predictions.slp`.
+    """
+    if stored:
+        stored = stored.replace("\\", "/")
+        places = (source.parent / Path(stored).name, source.parent / stored)
+        return next((place for place in places if place.suffix.lower() in _VIDEO_SUFFIXES and _is_file(place)), None)
+    videos = [
+        file
+        for file in source.absolute().parent.iterdir()
+        if file.suffix.lower() in _VIDEO_SUFFIXES and source.name.startswith(file.stem) and _is_file(file)
+    ]
+    return max(videos, key=lambda file: len(file.stem), default=None)
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # the name is too long, or no file can have it
+        return False

@@ -1,0 +1,209 @@
+"""Keypoints as tracking programs store them, and their conversion to observations."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jaxfit.data.boxes import box_of_keypoints
+from jaxfit.data.formats.fields import LARGEST_POSITION_PX
+from jaxfit.data.formats.image_sizes import image_sizes
+from jaxfit.data.formats.picture_names import frame_numbers
+from jaxfit.data.observations import Observations
+from jaxfit.errors import InputError, one_line, shortened
+from jaxfit.limits import CONFIDENCE, NAME_CHARACTERS, TABLE_BIRDS, TABLE_PICTURES, TABLE_VALUES
+
+__all__ = ["KeypointTable", "check_table_size", "table_observations"]
+
+_log = logging.getLogger(__name__)
+
+CERTAIN = 0.6
+"""Keypoints from this confidence on determine the box of a bird; DeepLabCut draws keypoints from 0.6 on."""
+_OUTSIDE = 0.2
+"""Largest accepted fraction of certain keypoints outside their image."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeypointTable:
+    """Keypoints of N birds in T frames, with K keypoints per bird."""
+
+    keypoint_names: tuple[str, ...]
+    bird_names: tuple[str, ...]
+    """N names, for messages. The track ids count the birds from 1."""
+    keypoints_px: np.ndarray
+    """(N, T, K, 2): x, y in image pixels; NaN where a keypoint is missing."""
+    confidence: np.ndarray | None
+    """(N, T, K), or None for labels, which are certain."""
+    frame_index: np.ndarray | None = None
+    """(T,) frame numbers, or None if `pictures` names the frames."""
+    pictures: tuple[str, ...] | None = None
+    """(T,) file names of the labelled pictures, with their folders."""
+    score: np.ndarray | None = None
+    """(N, T) scores of the detections of the birds."""
+    skeleton: tuple[tuple[int, int], ...] = ()
+    size_px: tuple[int, int] | None = None
+    """Width and height of the images, if the file stores them."""
+    video: str | None = None
+    """Path of the video, if the file stores it."""
+
+
+def check_table_size(source: Path, birds: int, frames: int, keypoints: int) -> None:
+    """Raise InputError if a file has no keypoints, or more birds, frames and keypoints than memory should hold."""
+    if not (birds and keypoints):
+        raise InputError(source, f"holds no {'keypoints' if birds else 'birds'}", "choose another file")
+    too_many = max(birds / TABLE_BIRDS, keypoints / birds * frames * keypoints / TABLE_VALUES) > 1
+    if too_many:
+        problem = f"holds {birds:,} birds × {frames:,} frames × {keypoints:,} keypoints, too many for one table"
+        raise InputError(source, problem, "split the file")
+
+
+def table_observations(
+    table: KeypointTable, source: Path, video: Path | None = None, size_px: tuple[int, int] | None = None
+) -> Observations:
+    """Return the observations of a table.
+
+    Birds have the box of their certain keypoints. A bird is present in a frame where one keypoint is known. Pictures
+    that are not frames of one video become photographs: every bird has frame 0 of a picture of its own.
+
+    Args:
+        table: the keypoints.
+        source: the file of the table.
+        video: the video or folder of pictures of the keypoints, for the size of the images. None: the size is that of
+            the file, of its pictures, or of a video beside the file.
+        size_px: width and height of the images of a file that stores none.
+
+    Raises:
+        InputError: an unusable name, position or confidence, a frame twice, no image size, or a video that does not
+            fit.
+    """
+    _check_names(table, source)
+    keypoints, confidence = _checked(table, source)
+    numbers = None if table.pictures is None else frame_numbers(table.pictures, video)
+    frames = table.frame_index if table.pictures is None else numbers if numbers is None else np.array(numbers)
+    sizes = image_sizes(table.size_px, table.pictures, table.video, source, video, size_px)
+    order = np.arange(keypoints.shape[1]) if frames is None else np.argsort(frames, kind="stable")
+    keypoints, confidence = keypoints[:, order], confidence[:, order]
+    score = None if table.score is None else _clean_score(table.score[:, order])
+    names = _file_names(table, source, sizes.video, frames)[order]
+    size = np.broadcast_to(sizes.size_px, (len(order), 2))[order]
+    present = np.any(confidence > 0, axis=-1)
+    _check_inside(keypoints, confidence, size, source)
+    certain = confidence >= CERTAIN
+    certain = np.where(certain.any(-1, keepdims=True), certain, confidence > 0)
+    box = np.where(present[..., None], _with_area(box_of_keypoints(keypoints, certain)), 0)
+    parts = {
+        "keypoints_px": np.where(confidence[..., None] > 0, keypoints, 0),
+        "confidence": confidence,
+        "present": present,
+        "box_px": box,
+        "score": np.where(present, 1.0, 0.0) if score is None else np.where(present, score, 0.0),
+    }
+    if frames is None:
+        parts, own = _photographs(parts, names, size)
+        named = {"track_id": np.arange(1, len(own) + 1), "frame_index": np.zeros(1, np.int64), "own_images": own}
+        return Observations(**named, **parts, **_common(table, size[:1], names[:1]))
+    numbers = np.asarray(frames, np.int64)[order]
+    if (np.diff(numbers) == 0).any():
+        twice = int(numbers[:-1][np.diff(numbers) == 0][0])
+        raise InputError(source, f"holds frame {twice} twice", "remove one of its rows")
+    if len(numbers) and numbers[0] < 0:
+        raise InputError(source, f"holds frame {numbers[0]}", "number the frames from 0 on")
+    sizes.check_frames(int(numbers[-1]) if len(numbers) else 0, source)
+    track_id = np.arange(1, len(table.bird_names) + 1)
+    if len(table.bird_names) > 1:
+        tracks = ", ".join(f"{name} = {i}" for i, name in enumerate(table.bird_names, 1))
+        _log.warning("%s: %d birds become tracks: %s", source, len(table.bird_names), shortened(one_line(tracks), 150))
+    kept = np.any(present, axis=1)  # a bird without any keypoint is no track
+    parts = {name: array[kept] for name, array in parts.items()}
+    return Observations(track_id[kept], numbers, **parts, **_common(table, size, names))
+
+
+def _common(table: KeypointTable, size: np.ndarray, names: np.ndarray) -> dict:
+    return {
+        "image_size_px": size.astype(np.int64),
+        "file_name": names,
+        "keypoint_names": table.keypoint_names,
+        "skeleton": table.skeleton,
+    }
+
+
+def _photographs(parts: dict[str, np.ndarray], names: np.ndarray, size: np.ndarray) -> tuple[dict, dict]:
+    """Return the arrays with one track for every bird of every picture, in frame 0, and the pictures of the tracks."""
+    at = np.argwhere(parts["present"])
+    own = {(i, 0): (str(names[t]), int(size[t][0]), int(size[t][1])) for i, (_, t) in enumerate(at.tolist())}
+    return {name: array[at[:, 0], at[:, 1]][:, None] for name, array in parts.items()}, own
+
+
+def _check_names(table: KeypointTable, source: Path) -> None:
+    names = table.keypoint_names
+    pictures = table.pictures or ()
+    if len(pictures) > TABLE_PICTURES:
+        raise InputError(source, f"names {len(pictures):,} pictures, more than {TABLE_PICTURES:,}", "split the file")
+    for name in (*names, *table.bird_names, *pictures, _video_name(table, source)):
+        if not name or len(name) > NAME_CHARACTERS:
+            problem = f"holds a name of {len(name):,} characters" if name else "holds an empty name"
+            raise InputError(source, problem, f"use names of 1 to {NAME_CHARACTERS} characters")
+    twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
+    if twice is not None:
+        raise InputError(source, f"holds the keypoint {twice} twice", "give every keypoint a name of its own")
+
+
+def _checked(table: KeypointTable, source: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return keypoints and confidences as float32, with confidence 0 where a keypoint is missing."""
+    keypoints = np.asarray(table.keypoints_px)
+    known = np.all(np.isfinite(keypoints), axis=-1)
+    confidence = known.astype(np.float32) if table.confidence is None else np.asarray(table.confidence, np.float64)
+    confidence = np.where(known & ~np.isnan(confidence), confidence, 0)
+
+    def first(wrong: np.ndarray, values: np.ndarray, problem: str, remedy: str) -> None:
+        if wrong.any():
+            n, t, k = np.argwhere(wrong)[0]
+            frame = table.frame_index[t] if table.pictures is None and table.frame_index is not None else None
+            where = f"frame {frame}" if table.pictures is None else table.pictures[t]
+            value = np.abs(values[n, t, k]).max()
+            raise InputError(source, f"{table.keypoint_names[k]} in {where} has {problem} {value:g}", remedy)
+
+    with np.errstate(invalid="ignore"):
+        far = np.any(np.abs(np.where(known[..., None], keypoints, 0)) > LARGEST_POSITION_PX, axis=-1)
+    first(far & (confidence > 0), keypoints, "the position", "give image pixels")
+    first(np.abs(confidence) > CONFIDENCE, confidence[..., None], "the confidence", "scale the scores to 0 to 1")
+    confidence = np.clip(confidence, 0, 1).astype(np.float32)
+    return np.where(known[..., None], keypoints, np.nan).astype(np.float32), confidence
+
+
+def _clean_score(score: np.ndarray) -> np.ndarray:
+    """Return scores in [0, 1]; a score that is not a number counts as 1."""
+    return np.clip(np.where(np.isfinite(score), score, 1), 0, 1)
+
+
+def _video_name(table: KeypointTable, source: Path) -> str:
+    return (table.video or source.stem).replace("\\", "/").rsplit("/", 1)[-1]
+
+
+def _file_names(table: KeypointTable, source: Path, video: Path | None, frames: np.ndarray | None) -> np.ndarray:
+    if table.pictures is not None:
+        return np.array(table.pictures, str).reshape(-1)
+    name = video.name if video is not None else _video_name(table, source)
+    return np.array([f"{name}#{frame}" for frame in (frames if frames is not None else ())], str).reshape(-1)
+
+
+def _with_area(boxes_px: np.ndarray) -> np.ndarray:
+    """Return boxes with sides of at least one pixel, with the same centres; a single keypoint has no area."""
+    side = np.maximum(boxes_px[..., 2:], 1)
+    return np.concatenate([boxes_px[..., :2] + (boxes_px[..., 2:] - side) / 2, side], axis=-1)
+
+
+def _check_inside(keypoints: np.ndarray, confidence: np.ndarray, size: np.ndarray, source: Path) -> None:
+    """Raise InputError if many certain keypoints lie outside their image, as with pictures of another size."""
+    certain = confidence >= CERTAIN
+    with np.errstate(invalid="ignore"):
+        outside = certain & ((keypoints < -1) | (keypoints > size[None, :, None] + 1)).any(-1)
+    if outside.sum() > _OUTSIDE * certain.sum():
+        t = int(np.flatnonzero(outside.any((0, 2)))[0])
+        far = np.where(outside[:, t, :, None], keypoints[:, t], -np.inf).max((0, 1))
+        problem = f"has {outside.sum():,} of {certain.sum():,} keypoints outside images of {size[t][0]}×{size[t][1]}, "
+        problem += f"such as x {far[0]:.0f}, y {far[1]:.0f}"
+        raise InputError(source, problem, "give the video or pictures in the size that was labelled, by --video")

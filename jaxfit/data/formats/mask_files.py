@@ -1,0 +1,164 @@
+"""Masks from a folder of pictures or from a COCO file, for observations that have keypoints only.
+
+A mask belongs to the bird whose keypoints it covers best. A picture of masks has the size of its image. Every grey
+value except 0 is one mask; a picture with one value holds one mask for every connected region if its frame has several
+birds.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from jaxfit.data.formats.coco_exports import complete_export
+from jaxfit.data.formats.coco_records import read_images
+from jaxfit.data.formats.fields import read_json
+from jaxfit.data.formats.rle import read_segmentation
+from jaxfit.data.masks import decode_mask, encode_mask
+from jaxfit.data.observations import Observations
+from jaxfit.errors import InputError
+from jaxfit.limits import FRAME_DIGITS, MASKS_PER_PICTURE
+from jaxfit.progress import ProgressTask, silent
+from jaxfit.video.pictures import image_files, read_picture
+
+__all__ = ["add_masks"]
+
+_COVERED = 0.3
+"""Least fraction of a bird's keypoints that its mask covers, weighted by confidence; another bird may hide the rest."""
+_MOST_VALUES = 64
+"""A picture with more grey values is no picture of labels: masks are where the grey value is 128 or more."""
+_NUMBER = re.compile(rf"\d{{1,{FRAME_DIGITS}}}", re.ASCII)
+
+_Masks = Callable[[int, int], Sequence[np.ndarray]]
+
+
+def add_masks(observations: Observations, source: Path, progress: ProgressTask = silent) -> Observations:
+    """Return the observations with masks from a folder of pictures or from a COCO file.
+
+    The pictures belong to the images of the same name, or else to the frames of the numbers in their names, or else to
+    the frames in their order. The birds of a COCO file belong to the frames of the same number, or to photographs of
+    the same name. Birds without a mask that covers three tenths of their keypoints keep the mask that they had.
+
+    Args:
+        observations: birds with keypoints.
+        source: the folder or the COCO file.
+        progress: shows progress.
+
+    Raises:
+        InputError: the source cannot be read, holds no mask for any image, or holds a mask of another size.
+    """
+    masks_of = _folder_masks(observations, source) if source.is_dir() else _coco_masks(observations, source)
+    masks = dict(observations.masks)
+    given = 0
+    images = list(_images(observations))
+    with progress("Reading masks", len(images)) as report_progress:
+        for n, t, birds in images:
+            report_progress(1, "")
+            candidates = masks_of(n, t)
+            given += len(candidates)
+            width, height = observations.image_size(n, t)
+            for mask in candidates:
+                if mask.shape != (height, width):
+                    problem = f"has masks of {mask.shape[1]}×{mask.shape[0]}, but the image is {width}×{height}"
+                    raise InputError(source, problem, "give masks in the size of the images")
+            for bird, mask in _assigned(observations, birds, t, candidates):
+                masks[bird, t] = encode_mask(mask)
+    if not given:
+        remedy = "name the pictures by frame numbers or as the images, or give a COCO file with segmentation"
+        raise InputError(source, "holds no mask for any image of the birds", remedy)
+    return replace(observations, masks=masks)
+
+
+def _images(observations: Observations) -> Iterator[tuple[int, int, list[int]]]:
+    """Yield one bird, the frame and all birds of every image."""
+    for t in range(observations.num_frames):
+        groups: dict[str, list[int]] = {}
+        for n in np.flatnonzero(observations.present[:, t]).tolist():
+            groups.setdefault(observations.image_file(n, t), []).append(n)
+        for birds in groups.values():
+            yield birds[0], t, birds
+
+
+def _assigned(
+    observations: Observations, birds: list[int], t: int, masks: Sequence[np.ndarray]
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield pairs of bird and mask, so that the masks cover as many keypoints of their birds as possible."""
+    covered = np.zeros((len(birds), len(masks)))
+    for i, n in enumerate(birds):
+        confidence = observations.confidence[n, t]
+        known = confidence > 0
+        x, y = np.floor(observations.keypoints_px[n, t][known]).astype(int).T
+        for j, mask in enumerate(masks):
+            inside = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])
+            hit = np.zeros(len(x), bool)
+            hit[inside] = mask[y[inside], x[inside]]
+            covered[i, j] = (hit * confidence[known]).sum() / max(confidence[known].sum(), 1e-6)
+    for i, j in zip(*linear_sum_assignment(-covered), strict=True):
+        if covered[i, j] >= _COVERED:
+            yield birds[i], masks[j]
+
+
+def _coco_masks(observations: Observations, source: Path) -> _Masks:
+    """Return a function of bird and frame that returns the masks of the image in a COCO file."""
+    root = complete_export(read_json(source))
+    images = read_images(root["images"])
+    photographs = bool(observations.own_images)
+    found: dict[Any, list[dict[str, Any]]] = {}
+    for annotation in root["annotations"]:
+        image = images.get(annotation["image_id"].identifier())
+        crowd = annotation.has("iscrowd") and annotation["iscrowd"].integer(0, 1)
+        if image is None or crowd or not annotation.has("segmentation"):
+            continue
+        rle = read_segmentation(annotation["segmentation"], image.height, image.width)
+        if rle is not None:
+            found.setdefault(Path(image.file_name).name if photographs else image.frame_index, []).append(rle)
+
+    def masks_of(n: int, t: int) -> list[np.ndarray]:
+        key = Path(observations.image_file(n, t)).name if photographs else int(observations.frame_index[t])
+        return [decode_mask(rle) for rle in found.get(key, ())]
+
+    return masks_of
+
+
+def _folder_masks(observations: Observations, source: Path) -> _Masks:
+    """Return a function of bird and frame that returns the masks of a picture of a folder."""
+    files = image_files(source)
+    by_stem = {file.stem: file for file in files}
+    numbers = [_NUMBER.findall(file.stem) for file in files]
+    last = [int(found[-1]) for found in numbers if found]
+    unique = len(last) == len(files) == len(set(last))
+    by_number = dict(zip(last if unique else range(len(files)), files, strict=True))
+    stems = {Path(observations.image_file(n, t)).stem for n, t, _ in _images(observations)}
+    named = bool(stems & by_stem.keys())
+
+    def masks_of(n: int, t: int) -> list[np.ndarray]:
+        stem = Path(observations.image_file(n, t)).stem
+        file = by_stem.get(stem) if named else by_number.get(int(observations.frame_index[t]))
+        if file is None:
+            return []
+        picture = read_picture(file, grey=True)
+        if picture is None:
+            raise InputError(file, "is no readable picture", "write the picture again, or remove it")
+        return _masks_of_picture(picture, file, int(observations.present[:, t].sum()) > 1)
+
+    return masks_of
+
+
+def _masks_of_picture(picture: np.ndarray, file: Path, several_birds: bool) -> list[np.ndarray]:
+    values = np.flatnonzero(np.bincount(picture.reshape(-1), minlength=256)[1:]) + 1
+    if len(values) > _MOST_VALUES or file.suffix.lower() in (".jpg", ".jpeg", ".webp"):
+        picture, values = np.where(picture >= 128, 255, 0).astype(np.uint8), np.array([255])
+    if len(values) == 1 and several_birds:
+        count, regions = cv2.connectedComponents((picture == values[0]).astype(np.uint8))
+        if count - 1 > MASKS_PER_PICTURE:
+            problem = f"holds {count - 1:,} connected regions, more than {MASKS_PER_PICTURE:,}"
+            raise InputError(file, problem, "give one grey value to every bird")
+        return [regions == i for i in range(1, count)]
+    return [picture == value for value in values]

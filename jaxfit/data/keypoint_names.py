@@ -1,0 +1,227 @@
+"""Mapping of keypoint names: from the names of a file to the names of a bird model.
+
+A proposal compares words: `Beak`, `bill_tip` and `tipOfBill` are one keypoint, and so are `L_wing`, `wingL` and
+`left wing tip`. A map from a file replaces the proposal.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from jaxfit.data.observations import Observations
+from jaxfit.errors import InputError
+
+__all__ = ["NameMap", "checked_map", "map_keypoints", "propose_names"]
+
+_SYNONYMS = {
+    "beak": "bill",
+    "rostrum": "bill",
+    "chest": "breast",
+    "sternum": "breast",
+    "carpal": "wrist",
+    "carpus": "wrist",
+    "mantle": "back",
+    "spine": "back",
+    "rump": "tailbase",
+    "feet": "foot",
+    "toe": "foot",
+    "toes": "foot",
+    "tarsus": "shin",
+    "ankle": "shin",
+    "chin": "throat",
+    "gular": "throat",
+    "vertex": "crown",
+    "occiput": "nape",
+    "hindneck": "nape",
+    "hind": "back",
+    "frons": "forehead",
+    "end": "tip",
+    "point": "tip",
+    "root": "base",
+    "start": "base",
+    "bend": "wrist",
+    "joint": "",
+    "of": "",
+    "the": "",
+    "middle": "",
+    "centre": "",
+    "center": "",
+    "mid": "",
+}
+"""Word → the word that replaces it; empty words do not count."""
+_WORDS = {
+    *_SYNONYMS,
+    *("left", "right", "bill", "tip", "base", "tail", "wing", "head", "neck", "eye", "foot", "shin", "wrist", "back"),
+    *("throat", "breast", "crown", "nape", "forehead", "top", "front", "upper", "lower"),
+}
+"""Words that a name without separators is split into, such as `tailbase`."""
+_SIDES = {"l": "left", "r": "right", "lt": "left", "rt": "right", "left": "left", "right": "right"}
+_ALIASES: Mapping[str, tuple[str, ...]] = {
+    "bill_tip": ("bill",),
+    "crown": ("head", "head top"),
+    "forehead": ("front head",),
+    "nape": ("neck", "back neck", "back head"),
+    "throat": ("front neck", "front throat"),
+    "back": ("back upper",),
+    "tail_base": ("tailbase",),
+    "tail_tip": ("tail",),
+    "wingtip": ("wing",),
+    "wrist": ("wing wrist",),
+}
+"""Keypoint of a model, without its side → other names for it, as sorted words; earlier names are preferred."""
+_PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+
+
+class NameMap(NamedTuple):
+    """A map from the names of a file to the names of a model."""
+
+    mapped: dict[str, str]
+    """Name in the file → name in the model."""
+    unmapped: tuple[str, ...]
+    """Names in the file that no keypoint of the model has."""
+    missing: tuple[str, ...]
+    """Names of the model that no keypoint of the file has."""
+
+    @property
+    def changes_names(self) -> bool:
+        """Whether any keypoint gets another name, or is left out."""
+        return bool(self.unmapped) or any(old != new for old, new in self.mapped.items())
+
+
+def propose_names(names: Sequence[str], model_names: Sequence[str]) -> NameMap:
+    """Propose which keypoint of a model each keypoint of a file is.
+
+    A keypoint of the model takes the name that agrees best: the same name, then the same words, then a synonym. Every
+    keypoint of the model and of the file is used at most once.
+
+    Args:
+        names: names of the file.
+        model_names: names of the model.
+    """
+    words = {name: _words(name) for name in names}
+    found: dict[str, str] = {}
+    ranked = {model: _alternatives(model) for model in model_names}
+    for rank in range(2 + max(map(len, _ALIASES.values()))):
+        for model, alternatives in ranked.items():
+            if model in found.values():
+                continue
+            wanted = alternatives[rank - 1] if 0 < rank <= len(alternatives) else None
+            for name in names:
+                same = name == model if rank == 0 else wanted is not None and words[name] == wanted
+                if same and name not in found:
+                    found[name] = model
+                    break
+    return _name_map(found, names, model_names)
+
+
+def checked_map(
+    given: Mapping[str, str | None], names: Sequence[str], model_names: Sequence[str], source: object
+) -> NameMap:
+    """Return the map that a user gives.
+
+    Args:
+        given: name in the file → name in the model, or None for a keypoint that is not used.
+        names: names of the file. Names that `given` lacks are not used.
+        model_names: names of the model.
+        source: the file of the map, for messages.
+
+    Raises:
+        InputError: an unknown name, or two names of the file for one name of the model.
+    """
+    for old, new in given.items():
+        if old not in names:
+            raise InputError(source, f"maps {old}, which the file of keypoints lacks", f"known: {', '.join(names)}")
+        if new is not None and new not in model_names:
+            raise InputError(source, f"maps {old} to {new}, which the model lacks", f"known: {', '.join(model_names)}")
+    mapped = {old: new for old, new in given.items() if new is not None}
+    first: dict[str, str] = {}
+    for old, new in mapped.items():
+        if new in first:
+            raise InputError(source, f"maps both {first[new]} and {old} to {new}", "map one of the two to null")
+        first[new] = old
+    return _name_map(mapped, names, model_names)
+
+
+def map_keypoints(observations: Observations, names: NameMap, model_names: Sequence[str]) -> Observations:
+    """Return the observations with the keypoints of a model; keypoints that the file lacks have confidence 0.
+
+    A bird without any mapped keypoint in a frame keeps its box and mask there.
+    """
+    old_place = {name: k for k, name in enumerate(observations.keypoint_names)}
+    new_place = {name: k for k, name in enumerate(model_names)}
+    pairs = [(old_place[old], new_place[new]) for old, new in names.mapped.items()]
+    old, new = ([pair[end] for pair in pairs] for end in (0, 1))
+
+    def placed(array: np.ndarray) -> np.ndarray:
+        shape = (*array.shape[:2], len(model_names), *array.shape[3:])
+        values = np.zeros(shape, array.dtype)
+        values[:, :, new] = array[:, :, old]
+        return values
+
+    moved = dict(pairs)
+    return replace(
+        observations,
+        keypoint_names=tuple(model_names),
+        keypoints_px=placed(observations.keypoints_px),
+        confidence=placed(observations.confidence),
+        occluded=placed(cast(np.ndarray, observations.occluded)),
+        skeleton=tuple((moved[a], moved[b]) for a, b in observations.skeleton if a in moved and b in moved),
+    )
+
+
+def _name_map(mapped: dict[str, str], names: Sequence[str], model_names: Sequence[str]) -> NameMap:
+    return NameMap(
+        {name: mapped[name] for name in names if name in mapped},
+        tuple(name for name in names if name not in mapped),
+        tuple(model for model in model_names if model not in mapped.values()),
+    )
+
+
+def _alternatives(model: str) -> list[tuple[str, str]]:
+    """Return side and words of a keypoint of a model, and of its other names, in the order of preference."""
+    side, own = _words(model)
+    part = model.removeprefix("left_").removeprefix("right_")
+    return [(side, own), *((side, words) for words in _ALIASES.get(part, ()))]
+
+
+def _words(name: str) -> tuple[str, str]:
+    """Return the side of a name (`left`, `right` or empty) and its other words, sorted, with one word per synonym."""
+    words: list[str] = []
+    for part in _PARTS.findall(name):
+        words += _split(part.lower())
+    sides = [_SIDES[word] for word in words if word in _SIDES]
+    others = [_SYNONYMS.get(word, word) for word in words if word not in _SIDES]
+    return (sides[0] if len(set(sides)) == 1 else ""), " ".join(sorted(word for word in others if word))
+
+
+def _split(word: str) -> list[str]:
+    """Split a word such as `lefttailbase` into known words; a side may be one letter at an end."""
+    if word in _WORDS or word in _SIDES:
+        return [word]
+    if len(word) > 40:
+        return [word]
+    found = _known_words(word)
+    if found is None and word[0] in "lr":
+        found = [word[0], *rest] if (rest := _known_words(word[1:])) else None
+    if found is None and word[-1] in "lr":
+        found = [*rest, word[-1]] if (rest := _known_words(word[:-1])) else None
+    return found or [word]
+
+
+def _known_words(text: str) -> list[str] | None:
+    """Return a text as known words, with the fewest words; None if it is not made of known words."""
+    best: list[list[str] | None] = [[]] + [None] * len(text)
+    for end in range(1, len(text) + 1):
+        for start in range(end):
+            before = best[start]
+            if before is None or text[start:end] not in _WORDS:
+                continue
+            known = best[end]
+            if known is None or len(before) + 1 < len(known):
+                best[end] = [*before, text[start:end]]
+    return best[-1]

@@ -1,0 +1,100 @@
+"""COCO keypoints of CVAT and Label Studio: without frame numbers, with tracks in attributes or without tracks."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.formats.recognise import read_observations
+from jaxfit.errors import InputError
+
+KEYPOINTS = [10, 5, 2, 20.5, 6.25, 1, 0, 0, 0]
+
+
+def cvat(files, birds):
+    """Return an export of CVAT; `birds` holds (picture, changes) of every annotation."""
+    images = [
+        {"id": i, "width": 30, "height": 20, "file_name": file, "license": 0, "date_captured": 0}
+        for i, file in enumerate(files, 1)
+    ]
+    skeleton = {
+        "id": 1,
+        "name": "bird",
+        "supercategory": "",
+        "keypoints": ["beak", "nape", "tail"],
+        "skeleton": [[1, 2]],
+    }
+    part = {"id": 2, "name": "beak", "supercategory": "bird", "keypoints": [], "skeleton": []}
+    basic = {"category_id": 1, "segmentation": [], "area": 90.0, "bbox": [9.0, 4.0, 12.0, 4.0], "iscrowd": 0}
+    basic |= {"keypoints": KEYPOINTS, "num_keypoints": 2}
+    annotations = [basic | {"id": i, "image_id": image} | more for i, (image, more) in enumerate(birds, 1)]
+    return {"licenses": [], "info": {}, "images": images, "categories": [skeleton, part], "annotations": annotations}
+
+
+def label_studio(files):
+    """Return an export of Label Studio: one bird per picture, ids from 0, no attributes."""
+    images = [{"width": 30, "height": 20, "id": i, "file_name": f"images/{file}"} for i, file in enumerate(files)]
+    category = {"id": 1, "name": "default", "supercategory": "default", "keypoints": ["beak", "nape", "tail"]}
+    rectangle = {"id": 9, "image_id": 0, "category_id": 0, "segmentation": [], "bbox": [1, 1, 3, 3], "ignore": 0}
+    single = {"keypoints": [7, 8, 2, *[0] * 6], "num_keypoints": 1, "bbox": [7, 8, 0, 0]}
+    birds = [{"id": i, "image_id": i, "category_id": 1, "iscrowd": 0} | single for i in range(len(files))]
+    categories = [{"id": 0, "name": "box"}, category | {"skeleton": []}]
+    return {"images": images, "categories": categories, "annotations": [rectangle, *birds]}
+
+
+def saved(tmp_path, content):
+    (tmp_path / "export.json").write_text(json.dumps(content))
+    return tmp_path / "export.json"
+
+
+def test_tracks_of_cvat(tmp_path):
+    """The number in the name is the frame; tracks stand in the attributes; birds outside the picture are absent."""
+    outside = {"keypoints": [], "num_keypoints": 0, "bbox": [0.0, 0.0, 0.0, 0.0]}
+    birds = [(image, {"attributes": {"occluded": False, "track_id": k}}) for image in (1, 2) for k in (0, 3)]
+    birds[3] = (2, outside | birds[3][1])
+    path = saved(tmp_path, cvat(["frame_000012.PNG", "frame_000015.PNG"], birds))
+    observed = read_observations(path)
+    assert observed.frame_index.tolist() == [12, 15]
+    assert observed.track_id.tolist() == [0, 3]
+    assert observed.present.tolist() == [[True, True], [True, False]]
+    assert observed.confidence[0, 0].tolist() == [1, 1, 0]
+    assert observed.skeleton == ((0, 1),)
+    write_coco(observed, tmp_path / "again.json")
+    np.testing.assert_array_equal(read_observations(tmp_path / "again.json").keypoints_px, observed.keypoints_px)
+
+
+def test_pictures_of_label_studio(tmp_path):
+    """The prefix of uploads is no part of the name; one bird per picture is one track; a keypoint has a box."""
+    observed = read_observations(saved(tmp_path, label_studio(["0a1b2c3d-img_7.png", "99990000-img_5.png"])))
+    assert observed.frame_index.tolist() == [5, 7]
+    assert observed.track_id.tolist() == [1]
+    assert observed.box_px[0, 0].tolist() == [6.5, 7.5, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("files", "frames", "tracks"),
+    [
+        (["img_1.png", "img_2.png"], [1, 2], [1, 2, 3]),  # several birds in a frame, without tracks
+        (["murre.png", "gull.png"], [0], [1, 2, 3]),  # photographs
+        (["a/1.png", "b/1.png"], [0], [1, 2, 3]),  # two videos
+    ],
+)
+def test_birds_without_tracks(tmp_path, files, frames, tracks):
+    observed = read_observations(saved(tmp_path, cvat(files, [(1, {}), (1, {}), (2, {})])))
+    assert observed.frame_index.tolist() == frames
+    assert observed.track_id.tolist() == tracks
+    if frames == [0]:
+        assert observed.image_file(2, 0) == files[1]
+
+
+def test_a_video_file_that_lacks_a_track_is_still_an_error(tmp_path):
+    content = cvat(["frame_1.png", "frame_2.png"], [(1, {"track_id": 4}), (2, {})])
+    with pytest.raises(InputError, match=r"annotations\[1\] lacks the key track_id"):
+        read_observations(saved(tmp_path, content))
+
+
+def test_damaged_exports(tmp_path):
+    for change in ({"images": [1]}, {"annotations": 3}, {"images": [{"file_name": 3}]}):
+        with pytest.raises(InputError):
+            read_observations(saved(tmp_path, cvat(["frame_1.png"], [(1, {})]) | change))

@@ -1,0 +1,74 @@
+"""Masks of pictures and COCO files go to the birds whose keypoints they cover."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from support.tracking_files import T, write_csv
+
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.formats.mask_files import add_masks
+from jaxfit.data.formats.recognise import read_observations
+from jaxfit.errors import InputError
+
+SIZE = (120, 100)
+
+
+@pytest.fixture
+def birds(tmp_path):
+    """Two birds, the first in the left half of the image, the second in the right half."""
+    path = write_csv(tmp_path / "a.csv", ("b1", "b2"), ("x", "y"))
+    observed = read_observations(path, size_px=SIZE)
+    x = np.array([10, 70])[:, None, None] + observed.keypoints_px[..., 0] * 0.3
+    return observed.with_keypoints(np.stack([x, observed.keypoints_px[..., 1]], -1), observed.confidence)
+
+
+def halves(left, right):
+    picture = np.zeros((100, 120), np.uint8)
+    picture[:, 5:45], picture[:, 65:110] = left, right
+    return picture
+
+
+@pytest.mark.parametrize(("left", "right", "suffix"), [(7, 3, "png"), (255, 255, "png"), (255, 255, "jpg")])
+def test_pictures(tmp_path, birds, left, right, suffix):
+    """Pictures hold one grey value per bird, or one value for all birds."""
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    for t in range(T - 1):
+        cv2.imwrite(str(folder / f"mask_{t:04d}.{suffix}"), halves(left, right))
+    masked = add_masks(birds, folder)
+    assert masked.masks.keys() == {(n, t) for n in range(2) for t in range(T - 1)}
+    np.testing.assert_array_equal(masked.mask(0, 0), halves(1, 0) > 0)
+    np.testing.assert_array_equal(masked.mask(1, 2), halves(0, 1) > 0)
+    write_coco(masked, tmp_path / "masks.json")
+    content = json.loads((tmp_path / "masks.json").read_text())
+    content["categories"] = [{"id": 1, "name": "bird"}]  # a file of masks needs no keypoints
+    kept = ("id", "image_id", "segmentation")
+    content["annotations"] = [{k: a[k] for k in kept if k in a} for a in content["annotations"]]
+    (tmp_path / "masks.json").write_text(json.dumps(content))
+    again = add_masks(birds, tmp_path / "masks.json")
+    assert again.masks == masked.masks
+
+
+def test_masks_that_cover_no_bird_are_not_used(tmp_path, birds):
+    (tmp_path / "m").mkdir()
+    for t in range(T):
+        cv2.imwrite(str(tmp_path / "m" / f"{t}.png"), halves(0, 9) if t else np.zeros((100, 120), np.uint8))
+    assert add_masks(birds, tmp_path / "m").masks.keys() == {(1, t) for t in range(1, T)}
+
+
+@pytest.mark.parametrize(
+    ("name", "picture", "message"),
+    [
+        ("0.png", np.ones((50, 60), np.uint8), "has masks of 60×50, but the image is 120×100"),
+        ("900.png", halves(1, 2), "holds no mask for any image"),
+        ("0.png", np.tile([0, 255], (100, 60)).astype(np.uint8) * np.tile([[1], [0]], (50, 120)).astype(np.uint8),
+         "holds 3,000 connected regions, more than 100"),
+    ],
+)  # fmt: skip
+def test_unusable_masks(tmp_path, birds, name, picture, message):
+    (tmp_path / "m").mkdir()
+    cv2.imwrite(str(tmp_path / "m" / name), picture)
+    with pytest.raises(InputError, match=message):
+        add_masks(birds, tmp_path / "m")

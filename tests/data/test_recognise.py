@@ -1,0 +1,110 @@
+"""Files and videos that do not belong together, sizes of images, and files of no known format."""
+
+import json
+import os
+
+import cv2
+import numpy as np
+import pytest
+from support.tracking_files import T, write_analysis, write_csv, write_project, write_table
+
+from jaxfit.data.formats import recognise
+from jaxfit.data.formats.recognise import read_observations
+from jaxfit.errors import InputError
+from jaxfit.video.writer import VideoWriter
+
+
+def film(path, frames=T, size=(120, 100)):
+    with VideoWriter(path, size, 25) as writer:
+        for i in range(frames):
+            writer.write(np.full((size[1], size[0], 3), 10 * i, np.uint8))
+    return path
+
+
+def pictures(folder, names, size=(120, 100)):
+    folder.mkdir()
+    for name in names:
+        cv2.imwrite(str(folder / name), np.zeros((size[1], size[0]), np.uint8))
+    return folder
+
+
+def test_size_of_a_video_beside_the_file(tmp_path):
+    write = {"clipDLC_net.csv": write_csv, "clipDLC_net.h5": write_table, "x.h5": lambda p: write_analysis(p)}
+    paths = [function(tmp_path / name) for name, function in write.items()]
+    for path in paths:
+        with pytest.raises(InputError, match=r"stores no image size .*--video VIDEO, or --size"):
+            read_observations(path)
+    film(tmp_path / "clip.mp4")
+    for path in paths:
+        assert read_observations(path).image_size_px[0].tolist() == [120, 100]
+        assert read_observations(path).file_name[1] == "clip.mp4#1"
+
+
+def test_a_video_that_does_not_fit(tmp_path):
+    path = write_csv(tmp_path / "a.csv")
+    with pytest.raises(InputError, match=r"keypoints for frame 3, but .* has 2 frames"):
+        read_observations(path, film(tmp_path / "short.mp4", 2))
+    with pytest.raises(InputError, match=r"keypoints outside images of 64×48, such as x .* in the size that was label"):
+        read_observations(path, film(tmp_path / "small.mp4", size=(64, 48)))
+    with pytest.raises(InputError, match=r"small.mp4: is 64×48, but birds.slp was made from 120×100"):
+        read_observations(write_project(tmp_path / "birds.slp"), tmp_path / "small.mp4")
+    with pytest.raises(InputError, match="does not exist"):
+        read_observations(path, tmp_path / "none.mp4")
+
+
+def test_labels_and_a_folder_of_pictures(tmp_path):
+    names = ["img9.png", "img10.png", "img40.png", "img700.png"]
+    path = write_csv(tmp_path / "labels.csv", coords=("x", "y"), rows=names)
+    folder = pictures(tmp_path / "clip", names)
+    assert read_observations(path, folder).frame_index.tolist() == [0, 1, 2, 3]  # as everywhere for folders
+    (folder / names[1]).unlink()
+    with pytest.raises(InputError, match=r"lacks the picture img10.png"):
+        read_observations(path, folder)
+
+
+def test_pictures_of_another_size_than_the_labels_say(tmp_path):
+    images = [{"id": 1, "width": 30, "height": 20, "file_name": "frame_1.png"}]
+    category = {"id": 1, "name": "bird", "keypoints": ["beak"]}
+    bird = {"id": 1, "image_id": 1, "category_id": 1, "keypoints": [3, 4, 2], "num_keypoints": 1, "bbox": [1, 1, 5, 5]}
+    path = tmp_path / "export.json"
+    path.write_text(json.dumps({"images": images, "categories": [category], "annotations": [bird]}))
+    assert read_observations(path).frame_index.tolist() == [1]
+    with pytest.raises(InputError, match=r"is 15×10, but export.json says 30×20"):
+        read_observations(path, pictures(tmp_path / "half", ["frame_1.png"], (15, 10)))
+    assert read_observations(path, pictures(tmp_path / "same", ["frame_1.png"], (30, 20))).frame_index.tolist() == [0]
+
+
+def test_pictures_of_several_sizes(tmp_path):
+    names = ["img1.png", "img2.png", "img3.png", "img4.png"]
+    path = write_csv(tmp_path / "labels.csv", coords=("x", "y"), rows=names)
+    for i, name in enumerate(names[:3]):
+        cv2.imwrite(str(tmp_path / name), np.zeros((100, 120 + i), np.uint8))
+    with pytest.raises(InputError, match=r"lacks the picture img4.png, and its pictures have several sizes"):
+        read_observations(path)
+    cv2.imwrite(str(tmp_path / names[3]), np.zeros((100, 99), np.uint8))
+    assert read_observations(path).image_size_px[:, 0].tolist() == [120, 121, 122, 99]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b"", "is empty"), (b"\x80\x04K\x01.", "is of no known format"), (b"{", "is not valid JSON"), (b"[1", "JSON")],
+)
+def test_other_content(tmp_path, content, message):
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_observations(tmp_path / "file")
+
+
+def test_paths_that_are_no_files(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "pipe", tmp_path / "none"):
+        with pytest.raises(InputError, match=r"is a folder|is a device or a pipe|does not exist"):
+            read_observations(path)
+
+
+def test_without_the_extra(tmp_path, monkeypatch):
+    from jaxfit import extras
+
+    monkeypatch.setattr(extras, "find_spec", lambda package: None)
+    with pytest.raises(InputError, match=r"needs h5py, which this installation lacks \(run pip install .*formats"):
+        recognise.read_observations(write_table(tmp_path / "a.h5"))

@@ -1,0 +1,210 @@
+"""Files of SLEAP: projects (`.slp`) with labels and predictions, and analysis files."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+from support.tracking_files import LIKELIHOOD, NAMES, XY, T, project, write_analysis, write_project, write_table
+
+from jaxfit.data.formats.recognise import read_observations
+from jaxfit.errors import InputError
+
+SIZE = (120, 100)
+
+
+def labelled(parts, rows, **changes):
+    """Turn instances into labels of persons."""
+    parts["points"] = parts["pred_points"][["x", "y", "visible", "complete"]]
+    parts["instances"]["instance_type"][rows] = 0
+    for name, value in changes.items():
+        parts["instances"][name][rows] = value
+
+
+def test_predictions_of_a_project(tmp_path):
+    observed = read_observations(write_project(tmp_path / "birds.slp"))
+    assert observed.keypoint_names == NAMES
+    assert observed.skeleton == ((0, 1), (1, 2))
+    assert observed.frame_index.tolist() == [0, 10, 20, 30]
+    assert observed.image_size_px[0].tolist() == list(SIZE)
+    assert observed.file_name[1] == "clip.mp4#10"
+    np.testing.assert_allclose(observed.keypoints_px, XY, atol=1e-5)
+    np.testing.assert_allclose(observed.confidence, LIKELIHOOD, atol=1e-6)
+    np.testing.assert_allclose(observed.score, 0.9, atol=1e-6)
+
+
+def test_labels_replace_predictions(tmp_path):
+    """A label of the same track, or made from a prediction, replaces this prediction; invisible points are missing."""
+    parts = project()
+    parts["instances"] = np.repeat(parts["instances"], 2)
+    parts["frames"]["instance_id_start"], parts["frames"]["instance_id_end"] = np.arange(0, 16, 4), np.arange(4, 20, 4)
+    parts["instances"]["instance_id"] = np.arange(16)
+    labelled(parts, np.arange(0, 16, 2))
+    parts["points"]["x"] += 1
+    parts["points"]["visible"][::3] = False
+    observed = read_observations(write_project(tmp_path / "birds.slp", parts))
+    assert observed.num_tracks == 2
+    assert (observed.confidence[..., 0] == 0).all()
+    assert (observed.confidence[..., 1:] == 1).all()
+    np.testing.assert_allclose(observed.keypoints_px[:, :, 1:, 0], XY[:, :, 1:, 0] + 1, atol=1e-5)
+
+
+def test_birds_without_a_track(tmp_path, caplog):
+    """One bird per frame is one track; otherwise every bird is a track of its own."""
+    parts = project()
+    labelled(parts, slice(None), track=-1)
+    assert read_observations(write_project(tmp_path / "a.slp", parts)).num_tracks == 2 * T
+    assert "8 birds without a track" in caplog.text
+    parts["frames"]["instance_id_end"] -= 1
+    alone = read_observations(write_project(tmp_path / "b.slp", parts))
+    np.testing.assert_allclose(alone.keypoints_px, XY[:1], atol=1e-5)
+
+
+def test_positions_of_the_first_format(tmp_path):
+    observed = read_observations(write_project(tmp_path / "a.slp", project() | {"format_id": 1.0}))
+    np.testing.assert_allclose(observed.keypoints_px, XY - 0.5, atol=1e-5)
+
+
+@pytest.mark.parametrize("dims", [None, ("track", "xy", "node", "frame"), ("frame", "track", "node", "xy")])
+@pytest.mark.parametrize("scores", [True, False])
+def test_analysis_files(tmp_path, dims, scores):
+    path = write_analysis(tmp_path / "a.analysis.h5", dims, scores)
+    observed = read_observations(path, size_px=None if dims else SIZE)
+    np.testing.assert_allclose(observed.keypoints_px, XY, atol=1e-5)
+    np.testing.assert_allclose(observed.confidence, LIKELIHOOD if scores else 1, atol=1e-6)
+    assert observed.image_size_px[0].tolist() == list(SIZE)
+    assert observed.file_name[2] == "clip.mp4#2"
+
+
+def change(name, value, row=0):
+    def changed(parts):
+        table, _, column = name.partition(".")
+        if column:
+            parts[table][column][row] = value
+        else:
+            parts[table] = value
+
+    return changed
+
+
+def two_skeletons(parts):
+    parts["metadata"]["skeletons"] *= 2
+    parts["instances"]["skeleton"][3] = 1
+
+
+def two_videos(parts):
+    parts["videos_json"] = [json.dumps({"backend": {"filename": f"/films/{name}.mp4"}}) for name in "ab"]
+    parts["frames"]["video"][2] = 1
+
+
+BAD = {
+    "several skeletons": (two_skeletons, "holds birds with 2 skeletons: bird, bird"),
+    "several videos": (two_videos, "holds birds of 2 videos: a.mp4, b.mp4 .*--video"),
+    "no video": (
+        change("videos_json", ['{"backend": {"filename": "/x/clip.mp4"}}']),
+        "made from clip.mp4, which is not",
+    ),
+    "no JSON": (change("videos_json", ["{"]), r"videos_json\[0\] is not valid JSON"),
+    "video unknown": (change("frames.video", 3), "a video that is not among its 1 videos"),
+    "instances": (change("frames.instance_id_end", 2**40), "lists instances that are not among the 8"),
+    "huge": (change("frames.frame_idx", 2**63), "holds a number in the column frame_idx that is not whole or is too"),
+    "points": (change("instances.point_id_end", 4), "lists points that are not 3 of the 24 rows of pred_points"),
+    "track": (change("instances.track", 7), "names track 7, but has 2 tracks"),
+    "skeleton": (change("instances.skeleton", 7, slice(None)), "names skeleton 7, but the file has 1 skeletons"),
+    "frame twice": (change("frames.frame_idx", 20), "holds frame 20 twice"),
+    "metadata": (change("metadata", {"skeletons": [{}], "nodes": []}), "lacks the key nodes"),
+    "nothing": (change("frames.instance_id_end", 0, slice(None)), "frames lists instances|holds no labels"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_projects(tmp_path, case):
+    parts = project()
+    BAD[case][0](parts)
+    with pytest.raises(InputError, match=BAD[case][1]):
+        read_observations(write_project(tmp_path / "birds.slp", parts))
+
+
+def test_one_of_several_videos(tmp_path):
+    parts = project()
+    two_videos(parts)
+    parts["videos_json"] = [text.replace("}}", ', "shape": [9, 100, 120, 3]}}') for text in parts["videos_json"]]
+    path = write_project(tmp_path / "birds.slp", parts)
+    with h5py.File(path) as file:
+        assert len(file["frames"]) == T
+    with pytest.raises(InputError, match="does not exist"):
+        read_observations(path, video=tmp_path / "b.mp4")  # the birds of this video are chosen first
+
+
+def damage(name, change_file, tmp_path, write):
+    path = write(tmp_path / name)
+    with h5py.File(path, "a") as file:
+        change_file(file)
+    return path
+
+
+def external_link(file):
+    del file["tracks"]
+    file["tracks"] = h5py.ExternalLink("/etc/passwd", "/x")
+
+
+def soft_link(file):
+    file["other"] = file["tracks"][()]
+    del file["tracks"]
+    file["tracks"] = h5py.SoftLink("/other")
+
+
+def external_storage(file):
+    shape = file["tracks"].shape
+    del file["tracks"]
+    file.create_dataset("tracks", shape, "u1", external=[("/etc/passwd", 0, 48)])
+
+
+def virtual(file):
+    layout = h5py.VirtualLayout((2, 2, 3, T), "f8")
+    del file["tracks"]
+    file.create_virtual_dataset("tracks", layout)
+
+
+def huge(file):
+    del file["tracks"]
+    file.create_dataset("tracks", (10**5, 2, 10**5, 10**3), "f8", chunks=(1, 2, 3, 4))
+
+
+def text(file):
+    del file["tracks"]
+    file["tracks"] = "text"
+
+
+HOSTILE = {
+    "external link": (external_link, "tracks is a link to elsewhere"),
+    "soft link": (soft_link, "tracks is a link to elsewhere"),
+    "external storage": (external_storage, "tracks is stored outside the file"),
+    "virtual": (virtual, "tracks is stored outside the file"),
+    "huge": (huge, "tracks needs 160,000,000,000,000 bytes, more than"),
+    "text": (text, "tracks holds"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_hdf5(tmp_path, case):
+    path = damage("a.analysis.h5", HOSTILE[case][0], tmp_path, write_analysis)
+    with pytest.raises(InputError, match=HOSTILE[case][1]):
+        read_observations(path, size_px=SIZE)
+
+
+def test_a_damaged_heap_of_texts_ends_with_an_error(tmp_path):
+    """The HDF5 library never returns from an object without a size."""
+    path = write_analysis(tmp_path / "a.h5", ("track", "xy", "node", "frame"))
+    content = bytearray(path.read_bytes())
+    heap = content.index(b"GCOL") + 16
+    content[heap : heap + 16] = bytes(16)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"its heap of texts at byte [\d,]+ is not valid"):
+        read_observations(path)
+
+
+def test_other_hdf5_files(tmp_path):
+    path = damage("a.h5", lambda file: file["df_with_missing"].attrs.pop("pandas_type"), tmp_path, write_table)
+    with pytest.raises(InputError, match="is an HDF5 file of no known format: it holds df_with_missing"):
+        read_observations(path, size_px=SIZE)
