@@ -265,7 +265,7 @@ def test_the_installed_command_works_anywhere(inputs, tmp_path):
     script = Path(sys.executable).with_name("jaxfit")
     (tmp_path / "bad.json").write_text("{")
     tail = ["--model", str(inputs / "toy.npz"), "--out", "out"]
-    for config, expected in (("paper", "bad.json: "), ("papr", "papr: cannot read this config")):
+    for config, expected in (("paper", "bad.json: "), ("papr", "papr: does not exist")):
         command = [script, "fit", "bad.json", "--config", config, *tail]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 2, done.stderr
