@@ -35,6 +35,7 @@ def test_median_seconds(monkeypatch):
     assert len(runs) == 4  # the first run is not measured
 
 
+@pytest.mark.extended
 def test_report(monkeypatch):
     seconds = iter(range(1, 8))
 

@@ -71,6 +71,7 @@ def test_windows_are_refused_by_estimate():
     assert len(cut_windows(photographs, config(100))) == 600
 
 
+@pytest.mark.extended
 def test_the_filter_works_in_parts(monkeypatch):
     observations = tracks()
     whole = filter_observations(observations, 5).keypoints_px

@@ -92,9 +92,9 @@ def agree(vertices, faces, target, kind="l1", blur=None):
     ("seed", "size", "kind", "dtype"),
     [
         (0, 64, "l1", np.uint8),
-        (1, 100, "smooth_l1", np.float32),
+        pytest.param(1, 100, "smooth_l1", np.float32, marks=pytest.mark.extended),
         (2, 3, "l1", bool),
-        (3, 37, "smooth_l1", np.uint8),
+        pytest.param(3, 37, "smooth_l1", np.uint8, marks=pytest.mark.extended),
     ],
 )
 def test_random_meshes(each_isa, seed, size, kind, dtype):

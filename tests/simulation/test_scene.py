@@ -166,6 +166,7 @@ def test_pictures_change_only_near_birds(scene):
     assert np.mean(close) > 0.97  # shadows lie beside the birds
 
 
+@pytest.mark.extended
 def test_same_seed_gives_the_same_bytes(tmp_path):
     for name in ("a", "b"):
         simulate(MURRE, tmp_path / name, birds=2, frames=4, size=SIZE, seed=5)

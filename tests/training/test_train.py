@@ -57,6 +57,7 @@ def test_visible_keypoints_lie_on_their_bird(frames):
     assert own > 0.99 * len(visible)  # the thinnest tips fall between pixels
 
 
+@pytest.mark.extended
 def test_same_seed_gives_the_same_frames(frames):
     again = scenes._film_scene(0)
     assert np.array_equal(again.owner, frames.owner)
