@@ -77,7 +77,10 @@ def image_size(options: argparse.Namespace) -> tuple[int, int] | None:
 
 
 def _show_names(names: NameMap, path: Path, proposed: bool) -> None:
-    """Print the map of the names as a table."""
+    """Print the map of the names as a table, or only the unused keypoints if no name changes."""
+    if all(old == new for old, new in names.mapped.items()):
+        show(f"keypoints of {path.name} that are not used: {', '.join(names.unmapped)}")
+        return
     table = EscapedTable()
     table.add_column("in the file")
     table.add_column("in the model")

@@ -23,7 +23,7 @@ NASTY = "[bold]x[/]\x1b[31m\n\udcc5:bird:"
     [
         ([], "COMMAND (see `jaxfit --help`)"),
         (["frobnicate" * 99], "(see `jaxfit --help`)"),
-        (["fit"], "fit: the following arguments are required: OBS.json, --out (see `jaxfit fit --help`)"),
+        (["fit"], "fit: the following arguments are required: OBS, --out (see `jaxfit fit --help`)"),
         (["track", "v", "--out", "o", "--step", "9" * 5000], "--step: invalid int value: '9999"),
         (["model", "info", "m", "\udcc5\n" * 300], "(see `jaxfit --help`)"),
     ],

@@ -149,6 +149,7 @@ class TruthOfTheScene:
         return self.truth.keypoints_px[rows, self.t], self.truth.confidence[rows, self.t]
 
 
+@pytest.mark.extended
 def test_the_demo_writes_the_files_that_it_names(tmp_path, monkeypatch, capsys):
     (tmp_path / "quick.yaml").write_text(
         "base: reconstruct\ntrack: {min_track_frames: 2}\nfit:\n  base: paper\n  stages:\n"

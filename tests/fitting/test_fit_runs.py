@@ -52,6 +52,7 @@ def assert_equal(a, b):
         np.testing.assert_array_equal(a.loss[term], b.loss[term], err_msg=term)
 
 
+@pytest.mark.extended
 def test_a_sweep_compiles_once(observed, caplog):
     jax.clear_caches()  # other tests fit batches of these shapes
     with caplog.at_level(logging.WARNING), jax.log_compiles():

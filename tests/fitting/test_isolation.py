@@ -35,6 +35,7 @@ def observe(frames):
     return replaced(observed, DIVERGING, np.full((frames, BIRD.num_keypoints, 2), 1e30))
 
 
+@pytest.mark.extended
 def test_birds_do_not_depend_on_each_other():
     """The groups change the number of birds, their order, and the position of a bird in its tile."""
     groups = [[2], [3, DIVERGING, 0]]

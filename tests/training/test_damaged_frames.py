@@ -46,6 +46,7 @@ def test_impossible_labels(folder, name, value, message):
         load_frames(folder)
 
 
+@pytest.mark.extended
 def test_damaged_labels(folder):
     valid = (folder / "frames.npz").read_bytes()
 
