@@ -15,7 +15,7 @@ from jaxfit.clock import Clock
 from jaxfit.config.checks import require
 from jaxfit.config.perception import TrackConfig
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
+from jaxfit.errors import InputError, one_line
 from jaxfit.model.anatomy import mirror_pairs, skeleton_pairs
 from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.keypoints import load_keypoint_detector
@@ -162,7 +162,8 @@ def run_tracking(
             birds = [bird for bird, _ in tracked]
             with clock("keypoints"):
                 points_px, confidence = keypoints(picture, birds)
-            name, size_px = f"{reader.path.name}#{number}", (picture.shape[1], picture.shape[0])
+            name = f"{one_line(reader.path.name)}#{number}"  # a name on the disk may be no text
+            size_px = (picture.shape[1], picture.shape[0])
             with clock("record"):
                 recorder.add(number, name, size_px, birds, [identity for _, identity in tracked], points_px, confidence)
             best_score, frame_count = max([best_score, *(bird.score for bird in instances)]), frame_count + 1

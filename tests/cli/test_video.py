@@ -1,6 +1,8 @@
 """`track` and `reconstruct` from end to end, with replaced networks, and their unusable inputs."""
 
 import json
+import os
+import shutil
 
 import numpy as np
 import pytest
@@ -60,6 +62,15 @@ def test_track_writes_the_truth(inputs, tmp_path, capsys):
     assert "3 birds over 5 frames" in said.replace("\n", "")
     for heading in ("coverage", "confidence", "jitter"):
         assert heading in said
+
+
+@pytest.mark.usefixtures("networks")
+def test_a_folder_with_a_name_that_is_not_utf8(inputs, tmp_path):
+    frames = tmp_path / os.fsdecode(b"\xc5land")
+    shutil.copytree(inputs / "frames", frames)
+    out = tmp_path / "obs.json"
+    assert main(["track", str(frames), "--config", str(inputs / "quick.yaml"), "--out", str(out)]) == 0
+    assert read_coco(out).file_name[0] == "\\udcc5land#0"
 
 
 @pytest.mark.usefixtures("networks")
