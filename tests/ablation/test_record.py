@@ -197,6 +197,7 @@ def readers():
         yield call
 
 
+@pytest.mark.extended
 @pytest.mark.parametrize("reader", ["record", "metrics"])
 def test_any_damage_is_one_error(folder, readers, reader):
     store_metrics(folder)

@@ -106,6 +106,7 @@ def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
     assert not (tmp_path / "result").exists()
 
 
+@pytest.mark.extended
 def test_a_reconstruction(inputs, tmp_path, networks, capsys):
     """All files exist and can be read; a short track is reported."""
     networks += [(t, 2) for t in range(2, FRAMES)]

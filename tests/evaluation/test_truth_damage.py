@@ -36,6 +36,7 @@ def test_truths_that_are_no_files(tmp_path):
         assert str(caught.value).isprintable()
 
 
+@pytest.mark.extended
 def test_damaged_scenes(tmp_path):
     trees = damaged_tree(SCENE).map(lambda tree: json.dumps(tree).encode())
     with Isolated("jaxfit.evaluation.truth:read_behaviours") as reader:

@@ -126,6 +126,7 @@ def test_the_term_that_makes_a_fit_diverge_is_named(inputs, tmp_path, caplog, na
         assert f"track {track}, {failure}" in caplog.text
 
 
+@pytest.mark.extended
 def test_the_step_of_a_failure_is_reported(inputs, tmp_path):
     """The first step of Adam moves every translation by 0.01, so the value is not finite at the second step."""
     assert main(command(inputs, tmp_path, "own_terms:nan_value_later", steps=20)) == 0

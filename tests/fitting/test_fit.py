@@ -77,6 +77,7 @@ def test_the_arrays_of_the_solution_are_consistent(solution):
     assert set(solution.loss) == {"keypoints", "mask", "pose_prior", "velocity", "acceleration"}
 
 
+@pytest.mark.extended
 def test_the_common_size_is_constant_in_a_window(solution, observed):
     assert (np.ptp(solution.scale, axis=1) == 0).all()
     keypoints_only = dataclasses.replace(config(common_size=False), stages=config(steps=(30, 1)).stages[:1])
