@@ -239,6 +239,8 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, oldest=FORMAT_VERSION)
+    arrays |= {name: arrays[name].item() for name in _CAMERA}
+    arrays |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays.pop("loss_terms"), arrays.pop("loss")
     try:
         if terms.dtype.kind != "U" or len(np.unique(terms)) < len(terms):

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -106,7 +105,7 @@ def load_bird(path: Path | str) -> Bird:
     arrays.setdefault("vertex_colours", neutral_colours(len(content["vertices"])))
     arrays.setdefault("joint_limits", unlimited_joints(max(len(content["parents"]) - 1, 0)))
     bird = Bird(
-        **arrays,
+        **{field: jnp.asarray(array) for field, array in arrays.items()},
         parents=tuple(int(parent) for parent in content["parents"]),
         joint_names=tuple(map(str, content["joint_names"])),
         keypoint_names=tuple(map(str, content["keypoint_names"])),
@@ -114,7 +113,7 @@ def load_bird(path: Path | str) -> Bird:
         keypoint_pairs=pairs("keypoint_pairs"),
         name=str(content["name"]),
     )
-    return jax.tree.map(jnp.asarray, check_bird(bird, path))
+    return check_bird(bird, path)
 
 
 def load_murre() -> Bird:
