@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxfit.cli.observation_files import image_size, observations_for, rename_keypoints
+from jaxfit.cli.observation_files import image_size, keypoint_map, observations_for
 from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, right_aligned, show
 from jaxfit.errors import InputError
 from jaxfit.model.files import find_bird
@@ -81,6 +81,7 @@ def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namesp
 def evaluate(options: argparse.Namespace) -> None:
     """Compare a result or observations with the truth and print metrics."""
     from jaxfit.cli.observation_tables import matching_line
+    from jaxfit.data.keypoint_names import map_keypoints
     from jaxfit.data.solution import load_solution
     from jaxfit.evaluation.evaluate import evaluate
     from jaxfit.evaluation.matching import match_tracks
@@ -94,11 +95,10 @@ def evaluate(options: argparse.Namespace) -> None:
         return
     solution, bird = load_solution(options.result)
     truth = read_truth(options.truth, options.video, image_size(options))
-    if set(truth.observations.keypoint_names) != set(bird.keypoint_names):
-        renamed = rename_keypoints(
-            truth.observations, options.truth, bird.keypoint_names, options.names, quiet=options.json
-        )
-        truth = replace(truth, observations=renamed.observations)
+    true_names = truth.observations.keypoint_names
+    if set(true_names) != set(bird.keypoint_names):
+        names = keypoint_map(true_names, options.truth, bird.keypoint_names, options.names, quiet=options.json)
+        truth = replace(truth, observations=map_keypoints(truth.observations, names, bird.keypoint_names))
     if options.by == "behaviour" and truth.behaviours is None:
         remedy = "give the folder of a simulated scene, or remove --by behaviour"
         raise InputError(options.truth, "holds no behaviours of the birds", remedy)
@@ -134,9 +134,10 @@ def _evaluate_observations(options: argparse.Namespace) -> None:
     observations = read_observations(options.result, options.video, image_size(options))
     true_names = truth.observations.keypoint_names
     if options.names or propose_names(observations.keypoint_names, true_names).mapped:
-        renamed = rename_keypoints(observations, options.result, true_names, options.names, quiet=options.json)
+        own_names = observations.keypoint_names
+        names = keypoint_map(own_names, options.result, true_names, options.names, quiet=options.json)
         # keypoints that only one of the files has are not compared
-        observations = map_keypoints(observations, renamed.names, list(renamed.names.mapped.values()))
+        observations = map_keypoints(observations, names, list(names.mapped.values()))
     result = evaluate_observations(observations, truth)
     if options.json:
         keypoints = {name: row._asdict() for name, row in result.keypoints.items()}

@@ -15,7 +15,7 @@ from jaxfit.errors import InputError
 from jaxfit.limits import NAME_MAP_BYTES
 from jaxfit.storage.reading import read_text
 
-__all__ = ["MappedObservations", "image_size", "observations_for", "rename_keypoints"]
+__all__ = ["MappedObservations", "image_size", "keypoint_map", "observations_for"]
 
 
 class MappedObservations(NamedTuple):
@@ -42,14 +42,14 @@ def observations_for(
     from jaxfit.data.formats.recognise import read_observations  # imports the video libraries
 
     observations = read_observations(path, options.video, image_size(options))
-    return rename_keypoints(observations, path, model_names, options.names, quiet)
+    names = keypoint_map(observations.keypoint_names, path, model_names, options.names, quiet)
+    return MappedObservations(map_keypoints(observations, names, model_names), names)
 
 
-def rename_keypoints(
-    observations: Observations, path: Path, model_names: Sequence[str], map_file: Path | None, quiet: bool = False
-) -> MappedObservations:
-    """Return observations with the names of a model; arguments and errors as `observations_for`."""
-    own = observations.keypoint_names
+def keypoint_map(
+    own: Sequence[str], path: Path, model_names: Sequence[str], map_file: Path | None, quiet: bool = False
+) -> NameMap:
+    """Return the map from the keypoints `own` of a file to those of a model; otherwise as `observations_for`."""
     if map_file is not None:
         names = checked_map(_read_map(map_file), own, model_names, map_file)
     else:
@@ -59,7 +59,7 @@ def rename_keypoints(
         raise InputError(path, problem, "map the names by --names MAP.yaml")
     if names.changes_names and not quiet:
         _show_names(names, path, proposed=map_file is None)
-    return MappedObservations(map_keypoints(observations, names, model_names), names)
+    return names
 
 
 def image_size(options: argparse.Namespace) -> tuple[int, int] | None:

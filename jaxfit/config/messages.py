@@ -41,7 +41,7 @@ def shown(value: Any) -> str:
 
 
 def known_names(name: object, names: Iterable[object]) -> str:
-    """Return the remedy for an unknown name: some known names, those that resemble the unknown name first."""
+    """Return the remedy for an unknown name: some known names, the most similar names first."""
 
     def unlike(known: str) -> float:
         return -difflib.SequenceMatcher(None, str(name)[:100].lower(), known[:100].lower()).ratio()

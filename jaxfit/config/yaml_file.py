@@ -118,7 +118,8 @@ def _layers(source: str, kind: type, above: tuple[str, ...] = ()) -> list[_Layer
         above: the files whose bases lead to this file.
     """
     shipped = source in shipped_configs()
-    if not shipped and not _exists(source):
+    # os.path.exists is False for names that no file can have, where Path.exists raises an error
+    if not shipped and not os.path.exists(source):  # noqa: PTH110
         raise InputError(source, "does not exist", _choice())
     # one file can have several paths: links, and names such as folder/../file
     own = source if shipped else os.path.realpath(source)
@@ -152,7 +153,7 @@ def _base_layers(
     if not isinstance(base, str) or not base:
         raise InputError(source, f"{where} is {shown(base)}", "expected the name of a config or of a file")
     found = _resolve(base, source)
-    if found not in shipped_configs() and not _exists(found):
+    if found not in shipped_configs() and not os.path.exists(found):  # noqa: PTH110
         raise InputError(source, f"{where} names {base!r}, which does not exist", _choice())
     return _layers(found, kind, above)
 
@@ -172,15 +173,9 @@ def _resolve(base: str, source: str) -> str:
     if source in shipped_configs():  # its base is shipped too, whatever files the current folder holds
         return base
     path = str(Path(source).parent / base)
-    is_other = base in shipped_configs() and _exists(path) and not Path(path).is_file()
-    return path if _exists(path) and not is_other else base
-
-
-def _exists(path: str) -> bool:
-    try:
-        return Path(path).exists()
-    except (OSError, ValueError):  # the name is too long, or holds NUL
-        return False
+    # a folder or a pipe with the name of a shipped config does not replace the shipped config
+    exists = os.path.isfile if base in shipped_configs() else os.path.exists
+    return path if exists(path) else base
 
 
 def _origin(layers: list[_Layer], path: str) -> _Layer:

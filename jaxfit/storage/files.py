@@ -34,7 +34,6 @@ _REMEDIES = {
     errno.EBUSY: "it is a mount point or in use: choose a folder inside it",
     errno.EIO: "check the disk or choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ELOOP: "choose a path without cyclic links",
     errno.ENOENT: "choose another place",
     errno.ENOTDIR: "a part of its path is a file: choose another place",
     errno.EEXIST: "a part of its path is a file: choose another place",
@@ -171,7 +170,8 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
     ``with new_folder("out") as folder:`` yields a temporary folder beside ``path``. At the end of the body, the
     temporary folder is renamed to ``path``; if the body fails, the temporary folder is removed. An existing folder is
     replaced only after the new folder is complete. (A power failure between the two renames leaves the existing folder
-    under ``.out.<hex>.old``; the next write beside it restores it, see `jaxfit.storage.temporary`.)
+    under ``.out.<hex>.old``; the next write into the same folder renames this folder back, see
+    `jaxfit.storage.temporary`.)
 
     Args:
         path: the folder; missing folders above are created.

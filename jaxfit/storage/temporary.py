@@ -1,10 +1,10 @@
-"""Temporary files and folders beside a target, and the removal of those that a killed process has left.
+"""Temporary files and folders next to a target; removal of the temporary files of killed processes.
 
 A writer of `out` first creates `.out.<hex>.lock` in the same folder and holds a lock (flock) on this file as long as
 `.out.<hex>.part` or `.out.<hex>.old` exists. The operating system frees the lock when the process ends, also after
-SIGKILL. So a file `.lock` that nobody locks belongs to no living process, and the next write into the folder removes
-it with its `.part` and `.old`. An `.old` without its target is the earlier folder of an interrupted replacement, and
-is renamed back to its target.
+SIGKILL. A file `.lock` without a lock therefore belongs to no living process. The next write into the folder removes
+this file with its `.part` and `.old`. An `.old` without its target is the earlier folder of an interrupted replacement,
+and is renamed back to its target.
 
 On a shared disk, some network file systems keep locks to each computer. The lock file therefore names its computer, and
 what another computer has left is removed only after `LEFTOVER_DAYS` without a change. Where the file system has no

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 from support import hostile_files as files
@@ -55,6 +56,14 @@ def stored_ablation(text):
     return arguments
 
 
+def pictures(folder):
+    """A folder of two small pictures."""
+    (folder / "frames").mkdir()
+    for name in ("000.png", "001.png"):
+        cv2.imwrite(str(folder / "frames" / name), np.zeros((32, 32, 3), np.uint8))
+    return folder / "frames"
+
+
 def result(make):
     """Return a folder whose poses.npz is a hostile file, drawn on a video that does not matter."""
 
@@ -64,6 +73,32 @@ def result(make):
         return ["overlay", folder / "result", "--video", inputs / "birds.json", "--out", folder / "o.mp4"]
 
     return arguments
+
+
+# An option → the command whose option is the given file.
+OPTIONS = {
+    "--out": lambda i, f, file: fit(i, file),
+    "--model": lambda i, f, file: fit(i, f / "out", model=file),
+    "--init": lambda i, f, file: [*fit(i, f / "out"), "--init", file],
+    "--config": lambda i, f, file: fit(i, f / "out", config=file),
+    "--truth": lambda i, f, file: ["evaluate", i / "birds.json", "--truth", file],
+    "--segmenter": lambda i, f, file: ["track", pictures(f), "--segmenter", file, "--out", f / "o.json"],
+    "--keypoints": lambda i, f, file: ["track", pictures(f), "--keypoints", file, "--out", f / "o.json"],
+    "observations": lambda i, f, file: fit(i, f / "out", obs=file),
+    "video": lambda i, f, file: ["track", file, "--out", f / "o.json"],
+}
+# A file that cannot be read → (function that makes it in a folder, words of the message).
+UNREADABLE = {
+    "long name": (lambda f: f / files.LONG, ["nnn"]),
+    "loop of links": (files.loop, ["loop"]),
+    "pipe": (files.pipe, ["pipe"]),
+    "/dev/zero": (lambda f: "/dev/zero", ["/dev/zero"]),
+}
+
+
+def unreadable(option, kind):
+    make, words = UNREADABLE[kind]
+    return lambda inputs, folder: OPTIONS[option](inputs, folder, make(folder)), words
 
 
 # Name → (function of the inputs' folder and an empty folder that returns the command, words of the message).
@@ -95,37 +130,7 @@ CASES = {
     "ablation.json holds a list": (stored_ablation("[]"), ["ablation.json"]),
     "ablation.json holds a number": (stored_ablation("3"), ["ablation.json"]),
     "ablation.json is deep": (stored_ablation("[" * 100_000), ["ablation.json"]),
-    "long --out": (lambda i, f: fit(i, f / files.LONG), ["name"]),
-    "long --model": (lambda i, f: fit(i, f / "out", model=f / files.LONG), ["name"]),
-    "long --init": (lambda i, f: [*fit(i, f / "out"), "--init", f / files.LONG], ["name"]),
-    "long observations": (lambda i, f: fit(i, f / "out", obs=f / files.LONG), ["name"]),
-    "long --config": (lambda i, f: fit(i, f / "out", config=f / files.LONG), ["nnn"]),
-    "long --truth": (lambda i, f: ["evaluate", i / "birds.json", "--truth", f / files.LONG], ["name"]),
-    "long --video": (
-        lambda i, f: ["overlay", f, "--video", f / files.LONG, "--out", f / "o.mp4"],
-        [],
-    ),
-    "long --segmenter": (
-        lambda i, f: ["track", i / "birds.json", "--segmenter", f / files.LONG, "--out", f / "o.json"],
-        [],
-    ),
-    "loop as --out": (lambda i, f: fit(i, files.loop(f) / "out"), ["loop"]),
-    "loop as --model": (lambda i, f: fit(i, f / "out", model=files.loop(f)), ["loop"]),
-    "loop as --init": (lambda i, f: [*fit(i, f / "out"), "--init", files.loop(f)], ["loop"]),
-    "loop as observations": (lambda i, f: fit(i, f / "out", obs=files.loop(f)), ["loop"]),
-    "loop as --config": (lambda i, f: fit(i, f / "out", config=files.loop(f)), ["loop"]),
-    "loop as --truth": (lambda i, f: ["evaluate", i / "birds.json", "--truth", files.loop(f)], ["loop"]),
-    "loop as the video": (lambda i, f: ["track", files.loop(f), "--out", f / "o.json"], ["loop"]),
-    "pipe as --model": (lambda i, f: fit(i, f / "out", model=files.pipe(f)), ["pipe"]),
-    "pipe as --init": (lambda i, f: [*fit(i, f / "out"), "--init", files.pipe(f)], ["pipe"]),
-    "pipe as observations": (lambda i, f: fit(i, f / "out", obs=files.pipe(f)), ["pipe"]),
-    "pipe as --config": (lambda i, f: fit(i, f / "out", config=files.pipe(f)), ["pipe"]),
-    "pipe as --truth": (lambda i, f: ["evaluate", i / "birds.json", "--truth", files.pipe(f)], ["pipe"]),
-    "pipe as the video": (lambda i, f: ["track", files.pipe(f), "--out", f / "o.json"], ["pipe"]),
-    "/dev/zero as observations": (lambda i, f: fit(i, f / "out", obs="/dev/zero"), ["/dev/zero"]),
-    "/dev/zero as --config": (lambda i, f: fit(i, f / "out", config="/dev/zero"), ["/dev/zero"]),
-    "/dev/zero as --model": (lambda i, f: fit(i, f / "out", model="/dev/zero"), ["/dev/zero"]),
-}
+} | {f"{kind} as {option}": unreadable(option, kind) for option in OPTIONS for kind in UNREADABLE}
 
 
 @pytest.fixture(scope="module")
@@ -163,13 +168,14 @@ def test_a_stored_ablation_runs_no_code(prepared, tmp_path):
     assert not (tmp_path / "it ran").exists()
 
 
-def test_a_far_keypoint_costs_its_frame_only(command_line, prepared, tmp_path):
+def test_a_far_keypoint_costs_its_frame_only(prepared, tmp_path):
     """A keypoint and a box 300,000 px outside the image are skipped; all birds are fitted."""
     content = json.loads((prepared / "birds.json").read_text())
     far = content["annotations"][0]
     far["keypoints"][:2], far["bbox"] = [3e5, 3e5], [3e5, 3e5, 10, 10]
     (tmp_path / "far.json").write_text(json.dumps(content))
-    outcome = command_line(*fit(prepared, tmp_path / "out", obs=tmp_path / "far.json"))
+    with Isolated("support.hostile_commands:run_command", memory_mb=600, seconds=60) as command:
+        outcome = command(*fit(prepared, tmp_path / "out", obs=tmp_path / "far.json"))
     assert outcome.kind == "success", outcome
     with np.load(tmp_path / "out" / "poses.npz") as poses:
         assert poses["valid"].sum() == len(content["annotations"]) - 1 - 6  # the third bird has three keypoints

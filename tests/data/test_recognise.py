@@ -32,7 +32,7 @@ def test_size_of_a_video_beside_the_file(tmp_path):
     write = {"clipDLC_net.csv": write_csv, "clipDLC_net.h5": write_table, "x.h5": lambda p: write_analysis(p)}
     paths = [function(tmp_path / name) for name, function in write.items()]
     for path in paths:
-        with pytest.raises(InputError, match=r"stores no image size .*--video VIDEO, or --size"):
+        with pytest.raises(InputError, match=r"stores no image size.* \(give --video VIDEO, or --size"):
             read_observations(path)
     film(tmp_path / "clip.mp4")
     for path in paths:

@@ -1,4 +1,4 @@
-"""Real files of DeepLabCut and SLEAP: the values are those that pandas 3.1, sleap-io 0.9 and h5py read."""
+"""Real files of DeepLabCut and SLEAP: pandas 3.1, sleap-io 0.9 and h5py read the same values."""
 
 import numpy as np
 import pytest

@@ -102,7 +102,7 @@ BAD = {
     "several videos": (two_videos, "holds birds of 2 videos: a.mp4, b.mp4 .*--video"),
     "no video": (
         change("videos_json", ['{"backend": {"filename": "/x/clip.mp4"}}']),
-        "made from clip.mp4, which is not",
+        "its video clip.mp4 is not in the same folder",
     ),
     "no JSON": (change("videos_json", ["{"]), r"videos_json\[0\] is not valid JSON"),
     "video unknown": (change("frames.video", 3), "a video that is not among its 1 videos"),

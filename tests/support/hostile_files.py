@@ -131,6 +131,6 @@ def loop(folder: Path, name: str = "loop") -> Path:
 
 
 def pipe(folder: Path, name: str = "pipe") -> Path:
-    """A named pipe that nobody writes to: a reader that opens the pipe waits for ever."""
+    """A named pipe without a writer: a reader that opens the pipe never returns."""
     os.mkfifo(folder / name)
     return folder / name

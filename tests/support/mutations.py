@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import math
 from typing import Any
 
@@ -121,3 +122,15 @@ def damaged_arrays(draw: Any, valid: dict[str, np.ndarray]) -> dict[str, np.ndar
         else:
             arrays[name] = np.frombuffer(draw(st.binary(max_size=64)), np.uint8)
     return arrays
+
+
+def damaged_npz(valid: bytes) -> st.SearchStrategy[bytes]:
+    """Return files like an .npz with damaged bytes, or with the arrays of `damaged_arrays`."""
+
+    def saved(arrays: dict[str, np.ndarray]) -> bytes:
+        file = io.BytesIO()
+        np.savez(file, **arrays)
+        return file.getvalue()
+
+    with np.load(io.BytesIO(valid)) as stored:
+        return damaged_bytes(valid) | damaged_arrays(dict(stored)).map(saved)

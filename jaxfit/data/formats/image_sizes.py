@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,7 +71,7 @@ def image_sizes(
         if sizes is not None:
             if stored is not None and (sizes != stored).any():
                 other = sizes[(sizes != stored).any(1)][0]
-                problem = f"says {stored[0]}×{stored[1]}, but a picture beside it is {other[0]}×{other[1]}"
+                problem = f"says {stored[0]}×{stored[1]}, but a picture has {other[0]}×{other[1]} pixels"
                 raise InputError(source, problem, "give the pictures in the size that was labelled")
             return ImageSizes(sizes)
     if stored is not None:
@@ -82,9 +83,9 @@ def image_sizes(
         info = probe_video(found)
         return ImageSizes(np.array(info.size_px), found, info.frames)
     if stored_video:
-        problem = f"was made from {Path(stored_video).name}, which is not beside it, and stores no image size"
+        problem = f"stores no image size, and its video {Path(stored_video).name} is not in the same folder"
     else:
-        problem = "stores no image size" + (", and its pictures are not beside it" if pictures else "")
+        problem = "stores no image size" + (", and its pictures are not in the same folder" if pictures else "")
     raise InputError(source, problem, "give --video VIDEO, or --size WIDTHxHEIGHT")
 
 
@@ -112,7 +113,7 @@ def _picture_sizes(pictures: Sequence[str], source: Path) -> np.ndarray | None:
     for t, picture in enumerate(pictures):
         name = picture.replace("\\", "/")
         places = [folder / name for folder in folders] + [source.parent / Path(name).name]
-        file = next((place for place in places if _is_file(place)), None)
+        file = next(filter(_is_file, places), None)
         image = None if file is None else read_picture(file, grey=True)
         if image is not None:
             sizes[t] = image.shape[1], image.shape[0]
@@ -145,7 +146,4 @@ def _video_beside(source: Path, stored: str | None) -> Path | None:
 
 
 def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # the name is too long, or no file can have it
-        return False
+    return os.path.isfile(path)  # noqa: PTH113  (False for names that no file can have, where Path.is_file fails)
