@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.tracking_files import LIKELIHOOD, NAMES, XY, T, write_csv, write_fixed, write_table
 
-from jaxfit.data.formats.pickled_literals import NotLiteralError, read_literal
+from jaxfit.data.formats.deeplabcut.pickled_literals import NotLiteralError, read_literal
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.errors import InputError
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.data.formats.deeplabcut_csv import read_deeplabcut_csv
-from jaxfit.data.formats.deeplabcut_hdf5 import find_pandas_table, read_deeplabcut_hdf5
+from jaxfit.data.formats.deeplabcut.csv_file import read_deeplabcut_csv
+from jaxfit.data.formats.deeplabcut.hdf5_file import find_pandas_table, read_deeplabcut_hdf5
 from jaxfit.data.formats.hdf5 import HDF5_SIGNATURE, open_hdf5
 from jaxfit.data.formats.image_sizes import check_video
 from jaxfit.data.formats.keypoint_table import KeypointTable, table_observations
-from jaxfit.data.formats.sleap_analysis import read_sleap_analysis
-from jaxfit.data.formats.sleap_project import read_sleap_project
+from jaxfit.data.formats.sleap.analysis import read_sleap_analysis
+from jaxfit.data.formats.sleap.project import read_sleap_project
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.storage.reading import open_file

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxfit.data.formats.deeplabcut_columns import keypoint_table, row_names
+from jaxfit.data.formats.deeplabcut.columns import keypoint_table, row_names
+from jaxfit.data.formats.deeplabcut.pickled_literals import NotLiteralError, read_literal
 from jaxfit.data.formats.hdf5 import Hdf5Group
 from jaxfit.data.formats.keypoint_table import KeypointTable
-from jaxfit.data.formats.pickled_literals import NotLiteralError, read_literal
 from jaxfit.errors import InputError
 
 __all__ = ["find_pandas_table", "read_deeplabcut_hdf5"]

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxfit.data.formats.hdf5 import Hdf5Group
 from jaxfit.data.formats.keypoint_table import KeypointTable, check_table_size
-from jaxfit.data.formats.sleap_metadata import Skeleton, Video, read_skeletons, read_track_names, read_videos
+from jaxfit.data.formats.sleap.metadata import Skeleton, Video, read_skeletons, read_track_names, read_videos
 from jaxfit.errors import InputError
 
 __all__ = ["read_sleap_project"]

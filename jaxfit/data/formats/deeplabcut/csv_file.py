@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfit.data.formats.deeplabcut_columns import COORDS, keypoint_table, row_names
+from jaxfit.data.formats.deeplabcut.columns import COORDS, keypoint_table, row_names
 from jaxfit.data.formats.keypoint_table import KeypointTable
 from jaxfit.errors import InputError
 from jaxfit.limits import CSV_BYTES, TABLE_VALUES
