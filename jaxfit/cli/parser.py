@@ -139,7 +139,8 @@ def _fitting(commands: Any) -> None:
 
     text = "fit the same birds with a grid of configs and compare the results (needs the extra `report`)"
     ablate = _command(commands, "ablate", "ablation.ablate", text)
-    ablate.add_argument("observations", type=Path, metavar="OBS.json", help=OBSERVATIONS)
+    text = "COCO file with the keypoint names of the model; `jaxfit import` writes it from other files"
+    ablate.add_argument("observations", type=Path, metavar="OBS.json", help=text)
     _add_truth(ablate)
     text = "`ablation` (34 runs, after the paper) or a YAML file (default %(default)s)"
     ablate.add_argument("--grid", default="ablation", help=text)
