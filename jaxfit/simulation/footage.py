@@ -16,7 +16,8 @@ from jaxfit.raster.zbuffer import hard_mask, interpolate, vertex_normals
 from jaxfit.simulation.flock import SimulatedBird
 from jaxfit.simulation.ledge import Light, paint_ledge
 from jaxfit.simulation.motion import smooth_noise
-from jaxfit.simulation.texture import Noise, smoothstep
+from jaxfit.simulation.plumage_light import lit_plumage
+from jaxfit.simulation.texture import Noise
 from jaxfit.simulation.viewpoint import Viewpoint
 
 __all__ = ["Footage"]
@@ -122,23 +123,10 @@ class Footage:
         box = out[low[1] : high[1], low[0] : high[0]]
         inside = coverage > 0
         alpha = coverage[inside][:, None]
-        box[inside] = (1 - alpha) * box[inside] + alpha * self._lit(values[inside] / alpha)
+        box[inside] = (1 - alpha) * box[inside] + alpha * lit_plumage(
+            values[inside] / alpha, self.light, self._feathers
+        )
         return out
-
-    def _lit(self, attributes: Float[np.ndarray, "P C"]) -> Float[np.ndarray, "P 3"]:
-        """Shade the plumage: texture of feathers, sheen, and less skylight near the feet."""
-        colour, normal, rest, height = np.split(attributes, [3, 6, 9], axis=1)
-        normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
-        across, along, up = (np.ascontiguousarray(rest[:, i]) for i in range(3))
-        barbs = self._feathers(across + up, 0.35 * along, 9.0)
-        tracts = self._feathers(along, 1.5 * (up - across), 60.0)
-        colour = colour * np.clip(1 + 0.13 * barbs + 0.10 * tracts, 0.5, 1.6)[:, None]
-        sun = np.maximum(normal @ self.light.to_sun_world, 0)
-        sky = 0.5 + 0.5 * normal[:, 2]
-        open_sky = 0.55 + 0.45 * smoothstep(0, 9, height[:, 0])  # ledge and body shade low parts
-        light = 1.35 * self.light.sun * sun + (1 - 0.6 * self.light.sun) * (0.35 + 0.65 * sky) * open_sky
-        sheen = 0.05 * sun**6 + 0.02 * sky
-        return (colour * light[:, None] + (sheen * open_sky)[:, None]) * self.light.tint
 
     def _expose(self, linear: Float[np.ndarray, "H W 3"], t: int) -> UInt8[np.ndarray, "H W 3"]:
         """Apply blur, vignetting, flicker, gamma and noise (most visible in dark parts), and encode eight bits."""

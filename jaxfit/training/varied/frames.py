@@ -1,0 +1,238 @@
+"""Frames with random birds in random landscapes, with exact labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxfit.model.bird import Bird
+from jaxfit.raster.zbuffer import hard_mask, interpolate, vertex_normals, zbuffer
+from jaxfit.simulation.ledge import Light, random_light
+from jaxfit.simulation.plumage_light import lit_plumage
+from jaxfit.simulation.texture import Noise
+from jaxfit.simulation.viewpoint import camera_axes
+from jaxfit.simulation.visibility import SURFACE_TOLERANCE
+from jaxfit.training.varied.bodies import Species, draw_species
+from jaxfit.training.varied.landscapes import Landscape, draw_landscape
+
+__all__ = ["MAX_BIRDS", "draw_frames"]
+
+MAX_BIRDS = 40
+LENGTH_UNITS = 20.0
+"""Length of the murre in model units; the sizes of birds refer to this length."""
+LENGTH_PX = 28.0, 420.0
+"""Range of the length of birds in pixels of a picture of 960 × 640."""
+GAMMA = 2.2
+DEPTH_STEP = 1000.0
+"""Depth between birds in model units: a nearer bird hides a farther bird completely."""
+
+
+class _Placed(NamedTuple):
+    """One bird in the picture."""
+
+    vertices_world: Float[np.ndarray, "V 3"]
+    vertices_screen: Float[np.ndarray, "V 3"]
+    keypoints_screen: Float[np.ndarray, "K 3"]
+    species: Species
+    waterline: float | None
+    """Height below which water hides the bird, model units; None on the ground and in the air."""
+    flies: bool
+
+
+def draw_frames(
+    rng: np.random.Generator, bird: Bird, count: int, width: int, height: int
+) -> tuple[float, Iterator[tuple[Any, ...]]]:
+    """Draw a scene, which is one or two species, one landscape, one light and one camera, and some of its frames.
+
+    Args:
+        rng: source of randomness.
+        bird: the murre.
+        count: number of frames; birds have other places and postures in every frame.
+        width, height: size of the frames, pixels.
+
+    Returns:
+        Mean pixels per model unit, and the frames as picture (H, W, 3) uint8 in blue, green, red; bird of each pixel
+        (H, W) uint8, from 1; keypoints (N, K, 2) in pixels; visibility (N, K) as in `LabelledFrames`.
+    """
+    pitch = float(rng.uniform(0, 90))
+    R_cam_world = camera_axes(pitch, 0, rng.uniform(-8, 8))
+    species = [draw_species(rng, bird) for _ in range(int(rng.integers(1, 3)))]
+    scale = float(np.exp(rng.uniform(*np.log(LENGTH_PX)))) / LENGTH_UNITS
+    landscape, light = draw_landscape(rng, width, height, pitch), random_light(rng)
+    room = width * height / (LENGTH_UNITS * scale) ** 2
+    expected = min(rng.uniform(0.05, 0.6) * room, MAX_BIRDS)
+
+    def frames() -> Iterator[tuple[Any, ...]]:
+        feathers = Noise(rng, octaves=5, coarsest=16)
+        for _ in range(count):
+            N = int(np.clip(rng.poisson(expected), 1, MAX_BIRDS))
+            birds = _place(rng, species, N, scale, R_cam_world, landscape, (width, height))
+            yield _render(rng, birds, landscape, light, feathers)
+
+    return scale, frames()
+
+
+def _place(
+    rng: np.random.Generator,
+    species: list[Species],
+    N: int,
+    scale: float,
+    R_cam_world: np.ndarray,
+    landscape: Landscape,
+    size_px: tuple[int, int],
+) -> list[_Placed]:
+    """Place birds at random points of the picture; birds that stand lower in the picture are nearer."""
+    flies = rng.random() < 0.15
+    centres = rng.uniform([0, 0], size_px, (N, 2))
+    for n in range(1, N):  # some birds stand close to another bird
+        if rng.random() < 0.35:
+            centres[n] = centres[rng.integers(n)] + rng.normal(0, 0.6 * LENGTH_UNITS * scale, 2)
+    centres = np.clip(centres, 0, size_px)[np.argsort(centres[:, 1])]
+    kinds = rng.integers(len(species), size=N)
+    swims = np.zeros(N, bool) if flies else centres[:, 1] >= landscape.water_from
+    # most birds on water swim, the others stand on something that the picture does not show
+    swims &= rng.random(N) < 0.95
+    manners = ("fly",) if flies else ("stand", "swim")
+    posed = {manner: [one.pose(rng, N, manner) for one in species] for manner in manners}
+    placed = []
+    for n, (centre, kind) in enumerate(zip(centres, kinds, strict=True)):
+        own = scale * float(np.exp(rng.normal(0, 0.12)))
+        birds = posed["fly" if flies else "swim" if swims[n] else "stand"][kind]
+        vertices, keypoints = birds.vertices_world[n], birds.keypoints_world[n]
+        depth = DEPTH_STEP * (N - n + 1)
+
+        def on_screen(points: np.ndarray, own: float = own, centre: np.ndarray = centre, depth: float = depth):
+            cam = points @ R_cam_world.T
+            return np.column_stack([centre + own * cam[:, :2], depth + cam[:, 2]])
+
+        low, high = vertices[:, 2].min(), vertices[:, 2].max()
+        waterline = low + rng.uniform(0.25, 0.5) * (high - low) if swims[n] else None
+        placed.append(_Placed(vertices, on_screen(vertices), on_screen(keypoints), species[kind], waterline, flies))
+    return placed
+
+
+def _render(
+    rng: np.random.Generator, birds: list[_Placed], landscape: Landscape, light: Light, feathers: Noise
+) -> tuple[Any, ...]:
+    picture = landscape.picture * light.tint.astype(np.float32)
+    height, width = picture.shape[:2]
+    owner = np.zeros((height, width), np.uint8)
+    depths = np.full((height, width), np.inf, np.float32)
+    faces = np.asarray(birds[0].species.body.faces)
+    strength = rng.uniform(0, 0.6)
+    for bird in birds:
+        if not bird.flies and bird.waterline is None:
+            picture = _add_shadow(picture, bird, faces, light, strength)
+    reflection = rng.uniform(0, 0.5)
+    for n, bird in enumerate(birds, start=1):
+        _draw(picture, owner, depths, n, bird, faces, light, feathers, reflection)
+    if rng.random() < 0.2:
+        _add_foreground(rng, picture, owner)
+    exposed = np.clip(picture * rng.uniform(0.9, 1.6), 0, 1) ** (1 / GAMMA)
+    points = np.stack([bird.keypoints_screen for bird in birds])
+    return (
+        np.clip(255 * exposed + 0.5, 0, 255).astype(np.uint8),
+        owner,
+        points[..., :2].astype(np.float32),
+        _visibility(points, owner, depths),
+    )
+
+
+def _box(points: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    low = np.clip(np.floor(points[:, :2].min(0)).astype(int) - 1, 0, [width, height])
+    return low, np.clip(np.ceil(points[:, :2].max(0)).astype(int) + 1, 0, [width, height])
+
+
+def _draw(
+    picture: np.ndarray,
+    owner: np.ndarray,
+    depths: np.ndarray,
+    n: int,
+    bird: _Placed,
+    faces: np.ndarray,
+    light: Light,
+    feathers: Noise,
+    reflection: float,
+) -> None:
+    """Draw one bird, and its reflection if the bird swims."""
+    height, width = owner.shape
+    low, high = _box(bird.vertices_screen, width, height)
+    columns, rows = (high - low).tolist()
+    if columns <= 0 or rows <= 0:
+        return
+    screen = (bird.vertices_screen - [*low, 0]).astype(np.float32)
+    normals = vertex_normals(bird.vertices_world, faces)
+    up = bird.vertices_world[:, 2:] - bird.vertices_world[:, 2].min()
+    rest = np.asarray(bird.species.body.vertices)
+    attributes = np.concatenate([bird.species.colours, normals, rest, up, bird.vertices_world[:, 2:]], axis=1)
+    values, coverage, _ = interpolate(screen, faces, attributes.astype(np.float32), columns, rows)
+    inside = coverage > 0
+    mean = values[inside] / coverage[inside][:, None]
+    colours = np.zeros((rows, columns, 3))
+    colours[inside] = lit_plumage(mean[:, :10], light, feathers)
+    alpha = coverage.copy()
+    if bird.waterline is not None:
+        alpha[inside] *= mean[:, 10] > bird.waterline
+    box = (slice(low[1], high[1]), slice(low[0], high[0]))
+    if bird.waterline is not None and alpha.any():
+        _reflect(picture, colours, alpha, low, reflection)
+    picture[box] = picture[box] * (1 - alpha[..., None]) + colours * alpha[..., None]
+    shown = alpha > 0.5
+    owner[box][shown] = n
+    depths[box][shown] = zbuffer(screen, faces, columns, rows).depth[shown]
+
+
+def _reflect(picture: np.ndarray, colours: np.ndarray, alpha: np.ndarray, low: np.ndarray, strength: float) -> None:
+    """Draw the mirror image of a swimming bird below the lowest row of the bird."""
+    bottom = int(np.flatnonzero(alpha.any(1))[-1]) + 1
+    top = low[1] + bottom
+    rows = min(bottom, picture.shape[0] - top)
+    if rows <= 0:
+        return
+    share = cv2.GaussianBlur(alpha[bottom - rows : bottom][::-1], (0, 0), 2.0)[..., None] * strength
+    box = (slice(top, top + rows), slice(low[0], low[0] + alpha.shape[1]))
+    picture[box] = picture[box] * (1 - share) + 0.7 * colours[bottom - rows : bottom][::-1] * share
+
+
+def _add_shadow(picture: np.ndarray, bird: _Placed, faces: np.ndarray, light: Light, strength: float) -> np.ndarray:
+    """Darken the ground where the body hides sun and sky."""
+    height, width = picture.shape[:2]
+    world, screen = bird.vertices_world, bird.vertices_screen
+    # the affine map from the world to the screen, from the vertices themselves
+    system = np.column_stack([world, np.ones(len(world))])
+    to_screen, *_ = np.linalg.lstsq(system, screen, rcond=None)
+    above = world[:, 2:] - world[:, 2].min()
+    fallen = world - above * (light.to_sun_world / light.to_sun_world[2])
+    shadow = np.column_stack([fallen, np.ones(len(world))]) @ to_screen
+    mask = hard_mask((shadow / [4, 4, 1]).astype(np.float32), faces, width // 4, height // 4).astype(np.float32)
+    soft = cv2.resize(cv2.GaussianBlur(mask, (0, 0), 1.5), (width, height), interpolation=cv2.INTER_LINEAR)
+    return picture * (1 - strength * soft[..., None])
+
+
+def _add_foreground(rng: np.random.Generator, picture: np.ndarray, owner: np.ndarray) -> None:
+    """Draw blades of grass or twigs in front of the birds."""
+    height, width = owner.shape
+    drawn = np.zeros((height, width), np.float32)
+    around = rng.uniform(0, width)
+    for _ in range(int(rng.integers(5, 60))):
+        root = np.array([around + rng.normal(0, 0.15 * width), height * rng.uniform(0.4, 1.1)])
+        tip = root + [rng.normal(0, 30), -rng.uniform(40, 260)]
+        thickness = int(rng.integers(1, 4))
+        cv2.line(drawn, root.astype(int).tolist(), tip.astype(int).tolist(), 1.0, thickness, cv2.LINE_AA)
+    colour = np.array([0.05, 0.2, 0.1]) * rng.uniform(0.3, 2.5) * rng.uniform(0.7, 1.3, 3)
+    picture[:] = picture * (1 - drawn[..., None]) + colour * drawn[..., None]
+    owner[drawn > 0.5] = 0
+
+
+def _visibility(points: Float[np.ndarray, "N K 3"], owner: np.ndarray, depths: np.ndarray) -> Float[np.ndarray, "N K"]:
+    """Return 2 for visible keypoints, 1 for hidden keypoints and 0 for keypoints outside the picture."""
+    height, width = owner.shape
+    inside: Bool[np.ndarray, "N K"] = np.all((points[..., :2] >= 0) & (points[..., :2] < [width, height]), axis=-1)
+    column, row = (np.clip(points[..., i].astype(int), 0, side - 1) for i, side in enumerate((width, height)))
+    own = owner[row, column] == np.arange(1, len(points) + 1)[:, None]
+    visible = inside & own & (points[..., 2] <= depths[row, column] + SURFACE_TOLERANCE)
+    return inside.astype(np.uint8) + visible
