@@ -27,14 +27,17 @@ _POSTURES = {
 _PITCHES_DEG = {"stand": (0, 10, 25, 45, 55), "swim": (0, 8), "fly": (0, 15)}
 _POSE_SPREAD = 0.5
 """Amplitude of the variation about a posture, in standard deviations of the pose prior."""
-_NECK, _BILL_TIP = ("neck_root", "neck", "head"), ("bill_tip",)
+_NECK = "neck_root", "neck", "head"
 _LEGS = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in ("hip", "knee", "ankle", "foot"))
 _WINGS = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "elbow", "wrist"))
 _NATURAL = np.array(
-    [[0.03, 0.03, 0.03], [0.8, 0.8, 0.78], [0.35, 0.35, 0.36], [0.12, 0.2, 0.3], [0.2, 0.3, 0.42], [0.3, 0.4, 0.5]]
-    + [[0.05, 0.08, 0.12], [0.5, 0.62, 0.7], [0.6, 0.6, 0.62], [0.08, 0.2, 0.05], [0.3, 0.15, 0.05], [0.05, 0.3, 0.7]]
+    [
+        *([0.03, 0.03, 0.03], [0.8, 0.8, 0.78], [0.35, 0.35, 0.36], [0.6, 0.6, 0.62]),
+        *([0.12, 0.2, 0.3], [0.2, 0.3, 0.42], [0.3, 0.4, 0.5], [0.05, 0.08, 0.12], [0.5, 0.62, 0.7]),
+        *([0.08, 0.2, 0.05], [0.3, 0.15, 0.05], [0.05, 0.3, 0.7]),
+    ]
 )
-"""Colours of plumage in linear light (blue, green, red): black, white, greys, browns, a dark green, a blue, orange."""
+"""Colours of plumage in linear light (blue, green, red): black, white, greys; browns; dark green, blue, orange."""
 
 
 class PosedBirds(NamedTuple):

@@ -220,7 +220,7 @@ def _add_foreground(rng: np.random.Generator, picture: np.ndarray, owner: np.nda
     around = rng.uniform(0, width)
     for _ in range(int(rng.integers(5, 60))):
         root = np.array([around + rng.normal(0, 0.15 * width), height * rng.uniform(0.4, 1.1)])
-        tip = root + [rng.normal(0, 30), -rng.uniform(40, 260)]
+        tip = root + np.array([rng.normal(0, 30), -rng.uniform(40, 260)])
         thickness = int(rng.integers(1, 4))
         cv2.line(drawn, root.astype(int).tolist(), tip.astype(int).tolist(), 1.0, thickness, cv2.LINE_AA)
     colour = np.array([0.05, 0.2, 0.1]) * rng.uniform(0.3, 2.5) * rng.uniform(0.7, 1.3, 3)

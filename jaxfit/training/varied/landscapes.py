@@ -97,7 +97,7 @@ def _grass(rng: np.random.Generator, shape: _Shape, flatness: float) -> np.ndarr
     if rng.random() < 0.6:
         for _ in range(int(rng.integers(200, 900))):
             root = rng.uniform(0, [shape[1], shape[0]])
-            tip = root + [rng.normal(0, 6), -rng.uniform(4, 40)]
+            tip = root + np.array([rng.normal(0, 6), -rng.uniform(4, 40)])
             shade = (colours[1] * rng.uniform(0.4, 2.2)).tolist()
             cv2.line(picture, root.astype(int).tolist(), tip.astype(int).tolist(), shade, 1, cv2.LINE_AA)
     return picture
