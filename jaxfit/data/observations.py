@@ -81,7 +81,7 @@ class Observations:
     """(T,) float64: presentation times of the frames in seconds, as ``jaxfit.video.reader.Frame.time_s``; NaN where the
     time is unknown. None means that no time is known."""
     fps: float | None = None
-    """Mean frame rate of the video in frames per second, which counts every frame of the video; None if unknown."""
+    """Mean frame rate of the whole video in frames per second, as its container states; None if unknown."""
 
     def __post_init__(self):
         occluded = np.zeros(np.shape(self.confidence), bool) if self.occluded is None else self.occluded

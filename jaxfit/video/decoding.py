@@ -10,20 +10,18 @@ from typing import Any, NamedTuple
 import av
 import av.error
 import numpy as np
-from av.video.reformatter import Interpolation
 from jaxtyping import UInt8
 
 from jaxfit.errors import InputError
+from jaxfit.video.deinterlacing import NumberedPicture, deinterlaced
+from jaxfit.video.display import displayed, displayed_size, warn_of_difference
 from jaxfit.video.numbering import Timeline
-from jaxfit.video.opening import opened
+from jaxfit.video.opening import frame_count, opened
 from jaxfit.video.packets import add_packet, begin, checked_by_index, demuxed, packet_timeline, time_of
 
-__all__ = ["EXACT", "Frame", "decode"]
+__all__ = ["Frame", "decode"]
 
 _logger = logging.getLogger(__name__)
-
-EXACT = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.BITEXACT
-"""Settings that convert colours identically on every machine."""
 
 
 class Frame(NamedTuple):
@@ -32,12 +30,14 @@ class Frame(NamedTuple):
     index: int
     """Number of the frame, from 0. The number of a picture does not depend on the first frame that is read."""
     picture: UInt8[np.ndarray, "H W 3"]
-    """Pixels, in the channel order blue, green, red."""
+    """Pixels as players show the frame: upright and deinterlaced. The channel order is blue, green, red."""
     time_s: float | None
     """Presentation time in seconds, as `jaxfit.video.packets.time_of` defines it. None if the time is unknown."""
 
 
-def decode(path: Path, numbers: range, stopped: Callable[[], bool]) -> Generator[Frame | int, None, None]:
+def decode(
+    path: Path, numbers: range, size_px: tuple[int, int], stopped: Callable[[], bool]
+) -> Generator[Frame | int, None, None]:
     """Yield the requested frames of a video in order. For a damaged or lost frame, yield only its number.
 
     If the container has time stamps (mp4, mkv, webm), the packets of earlier frames are counted and not decoded.
@@ -47,21 +47,22 @@ def decode(path: Path, numbers: range, stopped: Callable[[], bool]) -> Generator
     Args:
         path: the file.
         numbers: numbers of the requested frames.
+        size_px: width and height of the video as players show it.
         stopped: called between packets; True ends the decoding.
 
     Raises:
-        InputError: the file is not a readable video, or no picture of it can be decoded.
+        InputError: the file is not a readable video, no picture of it can be decoded, or a picture has another size.
     """
     if not numbers:
         return
     with opened(path) as (container, stream):
         begun = begin(container, stream, numbers.start, stopped)
         if begun is not None:
-            yield from _read(path, container, stream, *begun, numbers, stopped)
+            yield from _read(path, container, stream, *begun, numbers, size_px, stopped)
             return
     with opened(path) as (container, stream):
         line = packet_timeline(container, stream)
-        yield from _read(path, container, stream, demuxed(container, stream), line, numbers, stopped)
+        yield from _read(path, container, stream, demuxed(container, stream), line, numbers, size_px, stopped)
 
 
 def _read(
@@ -71,10 +72,30 @@ def _read(
     packets: Iterator[tuple[Any, bool]],
     line: Timeline,
     numbers: range,
+    size_px: tuple[int, int],
     stopped: Callable[[], bool],
 ) -> Iterator[Frame | int]:
+    pictures = _numbered(path, container, stream, packets, line, stopped)
+    for number, time_s, picture in deinterlaced(path, pictures):
+        if stopped():
+            return
+        if number in numbers:
+            picture_bgr = None if picture is None else _convert(path, number, picture, size_px)
+            yield number if picture_bgr is None else Frame(number, picture_bgr, time_s)
+        if number >= numbers[-1]:
+            return
+
+
+def _numbered(
+    path: Path,
+    container: Any,
+    stream: Any,
+    packets: Iterator[tuple[Any, bool]],
+    line: Timeline,
+    stopped: Callable[[], bool],
+) -> Iterator[NumberedPicture]:
+    """Yield all pictures from the first packet on, in the order of their numbers."""
     any_picture, problem = False, ""
-    size = stream.width, stream.height  # the decoder changes these values if the size of the pictures changes
     decoded = _decoded(packets, stream, line, stopped)
     while True:
         try:
@@ -86,19 +107,12 @@ def _read(
         if picture is None:
             line.finish()
         else:
-            if not any_picture and picture.rotation:
-                _logger.warning("%s: players rotate this video by %d°, the frames here are not", path, picture.rotation)
+            if not any_picture:
+                warn_of_difference(path, stream, picture)
             any_picture = True
             line.show(picture)
         for number, packet, whole in line.ready():
-            if number in numbers and whole is None:
-                yield number
-            elif number in numbers:
-                time_s = time_of(number, packet, line, stream)
-                picture_bgr = _convert(path, number, whole, size)
-                yield number if picture_bgr is None else Frame(number, picture_bgr, time_s)
-            if number >= numbers[-1]:
-                return
+            yield NumberedPicture(number, time_of(number, packet, line, stream), whole)
         if picture is None:
             break
     if not any_picture:
@@ -106,13 +120,14 @@ def _read(
     _warn_if_short(path, container, stream, line, problem)
 
 
-def _convert(path: Path, number: int, picture: Any, size: tuple[int, int]) -> np.ndarray | None:
+def _convert(path: Path, number: int, picture: Any, size_px: tuple[int, int]) -> np.ndarray | None:
     """Return the pixels of a decoded picture; None if its pixel format is damaged."""
-    if (picture.width, picture.height) != size:
-        problem = f"its frame {number} is {picture.width}×{picture.height}, but the video is {size[0]}×{size[1]}"
+    width, height = displayed_size(picture)
+    if (width, height) != size_px:
+        problem = f"its frame {number} is {width}×{height}, but the video is {size_px[0]}×{size_px[1]}"
         raise InputError(path, problem, "convert the video to a single size")
     try:
-        return picture.to_ndarray(format="bgr24", interpolation=EXACT)
+        return displayed(picture)
     except av.error.FFmpegError:
         return None
 
@@ -142,10 +157,10 @@ def _decoded(
 
 
 def _warn_if_short(path: Path, container: Any, stream: Any, line: Timeline, problem: str) -> None:
-    count = line.number + line.skipped
-    if problem or count < stream.frames:
-        _logger.warning("%s: ends after %d of %s frames%s", path, count, stream.frames or "more", problem)
-    elif not stream.frames and container.duration and line.last is not None and len(container.streams) == 1:
+    frames = frame_count(stream)
+    if problem or line.number + line.skipped < (frames or 0):
+        _logger.warning("%s: ends after %d of %s frames%s", path, line.number, frames or "more", problem)
+    elif not frames and container.duration and line.last is not None and len(container.streams) == 1:
         promised, end = container.duration / av.time_base, float(line.last * stream.time_base)
         if end + 1 < promised:
             _logger.warning("%s: ends after %.1f of %.1f seconds", path, end, promised)

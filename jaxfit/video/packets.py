@@ -13,14 +13,24 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit.video.numbering import Packet, Place, Timeline
-from jaxfit.video.opening import frame_rate, opened
+from jaxfit.video.opening import MP4, frame_rate, opened
 
-__all__ = ["add_packet", "begin", "checked_by_index", "demuxed", "frame_times", "packet_timeline", "time_of"]
+__all__ = [
+    "add_packet",
+    "begin",
+    "checked_by_index",
+    "demuxed",
+    "first_picture",
+    "frame_times",
+    "packet_timeline",
+    "time_of",
+]
 
 _MATROSKA = "matroska,webm"
-_STAMPED = ("mov,mp4,m4a,3gp,3g2,mj2", _MATROSKA)  # every packet has a time stamp, so seeks are exact
+_STAMPED = (MP4, _MATROSKA)  # every packet has a time stamp, so seeks are exact
 _REORDERED = ("h264", "hevc")  # AVI has no time stamps, and FFmpeg cannot derive correct time stamps for these
 _CHUNK_HEADER = 8  # bytes between the position in the index of an AVI file and the packet
+_FIRST_PACKETS = 500  # packets; a later first picture would make probing slow
 _MOST_HEADERS = 1024  # bytes; a larger gap between the packets of a Matroska file is damage
 
 
@@ -185,3 +195,19 @@ def frame_times(path: Path, stop: int) -> Float[np.ndarray, "F"]:
             pass
         settle(np.inf)
     return np.array(times[:stop], np.float64)
+
+
+def first_picture(container: Any, stream: Any) -> Any:
+    """Return the first picture that can be decoded; None if there is none in the first packets."""
+    packets = container.demux(stream)
+    for _ in range(_FIRST_PACKETS):
+        try:
+            packet = next(packets, None)
+            if packet is None:
+                break
+            pictures = stream.decode(packet)
+        except av.error.FFmpegError:
+            continue
+        if pictures:
+            return pictures[0]
+    return None
