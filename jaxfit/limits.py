@@ -111,6 +111,8 @@ FRAMES_PER_S = 100_000
 """Highest frame rate of a video. A higher rate counts as unknown."""
 SECONDS_PER_FRAME = 100_000
 """Longest time between the frames of a video. A lower frame rate counts as unknown."""
+TIMESTAMP_S = 1e9
+"""Largest absolute time stamp of a frame in a file of observations, in seconds."""
 VIDEO_GAP_FRAMES = 100_000
 """Most frames that damage can hide at one place of a video. A longer gap of the time stamps counts as damaged."""
 

@@ -148,10 +148,10 @@ def run_tracking(
     )
     keypoints = keypoints or open_keypoint_detector(config)
     segmenter = segmenter or open_segmenter(config)
-    recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names))
+    recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names), reader.info.fps)
     clock, best_score, frame_count, start = Clock(), 0.0, 0, time.perf_counter()
     with _single_opencv_thread(), progress("Tracking", _expected_frames(reader, config)) as report_progress:
-        for number, picture, _ in clock.each("decode", reader):
+        for number, picture, time_s in clock.each("decode", reader):
             with clock("segment"):
                 instances = segmenter(picture)
             with clock("track"):
@@ -165,7 +165,8 @@ def run_tracking(
             name = f"{one_line(reader.path.name)}#{number}"  # a name on the disk may be no text
             size_px = (picture.shape[1], picture.shape[0])
             with clock("record"):
-                recorder.add(number, name, size_px, birds, [identity for _, identity in tracked], points_px, confidence)
+                identities = [identity for _, identity in tracked]
+                recorder.add(number, name, size_px, birds, identities, points_px, confidence, time_s)
             best_score, frame_count = max([best_score, *(bird.score for bird in instances)]), frame_count + 1
             noun = "bird" if len(birds) == 1 else "birds"
             report_progress(1, f"{frame_count / (time.perf_counter() - start):.1f} frames/s, {len(birds)} {noun}")

@@ -74,10 +74,9 @@ def image_sizes(
                 problem = f"says {stored[0]}×{stored[1]}, but a picture has {other[0]}×{other[1]} pixels"
                 raise InputError(source, problem, "give the pictures in the size that was labelled")
             return ImageSizes(sizes)
-    if stored is not None:
-        return ImageSizes(np.array(stored))
-    if given is not None:
-        return ImageSizes(np.array(given))
+    known = stored if stored is not None else given
+    if known is not None:
+        return ImageSizes(np.array(known), None if pictures else _video_of_size(known, source, stored_video))
     found = _video_beside(source, stored_video) if pictures is None else None
     if found is not None:
         info = probe_video(found)
@@ -143,6 +142,15 @@ def _video_beside(source: Path, stored: str | None) -> Path | None:
         if file.suffix.lower() in _VIDEO_SUFFIXES and source.name.startswith(file.stem) and _is_file(file)
     ]
     return max(videos, key=lambda file: len(file.stem), default=None)
+
+
+def _video_of_size(size_px: tuple[int, int], source: Path, stored: str | None) -> Path | None:
+    """Return the video beside a file if it has the size of the images; the file does not need the video."""
+    found = _video_beside(source, stored)
+    try:
+        return found if found is not None and probe_video(found).size_px == size_px else None
+    except (InputError, OSError):
+        return None
 
 
 def _is_file(path: Path) -> bool:

@@ -12,6 +12,7 @@ from jaxfit.data.formats.image_sizes import check_video
 from jaxfit.data.formats.keypoint_table import KeypointTable, table_observations
 from jaxfit.data.formats.sleap.analysis import read_sleap_analysis
 from jaxfit.data.formats.sleap.project import read_sleap_project
+from jaxfit.data.formats.video_times import add_times
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.storage.reading import open_file
@@ -33,7 +34,8 @@ def read_observations(
     Args:
         path: the file.
         video: the video, or folder of pictures, of the observations. It gives the size of the images where the file
-            does not store the size, and must fit to the file. None: as the file and its folder say.
+            does not store the size, and the times of the frames where the file does not store times. It must fit to the
+            file. None: as the file and its folder say.
         size_px: width and height of the images, in place of `video`, for a file that does not store the size.
 
     Raises:
@@ -50,6 +52,7 @@ def read_observations(
         observations = read_coco(path, video)
         if video is not None:
             check_video(observations, path, video)
+            observations = add_times(observations, video)
         return observations
     if text[:6].lower() == b"scorer" or path.suffix.lower() == ".csv":
         return table_observations(read_deeplabcut_csv(path), path, video, size_px)
