@@ -19,7 +19,10 @@ from jaxfit.video.codecs import CODECS
 __all__ = ["build_parser"]
 
 MODEL = "`murre`, or a model file (.npz) that `jaxfit model import` writes"
-OBSERVATIONS = "keypoints and masks: COCO, DeepLabCut (.h5, .csv), Lightning Pose (.csv) or SLEAP (.slp, .analysis.h5)"
+OBSERVATIONS = (
+    "keypoints and masks: COCO, Label Studio (.json), DeepLabCut (.h5, .csv), Lightning Pose (.csv) or SLEAP (.slp, "
+    ".analysis.h5)"
+)
 
 
 def _names(text: str) -> list[str]:

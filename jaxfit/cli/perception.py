@@ -69,6 +69,7 @@ def reconstruct(options: argparse.Namespace) -> None:
 def reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
     """Return the config of `--config`, with the values of the options for single settings."""
     from jaxfit.config.paths import with_values
+    from jaxfit.config.reconstruct import load_reconstruct_config
 
     settings = {path: value for path, value in vars(options).items() if path.startswith("track.") and value is not None}
     return with_values(load_reconstruct_config(options.config), settings)

@@ -11,8 +11,11 @@ __all__ = ["choose", "shortlist", "thumbnail"]
 THUMBNAIL_PX = (32, 20)
 SHORTLIST = 4
 """Number of frames that are examined in detail, per frame to choose."""
-SHARPNESS = 2.0
+SHARPNESS = 4.0
 """Exponent of the score against the distance from the chosen frames: 0 chooses by variety alone."""
+
+LEAST_GAP = 0.25
+"""Least distance in time of chosen frames, as a share of the mean distance of evenly spaced frames."""
 
 
 def thumbnail(picture: UInt8[np.ndarray, "H W 3"]) -> Float[np.ndarray, "D"]:
@@ -53,8 +56,9 @@ def choose(
 
     The weighted distance of a frame is score^`SHARPNESS` · (distance from the nearest chosen frame). The squared
     distance of two frames is the sum of two squared parts: the distance of the thumbnails, divided by its median over
-    all pairs, and the distance in time, divided by the mean distance of `count` evenly spaced frames, at most 1. The
-    first frame is the frame with the largest score. Equal values choose the earlier frame.
+    all pairs, and the distance in time, divided by the mean distance of `count` evenly spaced frames, at most 1. Frames
+    that are closer in time to a chosen frame than a quarter of this mean distance are chosen last. The first frame is
+    the frame with the largest score. Equal values choose the earlier frame.
 
     Args:
         score: in [0, 1].
@@ -71,14 +75,16 @@ def choose(
     spacing = max(int(numbers[-1] - numbers[0]) / count, 1.0)
     scale = _median_distance(thumbnails)
     nearest = np.full(len(score), np.inf)
-    chosen = [int(np.argmax(weight))]
+    chosen, crowded = [int(np.argmax(weight))], np.zeros(len(score), bool)
     while len(chosen) < count:
         last = chosen[-1]
         look = np.linalg.norm(thumbnails - thumbnails[last], axis=-1)
-        time = np.minimum(np.abs(numbers - numbers[last]) / spacing, 1)
-        nearest = np.minimum(nearest, np.hypot(look / scale, time))
-        nearest[chosen] = -np.inf
-        chosen.append(int(np.argmax(weight * nearest)))
+        gap = np.abs(numbers - numbers[last]) / spacing
+        crowded |= gap < LEAST_GAP
+        nearest = np.minimum(nearest, np.hypot(look / scale, np.minimum(gap, 1)))
+        value = weight * nearest - np.where(crowded, 1e6, 0)
+        value[chosen] = -np.inf
+        chosen.append(int(np.argmax(value)))
     return chosen
 
 

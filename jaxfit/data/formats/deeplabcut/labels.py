@@ -12,6 +12,7 @@ import csv
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,8 @@ def write_deeplabcut_labels(
     birds = [f"bird{track}" for track in observations.track_id[kept].tolist()]
     columns = [(scorer, bird, name, axis) for bird in birds for name in observations.keypoint_names for axis in "xy"]
     known = observations.confidence[kept] > 0
-    points = np.where(known[..., None], observations.keypoints_px[kept], np.nan)
+    shortest = observations.keypoints_px[kept].astype(str).astype(np.float64)  # the same numbers in both files
+    points = np.where(known[..., None], shortest, np.nan)
     values = points.transpose(1, 0, 2, 3).reshape(len(pictures), -1)  # one row per frame: bird, keypoint, x and y
     rows = [(_FOLDER, folder.name, picture) for picture in pictures]
     path = folder / f"CollectedData_{scorer}"
@@ -75,18 +77,18 @@ def _write_hdf5(path: Path, columns: list[tuple[str, ...]], rows: list[tuple[str
         for axis, entries, names in (
             ("axis0", columns, _LEVELS),
             ("block0_items", columns, _LEVELS),
-            ("axis1", rows, None),
+            ("axis1", rows, ()),
         ):
             _describe(table, "GROUP", **{f"{axis}_variety": "multi"})
             _write_axis(table, axis, entries, names)
-        table["block0_values"] = values.astype(np.float64)
+        table["block0_values"] = values
         _describe(table["block0_values"], "ARRAY", transposed=1)
     write_whole(path, content.getvalue())
 
 
-def _write_axis(table, axis: str, entries: list[tuple[str, ...]], names: Sequence[str] | None) -> None:
+def _write_axis(table: Any, axis: str, entries: list[tuple[str, ...]], names: Sequence[str]) -> None:
     """Write the names along an axis: for each level, the different texts and the position of every entry's text."""
-    for i in range(len(_LEVELS) if names else 3):
+    for i in range(len(names) or 3):
         own = [entry[i] for entry in entries]
         texts = list(dict.fromkeys(own))
         place = {text: k for k, text in enumerate(texts)}
@@ -98,12 +100,14 @@ def _write_axis(table, axis: str, entries: list[tuple[str, ...]], names: Sequenc
         _describe(table[label], "ARRAY", transposed=1)
 
 
-def _describe(entry, node: str, **attributes: str | int) -> None:
-    """Write the attributes that PyTables and pandas need."""
+def _describe(entry: Any, node: str, **attributes: str | int) -> None:
+    """Write the attributes that PyTables and pandas need; PyTables reads text with the character set UTF-8 as `str`."""
+    import h5py
+
     version = {"GROUP": "1.0", "ARRAY": "2.4"}[node]
     flavour = {"FLAVOR": "numpy"} if node == "ARRAY" else {}
-    for name, value in ({"CLASS": node, "VERSION": version, "TITLE": ""} | flavour | attributes).items():
-        if name == "transposed":
-            entry.attrs[name] = np.uint8(value)
+    for name, value in ({"CLASS": node, "VERSION": version} | flavour | attributes).items():
+        if isinstance(value, str):
+            entry.attrs.create(name, value.encode(), dtype=h5py.string_dtype("utf-8", len(value.encode())))
         else:
-            entry.attrs[name] = np.bytes_(value) if isinstance(value, str) else np.int64(value)
+            entry.attrs[name] = np.uint8(value) if name == "transposed" else np.int64(value)
