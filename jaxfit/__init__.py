@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.evaluation.matching import match_tracks
     from jaxfit.evaluation.truth import Truth, read_truth
     from jaxfit.fitting.fit import fit
+    from jaxfit.labelling.suggest import suggest
     from jaxfit.model.bird import Bird
     from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
     from jaxfit.objective.registry import term
@@ -73,6 +74,7 @@ __all__ = [
     "save_solution",
     "simulate",
     "stage_scene",
+    "suggest",
     "sweep",
     "term",
     "track_quality",
@@ -99,6 +101,7 @@ _HOMES = {
     "evaluation.matching": ("match_tracks",),
     "evaluation.truth": ("Truth", "read_truth"),
     "fitting.fit": ("fit",),
+    "labelling.suggest": ("suggest",),
     "model.bird": ("Bird",),
     "model.files": ("find_bird", "load_bird", "load_murre", "save_bird"),
     "objective.registry": ("term",),

@@ -19,7 +19,10 @@ from jaxfit.video.codecs import CODECS
 __all__ = ["build_parser"]
 
 MODEL = "`murre`, or a model file (.npz) that `jaxfit model import` writes"
-OBSERVATIONS = "keypoints and masks: COCO, DeepLabCut (.h5, .csv), Lightning Pose (.csv) or SLEAP (.slp, .analysis.h5)"
+OBSERVATIONS = (
+    "keypoints and masks: COCO, Label Studio (.json), DeepLabCut (.h5, .csv), Lightning Pose (.csv) or SLEAP (.slp, "
+    ".analysis.h5)"
+)
 
 
 def _names(text: str) -> list[str]:
@@ -34,7 +37,7 @@ TRACK_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "--stop": ("frames.stop", {"metavar": "FRAME", "type": int}),
     "--step": ("frames.step", {"metavar": "N", "type": int}),
 }
-"""Option of `track` and `reconstruct` → the path of its setting in `TrackConfig`, which holds its description."""
+"""Option of the commands that track → the path of its setting in `TrackConfig`, which holds its description."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -51,7 +54,18 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
     parser.add_argument("-v", "--verbose", action="store_true", help="print more messages, also of libraries")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add_commands in (_perception, _import, _fitting, _simulation, _training, _datasets, _models, _configs, _bench):
+    for add_commands in (
+        _perception,
+        _labelling,
+        _import,
+        _fitting,
+        _simulation,
+        _training,
+        _datasets,
+        _models,
+        _configs,
+        _bench,
+    ):
         add_commands(commands)
     return parser
 
@@ -98,19 +112,32 @@ def _add_codec(command: argparse.ArgumentParser) -> None:
     command.add_argument("--codec", default="auto", choices=("auto", *CODECS), help=text)
 
 
+def _add_tracking_options(command: argparse.ArgumentParser) -> None:
+    """Add the video and the settings of tracking."""
+    command.add_argument("video", type=Path, metavar="VIDEO", help="a video, or a folder of frames")
+    text = "YAML file with `base: reconstruct` and changed settings; `jaxfit config show reconstruct` lists them all"
+    command.add_argument("--config", default="reconstruct", help=text)
+    for option, (path, details) in TRACK_OPTIONS.items():
+        text = option_help(TrackConfig, path)
+        command.add_argument(option, dest=f"track.{path}", help=text[0].lower() + text[1:], **details)
+
+
+def _labelling(commands: Any) -> None:
+    text = "choose frames that a person should label, and write their pictures and pre-filled labels (extra `formats`)"
+    suggest = _command(commands, "suggest", "labelling.suggest_frames", text)
+    _add_tracking_options(suggest)
+    text = "result of this video, instead of tracking: a folder of reconstruct or fit, or a file of keypoints (as OBS)"
+    suggest.add_argument("--result", type=Path, metavar="DIR|OBS", help=text)
+    suggest.add_argument("--count", type=int, default=40, help="number of frames (default %(default)s)")
+    _add_out(suggest, "DIR", "folder for the pictures and labels", overwrite="earlier suggestions in the folder")
+
+
 def _perception(commands: Any) -> None:
     track = _command(commands, "track", "perception.track", "detect and track the birds of a video and their keypoints")
     text = "track the birds of a video, fit their poses and draw them"
     reconstruct = _command(commands, "reconstruct", "perception.reconstruct", text)
     for command in (track, reconstruct):
-        command.add_argument("video", type=Path, metavar="VIDEO", help="a video, or a folder of frames")
-        text = (
-            "YAML file with `base: reconstruct` and changed settings; `jaxfit config show reconstruct` lists them all"
-        )
-        command.add_argument("--config", default="reconstruct", help=text)
-        for option, (path, details) in TRACK_OPTIONS.items():
-            text = option_help(TrackConfig, path)
-            command.add_argument(option, dest=f"track.{path}", help=text[0].lower() + text[1:], **details)
+        _add_tracking_options(command)
     _add_out(track, "OBS.json", "COCO file to write", overwrite="an existing file")
     _add_model(reconstruct)
     _add_out(reconstruct, "DIR", "folder for the result", overwrite="an earlier result in the folder")

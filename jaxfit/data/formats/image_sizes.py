@@ -104,14 +104,15 @@ def check_video(observations: Observations, source: Path, video: Path) -> None:
 def _picture_sizes(pictures: Sequence[str], source: Path) -> np.ndarray | None:
     """Return the (T, 2) sizes of the pictures; None if no picture is beside the file.
 
-    The project folder of DeepLabCut holds `labeled-data/VIDEO/`, which holds the pictures and the file of labels. A
-    missing picture has the size of the others.
+    The project folder of DeepLabCut holds `labeled-data/VIDEO/`, which holds the pictures and the file of labels.
+    Pictures may also lie in the folder `images` beside the file. A missing picture has the size of the others.
     """
     folders = [source.parent, *source.absolute().parents[1:4]]
     sizes = np.zeros((len(pictures), 2), np.int64)
     for t, picture in enumerate(pictures):
         name = picture.replace("\\", "/")
-        places = [folder / name for folder in folders] + [source.parent / Path(name).name]
+        places = [folder / name for folder in folders]
+        places += [source.parent / Path(name).name, source.parent / "images" / Path(name).name]
         file = next(filter(_is_file, places), None)
         image = None if file is None else read_picture(file, grey=True)
         if image is not None:

@@ -7,9 +7,11 @@ from pathlib import Path
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.deeplabcut.csv_file import read_deeplabcut_csv
 from jaxfit.data.formats.deeplabcut.hdf5_file import find_pandas_table, read_deeplabcut_hdf5
+from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.hdf5 import HDF5_SIGNATURE, open_hdf5
 from jaxfit.data.formats.image_sizes import check_video
 from jaxfit.data.formats.keypoint_table import KeypointTable, table_observations
+from jaxfit.data.formats.label_studio import read_label_studio
 from jaxfit.data.formats.sleap.analysis import read_sleap_analysis
 from jaxfit.data.formats.sleap.project import read_sleap_project
 from jaxfit.data.formats.video_times import add_times
@@ -19,7 +21,9 @@ from jaxfit.storage.reading import open_file
 
 __all__ = ["read_observations"]
 
-_FORMATS = "give COCO json, DeepLabCut or Lightning Pose .csv, DeepLabCut .h5, SLEAP .slp or .analysis.h5"
+_FORMATS = (
+    "give COCO or Label Studio json, DeepLabCut or Lightning Pose .csv, DeepLabCut .h5, SLEAP .slp or .analysis.h5"
+)
 
 
 def read_observations(
@@ -48,7 +52,9 @@ def read_observations(
     if start.startswith(HDF5_SIGNATURE):
         return table_observations(_read_hdf5(path, video), path, video, size_px)
     text = start.removeprefix(b"\xef\xbb\xbf").lstrip()
-    if text[:1] in (b"{", b"[") or path.suffix.lower() == ".json":
+    if text[:1] == b"[":
+        return table_observations(read_label_studio(read_json(path)), path, video, size_px)
+    if text[:1] == b"{" or path.suffix.lower() == ".json":
         observations = read_coco(path, video)
         if video is not None:
             check_video(observations, path, video)
