@@ -179,7 +179,10 @@ BAD = {
     "no task": (lambda tasks: tasks.clear(), "holds no task"),
     "no data": (lambda tasks: tasks[0].pop("data"), "lacks the key data"),
     "no bird": (lambda tasks: [task.pop("predictions") for task in tasks], "no bird"),
-    "twice": (lambda tasks: result(tasks).append(result(tasks)[1]), "labels bill_tip of a bird in clip_000003.png twice"),
+    "twice": (
+        lambda tasks: result(tasks).append(result(tasks)[1]),
+        "labels bill_tip of a bird in clip_000003.png twice",
+    ),
     "track twice": (lambda tasks: result(tasks)[4]["meta"].update(text="track 4"), "holds track 4 twice"),
     "size": (lambda tasks: result(tasks)[0].update(original_width=91), "is 91, but clip_000003.png is 90 pixels"),
     "sizes": (lambda tasks: tasks[3]["data"].update(width=91), "pictures of several sizes"),

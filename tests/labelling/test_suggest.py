@@ -91,9 +91,7 @@ def test_without_birds_variety_decides(footage, tmp_path, caplog):
     """The labels are empty, the frames lie apart, and a line says so."""
     film, video, _ = footage
     missed = [(t, n) for t in range(FRAMES) for n in range(BIRDS)]
-    done = suggest(
-        video, tmp_path / "label", 3, None, CONFIG, TrueSegmenter(film, missed), TrueKeypoints(film)
-    )
+    done = suggest(video, tmp_path / "label", 3, None, CONFIG, TrueSegmenter(film, missed), TrueKeypoints(film))
     assert "chosen by variety alone" in caplog.text
     assert np.diff(done.observations.frame_index).min() >= 2
     assert {frame.reason for frame in done.frames} == {"variety"}
