@@ -16,11 +16,12 @@ from scipy.optimize import isotonic_regression, linear_sum_assignment
 
 from jaxfit.data.masks import box_of_mask
 from jaxfit.errors import InputError
-from jaxfit.perception.calibration import Curve
+from jaxfit.perception.calibration import CONFIDENCE_KEY, Curve
 from jaxfit.perception.instances import Instance, KeypointDetector, Segmenter
+from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.training.onnx_metadata import set_metadata
 
-__all__ = ["LabelledPicture", "Outcomes", "fit_curve", "keypoint_outcomes", "store_curve"]
+__all__ = ["LabelledPicture", "Outcomes", "calibrate_keypoints", "fit_curve", "keypoint_outcomes", "store_curve"]
 
 RIGHT = 0.05
 """Largest error of a keypoint that is right, as a share of the longer side of the bird's box."""
@@ -51,6 +52,24 @@ class Outcomes(NamedTuple):
     values: Float[np.ndarray, "M"]
     """Raw values of the network."""
     right: Bool[np.ndarray, "M"]
+
+
+def calibrate_keypoints(path: str | Path, pictures: Iterable[LabelledPicture], segmenter: Segmenter) -> Curve:
+    """Fit the curve of a keypoint network on known birds, and store the curve in the file.
+
+    Args:
+        path: the ONNX file; it is replaced. A curve that the file holds is replaced too.
+        pictures: pictures that neither network was trained on.
+        segmenter: detects the birds.
+
+    Raises:
+        InputError: the file is no keypoint network, or fewer than 200 keypoints are detected.
+    """
+    detector = load_keypoint_detector(path)
+    detector.curve = None
+    curve = fit_curve(keypoint_outcomes(pictures, segmenter, detector), path)
+    store_curve(path, CONFIDENCE_KEY, curve)
+    return curve
 
 
 def keypoint_outcomes(

@@ -16,14 +16,43 @@ from jaxfit.perception.instances import Segmenter
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.perception.segmentation.bottom_up import BottomUp
+from jaxfit.progress import ProgressTask, silent
+from jaxfit.training.activations import store_activations
 from jaxfit.training.augment import randomise_appearance
 
-__all__ = ["keypoint_inputs", "pictures_in_use", "segmenter_inputs"]
+__all__ = ["keypoint_inputs", "pictures_in_use", "segmenter_inputs", "store_training_activations"]
 
 LONGER_SIDE_PX = 864
 """Longer side of the pictures with a random appearance; blur and noise have the scale of the training there."""
 MAX_PICTURES = 400
 """Largest number of pictures; more pictures hardly change the statistics."""
+
+
+def store_training_activations(
+    which: str,
+    path: str | Path,
+    pictures: UInt8[np.ndarray, "S H W 3"],
+    owner: UInt8[np.ndarray, "S H W"],
+    progress: ProgressTask = silent,
+) -> None:
+    """Store the statistics of the activations of a trained network over its training pictures.
+
+    Args:
+        which: `segmenter`, or `keypoints`, whose birds are those that the built-in segmenter detects.
+        path: the ONNX file; it is replaced.
+        pictures: blue, green, red; may be memory-mapped.
+        owner: number of the bird of each pixel, 0 for no bird.
+        progress: reports every picture.
+
+    Raises:
+        InputError: the file is no such network, or the pictures show fewer than 10 birds.
+    """
+    shown = pictures_in_use(pictures, owner)
+    if which == "segmenter":
+        inputs = segmenter_inputs(path, shown)
+    else:
+        inputs = keypoint_inputs(path, shown, load_segmenter("builtin"))
+    store_activations(path, inputs, min(len(pictures), MAX_PICTURES), progress)
 
 
 def pictures_in_use(
