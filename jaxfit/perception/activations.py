@@ -1,9 +1,9 @@
 """Distance of a network's activations from the activations of its training.
 
-A network that `jaxfit train` wrote has an output `activations`: its last feature map, averaged over the cells. Its metadata
-hold the mean μ of the activations of its training inputs and a matrix W (`jaxfit.training.activations`). The
-distance of an input with activations a is ‖W (a − μ)‖. W whitens the activations of the training, and its scale is
-such that 99 % of the training inputs have a distance below 1.
+A network that `jaxfit train` wrote has an output `activations`: its last feature map, averaged over the cells. Its
+metadata hold the mean μ of the activations of its training inputs and a matrix W (`jaxfit.training.activations`). The
+distance of an input with activations a is ‖W (a − μ)‖. W whitens the activations of the training, and its scale is such
+that 99 % of the training inputs have a distance below 1.
 """
 
 from __future__ import annotations

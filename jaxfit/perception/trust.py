@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -39,9 +39,9 @@ class FootageSignals(NamedTuple):
     count_change: float | None
     """Mean change of the number of birds between consecutive frames, divided by `birds_per_frame`."""
     score: float | None
-    """Median score of the birds."""
+    """Median score of the birds; None for a segmenter without statistics, because scores of networks differ."""
     confidence: float | None
-    """Median over the birds of the mean confidence of the keypoints of a bird in a frame; only with a curve."""
+    """Median over the birds of the mean confidence of a bird's keypoints; None for confidences without a curve."""
     frame_distance: float | None
     """Median over the frames of the distance of the segmenter's activations."""
     bird_distance: float | None
@@ -60,7 +60,9 @@ class Trust(NamedTuple):
     def sentence(self) -> str:
         """Return the judgement as one sentence for the user."""
         if self.level == "high":
-            return "trust is high: the networks behave on this footage as on the simulated footage of their training"
+            if None in (self.signals.frame_distance, self.signals.bird_distance):
+                return "trust is high, but not certain: a network without statistics of its training is judged by tracks only"
+            return "trust is high: the networks work on this footage as on simulated footage"
         return f"trust is low: {'; '.join(self.reasons)}. {REMEDY}"
 
     def info(self) -> dict[str, str]:
@@ -82,18 +84,19 @@ def footage_signals(
         distances: distances of the segmenter's activations and of the keypoint network's activations.
         calibrated: whether the confidences of the keypoints are calibrated.
     """
-    present, scores = observations.present, observations.score
+    present, scores = observations.present, cast(np.ndarray, observations.score)
     detections = int(present.sum())
     counts = present.sum(0)
     frame_distance, bird_distance = (float(np.median(values)) if len(values) else None for values in distances)
     confidence = observations.confidence.mean(-1)[present] if observations.num_keypoints and calibrated else ()
+    is_changing = detections and len(counts) > 1
     return FootageSignals(
         birds_per_frame=float(counts.mean()),
         short_tracks=len(short_tracks),
         tracks=observations.num_tracks,
         short_share=sum(short_tracks.values()) / detections if detections else None,
-        count_change=float(np.abs(np.diff(counts)).mean() / counts.mean()) if detections and len(counts) > 1 else None,
-        score=float(np.median(scores[present])) if detections and scores is not None else None,
+        count_change=float(np.abs(np.diff(counts)).mean() / counts.mean()) if is_changing else None,
+        score=float(np.median(scores[present])) if detections and frame_distance is not None else None,
         confidence=float(np.median(confidence)) if len(confidence) else None,
         frame_distance=frame_distance,
         bird_distance=bird_distance,

@@ -106,9 +106,9 @@ def activation_statistics(activations: Float[np.ndarray, "N C"], source: object 
 def add_activation_output(path: str | Path) -> None:
     """Add the output `activations` (N, C) to a network: its last feature map, averaged over the cells.
 
-    The last feature map is the result of the last Relu of the graph, from which a network of `jaxfit train` computes its
-    outputs. On simulated footage and on pictures without birds, the last map separated known from unknown pictures better
-    than the deepest map (the coarsest resolution). A network that has the output does not change.
+    The last feature map is the result of the last Relu of the graph. A network of `jaxfit train` computes its outputs
+    from this map. On simulated footage and on pictures without birds, this map separated known from unknown pictures
+    better than the map with the coarsest resolution. A network that has the output does not change.
 
     Raises:
         InputError: the network has no Relu.

@@ -73,7 +73,8 @@ def pictures_in_use(
             picture = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
             size = picture.shape[1], picture.shape[0]
             birds = cv2.resize(np.asarray(owner[s]), size, interpolation=cv2.INTER_NEAREST) > 0
-            picture = randomise_appearance(np.random.default_rng((seed, s)), np.asarray(picture, np.uint8), birds)
+            with np.errstate(over="ignore"):  # far from the edge of a cast shadow
+                picture = randomise_appearance(np.random.default_rng((seed, s)), np.asarray(picture, np.uint8), birds)
         yield picture
 
 
