@@ -27,8 +27,10 @@ RIGHT = 0.05
 """Largest error of a keypoint that is right, as a share of the longer side of the bird's box."""
 MIN_IOU = 0.5
 """Least IoU of a detected and a true bird that are the same bird."""
-POINTS = 12
-"""Number of groups of equal size, each of which gives one point of a curve."""
+RANGES = 20
+"""Number of equal ranges of values, each of which gives at most one point of a curve."""
+MIN_IN_RANGE = 50
+"""A range with fewer detections is merged with the next range."""
 MIN_OUTCOMES = 200
 """Least number of detections for a curve."""
 
@@ -106,8 +108,9 @@ def keypoint_outcomes(
 def fit_curve(outcomes: Outcomes, source: object = "outcomes") -> Curve:
     """Fit a monotone curve from raw values to the share of right detections.
 
-    An isotonic regression gives the shares. The detections are sorted by value and cut into 12 groups of equal size;
-    the mean value and the mean share of a group are a point of the curve.
+    An isotonic regression gives the shares. The values are cut into 20 equal ranges; a range with fewer than 50
+    detections is merged with the next range. The mean value and the mean share of a range are a point of the curve,
+    and (0, 0) is its first point.
 
     Args:
         outcomes: detections and whether they are right.
@@ -123,10 +126,14 @@ def fit_curve(outcomes: Outcomes, source: object = "outcomes") -> Curve:
         problem = f"has {len(values)} detections of known birds, or equal confidences"
         raise InputError(source, problem, f"calibrate on pictures with at least {MIN_OUTCOMES} detected keypoints")
     shares = isotonic_regression(right[order].astype(float)).x
-    groups = [np.arange(0, 1), *np.array_split(np.arange(len(order)), POINTS), np.arange(len(order) - 1, len(order))]
-    points = np.array([[values[order][group].mean(), shares[group].mean()] for group in groups])
-    kept = np.concatenate([[True], np.diff(points[:, 0]) > 1e-4 * (values.max() - values.min())])
-    return Curve(points[kept, 0], points[kept, 1])
+    edges = np.searchsorted(values[order], np.linspace(values.min(), values.max(), RANGES + 1)[1:-1])
+    points, start = [(0.0, 0.0)], 0
+    for stop in [*edges.tolist(), len(order)]:
+        is_last = stop == len(order)
+        if stop - start >= MIN_IN_RANGE and (is_last or len(order) - stop >= MIN_IN_RANGE):
+            points.append((values[order][start:stop].mean(), shares[start:stop].mean()))
+            start = stop
+    return Curve(*np.array(points).T)
 
 
 def store_curve(path: str | Path, key: str, curve: Curve) -> None:
