@@ -29,7 +29,8 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.objective.registry import term
     from jaxfit.perception.keypoints import load_keypoint_detector
     from jaxfit.perception.segmentation import load_segmenter
-    from jaxfit.perception.track import track_video
+    from jaxfit.perception.track import run_tracking, track_video
+    from jaxfit.perception.trust import Trust
     from jaxfit.pipeline import Reconstruction, reconstruct
     from jaxfit.simulation.scene import Scene, simulate, stage_scene
     from jaxfit.view.contact_sheet import contact_sheet
@@ -48,6 +49,7 @@ __all__ = [
     "Scene",
     "Solution",
     "TrackConfig",
+    "Trust",
     "Truth",
     "ablate",
     "contact_sheet",
@@ -70,6 +72,7 @@ __all__ = [
     "read_observations",
     "read_truth",
     "reconstruct",
+    "run_tracking",
     "save_bird",
     "save_solution",
     "simulate",
@@ -107,7 +110,8 @@ _HOMES = {
     "objective.registry": ("term",),
     "perception.keypoints": ("load_keypoint_detector",),
     "perception.segmentation": ("load_segmenter",),
-    "perception.track": ("track_video",),
+    "perception.track": ("run_tracking", "track_video"),
+    "perception.trust": ("Trust",),
     "pipeline": ("Reconstruction", "reconstruct"),
     "simulation.scene": ("Scene", "simulate", "stage_scene"),
     "view.overlay": ("overlay", "overlay_frame"),

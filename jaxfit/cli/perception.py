@@ -32,7 +32,8 @@ def track(options: argparse.Namespace) -> None:
     check_writable(options.out)
     config = reconstruct_config(options).track
     tracking = run_tracking(options.video, config, progress=terminal)
-    write_coco(tracking.observations, options.out)
+    write_coco(tracking.observations, options.out, tracking.trust.info())
+    show(tracking.trust.sentence())
     if tracking.failure:
         _logger.warning("%s", tracking.failure)
     else:
@@ -51,6 +52,7 @@ def reconstruct(options: argparse.Namespace) -> None:
     config = reconstruct_config(options)
     bird = find_bird(options.model)
     done = reconstruct(options.video, options.out, bird, config, overwrite=options.overwrite, progress=terminal)
+    show(done.tracking.trust.sentence())
     show(track_table(done.tracking.observations, done.solution))
     _show_short_tracks(done.tracking.short_tracks, config.track.min_track_frames)
     birds = counted(done.summary["tracks"], "bird")

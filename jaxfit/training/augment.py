@@ -159,6 +159,9 @@ def _noise_array() -> Float[np.ndarray, "512 512 3"]:
 def _add_grain(rng: np.random.Generator, picture: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
     """Add sensor noise: a random part of one array of noise, which is much faster than new noise."""
     height, width = picture.shape[:2]
-    y, x = rng.integers(0, [512 - height, 512 - width])
-    grain = _noise_array()[y : y + height, x : x + width]
+    noise = _noise_array()
+    if max(height, width) >= 512:  # a picture larger than the training samples
+        noise = np.tile(noise, (height // 512 + 2, width // 512 + 2, 1))
+    y, x = rng.integers(0, [noise.shape[0] - height, noise.shape[1] - width])
+    grain = noise[y : y + height, x : x + width]
     return np.clip(picture + rng.uniform(0, 10) * grain + 0.5, 0, 255).astype(np.uint8)

@@ -17,6 +17,7 @@ from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
 from jaxfit.training.export import export_onnx
+from jaxfit.training.familiarity import store_training_activations
 from jaxfit.training.loop import Schedule, train
 from jaxfit.training.networks import FeaturePyramid
 from jaxfit.training.scenes import FRAMES_PER_SCENE, LabelledFrames, film_scenes, load_frames
@@ -81,6 +82,7 @@ def train_network(
         "loss": json.dumps({name: round(value, 5) for name, value in losses.items()}),
     }
     (_write_segmenter if which == "segmenter" else _write_keypoints)(network, facts, path)
+    store_training_activations(which, path, frames.pictures, frames.owner, progress)
     return losses
 
 
