@@ -67,12 +67,12 @@ def split_pictures(pictures: Sequence[LabelledPicture], share: float) -> Split:
 
 
 def _by_video(pictures: Sequence[LabelledPicture], videos: list[list[int]], share: float) -> Split | None:
-    """Hold out the videos, smallest first, until the share is reached; None if that takes too many pictures."""
+    """Hold out videos, smallest first, until at least half the share is reached; None if that takes too many."""
     if len(videos) < 2:
         return None
     held: list[list[int]] = []
     for video in sorted(videos, key=len):
-        if sum(map(len, held)) >= share * len(pictures):
+        if sum(map(len, held)) >= 0.5 * share * len(pictures):
             break
         held.append(video)
     holdout = sorted(i for video in held for i in video)
