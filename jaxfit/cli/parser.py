@@ -208,15 +208,26 @@ def _simulation(commands: Any) -> None:
 
 
 def _training(commands: Any) -> None:
-    text = "train a built-in network on simulated footage (needs the extra `train`)"
+    text = "train a network on labelled footage, or a built-in network again (needs the extra `train`)"
     train = _command(commands, "train", "training.train", text)
     train.add_argument("network", choices=("segmenter", "keypoints"), help="network to train")
     _add_out(train, "N.onnx", "network file to write", overwrite="an existing file")
-    text = "folder of the footage; absent footage is simulated first (5 GB, default %(default)s)"
-    train.add_argument("--frames", type=Path, default=Path("training_frames"), metavar="DIR", help=text)
-    text = "number of scenes, of 10 frames each (default %(default)s)"
-    train.add_argument("--scenes", type=int, default=160, help=text)
-    train.add_argument("--steps", type=int, help="number of training steps (default: as for the built-in network)")
+    text = f"labelled frames: {OBSERVATIONS}; for a segmenter also COCO masks without keypoints, or folders of masks"
+    train.add_argument("--labels", type=Path, nargs="+", metavar="FILE", help=text)
+    text = "video or folder of the labelled frames, one for all files or one for each (default: beside the labels)"
+    train.add_argument("--images", type=Path, nargs="+", metavar="DIR|VIDEO", help=text)
+    text = "masks of the labelled birds: a folder of pictures, or a COCO file"
+    train.add_argument("--masks", type=Path, metavar="DIR|OBS.json", help=text)
+    text = "network to start from: `builtin`, or a network that this command wrote (default %(default)s)"
+    train.add_argument("--base", default="builtin", metavar="N.onnx", help=text)
+    text = "share of the labelled frames for the check of the result; 0 trains without a check (default %(default)s)"
+    train.add_argument("--holdout", type=float, default=0.2, metavar="SHARE", help=text)
+    text = "folder of simulated frames; absent frames are simulated first (default: simulated_frames with labels, else "
+    text += "training_frames, 5 GB)"
+    train.add_argument("--frames", type=Path, metavar="DIR", help=text)
+    text = "number of simulated scenes, of 10 frames each (default: 20 with labels, else 160)"
+    train.add_argument("--scenes", type=int, help=text)
+    train.add_argument("--steps", type=int, help="number of training steps (default: by the number of labels)")
     text = "random seed of the initial weights and of the sampling (default %(default)s)"
     train.add_argument("--seed", type=int, default=0, help=text)
 

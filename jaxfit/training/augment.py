@@ -12,11 +12,17 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-__all__ = ["randomise_appearance"]
+__all__ = ["SCENE_SHARE", "randomise_appearance"]
+
+SCENE_SHARE = 0.75
+"""Share of the simulated pictures with a random scene; in all others, only the camera is randomised."""
 
 
 def randomise_appearance(
-    rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], birds: Bool[np.ndarray, "H W"]
+    rng: np.random.Generator,
+    picture: UInt8[np.ndarray, "H W 3"],
+    birds: Bool[np.ndarray, "H W"],
+    scene_share: float = SCENE_SHARE,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Randomise light, background and camera of a picture; the positions of the birds do not change.
 
@@ -24,8 +30,9 @@ def randomise_appearance(
         rng: source of randomness.
         picture: blue, green, red, at the network's resolution.
         birds: the pixels of birds.
+        scene_share: probability of a random scene: ground, clutter, contrast and light.
     """
-    if rng.random() < 0.75:  # otherwise only the camera is randomised
+    if rng.random() < scene_share:
         picture = _to_bytes(_randomise_scene(rng, picture, birds))
     picture = _randomise_colours(rng, picture)
     picture = _random_blur(rng, picture)

@@ -56,7 +56,7 @@ from jaxfit.data.tables import check_memory, observations_bytes
 from jaxfit.data.track_quality import track_quality
 from jaxfit.storage.files import write_whole
 
-__all__ = ["check_keypoints", "read_coco", "reorder_keypoints", "write_coco"]
+__all__ = ["check_keypoints", "coco_observations", "read_coco", "reorder_keypoints", "write_coco"]
 
 _log = logging.getLogger(__name__)
 
@@ -75,7 +75,11 @@ def read_coco(path: str | Path, video: Path | None = None) -> Observations:
     Raises:
         InputError: the file cannot be read, or its content is invalid; the message names file, field and remedy.
     """
-    root = complete_export(read_json(Path(path)), video)
+    return coco_observations(complete_export(read_json(Path(path)), video))
+
+
+def coco_observations(root: Field) -> Observations:
+    """Return the observations of the content of a COCO file; result and errors as ``read_coco``."""
     if not isinstance(root.value, dict):
         root.fail("must hold an object with images, categories and annotations", "give a COCO json")
     images = read_images(root["images"])
@@ -91,7 +95,7 @@ def read_coco(path: str | Path, video: Path | None = None) -> Observations:
         else:
             annotation["category_id"].fail(f"is {category!r}, which no category has", "add the category")
     if skipped:
-        _log.warning("%s: skipped %d annotations of categories without the keypoints of the bird", path, skipped)
+        _log.warning("%s: skipped %d annotations of categories without the keypoints of the bird", root.source, skipped)
         if not annotations:
             problem = f"hold no bird ({skipped} of other categories)"
             root["annotations"].fail(problem, "run detection on footage with a bird in it, or choose another file")
