@@ -93,7 +93,7 @@ def displayed(picture: Any) -> UInt8[np.ndarray, "H W 3"]:
 def warn_of_difference(path: Path, stream: Any, picture: Any) -> None:
     """Warn if players show a video in another way: tilted, with stretched pixels, or with tone mapping."""
     if display_turn(picture) is None:
-        _logger.warning("%s: players tilt this video by %d°, the frames here are not tilted", path, picture.rotation)
+        _logger.warning("%s: players tilt this video by an angle between multiples of 90°, jaxfit does not", path)
     aspect = stream.sample_aspect_ratio
     if aspect and aspect != 1:
         remedy = "convert the video to square pixels, because the camera model needs square pixels"
