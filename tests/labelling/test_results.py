@@ -61,7 +61,10 @@ def test_the_residual_of_a_folder_of_reconstruct(folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("film_of", "problem"),
-    [({"frames": FIRST + 2}, "has keypoints for frame 8"), ({"size": (WIDTH, 240)}, "is 320×240, but result says 320×200")],
+    [
+        ({"frames": FIRST + 2}, "has keypoints for frame 8"),
+        ({"size": (WIDTH, 240)}, "is 320×240, but result says 320×200"),
+    ],
 )
 def test_the_video_of_another_result(folder, tmp_path, film_of, problem):
     with pytest.raises(InputError, match=problem):
@@ -70,7 +73,9 @@ def test_the_video_of_another_result(folder, tmp_path, film_of, problem):
 
 def test_photographs_are_no_video(tmp_path):
     birds = observed(np.zeros(T)).select(tracks=[0], frames=[0])
-    own = Observations(**{**vars(birds), "frame_index": np.array([0]), "own_images": {(0, 0): ("a.png", WIDTH, HEIGHT)}})
+    own = Observations(
+        **{**vars(birds), "frame_index": np.array([0]), "own_images": {(0, 0): ("a.png", WIDTH, HEIGHT)}}
+    )
     write_coco(own, tmp_path / "photographs.json")
     with pytest.raises(InputError, match="holds photographs"):
         read_result(tmp_path / "photographs.json", film(tmp_path / "film.mp4"))
