@@ -17,8 +17,8 @@ REMEDY = (
 )
 """What to do when trust is low."""
 
-# The limits were set on 15 simulated clips (seeds 700 to 714, random cameras of `jaxfit.training.scenes`, 960×640, 12 or
-# 20 consecutive frames at 12 frames/s) and on a clip from the side (seed 790, 8° below the horizontal). In 11 good
+# The limits were set on 15 simulated clips (seeds 700 to 714, random cameras of `jaxfit.training.scenes`, 960×640, 12
+# or 20 consecutive frames at 12 frames/s) and on a clip from the side (seed 790, 8° below the horizontal). In 11 good
 # clips, 82 to 94 % of the keypoints are right; in the four other clips, 61 to 81 %; in the clip from the side, 48 %.
 MAX_FRAME_DISTANCE = 1.0
 """Largest median distance of the frames: 99 % of the training inputs are nearer. The clips have 0.16 to 0.37."""
