@@ -12,7 +12,7 @@ from jaxfit.data.observations import Observations
 __all__ = ["REMEDY", "FootageSignals", "Trust", "footage_signals", "judge"]
 
 REMEDY = (
-    "Use another network (--segmenter, --keypoints), label frames of this footage (jaxfit suggest), "
+    "use another network (--segmenter, --keypoints), label frames of this footage (jaxfit suggest), "
     "or crop the video to the birds"
 )
 """What to do when trust is low."""
@@ -75,7 +75,7 @@ class Trust(NamedTuple):
             if None in (self.signals.frame_distance, self.signals.bird_distance):
                 return "trust is high, but not certain: a network stores no statistics of its training"
             return "trust is high: the networks work on this footage as on simulated footage"
-        return f"trust is low: {'; '.join(self.reasons)}. {REMEDY}"
+        return f"trust is low: {'; '.join(self.reasons)}; {REMEDY}"
 
     def info(self) -> dict[str, str]:
         """Return the judgement as texts, for the `info` of a COCO file."""
@@ -121,9 +121,9 @@ def judge(signals: FootageSignals) -> Trust:
     Args:
         signals: the signals; a signal that is None is not judged.
     """
-    if not signals.tracks:
-        return Trust("low", ("no bird was tracked",), signals)
     reasons = tuple(rule.reason(signals) for rule in _RULES if rule.is_broken(signals))
+    if not signals.tracks:
+        reasons = ("no bird was tracked", *reasons)
     return Trust("low" if reasons else "high", reasons, signals)
 
 
