@@ -70,7 +70,7 @@ def test_every_signal_has_a_limit(signal, limit, beyond):
     (reason,) = judged.reasons
     assert f"{limit:.2g}" in reason
     sentence = judged.sentence()
-    assert sentence.startswith(f"trust is low: {reason}.")
+    assert sentence.startswith(f"trust is low: {reason};")
     for remedy in ("--segmenter", "jaxfit suggest", "crop"):
         assert remedy in sentence
 
@@ -91,3 +91,9 @@ def test_a_single_frame():
     signals = footage_signals(observed([{1: (0.9, 0.9)}]), {}, ([0.5], [0.5]), calibrated=True)
     assert signals.count_change is None
     assert judge(signals).level == "high"
+
+
+def test_frames_without_birds_that_differ_from_the_training():
+    judged = judge(footage_signals(observed([{}] * 3), {}, ([9.0] * 3, [])))
+    assert judged.reasons[0] == "no bird was tracked"
+    assert "distance 9.00" in judged.reasons[1]
