@@ -63,7 +63,8 @@ def read_pictures(
     if images is not None and not images.is_dir():
         yield from _video_pictures(pictures, images, progress)
         return
-    files = [_file_of(picture, images) for picture in pictures]
+    listed = [] if images is None else image_files(images)
+    files = [_file_of(picture, images, listed) for picture in pictures]
     if not any(files):
         place = "beside the labels" if images is None else f"in {images}"
         problem = f"no picture of the labels is {place}, for example {pictures[0].name}"
@@ -89,8 +90,14 @@ def _video_pictures(
         yield picture, None
 
 
-def _file_of(picture: LabelledPicture, folder: Path | None) -> Path | None:
-    """Return the file of a picture: by its path, by its name, by the name without suffix, or by its frame number."""
+def _file_of(picture: LabelledPicture, folder: Path | None, listed: Sequence[Path]) -> Path | None:
+    """Return the file of a picture: by its path, by its name, by the name without suffix, or by its frame number.
+
+    Args:
+        picture: the labels.
+        folder: the folder of the pictures; None searches beside the file of the labels.
+        listed: the pictures of the folder, in their order.
+    """
     name = picture.name.replace("\\", "/")
     source = picture.source if picture.source.is_dir() else picture.source.parent
     roots = [folder] if folder is not None else [source, source / "images", *source.absolute().parents[: _LEVELS - 1]]
@@ -98,11 +105,6 @@ def _file_of(picture: LabelledPicture, folder: Path | None) -> Path | None:
         for candidate in (root / name, root / Path(name).name):
             if os.path.isfile(candidate):  # noqa: PTH113  (False for names that no file can have)
                 return candidate
-    if folder is None:
-        return None
-    files = image_files(folder)
-    stems = {file.stem: file for file in files}
-    if Path(name).stem in stems and "#" not in name:
-        return stems[Path(name).stem]
-    is_frame = "#" in name  # `jaxfit track` names frames of a video or of a folder `NAME#NUMBER`
-    return files[picture.frame] if is_frame and 0 <= picture.frame < len(files) else None
+    if "#" in name:  # `jaxfit track` names the frames of a video or of a folder `NAME#NUMBER`
+        return listed[picture.frame] if 0 <= picture.frame < len(listed) else None
+    return next((file for file in listed if file.stem == Path(name).stem), None)

@@ -153,10 +153,8 @@ def test_accuracy_of_known_detections(data):
         keypoint_names = ("here",)
 
         def __call__(self, frame, instances):
-            centres = [
-                [[bird.x0 + bird.mask.shape[1] / 2 + 2.4, bird.y0 + bird.mask.shape[0] / 2]] for bird in instances
-            ]
-            return np.array(centres, np.float32), np.ones((len(instances), 1), np.float32)
+            centres = [bird.box_px[:2] + bird.box_px[2:] / 2 + (2.4, 0) for bird in instances]
+            return np.array(centres, np.float32)[:, None], np.ones((len(instances), 1), np.float32)
 
     found = keypoint_accuracy(Detector(), holdout, {"centre": "here"})  # 8 % of the bird's length
     assert found["pck_05"] == 0
