@@ -28,6 +28,7 @@ from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
 from jaxfit.training.base_network import base_file, load_keypoint_base, load_segmenter_base
 from jaxfit.training.checkpoint import Checkpoint, set_weights
+from jaxfit.training.familiarity import store_training_activations
 from jaxfit.training.fine_tune_data import (
     FRAMES,
     PICTURES,
@@ -156,6 +157,7 @@ def fine_tune(
     set_weights(model, checkpoint.best_weights)
     facts = _facts(network, base, data, simulated, schedule, checkpoint)
     _write(network, model, data, facts, path)
+    store_training_activations(network, path, [f for f in (data.frames, simulated) if f is not None], progress=progress)
     after = _accuracy(network, path, data, {name: name for name in data.keypoint_names})
     _remove(folder)
     history = checkpoint.history

@@ -12,6 +12,7 @@ import torch
 
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
+from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
@@ -84,7 +85,9 @@ def train_network(
         write_segmenter(network, facts, path)
     else:
         write_keypoints(network, MURRE_KEYPOINTS, facts, path)
-    store_training_activations(which, path, frames.pictures, frames.owner, progress)
+    # a keypoint network sees the birds that a segmenter detects
+    birds = None if which == "segmenter" else load_segmenter("builtin")
+    store_training_activations(which, path, [frames], birds, progress)
     return losses
 
 
