@@ -136,7 +136,12 @@ def fine_tune(
     else:
         model, found = load_keypoint_base(base, labels.keypoint_names)
     simulated = load_or_film(Path(frames_folder), settings.scenes, progress)
-    data = prepare_data(network, files, settings.holdout, simulated, folder, labels, progress)
+    try:
+        data = prepare_data(network, files, settings.holdout, simulated, folder, labels, progress)
+    except BaseException:
+        if not (folder / CHECKPOINT).exists():
+            _remove(folder)
+        raise
     schedule = settings.schedule or default_schedule(network, len(data.frames.pictures))
     mark = fingerprint(data, simulated, base, (network, schedule, settings.seed))
     names = dict(zip(data.keypoint_names, found, strict=True))
@@ -264,5 +269,5 @@ def _remove(folder: Path) -> None:
     for name in (PICTURES, FRAMES):
         shutil.rmtree(folder / name, ignore_errors=True)
     (folder / CHECKPOINT).unlink(missing_ok=True)
-    if not any(folder.iterdir()):
+    if folder.exists() and not any(folder.iterdir()):
         folder.rmdir()

@@ -179,7 +179,7 @@ def test_wrong_use_of_the_command(tmp_path, capsys):
         *_progress, error = capsys.readouterr().err.strip().split("\n")
         assert error.startswith("jaxfit: ")
         assert message in error
-    assert not (tmp_path / "mine.onnx").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["labels"]
 
 
 @pytest.mark.extended
