@@ -24,6 +24,7 @@ def suggest_frames(options: argparse.Namespace) -> None:
         options.result,
         config,
         overwrite=options.overwrite,
+        empty=options.empty,
         progress=terminal,
     )
     table = right_aligned("frame", "time", "birds", "reason", "score")

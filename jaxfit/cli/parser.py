@@ -129,6 +129,7 @@ def _labelling(commands: Any) -> None:
     text = "result of this video, instead of tracking: a folder of reconstruct or fit, or a file of keypoints (as OBS)"
     suggest.add_argument("--result", type=Path, metavar="DIR|OBS", help=text)
     suggest.add_argument("--count", type=int, default=40, help="number of frames (default %(default)s)")
+    suggest.add_argument("--empty", action="store_true", help="write no labels, for footage with low trust")
     _add_out(suggest, "DIR", "folder for the pictures and labels", overwrite="earlier suggestions in the folder")
 
 
@@ -239,9 +240,9 @@ def _datasets(commands: Any) -> None:
     murre = _command(actions, "murre", "datasets.murre", text)
     murre.add_argument("folder", type=Path, metavar="DIR", help="folder with annotations.npy and images/")
     text = (
-        "names of the 20 keypoints in order, separated by commas; or `murre` if the keypoints are known to be those of "
+        "names of the 20 keypoints in order, separated by commas; or `murre` for the keypoints of the murre model; or "
     )
-    text += "the murre model; or `none` for numbers as names (default %(default)s)"
+    text += "`none` for numbers as names (default %(default)s)"
     murre.add_argument("--keypoints", default="none", metavar="NAMES", help=text)
     _add_out(murre, "OBS.json", "COCO file to write", overwrite="an existing file")
 

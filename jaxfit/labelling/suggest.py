@@ -75,6 +75,7 @@ def suggest(
     segmenter: Segmenter | None = None,
     keypoints: KeypointDetector | None = None,
     overwrite: bool = False,
+    empty: bool = False,
     progress: ProgressTask = silent,
 ) -> Suggestions:
     """Choose frames of a video for labelling, and write their pictures and pre-filled labels into a folder.
@@ -95,6 +96,7 @@ def suggest(
         config: frames, networks and tracker.
         segmenter, keypoints: networks that replace the networks of `config`.
         overwrite: replace an earlier folder of suggestions.
+        empty: write no labels, for networks that do not know the footage: wrong labels take longer than no labels.
         progress: reports every frame.
 
     Raises:
@@ -116,6 +118,10 @@ def suggest(
     if result is None:
         tracking = run_tracking(video, config, segmenter, keypoints, progress=progress)
         found = Result(tracking.observations, None)
+        if tracking.trust.level == "low" and not empty:
+            _logger.warning(
+                "%s: the labels may be wrong; --empty writes no labels. %s", video, tracking.trust.sentence()
+            )
     else:
         found = read_result(Path(result), video)
         found = found._replace(
@@ -133,7 +139,7 @@ def suggest(
         frames, positions = _choose(observations, signals, examined, count)
         for t in set(examined.positions) - set(positions):
             (part / IMAGES / picture_name(video, int(observations.frame_index[t]))).unlink()
-        chosen = observations.select(frames=positions)
+        chosen = observations.select(tracks=[] if empty else None, frames=positions)
         write_labels(chosen, video, part, out.resolve())
         rows = []
         for number, time_s, birds, reason, score in frames:

@@ -106,6 +106,15 @@ def later_frames(observations):
     return dataclasses.replace(observations, frame_index=np.arange(FRAMES) + 5)
 
 
+def test_empty_labels(footage, tmp_path):
+    """Labels of a network that does not know the footage can be left out."""
+    _, video, birds = footage
+    done = suggest(video, tmp_path / "label", 4, birds, CONFIG, empty=True)
+    assert all(frame.birds for frame in done.frames)
+    assert not done.observations.num_tracks
+    assert len(read_coco(tmp_path / "label" / "coco.json").frame_index) == 4
+
+
 @pytest.mark.parametrize(
     ("change", "problem"), [(other_size, "says 64×64"), (later_frames, "has 12 frames, counted from 0")]
 )
