@@ -239,10 +239,8 @@ def _datasets(commands: Any) -> None:
     text = "convert common_murre_temporal, with an inferred layout, to a COCO file"
     murre = _command(actions, "murre", "datasets.murre", text)
     murre.add_argument("folder", type=Path, metavar="DIR", help="folder with annotations.npy and images/")
-    text = (
-        "names of the 20 keypoints in order, separated by commas; or `murre` for the keypoints of the murre model; or "
-    )
-    text += "`none` for numbers as names (default %(default)s)"
+    text = "names of the 20 keypoints in order, with commas; `murre` for the names of the murre model; or `none` for "
+    text += "numbers as names (default %(default)s)"
     murre.add_argument("--keypoints", default="none", metavar="NAMES", help=text)
     _add_out(murre, "OBS.json", "COCO file to write", overwrite="an existing file")
 
