@@ -23,12 +23,14 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.evaluation.matching import match_tracks
     from jaxfit.evaluation.truth import Truth, read_truth
     from jaxfit.fitting.fit import fit
+    from jaxfit.labelling.suggest import suggest
     from jaxfit.model.bird import Bird
     from jaxfit.model.files import find_bird, load_bird, load_murre, save_bird
     from jaxfit.objective.registry import term
     from jaxfit.perception.keypoints import load_keypoint_detector
     from jaxfit.perception.segmentation import load_segmenter
-    from jaxfit.perception.track import track_video
+    from jaxfit.perception.track import run_tracking, track_video
+    from jaxfit.perception.trust import Trust
     from jaxfit.pipeline import Reconstruction, reconstruct
     from jaxfit.simulation.scene import Scene, simulate, stage_scene
     from jaxfit.view.contact_sheet import contact_sheet
@@ -47,6 +49,7 @@ __all__ = [
     "Scene",
     "Solution",
     "TrackConfig",
+    "Trust",
     "Truth",
     "ablate",
     "contact_sheet",
@@ -69,10 +72,12 @@ __all__ = [
     "read_observations",
     "read_truth",
     "reconstruct",
+    "run_tracking",
     "save_bird",
     "save_solution",
     "simulate",
     "stage_scene",
+    "suggest",
     "sweep",
     "term",
     "track_quality",
@@ -99,12 +104,14 @@ _HOMES = {
     "evaluation.matching": ("match_tracks",),
     "evaluation.truth": ("Truth", "read_truth"),
     "fitting.fit": ("fit",),
+    "labelling.suggest": ("suggest",),
     "model.bird": ("Bird",),
     "model.files": ("find_bird", "load_bird", "load_murre", "save_bird"),
     "objective.registry": ("term",),
     "perception.keypoints": ("load_keypoint_detector",),
     "perception.segmentation": ("load_segmenter",),
-    "perception.track": ("track_video",),
+    "perception.track": ("run_tracking", "track_video"),
+    "perception.trust": ("Trust",),
     "pipeline": ("Reconstruction", "reconstruct"),
     "simulation.scene": ("Scene", "simulate", "stage_scene"),
     "view.overlay": ("overlay", "overlay_frame"),

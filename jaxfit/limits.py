@@ -111,6 +111,8 @@ FRAMES_PER_S = 100_000
 """Highest frame rate of a video. A higher rate counts as unknown."""
 SECONDS_PER_FRAME = 100_000
 """Longest time between the frames of a video. A lower frame rate counts as unknown."""
+TIMESTAMP_S = 1e9
+"""Largest absolute time stamp of a frame in a file of observations, in seconds."""
 VIDEO_GAP_FRAMES = 100_000
 """Most frames that damage can hide at one place of a video. A longer gap of the time stamps counts as damaged."""
 
@@ -125,6 +127,10 @@ METADATA_CHARACTERS = 1_000_000
 """Longest text that is read as a Python literal from a network's metadata, such as the names of its classes."""
 METADATA_DEPTH = 10
 """Most levels of brackets in such a text."""
+ACTIVATION_CHANNELS = 1024
+"""Most channels of the statistics of a network's activations in its metadata; the matrix of 1024 channels has 4 MB."""
+CURVE_POINTS = 1000
+"""Most points of a curve that calibrates confidences in a network's metadata."""
 CLASSES = 100_000
 """Most classes of a network."""
 DETECTIONS = 10_000

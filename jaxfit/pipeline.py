@@ -102,7 +102,7 @@ def reconstruct(
         observations = tracking.observations
         with clock("fit"):
             solution = fit(observations, bird, config.fit, progress=progress, source=video)
-        write_coco(observations, part / OBSERVATIONS)
+        write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
         with clock("overlay"):
             _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
         summary = _summary(tracking, solution, bird, networks, video, info, clock)
@@ -154,6 +154,9 @@ def _summary(
         "video": {"file": str(video), **info._asdict(), "damaged": tracking.damaged_frames},
         "quality": {row.track_id: row._asdict() for row in track_quality(tracking.observations)},
         "short_tracks": tracking.short_tracks,
+        "trust": tracking.trust.level,
+        "trust_reasons": list(tracking.trust.reasons),
+        "trust_signals": tracking.trust.signals._asdict(),
         "seconds_of_tracking": {part: round(value, 3) for part, value in tracking.seconds.items()},
         "networks": {
             kind: {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}

@@ -19,7 +19,10 @@ from jaxfit.video.codecs import CODECS
 __all__ = ["build_parser"]
 
 MODEL = "`murre`, or a model file (.npz) that `jaxfit model import` writes"
-OBSERVATIONS = "keypoints and masks: COCO, DeepLabCut (.h5, .csv), Lightning Pose (.csv) or SLEAP (.slp, .analysis.h5)"
+OBSERVATIONS = (
+    "keypoints and masks: COCO, Label Studio (.json), DeepLabCut (.h5, .csv), Lightning Pose (.csv) or SLEAP (.slp, "
+    ".analysis.h5)"
+)
 
 
 def _names(text: str) -> list[str]:
@@ -34,7 +37,7 @@ TRACK_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "--stop": ("frames.stop", {"metavar": "FRAME", "type": int}),
     "--step": ("frames.step", {"metavar": "N", "type": int}),
 }
-"""Option of `track` and `reconstruct` → the path of its setting in `TrackConfig`, which holds its description."""
+"""Option of the commands that track → the path of its setting in `TrackConfig`, which holds its description."""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -51,7 +54,18 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
     parser.add_argument("-v", "--verbose", action="store_true", help="print more messages, also of libraries")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add_commands in (_perception, _import, _fitting, _simulation, _training, _datasets, _models, _configs, _bench):
+    for add_commands in (
+        _perception,
+        _labelling,
+        _import,
+        _fitting,
+        _simulation,
+        _training,
+        _datasets,
+        _models,
+        _configs,
+        _bench,
+    ):
         add_commands(commands)
     return parser
 
@@ -98,19 +112,33 @@ def _add_codec(command: argparse.ArgumentParser) -> None:
     command.add_argument("--codec", default="auto", choices=("auto", *CODECS), help=text)
 
 
+def _add_tracking_options(command: argparse.ArgumentParser) -> None:
+    """Add the video and the settings of tracking."""
+    command.add_argument("video", type=Path, metavar="VIDEO", help="a video, or a folder of frames")
+    text = "YAML file with `base: reconstruct` and changed settings; `jaxfit config show reconstruct` lists them all"
+    command.add_argument("--config", default="reconstruct", help=text)
+    for option, (path, details) in TRACK_OPTIONS.items():
+        text = option_help(TrackConfig, path)
+        command.add_argument(option, dest=f"track.{path}", help=text[0].lower() + text[1:], **details)
+
+
+def _labelling(commands: Any) -> None:
+    text = "choose frames that a person should label, and write their pictures and pre-filled labels (extra `formats`)"
+    suggest = _command(commands, "suggest", "labelling.suggest_frames", text)
+    _add_tracking_options(suggest)
+    text = "result of this video, instead of tracking: a folder of reconstruct or fit, or a file of keypoints (as OBS)"
+    suggest.add_argument("--result", type=Path, metavar="DIR|OBS", help=text)
+    suggest.add_argument("--count", type=int, default=40, help="number of frames (default %(default)s)")
+    suggest.add_argument("--empty", action="store_true", help="write no labels, for footage with low trust")
+    _add_out(suggest, "DIR", "folder for the pictures and labels", overwrite="earlier suggestions in the folder")
+
+
 def _perception(commands: Any) -> None:
     track = _command(commands, "track", "perception.track", "detect and track the birds of a video and their keypoints")
     text = "track the birds of a video, fit their poses and draw them"
     reconstruct = _command(commands, "reconstruct", "perception.reconstruct", text)
     for command in (track, reconstruct):
-        command.add_argument("video", type=Path, metavar="VIDEO", help="a video, or a folder of frames")
-        text = (
-            "YAML file with `base: reconstruct` and changed settings; `jaxfit config show reconstruct` lists them all"
-        )
-        command.add_argument("--config", default="reconstruct", help=text)
-        for option, (path, details) in TRACK_OPTIONS.items():
-            text = option_help(TrackConfig, path)
-            command.add_argument(option, dest=f"track.{path}", help=text[0].lower() + text[1:], **details)
+        _add_tracking_options(command)
     _add_out(track, "OBS.json", "COCO file to write", overwrite="an existing file")
     _add_model(reconstruct)
     _add_out(reconstruct, "DIR", "folder for the result", overwrite="an earlier result in the folder")
@@ -181,15 +209,26 @@ def _simulation(commands: Any) -> None:
 
 
 def _training(commands: Any) -> None:
-    text = "train a built-in network on simulated footage (needs the extra `train`)"
+    text = "train a network on labelled footage, or a built-in network again (needs the extra `train`)"
     train = _command(commands, "train", "training.train", text)
     train.add_argument("network", choices=("segmenter", "keypoints"), help="network to train")
     _add_out(train, "N.onnx", "network file to write", overwrite="an existing file")
-    text = "folder of the footage; absent footage is simulated first (5 GB, default %(default)s)"
-    train.add_argument("--frames", type=Path, default=Path("training_frames"), metavar="DIR", help=text)
-    text = "number of scenes, of 10 frames each (default %(default)s)"
-    train.add_argument("--scenes", type=int, default=160, help=text)
-    train.add_argument("--steps", type=int, help="number of training steps (default: as for the built-in network)")
+    text = f"labelled frames: {OBSERVATIONS}; for a segmenter also COCO masks without keypoints, or folders of masks"
+    train.add_argument("--labels", type=Path, nargs="+", metavar="FILE", help=text)
+    text = "video or folder of the labelled frames, one for all files or one for each (default: beside the labels)"
+    train.add_argument("--images", type=Path, nargs="+", metavar="DIR|VIDEO", help=text)
+    text = "masks of the labelled birds: a folder of pictures, or a COCO file"
+    train.add_argument("--masks", type=Path, metavar="DIR|OBS.json", help=text)
+    text = "network to start from: `builtin`, or a network that this command wrote (default %(default)s)"
+    train.add_argument("--base", default="builtin", metavar="N.onnx", help=text)
+    text = "share of the labelled frames for the check of the result; 0 trains without a check (default %(default)s)"
+    train.add_argument("--holdout", type=float, default=0.2, metavar="SHARE", help=text)
+    text = "folder of simulated frames; absent frames are simulated first (default: simulated_frames with labels, else "
+    text += "training_frames, 5 GB)"
+    train.add_argument("--frames", type=Path, metavar="DIR", help=text)
+    text = "number of simulated scenes, of 10 frames each (default: 20 with labels, else 160)"
+    train.add_argument("--scenes", type=int, help=text)
+    train.add_argument("--steps", type=int, help="number of training steps (default: by the number of labels)")
     text = "random seed of the initial weights and of the sampling (default %(default)s)"
     train.add_argument("--seed", type=int, default=0, help=text)
 
@@ -200,10 +239,8 @@ def _datasets(commands: Any) -> None:
     text = "convert common_murre_temporal, with an inferred layout, to a COCO file"
     murre = _command(actions, "murre", "datasets.murre", text)
     murre.add_argument("folder", type=Path, metavar="DIR", help="folder with annotations.npy and images/")
-    text = (
-        "names of the 20 keypoints in order, separated by commas; or `murre` if the keypoints are known to be those of "
-    )
-    text += "the murre model; or `none` for numbers as names (default %(default)s)"
+    text = "names of the 20 keypoints in order, with commas; `murre` for the names of the murre model; or `none` for "
+    text += "numbers as names (default %(default)s)"
     murre.add_argument("--keypoints", default="none", metavar="NAMES", help=text)
     _add_out(murre, "OBS.json", "COCO file to write", overwrite="an existing file")
 

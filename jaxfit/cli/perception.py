@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 
-__all__ = ["reconstruct", "track"]
+__all__ = ["reconstruct", "reconstruct_config", "track"]
 
 
 def track(options: argparse.Namespace) -> None:
@@ -30,9 +30,10 @@ def track(options: argparse.Namespace) -> None:
     if options.video.exists():  # tracking reports a missing video
         check_outputs([options.out], options.video, options.overwrite)  # before the long work
     check_writable(options.out)
-    config = _reconstruct_config(options).track
+    config = reconstruct_config(options).track
     tracking = run_tracking(options.video, config, progress=terminal)
-    write_coco(tracking.observations, options.out)
+    write_coco(tracking.observations, options.out, tracking.trust.info())
+    show(tracking.trust.sentence())
     if tracking.failure:
         _logger.warning("%s", tracking.failure)
     else:
@@ -48,9 +49,10 @@ def reconstruct(options: argparse.Namespace) -> None:
     from jaxfit.pipeline import OBSERVATIONS, OVERLAY, reconstruct
 
     start = time.perf_counter()
-    config = _reconstruct_config(options)
+    config = reconstruct_config(options)
     bird = find_bird(options.model)
     done = reconstruct(options.video, options.out, bird, config, overwrite=options.overwrite, progress=terminal)
+    show(done.tracking.trust.sentence())
     show(track_table(done.tracking.observations, done.solution))
     _show_short_tracks(done.tracking.short_tracks, config.track.min_track_frames)
     birds = counted(done.summary["tracks"], "bird")
@@ -66,7 +68,7 @@ def reconstruct(options: argparse.Namespace) -> None:
             show(f"  {options.out / name}: {text}")
 
 
-def _reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
+def reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
     """Return the config of `--config`, with the values of the options for single settings."""
     from jaxfit.config.paths import with_values
     from jaxfit.config.reconstruct import load_reconstruct_config

@@ -1,28 +1,107 @@
-"""Command that trains the built-in networks."""
+"""Command that trains networks: the built-in networks again, or networks for the labels of a user."""
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from jaxfit.cli.tables import show
+from jaxfit.cli.tables import counted, right_aligned, show
+from jaxfit.errors import InputError
 from jaxfit.extras import require_extra
 from jaxfit.progress import terminal
 from jaxfit.storage.files import check_new_file
 
+if TYPE_CHECKING:
+    from jaxfit.training.fine_tune import FineTuned
+    from jaxfit.training.label_checks import LeftOut
+
 __all__ = ["train"]
+
+BUILTIN_SCENES, LABEL_SCENES = 160, 20
+"""Default number of simulated scenes of a training from the beginning, and of a training on labels."""
+_SHOWN = 20
+"""Largest number of left-out labels that are printed."""
+_ROWS = {
+    "mean_iou": "mean mask IoU",
+    "ap50": "AP50",
+    "pck_05": "PCK@0.05",
+    "pck_10": "PCK@0.10",
+    "error": "mean error, % of the bird's length",
+}
 
 
 def train(options: argparse.Namespace) -> None:
-    """Train one network on simulated footage and write the network as an ONNX file."""
+    """Train one network and write the network as an ONNX file: on labels, or on simulated footage only."""
     require_extra("train", "train")
+    check_new_file(options.out, options.overwrite)
+    if options.labels:
+        _train_on_labels(options)
+        return
+    for name in ("images", "masks"):
+        if getattr(options, name):
+            raise InputError(f"--{name}", "needs labels", "give the files of the labels by --labels")
+    _train_on_simulation(options)
+
+
+def _train_on_simulation(options: argparse.Namespace) -> None:
     from jaxfit.training.train import SCHEDULES, train_network
 
     start = time.perf_counter()
-    check_new_file(options.out, options.overwrite)
     steps = SCHEDULES[options.network].steps if options.steps is None else options.steps
     schedule = SCHEDULES[options.network]._replace(steps=steps)
-    paths = options.out, options.frames
-    losses = train_network(options.network, *paths, options.scenes, schedule, options.seed, progress=terminal)
+    paths = options.out, options.frames or Path("training_frames")
+    scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
+    losses = train_network(options.network, *paths, scenes, schedule, options.seed, progress=terminal)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
     show(f"{options.network} trained in {(time.perf_counter() - start) / 60:.0f} min, loss {loss} → {options.out}")
+
+
+def _train_on_labels(options: argparse.Namespace) -> None:
+    from jaxfit.training.fine_tune import Settings, default_schedule, fine_tune
+    from jaxfit.training.fine_tune_data import LabelFiles
+
+    start = time.perf_counter()
+    files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)
+    steps = options.steps
+    schedule = None if steps is None else default_schedule(options.network, 0)._replace(steps=steps)
+    scenes = LABEL_SCENES if options.scenes is None else options.scenes
+    settings = Settings(options.base, options.holdout, scenes, schedule, options.seed)
+    frames = options.frames or Path("simulated_frames")
+    result = fine_tune(options.network, files, options.out, frames, settings, progress=terminal)
+    _show_left_out(result.left_out)
+    _show_result(result)
+    minutes = (time.perf_counter() - start) / 60
+    best = f"best after step {result.best_step} of {result.steps}"
+    show(f"{options.network} trained in {minutes:.1f} min, {best} → {options.out}")
+
+
+def _show_left_out(left_out: Sequence[LeftOut]) -> None:
+    """Print the labels that were not used."""
+    if not left_out:
+        return
+    show(f"{counted(len(left_out), 'label')} left out:")
+    for label in left_out[:_SHOWN]:
+        show(f"  {label}")
+    if len(left_out) > _SHOWN:
+        show(f"  … and {len(left_out) - _SHOWN} more")
+
+
+def _show_result(result: FineTuned) -> None:
+    """Print the parts of the labels, and the accuracy on the held-out part before and after the training."""
+    parts = result.pictures
+    training = counted(parts["training"], "labelled picture")
+    show(f"trained on {training}, {parts['holdout']} held out, {parts['gap']} in between ({result.rule})")
+    if result.new_keypoints:
+        show(f"new keypoints, which the base network lacks: {', '.join(result.new_keypoints)}")
+    if not result.after:
+        show("nothing is held out, so the accuracy of the network is unknown")
+        return
+    table = right_aligned("on the held-out pictures", "before", "after")
+    table.columns[0].justify = "left"
+    for key, value in result.after.items():
+        digits = 1 if key == "error" else 3
+        table.add_row(_ROWS[key], f"{result.before[key]:.{digits}f}", f"{value:.{digits}f}")
+    show(table)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 
-__all__ = ["NameMap", "checked_map", "map_keypoints", "propose_names"]
+__all__ = ["NameMap", "checked_map", "map_keypoints", "opposite_keypoints", "propose_names"]
 
 _SYNONYMS = {
     "beak": "bill",
@@ -172,6 +172,21 @@ def map_keypoints(observations: Observations, names: NameMap, model_names: Seque
         occluded=placed(cast(np.ndarray, observations.occluded)),
         skeleton=tuple((moved[a], moved[b]) for a, b in observations.skeleton if a in moved and b in moved),
     )
+
+
+def opposite_keypoints(names: Sequence[str]) -> tuple[int, ...]:
+    """Return, for each keypoint, the position of the same keypoint on the other side of the bird.
+
+    Names are compared by their words: `wingL` and `R_wing` are opposite. A keypoint without a side is its own
+    opposite. The position is −1 for a keypoint with a side whose opposite is not named.
+
+    Args:
+        names: names of the keypoints.
+    """
+    words = [_words(name) for name in names]
+    other = {"left": "right", "right": "left", "": ""}
+    place = {key: k for k, key in reversed(list(enumerate(words)))}
+    return tuple(k if not side else place.get((other[side], rest), -1) for k, (side, rest) in enumerate(words))
 
 
 def _name_map(mapped: dict[str, str], names: Sequence[str], model_names: Sequence[str]) -> NameMap:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -12,7 +13,7 @@ from jaxfit.data.masks import decode_mask
 from jaxfit.errors import InputError
 from jaxfit.storage.arrays import validate_arrays
 
-__all__ = ["Observations", "check_keypoints", "reorder_keypoints"]
+__all__ = ["Observations", "check_keypoints", "check_times", "reorder_keypoints"]
 
 _LAYOUT = {
     "track_id": ("N", np.int64),
@@ -26,6 +27,7 @@ _LAYOUT = {
     "image_size_px": ("T 2", np.int64),
     "file_name": ("T", np.str_),
     "keypoint_names": ("K", np.str_),
+    "timestamp_s": ("T", np.float64),
 }
 
 
@@ -39,7 +41,8 @@ class Observations:
     Raises:
         ValueError: the shapes do not agree, a ``track_id`` occurs twice, ``frame_index`` does not increase, a
             confidence or score is outside [0, 1], a confidence is above 0 where the bird is not present, a position is
-            not finite, or a mask does not have the size of its image.
+            not finite, a time stamp is infinite, ``fps`` is not positive and finite, or a mask does not have the size
+            of its image.
     """
 
     track_id: np.ndarray
@@ -74,12 +77,19 @@ class Observations:
     score: np.ndarray | None = None
     """(N, T) float32 in [0, 1]: score of the detection of the bird; 0 where not present. None means 1 where
     present."""
+    timestamp_s: np.ndarray | None = None
+    """(T,) float64: presentation times of the frames in seconds, as ``jaxfit.video.reader.Frame.time_s``; NaN where the
+    time is unknown. None means that no time is known."""
+    fps: float | None = None
+    """Mean frame rate of the whole video in frames per second, as its container states; None if unknown."""
 
     def __post_init__(self):
         occluded = np.zeros(np.shape(self.confidence), bool) if self.occluded is None else self.occluded
         score = np.asarray(self.present, np.float32) if self.score is None else self.score
+        timestamp_s = np.full(np.shape(self.frame_index), np.nan) if self.timestamp_s is None else self.timestamp_s
         values = {**vars(self), "keypoint_names": list(self.keypoint_names), "occluded": occluded, "score": score}
-        arrays = validate_arrays(values, _LAYOUT)
+        arrays = validate_arrays(values | {"timestamp_s": timestamp_s}, _LAYOUT)
+        check_times(arrays["timestamp_s"], self.fps)
         names = tuple(str(name) for name in arrays.pop("keypoint_names"))
         if len(np.unique(arrays["track_id"])) < len(arrays["track_id"]):
             raise ValueError(f"track_id must name each track once, not {arrays['track_id'].tolist()}")
@@ -209,6 +219,14 @@ class Observations:
             ValueError: as for the class.
         """
         return replace(self, keypoints_px=np.asarray(keypoints_px), confidence=np.asarray(confidence))
+
+
+def check_times(timestamp_s: np.ndarray, fps: float | None) -> None:
+    """Raise ValueError if a time stamp is infinite, or a frame rate is not positive and finite."""
+    if np.isinf(timestamp_s).any():
+        raise ValueError("timestamp_s must be finite, or NaN where it is unknown")
+    if fps is not None and not 0 < fps < math.inf:
+        raise ValueError(f"fps must be positive and finite, or None, not {fps}")
 
 
 def reorder_keypoints(observations: Observations, names: Sequence[str]) -> Observations:

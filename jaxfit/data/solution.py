@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.observations import check_times
 from jaxfit.errors import InputError
 from jaxfit.limits import IMAGE_SIDE_PX
 from jaxfit.model.bird import Bird
@@ -23,8 +24,10 @@ from jaxfit.storage.reading import check_folder
 
 __all__ = ["FORMAT_VERSION", "LAYOUT", "Solution", "check_poses", "load_solution", "save_solution", "write_solution"]
 
-FORMAT_VERSION = 2
-"""Version of ``poses.npz``; increased when names or meaning of its arrays change. Other versions are not read."""
+FORMAT_VERSION = 3
+"""Version of ``poses.npz``; increased when its arrays change. Version 2 lacks `timestamp_s` and `fps`."""
+_OLDEST_VERSION = 2
+"""Older versions are not read."""
 
 STATUSES = ("ok", "partly diverged", "diverged", "no usable frame")
 """The words of `Solution.status`."""
@@ -32,6 +35,7 @@ STATUSES = ("ok", "partly diverged", "diverged", "no usable frame")
 _POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
 
 _CAMERA = {"focal_px": ("", np.float64), "crop_px": ("", np.int64)}
+_TIMES = {"timestamp_s": ("T", np.float64), "fps": ("", np.float64)}
 
 LAYOUT = {
     "track_id": ("N", np.int64),
@@ -107,6 +111,11 @@ class Solution:
     failures: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     """Track → its skipped frames, and for each of its windows that diverged: frames, term and step. ``summary.json``
     holds them."""
+    timestamp_s: np.ndarray | None = None
+    """(T,) float64: presentation times of the frames in seconds, as ``jaxfit.video.reader.Frame.time_s``; NaN where the
+    time is unknown. None means that no time is known."""
+    fps: float | None = None
+    """Mean frame rate of the whole video in frames per second, as its container states; None if unknown."""
 
     def __post_init__(self):
         arrays = validate_arrays(vars(self), LAYOUT)
@@ -123,6 +132,10 @@ class Solution:
             raise ValueError(f"focal_px must be above 0 and finite, not {focal_px}")
         if not 1 <= crop_px <= IMAGE_SIDE_PX:
             raise ValueError(f"crop_px must be in 1…{IMAGE_SIDE_PX}, not {crop_px}")
+        times = np.full(len(arrays["frame_index"]), np.nan) if self.timestamp_s is None else self.timestamp_s
+        layout = {"frame_index": LAYOUT["frame_index"], "timestamp_s": _TIMES["timestamp_s"]}
+        arrays |= validate_arrays({"frame_index": arrays["frame_index"], "timestamp_s": times}, layout)
+        check_times(arrays["timestamp_s"], self.fps)
         check_poses(arrays, arrays["valid"])
         unknown = np.flatnonzero(~np.isin(arrays["status"], STATUSES))
         if len(unknown):
@@ -217,6 +230,8 @@ def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Ma
     arrays["loss_terms"] = np.array(terms, dtype=np.str_)
     arrays["focal_px"] = np.asarray(solution.focal_px, np.float64)
     arrays["crop_px"] = np.asarray(solution.crop_px, np.int64)
+    arrays["timestamp_s"] = solution.timestamp_s
+    arrays["fps"] = np.asarray(np.nan if solution.fps is None else solution.fps, np.float64)
     arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
     write_whole(folder / _POSES, lambda file: np.savez_compressed(file, **arrays))
     write_whole(folder / _CONFIG, config_yaml.encode())
@@ -238,14 +253,17 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     path = folder / _POSES
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
-    arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, oldest=FORMAT_VERSION)
+    times = {name: shape for name, (shape, _) in _TIMES.items()}
+    arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=times)
     arrays |= {name: arrays[name].item() for name in _CAMERA}
     arrays |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays.pop("loss_terms"), arrays.pop("loss")
     try:
         if terms.dtype.kind != "U" or len(np.unique(terms)) < len(terms):
             raise ValueError("loss_terms must be different names")
-        solution = Solution(**arrays, loss={str(term): loss[:, i] for i, term in enumerate(terms)})
+        fps = validate_arrays({"fps": arrays.pop("fps", np.nan)}, {"fps": _TIMES["fps"]})["fps"].item()
+        losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
+        solution = Solution(**arrays, loss=losses, fps=None if math.isnan(fps) else fps)
     except ValueError as error:
         raise InputError(path, str(error), "run the fit again") from error
     bird = load_bird(folder / _MODEL)

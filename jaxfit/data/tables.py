@@ -17,7 +17,7 @@ def observations_bytes(num_tracks: int, num_frames: int, num_keypoints: int, nam
         num_keypoints: K.
         name_characters: length of the longest file name of a frame.
     """
-    return num_tracks * num_frames * (60 + 44 * num_keypoints) + num_frames * (64 + 12 * name_characters)
+    return num_tracks * num_frames * (60 + 44 * num_keypoints) + num_frames * (80 + 12 * name_characters)
 
 
 def check_memory(source: object, what: str, needed_bytes: float, remedy: str, allowed_gb: float = TABLE_GB) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from jaxfit.data.frame_numbers import consecutive, frame_step
 from jaxfit.data.observations import Observations
 
-__all__ = ["TrackQuality", "track_quality"]
+__all__ = ["TrackQuality", "second_differences", "track_quality"]
 
 
 class TrackQuality(NamedTuple):
@@ -46,7 +46,7 @@ def track_quality(observations: Observations) -> list[TrackQuality]:
     """
     numbers = observations.frame_index
     step = frame_step(numbers)
-    jitter = _second_differences(observations)
+    jitter = second_differences(observations)
     qualities = []
     for n in range(observations.num_tracks):
         at = np.flatnonzero(observations.present[n])
@@ -69,7 +69,7 @@ def track_quality(observations: Observations) -> list[TrackQuality]:
     return qualities
 
 
-def _second_differences(observations: Observations) -> Float[np.ndarray, "N M K"]:
+def second_differences(observations: Observations) -> Float[np.ndarray, "N M K"]:
     """Return |p(t−1) − 2 p(t) + p(t+1)| / (longer side of the box) at the M = T − 2 inner frames; NaN where unknown."""
     points = observations.keypoints_px.astype(np.float64)
     known = observations.confidence >= CONFIDENT

@@ -117,6 +117,8 @@ def collect_windows(
         loss=loss,
         status=np.array([_status(*counts) for counts in zip(fitted.tolist(), diverged.tolist(), strict=True)], "<U32"),
         failures=failures,
+        timestamp_s=observations.timestamp_s,
+        fps=observations.fps,
     )
 
 

@@ -29,6 +29,7 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
     return {
         "tracks": len(solution.track_id),
         "frames": len(solution.frame_index),
+        "fps": solution.fps,
         "poses": int(solution.valid.sum()),
         "status": dict(Counter(str(status) for status in solution.status)),
         "track_status": {int(t): str(s) for t, s in zip(solution.track_id, solution.status, strict=True)},

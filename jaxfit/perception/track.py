@@ -22,6 +22,7 @@ from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.keypoints.detector import BUILTIN_PATH
 from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
 from jaxfit.perception.tracking import Tracker, TrackRecorder, drop_short_tracks, load_tracker, repair_left_right_flips
+from jaxfit.perception.trust import Trust, footage_signals, judge
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.video.reader import FrameReader, read_frames
 
@@ -44,6 +45,8 @@ class TrackingResult(NamedTuple):
     """Numbers of the frames that could not be read."""
     failure: InputError | None
     """The reason and the remedy if there is no track."""
+    trust: Trust
+    """Whether tracking worked as it works on simulated footage, and the reasons if not."""
     seconds: dict[str, float]
     """Duration of each part; for decoding, only the time that the other parts waited."""
 
@@ -148,10 +151,14 @@ def run_tracking(
     )
     keypoints = keypoints or open_keypoint_detector(config)
     segmenter = segmenter or open_segmenter(config)
-    recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names))
+    monitors = [getattr(network, "activations", None) for network in (segmenter, keypoints)]
+    for monitor in monitors:
+        if monitor is not None:
+            monitor.take()  # distances of an earlier video
+    recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names), reader.info.fps)
     clock, best_score, frame_count, start = Clock(), 0.0, 0, time.perf_counter()
     with _single_opencv_thread(), progress("Tracking", _expected_frames(reader, config)) as report_progress:
-        for number, picture, _ in clock.each("decode", reader):
+        for number, picture, time_s in clock.each("decode", reader):
             with clock("segment"):
                 instances = segmenter(picture)
             with clock("track"):
@@ -165,7 +172,8 @@ def run_tracking(
             name = f"{one_line(reader.path.name)}#{number}"  # a name on the disk may be no text
             size_px = (picture.shape[1], picture.shape[0])
             with clock("record"):
-                recorder.add(number, name, size_px, birds, [identity for _, identity in tracked], points_px, confidence)
+                identities = [identity for _, identity in tracked]
+                recorder.add(number, name, size_px, birds, identities, points_px, confidence, time_s)
             best_score, frame_count = max([best_score, *(bird.score for bird in instances)]), frame_count + 1
             noun = "bird" if len(birds) == 1 else "birds"
             report_progress(1, f"{frame_count / (time.perf_counter() - start):.1f} frames/s, {len(birds)} {noun}")
@@ -178,13 +186,16 @@ def run_tracking(
             observations, _ = repair_left_right_flips(observations, mirror_pairs(observations.keypoint_names))
     lengths = dict(zip(all_tracks.track_id.tolist(), all_tracks.present.sum(1).tolist(), strict=True))
     short_tracks = {track: length for track, length in lengths.items() if track not in observations.track_id}
+    distances = [() if monitor is None else monitor.take().tolist() for monitor in monitors]
+    is_calibrated = getattr(keypoints, "curve", None) is not None
+    trust = judge(footage_signals(all_tracks, short_tracks, distances, is_calibrated))
     failure = None
     if not observations.num_tracks:
         if short_tracks:
             failure = _only_short_tracks(source, config, short_tracks, best_score)
         else:
             failure = _no_bird(source, config, frame_count, has_own_segmenter)
-    return TrackingResult(observations, short_tracks, reader.damaged, failure, clock.seconds)
+    return TrackingResult(observations, short_tracks, reader.damaged, failure, trust, clock.seconds)
 
 
 def _only_short_tracks(

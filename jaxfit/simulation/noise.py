@@ -105,6 +105,8 @@ def simulate_detections(
         keypoint_names=truth.keypoint_names,
         skeleton=truth.skeleton,
         masks=masks,
+        timestamp_s=truth.timestamp_s,
+        fps=truth.fps,
     )
 
 

@@ -117,6 +117,8 @@ def stage_scene(
         masks=visible_masks,
         amodal_masks=amodal_masks,
         occluded=labelled & ~visible,
+        timestamp_s=np.arange(frames) / fps,
+        fps=fps,
     )
     poses = _true_poses(bird, simulated_birds, view, truth, points, np.swapaxes(keypoints, 0, 1))
     detections = simulate_detections(truth, visible, bird.keypoint_pairs, seed)
@@ -218,6 +220,8 @@ def _true_poses(
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
         status=np.full(N, "ok"),
+        timestamp_s=truth.timestamp_s,
+        fps=truth.fps,
         loss={},
         focal_px=view.focal_px * crop_px / float(view.crop[2]),
         crop_px=crop_px,

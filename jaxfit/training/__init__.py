@@ -1,1 +1,1 @@
-"""Training of the built-in networks on simulated footage only. It needs the extra `train` (PyTorch)."""
+"""Training of networks, on simulated footage and on labels of a user. It needs the extra `train` (PyTorch)."""

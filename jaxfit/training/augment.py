@@ -12,11 +12,17 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-__all__ = ["randomise_appearance"]
+__all__ = ["SCENE_SHARE", "randomise_appearance"]
+
+SCENE_SHARE = 0.75
+"""Share of the simulated pictures with a random scene; in all others, only the camera is randomised."""
 
 
 def randomise_appearance(
-    rng: np.random.Generator, picture: UInt8[np.ndarray, "H W 3"], birds: Bool[np.ndarray, "H W"]
+    rng: np.random.Generator,
+    picture: UInt8[np.ndarray, "H W 3"],
+    birds: Bool[np.ndarray, "H W"],
+    scene_share: float = SCENE_SHARE,
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Randomise light, background and camera of a picture; the positions of the birds do not change.
 
@@ -24,8 +30,9 @@ def randomise_appearance(
         rng: source of randomness.
         picture: blue, green, red, at the network's resolution.
         birds: the pixels of birds.
+        scene_share: probability of a random scene: ground, clutter, contrast and light.
     """
-    if rng.random() < 0.75:  # otherwise only the camera is randomised
+    if rng.random() < scene_share:
         picture = _to_bytes(_randomise_scene(rng, picture, birds))
     picture = _randomise_colours(rng, picture)
     picture = _random_blur(rng, picture)
@@ -159,6 +166,9 @@ def _noise_array() -> Float[np.ndarray, "512 512 3"]:
 def _add_grain(rng: np.random.Generator, picture: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
     """Add sensor noise: a random part of one array of noise, which is much faster than new noise."""
     height, width = picture.shape[:2]
-    y, x = rng.integers(0, [512 - height, 512 - width])
-    grain = _noise_array()[y : y + height, x : x + width]
+    noise = _noise_array()
+    if max(height, width) >= 512:  # a picture larger than the training samples
+        noise = np.tile(noise, (height // 512 + 2, width // 512 + 2, 1))
+    y, x = rng.integers(0, [noise.shape[0] - height, noise.shape[1] - width])
+    grain = noise[y : y + height, x : x + width]
     return np.clip(picture + rng.uniform(0, 10) * grain + 0.5, 0, 255).astype(np.uint8)

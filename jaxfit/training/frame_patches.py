@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from jaxfit.training.scenes import LabelledFrames
+from jaxfit.training.labelled_frames import LabelledFrames
 
 __all__ = ["patch_around", "random_rotation"]
 

@@ -9,23 +9,25 @@ window, so that the height of a peak, the confidence, is the probability that th
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
+from jaxfit.data.keypoint_names import opposite_keypoints
 from jaxfit.errors import InputError
-from jaxfit.model.anatomy import MURRE_KEYPOINTS, other_side
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception.instances import Instance, instance_of
 from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX, crop_bird
-from jaxfit.training.augment import randomise_appearance
+from jaxfit.training.augment import SCENE_SHARE, randomise_appearance
 from jaxfit.training.frame_patches import patch_around, random_rotation
+from jaxfit.training.labelled_frames import UNKNOWN, LabelledFrames
 from jaxfit.training.networks import FeaturePyramid
-from jaxfit.training.scenes import LabelledFrames
 
 __all__ = ["SIDE_PX", "STRIDE", "KeypointMaps", "KeypointSample", "draw_sample", "keypoint_network", "loss"]
 
@@ -42,7 +44,7 @@ MIN_VISIBLE = 4
 """Least number of visible keypoints of a bird in the training data."""
 MOST_DRAWS = 1000
 """Largest number of draws of a frame without a usable bird, so that damaged frames do not block the training."""
-_OTHER_SIDE = [MURRE_KEYPOINTS.index(other_side(name)) for name in MURRE_KEYPOINTS]
+_opposite = cache(opposite_keypoints)
 
 
 class KeypointSample(NamedTuple):
@@ -58,21 +60,23 @@ class KeypointSample(NamedTuple):
     """Weight in the loss."""
 
 
-def keypoint_network() -> FeaturePyramid:
-    """Create the network, with 2 million parameters."""
-    heads = {"logits": len(MURRE_KEYPOINTS)}
+def keypoint_network(keypoints: int = len(MURRE_KEYPOINTS)) -> FeaturePyramid:
+    """Create the network, with 2 million parameters, for a number of keypoints."""
+    heads = {"logits": keypoints}
     return FeaturePyramid((24, 48, 80, 128, 144), (0, 1, 2, 2, 2), (112, 80, 64), heads)
 
 
 class KeypointMaps(nn.Module):
     """The exported network: maps whose peaks are the confidences of the keypoints."""
 
+    window: Tensor
+
     def __init__(self, network: nn.Module, keypoints: int):
         super().__init__()
         self.network = network
         reach = torch.arange(-4, 5) / WINDOW_CELLS
         window = torch.exp(-0.5 * (reach[:, None] ** 2 + reach[None] ** 2))
-        self.window = window[None, None].repeat(keypoints, 1, 1, 1)
+        self.register_buffer("window", window[None, None].repeat(keypoints, 1, 1, 1), persistent=False)
         self.keypoints = keypoints
 
     def forward(self, pictures: Tensor) -> Tensor:
@@ -84,25 +88,38 @@ class KeypointMaps(nn.Module):
         return functional.conv2d(maps, self.window, padding=4, groups=self.keypoints)
 
 
-def draw_sample(rng: np.random.Generator, frames: LabelledFrames) -> KeypointSample:
+def _usable_birds(frames: LabelledFrames, s: int) -> Int[np.ndarray, "M"]:
+    """Return the birds of a frame with enough visible keypoints for a sample."""
+    least = min(MIN_VISIBLE, len(frames.keypoint_names))
+    return np.flatnonzero((frames.visibility[s] == 2).sum(-1) >= least)
+
+
+def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: float = SCENE_SHARE) -> KeypointSample:
     """Draw a random bird of a random frame, with random rotation, mirroring, appearance and errors of the mask.
+
+    Frames whose keypoints have no sides, such as numbers, are not mirrored.
+
+    Args:
+        rng: source of randomness.
+        frames: the frames.
+        scene_share: share of the samples with a random scene, as in `randomise_appearance`.
 
     Raises:
         InputError: none of many frames shows a bird.
     """
     for _ in range(MOST_DRAWS):
         s = int(rng.integers(len(frames.pictures)))
-        birds = np.flatnonzero((frames.visibility[s] == 2).sum(-1) >= MIN_VISIBLE)
+        birds = _usable_birds(frames, s)
         if not len(birds):
             continue
-        patch = _augmented_patch(rng, frames, s, int(rng.choice(birds)))
+        patch = _augmented_patch(rng, frames, s, int(rng.choice(birds)), scene_share)
         if patch is not None:
             return _crop_sample(rng, *patch)
     raise InputError("frames", f"show no bird in {MOST_DRAWS} draws", "film the frames again")
 
 
 def _augmented_patch(
-    rng: np.random.Generator, frames: LabelledFrames, s: int, n: int
+    rng: np.random.Generator, frames: LabelledFrames, s: int, n: int, scene_share: float
 ) -> tuple[np.ndarray, Instance, np.ndarray, np.ndarray, float] | None:
     """Resample the surroundings of a bird to about the network's scale; None if too little of the bird is visible.
 
@@ -122,8 +139,12 @@ def _augmented_patch(
     centre_px = np.array([bird.x0 + w / 2, bird.y0 + h / 2])
     rotation, mirrored = random_rotation(rng, factor, 20)
     points_px, visibility = frames.keypoints_px[s, n], frames.visibility[s, n]
-    if mirrored:
-        points_px, visibility = points_px[_OTHER_SIDE], visibility[_OTHER_SIDE]
+    opposite = np.array(_opposite(frames.keypoint_names))
+    if mirrored and (opposite == np.arange(len(opposite))).all():  # the names have no sides
+        rotation[:, 0] *= -1
+    elif mirrored:
+        points_px = points_px[opposite]
+        visibility = np.where(opposite < 0, UNKNOWN, visibility[opposite]).astype(np.uint8)
     picture, owner, low = patch_around(frames, s, centre_px, 0.75 * (max(h, w) + 2 * margin), factor)
     side = int(1.5 * SIDE_PX)
     affine = np.column_stack([rotation, side / 2 - rotation @ (centre_px - low)])
@@ -134,7 +155,7 @@ def _augmented_patch(
     instance = instance_of(_faulty_mask(rng, owner == n + 1, owner > 0), 1.0, "")
     if instance is None:
         return None
-    picture = randomise_appearance(rng, picture, owner > 0)
+    picture = randomise_appearance(rng, picture, owner > 0, scene_share)
     points_px = (points_px - low) @ affine[:, :2].T + affine[:, 2]
     return picture, instance, points_px, visibility, float(relative_scale * factor)
 
@@ -169,8 +190,9 @@ def _crop_sample(
     pad, dilate = (int(margin * relative_scale * rng.uniform(0.4, 2.0)) for margin in (PAD_PX, DILATE_PX))
     crop_picture, crop = crop_bird(picture, bird, (SIDE_PX, SIDE_PX), pad, max(dilate, 2))
     position = crop.to_crop(points_px) / STRIDE
-    present = (visibility > 0) & ((position >= 0) & (position < SIDE_PX / STRIDE)).all(-1)
-    weight = np.where(present, np.where(visibility == 2, 1.0, OCCLUDED_WEIGHT), ABSENT_WEIGHT)
+    known = visibility != UNKNOWN
+    present = known & (visibility > 0) & ((position >= 0) & (position < SIDE_PX / STRIDE)).all(-1)
+    weight = known * np.where(present, np.where(visibility == 2, 1.0, OCCLUDED_WEIGHT), ABSENT_WEIGHT)
     return KeypointSample(
         np.moveaxis(crop_picture, -1, 0).astype(np.float32) / 255,
         position.astype(np.float32),
@@ -196,4 +218,4 @@ def loss(maps: dict[str, Tensor], sample: Any) -> dict[str, Tensor]:
     target = torch.cat([target, 1 - sample.present[..., None]], dim=-1)
     log_probability = functional.log_softmax(functional.pad(logits.reshape(B, K, h * w), (0, 1)), dim=-1)
     entropy = -(target * log_probability).sum(-1)
-    return {"position": (entropy * sample.weight).sum() / sample.weight.sum()}
+    return {"position": (entropy * sample.weight).sum() / sample.weight.sum().clamp(min=1)}

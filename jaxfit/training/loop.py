@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,9 +15,12 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.training.scenes import LabelledFrames, load_frames
+from jaxfit.training.labelled_frames import LabelledFrames, load_frames
 
-__all__ = ["Schedule", "train"]
+__all__ = ["Loss", "Schedule", "Source", "batches", "has_fast_bfloat16", "train", "train_step"]
+
+Loss = Callable[[dict[str, Tensor], Any], dict[str, Tensor]]
+"""Function of the outputs of a network and of a batch that computes the terms of the loss."""
 
 
 class Schedule(NamedTuple):
@@ -30,26 +33,87 @@ class Schedule(NamedTuple):
     weight_decay: float = 0.02
 
 
+class Source(NamedTuple):
+    """A folder of labelled frames, and the samples that are drawn from the folder."""
+
+    folder: Path
+    draw: Callable[[np.random.Generator, LabelledFrames], Any]
+    """Draws one sample, a NamedTuple of arrays with the field `picture`; a module-level function or its `partial`."""
+    share: float = 1.0
+    """Share of the samples; the shares of all sources sum to 1."""
+    keypoint_names: tuple[str, ...] | None = None
+    """Names of the keypoints of the samples; None keeps those of the frames."""
+
+
 class _Samples(Dataset):
     """A dataset whose sample i depends only on the seed and i, not on the number of workers."""
 
-    def __init__(self, draw: Callable[..., Any], folder: Path, seed: int, count: int):
-        self._draw, self._folder, self._seed, self._count = draw, folder, seed, count
-        self._frames: LabelledFrames | None = None
+    def __init__(self, sources: Sequence[Source], seed: int, first: int, count: int):
+        self._sources, self._seed, self._first, self._count = tuple(sources), seed, first, count
+        self._frames: list[LabelledFrames] = []
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, i: int) -> Any:
-        if self._frames is None:  # each worker opens the frames itself
-            self._frames = load_frames(self._folder)
-        return self._draw(np.random.default_rng((self._seed, i)), self._frames)
+        if not self._frames:  # each worker opens the frames itself
+            frames = [load_frames(source.folder) for source in self._sources]
+            pairs = zip(frames, self._sources, strict=True)
+            self._frames = [own.with_keypoints(source.keypoint_names or own.keypoint_names) for own, source in pairs]
+        rng = np.random.default_rng((self._seed, self._first + i))
+        k = 0 if len(self._sources) == 1 else int(rng.choice(len(self._sources), p=[s.share for s in self._sources]))
+        return self._sources[k].draw(rng, self._frames[k])
+
+
+def batches(sources: Sequence[Source], batch: int, seed: int, first_step: int, last_step: int) -> Iterator[Any]:
+    """Draw the batches of some steps in another process; a batch depends only on the sources, the seed and its step.
+
+    Args:
+        sources: folders of labelled frames.
+        batch: number of samples of a batch.
+        seed: seed of the samples.
+        first_step, last_step: range of the steps, counted from 0; the last step is not included.
+    """
+    samples = _Samples(sources, seed, first_step * batch, (last_step - first_step) * batch)
+    yield from DataLoader(
+        samples,
+        batch,
+        num_workers=1,
+        prefetch_factor=4,
+        worker_init_fn=_use_one_thread,
+        multiprocessing_context="spawn",  # a fork breaks JAX's threads
+    )
+
+
+def train_step(
+    network: nn.Module, sample: Any, loss: Loss, optimiser: torch.optim.Optimizer, half_precision: bool
+) -> dict[str, float]:
+    """Take one step of an optimiser on one batch and return the terms of the loss.
+
+    Args:
+        network: maps a batch of `picture` to maps by name.
+        sample: the batch.
+        loss: computes the terms of the loss of a batch.
+        optimiser: an optimiser of the network's parameters.
+        half_precision: whether the network computes in bfloat16.
+    """
+    device = next(network.parameters()).device
+    sample = type(sample)(*(part.to(device) for part in sample))
+    picture = sample.picture.contiguous(memory_format=torch.channels_last)
+    with torch.autocast(device.type, torch.bfloat16, enabled=half_precision):
+        maps = network(picture)
+    terms = loss(maps, sample)
+    optimiser.zero_grad(set_to_none=True)
+    torch.stack(list(terms.values())).sum().backward()
+    nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+    optimiser.step()
+    return {key: float(term.detach()) for key, term in terms.items()}
 
 
 def train(
     network: nn.Module,
     draw: Callable[[np.random.Generator, LabelledFrames], Any],
-    loss: Callable[[dict[str, Tensor], Any], dict[str, Tensor]],
+    loss: Loss,
     frames_folder: Path,
     schedule: Schedule,
     seed: int = 0,
@@ -74,36 +138,30 @@ def train(
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.to(device).train()
     network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    samples = _Samples(draw, frames_folder, seed, schedule.steps * schedule.batch)
-    loader = DataLoader(
-        samples,
-        schedule.batch,
-        num_workers=1,
-        prefetch_factor=4,
-        worker_init_fn=_use_one_thread,
-        multiprocessing_context="spawn",  # a fork breaks JAX's threads
-    )
     optimiser = torch.optim.AdamW(network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay)
     scheduler = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, schedule.learning_rate, schedule.steps, pct_start=0.1, cycle_momentum=False
     )
     recent: list[dict[str, float]] = []
     with progress(name, schedule.steps) as report_progress:
-        for sample in loader:
-            sample = type(sample)(*(part.to(device) for part in sample))
-            picture = sample.picture.contiguous(memory_format=torch.channels_last)
-            with torch.autocast(device.type, torch.bfloat16):
-                maps = network(picture)
-            terms = loss(maps, sample)
-            optimiser.zero_grad(set_to_none=True)
-            torch.stack(list(terms.values())).sum().backward()
-            nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-            optimiser.step()
+        for sample in batches([Source(frames_folder, draw)], schedule.batch, seed, 0, schedule.steps):
+            terms = train_step(network, sample, loss, optimiser, half_precision=True)
             scheduler.step()
-            recent = [*recent[-(schedule.steps // 10) :], {key: float(term.detach()) for key, term in terms.items()}]
+            recent = [*recent[-(schedule.steps // 10) :], terms]
             report_progress(1, " ".join(f"{key} {np.mean([r[key] for r in recent[-50:]]):.4f}" for key in recent[-1]))
     network.cpu().eval()
     return {key: float(np.mean([values[key] for values in recent])) for key in recent[-1]}
+
+
+def has_fast_bfloat16() -> bool:
+    """Return whether the processor has instructions for bfloat16; without them, bfloat16 is slower than float32."""
+    if torch.cuda.is_available():
+        return True
+    try:
+        flags = Path("/proc/cpuinfo").read_text(errors="replace")
+    except OSError:  # not Linux
+        return False
+    return "avx512_bf16" in flags or "amx_bf16" in flags
 
 
 def _use_one_thread(_worker: int) -> None:

@@ -6,15 +6,10 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from numpy.lib.format import open_memmap
 
-from jaxfit.data.formats.fields import LARGEST_POSITION_PX
-from jaxfit.errors import InputError
-from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.model.files import load_murre
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.simulation.flock import simulate_flock
@@ -24,34 +19,15 @@ from jaxfit.simulation.scene import LEDGE_DEPTH
 from jaxfit.simulation.viewpoint import Viewpoint, camera_axes
 from jaxfit.simulation.visibility import mesh_keypoints, render_visibility
 from jaxfit.storage.files import new_folder
-from jaxfit.storage.npy import load_npy
-from jaxfit.storage.npz import load_npz
+from jaxfit.training.labelled_frames import MARKER, LabelledFrames, create_pictures, load_frames, save_labels
 
-__all__ = ["FRAMES_PER_SCENE", "LabelledFrames", "film_scenes", "load_frames"]
+__all__ = ["FRAMES_PER_SCENE", "film_scenes"]
 
 WIDTH, HEIGHT = 960, 640
 MAX_BIRDS = 14
 FRAMES_PER_SCENE = 10
 FPS, EVERY = 12.0, 4
 """Every fourth frame at 12 frames/s: the frames of a scene are 1/3 s apart, so that postures differ."""
-_MARKER = "frames.npz"
-_LABELS = {"keypoints_px": "S N K 2", "visibility": "S N K", "pixels_per_unit": "S"}
-"""The arrays of the labels, and their shapes."""
-
-
-class LabelledFrames(NamedTuple):
-    """S frames of simulated scenes; the large arrays are memory-mapped files."""
-
-    pictures: UInt8[np.ndarray, "S H W 3"]
-    """Blue, green, red."""
-    owner: UInt8[np.ndarray, "S H W"]
-    """Number of the bird of each pixel, from 1; 0 for no bird."""
-    keypoints_px: Float[np.ndarray, "S N K 2"]
-    """x, y of every keypoint, also if it is occluded or outside the picture."""
-    visibility: UInt8[np.ndarray, "S N K"]
-    """2 if the keypoint is visible, 1 if it is occluded, 0 if it is outside the picture or the bird does not exist."""
-    pixels_per_unit: Float[np.ndarray, "S"]
-    """Scale of the picture: pixels per model unit (2 cm) at the ledge."""
 
 
 def film_scenes(
@@ -71,9 +47,8 @@ def film_scenes(
     """
     bird = load_murre()
     S, K = len(seeds) * FRAMES_PER_SCENE, bird.num_keypoints
-    with new_folder(folder, overwrite, marker=_MARKER) as part:
-        pictures = open_memmap(part / "pictures.npy", "w+", np.uint8, (S, HEIGHT, WIDTH, 3))
-        owner = open_memmap(part / "owner.npy", "w+", np.uint8, (S, HEIGHT, WIDTH))
+    with new_folder(folder, overwrite, marker=MARKER) as part:
+        pictures, owner = create_pictures(part, S, HEIGHT, WIDTH)
         points, visibility = np.zeros((S, MAX_BIRDS, K, 2), np.float32), np.zeros((S, MAX_BIRDS, K), np.uint8)
         scale = np.zeros(S, np.float32)
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))  # a fork breaks compiled code
@@ -84,44 +59,9 @@ def film_scenes(
                 pictures[at], owner[at], scale[at] = frames.pictures, frames.owner, frames.pixels_per_unit
                 points[at, :N], visibility[at, :N] = frames.keypoints_px, frames.visibility
                 report_progress(1, "")
-        pictures.flush()
-        owner.flush()
-        np.savez(part / _MARKER, keypoints_px=points, visibility=visibility, pixels_per_unit=scale)
+        del pictures, owner  # writes the memory-mapped files
+        save_labels(part, points, visibility, scale)
     return load_frames(folder)
-
-
-def load_frames(folder: str | Path) -> LabelledFrames:
-    """Load the frames that `film_scenes` wrote.
-
-    Raises:
-        InputError: the frames cannot be read, an earlier version wrote them, or the labels hold impossible values.
-    """
-    folder = Path(folder)
-    labels = load_npz(folder / _MARKER, _LABELS)
-    points, visibility, scale = (labels[name] for name in _LABELS)
-    sizes = f"{len(scale)} {HEIGHT} {WIDTH}"
-    pictures = load_npy(folder / "pictures.npy", f"{sizes} 3", mapped=True)
-    owner = load_npy(folder / "owner.npy", sizes, mapped=True)
-    frames = LabelledFrames(pictures, owner, points, visibility, scale)
-    _check_labels(frames, folder)
-    return frames
-
-
-def _check_labels(frames: LabelledFrames, folder: Path) -> None:
-    integers = all(array.dtype == np.uint8 for array in (frames.pictures, frames.owner, frames.visibility))
-    numbers = all(array.dtype == np.float32 for array in (frames.keypoints_px, frames.pixels_per_unit))
-    valid = {
-        "type of numbers": integers and numbers,
-        "number of keypoints": frames.visibility.shape[2] == len(MURRE_KEYPOINTS),
-        "number of birds": frames.visibility.shape[1] <= MAX_BIRDS,
-        "number of frames": len(frames.pictures) > 0,
-        "position of a keypoint": bool((np.abs(frames.keypoints_px) <= LARGEST_POSITION_PX).all()),
-        "visibility": bool((frames.visibility <= 2).all()),
-        "scale": bool(((frames.pixels_per_unit > 0.01) & (frames.pixels_per_unit < 1e4)).all()),
-    }
-    for name, holds in valid.items():
-        if not holds:
-            raise InputError(folder, f"holds frames with a wrong {name}", "remove the folder, to film the frames again")
 
 
 def _film_scene(seed: int) -> LabelledFrames:

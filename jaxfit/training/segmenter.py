@@ -18,10 +18,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from jaxfit.training.augment import randomise_appearance
+from jaxfit.training.augment import SCENE_SHARE, randomise_appearance
 from jaxfit.training.frame_patches import patch_around, random_rotation
+from jaxfit.training.labelled_frames import LabelledFrames
 from jaxfit.training.networks import FeaturePyramid
-from jaxfit.training.scenes import LabelledFrames
 
 __all__ = ["OFFSET_UNIT_PX", "SIDE_PX", "STRIDE", "SegmenterSample", "draw_sample", "loss", "segmenter_network"]
 
@@ -61,8 +61,14 @@ def segmenter_network() -> FeaturePyramid:
     return FeaturePyramid((16, 32, 64, 96, 128), (0, 1, 2, 2, 2), (96, 64, 48, 24), heads)
 
 
-def draw_sample(rng: np.random.Generator, frames: LabelledFrames) -> SegmenterSample:
-    """Draw a random patch of a random frame, with random scale, rotation, mirroring and appearance."""
+def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: float = SCENE_SHARE) -> SegmenterSample:
+    """Draw a random patch of a random frame, with random scale, rotation, mirroring and appearance.
+
+    Args:
+        rng: source of randomness.
+        frames: the frames.
+        scene_share: share of the samples with a random scene, as in `randomise_appearance`.
+    """
     s = int(rng.integers(len(frames.pictures)))
     factor = np.exp(rng.uniform(*np.log(PIXELS_PER_UNIT))) / frames.pixels_per_unit[s]
     height, width = frames.owner.shape[1:]
@@ -73,7 +79,7 @@ def draw_sample(rng: np.random.Generator, frames: LabelledFrames) -> SegmenterSa
         shift_px = rng.normal(0, 0.2 * SIDE_PX / factor, 2)
         centre_px = frames.keypoints_px[s, n, frames.visibility[s, n] == 2].mean(0) + shift_px
     picture, owner = _resampled_patch(rng, frames, s, centre_px, factor)
-    picture = randomise_appearance(rng, picture, owner > 0)
+    picture = randomise_appearance(rng, picture, owner > 0, scene_share)
     return SegmenterSample(np.moveaxis(picture, -1, 0).astype(np.float32) / 255, *_targets(owner))
 
 

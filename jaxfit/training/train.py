@@ -9,17 +9,18 @@ from importlib import metadata
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
 
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
+from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
-from jaxfit.training.export import export_onnx
+from jaxfit.training.familiarity import store_training_activations
+from jaxfit.training.labelled_frames import LabelledFrames, load_frames
 from jaxfit.training.loop import Schedule, train
-from jaxfit.training.networks import FeaturePyramid
-from jaxfit.training.scenes import FRAMES_PER_SCENE, LabelledFrames, film_scenes, load_frames
+from jaxfit.training.network_files import write_keypoints, write_segmenter
+from jaxfit.training.scenes import FRAMES_PER_SCENE, film_scenes
 
 __all__ = ["SCENES", "SCHEDULES", "train_network"]
 
@@ -80,7 +81,13 @@ def train_network(
         "schedule": json.dumps(schedule._asdict()),
         "loss": json.dumps({name: round(value, 5) for name, value in losses.items()}),
     }
-    (_write_segmenter if which == "segmenter" else _write_keypoints)(network, facts, path)
+    if which == "segmenter":
+        write_segmenter(network, facts, path)
+    else:
+        write_keypoints(network, MURRE_KEYPOINTS, facts, path)
+    # a keypoint network sees the birds that a segmenter detects
+    birds = None if which == "segmenter" else load_segmenter("builtin")
+    store_training_activations(which, path, [frames], birds, progress)
     return losses
 
 
@@ -94,42 +101,3 @@ def _load_or_film(folder: Path, scenes: int, progress: ProgressTask) -> Labelled
         remedy = "give another folder or the same number of scenes"
         raise InputError(folder, f"holds {existing} scenes, not {scenes}", remedy)
     return frames
-
-
-class _Probabilities(nn.Module):
-    """The exported segmenter: probabilities, centres and offsets."""
-
-    def __init__(self, network: FeaturePyramid):
-        super().__init__()
-        self.network = network
-
-    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        maps = self.network(pictures)
-        return torch.sigmoid(maps["foreground"]), maps["centre"], maps["offset"]
-
-
-def _write_segmenter(network: FeaturePyramid, facts: dict[str, str], path: str | Path) -> None:
-    metadata_props = {"names": repr({0: "bird"}), "longer_side": "864", **facts}
-    variable_axes = {2: "height", 3: "width"}
-    export_onnx(
-        _Probabilities(network).eval(),
-        torch.rand(1, 3, 256, 320),
-        variable_axes,
-        ("foreground", "centre", "offset"),
-        metadata_props,
-        path,
-    )
-
-
-def _write_keypoints(network: FeaturePyramid, facts: dict[str, str], path: str | Path) -> None:
-    side = keypoints.SIDE_PX
-    metadata_props = {
-        "keypoint_names": ",".join(MURRE_KEYPOINTS),
-        "mean": "0",
-        "std": "255",
-        "colour": "bgr",
-        "input_size": f"{side},{side}",
-        **facts,
-    }
-    exported = keypoints.KeypointMaps(network, len(MURRE_KEYPOINTS)).eval()
-    export_onnx(exported, torch.rand(2, 3, side, side), {0: "birds"}, ("heatmaps",), metadata_props, path)

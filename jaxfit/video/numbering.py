@@ -37,8 +37,6 @@ class Place(NamedTuple):
 
     number: int
     stamp: int
-    origin: int
-    """Time stamp of frame 0."""
     steady: bool
     skipped: int
 
@@ -66,7 +64,6 @@ class Timeline:
         self.number = 0 if place is None else place.number
         """Number of the next frame, which is the count of numbered frames."""
         self.stamped = stamped
-        self.origin = None if place is None else place.origin
         self.skipped = 0 if place is None else place.skipped
         """Count of packets that are never shown and have no number."""
         self.troubled = False
@@ -128,8 +125,7 @@ class Timeline:
 
     def place(self, number: int, packet: Packet) -> Place:
         """Return the place of a keyframe that `settle` has just yielded."""
-        origin = packet.stamp if self.origin is None else self.origin
-        return Place(number, packet.stamp, origin, self._steady, self.skipped)
+        return Place(number, packet.stamp, self._steady, self.skipped)
 
     def show(self, picture: Any) -> None:
         """Add the next picture of the decoder."""
@@ -178,7 +174,6 @@ class Timeline:
             for _ in range(self._gap(packet)):
                 numbered.append((self.number, packet, False))
                 self.number += 1
-            self.origin = packet.stamp if self.origin is None else self.origin
             self.last = packet.stamp
         numbered.append((self.number, packet, True))
         self.number += 1

@@ -16,7 +16,10 @@ from jaxfit.limits import FRAMES_PER_S, IMAGE_PIXELS, IMAGE_SIDE_PX, SECONDS_PER
 from jaxfit.storage.reading import open_file
 from jaxfit.video.pictures import is_too_large
 
-__all__ = ["frame_rate", "opened"]
+__all__ = ["MP4", "frame_count", "frame_rate", "opened"]
+
+MP4 = "mov,mp4,m4a,3gp,3g2,mj2"
+"""Name of the format of MP4 and QuickTime files in FFmpeg."""
 
 _OPTIONS = {
     "protocol_whitelist": "none",  # a playlist may name other files and network addresses
@@ -56,6 +59,16 @@ def _video_stream(path: Path, container: Any) -> Any:
         problem = f"has pictures of {stream.width}×{stream.height}"
         raise InputError(path, problem, f"the limits are {IMAGE_SIDE_PX} pixels a side and {IMAGE_PIXELS:,} pixels")
     return stream
+
+
+def frame_count(stream: Any) -> int | None:
+    """Return the number of frames that players show; None if the container does not store a number.
+
+    An edit list of an MP4 file hides frames. FFmpeg marks these frames in its index, or leaves the frames out.
+    """
+    if not stream.frames or stream.container.format.name != MP4:
+        return stream.frames or None
+    return sum(not entry.is_discard for entry in stream.index_entries) or stream.frames
 
 
 def frame_rate(stream: Any) -> float | None:

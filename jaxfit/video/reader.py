@@ -15,7 +15,9 @@ from typing import NamedTuple
 from jaxfit.errors import InputError
 from jaxfit.storage.reading import check_readable
 from jaxfit.video.decoding import Frame, decode
-from jaxfit.video.opening import frame_rate, opened
+from jaxfit.video.display import displayed_size
+from jaxfit.video.opening import frame_count, frame_rate, opened
+from jaxfit.video.packets import first_picture
 from jaxfit.video.pictures import image_files, read_picture
 
 __all__ = ["Frame", "FrameReader", "VideoInfo", "probe_video", "read_frames"]
@@ -31,13 +33,14 @@ class VideoInfo(NamedTuple):
     frames: int | None
     """Number of frames. None if the container does not store it (``.mkv``, ``.webm``, streams)."""
     fps: float | None
-    """Mean frame rate in frames per second. For a folder of images, the rate given to the reader, or None."""
+    """Mean frame rate in frames per second, as the container states it. For a folder of images, the rate given to the
+    reader, or None."""
     size_px: tuple[int, int]
-    """Width and height. For a folder, those of its first readable image."""
+    """Width and height as players show the video. For a folder, those of its first readable image."""
 
 
 def probe_video(path: str | Path, *, fps: float | None = None) -> VideoInfo:
-    """Return frame count, rate and size of a video or of a folder of images, without reading the frames.
+    """Return frame count, rate and size of a video or of a folder of images, after decoding of the first picture.
 
     Raises:
         InputError: as ``read_frames``.
@@ -51,8 +54,10 @@ def probe_video(path: str | Path, *, fps: float | None = None) -> VideoInfo:
         return VideoInfo(len(files), fps, (first.shape[1], first.shape[0]))
     if fps is not None:
         raise InputError(path, "is a video, which has its own frame rate", "give a rate only for a folder of images")
-    with opened(path) as (_, stream):
-        return VideoInfo(stream.frames or None, frame_rate(stream), (stream.width, stream.height))
+    with opened(path) as (container, stream):
+        frames, rate, size_px = frame_count(stream), frame_rate(stream), (stream.width, stream.height)
+        picture = first_picture(container, stream)  # PyAV shows the display matrix of pictures only
+        return VideoInfo(frames, rate, size_px if picture is None else displayed_size(picture))
 
 
 def read_frames(
@@ -64,8 +69,12 @@ def read_frames(
     (`Timeline` describes the numbering and the treatment of variable frame rates). Damaged frames are skipped, together
     with the frames that depend on them, up to the next keyframe. The numbers of later frames stay correct. One warning
     lists the skipped frames, and so does `FrameReader.damaged`. A decoder detects damage only by contradictions in the
-    data: in VP8 and VP9 most damage is not detected. If a file is truncated, the frames end with a warning. A rotation
-    that the file requests from players is not applied, and a warning reports the rotation.
+    data: in VP8 and VP9 most damage is not detected. If a file is truncated, the frames end with a warning.
+
+    Frames come as players show them: rotated and mirrored by the display matrix of the file, in 8 bits by its colour
+    matrix and range, and deinterlaced where pictures are interlaced. Three things differ, and a warning reports each:
+    a rotation by other angles than multiples of 90° is not applied, pixels that are not square are not stretched, and
+    HDR video is not tone mapped.
 
     Args:
         path: a file of any type that FFmpeg reads, or a folder of images.
@@ -125,7 +134,7 @@ class FrameReader:
 
     def _read(self, stopped: Callable[[], bool]) -> Generator[Frame | int, None, None]:
         if not self.path.is_dir():
-            yield from decode(self.path, self._numbers, stopped)
+            yield from decode(self.path, self._numbers, self.info.size_px, stopped)
             return
         files, fps = image_files(self.path), self.info.fps
         for i in range(len(files))[self._numbers.start : self._numbers.stop : self._numbers.step]:

@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from jaxfit.errors import InputError
 from jaxfit.storage.files import new_file
 from jaxfit.video.codecs import CODECS, CONTAINERS
-from jaxfit.video.decoding import EXACT
+from jaxfit.video.display import EXACT
 
 __all__ = ["SLOWEST_FPS", "VideoWriter"]
 

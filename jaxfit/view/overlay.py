@@ -113,11 +113,12 @@ def overlay(
         progress("overlay", (last - first) // step + 1) as report_progress,
     ):
         number = None
-        for number, picture, _ in read_frames(video, first, last + 1, step):
+        for number, picture, time_s in read_frames(video, first, last + 1, step):
             t = int(np.searchsorted(numbers, number))
             here = t if numbers[t] == number else None
             tiles |= cut_tiles(drawing.posed, picture, [(n, at) for n, at in wanted if at == here])
-            writer.write(drawing.frame(picture, number, here, number / (fps * step)))
+            seconds = number / (fps * step) if time_s is None else time_s
+            writer.write(drawing.frame(picture, number, here, seconds))
             report_progress(1, f"frame {number}")
         if info.frames is None and number != last:
             raise too_short(video, solution, 0 if number is None else number + 1)
@@ -165,8 +166,9 @@ def overlay_frame(
         problem = f"has no frame {frame_index}: its frames are {solution.frame_index[0]} to {solution.frame_index[-1]}"
         raise InputError("result", problem, "give one of these frames")
     drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
-    for number, picture, _ in read_frames(video, frame_index, frame_index + 1):
-        t, seconds = int(np.searchsorted(solution.frame_index, number)), number / (info.fps or FOLDER_FPS)
+    for number, picture, time_s in read_frames(video, frame_index, frame_index + 1):
+        t = int(np.searchsorted(solution.frame_index, number))
+        seconds = number / FOLDER_FPS if time_s is None else time_s
         _, encoded = cv2.imencode(out.suffix, drawing.frame(picture, number, t, seconds))
         write_whole(out, encoded.tobytes())
         return

@@ -60,6 +60,8 @@ def test_track_writes_the_truth(inputs, tmp_path, capsys):
     np.testing.assert_array_equal(found.keypoints_px, truth.astype(np.float32))
     said = capsys.readouterr().out
     assert "3 birds over 5 frames" in said.replace("\n", "")
+    assert said.index("trust is high") < said.index("coverage")
+    assert json.loads(out.read_text())["info"]["trust"] == "high"
     for heading in ("coverage", "confidence", "jitter"):
         assert heading in said
 
@@ -100,7 +102,10 @@ def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
     assert "min_score" in message
     content = json.loads(out.read_text())
     assert (len(content["images"]), content["annotations"]) == (FRAMES, [])
-    assert "0 birds over 12 frames" in capsys.readouterr().out.replace("\n", "")
+    said = capsys.readouterr().out
+    assert "0 birds over 12 frames" in said.replace("\n", "")
+    assert "trust is low: no bird was tracked" in said
+    assert content["info"] == {"trust": "low", "trust_reasons": "no bird was tracked"}
     words = "no bird was detected in 12 frames", "min_score"
     rejected(capsys, command(inputs, "reconstruct", tmp_path / "result"), *words, alone=False)
     assert not (tmp_path / "result").exists()
@@ -126,6 +131,8 @@ def test_a_reconstruction(inputs, tmp_path, networks, capsys):
     assert (config.track.min_track_frames, config.fit.window) == (3, 12)
     summary = json.loads((out / "summary.json").read_text())
     assert summary["short_tracks"] == {"1": 2}
+    assert (summary["trust"], summary["trust_reasons"]) == ("high", [])
+    assert summary["trust_signals"]["tracks"] == 3
     assert set(summary["seconds"]) == {"load", "track", "fit", "overlay"}
     assert summary["quality"][str(found.track_id[0])]["coverage"] == 1
     assert summary["video"]["frames"] == FRAMES

@@ -52,6 +52,37 @@ def test_a_bird_has_a_score(tmp_path):
     assert_same(read_coco(tmp_path / "again.json"), seen)
 
 
+def test_times_of_the_frames(tmp_path):
+    """`info` of other programs may be anything; unknown times and rates are not written."""
+    timed = content() | {"info": {"fps": 29.97, "year": 2024}}
+    timed["images"][1] |= {"timestamp_s": 1.25}
+    seen = read_coco(saved(tmp_path, timed))
+    assert seen.fps == 29.97
+    stamped = seen.frame_index.tolist().index(timed["images"][1]["frame_index"])
+    assert seen.timestamp_s[stamped] == 1.25
+    assert np.isnan(np.delete(seen.timestamp_s, stamped)).all()
+    write_coco(seen, tmp_path / "again.json", {"description": "x"})
+    written = json.loads((tmp_path / "again.json").read_text())
+    assert written["info"] == {"description": "x", "fps": 29.97}
+    assert [image.get("timestamp_s") for image in written["images"]].count(None) == 2
+    for info in ("text", None, [1], {"fps": None}, {}):
+        unknown = read_coco(saved(tmp_path, content() | {"info": info}))
+        assert unknown.fps is None
+        assert np.isnan(unknown.timestamp_s).all()
+    write_coco(unknown, tmp_path / "again.json")
+    assert "info" not in json.loads((tmp_path / "again.json").read_text())
+
+
+@pytest.mark.parametrize("value", [0, -25, 1e9, "25", float("nan"), True])
+def test_absurd_times_are_rejected(tmp_path, value):
+    with pytest.raises(InputError, match=r"birds\.json: info\.fps (is|must be) .*(remove fps|write the file again)"):
+        read_coco(saved(tmp_path, content() | {"info": {"fps": value}}))
+    timed = content()
+    timed["images"][0] |= {"timestamp_s": value if isinstance(value, str | bool) else 1e300}
+    with pytest.raises(InputError, match=r"images\[0\]\.timestamp_s (is|must be) "):
+        read_coco(saved(tmp_path, timed))
+
+
 def test_what_is_hidden_keeps_its_place(tmp_path):
     """Visibility 1 is a keypoint that something hides; the whole mask stands beside the visible one."""
     hiding = content()
@@ -164,6 +195,8 @@ def test_round_trip_of_anything(tmp_path_factory, seed):
         keypoint_names=[f"k{k}" for k in range(K)],
         masks=masks,
         score=rng.random((N, T), np.float32) * present,
+        timestamp_s=np.where(rng.random(T) < 0.8, rng.normal(scale=1e3, size=T), np.nan),
+        fps=rng.choice([None, 30000 / 1001]),
     )
     path = tmp_path_factory.mktemp("coco") / "file.json"
     write_coco(seen, path)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.hostile import Isolated, many_examples
+from support.label_files import labelled_birds, write_label_file
 from support.mutations import HOSTILE_VALUES, damaged_arrays, damaged_bytes, damaged_tree
 from support.tracking_files import columns, project, write_analysis, write_csv, write_fixed, write_project, write_table
 
@@ -96,6 +97,19 @@ def test_damaged_exports(tmp_path, reader):
     def check(tree):
         (tmp_path / "export.json").write_text(json.dumps(tree, default=str))
         outcome = reader(tmp_path / "export.json")
+        assert outcome.acceptable, outcome
+
+    check()
+
+
+def test_damaged_tasks_of_label_studio(tmp_path, reader):
+    path = write_label_file("label studio", labelled_birds().select(frames=[0, 3]), tmp_path)
+
+    @many_examples
+    @given(damaged_tree(json.loads(path.read_text())))
+    def check(tree):
+        path.write_text(json.dumps(tree, default=str))
+        outcome = reader(path)
         assert outcome.acceptable, outcome
 
     check()

@@ -5,7 +5,7 @@ import pytest
 from support.coco_files import content, saved
 
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.data.keypoint_names import checked_map, map_keypoints, propose_names
+from jaxfit.data.keypoint_names import checked_map, map_keypoints, opposite_keypoints, propose_names
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import AVIAN_MESH_KEYPOINTS, MURRE_KEYPOINTS
 
@@ -81,3 +81,8 @@ def test_a_map_replaces_the_proposal():
     names = checked_map({"crown": "nape", "beak": None}, ["crown", "beak", "tail"], MURRE_KEYPOINTS, "map.yaml")
     assert names.mapped == {"crown": "nape"}
     assert names.unmapped == ("beak", "tail")
+
+
+def test_opposite_keypoints():
+    names = ("beak", "wingL", "R_wing", "left_eye", "tail")
+    assert opposite_keypoints(names) == (0, 2, 1, -1, 4)

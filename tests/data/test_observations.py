@@ -54,6 +54,20 @@ def test_what_is_missing_is_zero():
     np.testing.assert_array_equal(seen.box_px[1, 0], 0)
 
 
+def test_times_of_the_frames():
+    assert np.isnan(make().timestamp_s).all()
+    assert make().fps is None
+    timed = make(timestamp_s=[0.5, np.nan, 2], fps=25)
+    np.testing.assert_array_equal(timed.select(frames=[1, 2]).timestamp_s, [np.nan, 2])
+    moved = timed.select([0]).with_keypoints(timed.keypoints_px[:1], timed.confidence[:1])
+    np.testing.assert_array_equal(moved.timestamp_s, [0.5, np.nan, 2])
+    assert moved.fps == 25
+    assert timed.timestamp_s.dtype == np.float64
+    for wrong in ({"timestamp_s": [0, 1, np.inf]}, {"timestamp_s": [0, 1]}, {"fps": 0}, {"fps": np.nan}):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} must"):
+            make(**wrong)
+
+
 def test_a_score_goes_with_its_bird():
     np.testing.assert_array_equal(make().score, make().present)  # full trust where nobody says otherwise
     scored = make(score=[[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])

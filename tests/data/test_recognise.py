@@ -2,15 +2,19 @@
 
 import json
 import os
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from support.films import encode
 from support.tracking_files import T, write_analysis, write_csv, write_project, write_table
 
 from jaxfit.data.formats import recognise
+from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.errors import InputError
+from jaxfit.video.reader import probe_video
 from jaxfit.video.writer import VideoWriter
 
 
@@ -38,6 +42,21 @@ def test_size_of_a_video_beside_the_file(tmp_path):
     for path in paths:
         assert read_observations(path).image_size_px[0].tolist() == [120, 100]
         assert read_observations(path).file_name[1] == "clip.mp4#1"
+
+
+def test_times_come_from_the_video(tmp_path):
+    """The video has a variable frame rate and begins late."""
+    ticks = [5, 9, 60, 64]
+    encode(tmp_path / "clip.mkv", count=4, ticks=ticks)
+    for path, size in ((write_csv(tmp_path / "clipDLC.csv"), None), (write_table(tmp_path / "clip.h5"), (128, 80))):
+        observed = read_observations(path, size_px=size)
+        np.testing.assert_allclose(observed.timestamp_s, np.array(ticks)[observed.frame_index] / 100, atol=1e-3)
+        assert observed.fps == probe_video(tmp_path / "clip.mkv").fps
+    write_coco(replace(observed, timestamp_s=None, fps=None), tmp_path / "birds.json")
+    assert np.isnan(read_observations(tmp_path / "birds.json").timestamp_s).all()
+    np.testing.assert_array_equal(
+        read_observations(tmp_path / "birds.json", tmp_path / "clip.mkv").timestamp_s, observed.timestamp_s
+    )
 
 
 def test_a_video_that_does_not_fit(tmp_path):

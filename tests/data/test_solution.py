@@ -46,6 +46,8 @@ def make(**changes):
         "joint_names": BIRD.joint_names,
         "loss": {"keypoints": [1.5, math.nan], "mask": np.array([2.5, 3])},
         "status": ["ok", "no usable frame"],
+        "timestamp_s": [0.2, np.nan, 0.36],
+        "fps": 25.0,
     }
     return Solution(**values | changes)
 
@@ -55,7 +57,7 @@ def assert_same(a: Solution, b: Solution):
         if isinstance(value, np.ndarray):
             np.testing.assert_array_equal(value, getattr(b, name), err_msg=name)
             assert value.dtype == getattr(b, name).dtype, name
-    for name in ("focal_px", "crop_px", "keypoint_names", "joint_names"):
+    for name in ("focal_px", "crop_px", "keypoint_names", "joint_names", "fps"):
         assert getattr(a, name) == getattr(b, name), name
     assert list(a.loss) == list(b.loss)
     for term in a.loss:
@@ -64,7 +66,7 @@ def assert_same(a: Solution, b: Solution):
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"loss": {}}, {"global_orient": np.full((N, T, 3), np.nan), "valid": np.zeros((N, T), bool)}],
+    [{}, {"loss": {}, "fps": None}, {"global_orient": np.full((N, T, 3), np.nan), "valid": np.zeros((N, T), bool)}],
     ids=["plain", "no terms", "failed"],
 )
 def test_what_is_saved_is_loaded(tmp_path, changes):
@@ -178,6 +180,10 @@ def rewrite(folder, **changes):
         ({"joint_names": np.arange(J)}, "joint_names must be of type str, not int64"),
         ({"loss_terms": np.array(["a"])}, "loss_terms must have shape .* L is 2 in loss"),
         ({"loss": np.ones((5, 2))}, "loss must have shape .* N is 2"),
+        ({"timestamp_s": np.ones(T + 1)}, "timestamp_s must have shape .* T is 3"),
+        ({"timestamp_s": np.full(T, np.inf)}, "timestamp_s must be finite, or NaN"),
+        ({"fps": np.array("x")}, "fps must be of type float64"),
+        ({"fps": np.array(-1.0)}, "fps must be positive and finite"),
         ({"focal_px": np.array("x")}, "focal_px must be of type float64"),
         ({"status": np.array([None, {}], dtype=object)}, "status holds Python objects; jaxfit loads no pickles"),
     ],
@@ -199,6 +205,16 @@ def test_a_folder_of_an_older_version_is_rejected_by_its_version(tmp_path):
     rewrite(tmp_path / "out", format_version=np.int64(1), focal=np.float64(2167), **older, **newer)
     with pytest.raises(InputError, match=r"poses\.npz: format_version is 1, older than this jaxfit reads \(2\)"):
         load_solution(tmp_path / "out")
+
+
+def test_a_folder_without_times_is_read(tmp_path):
+    """Version 2 of the file has no times."""
+    save_solution(make(), BIRD, "", {}, tmp_path / "out")
+    rewrite(tmp_path / "out", format_version=np.int64(2), timestamp_s=None, fps=None)
+    solution, _ = load_solution(tmp_path / "out")
+    assert_same(solution, make(timestamp_s=None, fps=None))
+    assert np.isnan(solution.timestamp_s).all()
+    assert solution.fps is None
 
 
 def test_a_model_that_is_not_the_poses_is_refused(tmp_path):

@@ -210,3 +210,39 @@ def test_networks_that_cannot_be_opened(config, words):
 def test_an_unknown_tracker(video):
     with pytest.raises(InputError, match=r"tracker hungarian.*iou"):
         tracked(video, TrackConfig(tracker=TrackerConfig("hungarian")))
+
+
+class Monitor:
+    """Reports one distance for each call of the network since the last question."""
+
+    def __init__(self):
+        self.distances = [99.0]  # of an earlier video
+
+    def take(self):
+        taken, self.distances = np.array(self.distances), []
+        return taken
+
+
+def test_trust_uses_the_distances_of_this_video(video):
+    segmenter = TrueSegmenter(FOOTAGE)
+    segmenter.activations = Monitor()
+
+    class Distant(TrueKeypoints):
+        activations = Monitor()
+
+        def __call__(self, frame, instances):
+            self.activations.distances += [7.0] * len(instances)
+            segmenter.activations.distances.append(0.25)
+            return super().__call__(frame, instances)
+
+    judged = run_tracking(video, TrackConfig(min_track_frames=2), segmenter, Distant(FOOTAGE)).trust
+    assert (judged.signals.frame_distance, judged.signals.bird_distance) == (0.25, 7.0)
+    assert judged.level == "low"
+    assert any("keypoint network" in reason for reason in judged.reasons)
+
+
+def test_trust_without_statistics_or_birds(video):
+    tracking, _, _ = tracked(video)
+    assert tracking.trust.level == "high"
+    nothing, _, _ = tracked(video, missed=[(t, n) for t in range(FRAMES) for n in range(BIRDS)])
+    assert nothing.trust.reasons == ("no bird was tracked",)

@@ -1,5 +1,6 @@
 """Small videos, and damage to their files."""
 
+import struct
 import threading
 from fractions import Fraction
 
@@ -46,21 +47,62 @@ def number_in(picture):
     return sum(1 << bit for bit in range(BITS) if centres[bit] > 127)
 
 
-def encode(path, codec="libx264", count=100, gop=20, ticks=None, options=None, b_frames=None):
-    """Write a video of `numbered` pictures at 25 frames per second, or at times `ticks` in units of 1/100 s."""
+def encode(
+    path, codec="libx264", count=100, gop=20, ticks=None, options=None, b_frames=None, turn=None, picture_of=numbered
+):
+    """Write a video of `numbered` pictures at 25 frames per second, or at times `ticks` in units of 1/100 s.
+
+    `turn` is the rotation of the display matrix in degrees counterclockwise, and whether to mirror x and y after it.
+    """
     with av.open(str(path), "w") as container:
         stream = container.add_stream(codec, rate=25 if ticks is None else 100, options=options or {})
         stream.width, stream.height, stream.pix_fmt = BITS * CELL_PX, 64 + CELL_PX, "yuv420p"
         stream.codec_context.gop_size = gop
+        if turn is not None:
+            stream.set_display_rotation(*turn)
         stream.codec_context.thread_count = 1
         if b_frames is not None:
             stream.codec_context.max_b_frames = b_frames
         for i in range(count):
-            picture = av.VideoFrame.from_ndarray(numbered(i), format="bgr24")
+            picture = av.VideoFrame.from_ndarray(picture_of(i), format="bgr24")
             picture.pts, picture.time_base = (i, Fraction(1, 25)) if ticks is None else (ticks[i], Fraction(1, 100))
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
     return path
+
+
+def solid(path, colours, pix_fmt, matrix, full_range, codec="libx264", **settings):
+    """Write one lossless picture for every colour (Y, U, V in the depth of the format), with a tag for the matrix."""
+    with av.open(str(path), "w") as container:
+        options = {"qp": "0"} if codec == "libx264" else {"x265-params": "lossless=1:log-level=error"}
+        stream = container.add_stream(codec, rate=25, options=options)
+        stream.width, stream.height, stream.pix_fmt = 64, 64, pix_fmt
+        stream.codec_context.color_range = 2 if full_range else 1
+        stream.codec_context.colorspace = matrix
+        for name, value in settings.items():
+            setattr(stream.codec_context, name, value)
+        dtype = np.uint16 if pix_fmt.endswith("10le") else np.uint8
+        for i, colour in enumerate(colours):
+            picture = av.VideoFrame(64, 64, pix_fmt)
+            for plane, value in zip(picture.planes, colour, strict=True):
+                plane.update(np.full(plane.buffer_size // np.dtype(dtype).itemsize, value, dtype).tobytes())
+            picture.pts, picture.time_base = i, Fraction(1, 25)
+            picture.color_range, picture.colorspace = 2 if full_range else 1, matrix
+            container.mux(stream.encode(picture))
+        container.mux(stream.encode(None))
+    return path
+
+
+def trim(path, first, count):
+    """Change the edit list of an MP4 film at 25 frames per second, so that players show `count` frames from `first`."""
+    content = bytearray(path.read_bytes())
+    edit, media = content.index(b"elst") + 4, content.index(b"mdhd") + 4
+    (ticks_per_s,) = struct.unpack_from(">I", content, media + 12)
+    _, begin = struct.unpack_from(">Ii", content, edit + 8)
+    struct.pack_into(
+        ">Ii", content, edit + 8, 40 * count, begin + first * ticks_per_s // 25
+    )  # the film has 1000 ticks/s
+    path.write_bytes(content)
 
 
 def packets(path):

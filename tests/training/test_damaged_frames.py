@@ -11,7 +11,8 @@ from support.mutations import damaged_arrays, damaged_bytes
 
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
-from jaxfit.training.scenes import HEIGHT, WIDTH, load_frames
+from jaxfit.training.labelled_frames import load_frames
+from jaxfit.training.scenes import HEIGHT, WIDTH
 
 K = len(MURRE_KEYPOINTS)
 LABELS = {
@@ -33,7 +34,7 @@ def folder(tmp_path):
     ("name", "value", "message"),
     [
         ("keypoints_px", np.full((1, 2, K, 2), np.nan, np.float32), "wrong position of a keypoint"),
-        ("visibility", np.full((1, 2, K), 3, np.uint8), "wrong visibility"),
+        ("visibility", np.full((1, 2, K), 4, np.uint8), "wrong visibility"),
         ("visibility", np.zeros((1, 2, K)), "wrong type of numbers"),
         ("pixels_per_unit", np.zeros(1, np.float32), "wrong scale"),
         ("pixels_per_unit", np.full(1, 1e30, np.float32), "wrong scale"),
@@ -55,7 +56,7 @@ def test_damaged_labels(folder):
         np.savez(file, **arrays)
         return file.getvalue()
 
-    with Isolated("jaxfit.training.scenes:load_frames") as reader:
+    with Isolated("jaxfit.training.labelled_frames:load_frames") as reader:
         assert reader(folder).kind == "success"
 
         @many_examples

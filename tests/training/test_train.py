@@ -12,9 +12,10 @@ from jaxfit.perception.onnx_model import OnnxModel  # noqa: E402
 from jaxfit.perception.segmentation import load_segmenter  # noqa: E402
 from jaxfit.training import keypoints, scenes, segmenter  # noqa: E402
 from jaxfit.training.augment import randomise_appearance  # noqa: E402
+from jaxfit.training.labelled_frames import LabelledFrames, load_frames  # noqa: E402
 from jaxfit.training.loop import Schedule  # noqa: E402
 from jaxfit.training.networks import FeaturePyramid  # noqa: E402
-from jaxfit.training.scenes import FRAMES_PER_SCENE, LabelledFrames, film_scenes, load_frames  # noqa: E402
+from jaxfit.training.scenes import FRAMES_PER_SCENE, film_scenes  # noqa: E402
 from jaxfit.training.train import train_network  # noqa: E402
 
 K = len(MURRE_KEYPOINTS)
@@ -99,7 +100,7 @@ def test_keypoint_targets():
     for i in range(12):
         sample = keypoints.draw_sample(np.random.default_rng(i), two_squares())
         position = sample.position
-        order = keypoints._OTHER_SIDE
+        order = list(keypoints._opposite(MURRE_KEYPOINTS))
         for candidate in (position, position[order]):
             steps = np.diff(candidate, axis=0)
             if np.ptp(steps, axis=0).max() < 1e-3:

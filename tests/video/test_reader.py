@@ -9,7 +9,7 @@ import pytest
 from support.films import COUNT, SIZE, encode, frames, number_in, numbered, overwrite, packets, reader_threads, write
 
 from jaxfit.errors import InputError
-from jaxfit.video import decoding
+from jaxfit.video import packets as packet_reading
 from jaxfit.video.reader import Frame, VideoInfo, probe_video, read_frames
 
 KINDS = {
@@ -35,12 +35,12 @@ def shown(monkeypatch):
     """The count of decoded pictures."""
     count = []
 
-    class Counting(decoding.Timeline):
+    class Counting(packet_reading.Timeline):
         def show(self, picture):
             count.append(1)
             super().show(picture)
 
-    monkeypatch.setattr(decoding, "Timeline", Counting)
+    monkeypatch.setattr(packet_reading, "Timeline", Counting)
     return count
 
 
@@ -56,7 +56,9 @@ def test_frame_numbers_do_not_depend_on_the_start(films, shown, warnings_so_far,
     reader = read_frames(films[name])
     every = list(reader)
     assert [number_in(frame.picture) for frame in every] == [frame.index for frame in every] == list(range(100))
-    np.testing.assert_allclose([frame.time_s for frame in every], np.arange(100) / 25)
+    # FFmpeg gives the first picture of an AVI file the decoding time 0, and B-frames delay its presentation
+    first_s = 1 / 25 if name == "b_frames.avi" else 0
+    np.testing.assert_allclose([frame.time_s for frame in every], first_s + np.arange(100) / 25)
     assert reader.info == VideoInfo(None if name.endswith(("mkv", "webm")) else 100, 25, (128, 80))
     for start in (1, 19, 20, 21, 58, 77, 81, 99):
         shown.clear()
@@ -80,7 +82,7 @@ def test_a_variable_frame_rate(tmp_path, name):
         assert (
             [number_in(frame.picture) for frame in read] == [frame.index for frame in read] == list(range(start, 100))
         )
-        np.testing.assert_allclose([frame.time_s for frame in read], (ticks[start:] - ticks[0]) / 100, atol=1e-3)
+        np.testing.assert_allclose([frame.time_s for frame in read], ticks[start:] / 100, atol=1e-3)
     assert not read_frames(tmp_path / name).damaged
 
 
@@ -133,7 +135,7 @@ def test_lost_packets_of_uneven_time(tmp_path):
     given = list(read_frames(tmp_path / "a.mkv"))
     last = given[-1]
     assert (last.index < 99, number_in(last.picture)) == (True, 99)
-    np.testing.assert_allclose(last.time_s, (ticks[99] - ticks[0]) / 100, atol=1e-3)
+    np.testing.assert_allclose(last.time_s, ticks[99] / 100, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", ["b_frames.mp4", "plain.avi", "vp9.webm"])

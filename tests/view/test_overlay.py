@@ -203,7 +203,9 @@ def test_long_results_are_posed_chunk_by_chunk(tmp_path):
     crop = np.repeat(still.crop[:1, :1], frames, 1).copy()
     crop[:, :, 0] += np.arange(frames)  # it walks to the right, a pixel a frame
     many["keypoints_px"] = many["keypoints_px"] + (crop - still.crop[:1, :1])[:, :, None, :2]
-    long = dataclasses.replace(still, **many, crop=crop, track_id=[4], frame_index=np.arange(frames), status=["ok"])
+    long = dataclasses.replace(
+        still, **many, crop=crop, track_id=[4], frame_index=np.arange(frames), status=["ok"], timestamp_s=None
+    )
     made = overlay(long, BIRD, film(tmp_path / "f.mp4", frames), tmp_path / "o.mp4")
     middles = [np.flatnonzero(changed(frame.astype(int)).sum(0) > 3).mean() for _, frame, _ in read_frames(made.video)]
     np.testing.assert_allclose(np.diff(middles), 1, atol=6)  # the number may change sides

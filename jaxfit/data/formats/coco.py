@@ -2,7 +2,9 @@
 
 The file is an object with
 
-- ``images``: ``id``, ``width``, ``height``, ``file_name``, ``frame_index`` (0 for photographs);
+- ``info``, optional: ``fps``, the mean frame rate of the video in frames per second;
+- ``images``: ``id``, ``width``, ``height``, ``file_name``, ``frame_index`` (0 for photographs), optionally
+  ``timestamp_s`` (presentation time of the frame in seconds);
 - ``categories``: ``id``, ``keypoints`` (names), optionally ``skeleton`` (pairs counted from 1, as COCO does;
   from 0 where a 0 occurs);
 - ``annotations``: ``image_id``, ``category_id``, ``track_id``, ``bbox`` [x, y, width, height] and
@@ -30,6 +32,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -43,6 +46,7 @@ from jaxfit.data.formats.coco_records import (
     Image,
     read_annotation,
     read_categories,
+    read_fps,
     read_images,
 )
 from jaxfit.data.formats.fields import Field, read_json
@@ -52,7 +56,7 @@ from jaxfit.data.tables import check_memory, observations_bytes
 from jaxfit.data.track_quality import track_quality
 from jaxfit.storage.files import write_whole
 
-__all__ = ["check_keypoints", "read_coco", "reorder_keypoints", "write_coco"]
+__all__ = ["check_keypoints", "coco_observations", "read_coco", "reorder_keypoints", "write_coco"]
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +75,11 @@ def read_coco(path: str | Path, video: Path | None = None) -> Observations:
     Raises:
         InputError: the file cannot be read, or its content is invalid; the message names file, field and remedy.
     """
-    root = complete_export(read_json(Path(path)), video)
+    return coco_observations(complete_export(read_json(Path(path)), video))
+
+
+def coco_observations(root: Field) -> Observations:
+    """Return the observations of the content of a COCO file; result and errors as ``read_coco``."""
     if not isinstance(root.value, dict):
         root.fail("must hold an object with images, categories and annotations", "give a COCO json")
     images = read_images(root["images"])
@@ -87,14 +95,16 @@ def read_coco(path: str | Path, video: Path | None = None) -> Observations:
         else:
             annotation["category_id"].fail(f"is {category!r}, which no category has", "add the category")
     if skipped:
-        _log.warning("%s: skipped %d annotations of categories without the keypoints of the bird", path, skipped)
+        _log.warning("%s: skipped %d annotations of categories without the keypoints of the bird", root.source, skipped)
         if not annotations:
             problem = f"hold no bird ({skipped} of other categories)"
             root["annotations"].fail(problem, "run detection on footage with a bird in it, or choose another file")
-    return _assemble(root, list(images.values()), categories, annotations)
+    return _assemble(root, list(images.values()), categories, annotations, read_fps(root))
 
 
-def _assemble(root: Field, images: list[Image], categories: Categories, found: list[Annotation]) -> Observations:
+def _assemble(
+    root: Field, images: list[Image], categories: Categories, found: list[Annotation], fps: float | None
+) -> Observations:
     first_image: dict[int, Image] = {}
     for image in images:
         first_image.setdefault(image.frame_index, image)
@@ -142,6 +152,8 @@ def _assemble(root: Field, images: list[Image], categories: Categories, found: l
         amodal_masks={cell: a.amodal_rle for cell, a in holder.items() if a.amodal_rle is not None},
         occluded=keypoints[..., 3] > 0,
         score=score,
+        timestamp_s=np.array([first_image[f].timestamp_s for f in frames]),
+        fps=fps,
         own_images={
             cell: (a.image.file_name, a.image.width, a.image.height)
             for cell, a in holder.items()
@@ -159,16 +171,19 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
     Args:
         observations: the observations.
         path: the file; an existing file is replaced.
-        info: COCO's ``info`` about the file: ``description``, ``license``, …
+        info: COCO's ``info`` about the file: ``description``, ``license``, …; ``fps`` is added.
 
     Raises:
         InputError: the file cannot be written.
     """
     images: dict[tuple, dict[str, Any]] = {}
+    timestamp_s = cast(np.ndarray, observations.timestamp_s).tolist()
 
     def image_id(t: int, file_name: str, width: int, height: int) -> int:
         image = {"id": len(images), "width": width, "height": height, "file_name": file_name}
         image["frame_index"] = int(observations.frame_index[t])
+        if math.isfinite(timestamp_s[t]):
+            image["timestamp_s"] = timestamp_s[t]
         return images.setdefault((t, file_name, width, height), image)["id"]
 
     for t, (width, height) in enumerate(observations.image_size_px.tolist()):
@@ -215,8 +230,9 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         "annotations": annotations,
         "tracks": tracks,
     }
-    if info:
-        content = {"info": dict(info), **content}
+    about = dict(info or {}) | ({} if observations.fps is None else {"fps": observations.fps})
+    if about:
+        content = {"info": about, **content}
     write_whole(path, json.dumps(content, allow_nan=False).encode())
 
 

@@ -5,8 +5,8 @@ keys before the file is read:
 
 - The name of a picture gives the number of its frame (`frame_000012.png` → 12), as `picture_names` describes. Other
   pictures are photographs: `frame_index` is 0, and every bird is a track of its own.
-- CVAT stores the track in `attributes.track_id`. Birds without a track are one track if no picture holds two of
-  them; otherwise every one is a track of its own.
+- CVAT stores the track in `attributes.track_id`, or in `attributes.bird` for the label that `cvat` writes. Birds
+  without a track are one track if no picture holds two of them; otherwise every one is a track of its own.
 - A bird without a box with an area has the box of its keypoints. Birds without a keypoint, which CVAT writes where a
   track is outside the picture, are removed.
 """
@@ -14,6 +14,7 @@ keys before the file is read:
 from __future__ import annotations
 
 import logging
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -105,5 +106,9 @@ def _with_tracks(annotations: list[dict[str, Any]], photographs: bool, source: P
 
 def _track(annotation: dict[str, Any]) -> int | None:
     attributes = annotation.get("attributes")
-    track = attributes.get("track_id") if isinstance(attributes, dict) else None
+    if not isinstance(attributes, dict):
+        return None
+    track, text = attributes.get("track_id"), attributes.get("bird")
+    if track is None and isinstance(text, str) and re.fullmatch(r"[0-9]{1,15}", text):
+        return int(text)
     return track if type(track) is int and abs(track) < 2**62 else None

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.rle import read_segmentation
-from jaxfit.limits import IMAGE_SIDE_PX, KEYPOINTS
+from jaxfit.limits import FRAMES_PER_S, IMAGE_SIDE_PX, KEYPOINTS, SECONDS_PER_FRAME, TIMESTAMP_S
 
-__all__ = ["Annotation", "Categories", "Image", "read_annotation", "read_categories", "read_images"]
+__all__ = ["Annotation", "Categories", "Image", "read_annotation", "read_categories", "read_fps", "read_images"]
 
 _TRACK_REMEDY = "give every annotation the track_id of its bird; for photographs, a unique number"
 _FRAME_REMEDY = "give every image the number of its frame in the video; for photographs, 0"
@@ -26,6 +27,8 @@ class Image:
     width: int
     height: int
     file_name: str
+    timestamp_s: float = field(default=math.nan, compare=False)
+    """Presentation time in seconds; NaN if unknown."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +71,28 @@ def read_images(images: Field) -> dict[int | str, Image]:
             width=image["width"].integer(1, IMAGE_SIDE_PX),
             height=image["height"].integer(1, IMAGE_SIDE_PX),
             file_name=image["file_name"].text(),
+            timestamp_s=_timestamp(image),
         )
     if not found:
         images.fail("is empty", "add the images of the annotations")
     return found
+
+
+def _timestamp(image: Field) -> float:
+    if not image.has("timestamp_s"):
+        return math.nan
+    return image["timestamp_s"].number(-TIMESTAMP_S, TIMESTAMP_S, "give seconds, or remove timestamp_s")
+
+
+def read_fps(root: Field) -> float | None:
+    """Return ``info.fps``, the mean frame rate of the video in frames per second; None if the file lacks the rate.
+
+    Raises:
+        InputError: the rate is not a number, or is absurd.
+    """
+    if not isinstance(root.value.get("info"), dict) or not root["info"].has("fps"):
+        return None
+    return root["info"]["fps"].number(1 / SECONDS_PER_FRAME, FRAMES_PER_S, "give frames per second, or remove fps")
 
 
 @dataclass(frozen=True)

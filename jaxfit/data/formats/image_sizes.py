@@ -74,10 +74,9 @@ def image_sizes(
                 problem = f"says {stored[0]}×{stored[1]}, but a picture has {other[0]}×{other[1]} pixels"
                 raise InputError(source, problem, "give the pictures in the size that was labelled")
             return ImageSizes(sizes)
-    if stored is not None:
-        return ImageSizes(np.array(stored))
-    if given is not None:
-        return ImageSizes(np.array(given))
+    known = stored if stored is not None else given
+    if known is not None:
+        return ImageSizes(np.array(known), None if pictures else _video_of_size(known, source, stored_video))
     found = _video_beside(source, stored_video) if pictures is None else None
     if found is not None:
         info = probe_video(found)
@@ -105,14 +104,15 @@ def check_video(observations: Observations, source: Path, video: Path) -> None:
 def _picture_sizes(pictures: Sequence[str], source: Path) -> np.ndarray | None:
     """Return the (T, 2) sizes of the pictures; None if no picture is beside the file.
 
-    The project folder of DeepLabCut holds `labeled-data/VIDEO/`, which holds the pictures and the file of labels. A
-    missing picture has the size of the others.
+    The project folder of DeepLabCut holds `labeled-data/VIDEO/`, which holds the pictures and the file of labels.
+    Pictures may also lie in the folder `images` beside the file. A missing picture has the size of the others.
     """
     folders = [source.parent, *source.absolute().parents[1:4]]
     sizes = np.zeros((len(pictures), 2), np.int64)
     for t, picture in enumerate(pictures):
         name = picture.replace("\\", "/")
-        places = [folder / name for folder in folders] + [source.parent / Path(name).name]
+        places = [folder / name for folder in folders]
+        places += [source.parent / Path(name).name, source.parent / "images" / Path(name).name]
         file = next(filter(_is_file, places), None)
         image = None if file is None else read_picture(file, grey=True)
         if image is not None:
@@ -143,6 +143,15 @@ def _video_beside(source: Path, stored: str | None) -> Path | None:
         if file.suffix.lower() in _VIDEO_SUFFIXES and source.name.startswith(file.stem) and _is_file(file)
     ]
     return max(videos, key=lambda file: len(file.stem), default=None)
+
+
+def _video_of_size(size_px: tuple[int, int], source: Path, stored: str | None) -> Path | None:
+    """Return the video beside a file if it has the size of the images; the file does not need the video."""
+    found = _video_beside(source, stored)
+    try:
+        return found if found is not None and probe_video(found).size_px == size_px else None
+    except (InputError, OSError):
+        return None
 
 
 def _is_file(path: Path) -> bool:

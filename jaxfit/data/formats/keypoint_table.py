@@ -12,6 +12,7 @@ from jaxfit.data.boxes import box_of_keypoints
 from jaxfit.data.formats.fields import LARGEST_POSITION_PX
 from jaxfit.data.formats.image_sizes import image_sizes
 from jaxfit.data.formats.picture_names import frame_numbers
+from jaxfit.data.formats.video_times import add_times
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError, one_line, shortened
 from jaxfit.limits import CONFIDENCE, NAME_CHARACTERS, TABLE_BIRDS, TABLE_PICTURES, TABLE_VALUES
@@ -71,8 +72,8 @@ def table_observations(
     Args:
         table: the keypoints.
         source: the file of the table.
-        video: the video or folder of pictures of the keypoints, for the size of the images. None: the size is that of
-            the file, of its pictures, or of a video beside the file.
+        video: the video or folder of pictures of the keypoints, for the size of the images and the times of the frames.
+            None: the size is that of the file, of its pictures, or of a video beside the file.
         size_px: width and height of the images of a file that stores none.
 
     Raises:
@@ -118,7 +119,8 @@ def table_observations(
         _log.warning("%s: %d birds become tracks: %s", source, len(table.bird_names), shortened(one_line(tracks), 150))
     kept = np.any(present, axis=1)  # a bird without any keypoint is no track
     parts = {name: array[kept] for name, array in parts.items()}
-    return Observations(track_id[kept], numbers, **parts, **_common(table, size, names))
+    observations = Observations(track_id[kept], numbers, **parts, **_common(table, size, names))
+    return add_times(observations, sizes.video)
 
 
 def _common(table: KeypointTable, size: np.ndarray, names: np.ndarray) -> dict:

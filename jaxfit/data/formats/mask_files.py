@@ -28,7 +28,7 @@ from jaxfit.limits import FRAME_DIGITS, MASKS_PER_PICTURE
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.video.pictures import image_files, read_picture
 
-__all__ = ["add_masks"]
+__all__ = ["add_masks", "masks_of_picture"]
 
 _COVERED = 0.3
 """Least fraction of a bird's keypoints that its mask covers, weighted by confidence; another bird may hide the rest."""
@@ -146,12 +146,22 @@ def _folder_masks(observations: Observations, source: Path) -> _Masks:
         picture = read_picture(file, grey=True)
         if picture is None:
             raise InputError(file, "is no readable picture", "write the picture again, or remove it")
-        return _masks_of_picture(picture, file, int(observations.present[:, t].sum()) > 1)
+        return masks_of_picture(picture, file, int(observations.present[:, t].sum()) > 1)
 
     return masks_of
 
 
-def _masks_of_picture(picture: np.ndarray, file: Path, several_birds: bool) -> list[np.ndarray]:
+def masks_of_picture(picture: np.ndarray, file: Path, several_birds: bool) -> list[np.ndarray]:
+    """Return the masks of a picture of masks: one for every grey value except 0.
+
+    Args:
+        picture: (H, W) grey values.
+        file: the file of the picture.
+        several_birds: whether a picture with one value holds one mask for every connected region.
+
+    Raises:
+        InputError: the picture holds too many connected regions.
+    """
     values = np.flatnonzero(np.bincount(picture.reshape(-1), minlength=256)[1:]) + 1
     if len(values) > _MOST_VALUES or file.suffix.lower() in (".jpg", ".jpeg", ".webp"):
         picture, values = np.where(picture >= 128, 255, 0).astype(np.uint8), np.array([255])

@@ -7,18 +7,23 @@ from pathlib import Path
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.deeplabcut.csv_file import read_deeplabcut_csv
 from jaxfit.data.formats.deeplabcut.hdf5_file import find_pandas_table, read_deeplabcut_hdf5
+from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.hdf5 import HDF5_SIGNATURE, open_hdf5
 from jaxfit.data.formats.image_sizes import check_video
 from jaxfit.data.formats.keypoint_table import KeypointTable, table_observations
+from jaxfit.data.formats.label_studio import read_label_studio
 from jaxfit.data.formats.sleap.analysis import read_sleap_analysis
 from jaxfit.data.formats.sleap.project import read_sleap_project
+from jaxfit.data.formats.video_times import add_times
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.storage.reading import open_file
 
 __all__ = ["read_observations"]
 
-_FORMATS = "give COCO json, DeepLabCut or Lightning Pose .csv, DeepLabCut .h5, SLEAP .slp or .analysis.h5"
+_FORMATS = (
+    "give COCO or Label Studio json, DeepLabCut or Lightning Pose .csv, DeepLabCut .h5, SLEAP .slp or .analysis.h5"
+)
 
 
 def read_observations(
@@ -33,7 +38,8 @@ def read_observations(
     Args:
         path: the file.
         video: the video, or folder of pictures, of the observations. It gives the size of the images where the file
-            does not store the size, and must fit to the file. None: as the file and its folder say.
+            does not store the size, and the times of the frames where the file does not store times. It must fit to the
+            file. None: as the file and its folder say.
         size_px: width and height of the images, in place of `video`, for a file that does not store the size.
 
     Raises:
@@ -46,10 +52,13 @@ def read_observations(
     if start.startswith(HDF5_SIGNATURE):
         return table_observations(_read_hdf5(path, video), path, video, size_px)
     text = start.removeprefix(b"\xef\xbb\xbf").lstrip()
-    if text[:1] in (b"{", b"[") or path.suffix.lower() == ".json":
+    if text[:1] == b"[":
+        return table_observations(read_label_studio(read_json(path)), path, video, size_px)
+    if text[:1] == b"{" or path.suffix.lower() == ".json":
         observations = read_coco(path, video)
         if video is not None:
             check_video(observations, path, video)
+            observations = add_times(observations, video)
         return observations
     if text[:6].lower() == b"scorer" or path.suffix.lower() == ".csv":
         return table_observations(read_deeplabcut_csv(path), path, video, size_px)

@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Num, UInt8
 
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, MURRE_KEYPOINTS
+from jaxfit.perception.activations import OUTPUT, activation_monitor
+from jaxfit.perception.calibration import CONFIDENCE_KEY, read_curve
 from jaxfit.perception.instances import Instance
-from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX, crop_bird
+from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX, Crop, crop_bird
 from jaxfit.perception.keypoints.inputs import KeypointInput, read_input
 from jaxfit.perception.keypoints.metadata import read_metadata
 from jaxfit.perception.keypoints.output_layouts import HeatmapLayout, SimccLayout, detect_layout
@@ -44,6 +46,8 @@ class OnnxKeypoints:
         self._pad_px, self._dilate_px = pad_px, dilate_px
         self._batch = network_input.batch or batch
         self._shapes = shapes
+        self.activations = activation_monitor(model)
+        self.curve = read_curve(model, CONFIDENCE_KEY)
 
     def __call__(
         self, frame: UInt8[np.ndarray, "H W 3"], instances: Sequence[Instance]
@@ -51,21 +55,31 @@ class OnnxKeypoints:
         """Detect keypoints, as `KeypointDetector` describes."""
         K = len(self.keypoint_names)
         points_px, confidence = np.zeros((len(instances), K, 2), np.float32), np.zeros((len(instances), K), np.float32)
-        width, height = self._input.size_px
         for start in range(0, len(instances), self._batch):
-            birds = instances[start : start + self._batch]
-            batch = np.zeros((self._input.batch or len(birds), height, width, 3), np.uint8)
-            crops = []
-            for i, bird in enumerate(birds):
-                batch[i], crop = crop_bird(frame, bird, (width, height), self._pad_px, self._dilate_px)
-                crops.append(crop)
-            outputs = self._model(self._input.array(batch))
-            self._model.check_outputs(outputs, {name: (len(batch), *shape) for name, shape in self._shapes.items()})
+            array, crops = self.network_input(frame, instances[start : start + self._batch])
+            outputs = self._model(array)
+            self._model.check_outputs(outputs, {name: (len(array), *shape) for name, shape in self._shapes.items()})
+            if self.activations is not None:
+                self.activations.add(outputs, len(crops))
             crop_points_px, crop_confidence = self._layout(outputs)
+            if self.curve is not None:
+                crop_confidence = self.curve(crop_confidence)
             for i, crop in enumerate(crops):
                 points_px[start + i] = crop.to_image(crop_points_px[i])
                 confidence[start + i] = crop_confidence[i]
         return points_px, confidence
+
+    def network_input(
+        self, frame: UInt8[np.ndarray, "H W 3"], birds: Sequence[Instance]
+    ) -> tuple[Num[np.ndarray, "N _ _ _"], list[Crop]]:
+        """Return the input of the network for the birds of a frame, and their crops; a fixed batch is filled with 0."""
+        width, height = self._input.size_px
+        batch = np.zeros((self._input.batch or len(birds), height, width, 3), np.uint8)
+        crops = []
+        for i, bird in enumerate(birds):
+            batch[i], crop = crop_bird(frame, bird, (width, height), self._pad_px, self._dilate_px)
+            crops.append(crop)
+        return self._input.array(batch), crops
 
 
 def load_keypoint_detector(
@@ -99,7 +113,9 @@ def load_keypoint_detector(
     network_input = read_input(model, metadata)
     width, height = network_input.size_px
     outputs = model(network_input.array(np.zeros((network_input.batch or 1, height, width, 3), np.uint8)))
-    outputs = {name: value for name, value in outputs.items() if np.asarray(value).dtype.kind in "fiub"}
+    outputs = {
+        name: value for name, value in outputs.items() if name != OUTPUT and np.asarray(value).dtype.kind in "fiub"
+    }
     layout, count = detect_layout(model, outputs, kind, network_input, metadata)
     return OnnxKeypoints(
         model,

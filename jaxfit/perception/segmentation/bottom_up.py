@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from jaxfit.data.masks import box_of_mask
 from jaxfit.errors import InputError
 from jaxfit.limits import INSTANCES
+from jaxfit.perception.activations import activation_monitor
 from jaxfit.perception.instances import Instance, collect_instances
 from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation.network import SegmentationNetwork
@@ -64,6 +65,7 @@ class BottomUp(SegmentationNetwork):
             remedy = f"export it with a multiple of {MULTIPLE} pixels, at most {LARGEST_SIDE_PX}"
             raise InputError(self._model.path, f"its metadata `longer_side` is {text[:40]!r}", remedy)
         self._longer_side_px = int(text)
+        self.activations = activation_monitor(self._model)
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
         names_by_index = super()._all_classes(names)
@@ -79,8 +81,8 @@ class BottomUp(SegmentationNetwork):
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
         """Segment a frame, as `Segmenter` describes."""
         frame_px = frame.shape[1], frame.shape[0]
-        placement = Placement.letterboxed(frame_px, self._input_px(frame_px), centred=False)
-        outputs = self._model(self._input.array(_network_picture(frame, placement)))
+        array, placement = self.network_input(frame)
+        outputs = self._model(array)
         shape = (1, 1, "h", "w")
         self._model.check_outputs(outputs, {"foreground": shape, "centre": shape, "offset": (1, 2, "h", "w")})
         foreground, centre = (outputs[name][0, 0].astype(np.float32, copy=False) for name in ("foreground", "centre"))
@@ -89,6 +91,8 @@ class BottomUp(SegmentationNetwork):
         if len(peaks) > MOST_PEAKS:
             problem = f"gives {len(peaks)} centres of birds in one frame"
             raise InputError(self._model.path, problem, "give another network")
+        if self.activations is not None:
+            self.activations.add(outputs, 1)
         assignment = _assign_cells(foreground, outputs["offset"][0] * OFFSET_UNIT_PX, peaks, cell_px)
         instances = (
             self._instance(foreground, assignment == n, float(centre[row, column]), placement)
@@ -96,6 +100,12 @@ class BottomUp(SegmentationNetwork):
         )
         found = collect_instances(self._model.path, instances, frame_px)
         return sorted(found, key=lambda instance: -instance.score)
+
+    def network_input(self, frame: UInt8[np.ndarray, "H W 3"]) -> tuple[Float[np.ndarray, "1 3 h w"], Placement]:
+        """Return the input of the network for a frame, and the place of the frame in the input."""
+        frame_px = frame.shape[1], frame.shape[0]
+        placement = Placement.letterboxed(frame_px, self._input_px(frame_px), centred=False)
+        return self._input.array(_network_picture(frame, placement)), placement
 
     def _input_px(self, frame_px: tuple[int, int]) -> tuple[int, int]:
         """Return width and height of the input; a variable size has the frame's proportions, in multiples of 32."""

@@ -18,6 +18,7 @@ class _Frame(NamedTuple):
     frame_index: int
     file_name: str
     size_px: tuple[int, int]
+    time_s: float | None
 
 
 class _TrackedInstance(NamedTuple):
@@ -37,10 +38,13 @@ class TrackRecorder:
     Args:
         keypoint_names: K names in the order of the detector's output.
         skeleton: pairs of keypoint indices that a drawing connects.
+        fps: mean frame rate of the video in frames per second; None if unknown.
     """
 
-    def __init__(self, keypoint_names: Sequence[str], skeleton: Sequence[tuple[int, int]] = ()):
-        self._names, self._skeleton = tuple(keypoint_names), tuple(skeleton)
+    def __init__(
+        self, keypoint_names: Sequence[str], skeleton: Sequence[tuple[int, int]] = (), fps: float | None = None
+    ):
+        self._names, self._skeleton, self._fps = tuple(keypoint_names), tuple(skeleton), fps
         self._frames: list[_Frame] = []
         self._tracks: dict[int, list[_TrackedInstance]] = {}
 
@@ -53,6 +57,7 @@ class TrackRecorder:
         identities: Sequence[int | None],
         keypoints_px: Float[np.ndarray, "M K 2"],
         confidence: Float[np.ndarray, "M K"],
+        time_s: float | None = None,
     ) -> None:
         """Add one frame; a frame without instances is added too, a damaged frame is not.
 
@@ -64,6 +69,7 @@ class TrackRecorder:
             identities: the tracker's identity of each instance; instances with None are skipped.
             keypoints_px: x, y in image pixels.
             confidence: within [0, 1]; 0 where a keypoint was not detected.
+            time_s: presentation time of the frame in seconds; None if unknown.
 
         Raises:
             ValueError: `frame_index` does not increase, an identity occurs twice, or an array has the wrong shape.
@@ -80,7 +86,7 @@ class TrackRecorder:
                 f"not {np.shape(keypoints_px)} and {np.shape(confidence)}"
             )
         t = len(self._frames)
-        self._frames.append(_Frame(int(frame_index), file_name, size_px))
+        self._frames.append(_Frame(int(frame_index), file_name, size_px, time_s))
         for instance, identity, points_px, point_confidence in zip(
             instances, identities, keypoints_px, confidence, strict=True
         ):
@@ -118,4 +124,6 @@ class TrackRecorder:
             skeleton=self._skeleton,
             masks=masks,
             score=score,
+            timestamp_s=np.array([np.nan if frame.time_s is None else frame.time_s for frame in self._frames], float),
+            fps=self._fps,
         )

@@ -32,6 +32,8 @@ class Video(NamedTuple):
     """Path as SLEAP stores it; None for pictures inside the project file."""
     size_px: tuple[int, int] | None
     """Width and height, if the project stores them."""
+    pictures: tuple[str, ...] | None = None
+    """Paths of the pictures of a video that is a list of pictures; None for a video file."""
 
     @property
     def name(self) -> str:
@@ -117,6 +119,7 @@ def _video(root: Hdf5Group, index: int, entry: Field) -> Video:
         (each["filename"].value for each in (backend, entry) if "filename" in each),
         None,
     )
+    pictures = _pictures(backend) or _pictures(entry)
     file = file if isinstance(file, str) and file != "." else None
     shape = backend["shape"].value if "shape" in backend else None
     size = (shape[2], shape[1]) if isinstance(shape, list) and len(shape) == 4 else None
@@ -126,8 +129,17 @@ def _video(root: Hdf5Group, index: int, entry: Field) -> Video:
     if size is None and isinstance(dataset, str) and file is None:
         size = _embedded_size(root, dataset)
     if size is None or not all(type(side) is int and side > 0 for side in size):
-        return Video(index, file, None)
-    return Video(index, file, size)
+        return Video(index, file, None, pictures)
+    return Video(index, file, size, pictures)
+
+
+def _pictures(entry: Field) -> tuple[str, ...] | None:
+    """Return the paths of pictures, which stand in `filenames` or, as a list, in `filename`."""
+    for key in ("filenames", "filename"):
+        value = entry[key].value if key in entry else None
+        if isinstance(value, list) and value:
+            return tuple(path.text() for path in entry[key])
+    return None
 
 
 def _embedded_size(root: Hdf5Group, dataset: str) -> Any:

@@ -79,12 +79,14 @@ def read_sleap_project(root: Hdf5Group, path: Path, video: Path | None = None) -
         if kind == _PREDICTED:
             confidence[cell] = points["score"][index]
             score[cell] = instances["score"][at]
+    numbers = frames["frame_idx"][rows]
     return KeypointTable(
         skeleton.names,
         names,
         keypoints,
         confidence,
-        frame_index=frames["frame_idx"][rows],
+        frame_index=numbers if chosen.pictures is None else None,
+        pictures=None if chosen.pictures is None else _pictures(chosen.pictures, numbers, path),
         score=score,
         skeleton=skeleton.edges,
         size_px=chosen.size_px,
@@ -134,6 +136,20 @@ def _choose_video(
             raise InputError(path, f"holds birds of {len(found)} videos: {names}", "give one of them by --video")
         return named[0]
     return found[0]
+
+
+def _pictures(pictures: tuple[str, ...], numbers: np.ndarray, path: Path) -> tuple[str, ...]:
+    """Return the pictures of frames, whose numbers are positions in the list of pictures.
+
+    Pictures of one folder are named without the folder, because SLEAP stores long absolute paths.
+    """
+    wrong = numbers[(numbers < 0) | (numbers >= len(pictures))]
+    if len(wrong):
+        problem = f"has frame {wrong[0]}, but its video is a list of {len(pictures)} pictures, counted from 0"
+        raise InputError(path, problem, "save the file again")
+    named = [pictures[number].replace("\\", "/").rpartition("/") for number in numbers.tolist()]
+    one_folder = len({folder for folder, _, _ in named}) == 1
+    return tuple(name if one_folder else folder + slash + name for folder, slash, name in named)
 
 
 def _skeleton(root: Hdf5Group, instances: dict[str, np.ndarray], path: Path) -> Skeleton:

@@ -1,0 +1,1 @@
+"""Choice of the frames of a video that a person should label."""

@@ -1,0 +1,160 @@
+"""Calibration of the confidences of a network on pictures with known birds, stored in the ONNX file.
+
+The module needs the package `onnx`, but not PyTorch. `jaxfit.perception.calibration` describes the curves and reads
+them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.optimize import isotonic_regression, linear_sum_assignment
+
+from jaxfit.data.masks import box_of_mask
+from jaxfit.errors import InputError
+from jaxfit.perception.calibration import CONFIDENCE_KEY, Curve
+from jaxfit.perception.instances import Instance, KeypointDetector, Segmenter
+from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.training.onnx_metadata import set_metadata
+
+__all__ = ["LabelledPicture", "Outcomes", "calibrate_keypoints", "fit_curve", "keypoint_outcomes", "store_curve"]
+
+RIGHT = 0.05
+"""Largest error of a keypoint that is right, as a share of the longer side of the bird's box."""
+MIN_IOU = 0.5
+"""Least IoU of a detected and a true bird that are the same bird."""
+RANGES = 20
+"""Number of equal ranges of values, each of which gives at most one point of a curve."""
+MIN_IN_RANGE = 50
+"""A range with fewer detections is merged with the next range."""
+MIN_OUTCOMES = 200
+"""Least number of detections for a curve."""
+
+
+class LabelledPicture(NamedTuple):
+    """A picture with N known birds, as a frame of the training data."""
+
+    picture: UInt8[np.ndarray, "H W 3"]
+    """Blue, green, red."""
+    owner: UInt8[np.ndarray, "H W"]
+    """Number of the bird of each pixel, from 1; 0 for no bird."""
+    keypoints_px: Float[np.ndarray, "N K 2"]
+    """x, y in pixels, in the order of the network's output."""
+    visibility: UInt8[np.ndarray, "N K"]
+    """2 if the keypoint is visible, 1 if it is hidden, 0 if its position in the picture is unknown."""
+
+
+class Outcomes(NamedTuple):
+    """M detections: what the network said, and whether the detection is right."""
+
+    values: Float[np.ndarray, "M"]
+    """Raw values of the network."""
+    right: Bool[np.ndarray, "M"]
+
+
+def calibrate_keypoints(path: str | Path, pictures: Iterable[LabelledPicture], segmenter: Segmenter) -> Curve:
+    """Fit the curve of a keypoint network on known birds, and store the curve in the file.
+
+    Args:
+        path: the ONNX file; it is replaced. A curve that the file holds is replaced too.
+        pictures: pictures that neither network was trained on.
+        segmenter: detects the birds.
+
+    Raises:
+        InputError: the file is no keypoint network, or fewer than 200 keypoints are detected.
+    """
+    detector = load_keypoint_detector(path)
+    detector.curve = None
+    curve = fit_curve(keypoint_outcomes(pictures, segmenter, detector), path)
+    store_curve(path, CONFIDENCE_KEY, curve)
+    return curve
+
+
+def keypoint_outcomes(
+    pictures: Iterable[LabelledPicture], segmenter: Segmenter, keypoints: KeypointDetector
+) -> Outcomes:
+    """Detect the keypoints of known birds, and compare them with the known positions.
+
+    The birds are those of the segmenter, as in tracking. A bird is compared with the known bird whose mask it shares
+    with an IoU of at least 0.5. Every keypoint with a known position counts, also if it is hidden. A keypoint is right
+    if its error is at most 5 % of the longer side of the bird's box: the box around the mask and the known keypoints.
+
+    Args:
+        pictures: pictures that neither network was trained on.
+        segmenter: detects the birds.
+        keypoints: the detector, without a curve.
+    """
+    values, right = [np.zeros(0)], [np.zeros(0, bool)]
+    for labelled in pictures:
+        birds = segmenter(labelled.picture)
+        masks = [labelled.owner == n for n in range(1, len(labelled.visibility) + 1)]
+        pairs = _same_birds(birds, masks)
+        if not pairs:
+            continue
+        points_px, confidence = keypoints(labelled.picture, [birds[i] for i, _ in pairs])
+        for m, (_, n) in enumerate(pairs):
+            known = labelled.visibility[n] > 0
+            side = _longer_side(masks[n], labelled.keypoints_px[n, known])
+            error = np.linalg.norm(points_px[m] - labelled.keypoints_px[n], axis=-1)
+            values.append(confidence[m, known])
+            right.append(error[known] <= RIGHT * side)
+    return Outcomes(np.concatenate(values), np.concatenate(right))
+
+
+def fit_curve(outcomes: Outcomes, source: object = "outcomes") -> Curve:
+    """Fit a monotone curve from raw values to the share of right detections.
+
+    An isotonic regression gives the shares. The values are cut into 20 equal ranges; a range with fewer than 50
+    detections is merged with the next range. The mean value and the mean share of a range are a point of the curve,
+    and (0, 0) is its first point.
+
+    Args:
+        outcomes: detections and whether they are right.
+        source: the network, for messages.
+
+    Raises:
+        InputError: fewer than 200 detections, or detections with equal values.
+    """
+    detected = outcomes.values > 0
+    values, right = outcomes.values[detected].astype(np.float64), outcomes.right[detected]
+    order = np.argsort(values, kind="stable")
+    if len(values) < MIN_OUTCOMES or values.min() == values.max():
+        problem = f"has {len(values)} detections of known birds, or equal confidences"
+        raise InputError(source, problem, f"calibrate on pictures with at least {MIN_OUTCOMES} detected keypoints")
+    shares = isotonic_regression(right[order].astype(float)).x
+    edges = np.searchsorted(values[order], np.linspace(values.min(), values.max(), RANGES + 1)[1:-1])
+    points, start = [(0.0, 0.0)], 0
+    for stop in [*edges.tolist(), len(order)]:
+        is_last = stop == len(order)
+        if stop - start >= MIN_IN_RANGE and (is_last or len(order) - stop >= MIN_IN_RANGE):
+            points.append((values[order][start:stop].mean(), shares[start:stop].mean()))
+            start = stop
+    return Curve(*np.array(points).T)
+
+
+def store_curve(path: str | Path, key: str, curve: Curve) -> None:
+    """Store a curve in a network; `key` is `CONFIDENCE_KEY` or `SCORE_KEY` of `jaxfit.perception.calibration`."""
+    set_metadata(path, {key: curve.text()})
+
+
+def _same_birds(birds: Sequence[Instance], masks: Sequence[Bool[np.ndarray, "H W"]]) -> list[tuple[int, int]]:
+    """Return the pairs (detected, known) of the same bird: the assignment with the largest sum of IoU."""
+    iou = np.zeros((len(birds), len(masks)))
+    for i, bird in enumerate(birds):
+        height, width = bird.mask.shape
+        for n, mask in enumerate(masks):
+            shared = np.count_nonzero(bird.mask & mask[bird.y0 : bird.y0 + height, bird.x0 : bird.x0 + width])
+            iou[i, n] = shared / (np.count_nonzero(bird.mask) + np.count_nonzero(mask) - shared)
+    rows, columns = linear_sum_assignment(-iou)
+    return [(int(i), int(n)) for i, n in zip(rows, columns, strict=True) if iou[i, n] >= MIN_IOU]
+
+
+def _longer_side(mask: Bool[np.ndarray, "H W"], points_px: Float[np.ndarray, "M 2"]) -> float:
+    """Return the longer side of the box around a mask and points, pixels."""
+    x0, y0, width, height = box_of_mask(mask) or (0, 0, 0, 0)
+    corners = np.concatenate([[[x0, y0], [x0 + width, y0 + height]], points_px])
+    return float(np.ptp(corners, axis=0).max())

@@ -1,0 +1,273 @@
+"""Fine-tuning of a network on labelled footage: before, training with early stopping, after.
+
+Every sample comes from a labelled or from a simulated frame. The score on the held-out pictures decides which weights
+are written, and when the training stops. The state is stored after every measurement, so that the same call continues
+an interrupted training with the same result.
+"""
+
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from jaxfit.errors import InputError
+from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.perception.segmentation import load_segmenter
+from jaxfit.progress import ProgressTask, silent
+from jaxfit.storage.files import check_writable
+from jaxfit.training import keypoints, segmenter
+from jaxfit.training.base_network import base_file, load_keypoint_base, load_segmenter_base
+from jaxfit.training.checkpoint import Checkpoint, set_weights
+from jaxfit.training.familiarity import store_training_activations
+from jaxfit.training.fine_tune_data import (
+    FRAMES,
+    PICTURES,
+    FineTuningData,
+    LabelFiles,
+    fingerprint,
+    load_or_film,
+    prepare_data,
+    read_label_files,
+)
+from jaxfit.training.fine_tune_loop import CHECKS, continue_training
+from jaxfit.training.label_checks import LeftOut
+from jaxfit.training.labelled_frames import LabelledFrames
+from jaxfit.training.loop import Schedule, Source
+from jaxfit.training.network_files import Probabilities, write_keypoints, write_segmenter
+from jaxfit.training.networks import FeaturePyramid
+from jaxfit.training.validation import keypoint_accuracy, keypoint_detector, segmenter_accuracy, torch_segmenter
+
+__all__ = ["FineTuned", "Settings", "default_schedule", "fine_tune"]
+
+LABELLED_SHARE = 0.6
+"""Share of the samples from labelled frames; all others are simulated."""
+LABELLED_SCENE_SHARE = 0.3
+"""Share of the labelled samples with a random scene; most samples keep the scene of the footage."""
+LEAST_COMMON_KEYPOINTS = 4
+"""With fewer keypoints in common, the keypoint network sees no simulated frames."""
+CHECKED_PICTURES = 16
+"""Largest number of held-out pictures of a measurement during the training; the last measurement uses all."""
+CHECKPOINT = "checkpoint.npz"
+
+
+class Settings(NamedTuple):
+    """Settings of a fine-tuning."""
+
+    base: str | Path = "builtin"
+    holdout: float = 0.2
+    """Share of the labelled pictures that are held out; 0 trains without a check and without early stopping."""
+    scenes: int = 20
+    """Number of simulated scenes, if the folder of simulated frames does not exist; 0 trains on labels only."""
+    schedule: Schedule | None = None
+    """None chooses a schedule by the number of labelled pictures."""
+    seed: int = 0
+    """Seed of the samples and of new layers."""
+
+
+class FineTuned(NamedTuple):
+    """Result of a fine-tuning."""
+
+    before: dict[str, float]
+    """Accuracy of the base network on the held-out pictures; empty without held-out pictures."""
+    after: dict[str, float]
+    """Accuracy of the written network."""
+    left_out: list[LeftOut]
+    """Labels that were not used."""
+    pictures: dict[str, int]
+    """Number of labelled pictures: `training`, `holdout`, `gap`."""
+    rule: str
+    """How pictures were held out."""
+    new_keypoints: tuple[str, ...]
+    """Keypoints that the base network lacks."""
+    best_step: int
+    steps: int
+    """Number of steps that were taken."""
+
+
+def default_schedule(network: str, pictures: int) -> Schedule:
+    """Return the schedule for a number of labelled pictures."""
+    steps = min(max(200 + 4 * pictures, 240), 1000)
+    return Schedule(steps, 8 if network == "segmenter" else 16, 5e-4)
+
+
+def fine_tune(
+    network: str,
+    files: LabelFiles,
+    path: str | Path,
+    frames_folder: str | Path,
+    settings: Settings = Settings(),
+    progress: ProgressTask = silent,
+) -> FineTuned:
+    """Train a built-in or an earlier network further on labelled pictures, and write the new network.
+
+    All birds of a labelled picture must be labelled: a segmenter learns every other pixel as background. The folder
+    `PATH.training` holds the state of the training until the network is written.
+
+    Args:
+        network: `segmenter` or `keypoints`.
+        files: files of the labels, pictures and masks.
+        path: the `.onnx` file to write; an existing file is replaced.
+        frames_folder: folder of simulated frames, created if it does not exist; about 32 MB per scene.
+        settings: base network, hold-out, schedule, seed.
+        progress: reports every part of the work.
+
+    Raises:
+        InputError: a setting outside its range, unusable labels, too few labels for a hold-out, a base network of
+            another layout, or an interrupted training with other labels or settings.
+    """
+    path, folder = Path(path), Path(f"{path}.training")
+    _check(network, path, settings)
+    base = base_file(network, settings.base)
+    labels = read_label_files(network, files, progress)
+    torch.manual_seed(settings.seed)
+    found: tuple[str, ...] = labels.keypoint_names
+    if network == "segmenter":
+        model = load_segmenter_base(base)
+    else:
+        model, found = load_keypoint_base(base, labels.keypoint_names)
+    simulated = load_or_film(Path(frames_folder), settings.scenes, progress)
+    try:
+        data = prepare_data(network, files, settings.holdout, simulated, folder, labels, progress)
+    except BaseException:
+        if not (folder / CHECKPOINT).exists():
+            _remove(folder)
+        raise
+    schedule = settings.schedule or default_schedule(network, len(data.frames.pictures))
+    mark = fingerprint(data, simulated, base, (network, schedule, settings.seed))
+    names = dict(zip(data.keypoint_names, found, strict=True))
+    before = _accuracy(network, base, data, names)
+    sources = _sources(network, folder / FRAMES, data, None if simulated is None else Path(frames_folder), simulated)
+    checkpoint = continue_training(
+        model,
+        segmenter.loss if network == "segmenter" else keypoints.loss,
+        sources,
+        schedule,
+        settings.seed,
+        folder / CHECKPOINT,
+        mark,
+        _score(network, model, data) if data.holdout else None,
+        progress,
+        f"Training {network}",
+    )
+    set_weights(model, checkpoint.best_weights)
+    facts = _facts(network, base, data, simulated, schedule, checkpoint)
+    _write(network, model, data, facts, path)
+    store_training_activations(network, path, [f for f in (data.frames, simulated) if f is not None], progress=progress)
+    after = _accuracy(network, path, data, {name: name for name in data.keypoint_names})
+    _remove(folder)
+    history = checkpoint.history
+    return FineTuned(
+        before,
+        after,
+        data.left_out,
+        {"training": len(data.split.training), "holdout": len(data.holdout), "gap": len(data.split.gap)},
+        data.split.rule,
+        tuple(name for name, known in names.items() if not known),
+        int(history[::-1][history[::-1, 1].argmax(), 0]) if len(history) else checkpoint.step,
+        checkpoint.step,
+    )
+
+
+def _check(network: str, path: Path, settings: Settings) -> None:
+    if network not in ("segmenter", "keypoints"):
+        raise ValueError(f"network must be segmenter or keypoints, not {network!r}")
+    if path.suffix != ".onnx":
+        raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
+    if not 0 <= settings.holdout <= 0.5:
+        raise InputError("train: holdout", f"is {settings.holdout}", "give a share of 0 to 0.5")
+    if not 0 <= settings.scenes <= 900:
+        raise InputError("train: scenes", f"is {settings.scenes}", "give 0 to 900")
+    if settings.schedule is not None and settings.schedule.steps < CHECKS:
+        raise InputError("train: steps", f"is {settings.schedule.steps}", f"give {CHECKS} or more")
+    check_writable(path)  # before the training, not after it
+
+
+def _sources(
+    network: str, frames: Path, data: FineTuningData, simulated_folder: Path | None, simulated: LabelledFrames | None
+) -> list[Source]:
+    """Return the labelled and the simulated frames with their shares."""
+    module = segmenter if network == "segmenter" else keypoints
+    labelled = Source(frames, partial(module.draw_sample, scene_share=LABELLED_SCENE_SHARE))
+    if simulated is None or simulated_folder is None:
+        return [labelled]
+    if network == "keypoints":
+        mapped = simulated.with_keypoints(data.keypoint_names)
+        least = min(LEAST_COMMON_KEYPOINTS, len(data.keypoint_names))
+        if not ((mapped.visibility == 2).sum(-1) >= least).any():
+            return [labelled]
+    names = data.keypoint_names if network == "keypoints" else None
+    others = Source(simulated_folder, module.draw_sample, 1 - LABELLED_SHARE, names)
+    return [labelled._replace(share=LABELLED_SHARE), others]
+
+
+def _score(network: str, model: FeaturePyramid, data: FineTuningData) -> Callable[[], float]:
+    """Return a function that measures a network in training: the mean of two measures of the final table."""
+    places = np.unique(np.linspace(0, len(data.holdout) - 1, CHECKED_PICTURES).round().astype(int))
+    pictures = [data.holdout[i] for i in places.tolist()]
+    names = {name: name for name in data.keypoint_names}
+
+    def score() -> float:
+        model.eval()
+        if network == "segmenter":
+            found = segmenter_accuracy(torch_segmenter(Probabilities(model), data.scale.longer_side_px), pictures)
+            return (found["mean_iou"] + found["ap50"]) / 2
+        maps = keypoints.KeypointMaps(model, len(names)).to(next(model.parameters()).device)
+        detector = keypoint_detector(maps, data.keypoint_names, data.scale)
+        found = keypoint_accuracy(detector, pictures, names)
+        return (found["pck_05"] + found["pck_10"]) / 2
+
+    return score
+
+
+def _accuracy(network: str, path: Path, data: FineTuningData, names: dict[str, str]) -> dict[str, float]:
+    """Measure a network file on all held-out pictures, as perception uses the file."""
+    if not data.holdout:
+        return {}
+    if network == "segmenter":
+        return segmenter_accuracy(load_segmenter(path, kind="bottom_up"), data.holdout)
+    return keypoint_accuracy(load_keypoint_detector(path), data.holdout, names)
+
+
+def _facts(
+    network: str,
+    base: Path,
+    data: FineTuningData,
+    simulated: LabelledFrames | None,
+    schedule: Schedule,
+    checkpoint: Checkpoint,
+) -> dict[str, str]:
+    frames = 0 if simulated is None else len(simulated.pictures)
+    trained_on = f"{len(data.split.training)} labelled pictures and {frames} simulated frames"
+    return {
+        "trained_by": f"jaxfit {metadata.version('jaxfit')} train {network}, fine-tuned from {base.name}",
+        "trained_on": trained_on,
+        "schedule": json.dumps(schedule._asdict()),
+        "holdout": f"{len(data.holdout)} pictures, {data.split.rule}",
+        "holdout_score": json.dumps(np.round(checkpoint.history, 4).tolist()),
+    }
+
+
+def _write(network: str, model: Any, data: FineTuningData, facts: dict[str, str], path: Path) -> None:
+    if network == "segmenter":
+        write_segmenter(model, facts, path, data.scale.longer_side_px)
+    else:
+        write_keypoints(model, data.keypoint_names, facts, path, (data.scale.pad_px, data.scale.dilate_px))
+
+
+def _remove(folder: Path) -> None:
+    """Remove the files of a finished training; files of other programs stay."""
+    for name in (PICTURES, FRAMES):
+        shutil.rmtree(folder / name, ignore_errors=True)
+    (folder / CHECKPOINT).unlink(missing_ok=True)
+    if folder.exists() and not any(folder.iterdir()):
+        folder.rmdir()

@@ -1,0 +1,123 @@
+"""Labelled frames for training: pictures, the bird of every pixel, keypoints and scale, as files of one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from numpy.lib.format import open_memmap
+
+from jaxfit.data.formats.fields import LARGEST_POSITION_PX
+from jaxfit.data.keypoint_names import propose_names
+from jaxfit.errors import InputError
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
+from jaxfit.storage.npy import load_npy
+from jaxfit.storage.npz import load_npz
+
+__all__ = ["MARKER", "MOST_BIRDS", "UNKNOWN", "LabelledFrames", "create_pictures", "load_frames", "save_labels"]
+
+MARKER = "frames.npz"
+"""The file of the labels; every folder of labelled frames contains this file."""
+MOST_BIRDS = 255
+"""Largest number of birds in a frame."""
+UNKNOWN = 3
+"""Visibility of a keypoint without a label: the keypoint does not count in the training."""
+_LABELS = {"keypoints_px": "S N K 2", "visibility": "S N K", "pixels_per_unit": "S"}
+"""The arrays of the labels, and their shapes."""
+
+
+class LabelledFrames(NamedTuple):
+    """S frames; the large arrays are memory-mapped files."""
+
+    pictures: UInt8[np.ndarray, "S H W 3"]
+    """Blue, green, red."""
+    owner: UInt8[np.ndarray, "S H W"]
+    """Number of the bird of each pixel, from 1; 0 for no bird."""
+    keypoints_px: Float[np.ndarray, "S N K 2"]
+    """x, y of every keypoint, also if it is occluded or outside the picture."""
+    visibility: UInt8[np.ndarray, "S N K"]
+    """2 if the keypoint is visible, 1 if it is occluded, 0 if it is outside the picture or the bird does not exist;
+    `UNKNOWN` if the keypoint has no label."""
+    pixels_per_unit: Float[np.ndarray, "S"]
+    """Scale of the picture: pixels per model unit (2 cm). For labelled footage, the scale that the networks assume."""
+    keypoint_names: tuple[str, ...] = MURRE_KEYPOINTS
+    """K names."""
+
+    def with_keypoints(self, names: Sequence[str]) -> LabelledFrames:
+        """Return the frames with other keypoints: keypoints of the same name are kept, all others are `UNKNOWN`."""
+        if tuple(names) == self.keypoint_names:
+            return self
+        S, N, _ = self.visibility.shape
+        points = np.zeros((S, N, len(names), 2), np.float32)
+        visibility = np.where((self.visibility > 0).any(-1, keepdims=True), UNKNOWN, 0)
+        visibility = np.repeat(visibility, len(names), axis=-1).astype(np.uint8)
+        for own, old in propose_names(names, self.keypoint_names).mapped.items():
+            new, k = list(names).index(own), self.keypoint_names.index(old)
+            points[:, :, new], visibility[:, :, new] = self.keypoints_px[:, :, k], self.visibility[:, :, k]
+        return self._replace(keypoints_px=points, visibility=visibility, keypoint_names=tuple(names))
+
+
+def create_pictures(folder: Path, count: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Create the memory-mapped files of `count` pictures and of the bird of each pixel, both 0; the caller fills them.
+
+    Args:
+        folder: an existing folder.
+        count, height, width: number and size of the pictures.
+    """
+    pictures = open_memmap(folder / "pictures.npy", "w+", np.uint8, (count, height, width, 3))
+    owner = open_memmap(folder / "owner.npy", "w+", np.uint8, (count, height, width))
+    return pictures, owner
+
+
+def save_labels(
+    folder: Path,
+    keypoints_px: Float[np.ndarray, "S N K 2"],
+    visibility: UInt8[np.ndarray, "S N K"],
+    pixels_per_unit: Float[np.ndarray, "S"],
+    keypoint_names: Sequence[str] = MURRE_KEYPOINTS,
+) -> None:
+    """Write the labels, the last file of a folder of labelled frames; arguments as in `LabelledFrames`."""
+    np.savez(
+        folder / MARKER,
+        keypoints_px=keypoints_px,
+        visibility=visibility,
+        pixels_per_unit=pixels_per_unit,
+        keypoint_names=np.array(keypoint_names, str),
+    )
+
+
+def load_frames(folder: str | Path) -> LabelledFrames:
+    """Load the frames that `film_scenes` or `prepare_frames` wrote.
+
+    Raises:
+        InputError: the frames cannot be read, an earlier version wrote them, or the labels hold impossible values.
+    """
+    folder = Path(folder)
+    labels = load_npz(folder / MARKER, _LABELS, optional={"keypoint_names": "K"})
+    points, visibility, scale = (labels[name] for name in _LABELS)
+    pictures = load_npy(folder / "pictures.npy", f"{len(scale)} H W 3", mapped=True)
+    owner = load_npy(folder / "owner.npy", " ".join(map(str, pictures.shape[:3])), mapped=True)
+    names = tuple(str(name) for name in labels.get("keypoint_names", MURRE_KEYPOINTS))
+    frames = LabelledFrames(pictures, owner, points, visibility, scale, names)
+    _check_labels(frames, folder)
+    return frames
+
+
+def _check_labels(frames: LabelledFrames, folder: Path) -> None:
+    integers = all(array.dtype == np.uint8 for array in (frames.pictures, frames.owner, frames.visibility))
+    numbers = all(array.dtype == np.float32 for array in (frames.keypoints_px, frames.pixels_per_unit))
+    valid = {
+        "type of numbers": integers and numbers,
+        "number of keypoints": frames.visibility.shape[2] == len(frames.keypoint_names),
+        "number of birds": frames.visibility.shape[1] <= MOST_BIRDS,
+        "number of frames": len(frames.pictures) > 0,
+        "position of a keypoint": bool((np.abs(frames.keypoints_px) <= LARGEST_POSITION_PX).all()),
+        "visibility": bool((frames.visibility <= UNKNOWN).all()),
+        "scale": bool(((frames.pixels_per_unit > 0.01) & (frames.pixels_per_unit < 1e4)).all()),
+    }
+    for name, holds in valid.items():
+        if not holds:
+            raise InputError(folder, f"holds frames with a wrong {name}", "remove the folder, to make the frames again")
