@@ -228,6 +228,8 @@ def _training(commands: Any) -> None:
     train.add_argument("--frames", type=Path, metavar="DIR", help=text)
     text = "number of simulated scenes, of 10 frames each (default: 20 with labels, else 160)"
     train.add_argument("--scenes", type=int, help=text)
+    text = "without labels: share of scenes with other birds in other landscapes (default %(default)s)"
+    train.add_argument("--varied", type=float, default=0.0, metavar="SHARE", help=text)
     train.add_argument("--steps", type=int, help="number of training steps (default: by the number of labels)")
     text = "random seed of the initial weights and of the sampling (default %(default)s)"
     train.add_argument("--seed", type=int, default=0, help=text)

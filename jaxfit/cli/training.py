@@ -54,7 +54,7 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
     schedule = SCHEDULES[options.network]._replace(steps=steps)
     paths = options.out, options.frames or Path("training_frames")
     scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
-    losses = train_network(options.network, *paths, scenes, schedule, options.seed, progress=terminal)
+    losses = train_network(options.network, *paths, scenes, schedule, options.seed, terminal, options.varied)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
     show(f"{options.network} trained in {(time.perf_counter() - start) / 60:.0f} min, loss {loss} → {options.out}")
 

@@ -1,15 +1,17 @@
-"""Simulated frames for training: scenes of `jaxfit.simulation` with random cameras and exact labels."""
+"""Simulated frames for training: murres on ledges with random cameras, or other birds in other landscapes."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.simulation.flock import simulate_flock
@@ -20,6 +22,7 @@ from jaxfit.simulation.viewpoint import Viewpoint, camera_axes
 from jaxfit.simulation.visibility import mesh_keypoints, render_visibility
 from jaxfit.storage.files import new_folder
 from jaxfit.training.labelled_frames import MARKER, LabelledFrames, create_pictures, load_frames, save_labels
+from jaxfit.training.varied import frames as varied_frames
 
 __all__ = ["FRAMES_PER_SCENE", "film_scenes"]
 
@@ -31,7 +34,12 @@ FPS, EVERY = 12.0, 4
 
 
 def film_scenes(
-    folder: str | Path, seeds: range, workers: int = 2, overwrite: bool = False, progress: ProgressTask = silent
+    folder: str | Path,
+    seeds: range,
+    workers: int = 2,
+    overwrite: bool = False,
+    progress: ProgressTask = silent,
+    varied: float = 0.0,
 ) -> LabelledFrames:
     """Simulate scenes and write their frames to a folder; the same seeds give the same frames.
 
@@ -41,6 +49,7 @@ def film_scenes(
         workers: number of parallel processes.
         overwrite: replace the frames of an earlier run.
         progress: reports every scene.
+        varied: share of the scenes with other birds in other landscapes (`jaxfit.training.varied`).
 
     Raises:
         InputError: the folder contains other files, or cannot be written.
@@ -49,11 +58,12 @@ def film_scenes(
     S, K = len(seeds) * FRAMES_PER_SCENE, bird.num_keypoints
     with new_folder(folder, overwrite, marker=MARKER) as part:
         pictures, owner = create_pictures(part, S, HEIGHT, WIDTH)
-        points, visibility = np.zeros((S, MAX_BIRDS, K, 2), np.float32), np.zeros((S, MAX_BIRDS, K), np.uint8)
+        most = varied_frames.MAX_BIRDS if varied else MAX_BIRDS
+        points, visibility = np.zeros((S, most, K, 2), np.float32), np.zeros((S, most, K), np.uint8)
         scale = np.zeros(S, np.float32)
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))  # a fork breaks compiled code
         with progress("Filming scenes", len(seeds)) as report_progress, pool:
-            for i, frames in enumerate(pool.map(_film_scene, seeds)):
+            for i, frames in enumerate(pool.map(partial(_film_scene, varied=varied), seeds)):
                 at = slice(i * FRAMES_PER_SCENE, (i + 1) * FRAMES_PER_SCENE)
                 N = frames.visibility.shape[1]
                 pictures[at], owner[at], scale[at] = frames.pictures, frames.owner, frames.pixels_per_unit
@@ -64,9 +74,17 @@ def film_scenes(
     return load_frames(folder)
 
 
-def _film_scene(seed: int) -> LabelledFrames:
-    """Simulate the frames of one scene with a random camera, light and number of birds."""
+def _film_scene(seed: int, varied: float = 0.0) -> LabelledFrames:
+    """Simulate the frames of one scene: with probability `varied`, other birds in another landscape."""
     bird = load_murre()
+    if np.random.default_rng((seed, 11)).random() < varied:
+        rng = np.random.default_rng((seed, 12))
+        return varied_frames.draw_frames(rng, bird, FRAMES_PER_SCENE, WIDTH, HEIGHT)
+    return _film_ledge(seed, bird)
+
+
+def _film_ledge(seed: int, bird: Bird) -> LabelledFrames:
+    """Simulate murres on a ledge with a random camera, light and number of birds."""
     rng = np.random.default_rng((seed, 10))
     view, pixels_per_unit = _random_view(rng)
     # the expected number of birds grows with the visible area

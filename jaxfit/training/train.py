@@ -38,6 +38,7 @@ def train_network(
     schedule: Schedule | None = None,
     seed: int = 0,
     progress: ProgressTask = silent,
+    varied: float = 0.0,
 ) -> dict[str, float]:
     """Train a built-in network and write it; the weights differ slightly between processors.
 
@@ -49,6 +50,7 @@ def train_network(
         schedule: schedule of the training; None uses `SCHEDULES`.
         seed: seed of the initial weights and of the samples.
         progress: reports scenes and steps.
+        varied: share of the scenes with other birds in other landscapes, if the footage is simulated first.
 
     Returns:
         Each term of the loss, averaged over the last tenth of the steps.
@@ -62,13 +64,15 @@ def train_network(
     schedule = schedule or SCHEDULES[which]
     if not 1 <= scenes <= 900:
         raise InputError("train: scenes", f"is {scenes}", "give 1 to 900")
+    if not 0 <= varied <= 1:
+        raise InputError("train: varied", f"is {varied}", "give a share of 0 to 1")
     if schedule.steps < 20:
         raise InputError("train: steps", f"is {schedule.steps}", "give 20 or more")
     if Path(path).suffix != ".onnx":
         raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
     check_writable(path)  # before the training, not after it
     folder = Path(frames_folder)
-    frames = _load_or_film(folder, scenes, progress)
+    frames = _load_or_film(folder, scenes, varied, progress)
     torch.manual_seed(seed)
     if which == "segmenter":
         network, module = segmenter.segmenter_network(), segmenter
@@ -91,10 +95,10 @@ def train_network(
     return losses
 
 
-def _load_or_film(folder: Path, scenes: int, progress: ProgressTask) -> LabelledFrames:
+def _load_or_film(folder: Path, scenes: int, varied: float, progress: ProgressTask) -> LabelledFrames:
     """Load the frames, or simulate the frames if the folder does not exist."""
     if not folder.exists():
-        return film_scenes(folder, range(scenes), progress=progress)
+        return film_scenes(folder, range(scenes), progress=progress, varied=varied)
     frames = load_frames(folder)
     if len(frames.pictures) != scenes * FRAMES_PER_SCENE:
         existing = len(frames.pictures) // FRAMES_PER_SCENE

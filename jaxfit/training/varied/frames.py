@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import cv2
@@ -16,6 +15,7 @@ from jaxfit.simulation.plumage_light import lit_plumage
 from jaxfit.simulation.texture import Noise
 from jaxfit.simulation.viewpoint import camera_axes
 from jaxfit.simulation.visibility import SURFACE_TOLERANCE
+from jaxfit.training.labelled_frames import LabelledFrames
 from jaxfit.training.varied.bodies import Species, draw_species
 from jaxfit.training.varied.landscapes import Landscape, draw_landscape
 
@@ -24,8 +24,8 @@ __all__ = ["MAX_BIRDS", "draw_frames"]
 MAX_BIRDS = 40
 LENGTH_UNITS = 20.0
 """Length of the murre in model units; the sizes of birds refer to this length."""
-LENGTH_PX = 28.0, 420.0
-"""Range of the length of birds in pixels of a picture of 960 × 640."""
+LENGTH_SHARE = 0.03, 0.44
+"""Range of the length of birds, as a share of the width of the picture."""
 GAMMA = 2.2
 DEPTH_STEP = 1000.0
 """Depth between birds in model units: a nearer bird hides a farther bird completely."""
@@ -43,37 +43,32 @@ class _Placed(NamedTuple):
     flies: bool
 
 
-def draw_frames(
-    rng: np.random.Generator, bird: Bird, count: int, width: int, height: int
-) -> tuple[float, Iterator[tuple[Any, ...]]]:
+def draw_frames(rng: np.random.Generator, bird: Bird, count: int, width: int, height: int) -> LabelledFrames:
     """Draw a scene, which is one or two species, one landscape, one light and one camera, and some of its frames.
+
+    Birds have other places and postures in every frame.
 
     Args:
         rng: source of randomness.
         bird: the murre.
-        count: number of frames; birds have other places and postures in every frame.
+        count: number of frames.
         width, height: size of the frames, pixels.
-
-    Returns:
-        Mean pixels per model unit, and the frames as picture (H, W, 3) uint8 in blue, green, red; bird of each pixel
-        (H, W) uint8, from 1; keypoints (N, K, 2) in pixels; visibility (N, K) as in `LabelledFrames`.
     """
     pitch = float(rng.uniform(0, 90))
     R_cam_world = camera_axes(pitch, 0, rng.uniform(-8, 8))
     species = [draw_species(rng, bird) for _ in range(int(rng.integers(1, 3)))]
-    scale = float(np.exp(rng.uniform(*np.log(LENGTH_PX)))) / LENGTH_UNITS
+    scale = float(np.exp(rng.uniform(*np.log(LENGTH_SHARE)))) * width / LENGTH_UNITS
     landscape, light = draw_landscape(rng, width, height, pitch), random_light(rng)
-    room = width * height / (LENGTH_UNITS * scale) ** 2
-    expected = min(rng.uniform(0.05, 0.6) * room, MAX_BIRDS)
-
-    def frames() -> Iterator[tuple[Any, ...]]:
-        feathers = Noise(rng, octaves=5, coarsest=16)
-        for _ in range(count):
-            N = int(np.clip(rng.poisson(expected), 1, MAX_BIRDS))
-            birds = _place(rng, species, N, scale, R_cam_world, landscape, (width, height))
-            yield _render(rng, birds, landscape, light, feathers)
-
-    return scale, frames()
+    expected = min(rng.uniform(0.05, 0.6) * width * height / (LENGTH_UNITS * scale) ** 2, MAX_BIRDS)
+    feathers = Noise(rng, octaves=5, coarsest=16)
+    K = bird.num_keypoints
+    points, visibility = np.zeros((count, MAX_BIRDS, K, 2), np.float32), np.zeros((count, MAX_BIRDS, K), np.uint8)
+    pictures, owner = np.zeros((count, height, width, 3), np.uint8), np.zeros((count, height, width), np.uint8)
+    for s in range(count):
+        N = int(np.clip(rng.poisson(expected), 1, MAX_BIRDS))
+        birds = _place(rng, species, N, scale, R_cam_world, landscape, (width, height))
+        pictures[s], owner[s], points[s, :N], visibility[s, :N] = _render(rng, birds, landscape, light, feathers)
+    return LabelledFrames(pictures, owner, points, visibility, np.full(count, scale, np.float32))
 
 
 def _place(
