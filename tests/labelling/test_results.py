@@ -12,6 +12,8 @@ from jaxfit.errors import InputError
 from jaxfit.labelling.results import read_result
 from jaxfit.labelling.signals import frame_signals
 
+pytestmark = pytest.mark.extended  # the solution of the tests takes ten seconds
+
 
 @pytest.fixture
 def folder(tmp_path):

@@ -71,6 +71,7 @@ def trained(folder, state, score=None, stop_after=None):
 
 
 @pytest.mark.usefixtures("same_process")
+@pytest.mark.extended
 def test_interrupted_training_gives_the_same_weights(data, tmp_path):
     folder = tmp_path / "training" / "frames"
     whole, _ = trained(folder, tmp_path / "whole.npz")

@@ -10,6 +10,8 @@ from jaxfit.training.varied.bodies import draw_species
 from jaxfit.training.varied.frames import MAX_BIRDS, draw_frames
 from jaxfit.training.varied.landscapes import draw_landscape
 
+pytestmark = pytest.mark.extended  # half a minute
+
 WIDTH, HEIGHT = 240, 160
 
 
@@ -74,7 +76,6 @@ def test_landscapes(pitch_deg):
         assert 0 <= landscape.water_from <= HEIGHT
 
 
-@pytest.mark.extended
 def test_both_kinds_of_scenes(tmp_path):
     """The share decides the kind of every scene; the scenes on ledges do not change."""
     mixed = film_scenes(tmp_path / "mixed", range(2), varied=0.5)
