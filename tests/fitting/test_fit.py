@@ -156,8 +156,11 @@ def test_a_bird_without_keypoints_has_no_usable_frame(solution, observed):
 def test_missing_frames_have_no_valid_pose(observed):
     confidence = np.ones((T, BIRD.num_keypoints))
     confidence[[0, 3]] = 0
+    times_s = np.array([0, 0.1, 0.15, 0.3, 0.4, np.nan])
     gaps = replaced(observed, 0, confidence=confidence).select(tracks=[0])
-    result = fit(gaps, BIRD, config())
+    result = fit(dataclasses.replace(gaps, timestamp_s=times_s, fps=12.0), BIRD, config())
+    np.testing.assert_array_equal(result.timestamp_s, times_s)
+    assert result.fps == 12
     assert result.valid[0].tolist() == [False, True, True, False, True, True]
     error_px = np.linalg.norm(result.keypoints_px - keypoints_of(truths()[:1]), axis=-1)
     assert error_px[result.valid].max() < SIZE / 256

@@ -11,6 +11,7 @@ from jaxfit.config.perception import FramesConfig, SegmenterConfig, TrackConfig,
 from jaxfit.errors import InputError
 from jaxfit.perception import track
 from jaxfit.perception.track import open_segmenter, run_tracking, track_video
+from jaxfit.video.writer import VideoWriter
 
 FOOTAGE = Footage()
 
@@ -55,6 +56,19 @@ def test_a_range_of_frames(video):
     assert tracking.observations.frame_index.tolist() == [2, 5, 8]
     assert segmenter.frames == [2, 5, 8]
     assert tracking.observations.present.all()
+
+
+def test_times_of_the_frames(video, tmp_path):
+    """Tracks hold the times and the rate of a film; a folder of pictures has neither."""
+    with VideoWriter(tmp_path / "film.mp4", (BIRDS * SIDE, SIDE), 12.5) as writer:
+        for t in range(FRAMES):
+            writer.write(FOOTAGE.frame(t))
+    found = tracked(tmp_path / "film.mp4", TrackConfig(FramesConfig(2, 11, 3), min_track_frames=2))[0].observations
+    assert found.fps == 12.5
+    np.testing.assert_allclose(found.timestamp_s, [2 / 12.5, 5 / 12.5, 8 / 12.5])
+    pictures = tracked(video)[0].observations
+    assert pictures.fps is None
+    assert np.isnan(pictures.timestamp_s).all()
 
 
 def test_missed_bird_keeps_its_identity(video):
