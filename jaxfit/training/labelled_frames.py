@@ -109,15 +109,20 @@ def load_frames(folder: str | Path) -> LabelledFrames:
 def _check_labels(frames: LabelledFrames, folder: Path) -> None:
     integers = all(array.dtype == np.uint8 for array in (frames.pictures, frames.owner, frames.visibility))
     numbers = all(array.dtype == np.float32 for array in (frames.keypoints_px, frames.pixels_per_unit))
+    if not (integers and numbers):  # the checks below need numbers
+        raise _wrong(folder, "type of numbers")
     valid = {
-        "type of numbers": integers and numbers,
         "number of keypoints": frames.visibility.shape[2] == len(frames.keypoint_names),
         "number of birds": frames.visibility.shape[1] <= MOST_BIRDS,
         "number of frames": len(frames.pictures) > 0,
-        "position of a keypoint": bool((np.abs(frames.keypoints_px) <= LARGEST_POSITION_PX).all()),
+        "position of a keypoint": bool((np.abs(frames.keypoints_px.astype(np.float64)) <= LARGEST_POSITION_PX).all()),
         "visibility": bool((frames.visibility <= UNKNOWN).all()),
         "scale": bool(((frames.pixels_per_unit > 0.01) & (frames.pixels_per_unit < 1e4)).all()),
     }
     for name, holds in valid.items():
         if not holds:
-            raise InputError(folder, f"holds frames with a wrong {name}", "remove the folder, to make the frames again")
+            raise _wrong(folder, name)
+
+
+def _wrong(folder: Path, name: str) -> InputError:
+    return InputError(folder, f"holds frames with a wrong {name}", "remove the folder, to make the frames again")
