@@ -231,8 +231,7 @@ def _training(commands: Any) -> None:
     text = "without labels: share of scenes with other birds in other landscapes (default %(default)s)"
     train.add_argument("--varied", type=float, default=0.0, metavar="SHARE", help=text)
     train.add_argument("--steps", type=int, help="number of training steps (default: by the number of labels)")
-    text = "random seed of the initial weights and of the sampling (default %(default)s)"
-    train.add_argument("--seed", type=int, default=0, help=text)
+    train.add_argument("--seed", type=int, default=0, help="seed of new weights and of samples (default %(default)s)")
 
 
 def _datasets(commands: Any) -> None:
