@@ -18,7 +18,7 @@ __all__ = ["mirror_disagreement"]
 def mirror_disagreement(
     picture: UInt8[np.ndarray, "H W 3"], observations: Observations, t: int, detector: KeypointDetector
 ) -> float:
-    """Return the mean distance of the keypoints of a frame from those that a network detects in the mirror image.
+    """Return the mean distance between the keypoints of a frame and the keypoints that a network detects mirrored.
 
     The network sees the mirrored picture with mirrored masks. The detected positions are mirrored back, and left and
     right keypoints are exchanged. Distances are shares of the longer side of the box, at most `LARGEST_SHARE`.

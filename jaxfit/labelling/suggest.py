@@ -39,7 +39,7 @@ class SuggestedFrame(NamedTuple):
     frame_index: int
     """Number of the frame in the video."""
     time_s: float | None
-    """Seconds since frame 0; None if the video does not say."""
+    """Presentation time in seconds; None if the time is unknown."""
     birds: int
     """Number of birds with pre-filled labels."""
     reason: str

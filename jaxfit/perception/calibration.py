@@ -16,10 +16,10 @@ from jaxfit.errors import InputError
 from jaxfit.limits import CURVE_POINTS
 from jaxfit.perception.onnx_model import OnnxModel
 
-__all__ = ["CONFIDENCE_KEY", "SCORE_KEY", "Curve", "read_curve"]
+__all__ = ["CONFIDENCE_KEY", "Curve", "read_curve"]
 
-CONFIDENCE_KEY, SCORE_KEY = "confidence_curve", "score_curve"
-"""Keys of the metadata: the curve of the keypoints' confidences, and the curve of the birds' scores."""
+CONFIDENCE_KEY = "confidence_curve"
+"""Key of the metadata: the curve of the keypoints' confidences."""
 
 
 class Curve(NamedTuple):

@@ -57,8 +57,8 @@ def load_segmenter_base(path: Path) -> FeaturePyramid:
 def load_keypoint_base(path: Path, names: Sequence[str]) -> tuple[FeaturePyramid, tuple[str, ...]]:
     """Load a keypoint network that `jaxfit train keypoints` wrote, for keypoints of other names and number.
 
-    The last layer of a keypoint is that of the keypoint of the same name in the file, by `propose_names`. The last
-    layer of a keypoint without counterpart is new: the weights are those that PyTorch has drawn.
+    The last layer of a keypoint is copied from the keypoint of the same name in the file, by `propose_names`. Without a
+    counterpart, a keypoint gets a new last layer with random initial weights.
 
     Args:
         path: the ONNX file.

@@ -6,46 +6,33 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
-from scipy.optimize import isotonic_regression, linear_sum_assignment
+from jaxtyping import Bool, Float
+from scipy.optimize import isotonic_regression
 
 from jaxfit.data.masks import box_of_mask
 from jaxfit.errors import InputError
+from jaxfit.evaluation.overlap import assign
 from jaxfit.perception.calibration import CONFIDENCE_KEY, Curve
 from jaxfit.perception.instances import Instance, KeypointDetector, Segmenter
 from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.training.labelled_frames import LabelledFrames
 from jaxfit.training.onnx_metadata import set_metadata
 
-__all__ = ["LabelledPicture", "Outcomes", "calibrate_keypoints", "fit_curve", "keypoint_outcomes", "store_curve"]
+__all__ = ["Outcomes", "calibrate_keypoints", "fit_curve", "keypoint_outcomes"]
 
 RIGHT = 0.05
 """Largest error of a keypoint that is right, as a share of the longer side of the bird's box."""
-MIN_IOU = 0.5
-"""Least IoU of a detected and a true bird that are the same bird."""
 RANGES = 20
 """Number of equal ranges of values, each of which gives at most one point of a curve."""
 MIN_IN_RANGE = 50
 """A range with fewer detections is merged with the next range."""
 MIN_OUTCOMES = 200
 """Least number of detections for a curve."""
-
-
-class LabelledPicture(NamedTuple):
-    """A picture with N known birds, as a frame of the training data."""
-
-    picture: UInt8[np.ndarray, "H W 3"]
-    """Blue, green, red."""
-    owner: UInt8[np.ndarray, "H W"]
-    """Number of the bird of each pixel, from 1; 0 for no bird."""
-    keypoints_px: Float[np.ndarray, "N K 2"]
-    """x, y in pixels, in the order of the network's output."""
-    visibility: UInt8[np.ndarray, "N K"]
-    """2 if the keypoint is visible, 1 if it is hidden, 0 if its position in the picture is unknown."""
 
 
 class Outcomes(NamedTuple):
@@ -56,12 +43,12 @@ class Outcomes(NamedTuple):
     right: Bool[np.ndarray, "M"]
 
 
-def calibrate_keypoints(path: str | Path, pictures: Iterable[LabelledPicture], segmenter: Segmenter) -> Curve:
+def calibrate_keypoints(path: str | Path, frames: LabelledFrames, segmenter: Segmenter) -> Curve:
     """Fit the curve of a keypoint network on known birds, and store the curve in the file.
 
     Args:
         path: the ONNX file; it is replaced. A curve that the file holds is replaced too.
-        pictures: pictures that neither network was trained on.
+        frames: frames that neither network was trained on.
         segmenter: detects the birds.
 
     Raises:
@@ -69,14 +56,12 @@ def calibrate_keypoints(path: str | Path, pictures: Iterable[LabelledPicture], s
     """
     detector = load_keypoint_detector(path)
     detector.curve = None
-    curve = fit_curve(keypoint_outcomes(pictures, segmenter, detector), path)
-    store_curve(path, CONFIDENCE_KEY, curve)
+    curve = fit_curve(keypoint_outcomes(frames, segmenter, detector), path)
+    set_metadata(path, {CONFIDENCE_KEY: curve.text()})
     return curve
 
 
-def keypoint_outcomes(
-    pictures: Iterable[LabelledPicture], segmenter: Segmenter, keypoints: KeypointDetector
-) -> Outcomes:
+def keypoint_outcomes(frames: LabelledFrames, segmenter: Segmenter, keypoints: KeypointDetector) -> Outcomes:
     """Detect the keypoints of known birds, and compare them with the known positions.
 
     The birds are those of the segmenter, as in tracking. A bird is compared with the known bird whose mask it shares
@@ -84,24 +69,25 @@ def keypoint_outcomes(
     if its error is at most 5 % of the longer side of the bird's box: the box around the mask and the known keypoints.
 
     Args:
-        pictures: pictures that neither network was trained on.
+        frames: frames that neither network was trained on, with the keypoints in the order of the detector.
         segmenter: detects the birds.
         keypoints: the detector, without a curve.
     """
     values, right = [np.zeros(0)], [np.zeros(0, bool)]
-    for labelled in pictures:
-        birds = segmenter(labelled.picture)
-        masks = [labelled.owner == n for n in range(1, len(labelled.visibility) + 1)]
-        pairs = _same_birds(birds, masks)
-        if not pairs:
+    for picture, owner, true_px, known in zip(
+        frames.pictures, frames.owner, frames.keypoints_px, frames.known, strict=True
+    ):
+        birds = segmenter(picture)
+        masks = [owner == n for n in range(1, len(known) + 1)]
+        detected, true = assign(_ious(birds, masks))
+        if not len(detected):
             continue
-        points_px, confidence = keypoints(labelled.picture, [birds[i] for i, _ in pairs])
-        for m, (_, n) in enumerate(pairs):
-            known = labelled.visibility[n] > 0
-            side = _longer_side(masks[n], labelled.keypoints_px[n, known])
-            error = np.linalg.norm(points_px[m] - labelled.keypoints_px[n], axis=-1)
-            values.append(confidence[m, known])
-            right.append(error[known] <= RIGHT * side)
+        points_px, confidence = keypoints(picture, [birds[i] for i in detected])
+        for m, n in enumerate(true):
+            side = _longer_side(masks[n], true_px[n, known[n]])
+            error = np.linalg.norm(points_px[m] - true_px[n], axis=-1)
+            values.append(confidence[m, known[n]])
+            right.append(error[known[n]] <= RIGHT * side)
     return Outcomes(np.concatenate(values), np.concatenate(right))
 
 
@@ -136,21 +122,15 @@ def fit_curve(outcomes: Outcomes, source: object = "outcomes") -> Curve:
     return Curve(*np.array(points).T)
 
 
-def store_curve(path: str | Path, key: str, curve: Curve) -> None:
-    """Store a curve in a network; `key` is `CONFIDENCE_KEY` or `SCORE_KEY` of `jaxfit.perception.calibration`."""
-    set_metadata(path, {key: curve.text()})
-
-
-def _same_birds(birds: Sequence[Instance], masks: Sequence[Bool[np.ndarray, "H W"]]) -> list[tuple[int, int]]:
-    """Return the pairs (detected, known) of the same bird: the assignment with the largest sum of IoU."""
+def _ious(birds: Sequence[Instance], masks: Sequence[Bool[np.ndarray, "H W"]]) -> Float[np.ndarray, "M N"]:
+    """Return the IoU of every detected bird with every known bird."""
     iou = np.zeros((len(birds), len(masks)))
     for i, bird in enumerate(birds):
         height, width = bird.mask.shape
         for n, mask in enumerate(masks):
             shared = np.count_nonzero(bird.mask & mask[bird.y0 : bird.y0 + height, bird.x0 : bird.x0 + width])
             iou[i, n] = shared / (np.count_nonzero(bird.mask) + np.count_nonzero(mask) - shared)
-    rows, columns = linear_sum_assignment(-iou)
-    return [(int(i), int(n)) for i, n in zip(rows, columns, strict=True) if iou[i, n] >= MIN_IOU]
+    return iou
 
 
 def _longer_side(mask: Bool[np.ndarray, "H W"], points_px: Float[np.ndarray, "M 2"]) -> float:

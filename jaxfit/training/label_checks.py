@@ -96,9 +96,8 @@ def check_sides(
     references_px, references_known = np.zeros((0, len(names), 2)), np.zeros((0, len(names)), bool)
     if simulated is not None:
         frames = simulated.with_keypoints(names)
-        known = (frames.visibility == 1) | (frames.visibility == 2)
-        usable = known.sum(-1) >= LEAST_COMMON
-        references_px, references_known = frames.keypoints_px[usable], known[usable]
+        usable = frames.known.sum(-1) >= LEAST_COMMON
+        references_px, references_known = frames.keypoints_px[usable], frames.known[usable]
     points = np.stack([bird.keypoints_px for _, bird in birds])
     known = np.stack([bird.visibility > 0 for _, bird in birds])
     wrong = mixed_up_birds(points, known, references_px, references_known, names)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from numpy.lib.format import open_memmap
 
 from jaxfit.data.formats.fields import LARGEST_POSITION_PX
@@ -45,6 +45,11 @@ class LabelledFrames(NamedTuple):
     """Scale of the picture: pixels per model unit (2 cm). For labelled footage, the scale that the networks assume."""
     keypoint_names: tuple[str, ...] = MURRE_KEYPOINTS
     """K names."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, "S N K"]:
+        """Whether a keypoint has a label and lies in the picture, also if it is occluded."""
+        return (self.visibility == 1) | (self.visibility == 2)
 
     def with_keypoints(self, names: Sequence[str]) -> LabelledFrames:
         """Return the frames with other keypoints: keypoints of the same name are kept, all others are `UNKNOWN`."""

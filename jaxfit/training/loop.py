@@ -42,7 +42,7 @@ class Source(NamedTuple):
     share: float = 1.0
     """Share of the samples; the shares of all sources sum to 1."""
     keypoint_names: tuple[str, ...] | None = None
-    """Names of the keypoints of the samples; None keeps those of the frames."""
+    """Names of the keypoints of the samples; None keeps the names of the frames."""
 
 
 class _Samples(Dataset):

@@ -5,7 +5,8 @@ import pytest
 
 from jaxfit.errors import InputError
 from jaxfit.perception.instances import instance_of
-from jaxfit.training.calibration import LabelledPicture, Outcomes, fit_curve, keypoint_outcomes
+from jaxfit.training.calibration import Outcomes, fit_curve, keypoint_outcomes
+from jaxfit.training.labelled_frames import LabelledFrames
 
 
 def outcomes(probability, count=20_000, seed=0):
@@ -62,7 +63,7 @@ def test_outcomes_of_known_birds():
     points = np.zeros((2, 3, 2), np.float32)
     points[0] = (25, 30)
     visibility = np.array([[2, 1, 0], [0, 0, 0]], np.uint8)
-    labelled = LabelledPicture(picture, square(5).astype(np.uint8), points, visibility)
-    found = keypoint_outcomes([labelled], Segmenter(), Keypoints())
+    labels = [picture, square(5).astype(np.uint8), points, visibility, np.float32(9)]
+    found = keypoint_outcomes(LabelledFrames(*(np.stack([array]) for array in labels)), Segmenter(), Keypoints())
     assert found.values.tolist() == [0.3, 0.6]
     assert found.right.tolist() == [True, False]

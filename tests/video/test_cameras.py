@@ -1,6 +1,6 @@
 """Films as cameras make them: turned by a flag, interlaced, with 10 bits, with an edit list.
 
-The counts, sizes and times are those that ffprobe 6.0 shows for these films (`-show_frames`, `-show_streams`).
+The expected counts, sizes and times come from ffprobe 6.0 (`-show_frames`, `-show_streams`).
 """
 
 import logging
