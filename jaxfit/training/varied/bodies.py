@@ -14,7 +14,9 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird, window_transforms, window_vertices
 from jaxfit.model.murre import POSTURES
 from jaxfit.model.pose import Pose
+from jaxfit.simulation.footage import GAMMA
 from jaxfit.simulation.texture import Noise
+from jaxfit.training.varied.landscapes import log_uniform
 
 __all__ = ["PosedBirds", "Species", "draw_species"]
 
@@ -97,11 +99,6 @@ def draw_species(rng: np.random.Generator, bird: Bird) -> Species:
     return Species(body, _draw_plumage(rng, bird))
 
 
-def _factor(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a factor, uniform in its logarithm."""
-    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
-
-
 def _draw_body(rng: np.random.Generator, bird: Bird) -> Bird:
     names = bird.joint_names
     vertices, joints = np.asarray(bird.vertices, np.float64), np.asarray(bird.joints, np.float64)
@@ -112,14 +109,14 @@ def _draw_body(rng: np.random.Generator, bird: Bird) -> Bird:
     )
     head = weights[:, [names.index("head"), names.index("jaw")]].sum(1, keepdims=True)
     at = joints[names.index("head")]
-    size = _factor(rng, 0.7, 1.35)
+    size = log_uniform(rng, 0.7, 1.35)
     vertices = vertices + head * (size - 1) * (vertices - at)
     ahead = np.maximum(vertices[:, 1:2] - at[1] - 1.2 * size, 0)  # the bill begins in front of the head
-    vertices = vertices + head * ahead * [0, _factor(rng, 0.4, 2.2) - 1, rng.uniform(-0.4, 0.1)]
-    stretch = np.array([_factor(rng, 0.75, 1.35), _factor(rng, 0.85, 1.2), _factor(rng, 0.75, 1.3)])
+    vertices = vertices + head * ahead * [0, log_uniform(rng, 0.4, 2.2) - 1, rng.uniform(-0.4, 0.1)]
+    stretch = np.array([log_uniform(rng, 0.75, 1.35), log_uniform(rng, 0.85, 1.2), log_uniform(rng, 0.75, 1.3)])
     bone = np.asarray(bird.bone_mean, np.float64) * np.exp(0.05 * rng.normal(size=len(names) - 1))
     for group, low, high in ((_NECK, 0.7, 2.2), (_LEGS, 0.6, 1.8), (_WINGS, 0.8, 1.35), (("tail",), 0.7, 1.6)):
-        factor = _factor(rng, low, high)
+        factor = log_uniform(rng, low, high)
         for name in group:
             bone[names.index(name) - 1] *= factor
     return dataclasses.replace(
@@ -135,7 +132,7 @@ def _draw_body(rng: np.random.Generator, bird: Bird) -> Bird:
 def _draw_plumage(rng: np.random.Generator, bird: Bird) -> Float[np.ndarray, "V 3"]:
     """Draw colours of the vertices: the murre's, one colour for each part of the body, or a random pattern."""
     kind = rng.random()
-    own = np.asarray(bird.vertex_colours, np.float64)[:, ::-1] ** 2.2
+    own = np.asarray(bird.vertex_colours, np.float64)[:, ::-1] ** GAMMA
     if kind < 0.25:
         return np.clip(own * rng.uniform(0.5, 2, 3), 0.01, 0.95)
     vertices, names = np.asarray(bird.vertices, np.float64), bird.joint_names

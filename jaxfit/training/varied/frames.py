@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from jaxfit.model.bird import Bird
 from jaxfit.raster.zbuffer import hard_mask, interpolate, vertex_normals, zbuffer
+from jaxfit.simulation.footage import GAMMA
 from jaxfit.simulation.ledge import Light, random_light
 from jaxfit.simulation.plumage_light import lit_plumage
 from jaxfit.simulation.texture import Noise
@@ -26,7 +27,6 @@ LENGTH_UNITS = 20.0
 """Length of the murre in model units; the sizes of birds refer to this length."""
 LENGTH_SHARE = 0.03, 0.44
 """Range of the length of birds, as a share of the width of the picture."""
-GAMMA = 2.2
 DEPTH_STEP = 1000.0
 """Depth between birds in model units: a nearer bird hides a farther bird completely."""
 
@@ -98,16 +98,19 @@ def _place(
         own = scale * float(np.exp(rng.normal(0, 0.12)))
         birds = posed["fly" if flies else "swim" if swims[n] else "stand"][kind]
         vertices, keypoints = birds.vertices_world[n], birds.keypoints_world[n]
-        depth = DEPTH_STEP * (N - n + 1)
-
-        def on_screen(points: np.ndarray, own: float = own, centre: np.ndarray = centre, depth: float = depth):
-            cam = points @ R_cam_world.T
-            return np.column_stack([centre + own * cam[:, :2], depth + cam[:, 2]])
-
+        screen, points = (_on_screen(world, R_cam_world, own, centre, N - n + 1) for world in (vertices, keypoints))
         low, high = vertices[:, 2].min(), vertices[:, 2].max()
         waterline = low + rng.uniform(0.25, 0.5) * (high - low) if swims[n] else None
-        placed.append(_Placed(vertices, on_screen(vertices), on_screen(keypoints), species[kind], waterline, flies))
+        placed.append(_Placed(vertices, screen, points, species[kind], waterline, flies))
     return placed
+
+
+def _on_screen(
+    points_world: Float[np.ndarray, "P 3"], R_cam_world: np.ndarray, scale: float, centre_px: np.ndarray, rank: int
+) -> Float[np.ndarray, "P 3"]:
+    """Project points in parallel to x, y in pixels and depth in model units; birds of a higher rank are farther."""
+    cam = points_world @ R_cam_world.T
+    return np.column_stack([centre_px + scale * cam[:, :2], DEPTH_STEP * rank + cam[:, 2]])
 
 
 def _render(

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxfit.simulation.texture import Noise, smoothstep
 
-__all__ = ["Landscape", "draw_landscape"]
+__all__ = ["Landscape", "draw_landscape", "log_uniform"]
 
 _Shape = tuple[int, int]
 
@@ -189,7 +189,7 @@ def _add_objects(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
         drawn = _add_branches(rng, drawn)
     for _ in range(int(rng.integers(1, 9))):
         centre = rng.uniform(0, [width, height])
-        count, radius = int(rng.integers(5, 12)), _log_uniform(rng, 6, 110)
+        count, radius = int(rng.integers(5, 12)), log_uniform(rng, 6, 110)
         angles = np.sort(rng.uniform(0, 2 * np.pi, count))
         reach = radius * rng.uniform(0.6, 1.1, count) * rng.uniform(0.3, 1)
         corners = centre + np.stack([radius * np.cos(angles), reach * np.sin(angles)], 1)
@@ -206,5 +206,6 @@ def _add_objects(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
     return drawn
 
 
-def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """Draw a number that is uniform in its logarithm."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
