@@ -15,8 +15,8 @@ from jaxfit.progress import terminal
 from jaxfit.storage.files import check_new_file
 
 if TYPE_CHECKING:
-    from jaxfit.training.fine_tune import FineTuned
-    from jaxfit.training.label_checks import LeftOut
+    from jaxfit.training.fine_tuning.fine_tune import FineTuned
+    from jaxfit.training.fine_tuning.label_checks import LeftOut
 
 __all__ = ["train"]
 
@@ -60,8 +60,8 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
 
 
 def _train_on_labels(options: argparse.Namespace) -> None:
-    from jaxfit.training.fine_tune import Settings, default_schedule, fine_tune
-    from jaxfit.training.fine_tune_data import LabelFiles
+    from jaxfit.training.fine_tuning.data import LabelFiles
+    from jaxfit.training.fine_tuning.fine_tune import Settings, default_schedule, fine_tune
 
     start = time.perf_counter()
     files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)

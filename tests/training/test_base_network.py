@@ -11,7 +11,7 @@ from support.onnx_graphs import write_constant  # noqa: E402
 from jaxfit.errors import InputError  # noqa: E402
 from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
 from jaxfit.perception.onnx_model import OnnxModel  # noqa: E402
-from jaxfit.training.base_network import base_file, load_keypoint_base, load_segmenter_base  # noqa: E402
+from jaxfit.training.fine_tuning.base_network import base_file, load_keypoint_base, load_segmenter_base  # noqa: E402
 from jaxfit.training.keypoints import KeypointMaps  # noqa: E402
 from jaxfit.training.network_files import Probabilities  # noqa: E402
 

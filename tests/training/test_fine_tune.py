@@ -20,12 +20,12 @@ from jaxfit.errors import InputError  # noqa: E402
 from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
 from jaxfit.perception.instances import instance_of  # noqa: E402
 from jaxfit.training import fine_tune_loop, keypoints, segmenter  # noqa: E402
-from jaxfit.training.fine_tune_data import LabelFiles, prepare_data  # noqa: E402
-from jaxfit.training.fine_tune_loop import continue_training  # noqa: E402
+from jaxfit.training.fine_tuning.data import LabelFiles, prepare_data  # noqa: E402
+from jaxfit.training.fine_tuning.early_stopping import continue_training  # noqa: E402
+from jaxfit.training.fine_tuning.validation import keypoint_accuracy, segmenter_accuracy  # noqa: E402
 from jaxfit.training.labelled_frames import UNKNOWN, load_frames  # noqa: E402
 from jaxfit.training.loop import Schedule, Source, _Samples  # noqa: E402
 from jaxfit.training.networks import FeaturePyramid  # noqa: E402
-from jaxfit.training.validation import keypoint_accuracy, segmenter_accuracy  # noqa: E402
 
 TIMES = range(0, 400, 50)
 SCHEDULE = Schedule(10, 2, 1e-3)

@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
 from jaxfit.errors import InputError
-from jaxfit.training.holdout import GAP_FRAMES, split_pictures
-from jaxfit.training.labels import LabelledBird, LabelledPicture
+from jaxfit.training.fine_tuning.holdout import GAP_FRAMES, split_pictures
+from jaxfit.training.fine_tuning.labels import LabelledBird, LabelledPicture
 
 BIRD = LabelledBird("bird 1", np.ones(4), np.ones((1, 2)), np.full(1, 2), None)
 

@@ -9,10 +9,10 @@ pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
 from jaxfit.errors import InputError
 from jaxfit.model.files import load_murre
-from jaxfit.training.fine_tune_data import LabelFiles, prepare_data
+from jaxfit.training.fine_tuning.data import LabelFiles, prepare_data
+from jaxfit.training.fine_tuning.labels import read_labels
+from jaxfit.training.fine_tuning.left_right import mixed_up_birds
 from jaxfit.training.labelled_frames import UNKNOWN
-from jaxfit.training.labels import read_labels
-from jaxfit.training.left_right import mixed_up_birds
 
 TIMES = range(0, 400, 50)
 

@@ -26,10 +26,10 @@ from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
-from jaxfit.training.base_network import base_file, load_keypoint_base, load_segmenter_base
-from jaxfit.training.checkpoint import Checkpoint, set_weights
 from jaxfit.training.familiarity import store_training_activations
-from jaxfit.training.fine_tune_data import (
+from jaxfit.training.fine_tuning.base_network import base_file, load_keypoint_base, load_segmenter_base
+from jaxfit.training.fine_tuning.checkpoint import Checkpoint, set_weights
+from jaxfit.training.fine_tuning.data import (
     FRAMES,
     PICTURES,
     FineTuningData,
@@ -39,13 +39,18 @@ from jaxfit.training.fine_tune_data import (
     prepare_data,
     read_label_files,
 )
-from jaxfit.training.fine_tune_loop import CHECKS, continue_training
-from jaxfit.training.label_checks import LeftOut
+from jaxfit.training.fine_tuning.early_stopping import CHECKS, continue_training
+from jaxfit.training.fine_tuning.label_checks import LeftOut
+from jaxfit.training.fine_tuning.validation import (
+    keypoint_accuracy,
+    keypoint_detector,
+    segmenter_accuracy,
+    torch_segmenter,
+)
 from jaxfit.training.labelled_frames import LabelledFrames
 from jaxfit.training.loop import Schedule, Source
 from jaxfit.training.network_files import Probabilities, write_keypoints, write_segmenter
 from jaxfit.training.networks import FeaturePyramid
-from jaxfit.training.validation import keypoint_accuracy, keypoint_detector, segmenter_accuracy, torch_segmenter
 
 __all__ = ["FineTuned", "Settings", "default_schedule", "fine_tune"]
 

@@ -18,8 +18,9 @@ from jaxfit.data.masks import decode_mask
 from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX
 from jaxfit.perception.segmentation.bottom_up import LONGER_SIDE_PX, MULTIPLE
 from jaxfit.storage.files import new_folder
+from jaxfit.training.fine_tuning.label_pictures import StoredPicture
+from jaxfit.training.fine_tuning.labels import LabelledBird, LabelledPicture
 from jaxfit.training.keypoints import PAPER_PIXELS_PER_UNIT
-from jaxfit.training.label_pictures import StoredPicture
 from jaxfit.training.labelled_frames import (
     MARKER,
     UNKNOWN,
@@ -28,7 +29,6 @@ from jaxfit.training.labelled_frames import (
     load_frames,
     save_labels,
 )
-from jaxfit.training.labels import LabelledBird, LabelledPicture
 from jaxfit.training.segmenter import PIXELS_PER_UNIT
 
 __all__ = ["Scale", "choose_scale", "owner_of", "prepare_frames"]

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from jaxfit.errors import InputError
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.npy import load_npy
-from jaxfit.training.labels import LabelledPicture
+from jaxfit.training.fine_tuning.labels import LabelledPicture
 from jaxfit.video.pictures import image_files, read_picture
 from jaxfit.video.reader import read_frames
 

@@ -13,12 +13,12 @@ import numpy as np
 from jaxfit.errors import InputError
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import new_folder
-from jaxfit.training.holdout import Split, split_pictures
-from jaxfit.training.label_checks import LeftOut, check_picture, check_sides
-from jaxfit.training.label_pictures import StoredPicture, images_of, read_pictures
+from jaxfit.training.fine_tuning.holdout import Split, split_pictures
+from jaxfit.training.fine_tuning.label_checks import LeftOut, check_picture, check_sides
+from jaxfit.training.fine_tuning.label_pictures import StoredPicture, images_of, read_pictures
+from jaxfit.training.fine_tuning.labels import LabelSet, read_labels
+from jaxfit.training.fine_tuning.prepare import Scale, choose_scale, prepare_frames
 from jaxfit.training.labelled_frames import LabelledFrames, load_frames
-from jaxfit.training.labels import LabelSet, read_labels
-from jaxfit.training.prepare import Scale, choose_scale, prepare_frames
 from jaxfit.training.scenes import film_scenes
 
 __all__ = ["FRAMES", "PICTURES", "FineTuningData", "LabelFiles", "fingerprint", "load_or_film", "prepare_data"]

@@ -12,8 +12,15 @@ import numpy as np
 import torch
 
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.training.base_network import freeze_normalisation
-from jaxfit.training.checkpoint import Checkpoint, flat_weights, load_checkpoint, restore, save_checkpoint, state_of
+from jaxfit.training.fine_tuning.base_network import freeze_normalisation
+from jaxfit.training.fine_tuning.checkpoint import (
+    Checkpoint,
+    flat_weights,
+    load_checkpoint,
+    restore,
+    save_checkpoint,
+    state_of,
+)
 from jaxfit.training.loop import Loss, Schedule, Source, batches, has_fast_bfloat16, train_step
 from jaxfit.training.networks import FeaturePyramid
 

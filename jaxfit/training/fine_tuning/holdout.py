@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxfit.errors import InputError
-from jaxfit.training.labels import LabelledPicture
+from jaxfit.training.fine_tuning.labels import LabelledPicture
 
 __all__ = ["Split", "split_pictures"]
 

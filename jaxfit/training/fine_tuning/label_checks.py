@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from jaxfit.data.masks import decode_mask
+from jaxfit.training.fine_tuning.labels import LabelledBird, LabelledPicture
+from jaxfit.training.fine_tuning.left_right import LEAST_COMMON, mixed_up_birds
 from jaxfit.training.labelled_frames import MOST_BIRDS, LabelledFrames
-from jaxfit.training.labels import LabelledBird, LabelledPicture
-from jaxfit.training.left_right import LEAST_COMMON, mixed_up_birds
 
 __all__ = ["LeftOut", "check_picture", "check_sides"]
 

@@ -21,10 +21,10 @@ from jaxfit.perception.keypoints.inputs import KeypointInput
 from jaxfit.perception.keypoints.output_layouts import HeatmapLayout
 from jaxfit.perception.onnx_model import OnnxModel, Port
 from jaxfit.perception.segmentation.bottom_up import BottomUp
+from jaxfit.training.fine_tuning.label_pictures import StoredPicture
+from jaxfit.training.fine_tuning.labels import LabelledPicture
+from jaxfit.training.fine_tuning.prepare import Scale, owner_of
 from jaxfit.training.keypoints import SIDE_PX, STRIDE
-from jaxfit.training.label_pictures import StoredPicture
-from jaxfit.training.labels import LabelledPicture
-from jaxfit.training.prepare import Scale, owner_of
 
 __all__ = ["keypoint_accuracy", "keypoint_detector", "segmenter_accuracy", "torch_segmenter"]
 
