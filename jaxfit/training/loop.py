@@ -120,7 +120,7 @@ def train(
     progress: ProgressTask = silent,
     name: str = "Training",
 ) -> dict[str, float]:
-    """Train a network in place, with bfloat16 autocast, on a GPU if PyTorch finds a GPU.
+    """Train a network in place, on a GPU if PyTorch finds a GPU, in bfloat16 where it is faster than float32.
 
     Args:
         network: maps a batch of `picture` to maps by name.
@@ -142,10 +142,11 @@ def train(
     scheduler = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, schedule.learning_rate, schedule.steps, pct_start=0.1, cycle_momentum=False
     )
+    half = has_fast_bfloat16()
     recent: list[dict[str, float]] = []
     with progress(name, schedule.steps) as report_progress:
         for sample in batches([Source(frames_folder, draw)], schedule.batch, seed, 0, schedule.steps):
-            terms = train_step(network, sample, loss, optimiser, half_precision=True)
+            terms = train_step(network, sample, loss, optimiser, half)
             scheduler.step()
             recent = [*recent[-(schedule.steps // 10) :], terms]
             report_progress(1, " ".join(f"{key} {np.mean([r[key] for r in recent[-50:]]):.4f}" for key in recent[-1]))
