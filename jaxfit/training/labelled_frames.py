@@ -84,7 +84,13 @@ def save_labels(
     pixels_per_unit: Float[np.ndarray, "S"],
     keypoint_names: Sequence[str] = MURRE_KEYPOINTS,
 ) -> None:
-    """Write the labels, the last file of a folder of labelled frames; arguments as in `LabelledFrames`."""
+    """Write the labels, the last file of a folder of labelled frames; arguments as in `LabelledFrames`.
+
+    A bird that flies past the camera has keypoints very far outside the picture: their positions are clipped to the
+    range that `load_frames` accepts.
+    """
+    clipped_px = np.clip(keypoints_px, -LARGEST_POSITION_PX, LARGEST_POSITION_PX)
+    keypoints_px = np.where(visibility[..., None] == 0, clipped_px, keypoints_px).astype(np.float32)
     np.savez(
         folder / MARKER,
         keypoints_px=keypoints_px,

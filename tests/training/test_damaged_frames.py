@@ -11,7 +11,7 @@ from support.mutations import damaged_arrays, damaged_bytes
 
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
-from jaxfit.training.labelled_frames import load_frames
+from jaxfit.training.labelled_frames import load_frames, save_labels
 from jaxfit.training.scenes import HEIGHT, WIDTH
 
 K = len(MURRE_KEYPOINTS)
@@ -44,6 +44,17 @@ def test_impossible_labels(folder, name, value, message):
     assert len(load_frames(folder).pictures) == 1
     np.savez(folder / "frames.npz", **LABELS | {name: value})
     with pytest.raises(InputError, match=message):
+        load_frames(folder)
+
+
+def test_keypoints_far_outside_the_picture_are_clipped(folder):
+    points, visibility = LABELS["keypoints_px"].copy(), LABELS["visibility"].copy()
+    points[0, 1, 3], visibility[0, 1, 3] = (-6e8, 20), 0
+    save_labels(folder, points, visibility, LABELS["pixels_per_unit"])
+    assert load_frames(folder).keypoints_px[0, 1, 3].tolist() == [-1e6, 20]
+    visibility[0, 1, 3] = 2  # a visible keypoint cannot lie there
+    save_labels(folder, points, visibility, LABELS["pixels_per_unit"])
+    with pytest.raises(InputError, match="wrong position of a keypoint"):
         load_frames(folder)
 
 
