@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -28,10 +28,20 @@ __all__ = ["OFFSET_UNIT_PX", "SIDE_PX", "STRIDE", "SegmenterSample", "draw_sampl
 STRIDE = 2
 OFFSET_UNIT_PX = 32.0
 """Length of an offset of 1, pixels of the network's input."""
-SIDE_PX = 288
+SIDE_PX = 320
 """Side of the square training pictures."""
 PIXELS_PER_UNIT = 4.2, 11.5
-"""Range of the training scales, pixels per 2 cm in the network's input; 2.5 m over 864 pixels is 6.9."""
+"""Usual range of the training scales, pixels per 2 cm in the network's input; 2.5 m over 864 pixels is 6.9."""
+WIDE_PIXELS_PER_UNIT = 1.5, 15.0
+"""Wide range of the training scales: forty small birds (30 pixels) to one large bird (300 pixels)."""
+WIDE_SHARE = 0.5
+"""Share of the samples with a scale of the wide range."""
+RESAMPLING = 0.3, 1.6
+"""Range of the factor between the frame and the sample; the scale of a sample may lie outside its range."""
+SPREAD_SHARE = 0.2
+"""Share of the samples around a bird with spread wings, if the frames show such birds."""
+SPREAD_UNITS = 14.0
+"""Least distance of the wingtips of spread wings in the picture, model units; a murre is 20 units long."""
 CENTRE_SIGMA = 0.14
 """Standard deviation of the peak at a centre, as a share of the square root of the bird's area."""
 MIN_AREA_PX = 20
@@ -61,26 +71,48 @@ def segmenter_network() -> FeaturePyramid:
     return FeaturePyramid((16, 32, 64, 96, 128), (0, 1, 2, 2, 2), (96, 64, 48, 24), heads)
 
 
-def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: float = SCENE_SHARE) -> SegmenterSample:
+def draw_sample(
+    rng: np.random.Generator,
+    frames: LabelledFrames,
+    scene_share: float = SCENE_SHARE,
+    wide_share: float = WIDE_SHARE,
+) -> SegmenterSample:
     """Draw a random patch of a random frame, with random scale, rotation, mirroring and appearance.
 
     Args:
         rng: source of randomness.
         frames: the frames.
         scene_share: share of the samples with a random scene, as in `randomise_appearance`.
+        wide_share: share of the samples with a scale of `WIDE_PIXELS_PER_UNIT`; all others have a usual scale.
     """
-    s = int(rng.integers(len(frames.pictures)))
-    factor = np.exp(rng.uniform(*np.log(PIXELS_PER_UNIT))) / frames.pixels_per_unit[s]
+    spread = _birds_with_spread_wings(frames) if rng.random() < SPREAD_SHARE else np.zeros((0, 2), int)
+    if len(spread):
+        s, n = rng.choice(spread).tolist()
+    else:
+        s, n = int(rng.integers(len(frames.pictures))), None
+    scales = WIDE_PIXELS_PER_UNIT if rng.random() < wide_share else PIXELS_PER_UNIT
+    factor = np.clip(np.exp(rng.uniform(*np.log(scales))) / frames.pixels_per_unit[s], *RESAMPLING)
     height, width = frames.owner.shape[1:]
     centre_px = rng.uniform(0, [width, height])
     visible_birds = np.flatnonzero((frames.visibility[s] == 2).any(-1))
-    if rng.random() < 0.85 and len(visible_birds):
+    if n is None and rng.random() < 0.85 and len(visible_birds):
         n = rng.choice(visible_birds)
+    if n is not None:
         shift_px = rng.normal(0, 0.2 * SIDE_PX / factor, 2)
         centre_px = frames.keypoints_px[s, n, frames.visibility[s, n] == 2].mean(0) + shift_px
     picture, owner = _resampled_patch(rng, frames, s, centre_px, factor)
     picture = randomise_appearance(rng, picture, owner > 0, scene_share)
     return SegmenterSample(np.moveaxis(picture, -1, 0).astype(np.float32) / 255, *_targets(owner))
+
+
+def _birds_with_spread_wings(frames: LabelledFrames) -> Int[np.ndarray, "M 2"]:
+    """Return frame and bird of all birds whose wingtips are far apart in the picture and that are not hidden."""
+    if not {"left_wingtip", "right_wingtip"} <= set(frames.keypoint_names):
+        return np.zeros((0, 2), int)
+    left, right = (frames.keypoint_names.index(f"{side}_wingtip") for side in ("left", "right"))
+    span_px = np.linalg.norm(frames.keypoints_px[:, :, left] - frames.keypoints_px[:, :, right], axis=-1)
+    both = frames.known[:, :, left] & frames.known[:, :, right] & (frames.visibility == 2).any(-1)
+    return np.argwhere(both & (span_px > SPREAD_UNITS * frames.pixels_per_unit[:, None]))
 
 
 def _resampled_patch(

@@ -26,7 +26,7 @@ __all__ = ["SCENES", "SCHEDULES", "train_network"]
 
 SCENES = 160
 """Number of training scenes, with seeds from 0; seeds of 1000 and more are for tests."""
-SCHEDULES = {"segmenter": Schedule(3600, 12, 2e-3), "keypoints": Schedule(4000, 24, 2e-3)}
+SCHEDULES = {"segmenter": Schedule(3600, 8, 2e-3), "keypoints": Schedule(4000, 24, 2e-3)}
 """Schedules of the built-in networks."""
 
 
