@@ -74,8 +74,7 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     _show_left_out(result.left_out)
     _show_result(result)
     minutes = (time.perf_counter() - start) / 60
-    best = f"best after step {result.best_step} of {result.steps}"
-    show(f"{options.network} trained in {minutes:.1f} min, {best} → {options.out}")
+    show(f"{options.network} trained in {minutes:.1f} min, {result.best_step} steps → {options.out}")
 
 
 def _show_left_out(left_out: Sequence[LeftOut]) -> None:
@@ -93,7 +92,7 @@ def _show_result(result: FineTuned) -> None:
     """Print the parts of the labels, and the accuracy on the held-out part before and after the training."""
     parts = result.pictures
     training = counted(parts["training"], "labelled picture")
-    show(f"trained on {training}, {parts['holdout']} held out, {parts['gap']} in between ({result.rule})")
+    show(f"{training} for the training, {parts['holdout']} held out, {parts['gap']} in between ({result.rule})")
     if result.new_keypoints:
         show(f"new keypoints, which the base network lacks: {', '.join(result.new_keypoints)}")
     if not result.after:
@@ -105,3 +104,10 @@ def _show_result(result: FineTuned) -> None:
         digits = 1 if key == "error" else 3
         table.add_row(_ROWS[key], f"{result.before[key]:.{digits}f}", f"{value:.{digits}f}")
     show(table)
+    if result.best_step:
+        show(
+            f"best after step {result.best_step} of {result.steps}; the network that is written was trained again for "
+            "as many steps, on all labelled pictures"
+        )
+    else:
+        show("the training did not improve the base network, so the base network is written again")

@@ -19,7 +19,8 @@ from jaxfit.cli.main import main  # noqa: E402
 from jaxfit.errors import InputError  # noqa: E402
 from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
 from jaxfit.perception.instances import instance_of  # noqa: E402
-from jaxfit.training import fine_tune_loop, keypoints, segmenter  # noqa: E402
+from jaxfit.training import keypoints, segmenter  # noqa: E402
+from jaxfit.training.fine_tuning import early_stopping  # noqa: E402
 from jaxfit.training.fine_tuning.data import LabelFiles, prepare_data  # noqa: E402
 from jaxfit.training.fine_tuning.early_stopping import continue_training  # noqa: E402
 from jaxfit.training.fine_tuning.validation import keypoint_accuracy, segmenter_accuracy  # noqa: E402
@@ -46,7 +47,7 @@ def same_process(monkeypatch):
         for step in range(last - first):
             yield default_collate([samples[step * batch + i] for i in range(batch)])
 
-    monkeypatch.setattr(fine_tune_loop, "batches", batches)
+    monkeypatch.setattr(early_stopping, "batches", batches)
 
 
 def tiny_network():
@@ -81,7 +82,7 @@ def test_interrupted_training_gives_the_same_weights(data, tmp_path):
     assert steps == 4
     assert resumed.step == whole.step == 10
     assert np.array_equal(resumed.weights, whole.weights)
-    assert not np.array_equal(whole.weights, fine_tune_loop.flat_weights(tiny_network()))
+    assert not np.array_equal(whole.weights, early_stopping.flat_weights(tiny_network()))
     finished, steps = trained(folder, tmp_path / "parts.npz")
     assert steps == 0
     assert np.array_equal(finished.best_weights, whole.best_weights)

@@ -56,6 +56,12 @@ class Checkpoint(NamedTuple):
     history: np.ndarray
     """(E, 2) step and score on the held-out part, of every measurement so far."""
 
+    @property
+    def best_step(self) -> int:
+        """Number of steps with the best score, the last of equal scores; all steps if nothing was measured."""
+        latest_first = self.history[::-1]
+        return int(latest_first[latest_first[:, 1].argmax(), 0]) if len(latest_first) else self.step
+
 
 def state_of(
     network: nn.Module,

@@ -21,10 +21,19 @@ from jaxfit.training.fine_tuning.prepare import Scale, choose_scale, prepare_fra
 from jaxfit.training.labelled_frames import LabelledFrames, load_frames
 from jaxfit.training.scenes import film_scenes
 
-__all__ = ["FRAMES", "PICTURES", "FineTuningData", "LabelFiles", "fingerprint", "load_or_film", "prepare_data"]
+__all__ = [
+    "ALL_FRAMES",
+    "FRAMES",
+    "PICTURES",
+    "FineTuningData",
+    "LabelFiles",
+    "fingerprint",
+    "load_or_film",
+    "prepare_data",
+]
 
-PICTURES, FRAMES = "pictures", "frames"
-"""Folders of the stored pictures and of the labelled frames, in the folder of a training."""
+PICTURES, FRAMES, ALL_FRAMES = "pictures", "frames", "all_frames"
+"""Folders of the stored pictures, of the training part and of all labelled frames, in the folder of a training."""
 _PICTURES_MARKER = "pictures.txt"
 
 
@@ -45,6 +54,8 @@ class FineTuningData(NamedTuple):
     keypoint_names: tuple[str, ...]
     frames: LabelledFrames
     """The training part."""
+    pictures: list[StoredPicture]
+    """All labelled pictures that can be used, also those of the held-out part."""
     holdout: list[StoredPicture]
     left_out: list[LeftOut]
     """Labels that are not used."""
@@ -100,7 +111,7 @@ def prepare_data(
     training, holdout = ([stored[i] for i in part] for part in (split.training, split.holdout))
     scale = choose_scale(picture.labels for picture in training)
     frames = prepare_frames(folder / FRAMES, training, labels.keypoint_names, scale, network)
-    return FineTuningData(labels.keypoint_names, frames, holdout, left_out, split, scale)
+    return FineTuningData(labels.keypoint_names, frames, stored, holdout, left_out, split, scale)
 
 
 def read_label_files(network: str, files: LabelFiles, progress: ProgressTask = silent) -> LabelSet:

@@ -1,8 +1,9 @@
-"""Fine-tuning of a network on labelled footage: before, training with early stopping, after.
+"""Fine-tuning of a network on labelled footage, in two trainings.
 
-Every sample comes from a labelled or from a simulated frame. The score on the held-out pictures decides which weights
-are written, and when the training stops. The state is stored after every measurement, so that the same call continues
-an interrupted training with the same result.
+The first training uses a part of the labelled pictures. The score on the held-out pictures determines the number of
+steps, and the accuracy before and after. The second training uses all labelled pictures for this number of steps; its
+network is written. Every sample comes from a labelled or from a simulated frame. The state is stored at regular
+intervals, so that the same call continues an interrupted training with the same result.
 """
 
 # pyright: reportMissingImports=false
@@ -28,8 +29,9 @@ from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
 from jaxfit.training.familiarity import store_training_activations
 from jaxfit.training.fine_tuning.base_network import base_file, load_keypoint_base, load_segmenter_base
-from jaxfit.training.fine_tuning.checkpoint import Checkpoint, set_weights
+from jaxfit.training.fine_tuning.checkpoint import Checkpoint, flat_weights, set_weights
 from jaxfit.training.fine_tuning.data import (
+    ALL_FRAMES,
     FRAMES,
     PICTURES,
     FineTuningData,
@@ -41,6 +43,7 @@ from jaxfit.training.fine_tuning.data import (
 )
 from jaxfit.training.fine_tuning.early_stopping import CHECKS, continue_training
 from jaxfit.training.fine_tuning.label_checks import LeftOut
+from jaxfit.training.fine_tuning.prepare import prepare_frames
 from jaxfit.training.fine_tuning.validation import (
     keypoint_accuracy,
     keypoint_detector,
@@ -62,7 +65,10 @@ LEAST_COMMON_KEYPOINTS = 4
 """With fewer keypoints in common, the keypoint network sees no simulated frames."""
 CHECKED_PICTURES = 16
 """Largest number of held-out pictures of a measurement during the training; the last measurement uses all."""
-CHECKPOINT = "checkpoint.npz"
+CHECKPOINT, CHECKPOINT_ALL = "checkpoint.npz", "checkpoint_all.npz"
+"""States of the training on a part of the labelled pictures, and of the training on all."""
+CHECKED = "checked.onnx"
+"""The network of the training on a part, which is measured and then removed."""
 
 
 class Settings(NamedTuple):
@@ -85,7 +91,7 @@ class FineTuned(NamedTuple):
     before: dict[str, float]
     """Accuracy of the base network on the held-out pictures; empty without held-out pictures."""
     after: dict[str, float]
-    """Accuracy of the written network."""
+    """Accuracy of the network that was trained without the held-out pictures; the written network has seen them."""
     left_out: list[LeftOut]
     """Labels that were not used."""
     pictures: dict[str, int]
@@ -95,8 +101,9 @@ class FineTuned(NamedTuple):
     new_keypoints: tuple[str, ...]
     """Keypoints that the base network lacks."""
     best_step: int
+    """Number of steps of the written network; 0 if the base network was best."""
     steps: int
-    """Number of steps that were taken."""
+    """Number of steps on a part of the labelled pictures."""
 
 
 def default_schedule(network: str, pictures: int) -> Schedule:
@@ -151,26 +158,34 @@ def fine_tune(
     mark = fingerprint(data, simulated, base, (network, schedule, settings.seed))
     names = dict(zip(data.keypoint_names, found, strict=True))
     before = _accuracy(network, base, data, names)
-    sources = _sources(network, folder / FRAMES, data, None if simulated is None else Path(frames_folder), simulated)
-    checkpoint = continue_training(
-        model,
-        segmenter.loss if network == "segmenter" else keypoints.loss,
-        sources,
-        schedule,
-        settings.seed,
-        folder / CHECKPOINT,
-        mark,
-        _score(network, model, data) if data.holdout else None,
-        progress,
-        f"Training {network}",
-    )
-    set_weights(model, checkpoint.best_weights)
+    film = None if simulated is None else Path(frames_folder)
+    initial = flat_weights(model)
+
+    def train(frames: str, state: str, steps: int, score: Callable[[], float] | None) -> Checkpoint:
+        """Train from the initial weights on one folder of labelled frames."""
+        set_weights(model, initial)
+        loss = segmenter.loss if network == "segmenter" else keypoints.loss
+        sources = _sources(network, folder / frames, data, film, simulated)
+        what = f"Training {network}" if frames == FRAMES else f"Training {network} on all labels"
+        own = schedule._replace(steps=steps)
+        checkpoint = continue_training(
+            model, loss, sources, own, settings.seed, folder / state, f"{mark} {frames}", score, progress, what
+        )
+        set_weights(model, checkpoint.best_weights)
+        return checkpoint
+
+    checkpoint = train(FRAMES, CHECKPOINT, schedule.steps, _score(network, model, data) if data.holdout else None)
+    frames, after = data.frames, {}
     facts = _facts(network, base, data, simulated, schedule, checkpoint)
+    if data.holdout:
+        _write(network, model, data, facts, folder / CHECKED)
+        after = _accuracy(network, folder / CHECKED, data, {name: name for name in data.keypoint_names})
+        if checkpoint.best_step:
+            frames = prepare_frames(folder / ALL_FRAMES, data.pictures, data.keypoint_names, data.scale, network)
+            train(ALL_FRAMES, CHECKPOINT_ALL, checkpoint.best_step, None)
     _write(network, model, data, facts, path)
-    store_training_activations(network, path, [f for f in (data.frames, simulated) if f is not None], progress=progress)
-    after = _accuracy(network, path, data, {name: name for name in data.keypoint_names})
+    store_training_activations(network, path, [f for f in (frames, simulated) if f is not None], progress=progress)
     _remove(folder)
-    history = checkpoint.history
     return FineTuned(
         before,
         after,
@@ -178,7 +193,7 @@ def fine_tune(
         {"training": len(data.split.training), "holdout": len(data.holdout), "gap": len(data.split.gap)},
         data.split.rule,
         tuple(name for name, known in names.items() if not known),
-        int(history[::-1][history[::-1, 1].argmax(), 0]) if len(history) else checkpoint.step,
+        checkpoint.best_step,
         checkpoint.step,
     )
 
@@ -201,8 +216,9 @@ def _sources(
     network: str, frames: Path, data: FineTuningData, simulated_folder: Path | None, simulated: LabelledFrames | None
 ) -> list[Source]:
     """Return the labelled and the simulated frames with their shares."""
-    module = segmenter if network == "segmenter" else keypoints
-    labelled = Source(frames, partial(module.draw_sample, scene_share=LABELLED_SCENE_SHARE))
+    # the new segmenter sees the footage at one scale, so it needs no wide range of scales
+    draw = partial(segmenter.draw_sample, wide_share=0.0) if network == "segmenter" else keypoints.draw_sample
+    labelled = Source(frames, partial(draw, scene_share=LABELLED_SCENE_SHARE))
     if simulated is None or simulated_folder is None:
         return [labelled]
     if network == "keypoints":
@@ -211,7 +227,7 @@ def _sources(
         if not ((mapped.visibility == 2).sum(-1) >= least).any():
             return [labelled]
     names = data.keypoint_names if network == "keypoints" else None
-    others = Source(simulated_folder, module.draw_sample, 1 - LABELLED_SHARE, names)
+    others = Source(simulated_folder, draw, 1 - LABELLED_SHARE, names)
     return [labelled._replace(share=LABELLED_SHARE), others]
 
 
@@ -252,11 +268,12 @@ def _facts(
     checkpoint: Checkpoint,
 ) -> dict[str, str]:
     frames = 0 if simulated is None else len(simulated.pictures)
-    trained_on = f"{len(data.split.training)} labelled pictures and {frames} simulated frames"
+    count = len(data.pictures) if checkpoint.best_step else 0
+    trained_on = f"{count} labelled pictures and {frames} simulated frames"
     return {
         "trained_by": f"jaxfit {metadata.version('jaxfit')} train {network}, fine-tuned from {base.name}",
         "trained_on": trained_on,
-        "schedule": json.dumps(schedule._asdict()),
+        "schedule": json.dumps(schedule._replace(steps=checkpoint.best_step)._asdict()),
         "holdout": f"{len(data.holdout)} pictures, {data.split.rule}",
         "holdout_score": json.dumps(np.round(checkpoint.history, 4).tolist()),
     }
@@ -271,8 +288,9 @@ def _write(network: str, model: Any, data: FineTuningData, facts: dict[str, str]
 
 def _remove(folder: Path) -> None:
     """Remove the files of a finished training; files of other programs stay."""
-    for name in (PICTURES, FRAMES):
+    for name in (PICTURES, FRAMES, ALL_FRAMES):
         shutil.rmtree(folder / name, ignore_errors=True)
-    (folder / CHECKPOINT).unlink(missing_ok=True)
+    for name in (CHECKPOINT, CHECKPOINT_ALL, CHECKED):
+        (folder / name).unlink(missing_ok=True)
     if folder.exists() and not any(folder.iterdir()):
         folder.rmdir()
