@@ -96,7 +96,7 @@ def test_segmenter_targets():
 
 
 def test_scales_of_the_samples():
-    """Squares of 10 units: without the wide range, a bird is 42 to 115 pixels long; with it, 30 (by RESAMPLING) to 150."""
+    """A square of 10 units has 42 to 115 pixels at a usual scale, and 30 (by RESAMPLING) to 150 at a wide scale."""
 
     def lengths(wide_share):
         samples = [segmenter.draw_sample(np.random.default_rng(i), two_squares(), 0.0, wide_share) for i in range(60)]
