@@ -154,6 +154,7 @@ def _summary(
         "video": {"file": str(video), **info._asdict(), "damaged": tracking.damaged_frames},
         "quality": {row.track_id: row._asdict() for row in track_quality(tracking.observations)},
         "short_tracks": tracking.short_tracks,
+        "low_score_tracks": tracking.low_score_tracks,
         "trust": tracking.trust.level,
         "trust_reasons": list(tracking.trust.reasons),
         "trust_signals": tracking.trust.signals._asdict(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import time
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from jaxfit.cli.tables import counted, show, track_table
@@ -13,6 +14,7 @@ from jaxfit.progress import terminal
 
 if TYPE_CHECKING:
     from jaxfit.config.reconstruct import ReconstructConfig
+    from jaxfit.perception.track import TrackingResult
 
 _logger = logging.getLogger(__name__)
 
@@ -38,7 +40,7 @@ def track(options: argparse.Namespace) -> None:
         _logger.warning("%s", tracking.failure)
     else:
         show(track_table(tracking.observations))
-    _show_short_tracks(tracking.short_tracks, config.min_track_frames)
+    _show_skipped_tracks(tracking, config.min_track_frames)
     birds, frames = tracking.observations.present.shape
     seconds = time.perf_counter() - start
     show(f"{counted(birds, 'bird')} over {counted(frames, 'frame')} in {seconds:.1f} s → {options.out}")
@@ -54,7 +56,7 @@ def reconstruct(options: argparse.Namespace) -> None:
     done = reconstruct(options.video, options.out, bird, config, overwrite=options.overwrite, progress=terminal)
     show(done.tracking.trust.sentence())
     show(track_table(done.tracking.observations, done.solution))
-    _show_short_tracks(done.tracking.short_tracks, config.track.min_track_frames)
+    _show_skipped_tracks(done.tracking, config.track.min_track_frames)
     birds = counted(done.summary["tracks"], "bird")
     show(f"{counted(done.summary['poses'], 'pose')} of {birds} in {time.perf_counter() - start:.0f} s. Files:")
     for name, text in (
@@ -77,9 +79,18 @@ def reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
     return with_values(load_reconstruct_config(options.config), settings)
 
 
-def _show_short_tracks(short: dict[int, int], min_frames: int) -> None:
-    """Print which tracks were skipped because of too few frames; `short` maps track ids to numbers of frames."""
+def _show_skipped_tracks(tracking: TrackingResult, min_frames: int) -> None:
+    """Print which tracks were skipped, because of too few frames or of low scores."""
+    short, low = tracking.short_tracks, tracking.low_score_tracks
     if short:
-        frames = ", ".join(f"{track} ({count})" for track, count in list(short.items())[:10])
-        more = ", …" if len(short) > 10 else ""
-        show(f"{counted(len(short), 'track')} with fewer than {min_frames} frames skipped: {frames}{more}")
+        frames = _some(f"{track} ({count})" for track, count in short.items())
+        show(f"{counted(len(short), 'track')} with fewer than {min_frames} frames skipped: {frames}")
+    if low:
+        scores = _some(f"{track} ({score:.2f})" for track, score in low.items())
+        show(f"{counted(len(low), 'track')} with a low mean score skipped (min_track_score): {scores}")
+
+
+def _some(texts: Iterable[str]) -> str:
+    """Return the first ten texts as one text."""
+    shown = list(texts)
+    return ", ".join([*shown[:10], *(["…"] if len(shown) > 10 else [])])

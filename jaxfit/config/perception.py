@@ -110,6 +110,9 @@ class TrackConfig:
     tracker: TrackerConfig = TrackerConfig()
     min_track_frames: int = 10
     """Tracks with fewer frames are skipped."""
+    min_track_score: float | None = None
+    """Tracks with a lower mean score are skipped; null uses the value in the file of the segmenter (0.65 for the
+    built-in segmenter), or 0."""
     repair_left_right_flips: bool = False
     """Exchange left and right keypoints in frames where the network confuses the two sides; the paper does not."""
     threads: int | None = None
@@ -117,4 +120,5 @@ class TrackConfig:
 
     def __post_init__(self):
         require_within(self, 1, limits.FRAME_NUMBER, "min_track_frames")
+        require_fraction(self, "min_track_score")
         require_within(self, 1, limits.THREADS, "threads")

@@ -21,7 +21,15 @@ from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.keypoints.detector import BUILTIN_PATH
 from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
-from jaxfit.perception.tracking import Tracker, TrackRecorder, drop_short_tracks, load_tracker, repair_left_right_flips
+from jaxfit.perception.tracking import (
+    Tracker,
+    TrackRecorder,
+    drop_low_scores,
+    drop_short_tracks,
+    load_tracker,
+    mean_scores,
+    repair_left_right_flips,
+)
 from jaxfit.perception.trust import Trust, footage_signals, judge
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.video.reader import FrameReader, read_frames
@@ -38,9 +46,11 @@ class TrackingResult(NamedTuple):
     """Tracks of a video, and how tracking went."""
 
     observations: Observations
-    """The tracks that are long enough; all readable frames, including frames without a bird."""
+    """The tracks that are not excluded; all readable frames, including frames without a bird."""
     short_tracks: dict[int, int]
     """Track → number of frames, for the excluded short tracks."""
+    low_score_tracks: dict[int, float]
+    """Track → mean score, for the excluded longer tracks of birds with low scores."""
     damaged_frames: list[int]
     """Numbers of the frames that could not be read."""
     failure: InputError | None
@@ -181,21 +191,35 @@ def run_tracking(
         raise InputError(source, f"has no frame from {frames.start} on", "begin with an earlier frame")
     with clock("clean up"):
         all_tracks = recorder.observations()
-        observations = drop_short_tracks(all_tracks, config.min_track_frames)
+        long_tracks = drop_short_tracks(all_tracks, config.min_track_frames)
+        least = getattr(segmenter, "min_track_score", 0.0) if config.min_track_score is None else config.min_track_score
+        observations = drop_low_scores(long_tracks, least)
         if config.repair_left_right_flips:
             observations, _ = repair_left_right_flips(observations, mirror_pairs(observations.keypoint_names))
     lengths = dict(zip(all_tracks.track_id.tolist(), all_tracks.present.sum(1).tolist(), strict=True))
-    short_tracks = {track: length for track, length in lengths.items() if track not in observations.track_id}
+    short_tracks = {track: length for track, length in lengths.items() if track not in long_tracks.track_id}
+    scores = dict(zip(long_tracks.track_id.tolist(), mean_scores(long_tracks).tolist(), strict=True))
+    low_score_tracks = {track: score for track, score in scores.items() if track not in observations.track_id}
     distances = [() if monitor is None else monitor.take().tolist() for monitor in monitors]
     is_calibrated = getattr(keypoints, "curve", None) is not None
     trust = judge(footage_signals(all_tracks, short_tracks, distances, is_calibrated))
     failure = None
     if not observations.num_tracks:
-        if short_tracks:
+        if low_score_tracks:
+            failure = _only_low_scores(source, low_score_tracks, least)
+        elif short_tracks:
             failure = _only_short_tracks(source, config, short_tracks, best_score)
         else:
             failure = _no_bird(source, config, frame_count, has_own_segmenter)
-    return TrackingResult(observations, short_tracks, reader.damaged, failure, trust, clock.seconds)
+    return TrackingResult(observations, short_tracks, low_score_tracks, reader.damaged, failure, trust, clock.seconds)
+
+
+def _only_low_scores(source: str | Path, low_score_tracks: dict[int, float], least: float) -> InputError:
+    problem = (
+        f"no tracked bird has a mean score of {least:g}: the highest of {len(low_score_tracks)} tracks is "
+        f"{max(low_score_tracks.values()):.2f}"
+    )
+    return InputError(source, problem, "lower min_track_score, or try another segmenter")
 
 
 def _only_short_tracks(

@@ -26,7 +26,7 @@ __all__ = ["keypoint_inputs", "pictures_in_use", "segmenter_inputs", "store_trai
 
 LONGER_SIDE_PX = 864
 """Longer side of the pictures with a random appearance; blur and noise have the scale of the training there."""
-MAX_PICTURES = 400
+MAX_PICTURES = 200
 """Number of pictures; more pictures hardly change the statistics."""
 
 

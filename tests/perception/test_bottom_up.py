@@ -112,6 +112,9 @@ def test_variable_sides_are_multiples_of_32(tmp_path):
         ({}, ["cat"], "lacks cat"),
         ({"longer_side": "x"}, None, "longer_side"),
         ({"longer_side": "850"}, None, "a multiple of 32"),
+        ({"min_track_score": "1.5"}, None, "min_track_score"),
+        ({"min_track_score": "high"}, None, "min_track_score"),
+        ({"min_track_score": "nan"}, None, "min_track_score"),
     ],
 )
 def test_invalid_metadata_and_classes(tmp_path, metadata, classes, message):

@@ -90,6 +90,26 @@ def test_short_tracks_are_excluded_and_reported(video):
     assert tracking.failure is None
 
 
+def test_tracks_with_low_scores_are_excluded_and_reported(video):
+    """The birds have scores of 0.9, 0.8 and 0.7; the network asks for 0.75, and a config asks for other values."""
+
+    class Scored(TrueSegmenter):
+        min_track_score = 0.75
+
+    def run(**settings):
+        return run_tracking(video, TrackConfig(min_track_frames=2, **settings), Scored(FOOTAGE), TrueKeypoints(FOOTAGE))
+
+    tracking = run()
+    assert sorted(columns(tracking.observations)) == [0, 1]
+    assert list(tracking.low_score_tracks.values()) == pytest.approx([0.7])
+    assert not set(tracking.low_score_tracks) & set(tracking.observations.track_id.tolist())
+    assert not tracking.short_tracks
+    assert tracking.trust.signals.tracks == BIRDS  # the trust judges all tracks
+    assert run(min_track_score=0.0).observations.num_tracks == BIRDS
+    failure = run(min_track_score=0.95).failure
+    assert "no tracked bird has a mean score of 0.95: the highest of 3 tracks is 0.90" in str(failure)
+
+
 def test_no_keypoints_for_birds_without_a_track(video):
     class OneBird:
         def update(self, frame_index, instances, frame=None):

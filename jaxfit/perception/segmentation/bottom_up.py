@@ -35,6 +35,8 @@ MAX_DISTANCE_PX = 60.0
 """Cells whose offset ends at least this far from every centre belong to no bird; pixels of the input."""
 MOST_PEAKS = 10 * INSTANCES
 """More peaks are the output of a network that was not trained."""
+MOST_DIGITS = 20
+"""Characters of a number in the metadata; the rest is not read."""
 MIN_CELLS = 12
 """Instances with fewer cells are dropped."""
 
@@ -48,7 +50,8 @@ class BottomUp(SegmentationNetwork):
     is the peak of the centre times the mean foreground.
 
     Raises:
-        InputError: an unsupported input, more than one class, or an invalid `longer_side` in the metadata.
+        InputError: an unsupported input, more than one class, or an invalid `longer_side` or `min_track_score` in the
+            metadata.
 
     Source: Cheng et al. 2020, Panoptic-DeepLab.
     """
@@ -65,7 +68,20 @@ class BottomUp(SegmentationNetwork):
             remedy = f"export it with a multiple of {MULTIPLE} pixels, at most {LARGEST_SIDE_PX}"
             raise InputError(self._model.path, f"its metadata `longer_side` is {text[:40]!r}", remedy)
         self._longer_side_px = int(text)
+        self.min_track_score = self._min_track_score()
         self.activations = activation_monitor(self._model)
+
+    def _min_track_score(self) -> float:
+        """Return the least mean score of a track, 0 if the file does not contain it."""
+        text = self._model.metadata.get("min_track_score", "0")[:MOST_DIGITS]
+        try:
+            score = float(text)
+        except ValueError:
+            score = float("nan")
+        if not 0 <= score <= 1:
+            problem = f"its metadata `min_track_score` is {text!r}"
+            raise InputError(self._model.path, problem, "export it with a number within 0 and 1")
+        return score
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
         names_by_index = super()._all_classes(names)

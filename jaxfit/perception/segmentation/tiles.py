@@ -50,6 +50,7 @@ class Tiled:
             raise ValueError(f"overlap must be within 0 and 1, not {overlap}")
         self._segmenter, self._tile_px, self._overlap = segmenter, tile_px, overlap
         self.class_names = segmenter.class_names
+        self.min_track_score = getattr(segmenter, "min_track_score", 0.0)
 
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
         """Segment a frame, as `Segmenter` describes."""
