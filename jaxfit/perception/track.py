@@ -143,7 +143,7 @@ def network_files(config: TrackConfig) -> dict[str, list[Path]]:
 
 def run_tracking(
     source: str | Path,
-    config: TrackConfig,
+    config: TrackConfig = TrackConfig(),
     segmenter: Segmenter | None = None,
     keypoints: KeypointDetector | None = None,
     tracker: Tracker | None = None,
