@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+import logging
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +44,7 @@ def export_onnx(
         path: an `.onnx` file; an existing file is replaced.
     """
     shapes = {axis: torch.export.Dim.DYNAMIC for axis in variable_axes}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporter itself
+    with _quiet_exporter():
         program = torch.onnx.export(
             network,
             (example,),
@@ -67,6 +68,20 @@ def export_onnx(
         del node.metadata_props[:]  # the exporter writes local paths into it
     onnx.checker.check_model(model)
     write_whole(path, model.SerializeToString())
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    """Hide the warnings of the exporter itself, for example that torchvision is not installed."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
 
 
 def _convert_weights(model: onnx.ModelProto) -> None:
