@@ -16,7 +16,7 @@ help:
 	@echo "make lint       formatting, lint and types"
 	@echo "make bench      benchmarks against the committed baseline"
 	@echo "make demo       simulate a short scene, reconstruct it from its footage and show it"
-	@echo "make notebooks  run the notebooks and store their output (25 minutes)"
+	@echo "make notebooks  run the notebooks and store their output (16 minutes)"
 	@echo "make clean      remove the environment and everything built"
 
 install: $(VENV)/installed

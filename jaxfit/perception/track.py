@@ -217,7 +217,7 @@ def run_tracking(
 def _only_low_scores(source: str | Path, low_score_tracks: dict[int, float], least: float) -> InputError:
     problem = (
         f"no tracked bird has a mean score of {least:g}: the highest of {len(low_score_tracks)} tracks is "
-        f"{max(low_score_tracks.values()):.2f}"
+        f"{max(low_score_tracks.values()):.3f}"
     )
     return InputError(source, problem, "lower min_track_score, or try another segmenter")
 

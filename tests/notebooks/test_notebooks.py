@@ -25,9 +25,10 @@ SMALL = {
     "02_ablation": SMALL_SCENE | {"WEIGHTS": [10, 100]},
     "03_new_prior": SMALL_SCENE | {"WEIGHTS": [0, 10]},
     "04_from_video": SMALL_SCENE,
+    "05_your_own_footage": SMALL_SCENE | {"BIRDS": 2, "FRAMES": 30, "LABELLED": 8, "SCENES": 1, "STEPS": 10},
 }
 """Parameters that keep the run of every notebook short."""
-PICTURES = {"01_fit_a_window": 3, "02_ablation": 1, "03_new_prior": 1, "04_from_video": 3}
+PICTURES = {"01_fit_a_window": 3, "02_ablation": 1, "03_new_prior": 1, "04_from_video": 3, "05_your_own_footage": 2}
 """Number of pictures that every notebook shows."""
 every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -64,7 +65,7 @@ def executed(tmp_path_factory):
     return notebooks
 
 
-def test_there_are_four_notebooks():
+def test_every_notebook_has_small_parameters():
     assert [path.stem for path in NOTEBOOKS] == list(SMALL)
 
 

@@ -107,7 +107,7 @@ def test_tracks_with_low_scores_are_excluded_and_reported(video):
     assert tracking.trust.signals.tracks == BIRDS  # the trust judges all tracks
     assert run(min_track_score=0.0).observations.num_tracks == BIRDS
     failure = run(min_track_score=0.95).failure
-    assert "no tracked bird has a mean score of 0.95: the highest of 3 tracks is 0.90" in str(failure)
+    assert "no tracked bird has a mean score of 0.95: the highest of 3 tracks is 0.900" in str(failure)
 
 
 def test_no_keypoints_for_birds_without_a_track(video):
