@@ -15,6 +15,8 @@ from nbformat import NotebookNode
 
 FOLDER = Path(__file__).resolve().parents[2] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+RESET = "%reset_selective -f ^[^_]"
+"""Removes the names of a notebook, but not `__spec__` of the main module: new processes need it."""
 
 
 def read(path: Path) -> NotebookNode:
@@ -60,7 +62,7 @@ def execute_together(notebooks: list[NotebookNode], folder: Path) -> None:
     The notebooks share imports and compiled programs, which saves time. Names are reset before every notebook.
     """
     v4 = nbformat.v4
-    cells = [cell for notebook in notebooks for cell in (v4.new_code_cell("%reset -f"), *notebook.cells)]
+    cells = [cell for notebook in notebooks for cell in (v4.new_code_cell(RESET), *notebook.cells)]
     execute(v4.new_notebook(cells=cells), folder, allow_errors=True)
 
 
