@@ -111,7 +111,8 @@ def _birds_with_spread_wings(frames: LabelledFrames) -> Int[np.ndarray, "M 2"]:
         return np.zeros((0, 2), int)
     left, right = (frames.keypoint_names.index(f"{side}_wingtip") for side in ("left", "right"))
     span_px = np.linalg.norm(frames.keypoints_px[:, :, left] - frames.keypoints_px[:, :, right], axis=-1)
-    both = frames.known[:, :, left] & frames.known[:, :, right] & (frames.visibility == 2).any(-1)
+    known = frames.known
+    both = known[:, :, left] & known[:, :, right] & (frames.visibility == 2).any(-1)
     return np.argwhere(both & (span_px > SPREAD_UNITS * frames.pixels_per_unit[:, None]))
 
 

@@ -220,4 +220,4 @@ def test_command_after_a_kill(tmp_path):
     subprocess.run([*command, "--out", str(parts)], env=environment, check=True)
     assert parts.read_bytes() == whole.read_bytes()
     assert not state.parent.exists()
-    assert OnnxModel(whole).metadata["trained_on"].startswith("8 labelled pictures")  # also those that were held out
+    assert OnnxModel(whole).metadata["trained_on"].startswith("8 labelled pictures")  # the held-out pictures too

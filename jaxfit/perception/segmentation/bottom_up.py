@@ -35,8 +35,6 @@ MAX_DISTANCE_PX = 60.0
 """Cells whose offset ends at least this far from every centre belong to no bird; pixels of the input."""
 MOST_PEAKS = 10 * INSTANCES
 """More peaks are the output of a network that was not trained."""
-MOST_DIGITS = 20
-"""Characters of a number in the metadata; the rest is not read."""
 MIN_CELLS = 12
 """Instances with fewer cells are dropped."""
 
@@ -73,13 +71,13 @@ class BottomUp(SegmentationNetwork):
 
     def _min_track_score(self) -> float:
         """Return the least mean score of a track, 0 if the file does not contain it."""
-        text = self._model.metadata.get("min_track_score", "0")[:MOST_DIGITS]
+        text = self._model.metadata.get("min_track_score", "0")
         try:
             score = float(text)
         except ValueError:
             score = float("nan")
         if not 0 <= score <= 1:
-            problem = f"its metadata `min_track_score` is {text!r}"
+            problem = f"its metadata `min_track_score` is {text[:40]!r}"
             raise InputError(self._model.path, problem, "export it with a number within 0 and 1")
         return score
 

@@ -176,13 +176,13 @@ def fine_tune(
 
     checkpoint = train(FRAMES, CHECKPOINT, schedule.steps, _score(network, model, data) if data.holdout else None)
     frames, after = data.frames, {}
-    facts = _facts(network, base, data, simulated, schedule, checkpoint)
     if data.holdout:
-        _write(network, model, data, facts, folder / CHECKED)
+        _write(network, model, data, {}, folder / CHECKED)
         after = _accuracy(network, folder / CHECKED, data, {name: name for name in data.keypoint_names})
         if checkpoint.best_step:
             frames = prepare_frames(folder / ALL_FRAMES, data.pictures, data.keypoint_names, data.scale, network)
             train(ALL_FRAMES, CHECKPOINT_ALL, checkpoint.best_step, None)
+    facts = _facts(network, base, data, len(frames.pictures), simulated, schedule, checkpoint)
     _write(network, model, data, facts, path)
     store_training_activations(network, path, [f for f in (frames, simulated) if f is not None], progress=progress)
     _remove(folder)
@@ -263,13 +263,13 @@ def _facts(
     network: str,
     base: Path,
     data: FineTuningData,
+    labelled: int,
     simulated: LabelledFrames | None,
     schedule: Schedule,
     checkpoint: Checkpoint,
 ) -> dict[str, str]:
     frames = 0 if simulated is None else len(simulated.pictures)
-    count = len(data.pictures) if checkpoint.best_step else 0
-    trained_on = f"{count} labelled pictures and {frames} simulated frames"
+    trained_on = f"{labelled if checkpoint.best_step else 0} labelled pictures and {frames} simulated frames"
     return {
         "trained_by": f"jaxfit {metadata.version('jaxfit')} train {network}, fine-tuned from {base.name}",
         "trained_on": trained_on,
