@@ -198,8 +198,7 @@ def _simulation(commands: Any) -> None:
     simulate.add_argument("--frames", type=int, default=100, help="number of frames (default %(default)s)")
     simulate.add_argument("--size", default="2592x1520", help="picture size in pixels (default %(default)s)")
     simulate.add_argument("--fps", type=float, default=25, help="frames per second (default %(default)s)")
-    text = "random seed; every seed gives another scene (default %(default)s)"
-    simulate.add_argument("--seed", type=int, default=0, help=text)
+    simulate.add_argument("--seed", type=int, default=0, help="every seed gives another scene (default %(default)s)")
     _add_codec(simulate)
 
     text = "simulate a short scene, reconstruct the scene from its footage, and measure the result"
@@ -226,10 +225,13 @@ def _training(commands: Any) -> None:
     text = "folder of simulated frames; absent frames are simulated first (default: simulated_frames with labels, else "
     text += "training_frames, 5 GB)"
     train.add_argument("--frames", type=Path, metavar="DIR", help=text)
-    text = "number of simulated scenes, of 10 frames each (default: 20 with labels, else 160)"
-    train.add_argument("--scenes", type=int, help=text)
+    train.add_argument(
+        "--scenes", type=int, help="simulated scenes, of 10 frames each (default: 20 with labels, else 160)"
+    )
     text = "without labels: share of scenes with other birds in other landscapes (default %(default)s)"
     train.add_argument("--varied", type=float, default=0.0, metavar="SHARE", help=text)
+    text = "without labels: weights of EfficientNet-lite0, .pth (default: the encoder of the built-in segmenter)"
+    train.add_argument("--encoder", type=Path, metavar="FILE", help=text)
     train.add_argument("--steps", type=int, help="number of training steps (default: by the number of labels)")
     train.add_argument("--seed", type=int, default=0, help="seed of new weights and of samples (default %(default)s)")
 

@@ -38,6 +38,8 @@ def train(options: argparse.Namespace) -> None:
     require_extra("train", "train")
     check_new_file(options.out, options.overwrite)
     if options.labels:
+        if options.encoder:
+            raise InputError("--encoder", "is given with labels", "give the network to start from by --base")
         _train_on_labels(options)
         return
     for name in ("images", "masks"):
@@ -54,7 +56,8 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
     schedule = SCHEDULES[options.network]._replace(steps=steps)
     paths = options.out, options.frames or Path("training_frames")
     scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
-    losses = train_network(options.network, *paths, scenes, schedule, options.seed, terminal, options.varied)
+    what = options.network, *paths, scenes, schedule, options.seed, terminal, options.varied, options.encoder
+    losses = train_network(*what)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
     show(f"{options.network} trained in {(time.perf_counter() - start) / 60:.0f} min, loss {loss} → {options.out}")
 

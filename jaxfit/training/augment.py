@@ -11,6 +11,7 @@ from functools import cache
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy.special import expit
 
 __all__ = ["SCENE_SHARE", "randomise_appearance"]
 
@@ -123,7 +124,7 @@ def _cast_shadow(rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.n
     y, x = np.ogrid[:height, :width]
     angle = rng.uniform(0, 2 * np.pi)
     beyond = (x - rng.uniform(0, width)) * np.cos(angle) + (y - rng.uniform(0, height)) * np.sin(angle)
-    return (1 - rng.uniform(0.2, 0.6) / (1 + np.exp(-beyond / rng.uniform(0.5, 8)))).astype(np.float32)
+    return (1 - rng.uniform(0.2, 0.6) * expit(beyond / rng.uniform(0.5, 8))).astype(np.float32)
 
 
 def _randomise_colours(rng: np.random.Generator, picture: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:

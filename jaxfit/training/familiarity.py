@@ -76,9 +76,8 @@ def pictures_in_use(
             zoom = LONGER_SIDE_PX / max(picture.shape[:2])
             picture = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
             owner = cv2.resize(owner, picture.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-            with np.errstate(over="ignore"):  # far from the edge of a cast shadow
-                rng = np.random.default_rng((seed, i))
-                picture = randomise_appearance(rng, np.asarray(picture, np.uint8), np.asarray(owner) > 0)
+            rng = np.random.default_rng((seed, i))
+            picture = randomise_appearance(rng, np.asarray(picture, np.uint8), np.asarray(owner) > 0)
         yield picture, np.asarray(owner, np.uint8)
 
 

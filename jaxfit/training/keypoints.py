@@ -27,7 +27,7 @@ from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX, crop_bird
 from jaxfit.training.augment import SCENE_SHARE, randomise_appearance
 from jaxfit.training.frame_patches import patch_around, random_rotation
 from jaxfit.training.labelled_frames import UNKNOWN, LabelledFrames
-from jaxfit.training.networks import FeaturePyramid
+from jaxfit.training.networks import FeaturePyramid, residual_stages
 
 __all__ = ["SIDE_PX", "STRIDE", "KeypointMaps", "KeypointSample", "draw_sample", "keypoint_network", "loss"]
 
@@ -62,8 +62,8 @@ class KeypointSample(NamedTuple):
 
 def keypoint_network(keypoints: int = len(MURRE_KEYPOINTS)) -> FeaturePyramid:
     """Create the network, with 2 million parameters, for a number of keypoints."""
-    heads = {"logits": keypoints}
-    return FeaturePyramid((24, 48, 80, 128, 144), (0, 1, 2, 2, 2), (112, 80, 64), heads)
+    widths = 24, 48, 80, 128, 144
+    return FeaturePyramid(residual_stages(widths, (0, 1, 2, 2, 2)), widths, (112, 80, 64), {"logits": keypoints})
 
 
 class KeypointMaps(nn.Module):

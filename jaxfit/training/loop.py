@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.training.labelled_frames import LabelledFrames, load_frames
+from jaxfit.training.networks import FeaturePyramid
 
 __all__ = ["Loss", "Schedule", "Source", "batches", "has_fast_bfloat16", "train", "train_step"]
 
@@ -31,6 +33,22 @@ class Schedule(NamedTuple):
     learning_rate: float
     """Maximum of AdamW's learning rate: a rise over the first tenth, then a cosine decay (one cycle)."""
     weight_decay: float = 0.02
+
+    def learning_rate_at(self, step: int) -> float:
+        """Return the learning rate of a step, counted from 1."""
+        rise = max(1.0, self.steps / 10)
+        if step < rise:
+            return self.learning_rate * step / rise
+        return self.learning_rate * 0.5 * (1 + math.cos(math.pi * (step - rise) / max(self.steps - rise, 1.0)))
+
+    def optimiser(self, network: FeaturePyramid) -> torch.optim.Optimizer:
+        """Create the optimiser of a network; `set_learning_rate` must be called before every step."""
+        return torch.optim.AdamW(network.parameter_groups(), lr=0.0, weight_decay=self.weight_decay)
+
+    def set_learning_rate(self, optimiser: torch.optim.Optimizer, step: int) -> None:
+        """Set the learning rates of all parameters for a step, counted from 1."""
+        for group in optimiser.param_groups:
+            group["lr"] = group["share"] * self.learning_rate_at(step)
 
 
 class Source(NamedTuple):
@@ -111,7 +129,7 @@ def train_step(
 
 
 def train(
-    network: nn.Module,
+    network: FeaturePyramid,
     draw: Callable[[np.random.Generator, LabelledFrames], Any],
     loss: Loss,
     frames_folder: Path,
@@ -138,16 +156,14 @@ def train(
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.to(device).train()
     network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    optimiser = torch.optim.AdamW(network.parameters(), lr=schedule.learning_rate, weight_decay=schedule.weight_decay)
-    scheduler = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser, schedule.learning_rate, schedule.steps, pct_start=0.1, cycle_momentum=False
-    )
+    optimiser = schedule.optimiser(network)
     half = has_fast_bfloat16()
     recent: list[dict[str, float]] = []
     with progress(name, schedule.steps) as report_progress:
-        for sample in batches([Source(frames_folder, draw)], schedule.batch, seed, 0, schedule.steps):
+        drawn = batches([Source(frames_folder, draw)], schedule.batch, seed, 0, schedule.steps)
+        for step, sample in enumerate(drawn, 1):
+            schedule.set_learning_rate(optimiser, step)
             terms = train_step(network, sample, loss, optimiser, half)
-            scheduler.step()
             recent = [*recent[-(schedule.steps // 10) :], terms]
             report_progress(1, " ".join(f"{key} {np.mean([r[key] for r in recent[-50:]]):.4f}" for key in recent[-1]))
     network.cpu().eval()

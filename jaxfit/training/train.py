@@ -16,17 +16,20 @@ from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
+from jaxfit.training.encoder import load_photograph_weights
 from jaxfit.training.familiarity import store_training_activations
+from jaxfit.training.fine_tuning.base_network import base_file, load_segmenter_base
 from jaxfit.training.labelled_frames import LabelledFrames, load_frames
 from jaxfit.training.loop import Schedule, train
 from jaxfit.training.network_files import write_keypoints, write_segmenter
+from jaxfit.training.networks import FeaturePyramid
 from jaxfit.training.scenes import FRAMES_PER_SCENE, film_scenes
 
 __all__ = ["SCENES", "SCHEDULES", "train_network"]
 
 SCENES = 160
 """Number of training scenes, with seeds from 0; seeds of 1000 and more are for tests."""
-SCHEDULES = {"segmenter": Schedule(3600, 8, 2e-3), "keypoints": Schedule(4000, 24, 2e-3)}
+SCHEDULES = {"segmenter": Schedule(2400, 8, 2e-3), "keypoints": Schedule(4000, 24, 2e-3)}
 """Schedules of the built-in networks."""
 
 
@@ -39,6 +42,7 @@ def train_network(
     seed: int = 0,
     progress: ProgressTask = silent,
     varied: float = 0.0,
+    encoder: str | Path | None = None,
 ) -> dict[str, float]:
     """Train a built-in network and write it; the weights differ slightly between processors.
 
@@ -51,6 +55,8 @@ def train_network(
         seed: seed of the initial weights and of the samples.
         progress: reports scenes and steps.
         varied: share of the scenes with other birds in other landscapes, if the footage is simulated first.
+        encoder: weights of EfficientNet-lite0 for the encoder of a segmenter, as in `load_photograph_weights`; None
+            uses the encoder of the built-in segmenter.
 
     Returns:
         Each term of the loss, averaged over the last tenth of the steps.
@@ -62,6 +68,8 @@ def train_network(
     if which not in SCHEDULES:
         raise ValueError(f"which must be one of {', '.join(SCHEDULES)}, not {which!r}")
     schedule = schedule or SCHEDULES[which]
+    if encoder is not None and which != "segmenter":
+        raise InputError("train: encoder", "is given for a keypoint network", "train a segmenter, or leave it out")
     if not 1 <= scenes <= 900:
         raise InputError("train: scenes", f"is {scenes}", "give 1 to 900")
     if not 0 <= varied <= 1:
@@ -75,13 +83,14 @@ def train_network(
     frames = _load_or_film(folder, scenes, varied, progress)
     torch.manual_seed(seed)
     if which == "segmenter":
-        network, module = segmenter.segmenter_network(), segmenter
+        network, module = _segmenter_with_encoder(encoder), segmenter
     else:
         network, module = keypoints.keypoint_network(), keypoints
     losses = train(network, module.draw_sample, module.loss, folder, schedule, seed, progress, f"Training {which}")
+    photographs = ", but the encoder was trained on photographs before" if which == "segmenter" else ""
     facts = {
         "trained_by": f"jaxfit {metadata.version('jaxfit')} train {which}",
-        "trained_on": f"{len(frames.pictures)} simulated frames of {scenes} scenes; no real footage",
+        "trained_on": f"{len(frames.pictures)} simulated frames of {scenes} scenes; no real footage{photographs}",
         "schedule": json.dumps(schedule._asdict()),
         "loss": json.dumps({name: round(value, 5) for name, value in losses.items()}),
     }
@@ -93,6 +102,17 @@ def train_network(
     birds = None if which == "segmenter" else load_segmenter("builtin")
     store_training_activations(which, path, [frames], birds, progress)
     return losses
+
+
+def _segmenter_with_encoder(encoder: str | Path | None) -> FeaturePyramid:
+    """Create a segmenter with a trained encoder; all other layers have random weights."""
+    network = segmenter.segmenter_network()
+    if encoder is None:
+        builtin = load_segmenter_base(base_file("segmenter", "builtin"))
+        network.down.load_state_dict(builtin.down.state_dict())
+    else:
+        load_photograph_weights(network.down, encoder)
+    return network
 
 
 def _load_or_film(folder: Path, scenes: int, varied: float, progress: ProgressTask) -> LabelledFrames:

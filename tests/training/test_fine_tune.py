@@ -27,7 +27,7 @@ from jaxfit.training.fine_tuning.early_stopping import continue_training  # noqa
 from jaxfit.training.fine_tuning.validation import keypoint_accuracy, segmenter_accuracy  # noqa: E402
 from jaxfit.training.labelled_frames import UNKNOWN, load_frames  # noqa: E402
 from jaxfit.training.loop import Schedule, Source, _Samples  # noqa: E402
-from jaxfit.training.networks import FeaturePyramid  # noqa: E402
+from jaxfit.training.networks import FeaturePyramid, residual_stages  # noqa: E402
 
 TIMES = range(0, 400, 50)
 SCHEDULE = Schedule(10, 2, 1e-3)
@@ -53,7 +53,7 @@ def same_process(monkeypatch):
 
 def tiny_network():
     torch.manual_seed(0)
-    return FeaturePyramid((4, 4), (0, 1), (4,), {"foreground": 1, "centre": 1, "offset": 2})
+    return FeaturePyramid(residual_stages((4, 4), (0, 1)), (4, 4), (4,), {"foreground": 1, "centre": 1, "offset": 2})
 
 
 def trained(folder, state, score=None, stop_after=None):

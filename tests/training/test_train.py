@@ -15,7 +15,7 @@ from jaxfit.training import keypoints, scenes, segmenter  # noqa: E402
 from jaxfit.training.augment import randomise_appearance  # noqa: E402
 from jaxfit.training.labelled_frames import LabelledFrames, load_frames  # noqa: E402
 from jaxfit.training.loop import Schedule  # noqa: E402
-from jaxfit.training.networks import FeaturePyramid  # noqa: E402
+from jaxfit.training.networks import FeaturePyramid, residual_stages  # noqa: E402
 from jaxfit.training.scenes import FRAMES_PER_SCENE, film_scenes  # noqa: E402
 from jaxfit.training.train import train_network  # noqa: E402
 
@@ -181,7 +181,7 @@ def test_peaks_are_probabilities():
 
 
 def test_pyramid_strides():
-    network = FeaturePyramid((4, 8, 12), (0, 1, 1), (8, 6), {"a": 2, "b": 1}).eval()
+    network = FeaturePyramid(residual_stages((4, 8, 12), (0, 1, 1)), (4, 8, 12), (8, 6), {"a": 2, "b": 1}).eval()
     maps = network(torch.zeros(1, 3, 32, 48))
     assert {name: tuple(map_.shape) for name, map_ in maps.items()} == {"a": (1, 2, 16, 24), "b": (1, 1, 16, 24)}
 
@@ -197,7 +197,7 @@ def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
     assert load_segmenter(tmp_path / "s.onnx").class_names == ("bird",)
     outputs = model(np.zeros((1, 3, 64, 96), np.float32))
     assert outputs["foreground"].shape == (1, 1, 32, 48)
-    assert (tmp_path / "s.onnx").stat().st_size < 3.5e6
+    assert (tmp_path / "s.onnx").stat().st_size < 7e6
 
 
 @pytest.mark.extended

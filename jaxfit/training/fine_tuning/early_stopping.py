@@ -69,7 +69,7 @@ def continue_training(
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     model.to(device).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
-    optimiser = torch.optim.AdamW(model.parameters(), lr=0.0, weight_decay=schedule.weight_decay)
+    optimiser = schedule.optimiser(model)
     state = load_checkpoint(path, fingerprint, len(flat_weights(model)))
     if state is None:
         history = [(0, score())] if score is not None else []
@@ -86,8 +86,7 @@ def continue_training(
         for step, sample in enumerate(drawn, state.step + 1):
             model.train()
             freeze_normalisation(model)
-            for group in optimiser.param_groups:
-                group["lr"] = _learning_rate(schedule, step)
+            schedule.set_learning_rate(optimiser, step)
             terms = train_step(model, sample, loss, optimiser, half)
             recent = [*recent[-20:], sum(terms.values())]
             report_progress(1, f"loss {np.mean(recent):.3f}, {_note(state)}")
@@ -122,14 +121,6 @@ def _is_finished(state: Checkpoint, schedule: Schedule) -> bool:
     scores = state.history[:, 1]
     waited = int(scores[::-1].argmax()) if len(scores) else 0  # of equal scores, the last is the best
     return state.step >= schedule.steps or waited >= PATIENCE
-
-
-def _learning_rate(schedule: Schedule, step: int) -> float:
-    """Return the learning rate of a step from 1 on: a rise over the first tenth, then a cosine decay."""
-    rise = max(1.0, schedule.steps / 10)
-    if step < rise:
-        return schedule.learning_rate * step / rise
-    return schedule.learning_rate * 0.5 * (1 + math.cos(math.pi * (step - rise) / max(schedule.steps - rise, 1.0)))
 
 
 def _note(state: Checkpoint) -> str:
