@@ -29,7 +29,7 @@ OPTIONAL_PACKAGES = {
     "xarray": OptionalPackage("xarray", "2024.10", "formats", "`jaxfit export --to movement`"),
     "h5netcdf": OptionalPackage("h5netcdf", "1.4", "formats", "`jaxfit export --to movement`"),
     "pyarrow": OptionalPackage("pyarrow", "18", "formats", "`jaxfit export --to parquet`"),
-    "pynwb": OptionalPackage("pynwb", "3.0", "formats", "`jaxfit export --to nwb`"),
+    "pynwb": OptionalPackage("pynwb", "4.2", "formats", "`jaxfit export --to nwb`"),
     "ndx-pose": OptionalPackage("ndx_pose", "0.4", "formats", "`jaxfit export --to nwb`"),
     "matplotlib": OptionalPackage("matplotlib", "3.9", "report", "`jaxfit ablate`"),
     "tabulate": OptionalPackage("tabulate", "0.9", "report", "`jaxfit ablate`"),

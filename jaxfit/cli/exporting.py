@@ -31,6 +31,7 @@ def export(options: argparse.Namespace) -> None:
         dims=options.dims,
         one_file=options.one_file,
         ground=options.ground,
+        start=options.start,
     )
     for note in done.notes:
         show(note)

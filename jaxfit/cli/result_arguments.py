@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ __all__ = ["add_result_commands"]
 def add_result_commands(commands: Any) -> None:
     """Add the commands."""
     _export(commands)
+    _tracks(commands)
 
 
 def _export(commands: Any) -> None:
@@ -37,5 +39,34 @@ def _export(commands: Any) -> None:
     export.add_argument("--space", choices=("2d", "3d"), help=text)
     text = "movement: names of the dimensions; plural for movement before 0.17 (default singular)"
     export.add_argument("--dims", choices=("singular", "plural"), help=text)
+    text = "nwb: time of frame 0 of the footage, such as 2024-06-01T12:00:00+02:00"
+    export.add_argument("--start", metavar="TIME", help=text)
     export.add_argument("--one-file", action="store_true", help="glb: all birds in one file")
     export.add_argument("--ground", action="store_true", help="glb: add a level ground below the feet of the birds")
+
+
+class _AddEdit(argparse.Action):
+    """Collects the corrections in the order of the command line."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        edits = [*(namespace.edits or []), ((option_string or "").lstrip("-"), values)]
+        namespace.edits = edits
+
+
+def _tracks(commands: Any) -> None:
+    text = "list the tracks of a result, or correct the tracks and fit only the windows that change"
+    tracks = add_command(commands, "tracks", "correcting.tracks", text)
+    tracks.add_argument("result", type=Path, metavar="RESULT", help="folder of a result")
+    for option, metavar, what in (
+        ("--swap", "ID,ID@A:B", "exchange two tracks, from frame A to frame B − 1 (or to the end, or everywhere)"),
+        ("--cut", "ID@A", "the frames from A on become a new track"),
+        ("--join", "ID,ID", "the second track becomes a part of the first track"),
+        ("--delete", "ID,ID", "delete tracks"),
+    ):
+        text = f"{what}; may be repeated, corrections happen in their order"
+        tracks.add_argument(option, dest="edits", action=_AddEdit, metavar=metavar, help=text)
+    text = "the file that was fitted, for a result of `jaxfit fit`"
+    tracks.add_argument("--observations", type=Path, metavar="OBS.json", help=text)
+    tracks.add_argument("--out", type=Path, metavar="DIR", help="folder for the corrected result")
+    text = "replace an earlier result in the folder of --out"
+    tracks.add_argument("--overwrite", action="store_true", help=text)

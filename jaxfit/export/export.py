@@ -56,7 +56,7 @@ def export_result(
         overwrite: replace existing files, or an earlier export in the folder.
         progress: shows progress.
         **options: options of the format: `space` ("2d", "3d") and `dims` ("singular", "plural") of `movement`;
-            `one_file` and `ground` (bools) of `glb`.
+            `one_file` and `ground` (bools) of `glb`; `start` (ISO 8601, time of frame 0) of `nwb`.
 
     Returns:
         The written files, the unit of lengths, and notes.

@@ -27,6 +27,8 @@ FORMATS = {
     "csv": Format("tables", "write_csv", "R, spreadsheets, pandas", (".csv",)),
     "parquet": Format("tables", "write_parquet", "R, pandas, polars, DuckDB", (".parquet",)),
     "movement": Format("movement", "write_movement", "movement, xarray, napari", (".nc",), ("space", "dims")),
+    "glb": Format("glb", "write_glb", "Blender, three.js, viewers", (".glb",), ("one_file", "ground"), True),
+    "nwb": Format("nwb", "write_nwb", "pynwb, NWB Explorer, DANDI", (), ("start",), True),
     "coco": Format("keypoint_files", "write_coco_keypoints", "CVAT, programs that read COCO", (".json",)),
     "slp": Format("keypoint_files", "write_slp_keypoints", "SLEAP", (".slp",)),
     "dlc": Format("keypoint_files", "write_dlc_keypoints", "DeepLabCut, napari-deeplabcut", (".h5", ".csv")),

@@ -77,9 +77,18 @@ class Exported:
 
     @property
     def keypoints_3d(self) -> Float[np.ndarray, "N T K 3"]:
-        """Keypoints in the camera frame of the crop, in `unit`; NaN without a pose."""
-        points = self.solution.keypoints_cam * np.float32(self.length)
-        return np.where(self.solution.valid[..., None, None], points, np.float32(np.nan))
+        """Keypoints in the camera frame of the crop at the size of the model, in `unit`; NaN without a pose.
+
+        One camera does not measure size: a bird that is larger and farther away gives the same picture. The result
+        holds the keypoints at `Solution.scale` times the size of the model; here they are divided by the scale.
+        """
+        return self.at_model_size(self.solution.keypoints_cam)
+
+    def at_model_size(self, points: Float[np.ndarray, "N T K 3"]) -> Float[np.ndarray, "N T K 3"]:
+        """Return points of the camera frame (model units) for a bird of the model's size, in `unit`."""
+        valid = self.solution.valid[..., None, None]
+        scale = np.where(valid, self.solution.scale[..., None, None], np.float32(np.nan))
+        return points / scale * np.float32(self.length)
 
     @property
     def sampling_fps(self) -> float:

@@ -2,7 +2,8 @@
 
 Both tables have a row for every track and frame. A row without a pose has `fitted` = false and empty values. The last
 part of the name of a column is its unit: `s`, `px` (image pixels), `m` or `unit` (model units), `rad`. Positions are in
-the camera frame of the crop: x right, y down, z forward.
+the camera frame of the crop: x right, y down, z forward. Positions in space are those of a bird of the model's size:
+times `size`, they are those of the result.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def _row_columns(exported: Exported) -> Columns:
 
 def _pose_columns(exported: Exported) -> Columns:
     """Return the quality of the track, position, orientation and size of the bird, and its keypoints."""
-    s, unit, factor = exported.solution, exported.unit, np.float32(exported.length)
+    s, unit, points = exported.solution, exported.unit, exported.keypoints_3d
     T = len(s.frame_index)
     columns = _row_columns(exported)
     for name in ("coverage", "mean_confidence", "jitter"):
@@ -82,14 +83,14 @@ def _pose_columns(exported: Exported) -> Columns:
         values = [np.nan if row is None or getattr(row, name) is None else getattr(row, name) for row in rows]
         columns[f"track_{name}"] = np.repeat(np.array(values, np.float64), T)
     root = s.transl + s.scale[..., None] * np.asarray(exported.bird.joints[0])
-    columns |= _vectors(exported, {"root": root * factor}, unit)
+    columns |= _vectors(exported, {"root": exported.at_model_size(root[:, :, None])[:, :, 0]}, unit)
     columns |= _vectors(exported, {"orientation": s.global_orient}, "rad")
     columns["size"] = _known(exported, s.scale)
     confidence = exported.confidence
     for k, name in enumerate(s.keypoint_names):
         columns |= _vectors(exported, {name: s.keypoints_px[:, :, k]}, "px")
         columns[f"{name}_confidence"] = _known(exported, confidence[:, :, k])
-        columns |= _vectors(exported, {name: s.keypoints_cam[:, :, k] * factor}, unit)
+        columns |= _vectors(exported, {name: points[:, :, k]}, unit)
     return columns
 
 
@@ -125,7 +126,7 @@ def _facts(exported: Exported) -> dict[str, str]:
         "units": json_text(units),
         "frames": frames,
         "confidence": CONFIDENCE,
-        "size": "size of the bird relative to the model",
+        "size": "size of the bird relative to the model in the result; positions in m or unit are divided by the size",
         "model": exported.bird.name,
         "fps": str(exported.fps or "unknown"),
     }

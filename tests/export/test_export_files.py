@@ -51,7 +51,7 @@ def test_tables_hold_a_row_for_every_bird_and_frame(folder, made, tmp_path):
     for k, name in enumerate(made.keypoint_names):
         expected = np.where(valid, made.keypoints_px[:, :, k, 1], np.nan)
         np.testing.assert_array_equal(column(rows, f"{name}_y_px"), expected)
-        expected = np.where(valid, made.keypoints_cam[:, :, k, 2] * np.float32(0.02), np.nan)
+        expected = np.where(valid, made.keypoints_cam[:, :, k, 2] / made.scale * 0.02, np.nan)
         np.testing.assert_allclose(column(rows, f"{name}_z_m"), expected, rtol=1e-6)
     for j, name in enumerate(made.joint_names[1:]):
         np.testing.assert_array_equal(
@@ -103,8 +103,10 @@ def test_netcdf_for_movement(folder, made, tmp_path, dims, names):
         assert data.status.values.tolist() == ["ok", "partly diverged", "diverged"]
         position = data.position.transpose(names[1], "time", names[0], "space").values
         assert np.isnan(position[:, 3]).all()
-        expected = np.where(made.valid[..., None, None], made.keypoints_cam * np.float32(0.02), np.nan)
-        np.testing.assert_array_equal(np.delete(position, 3, axis=1), expected)
+        expected = np.where(
+            made.valid[..., None, None], made.keypoints_cam / made.scale[..., None, None] * 0.02, np.nan
+        )
+        np.testing.assert_allclose(np.delete(position, 3, axis=1), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
