@@ -1,4 +1,4 @@
-"""The arguments of the commands that use results: `export`, `tracks`."""
+"""The arguments of `export`, `tracks` and `doctor`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ def add_result_commands(commands: Any) -> None:
     """Add the commands."""
     _export(commands)
     _tracks(commands)
+    text = "check the installation: kernels, FFmpeg, codecs, networks, optional packages, cache"
+    add_command(commands, "doctor", "doctor.doctor", text)
 
 
 def _export(commands: Any) -> None:
