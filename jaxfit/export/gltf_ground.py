@@ -17,6 +17,8 @@ __all__ = ["Ground", "add_ground", "level_ground"]
 
 _MARGIN = 0.5
 """Margin of the ground around the birds, as a share of their spread and of a body length."""
+_FARTHEST = 5.0
+"""Birds beyond this multiple of the median distance do not widen the ground: their fits are wrong."""
 _BACKS = 0.1
 """Weight of the direction of the birds' backs, which decides where the lateral axes do not."""
 
@@ -64,6 +66,8 @@ def level_ground(exported: Exported, motions: dict[int, Motion]) -> Ground:
     placed = [each @ rotation.T for each in points]
     height = float(np.median([np.median(each[..., 1].min(axis=1)) for each in placed]))
     flat = np.concatenate([each.reshape(-1, 3) for each in placed])[:, [0, 2]]
+    distance = np.linalg.norm(np.concatenate([each.reshape(-1, 3) for each in points]), axis=1)
+    flat = flat[distance <= _FARTHEST * np.median(distance)]
     low, high = flat.min(0), flat.max(0)
     margin = _MARGIN * (body_length(bird) * exported.length + float((high - low).max()))
     return Ground(rotation, np.array([0, -height, 0]), low - margin, high + margin)
