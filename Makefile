@@ -15,7 +15,7 @@ help:
 	@echo "make extended   the slow tests, and those that install packages in environments of their own"
 	@echo "make lint       formatting, lint and types"
 	@echo "make bench      benchmarks against the committed baseline"
-	@echo "make demo       simulate a short scene, reconstruct it from its footage and show it"
+	@echo "make demo       simulate a short scene, reconstruct it from its footage, show and export it"
 	@echo "make notebooks  run the notebooks and store their output (16 minutes)"
 	@echo "make clean      remove the environment and everything built"
 

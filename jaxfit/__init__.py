@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.evaluation.evaluate import Evaluation, evaluate
     from jaxfit.evaluation.matching import match_tracks
     from jaxfit.evaluation.truth import Truth, read_truth
+    from jaxfit.export.export import export_result
     from jaxfit.fitting.fit import fit
     from jaxfit.labelling.suggest import suggest
     from jaxfit.model.bird import Bird
@@ -54,6 +55,7 @@ __all__ = [
     "ablate",
     "contact_sheet",
     "evaluate",
+    "export_result",
     "find_bird",
     "fit",
     "load_bird",
@@ -103,6 +105,7 @@ _HOMES = {
     "evaluation.evaluate": ("Evaluation", "evaluate"),
     "evaluation.matching": ("match_tracks",),
     "evaluation.truth": ("Truth", "read_truth"),
+    "export.export": ("export_result",),
     "fitting.fit": ("fit",),
     "labelling.suggest": ("suggest",),
     "model.bird": ("Bird",),

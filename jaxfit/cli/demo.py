@@ -1,4 +1,4 @@
-"""The demo: simulate a short scene, reconstruct the scene from its footage, and measure the result."""
+"""The demo: simulate a short scene, reconstruct the scene from its footage, measure and export the result."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.evaluation.matching import match_tracks
 from jaxfit.evaluation.observed import evaluate_observations
 from jaxfit.evaluation.truth import Truth
+from jaxfit.export.export import export_result
 from jaxfit.model.files import load_murre
 from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.progress import terminal
@@ -25,14 +26,15 @@ from jaxfit.storage.temporary import remove_leftovers
 __all__ = ["run_demo"]
 
 BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 1003
-METRICS = "evaluation.json"
+METRICS, ANIMATION = "evaluation.json", "birds.glb"
 
 
 def run_demo(folder: Path) -> Evaluation:
     """Write a simulated scene and its reconstruction to a folder, and print how well the two agree.
 
     Args:
-        folder: receives `scene/`, `result/` and `evaluation.json`; an earlier demo in the folder is replaced.
+        folder: receives `scene/`, `result/`, `evaluation.json` and `birds.glb`; an earlier demo in the folder is
+            replaced.
 
     Returns:
         The metrics of the reconstruction.
@@ -54,6 +56,7 @@ def run_demo(folder: Path) -> Evaluation:
     observed = evaluate_observations(observations, truth)
     solution, matching = match_tracks(done.solution, truth, "overlap")
     result = evaluate(solution, bird, truth, terminal)
+    export_result(result_folder, "glb", folder / ANIMATION, one_file=True, overwrite=True, progress=terminal)
     metrics = {"detection": observed.detection, "tracking": observed.tracking, **result.overall}
     write_whole(folder / METRICS, json_text(metrics).encode())
     show(track_table(observations, done.solution))
@@ -71,6 +74,7 @@ def run_demo(folder: Path) -> Evaluation:
         (result_folder, "observations.json, poses.npz, summary.json"),
         (scene_folder, "footage and ground truth"),
         (folder / METRICS, "the metrics above"),
+        (folder / ANIMATION, "the animated birds, for Blender (File > Import > glTF 2.0)"),
     ):
         show(f"  {path}: {text}")
     return result

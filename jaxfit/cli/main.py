@@ -17,7 +17,7 @@ from jaxfit.cli.parser import build_parser
 from jaxfit.errors import InputError, one_line, shortened
 from jaxfit.limits import MESSAGE_CHARACTERS
 
-__all__ = ["main", "run", "use_cache"]
+__all__ = ["cache_folder", "main", "run", "use_cache"]
 
 STOPPED = 130
 """Exit code of an interrupted command."""
@@ -142,6 +142,10 @@ def use_cache() -> None:
     """Store compiled programs in the user's cache folder, for later runs."""
     import jax
 
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxfit"
-    jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def cache_folder() -> Path:
+    """Return the user's folder for compiled programs."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxfit"

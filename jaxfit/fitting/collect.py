@@ -17,7 +17,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera, crop_to_image
 from jaxfit.model.pose import Pose
 
-__all__ = ["FittedWindow", "collect_windows", "window_of_batch"]
+__all__ = ["FittedWindow", "collect_windows", "track_status", "window_of_batch"]
 
 _logger = logging.getLogger(__name__)
 
@@ -104,6 +104,7 @@ def collect_windows(
         image_size_px[n, at] = [observations.image_size(n, int(t)) for t in at]
         for name, value in _frame_values(result, windows.crop[w], present, bird, camera).items():
             arrays[name][n, at] = value
+    counts = zip(fitted.tolist(), diverged.tolist(), strict=True)
     return Solution(
         track_id=observations.track_id,
         frame_index=observations.frame_index,
@@ -115,7 +116,7 @@ def collect_windows(
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
         loss=loss,
-        status=np.array([_status(*counts) for counts in zip(fitted.tolist(), diverged.tolist(), strict=True)], "<U32"),
+        status=np.array([track_status(*count) for count in counts], "<U32"),
         failures=failures,
         timestamp_s=observations.timestamp_s,
         fps=observations.fps,
@@ -142,7 +143,7 @@ def _frame_values(
     }
 
 
-def _status(fitted: int, diverged: int) -> str:
+def track_status(fitted: int, diverged: int) -> str:
     """Return the status of a track from its numbers of fitted and diverged windows."""
     if fitted and diverged:
         return "partly diverged"

@@ -73,11 +73,13 @@ def fit_runs(
     initial_poses: InitialPoses | None = None,
     progress: ProgressTask = silent,
     source: object = "observations",
+    select: Int[np.ndarray, "rows"] | None = None,
 ) -> list[Solution]:
     """Fit the same birds under several configs at once, with one compiled program.
 
     Args:
         configs: configs with an equal `stages.compiled_part`.
+        select: rows of the windows (`windows_of`) that are fitted; None fits all. Other windows have no valid pose.
         observations, bird, initial_poses, progress, source: as for `fit`.
 
     Returns:
@@ -98,6 +100,8 @@ def fit_runs(
     model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
     check_terms(configs[0], model)
     runs = _cut_runs(observations, configs, initial_poses, source)
+    if select is not None:
+        runs = [run._replace(windows=run.windows[select]) for run in runs]
     prepare_poses = partial(_initial_poses, model, initial_poses)
     # each problem is one window of one run
     problems = [(r, w) for r, run in enumerate(runs) for w in range(len(run.windows))]

@@ -5,15 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
-from jaxfit.data.boxes import box_of_keypoints
 from jaxfit.data.formats.image_sizes import check_video
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.observations import Observations
+from jaxfit.data.projected import projected_observations
 from jaxfit.data.solution import Solution, load_solution
 from jaxfit.errors import InputError
-from jaxfit.model.anatomy import skeleton_pairs
 
 __all__ = ["Result", "read_result"]
 
@@ -47,7 +44,7 @@ def read_result(path: Path, video: Path) -> Result:
         if (path / _OBSERVATIONS).is_file():
             observations = read_observations(path / _OBSERVATIONS, video)
         else:
-            observations, solution = _projected(solution), None
+            observations, solution = projected_observations(solution), None
             check_video(observations, path, video)
     else:
         observations = read_observations(path, video)
@@ -56,25 +53,3 @@ def read_result(path: Path, video: Path) -> Result:
     if not observations.num_frames:
         raise InputError(path, "holds no frames", "give the result of this video")
     return Result(observations, solution)
-
-
-def _projected(solution: Solution) -> Observations:
-    """Return the projected keypoints of a fit as observations."""
-    N, T = solution.valid.shape
-    K = len(solution.keypoint_names)
-    confidence = np.broadcast_to(solution.valid[..., None], (N, T, K)).astype(np.float32)
-    points = np.where(solution.valid[..., None, None], solution.keypoints_px, 0)
-    box = box_of_keypoints(points, confidence > 0)
-    sizes = solution.image_size_px[solution.valid]
-    return Observations(
-        track_id=solution.track_id,
-        frame_index=solution.frame_index,
-        present=solution.valid,
-        keypoints_px=points,
-        confidence=confidence,
-        box_px=np.where(solution.valid[..., None], np.concatenate([box[..., :2], np.maximum(box[..., 2:], 1)], -1), 0),
-        image_size_px=np.tile(sizes.max(0) if len(sizes) else np.ones(2, np.int64), (T, 1)),
-        file_name=np.array([f"frame {number}" for number in solution.frame_index.tolist()], str).reshape(T),
-        keypoint_names=solution.keypoint_names,
-        skeleton=skeleton_pairs(solution.keypoint_names),
-    )

@@ -56,6 +56,8 @@ class Bird(eqx.Module):
     keypoint_pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
     """(left, right) keypoints that mirror each other."""
     name: str = eqx.field(static=True)
+    metres_per_unit: float | None = eqx.field(static=True, default=None)
+    """Length of one model unit in metres; None if unknown. A fit does not depend on this length."""
 
     @property
     def num_joints(self) -> int:

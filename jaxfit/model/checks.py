@@ -63,6 +63,8 @@ class _Checker:
         for field in ("joint_names", "keypoint_names"):
             self.check_names(field)
         self.require("name", self.bird.name.isprintable(), "cannot be printed")
+        unit = self.bird.metres_per_unit
+        self.require("metres_per_unit", unit is None or 0 < unit < np.inf, f"{unit} is not positive and finite")
         self.check_pairs("joint_pairs", len(self.bird.parents))
         self.check_pairs("keypoint_pairs", len(self.bird.keypoint_names))
         faces, last = self.arrays["faces"], len(self.arrays["vertices"]) - 1

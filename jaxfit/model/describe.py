@@ -37,9 +37,9 @@ def describe_bird(bird: Bird) -> dict[str, Any]:
     """Return facts about a model, as values that JSON can hold.
 
     Returns:
-        `name`, `model_hash`; counts (`vertices`, `faces`, `joints`, `keypoints`, `shapes`); `joint_names`,
-        `keypoint_names`, `parents` by name (None for the root), `joint_pairs` and `keypoint_pairs` as
-        [left, right] names; `minimum`, `maximum`, `extents` (x, y, z, model units); `watertight`,
+        `name`, `model_hash`; `metres_per_unit` (None if unknown); counts (`vertices`, `faces`, `joints`, `keypoints`,
+        `shapes`); `joint_names`, `keypoint_names`, `parents` by name (None for the root), `joint_pairs` and
+        `keypoint_pairs` as [left, right] names; `minimum`, `maximum`, `extents` (x, y, z, model units); `watertight`,
         `boundary_edges` (edges that belong to one face only), `volume` (cubed model units; None if not watertight);
         `max_influences` (maximum number of joints that move one vertex); `pose_prior_variance`,
         `bone_prior_variance` and `shape_variance`: smallest and largest eigenvalue (rad², 1, 1; None without shapes).
@@ -56,6 +56,7 @@ def describe_bird(bird: Bird) -> dict[str, Any]:
     variance = np.asarray(bird.shape_variance)
     return {
         "name": bird.name,
+        "metres_per_unit": bird.metres_per_unit,
         "model_hash": model_hash(bird),
         "vertices": len(vertices),
         "faces": len(faces),

@@ -3,7 +3,7 @@
 The file contains the fields of `Bird` under their own names, and `format_version` (now 1). Parents and pairs are
 integer arrays, names are text arrays. A file of a newer version is rejected; unknown extra arrays are ignored.
 `vertex_colours` and `joint_limits` may be absent, because older files lack these fields: then the bird is grey and
-the joints have no limits.
+the joints have no limits. `metres_per_unit` is absent where the length of a model unit is unknown.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ FORMAT_VERSION = 1
 MURRE_PATH = Path(__file__).with_name("murre.npz")
 """The model file that comes with jaxfit; `jaxfit.model.murre.build` writes this file."""
 OPTIONAL_FIELDS = ("vertex_colours", "joint_limits")
+_UNIT = "metres_per_unit"
 STATIC_FIELDS = {
     "parents": "J",
     "joint_names": "J",
@@ -60,6 +61,8 @@ def save_bird(bird: Bird, path: Path | str, notes: Mapping[str, float] | None = 
         value = getattr(bird, field)
         array = np.asarray(value, np.str_ if field in TEXT_FIELDS else np.int32)
         arrays[field] = array.reshape(-1, 2) if axes.endswith(" 2") else array
+    if bird.metres_per_unit is not None:
+        arrays[_UNIT] = np.asarray(bird.metres_per_unit, np.float64)
     arrays |= {name: np.asarray(value) for name, value in (notes or {}).items()}
     write_whole(path, lambda file: np.savez_compressed(file, allow_pickle=False, **arrays))
 
@@ -79,10 +82,10 @@ def load_bird(path: Path | str) -> Bird:
     """
     path = Path(path)
     layout = ARRAY_FIELDS | STATIC_FIELDS
-    optional = {field: layout.pop(field) for field in OPTIONAL_FIELDS}
+    optional = {field: layout.pop(field) for field in OPTIONAL_FIELDS} | {_UNIT: ""}
     content = load_npz(path, layout, FORMAT_VERSION, optional=optional, most_bytes=MODEL_BYTES)
     for field, array in content.items():
-        kinds = "U" if field in TEXT_FIELDS else "f" if field in ARRAY_FIELDS and field != "faces" else "iu"
+        kinds = "U" if field in TEXT_FIELDS else "f" if field in (*ARRAY_FIELDS, _UNIT) and field != "faces" else "iu"
         if array.dtype.kind not in kinds:
             kind = {"U": "text", "f": "real numbers", "iu": "integers"}[kinds]
             problem = f"{field}: {array.dtype} array of shape {array.shape}, expected {kind}"
@@ -112,6 +115,7 @@ def load_bird(path: Path | str) -> Bird:
         joint_pairs=pairs("joint_pairs"),
         keypoint_pairs=pairs("keypoint_pairs"),
         name=str(content["name"]),
+        metres_per_unit=float(content[_UNIT]) if _UNIT in content else None,
     )
     return check_bird(bird, path)
 

@@ -171,7 +171,7 @@ def test_the_demo_writes_the_files_that_it_names(tmp_path, monkeypatch, capsys):
     for _ in range(2):  # a second demo replaces the first
         assert main(["demo", "--out", str(tmp_path / "demo")]) == 0
     said = capsys.readouterr().out.replace("\n", "")
-    for name in ("result/overlay.mp4", "result/overlay.png", "result", "scene", "evaluation.json"):
+    for name in ("result/overlay.mp4", "result/overlay.png", "result", "scene", "evaluation.json", "birds.glb"):
         assert (tmp_path / "demo" / name).exists()
         assert str(tmp_path / "demo" / name) in said
     assert "PA-MPJPE" in said

@@ -13,6 +13,9 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from support.exported import write_result
+
+from jaxfit.export.export import export_result
 
 pytestmark = pytest.mark.extended
 
@@ -124,6 +127,18 @@ def test_the_extra_trackers(clean_python, wheel):
     output = run(*pytest_command, "-c", ROOT / "pyproject.toml", *tests)
     assert " passed" in output
     assert "SKIPPED" not in output
+
+
+def test_movement_opens_an_export(tmp_path):
+    """movement requires other packages, so it opens the file in an environment of its own; 0.15 has plural names."""
+    write_result(tmp_path / "result", with_detections=True)
+    out = tmp_path / "birds.nc"
+    export_result(tmp_path / "result", "movement", out, dims="plural")
+    python = new_environment(tmp_path / "venv", "movement<0.17", "h5netcdf")
+    code = "import sys; from movement.io.load import load_dataset; from movement.kinematics import compute_velocity; "
+    code += "from movement.validators.datasets import ValidPosesInputs; data = load_dataset(sys.argv[1]); "
+    code += "ValidPosesInputs.validate(data); print(*compute_velocity(data.position).dims, data.attrs['fps'])"
+    assert run(python, "-c", code, out).split()[-5:] == ["time", "space", "keypoints", "individuals", "12.5"]
 
 
 @pytest.mark.parametrize("named", [False, True], ids=["no compiler in PATH", "CXX names no program"])

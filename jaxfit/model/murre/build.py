@@ -52,6 +52,7 @@ def build_murre() -> Bird:
         joint_pairs=mirror_pairs(JOINT_NAMES),
         keypoint_pairs=mirror_pairs(MURRE_KEYPOINTS),
         name="murre",
+        metres_per_unit=CM_PER_UNIT / 100,
     )
     return check_bird(bird, "murre")
 

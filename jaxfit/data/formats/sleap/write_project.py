@@ -1,7 +1,7 @@
-"""Project files of SLEAP (`.slp`) with predictions on pictures, for correction in SLEAP.
+"""Project files of SLEAP (`.slp`) with predictions on pictures or on a video, for correction in SLEAP.
 
-SLEAP shows a prediction, and a double click turns the prediction into a label. Every frame is also a suggestion, so
-that SLEAP lists the frames without a bird too. SLEAP has no place for hidden keypoints, boxes and masks.
+SLEAP shows a prediction, and a double click turns the prediction into a label. Every picture is also a suggestion, so
+that SLEAP lists the pictures without a bird too. SLEAP has no place for hidden keypoints, boxes and masks.
 
 Source: the layout is that of sleap-io 0.9, format 1.2.
 """
@@ -32,13 +32,13 @@ _INSTANCE += [("tracking_score", "f4")]
 _POINT = [("x", "f8"), ("y", "f8"), ("visible", "?"), ("complete", "?")]
 
 
-def write_sleap_project(observations: Observations, pictures: Sequence[str], path: str | Path) -> None:
-    """Write observations as the predictions of a SLEAP project whose video is a list of pictures.
+def write_sleap_project(observations: Observations, footage: Sequence[str] | str, path: str | Path) -> None:
+    """Write observations as the predictions of a SLEAP project.
 
     Args:
         observations: the predictions; tracks without a bird are left out.
-        pictures: T paths of the pictures of the frames, all of one size. SLEAP looks for relative paths in the folder
-            where it was started.
+        footage: T paths of the pictures of the frames, all of one size; or the path of a video, in which a frame has
+            its number. SLEAP looks for relative paths in the folder where it was started.
         path: the file; an existing file is replaced.
 
     Raises:
@@ -49,13 +49,16 @@ def write_sleap_project(observations: Observations, pictures: Sequence[str], pat
 
     content = io.BytesIO()
     with h5py.File(content, "w") as file:
-        for name, table in _tables(observations).items():
+        on_video = isinstance(footage, str)
+        for name, table in _tables(observations, on_video).items():
             file[name] = table
         kept = observations.present.any(1)
         texts = {
-            "videos_json": [_video(observations, pictures)],
+            "videos_json": [_video(observations, footage) if on_video else _pictures(observations, footage)],
             "tracks_json": [[0, f"bird {track}"] for track in observations.track_id[kept].tolist()],
-            "suggestions_json": [{"video": "0", "frame_idx": t, "group": 0} for t in range(len(pictures))],
+            "suggestions_json": [
+                {"video": "0", "frame_idx": t, "group": 0} for t in range(0 if on_video else len(footage))
+            ],
             "sessions_json": [],
         }
         for name, values in texts.items():
@@ -67,14 +70,15 @@ def write_sleap_project(observations: Observations, pictures: Sequence[str], pat
     write_whole(path, content.getvalue())
 
 
-def _tables(observations: Observations) -> dict[str, np.ndarray]:
-    """Return the tables of frames, instances and points."""
+def _tables(observations: Observations, on_video: bool) -> dict[str, np.ndarray]:
+    """Return the tables of frames, instances and points. Frames of a video have their numbers, pictures are counted."""
     T, K = observations.num_frames, observations.num_keypoints
     row = np.cumsum(observations.present.any(1)) - 1  # the track of SLEAP
     t, n = np.nonzero(observations.present.T)  # frame by frame
     ends = np.cumsum(observations.present.sum(0))
     frames = np.zeros(T, _FRAME)
-    frames["frame_id"] = frames["frame_idx"] = np.arange(T)
+    frames["frame_id"] = np.arange(T)
+    frames["frame_idx"] = observations.frame_index if on_video else np.arange(T)
     frames["instance_id_start"], frames["instance_id_end"] = ends - observations.present.sum(0), ends
     instances = np.zeros(len(n), _INSTANCE)
     instances["instance_id"], instances["instance_type"] = np.arange(len(n)), _PREDICTED
@@ -90,7 +94,14 @@ def _tables(observations: Observations) -> dict[str, np.ndarray]:
     return {"frames": frames, "instances": instances, "points": np.zeros(0, _POINT), "pred_points": points}
 
 
-def _video(observations: Observations, pictures: Sequence[str]) -> dict:
+def _video(observations: Observations, video: str) -> dict:
+    width, height = observations.image_size_px[0].tolist()
+    shape = [int(observations.frame_index[-1]) + 1, height, width, 3]
+    backend = {"type": "MediaVideo", "shape": shape, "filename": video, "grayscale": False, "bgr": True}
+    return {"filename": video, "backend": backend | {"dataset": "", "input_format": ""}}
+
+
+def _pictures(observations: Observations, pictures: Sequence[str]) -> dict:
     width, height = observations.image_size_px[0].tolist()
     shape = [len(pictures), height, width, 3]
     backend = {"type": "ImageVideo", "shape": shape, "filename": pictures[0], "filenames": list(pictures)}

@@ -1,0 +1,156 @@
+"""The command that checks the installation: one line for every part, with the remedy where a part is missing."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxfit import __version__
+from jaxfit.cli.tables import EscapedTable, counted, show
+from jaxfit.errors import InputError
+from jaxfit.extras import OPTIONAL_PACKAGES, package_problem
+
+__all__ = ["Finding", "doctor"]
+
+_DECODERS = ("h264", "hevc", "vp9", "av1", "mpeg4", "mjpeg", "prores")
+"""Codecs of cameras and of video archives."""
+
+
+class Finding(NamedTuple):
+    """The state of one part of the installation."""
+
+    part: str
+    state: str
+    remedy: str = ""
+    """What to do; empty where nothing is missing."""
+
+
+def doctor(_options: argparse.Namespace) -> None:
+    """Print the state of every part of the installation."""
+    findings = [finding for check in _CHECKS for finding in _checked(check)]
+    table = EscapedTable(pad_edge=False)
+    for column in ("part", "state", "remedy"):
+        table.add_column(column, overflow="fold")
+    for finding in findings:
+        table.add_row(*finding)
+    show(table)
+    missing = sum(bool(finding.remedy) for finding in findings)
+    show("nothing is missing" if not missing else f"{counted(missing, 'part')} can be added or repaired")
+
+
+def _checked(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
+    """Return the findings of a check. A check that fails is a finding, so that the other checks are shown."""
+    try:
+        return list(check())
+    except Exception as error:  # any fault of a library is what this command reports
+        name = check.__name__.strip("_").replace("_", " ")
+        return [Finding(name, f"fails: {type(error).__name__}: {error}"[:200], "reinstall jaxfit")]
+
+
+def _versions() -> Iterator[Finding]:
+    yield Finding("jaxfit", f"{__version__}, Python {platform.python_version()}, JAX {metadata.version('jax')}")
+
+
+def _processor() -> Iterator[Finding]:
+    name = platform.processor() or platform.machine()
+    if Path("/proc/cpuinfo").is_file():
+        lines = Path("/proc/cpuinfo").read_text(errors="replace").splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    yield Finding("processor", f"{name}, {counted(os.cpu_count() or 1, 'core')}, {platform.system()}")
+
+
+def _kernels() -> Iterator[Finding]:
+    from importlib.util import find_spec
+
+    from jaxfit.raster.kernels import ISA_VARIABLE, available_isas, current_isa
+
+    if os.environ.get(ISA_VARIABLE) == "none":
+        yield Finding("kernels", f"switched off by {ISA_VARIABLE}=none", f"unset {ISA_VARIABLE}")
+    elif find_spec("jaxfit.raster._kernels") is None:
+        remedy = "install GCC or Clang, and reinstall jaxfit: fits are hundreds of times slower without kernels"
+        yield Finding("kernels", "not built", remedy)
+    else:
+        yield Finding("kernels", f"{current_isa()} (this processor supports: {', '.join(available_isas())})")
+
+
+def _ffmpeg() -> Iterator[Finding]:
+    import av
+
+    from jaxfit.video.codecs import CODECS
+
+    codecs = ".".join(map(str, av.library_versions["libavcodec"]))
+    yield Finding("FFmpeg", f"PyAV {av.__version__} with libavcodec {codecs}")
+    remedy = 'run pip install --upgrade --force-reinstall "av>=18"'
+    decoders = [name for name in _DECODERS if _has_codec(name, "r")]
+    lacking = [name for name in _DECODERS if name not in decoders]
+    state = f"{', '.join(decoders)}" + (f"; without {', '.join(lacking)}" if lacking else "")
+    yield Finding("codecs that are read", state, remedy if lacking else "")
+    encoders = [name for name, (encoder, _) in CODECS.items() if _has_codec(encoder, "w")]
+    lacking = [name for name in CODECS if name not in encoders]
+    state = f"{', '.join(encoders) or 'none'}" + (f"; without {', '.join(lacking)}" if lacking else "")
+    yield Finding("codecs that are written", state, remedy if lacking else "")
+
+
+def _has_codec(name: str, mode: str) -> bool:
+    import av
+
+    try:
+        av.Codec(name, mode)  # type: ignore[arg-type]
+    except (ValueError, av.FFmpegError):
+        return False
+    return True
+
+
+def _networks() -> Iterator[Finding]:
+    import onnxruntime
+
+    from jaxfit.config.perception import TrackConfig
+    from jaxfit.perception.segmentation import load_segmenter
+    from jaxfit.perception.track import open_keypoint_detector
+
+    yield Finding("ONNX Runtime", f"{onnxruntime.__version__}: {', '.join(onnxruntime.get_available_providers())}")
+    for name, load in (
+        ("built-in segmenter", lambda: load_segmenter("builtin")),
+        ("built-in keypoint network", lambda: open_keypoint_detector(TrackConfig())),
+    ):
+        try:
+            load()
+            yield Finding(name, "loads")
+        except InputError as error:
+            yield Finding(name, str(error), "reinstall jaxfit")
+
+
+def _optional_packages() -> Iterator[Finding]:
+    for name, package in OPTIONAL_PACKAGES.items():
+        problem = package_problem(name)
+        if problem:
+            state = "missing" if "lacks" in problem else f"too old: version {metadata.version(name)}"
+            remedy = f'for {package.use}: pip install --upgrade "jaxfit[{package.extra}]"'
+            yield Finding(name, state, remedy)
+        else:
+            yield Finding(name, f"{metadata.version(name)}, for {package.use}")
+
+
+def _cache() -> Iterator[Finding]:
+    from jaxfit.cli.main import cache_folder
+    from jaxfit.storage.files import check_writable
+
+    folder = cache_folder()
+    files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
+    size = sum(path.stat().st_size for path in files) / 1e6
+    try:
+        check_writable(folder / "entry")
+    except InputError as error:
+        yield Finding(
+            "cache", f"{folder}: {error.problem}", "make it writable, or set XDG_CACHE_HOME to another folder"
+        )
+        return
+    yield Finding("cache", f"{folder}: {counted(len(files), 'compiled program')}, {size:.0f} MB; may be deleted")
+
+
+_CHECKS = (_versions, _processor, _kernels, _ffmpeg, _networks, _optional_packages, _cache)

@@ -1,0 +1,192 @@
+"""One skinned, animated bird of a glTF file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit.data.frame_numbers import frame_step
+from jaxfit.data.posed_meshes import PosedBirds
+from jaxfit.export.folder import describe_tracks
+from jaxfit.export.gltf_file import INDICES, VERTICES, GltfBuilder
+from jaxfit.export.gltf_motion import FOUR, Motion, four_weights
+from jaxfit.export.result import Exported
+from jaxfit.model.bird import Bird
+
+__all__ = ["add_bird", "body_length", "timeline", "weight_error"]
+
+
+def add_bird(builder: GltfBuilder, exported: Exported, n: int, motion: Motion, parent: int, animation: int) -> None:
+    """Add the mesh, the skin and the motion of one bird.
+
+    Args:
+        builder: the file.
+        exported: the result.
+        n: position of the track.
+        motion: the motion of the bird.
+        parent: node of the camera frame of the image.
+        animation: the animation that receives the channels.
+    """
+    bird, track = exported.bird, int(exported.solution.track_id[n])
+    name = f"bird_{track}"
+    joints = _add_joints(builder, bird, motion, name)
+    own = builder.add("nodes", {"name": name, "children": [joints[0]], "extras": describe_tracks(exported)[str(track)]})
+    builder.root["nodes"][parent].setdefault("children", []).append(own)
+    inverse_bind = np.tile(np.eye(4, dtype=np.float32), (len(joints), 1, 1))
+    inverse_bind[:, :3, 3] = -np.asarray(bird.joints)
+    matrices = builder.add_array(inverse_bind)
+    skin = builder.add("skins", {"joints": joints, "skeleton": own, "inverseBindMatrices": matrices})
+    mesh = _add_mesh(builder, bird, motion, name)
+    mesh_node = builder.add("nodes", {"name": f"{name}_mesh", "mesh": mesh, "skin": skin})
+    builder.root["scenes"][0]["nodes"].append(mesh_node)  # viewers ignore the place of a skinned mesh
+    _add_motion(builder, exported, motion, animation, own, joints, mesh_node)
+
+
+def _add_joints(builder: GltfBuilder, bird: Bird, motion: Motion, name: str) -> list[int]:
+    """Add a node for every joint, in the pose of the first fitted frame; returns the nodes."""
+    first = len(builder.root.get("nodes", []))
+    joints = list(range(first, first + bird.num_joints))
+    for j, joint in enumerate(bird.joint_names):
+        node: dict[str, Any] = {
+            "name": f"{name}_{joint}",
+            "translation": _floats(motion.translations[0, j]),
+            "rotation": _floats(motion.rotations[0, j]),
+        }
+        children = [joints[k] for k, above in enumerate(bird.parents) if above == j and k > 0]
+        builder.add("nodes", node | ({"children": children} if children else {}))
+    return joints
+
+
+def _add_mesh(builder: GltfBuilder, bird: Bird, motion: Motion, name: str) -> int:
+    """Add the mesh. Shape coefficients that are constant change the mesh, others become morph targets."""
+    vertices = np.asarray(bird.vertices, np.float64)
+    basis = np.asarray(bird.shape_basis, np.float64)
+    if not _morphs(motion):
+        vertices = vertices + np.tensordot(motion.betas[0], basis, axes=1)
+    faces = np.asarray(bird.faces)
+    joints, weights = four_weights(bird)
+    short = weights.astype(np.float32)
+    short[:, 0] = 1 - short[:, 1:].sum(axis=1, dtype=np.float32)  # the sum is 1 after rounding, too
+    colours = np.asarray(bird.vertex_colours, np.float64)
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    attributes = {
+        "POSITION": builder.add_array(vertices.astype(np.float32), VERTICES, bounds=True),
+        "NORMAL": builder.add_array(_normals(vertices, faces), VERTICES),
+        "COLOR_0": builder.add_array(linear.astype(np.float32), VERTICES),
+        "JOINTS_0": builder.add_array(joints.astype(np.uint8), VERTICES),
+        "WEIGHTS_0": builder.add_array(short, VERTICES),
+    }
+    kind = np.uint16 if len(vertices) < 65535 else np.uint32
+    primitive: dict[str, Any] = {"attributes": attributes, "material": _plumage(builder)}
+    primitive["indices"] = builder.add_array(faces.reshape(-1).astype(kind), INDICES)
+    mesh: dict[str, Any] = {"name": name, "primitives": [primitive]}
+    if _morphs(motion):
+        targets = [builder.add_array(each.astype(np.float32), VERTICES, bounds=True) for each in basis]
+        primitive["targets"] = [{"POSITION": target} for target in targets]
+        mesh["weights"] = _floats(motion.betas[0])
+    return builder.add("meshes", mesh)
+
+
+def _add_motion(
+    builder: GltfBuilder, exported: Exported, motion: Motion, animation: int, own: int, joints: list[int], mesh: int
+) -> None:
+    """Add the channels of a bird. A bird without a pose in a frame has size 0, which hides the bird."""
+    line, column = timeline(exported)
+    times = builder.add_array(line[column[motion.at]].astype(np.float32), bounds=True)
+    target = builder.root["animations"][animation]
+
+    def animate(node: int, path: str, values: np.ndarray, at: int = times, step: bool = False) -> None:
+        sampler = {"input": at, "output": builder.add_array(values.astype(np.float32))}
+        sampler["interpolation"] = "STEP" if step else "LINEAR"
+        target["samplers"].append(sampler)
+        channel = {"sampler": len(target["samplers"]) - 1, "target": {"node": node, "path": path}}
+        target["channels"].append(channel)
+
+    node = builder.root["nodes"][own]
+    node |= {"translation": _floats(motion.place[0]), "rotation": _floats(motion.facing[0])}
+    animate(own, "translation", motion.place)
+    animate(own, "rotation", motion.facing)
+    size = np.zeros(len(line))
+    size[column[motion.at]] = motion.size
+    node["scale"] = _floats(np.repeat(size[0], 3))
+    if np.ptp(size) > 0:
+        every = builder.add_array(line.astype(np.float32), bounds=True)
+        animate(own, "scale", np.repeat(size[:, None], 3, axis=1), every, step=True)
+    for j, joint in enumerate(joints):
+        if np.ptp(motion.rotations[:, j], axis=0).any():
+            animate(joint, "rotation", motion.rotations[:, j])
+        if np.ptp(motion.translations[:, j], axis=0).any():
+            animate(joint, "translation", motion.translations[:, j])
+    if _morphs(motion):
+        animate(mesh, "weights", motion.betas.reshape(-1))
+
+
+def timeline(exported: Exported) -> tuple[Float[np.ndarray, "L"], np.ndarray]:
+    """Return the times of all frame numbers of the export, from 0 on, and the position of every frame of the result.
+
+    Frame numbers that the result lacks are included.
+    """
+    numbers = exported.solution.frame_index
+    line = np.arange(numbers[0], numbers[-1] + 1, frame_step(numbers))
+    times = np.interp(line, numbers, exported.times_s)
+    return times - times[0], np.searchsorted(line, numbers)
+
+
+def weight_error(exported: Exported) -> float:
+    """Return the largest error of a vertex that comes of at most four weights, as a share of the body length.
+
+    The error is taken over ten fitted frames of every bird; 0 where no vertex has more than four weights.
+    """
+    bird, s = exported.bird, exported.solution
+    weights = np.asarray(bird.skin_weights)
+    if (weights > 0).sum(axis=1).max() <= FOUR:
+        return 0.0
+    joints, kept = four_weights(bird)
+    fewer = np.zeros(weights.shape, np.float32)
+    np.add.at(fewer, (np.arange(len(fewer))[:, None], joints), kept.astype(np.float32))
+    posed = PosedBirds(s, bird), PosedBirds(s, replace(bird, skin_weights=jnp.asarray(fewer)))
+    worst = 0.0
+    for n in range(len(s.track_id)):
+        at = np.flatnonzero(s.valid[n])
+        for t in at[np.linspace(0, len(at) - 1, min(len(at), 10)).astype(int)]:
+            full, short = (each.vertices_cam_window(n, slice(t, t + 1))[0] for each in posed)
+            worst = max(worst, float(np.linalg.norm(full - short, axis=1).max() / s.scale[n, t]))
+    return worst / body_length(bird)
+
+
+def body_length(bird: Bird) -> float:
+    """Return the longest side of the box of the mesh in its rest pose, model units."""
+    return float(np.ptp(np.asarray(bird.vertices), axis=0).max())
+
+
+def _morphs(motion: Motion) -> bool:
+    return bool(np.ptp(motion.betas, axis=0).any())
+
+
+def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Return unit normals of the vertices: means over their faces, weighted by area."""
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    sums = np.zeros(vertices.shape)
+    for i in range(3):
+        np.add.at(sums, faces[:, i], normal)
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    return np.where(length > 0, sums / np.where(length > 0, length, 1), [0, 0, 1.0]).astype(np.float32)
+
+
+def _plumage(builder: GltfBuilder) -> int:
+    """Return the material of all birds."""
+    materials = builder.root.setdefault("materials", [])
+    for i, material in enumerate(materials):
+        if material["name"] == "plumage":
+            return i
+    surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9}
+    return builder.add("materials", {"name": "plumage", "pbrMetallicRoughness": surface, "doubleSided": True})
+
+
+def _floats(values: Any) -> list[float]:
+    return [float(value) for value in np.asarray(values, np.float32)]

@@ -1,0 +1,222 @@
+"""The result that is exported: chosen tracks and frames, times, units, confidences and quality."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.formats.fields import read_json
+from jaxfit.data.frame_numbers import frame_step
+from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.selection import frame_positions, select_solution, track_positions
+from jaxfit.data.solution import Solution, load_solution
+from jaxfit.data.track_quality import TrackQuality, track_quality
+from jaxfit.errors import InputError
+from jaxfit.model.bird import Bird
+from jaxfit.video.reader import probe_video
+
+__all__ = ["CONFIDENCE", "Exported", "open_result"]
+
+CONFIDENCE = (
+    "confidence of the detected keypoint that the pose was fitted to, in [0, 1], as the keypoint network gives it; 0 "
+    "where the keypoint was not detected; NaN where the result does not hold detections or has no pose"
+)
+"""Definition of the confidences of an export."""
+
+_OBSERVATIONS, _SUMMARY = "observations.json", "summary.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Exported:
+    """The chosen part of a result, with N tracks, T frames and K keypoints."""
+
+    source: Path
+    """Folder of the result, for messages."""
+    solution: Solution
+    bird: Bird
+    observations: Observations | None
+    """Detections of the same tracks and frames, in the same order; None if the result folder has none."""
+    quality: Mapping[int, TrackQuality]
+    """Track → quality of its detections over the whole result. Empty without detections."""
+    metres_per_unit: float | None
+    """Length of a model unit; None if unknown."""
+    fps: float | None
+    """Frames per second of the footage; None if unknown."""
+    times_s: Float[np.ndarray, "T"]
+    """Time of every frame in seconds: the stored times, or frame number / fps; NaN if unknown."""
+    video: Path | None
+    """The footage, which may have been moved; None if unknown."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of exported lengths: `m`, or `unit` (model unit) where the length of a model unit is unknown."""
+        return "unit" if self.metres_per_unit is None else "m"
+
+    @property
+    def length(self) -> float:
+        """Factor from model units to the unit of exported lengths."""
+        return self.metres_per_unit or 1.0
+
+    @property
+    def confidence(self) -> Float[np.ndarray, "N T K"]:
+        """The confidences as `CONFIDENCE` defines them."""
+        valid = self.solution.valid[..., None]
+        if self.observations is None:
+            return np.full(self.solution.keypoints_px.shape[:3], np.nan, np.float32)
+        return np.where(valid, self.observations.confidence, np.float32(np.nan))
+
+    @property
+    def keypoints_px(self) -> Float[np.ndarray, "N T K 2"]:
+        """Projected keypoints in image pixels; NaN without a pose."""
+        return np.where(self.solution.valid[..., None, None], self.solution.keypoints_px, np.float32(np.nan))
+
+    @property
+    def keypoints_3d(self) -> Float[np.ndarray, "N T K 3"]:
+        """Keypoints in the camera frame of the crop at the size of the model, in `unit`; NaN without a pose.
+
+        One camera does not measure size: a bird that is larger and farther away gives the same picture. The result
+        holds the keypoints at `Solution.scale` times the size of the model; here they are divided by the scale.
+        """
+        return self.at_model_size(self.solution.keypoints_cam)
+
+    def at_model_size(self, points: Float[np.ndarray, "N T K 3"]) -> Float[np.ndarray, "N T K 3"]:
+        """Return points of the camera frame (model units) for a bird of the model's size, in `unit`."""
+        valid = self.solution.valid[..., None, None]
+        scale = np.where(valid, self.solution.scale[..., None, None], np.float32(np.nan))
+        return points / scale * np.float32(self.length)
+
+    @property
+    def sampling_fps(self) -> float:
+        """Frames of the export per second: the frame rate divided by the step of the frame numbers."""
+        return self.require_fps() / frame_step(self.solution.frame_index)
+
+    def require_fps(self) -> float:
+        """Return the frame rate of the footage.
+
+        Raises:
+            InputError: the frame rate is unknown.
+        """
+        if self.fps is None:
+            raise InputError(self.source, "does not hold the frame rate of the footage", "give --fps, or --video")
+        return self.fps
+
+    def require_video(self) -> Path:
+        """Return the footage.
+
+        Raises:
+            InputError: the footage is unknown.
+        """
+        if self.video is None:
+            raise InputError(self.source, "does not name its footage, which this format links", "give --video")
+        return self.video
+
+    def require_poses(self) -> None:
+        """Raise InputError if no chosen track has a pose in a chosen frame."""
+        if not self.solution.valid.any():
+            problem = "holds no pose in the chosen tracks and frames"
+            raise InputError(self.source, problem, "choose other tracks and frames; `jaxfit tracks` lists them")
+
+
+def open_result(
+    folder: str | Path,
+    tracks: Sequence[int] | None = None,
+    frames: tuple[int | None, int | None] = (None, None),
+    fps: float | None = None,
+    metres_per_unit: float | None = None,
+    video: str | Path | None = None,
+) -> Exported:
+    """Read a result folder for an export.
+
+    Args:
+        folder: folder of `jaxfit fit` or `jaxfit reconstruct`.
+        tracks: ids of the tracks; None takes all tracks.
+        frames: number of the first frame, and number after the last frame; None is an end of the result.
+        fps: frame rate of the footage in frames per second. None takes the rate and the times of the result, or the
+            rate of the video.
+        metres_per_unit: length of a model unit in metres; None takes the length of the model, which may be unknown.
+        video: the footage; None takes the footage that the result names.
+
+    Raises:
+        InputError: the folder holds no result, a track or frame is not in the result, a number is not positive, the
+            video cannot be read or has other images, or the detections do not belong to the result.
+    """
+    folder = Path(folder)
+    for name, value in (("--fps", fps), ("--metres-per-unit", metres_per_unit)):
+        if value is not None and not 0 < value < np.inf:
+            raise InputError(name, f"is {value}, not a positive number", "give a number above 0")
+    solution, bird = load_solution(folder)
+    rows = track_positions(solution, tracks, folder)
+    columns = frame_positions(solution, frames, folder)
+    observations, quality = _detections(folder, solution, bird)
+    chosen = select_solution(solution, rows, columns)
+    if video is None:
+        video = _stored_video(folder)
+        rate = fps or solution.fps
+    else:
+        video = Path(video)
+        footage_fps = _rate_of(video, solution)
+        rate = fps or solution.fps or footage_fps
+    return Exported(
+        source=folder,
+        solution=chosen,
+        bird=bird,
+        observations=None if observations is None else observations.select(rows, columns),
+        quality={track: quality[track] for track in chosen.track_id.tolist() if track in quality},
+        metres_per_unit=metres_per_unit or bird.metres_per_unit,
+        fps=rate,
+        times_s=_times(chosen, fps, rate),
+        video=video,
+    )
+
+
+def _times(solution: Solution, given: float | None, rate: float | None) -> Float[np.ndarray, "T"]:
+    """Return the time of every frame: by the given rate, by the stored times, else by the rate of the footage."""
+    numbers = solution.frame_index.astype(np.float64)
+    stored = np.full(len(numbers), np.nan) if solution.timestamp_s is None else solution.timestamp_s
+    known = np.isfinite(stored)
+    increasing = known.all() and (np.diff(stored) > 0).all()
+    if given is None and increasing:
+        return stored
+    return numbers / rate if rate else np.full(len(numbers), np.nan)
+
+
+def _detections(folder: Path, solution: Solution, bird: Bird) -> tuple[Observations | None, dict[int, TrackQuality]]:
+    """Return the detections of a result, with the tracks and frames of the solution, and the quality of the tracks."""
+    path = folder / _OBSERVATIONS
+    if not path.is_file():
+        return None, {}
+    read = check_keypoints(read_coco(path), bird.keypoint_names, path)
+    quality = {row.track_id: row for row in track_quality(read)}
+    row = {track: n for n, track in enumerate(read.track_id.tolist())}
+    column = {number: t for t, number in enumerate(read.frame_index.tolist())}
+    tracks, frames = solution.track_id.tolist(), solution.frame_index.tolist()
+    if not (set(tracks) <= set(row) and set(frames) <= set(column)):
+        problem = "lacks tracks or frames of poses.npz, so it belongs to another result"
+        raise InputError(path, problem, "remove it, or run the reconstruction again")
+    order = np.array([row[track] for track in tracks], int)
+    return read.select(order, np.array([column[number] for number in frames], int)), quality
+
+
+def _stored_video(folder: Path) -> Path | None:
+    """Return the footage that a summary names; a relative path begins in the folder where the command ran."""
+    path = folder / _SUMMARY
+    if not path.is_file():
+        return None
+    summary = read_json(path)
+    named = summary.value.get("video") if isinstance(summary.value, dict) else None
+    file = named.get("file") if isinstance(named, dict) else None
+    return Path(file) if isinstance(file, str) and file and "\0" not in file else None
+
+
+def _rate_of(video: Path, solution: Solution) -> float | None:
+    info = probe_video(video)
+    sizes = solution.image_size_px[solution.valid]
+    if len(sizes) and (sizes != info.size_px).any():
+        problem = f"is {info.size_px[0]}×{info.size_px[1]}, but the result has images of {sizes[0, 0]}×{sizes[0, 1]}"
+        raise InputError(video, problem, "give the video that the result was fitted to")
+    return info.fps

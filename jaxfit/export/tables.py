@@ -1,0 +1,166 @@
+"""Tables for R, pandas and spreadsheets, as CSV or Parquet: poses and keypoints, and joint angles.
+
+Both tables have a row for every track and frame. A row without a pose has `fitted` = false and empty values. The last
+part of the name of a column is its unit: `s`, `px` (image pixels), `m` or `unit` (model units), `rad`. Positions are in
+the camera frame of the crop: x right, y down, z forward. Positions in space are those of a bird of the model's size:
+times `size`, they are those of the result.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxfit.export.result import CONFIDENCE, Exported
+from jaxfit.extras import require_package
+from jaxfit.progress import ProgressTask
+from jaxfit.storage.files import write_whole
+from jaxfit.storage.json_values import json_text
+
+__all__ = ["angles_path", "write_csv", "write_parquet"]
+
+Columns = dict[str, np.ndarray]
+"""Name → values of all rows; NaN and None are empty cells."""
+
+
+def write_csv(exported: Exported, out: Path, progress: ProgressTask) -> list[Path]:
+    """Write both tables as CSV; returns their paths."""
+    return _write(exported, out, _csv, progress)
+
+
+def write_parquet(exported: Exported, out: Path, progress: ProgressTask) -> list[Path]:
+    """Write both tables as Parquet with units and definitions in the metadata; returns their paths.
+
+    Raises:
+        InputError: PyArrow is not installed.
+    """
+    require_package("pyarrow", "--to parquet")
+    return _write(exported, out, _parquet, progress)
+
+
+def angles_path(out: Path) -> Path:
+    """Return the path of the table of joint angles: `birds.csv` has its angles in `birds_angles.csv`."""
+    return out.with_name(f"{out.stem}_angles{out.suffix}")
+
+
+def _write(
+    exported: Exported, out: Path, content: Callable[[Columns, dict[str, str]], bytes], progress: ProgressTask
+) -> list[Path]:
+    facts = _facts(exported)
+    tables = {out: _pose_columns(exported), angles_path(out): _angle_columns(exported)}
+    with progress("Writing tables", len(tables)) as report_progress:
+        for path, columns in tables.items():
+            write_whole(path, content(columns, facts))
+            report_progress(1, path.name)
+    return list(tables)
+
+
+def _row_columns(exported: Exported) -> Columns:
+    """Return the columns that both tables share: track, frame, time, fitted and status."""
+    s = exported.solution
+    N, T = s.valid.shape
+    return {
+        "track": np.repeat(s.track_id, T),
+        "frame": np.tile(s.frame_index, N),
+        "time_s": np.tile(exported.times_s, N),
+        "fitted": s.valid.reshape(-1),
+        "status": np.repeat(s.status.astype(object), T),
+    }
+
+
+def _pose_columns(exported: Exported) -> Columns:
+    """Return the quality of the track, position, orientation and size of the bird, and its keypoints."""
+    s, unit, points = exported.solution, exported.unit, exported.keypoints_3d
+    T = len(s.frame_index)
+    columns = _row_columns(exported)
+    for name in ("coverage", "mean_confidence", "jitter"):
+        rows = [exported.quality.get(track) for track in s.track_id.tolist()]
+        values = [np.nan if row is None or getattr(row, name) is None else getattr(row, name) for row in rows]
+        columns[f"track_{name}"] = np.repeat(np.array(values, np.float64), T)
+    root = s.transl + s.scale[..., None] * np.asarray(exported.bird.joints[0])
+    columns |= _vectors(exported, {"root": exported.at_model_size(root[:, :, None])[:, :, 0]}, unit)
+    columns |= _vectors(exported, {"orientation": s.global_orient}, "rad")
+    columns["size"] = _known(exported, s.scale)
+    confidence = exported.confidence
+    for k, name in enumerate(s.keypoint_names):
+        columns |= _vectors(exported, {name: s.keypoints_px[:, :, k]}, "px")
+        columns[f"{name}_confidence"] = _known(exported, confidence[:, :, k])
+        columns |= _vectors(exported, {name: points[:, :, k]}, unit)
+    return columns
+
+
+def _angle_columns(exported: Exported) -> Columns:
+    """Return the rotation of every joint except the root relative to its parent, as axis-angles."""
+    s = exported.solution
+    angles = {name: s.body_pose[:, :, j] for j, name in enumerate(s.joint_names[1:])}
+    return _row_columns(exported) | _vectors(exported, angles, "rad")
+
+
+def _vectors(exported: Exported, points: dict[str, np.ndarray], unit: str) -> Columns:
+    """Return one column for each component of some vectors (N, T, 2 or 3)."""
+    return {
+        f"{name}_{axis}_{unit}": _known(exported, values[..., i])
+        for name, values in points.items()
+        for i, axis in enumerate("xyz"[: values.shape[-1]])
+    }
+
+
+def _known(exported: Exported, values: np.ndarray) -> np.ndarray:
+    """Return values (N, T) as one column, NaN without a pose."""
+    return np.where(exported.solution.valid, values, np.float32(np.nan)).astype(np.float32).reshape(-1)
+
+
+def _facts(exported: Exported) -> dict[str, str]:
+    """Return facts about the whole table, for its metadata."""
+    units = {"s": "seconds", "px": "image pixels, origin at the upper left corner of the image", "rad": "radians"}
+    units |= {"m": "metres"} if exported.unit == "m" else {"unit": "model units, whose length in metres is unknown"}
+    frames = "positions: camera frame of the crop, x right, y down, z forward; orientation: axis-angle, model to "
+    frames += "camera; joint angles: axis-angle relative to the parent joint"
+    return {
+        "source_software": "jaxfit",
+        "units": json_text(units),
+        "frames": frames,
+        "confidence": CONFIDENCE,
+        "size": "size of the bird relative to the model in the result; positions in m or unit are divided by the size",
+        "model": exported.bird.name,
+        "fps": str(exported.fps or "unknown"),
+    }
+
+
+def _csv(columns: Columns, _facts: dict[str, str]) -> bytes:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*map(_texts, columns.values()), strict=True))
+    return text.getvalue().encode()
+
+
+def _texts(values: np.ndarray) -> list[Any]:
+    """Return the cells of a column: the shortest digits that give the same number; nothing for NaN."""
+    if values.dtype.kind == "f":
+        return np.where(np.isnan(values), "", values.astype(str)).tolist()
+    if values.dtype.kind == "b":
+        return np.where(values, "true", "false").tolist()
+    return values.tolist()
+
+
+def _parquet(columns: Columns, facts: dict[str, str]) -> bytes:
+    import pyarrow
+    import pyarrow.parquet
+
+    fields, arrays = [], []
+    for name, values in columns.items():
+        array = pyarrow.array(values, from_pandas=True)  # NaN becomes null
+        unit = name.rpartition("_")[2]
+        metadata = {"unit": unit} if unit in ("s", "px", "m", "unit", "rad") else None
+        fields.append(pyarrow.field(name, array.type, metadata=metadata))
+        arrays.append(array)
+    table = pyarrow.Table.from_arrays(arrays, schema=pyarrow.schema(fields, metadata=facts))
+    content = io.BytesIO()
+    pyarrow.parquet.write_table(table, content)
+    return content.getvalue()
