@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import os
 import uuid
 from importlib import import_module
 from pathlib import Path
@@ -60,7 +61,7 @@ def write_nwb(
         progress("Writing NWB", len(fitted)) as report_progress,
     ):
         for n in fitted:
-            _write_bird(exported, n, began, folder / names[tracks[n]])
+            _write_bird(exported, n, began, _link(exported.require_video(), out), folder / names[tracks[n]])
             report_progress(1, names[tracks[n]])
     notes = []
     if start is None:
@@ -77,11 +78,15 @@ def _start(text: str | None) -> datetime.datetime:
     return time if time.tzinfo else time.replace(tzinfo=datetime.UTC)
 
 
-def _write_bird(exported: Exported, n: int, began: datetime.datetime, path: Path) -> None:
+def _link(video: Path, folder: Path) -> str:
+    """Return the path of the footage from the folder of the NWB files; the stored path if the footage was moved."""
+    return os.path.relpath(video.resolve(), folder.resolve()) if video.exists() else str(video)
+
+
+def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str, path: Path) -> None:
     pynwb, ndx_pose = _library("pynwb"), _library("ndx_pose")
     s, track = exported.solution, int(exported.solution.track_id[n])
     facts = describe_tracks(exported)[str(track)]
-    video = str(exported.require_video())
     # the same export has the same identifier
     digest = hashlib.sha256(f"{video} {track}".encode() + s.keypoints_px[n].tobytes() + s.valid[n].tobytes()).digest()
     file = pynwb.NWBFile(
@@ -106,17 +111,16 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, path: Path
         starting_time=0.0,
         num_samples=int(s.frame_index[-1]) + 1,
         unit="n.a.",
+        dimension=s.image_size_px[s.valid].max(0).tolist(),
     )
     file.add_acquisition(footage)
     edges = np.array(skeleton_pairs(s.keypoint_names), np.uint8).reshape(-1, 2)
     skeleton = ndx_pose.Skeleton(name="bird", nodes=list(s.keypoint_names), edges=edges, subject=subject)
-    width, height = s.image_size_px[s.valid].max(0).tolist()
     pose = ndx_pose.PoseEstimation(
         name="PoseEstimation",
         pose_estimation_series=_series(exported, n),
         description=f"projected keypoints of the fitted mesh; the fit ended with the status: {facts['status']}",
         original_videos=[video],
-        dimensions=np.array([[height, width]], np.uint16),
         scorer="jaxfit",
         source_software="jaxfit",
         source_software_version=__version__,
