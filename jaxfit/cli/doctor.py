@@ -101,7 +101,7 @@ def _has_codec(name: str, mode: str) -> bool:
 
     try:
         av.Codec(name, mode)  # type: ignore[arg-type]
-    except (ValueError, av.FFmpegError):
+    except ValueError:  # PyAV's error for unknown codecs
         return False
     return True
 

@@ -100,7 +100,7 @@ def _add_motion(
     target = builder.root["animations"][animation]
 
     def animate(node: int, path: str, values: np.ndarray, at: int = times, step: bool = False) -> None:
-        sampler = {"input": at, "output": builder.add_array(values.astype(np.float32))}
+        sampler: dict[str, Any] = {"input": at, "output": builder.add_array(values.astype(np.float32))}
         sampler["interpolation"] = "STEP" if step else "LINEAR"
         target["samplers"].append(sampler)
         channel = {"sampler": len(target["samplers"]) - 1, "target": {"node": node, "path": path}}

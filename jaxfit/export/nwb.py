@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import os
 import uuid
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +61,7 @@ def write_nwb(
         progress("Writing NWB", len(fitted)) as report_progress,
     ):
         for n in fitted:
-            _write_bird(exported, n, began, folder / names[tracks[n]])
+            _write_bird(exported, n, began, _link(exported.require_video(), out), folder / names[tracks[n]])
             report_progress(1, names[tracks[n]])
     notes = []
     if start is None:
@@ -76,18 +78,18 @@ def _start(text: str | None) -> datetime.datetime:
     return time if time.tzinfo else time.replace(tzinfo=datetime.UTC)
 
 
-def _write_bird(exported: Exported, n: int, began: datetime.datetime, path: Path) -> None:
-    from ndx_pose import PoseEstimation, Skeleton, Skeletons
-    from pynwb import NWBHDF5IO, NWBFile
-    from pynwb.file import Subject
-    from pynwb.image import ImageSeries
+def _link(video: Path, folder: Path) -> str:
+    """Return the path of the footage from the folder of the NWB files; the stored path if the footage was moved."""
+    return os.path.relpath(video.resolve(), folder.resolve()) if video.exists() else str(video)
 
+
+def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str, path: Path) -> None:
+    pynwb, ndx_pose = _library("pynwb"), _library("ndx_pose")
     s, track = exported.solution, int(exported.solution.track_id[n])
     facts = describe_tracks(exported)[str(track)]
-    video = str(exported.require_video())
     # the same export has the same identifier
     digest = hashlib.sha256(f"{video} {track}".encode() + s.keypoints_px[n].tobytes() + s.valid[n].tobytes()).digest()
-    file = NWBFile(
+    file = pynwb.NWBFile(
         session_description=f"3D pose of bird {track}, fitted by jaxfit to {one_line(exported.require_video().name)}",
         identifier=str(uuid.UUID(bytes=digest[:16])),
         session_start_time=began,
@@ -95,9 +97,11 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, path: Path
     )
     species = _SPECIES.get(exported.bird.name)
     about: dict[str, Any] = {"species": species} if species else {}
-    subject = Subject(subject_id=f"bird_{track}", sex="U", age="P0D/", description="track of a video", **about)
+    subject = pynwb.file.Subject(
+        subject_id=f"bird_{track}", sex="U", age="P0D/", description="track of a video", **about
+    )
     file.subject = subject
-    footage = ImageSeries(
+    footage = pynwb.image.ImageSeries(
         name="footage",
         description="the video that the poses were fitted to",
         external_file=[video],
@@ -107,17 +111,16 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, path: Path
         starting_time=0.0,
         num_samples=int(s.frame_index[-1]) + 1,
         unit="n.a.",
+        dimension=s.image_size_px[s.valid].max(0).tolist(),
     )
     file.add_acquisition(footage)
     edges = np.array(skeleton_pairs(s.keypoint_names), np.uint8).reshape(-1, 2)
-    skeleton = Skeleton(name="bird", nodes=list(s.keypoint_names), edges=edges, subject=subject)
-    width, height = s.image_size_px[s.valid].max(0).tolist()
-    pose = PoseEstimation(
+    skeleton = ndx_pose.Skeleton(name="bird", nodes=list(s.keypoint_names), edges=edges, subject=subject)
+    pose = ndx_pose.PoseEstimation(
         name="PoseEstimation",
         pose_estimation_series=_series(exported, n),
         description=f"projected keypoints of the fitted mesh; the fit ended with the status: {facts['status']}",
         original_videos=[video],
-        dimensions=np.array([[height, width]], np.uint16),
         scorer="jaxfit",
         source_software="jaxfit",
         source_software_version=__version__,
@@ -125,16 +128,15 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, path: Path
         source_video=footage,
     )
     behaviour = file.create_processing_module("behavior", "poses of the bird")
-    behaviour.add(Skeletons(skeletons=[skeleton]))
+    behaviour.add(ndx_pose.Skeletons(skeletons=[skeleton]))
     behaviour.add(pose)
-    with NWBHDF5IO(path, "w") as io:
+    with pynwb.NWBHDF5IO(path, "w") as io:
         io.write(file)
 
 
 def _series(exported: Exported, n: int) -> list[Any]:
     """Return one series for every keypoint. The series share their times."""
-    from ndx_pose import PoseEstimationSeries
-
+    ndx_pose = _library("ndx_pose")
     points, confidence = exported.keypoints_px[n], exported.confidence[n]
     times = exported.times_s
     steps = np.diff(times)
@@ -143,7 +145,7 @@ def _series(exported: Exported, n: int) -> list[Any]:
         timing = {"starting_time": float(times[0]), "rate": float(1 / steps.mean())}
     series: list[Any] = []
     for k, name in enumerate(_series_names(exported.solution.keypoint_names)):
-        one = PoseEstimationSeries(
+        one = ndx_pose.PoseEstimationSeries(
             name=name,
             description=f"keypoint {one_line(exported.solution.keypoint_names[k])}",
             data=points[:, k],
@@ -168,3 +170,8 @@ def _series_names(names: tuple[str, ...]) -> list[str]:
             plain += "_"
         changed.append(plain)
     return changed
+
+
+def _library(name: str) -> Any:
+    """Return a library that makes its classes when it is imported, so that type checkers do not know them."""
+    return import_module(name)

@@ -135,8 +135,8 @@ def test_movement_opens_an_export(tmp_path):
     out = tmp_path / "birds.nc"
     export_result(tmp_path / "result", "movement", out, dims="plural")
     python = new_environment(tmp_path / "venv", "movement<0.17", "h5netcdf")
-    code = "import sys; from movement.io.load import load_dataset; from movement.kinematics import compute_velocity; "
-    code += "from movement.validators.datasets import ValidPosesInputs; data = load_dataset(sys.argv[1]); "
+    code = "import sys, xarray; from movement.kinematics import compute_velocity; "
+    code += "from movement.validators.datasets import ValidPosesInputs; data = xarray.load_dataset(sys.argv[1]); "
     code += "ValidPosesInputs.validate(data); print(*compute_velocity(data.position).dims, data.attrs['fps'])"
     assert run(python, "-c", code, out).split()[-5:] == ["time", "space", "keypoints", "individuals", "12.5"]
 
