@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from jaxfit import __version__
+from jaxfit.cli.adapt_parser import add_adapt_commands, add_model_commands
 from jaxfit.config.help import option_help
 from jaxfit.config.perception import TrackConfig
 from jaxfit.errors import InputError
@@ -54,18 +55,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
     parser.add_argument("-v", "--verbose", action="store_true", help="print more messages, also of libraries")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for add_commands in (
-        _perception,
-        _labelling,
-        _import,
-        _fitting,
-        _simulation,
-        _training,
-        _datasets,
-        _models,
-        _configs,
-        _bench,
-    ):
+    groups = (_perception, _labelling, _import, _fitting, _simulation, _training, _datasets, _models, _configs, _bench)
+    for add_commands in (*groups, add_adapt_commands):
         add_commands(commands)
     return parser
 
@@ -272,6 +263,7 @@ def _models(commands: Any) -> None:
     _add_out(view, "PNG", "picture to write")
     text = "posture of the murre: standing, incubating, … (default standing; other models have only the rest pose)"
     view.add_argument("--posture", help=text)
+    add_model_commands(actions)
 
     prior = commands.add_parser("prior", help="learn a pose prior from results")
     actions = prior.add_subparsers(required=True, metavar="ACTION")
