@@ -74,7 +74,8 @@ def _by_names(first: Bird, second: Bird) -> Similarity:
         ]
         common = [name for name in place[0] if name in place[1]]
         if len(common) >= LEAST_COMMON:
-            return fit_similarity(*(np.stack([place[i][name] for name in common]) for i in (1, 0)))
+            to_first = [np.stack([places[name] for name in common]) for places in place]
+            return fit_similarity(to_first[1], to_first[0])
     raise InputError(second.name, f"shares no four keypoints or joints with {first.name}", "compare models of birds")
 
 

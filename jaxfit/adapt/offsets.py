@@ -31,7 +31,7 @@ def mirror_vertices(bird: Bird) -> Int[np.ndarray, "V"]:
     """Return the vertex that mirrors each vertex at the plane x = 0. A vertex without a mirror image mirrors itself."""
     vertices = np.asarray(bird.vertices, np.float64)
     distance, other = KDTree(vertices).query(vertices * [-1, 1, 1])
-    own = np.arange(len(vertices))
+    own, other = np.arange(len(vertices)), np.asarray(other)
     paired = (other[other] == own) & (distance < MIRROR_TOLERANCE * np.ptp(vertices[:, 1]))
     return np.where(paired, other, own)
 
@@ -92,7 +92,7 @@ def _laplacian(bird: Bird) -> sparse.csr_matrix:
     _, near = KDTree(vertices).query(vertices, k=NEIGHBOURS + 1)
     pairs = np.concatenate(
         [faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]
-        + [np.stack([np.arange(count), near[:, k]], axis=1) for k in range(1, NEIGHBOURS + 1)]
+        + [np.stack([np.arange(count), np.asarray(near)[:, k]], axis=1) for k in range(1, NEIGHBOURS + 1)]
     )
     distance = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
     together = np.minimum(weights[pairs[:, 0]], weights[pairs[:, 1]]).sum(axis=1)  # 1 for equal skin weights
@@ -100,7 +100,8 @@ def _laplacian(bird: Bird) -> sparse.csr_matrix:
     links = sparse.coo_matrix((closeness, pairs.T), shape=(count, count)).tocsr()
     links = links.maximum(links.T)
     mirror = mirror_vertices(bird)
-    links = (links + links[mirror][:, mirror]) / 2
+    swap = sparse.csr_matrix((np.ones(count), (np.arange(count), mirror)), shape=(count, count))
+    links = (links + swap @ links @ swap.T) / 2
     return sparse.diags(np.asarray(links.sum(axis=1)).ravel()) - links
 
 

@@ -207,8 +207,8 @@ def _both_directions(
     own = samples.points(vertices, outer)
     to_scan = closest_points(own, scan.vertices, scan.faces, scan.search)
     from_scan = closest_points(scan.points, vertices, outer, search)
-    # a point of the model whose closest point lies at the border of a hole has no counterpart
-    whole = ~scan.boundary[to_scan.face]
+    # a point of the model far from the border of a hole has no counterpart; without the near points, the model grows
+    whole = ~scan.boundary[to_scan.face] | (to_scan.distance < reach / 3)
     corners = np.concatenate([outer[samples.face], outer[from_scan.face]])
     weights = np.concatenate([samples.barycentric, from_scan.barycentric])
     points = np.concatenate([own, from_scan.point])
