@@ -188,6 +188,14 @@ CHECKPOINT_ENTRIES = 10_000
 MODEL_JSON_BYTES = 2**24
 """Size of the JSON file of a bird model; the published file has about 3 MB."""
 
+# --- scans
+SCAN_BYTES = 2 << 30
+"""Largest file of a scan."""
+SCAN_FACES = 20_000_000
+"""Most faces of a scan. A scan of more than 150,000 faces is decimated."""
+KEYPOINTS_BYTES = 1_000_000
+"""Largest file of the annotated keypoints of a scan."""
+
 # --- written files
 NAME_BYTES = 255
 """Length of one name in a path."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxfit import __version__
+from jaxfit.cli.adapt_arguments import add_adapt_commands, add_model_commands
 from jaxfit.cli.arguments import (
     MODEL,
     OBSERVATIONS,
@@ -46,6 +47,7 @@ def build_parser() -> argparse.ArgumentParser:
         _models,
         _configs,
         _bench,
+        add_adapt_commands,
     ):
         add_commands(commands)
     return parser
@@ -205,6 +207,7 @@ def _models(commands: Any) -> None:
     add_out(view, "PNG", "picture to write")
     text = "posture of the murre: standing, incubating, … (default standing; other models have only the rest pose)"
     view.add_argument("--posture", help=text)
+    add_model_commands(actions)
 
     prior = commands.add_parser("prior", help="learn a pose prior from results")
     actions = prior.add_subparsers(required=True, metavar="ACTION")

@@ -41,14 +41,14 @@ STATIC_FIELDS = {
 TEXT_FIELDS = ("joint_names", "keypoint_names", "name")
 
 
-def save_bird(bird: Bird, path: Path | str, notes: Mapping[str, float] | None = None) -> None:
+def save_bird(bird: Bird, path: Path | str, notes: Mapping[str, Any] | None = None) -> None:
     """Write a bird to an `.npz` file atomically; an existing file of that name is replaced.
 
     Args:
         bird: the model; the arrays are stored as float32 and int32.
         path: the file, conventionally `<name>.npz`.
-        notes: further numbers to store, for example the number of poses that a prior was learnt from; `load_bird`
-            ignores them.
+        notes: further numbers or texts to store, for example the number of poses that a prior was learnt from;
+            `load_bird` ignores them.
 
     Raises:
         InputError: a field of the bird is wrong, or the file cannot be written.

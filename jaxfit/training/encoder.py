@@ -1,7 +1,7 @@
 """Initial weights of the segmenter's encoder: of the built-in segmenter, or of EfficientNet-lite0.
 
-EfficientNet-lite0 was trained on the photographs of ImageNet. A segmenter with the encoder of these photographs transfers
-better from simulated to real footage than a segmenter that has seen simulated footage only.
+EfficientNet-lite0 was trained on the photographs of ImageNet. A segmenter with this encoder transfers better from
+simulated to real footage than a segmenter that has seen simulated footage only.
 """
 
 # pyright: reportMissingImports=false

@@ -1,0 +1,142 @@
+"""Commands that adapt a bird model to a species."""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from jaxfit.cli.tables import counted, right_aligned, show
+from jaxfit.errors import InputError
+from jaxfit.model.files import find_bird, save_bird
+from jaxfit.progress import terminal
+from jaxfit.storage.files import check_writable
+
+__all__ = ["adapt_photos", "adapt_scan", "show_bones"]
+
+FEW_INDIVIDUALS = 5
+"""A warning says that fewer individuals than these do not represent a species."""
+_AXES = {"X": (1, 0, 0), "Y": (0, 1, 0), "Z": (0, 0, 1)}
+
+
+def adapt_scan(options: argparse.Namespace) -> None:
+    """Fit a model to a 3D scan, write the adapted model and a picture of the errors."""
+    from jaxfit.adapt.rigid_start import is_mirrored
+    from jaxfit.adapt.scan_file import read_scan
+    from jaxfit.adapt.scan_fit import ScanSettings, fit_scan
+    from jaxfit.adapt.scan_keypoints import read_scan_keypoints
+    from jaxfit.adapt.scan_report import UNITS_MM, draw_scan, measure_scan
+    from jaxfit.adapt.species import mean_keypoints, provenance_notes
+
+    check_writable(options.out)  # before the long work
+    bird = find_bird(options.model)
+    scan = read_scan(options.scan)
+    for remark in scan.remarks:
+        show(remark)
+    keypoints, unknown = read_scan_keypoints(options.keypoints, bird.keypoint_names, scan.numbered_vertices)
+    if unknown:
+        show(f"not used, because the model has no such keypoints: {', '.join(unknown)}")
+    index = [bird.keypoint_names.index(name) for name in keypoints]
+    annotated = np.stack(list(keypoints.values()))
+    if is_mirrored(mean_keypoints(bird)[index], annotated):
+        remedy = "mirror the scan, or exchange the names of the left and the right keypoints"
+        raise InputError(options.keypoints, "left and right are exchanged: the scan is a mirror image", remedy)
+    _check_near(scan, keypoints, options)
+    up = None
+    if options.up:
+        up = np.array(_AXES[options.up[-1]], float) * (-1 if options.up.startswith("-") else 1)
+    settings = ScanSettings(modes=40 if options.offset else 0)
+    name = options.out.stem
+    fit = fit_scan(bird, scan.vertices, scan.faces, keypoints, settings, name, up, terminal)
+    errors = measure_scan(fit, scan.vertices, scan.faces, keypoints, UNITS_MM[options.unit])
+    picture = options.out.with_suffix(".png")
+    draw_scan(picture, fit, scan.vertices, scan.faces, errors)
+    facts = {"source": "scan", "scan": options.scan.name, "keypoints": len(keypoints), "offset": bool(options.offset)}
+    facts |= {"unit": options.unit, "mm_per_model_unit": fit.size * UNITS_MM[options.unit]}
+    facts |= {"free": "pose, size, bone lengths, shape" + (", vertex offset" if options.offset else "")}
+    facts |= {f"error_{key}": round(value, 5) for key, value in errors.summary.items()}
+    save_bird(fit.bird, options.out, provenance_notes(bird, facts) | fit.pose_notes())
+    show_bones(bird, fit.bird)
+    summary = errors.summary
+    show(
+        f"length of the bird from bill to tail, in its rest pose: {errors.length:.4g} {options.unit}; its size is free"
+    )
+    if errors.implausible_size:
+        show(f"warning: {errors.implausible_size}")
+    if up is not None and (tilt := fit.tilt_deg(up)) > 100:
+        show(f"warning: the back of the bird points {tilt:.0f}° away from --up")
+    show(f"distance of the scan from the model: median {errors.shown(summary['median'])}, ")
+    show(f"  95 % below {errors.shown(summary['p95'])}; keypoints, median {errors.shown(summary['keypoints'])}")
+    show(f"the scan covers {100 * errors.covered:.0f} % of the model's visible surface")
+    for problem in errors.problems:
+        show(f"warning: the model does not fit this scan: {problem}")
+    show(f"{name} → {options.out}, picture → {picture}")
+
+
+def adapt_photos(options: argparse.Namespace) -> None:
+    """Fit the means of a species to photographs, and write the adapted model."""
+    from jaxfit.adapt.photo_fit import FREE, fit_photographs
+    from jaxfit.adapt.photographs import read_photographs
+    from jaxfit.adapt.species import provenance_notes
+    from jaxfit.cli.observation_files import observations_for
+
+    fixed = tuple(part for part in options.fix.split(",") if part)
+    unknown = [part for part in fixed if part not in FREE]
+    if unknown:
+        raise InputError("--fix", f"{unknown[0]!r} is not a part of a species", f"known: {', '.join(FREE)}")
+    if set(fixed) == set(FREE):
+        raise InputError("--fix", "all parts are fixed, so that nothing is left to fit", "fix fewer parts")
+    check_writable(options.out)  # before the long work
+    bird = find_bird(options.model)
+    sources = [(path.name, observations_for(path, bird.keypoint_names, options)[0]) for path in options.birds]
+    photographs = read_photographs(sources, bird, terminal)
+    count = len(photographs.names)
+    without = int((~photographs.has_mask).sum())
+    if without:
+        show(f"{without} of {counted(count, 'image')} have no mask; their keypoints are used")
+    name = options.out.stem
+    fit = fit_photographs(photographs, bird, fixed=fixed, name=name, progress=terminal)
+    facts = {
+        "source": "photographs",
+        "images": count,
+        "individuals": fit.individuals,
+        "images_with_mask": count - without,
+    }
+    facts |= {"free": ", ".join(part for part in FREE if part not in fixed)}
+    facts |= {f"setting_{key}": value for key, value in fit.settings._asdict().items()}
+    facts |= {"images_that_disagree": len(fit.disagreeing)}
+    save_bird(fit.bird, options.out, provenance_notes(bird, facts))
+    show_bones(bird, fit.bird)
+    for i in fit.disagreeing:
+        show(f"disagrees with the other images, weight {fit.weight[i]:.2f}: {photographs.names[i]}")
+    if fit.individuals < FEW_INDIVIDUALS:
+        show(f"warning: {counted(fit.individuals, 'individual')} say little about a species")
+    show(f"{counted(count, 'image')} of {counted(fit.individuals, 'individual')} → {options.out}")
+
+
+def show_bones(base, adapted) -> None:
+    """Print the change of the mean bone lengths, in per cent of the bones of the base."""
+    from jaxfit.adapt.species import absolute_bones
+
+    before, after = absolute_bones(base), absolute_bones(adapted)
+    table = right_aligned("base", "adapted", "change %", title="mean bone lengths, model units")
+    table.add_column("bone")
+    for bone in np.argsort(-np.abs(after / np.maximum(before, 1e-9) - 1)):
+        change = 100 * (after[bone] / max(before[bone], 1e-9) - 1)
+        table.add_row(f"{before[bone]:.2f}", f"{after[bone]:.2f}", f"{change:+.1f}", base.joint_names[bone + 1])
+    show(table)
+
+
+def _check_near(scan, keypoints, options: argparse.Namespace) -> None:
+    """Report keypoints off the surface; raise InputError if most keypoints are far from the scan."""
+    from jaxfit.adapt.scan_report import keypoints_off_surface
+
+    length = float(np.ptp(scan.vertices, axis=0).max())
+    off = keypoints_off_surface(scan.vertices, scan.faces, keypoints, length)
+    far = [name for name, distance in off.items() if distance > 0.3]
+    if len(far) > len(keypoints) / 2:
+        problem = f"{len(far)} of {len(keypoints)} keypoints are far from the surface of the scan"
+        raise InputError(options.keypoints, problem, "give keypoints in the coordinates and the unit of the scan")
+    if off:
+        listed = ", ".join(f"{name} ({100 * distance:.0f} %)" for name, distance in off.items())
+        show(f"warning: keypoints off the surface, in per cent of the scan's size: {listed}; wrong, or at holes")
