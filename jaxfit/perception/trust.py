@@ -31,8 +31,8 @@ MIN_CONFIDENCE = 0.75
 """Least median confidence of a bird. The good clips have 0.80 to 0.95, the others 0.65 and 0.72, the clip from the side
 0.72."""
 MAX_SHORT_SHARE = 0.2
-"""Largest share of the detections in short tracks. The good clips have 0 to 0.11, the others 0.05 and 0.16. A clip of 12
-frames has more short tracks than a video."""
+"""Largest share of the detections in short tracks. The good clips have 0 to 0.11, the others 0.05 and 0.16. A clip of
+12 frames has more short tracks than a video."""
 MAX_COUNT_CHANGE = 0.15
 """Largest change of the number of birds. The good clips have 0 to 0.05, the others 0.07 and 0.10. The limit is higher,
 because the number changes more in footage with fewer frames per second."""
