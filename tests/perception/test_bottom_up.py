@@ -67,8 +67,8 @@ def test_far_offsets_and_low_peaks_give_no_instance(tmp_path):
     assert [bird.box_px.tolist() for bird in birds] == [[20, 20, 20, 20]]  # others: too few cells, low score
 
 
-def test_input_is_as_in_training(tmp_path):
-    """Area-averaged, blue-green-red within 0 and 1, in the upper left corner; sides are multiples of 32."""
+def write_picture_network(path, longer_side):
+    """Write a network that returns blue as foreground, green as centre and red as offset."""
     nodes = [
         helper.make_node("AveragePool", ["pictures"], ["cells"], kernel_shape=[2, 2], strides=[2, 2]),
         helper.make_node("Split", ["cells", "one_each"], ["blue", "green", "red"], axis=1),
@@ -78,18 +78,16 @@ def test_input_is_as_in_training(tmp_path):
     ]
     shapes = {"foreground": (1, 1, "h", "w"), "centre": (1, 1, "h", "w"), "offset": (1, 2, "h", "w")}
     constants = {"one_each": np.array([1, 1, 1])}
-    path = write_graph(
-        tmp_path / "net.onnx",
-        {"pictures": (1, 3, "height", "width")},
-        shapes,
-        nodes,
-        constants,
-        {"longer_side": "96", "names": "['murre']"},
-    )
+    metadata = {"longer_side": str(longer_side), "names": "['murre']"}
+    return write_graph(path, {"pictures": (1, 3, "height", "width")}, shapes, nodes, constants, metadata)
+
+
+def test_input_is_as_in_training(tmp_path):
+    """Area-averaged, blue-green-red within 0 and 1, in the upper left corner; sides are multiples of 32."""
     frame = np.zeros((200, 288, 3), np.uint8)
     frame[60:120, 60:180, 0] = 255  # columns 20 to 60 of 96, rows 20 to 40
     frame[90, 120, 1] = 255  # a ninth of an input pixel, a quarter of that in a cell: below every threshold
-    segmenter = load_segmenter(path)
+    segmenter = load_segmenter(write_picture_network(tmp_path / "net.onnx", 96))
     assert segmenter(frame) == []
     frame[84:90, 114:120, 1] = 255  # one whole cell in the middle; offsets are 0: distant cells are excluded
     (bird,) = segmenter(frame)
@@ -98,11 +96,47 @@ def test_input_is_as_in_training(tmp_path):
     assert bird.mask[1:-1, 1:-1].all()
 
 
+class Counted:
+    """A network that stores the widths of its inputs."""
+
+    def __init__(self, model):
+        self._model, self.widths = model, []
+
+    def __call__(self, array):
+        self.widths.append(array.shape[-1])
+        return self._model(array)
+
+    def __getattr__(self, name):
+        return getattr(self._model, name)
+
+
+@pytest.mark.parametrize(
+    ("length", "found", "widths"),
+    [
+        (90, 90, [512]),  # a bird of which nothing is missing: half of the least length of a large bird is 100
+        (150, 120, [512, 256]),  # offsets of 0 reach 60 pixels; the bird is too short for the smaller input
+        (230, 230, [512, 256, 128]),  # the part of 120 pixels is replaced
+        (450, 450, [512, 256, 128]),
+    ],
+)
+def test_large_birds_are_detected_in_smaller_inputs(tmp_path, length, found, widths):
+    frame = np.zeros((64, 512, 3), np.uint8)
+    frame[10:54, 20 : 20 + length, 0] = 255
+    y, x = np.indices((64, 512))
+    # one highest cell at every size
+    frame[..., 1] = 255 * np.exp(-((x - 20 - length / 2 - 1.3) ** 2 + (y - 33.3) ** 2) / 200)
+    segmenter = load_segmenter(write_picture_network(tmp_path / "net.onnx", 512))
+    segmenter._model = counted = Counted(segmenter._model)
+    (bird,) = segmenter(frame)
+    assert bird.mask.shape[1] == pytest.approx(found, abs=8)
+    assert counted.widths == widths
+
+
 def test_variable_sides_are_multiples_of_32(tmp_path):
     segmenter = BottomUp(OnnxModel(write(tmp_path / "n.onnx", maps_of(), (1, 3, "h", "w"), longer_side="864")))
-    assert segmenter._input_px((2592, 1520)) == (864, 512)
-    assert segmenter._input_px((854, 480)) == (864, 512)
-    assert segmenter._input_px((480, 854)) == (512, 864)
+    assert segmenter._input_px((2592, 1520), 864) == (864, 512)
+    assert segmenter._input_px((854, 480), 864) == (864, 512)
+    assert segmenter._input_px((480, 854), 864) == (512, 864)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from jaxfit.limits import INSTANCES
 from jaxfit.perception.activations import activation_monitor
 from jaxfit.perception.instances import Instance, collect_instances
 from jaxfit.perception.onnx_model import OnnxModel
+from jaxfit.perception.segmentation.large_birds import length_px, replace_parts
 from jaxfit.perception.segmentation.network import SegmentationNetwork
 from jaxfit.perception.segmentation.placement import Placement
 
@@ -33,6 +34,10 @@ MIN_FOREGROUND = 0.1
 """Cells with a lower foreground belong to no bird. Masks are cut at 0.5, between cells."""
 MAX_DISTANCE_PX = 60.0
 """Cells whose offset ends at least this far from every centre belong to no bird; pixels of the input."""
+LARGE_BIRD_PX = 200.0
+"""Birds that are longer in the input are detected in parts, so an input of half the size detects them."""
+SMALLER_INPUTS = 2
+"""Number of smaller inputs: half and a quarter of the size."""
 MOST_PEAKS = 10 * INSTANCES
 """More peaks are the output of a network that was not trained."""
 MIN_CELLS = 12
@@ -46,6 +51,8 @@ class BottomUp(SegmentationNetwork):
     for each bird; `offset` (1, 2, h, w), x and y from a cell to the centre of its bird in units of 32 pixels. Input:
     blue-green-red within 0 and 1, sides multiples of 32; the frame in the upper left corner, the rest black. The score
     is the peak of the centre times the mean foreground.
+
+    Where the input has a variable size, birds that are long in the input are detected in smaller inputs.
 
     Raises:
         InputError: an unsupported input, more than one class, or an invalid `longer_side` or `min_track_score` in the
@@ -94,9 +101,28 @@ class BottomUp(SegmentationNetwork):
 
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
         """Segment a frame, as `Segmenter` describes."""
-        frame_px = frame.shape[1], frame.shape[0]
         array, placement = self.network_input(frame)
         outputs = self._model(array)
+        found = self._instances(outputs, placement)
+        if self.activations is not None:
+            self.activations.add(outputs, 1)
+        if self._input.size_px is None:
+            found = self._with_large_birds(frame, found)
+        return sorted(found, key=lambda instance: -instance.score)
+
+    def _with_large_birds(self, frame: UInt8[np.ndarray, "H W 3"], found: list[Instance]) -> list[Instance]:
+        """Replace the parts of large birds; a smaller input is used only if a detection could be half a large bird."""
+        least_px = LARGE_BIRD_PX * max(frame.shape[:2]) / self._longer_side_px
+        for n in range(1, SMALLER_INPUTS + 1):
+            if not any(2 * length_px(bird) >= least_px for bird in found):
+                break
+            array, placement = self.network_input(frame, self._longer_side_px / 2**n)
+            found = replace_parts(found, self._instances(self._model(array), placement), least_px)
+            least_px *= 2
+        return found
+
+    def _instances(self, outputs: dict[str, np.ndarray], placement: Placement) -> list[Instance]:
+        """Return the instances of the outputs of the network."""
         shape = (1, 1, "h", "w")
         self._model.check_outputs(outputs, {"foreground": shape, "centre": shape, "offset": (1, 2, "h", "w")})
         foreground, centre = (outputs[name][0, 0].astype(np.float32, copy=False) for name in ("foreground", "centre"))
@@ -105,27 +131,32 @@ class BottomUp(SegmentationNetwork):
         if len(peaks) > MOST_PEAKS:
             problem = f"gives {len(peaks)} centres of birds in one frame"
             raise InputError(self._model.path, problem, "give another network")
-        if self.activations is not None:
-            self.activations.add(outputs, 1)
         assignment = _assign_cells(foreground, outputs["offset"][0] * OFFSET_UNIT_PX, peaks, cell_px)
         instances = (
             self._instance(foreground, assignment == n, float(centre[row, column]), placement)
             for n, (row, column) in enumerate(peaks)
         )
-        found = collect_instances(self._model.path, instances, frame_px)
-        return sorted(found, key=lambda instance: -instance.score)
+        return collect_instances(self._model.path, instances, placement.frame_px)
 
-    def network_input(self, frame: UInt8[np.ndarray, "H W 3"]) -> tuple[Float[np.ndarray, "1 3 h w"], Placement]:
-        """Return the input of the network for a frame, and the place of the frame in the input."""
+    def network_input(
+        self, frame: UInt8[np.ndarray, "H W 3"], longer_side_px: float | None = None
+    ) -> tuple[Float[np.ndarray, "1 3 h w"], Placement]:
+        """Return the input of the network for a frame, and the place of the frame in the input.
+
+        Args:
+            frame: blue, green, red.
+            longer_side_px: longer side of an input of variable size; None for the size of the metadata.
+        """
         frame_px = frame.shape[1], frame.shape[0]
-        placement = Placement.letterboxed(frame_px, self._input_px(frame_px), centred=False)
+        input_px = self._input_px(frame_px, longer_side_px or self._longer_side_px)
+        placement = Placement.letterboxed(frame_px, input_px, centred=False)
         return self._input.array(_network_picture(frame, placement)), placement
 
-    def _input_px(self, frame_px: tuple[int, int]) -> tuple[int, int]:
+    def _input_px(self, frame_px: tuple[int, int], longer_side_px: float) -> tuple[int, int]:
         """Return width and height of the input; a variable size has the frame's proportions, in multiples of 32."""
         if self._input.size_px is not None:
             return self._input.size_px
-        zoom = self._longer_side_px / max(frame_px)
+        zoom = longer_side_px / max(frame_px)
         width, height = (MULTIPLE * max(1, int(np.ceil(round(side * zoom) / MULTIPLE))) for side in frame_px)
         return width, height
 
