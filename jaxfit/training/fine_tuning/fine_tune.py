@@ -109,7 +109,7 @@ class FineTuned(NamedTuple):
 def default_schedule(network: str, pictures: int) -> Schedule:
     """Return the schedule for a number of labelled pictures."""
     steps = min(max(200 + 4 * pictures, 240), 1000)
-    return Schedule(steps, 8 if network == "segmenter" else 16, 5e-4)
+    return Schedule(steps, 6 if network == "segmenter" else 16, 5e-4)
 
 
 def fine_tune(
