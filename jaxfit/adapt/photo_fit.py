@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit.adapt.hierarchy import Data, Hierarchy, Parameters, Weights, initial_state, run_steps
+from jaxfit.adapt.hierarchy import PLACE_UNITS, Data, Hierarchy, Parameters, Weights, initial_state, run_steps
 from jaxfit.adapt.offsets import with_offsets
 from jaxfit.adapt.photographs import Photographs
-from jaxfit.adapt.species import species_bird, symmetric_bones, widened_bone_covariance
+from jaxfit.adapt.species import species_bird, symmetric_bone_precision, symmetric_bones
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.objective.posed_window import priors_of
@@ -57,7 +57,6 @@ class PhotoFit:
     """Final weight of each image, from 0 to 1."""
     individuals: int
     settings: PhotoSettings
-    fixed: tuple[str, ...]
 
     @property
     def disagreeing(self) -> list[int]:
@@ -120,7 +119,7 @@ def fit_photographs(
     bones = np.asarray(bird.bone_mean) + symmetric @ np.asarray(p.bones)
     adapted = species_bird(bird, name, bones, shift, covariance)
     adapted = replace(adapted, shape_variance=jnp.asarray(own_shape, jnp.float32))
-    return PhotoFit(adapted, weight, individuals, settings, tuple(fixed))
+    return PhotoFit(adapted, weight, individuals, settings)
 
 
 def _shrunk(first, scatter, individuals: int, settings: PhotoSettings):
@@ -129,16 +128,14 @@ def _shrunk(first, scatter, individuals: int, settings: PhotoSettings):
 
 
 def _model(bird: Bird) -> Hierarchy:
-    symmetric, priors = symmetric_bones(bird), priors_of(bird)
-    precision = symmetric.T @ np.linalg.inv(widened_bone_covariance(bird)) @ symmetric
     return Hierarchy(
         rig=fold_bird(bird),
         keypoint_weights=bird.keypoint_weights,
-        symmetric=jnp.asarray(symmetric, jnp.float32),
+        symmetric=jnp.asarray(symmetric_bones(bird), jnp.float32),
         bone_mean=bird.bone_mean,
         pose_mean=bird.pose_mean,
-        pose_whitener=priors.pose_whitener,
-        bone_precision=jnp.asarray(precision, jnp.float32),
+        pose_whitener=priors_of(bird).pose_whitener,
+        bone_precision=jnp.asarray(symmetric_bone_precision(bird), jnp.float32),
         shape_precision=1 / bird.shape_variance,
     )
 
@@ -160,7 +157,7 @@ def _start(photographs: Photographs, bird: Bird, extended: Bird, individuals: in
     return Parameters(
         orient=jnp.asarray(pose.global_orient),
         body_pose=jnp.asarray(pose.body_pose),
-        place=jnp.asarray(pose.transl / np.array([1, 1, 18], np.float32)),
+        place=jnp.asarray(pose.transl / PLACE_UNITS),
         own_bones=jnp.zeros((individuals, bones)),
         own_shape=jnp.zeros((individuals, bird.num_shapes)),
         bones=jnp.zeros(bones),

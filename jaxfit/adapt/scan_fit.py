@@ -8,7 +8,7 @@ weights are renewed before every Gauss-Newton step.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -133,14 +133,7 @@ def fit_scan(
     pose, last = fit.pose(x), fit.linearise(x)
     shift = np.tensordot(pose.betas, np.asarray(fit.bird.shape_basis), axes=1)
     adapted = species_bird(bird, name, pose.bone_length, shift)
-    own_pose = Pose(
-        pose.global_orient,
-        pose.body_pose,
-        pose.transl,
-        pose.scale,
-        pose.bone_length,
-        np.zeros(bird.num_shapes, np.float32),
-    )
+    own_pose = replace(pose, betas=np.zeros(bird.num_shapes, np.float32))
     return ScanFit(adapted, own_pose, start, start.apply(last.vertices), start.apply(last.keypoints))
 
 
