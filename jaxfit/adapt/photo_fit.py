@@ -96,23 +96,24 @@ def fit_photographs(
     weight, state = np.ones(len(photographs.names)), initial_state(p)
     step = _step_sizes(p, bird, fixed)
     with progress(f"Fitting {len(weight)} images", sum(settings.rounds)) as report_progress:
-        for number, steps in enumerate(settings.rounds):
+        # the first round has no steps: images that no pose of the base fits lose weight before they bend the species
+        for number, steps in enumerate((0, *settings.rounds)):
             weights = Weights(
                 image=jnp.asarray(weight, jnp.float32),
-                mask=jnp.float32(number > 0),
+                mask=jnp.float32(number > 1),
                 own_bones=jnp.asarray(np.linalg.inv(own_bones), jnp.float32),
                 own_shape=jnp.asarray(1 / own_shape, jnp.float32),
                 step=step,
             )
-            for done in range(0, steps, 30):
+            for done in range(0, max(steps, 1), 30):
                 some = min(30, steps - done)
                 p, state, losses = run_steps(model, data, weights, p, state, jnp.int32(some))
-                report_progress(some, "masks" if number else "keypoints")
-            deviations = np.asarray(p.own_bones, np.float64), np.asarray(p.own_shape, np.float64)
-            own_bones = _shrunk(first_bones, deviations[0].T @ deviations[0], individuals, settings)
-            own_shape = _shrunk(first_shape, (deviations[1] ** 2).sum(0), individuals, settings)
-            if number:
-                weight = _image_weights(photographs, *(np.asarray(loss) for loss in losses))
+                report_progress(some, "masks" if number > 1 else "keypoints")
+            if steps:
+                deviations = np.asarray(p.own_bones, np.float64), np.asarray(p.own_shape, np.float64)
+                own_bones = _shrunk(first_bones, deviations[0].T @ deviations[0], individuals, settings)
+                own_shape = _shrunk(first_shape, (deviations[1] ** 2).sum(0), individuals, settings)
+            weight = _image_weights(photographs, *(np.asarray(loss) for loss in losses))
     symmetric = symmetric_bones(bird)
     covariance = symmetric @ own_bones @ symmetric.T + 1e-4 * np.eye(len(symmetric))
     shift = np.tensordot(np.asarray(p.shape), np.asarray(extended.shape_basis), axes=1)
