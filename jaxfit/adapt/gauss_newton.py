@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfit.adapt.species import symmetric_bones, widened_bone_covariance
+from jaxfit.adapt.species import symmetric_bone_precision, symmetric_bones
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Rig, fold_bird, joint_transforms, posed_keypoints, posed_vertices
 from jaxfit.model.pose import Pose
@@ -84,7 +84,7 @@ class PosedFit:
         self.precision = np.zeros((self.size, self.size))
         bones_at = slice(7 + angles, 7 + angles + bones.shape[1])
         self.precision[7 : 7 + angles, 7 : 7 + angles] = np.linalg.inv(np.asarray(bird.pose_covariance, np.float64))
-        self.precision[bones_at, bones_at] = bones.T @ np.linalg.inv(widened_bone_covariance(bird)) @ bones
+        self.precision[bones_at, bones_at] = symmetric_bone_precision(bird)
         shapes = np.arange(bones_at.stop, self.size)
         self.precision[shapes, shapes] = 1 / np.asarray(bird.shape_variance, np.float64)
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int
 
@@ -22,7 +23,7 @@ from jaxfit.model.pose import Pose
 from jaxfit.objective.terms import geman_mcclure
 from jaxfit.raster.silhouette import Blur, mask_loss
 
-__all__ = ["Data", "Hierarchy", "Parameters", "Weights", "initial_state", "run_steps"]
+__all__ = ["PLACE_UNITS", "Data", "Hierarchy", "Parameters", "Weights", "initial_state", "run_steps"]
 
 SIGMA_PX = 100.0
 """Scale of the robust error of keypoints, as in the config `photo`."""
@@ -31,6 +32,8 @@ PRIOR_WEIGHT = 10.0
 BLUR = 0.5
 """Blur of the silhouettes: at a blur of 1, the outline is drawn about 1 pixel outside the mesh."""
 LEARNING_RATE = 0.01
+PLACE_UNITS = np.array([1, 1, 18], np.float32)
+"""Units of the translation: a step of the depth is larger, because the depth hardly changes the picture."""
 
 
 class Parameters(NamedTuple):
@@ -39,7 +42,7 @@ class Parameters(NamedTuple):
     orient: Float[Array, "N 3"]
     body_pose: Float[Array, "N bones 3"]
     place: Float[Array, "N 3"]
-    """Translation, with the depth divided by 18."""
+    """Translation, divided by `PLACE_UNITS`."""
     own_bones: Float[Array, "individuals Q"]
     own_shape: Float[Array, "individuals S"]
     bones: Float[Array, "Q"]
@@ -88,7 +91,7 @@ class Hierarchy(eqx.Module):
         return Pose(
             p.orient,
             p.body_pose,
-            p.place * jnp.array([1.0, 1.0, 18.0]),
+            p.place * PLACE_UNITS,
             data.scale,
             bones,
             p.own_shape[data.individual],

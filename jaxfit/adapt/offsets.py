@@ -17,6 +17,7 @@ from scipy import sparse
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 
+from jaxfit.adapt.species import body_length
 from jaxfit.model.bird import Bird
 
 __all__ = ["mirror_vertices", "offset_directions", "with_offsets"]
@@ -32,7 +33,7 @@ def mirror_vertices(bird: Bird) -> Int[np.ndarray, "V"]:
     vertices = np.asarray(bird.vertices, np.float64)
     distance, other = KDTree(vertices).query(vertices * [-1, 1, 1])
     own, other = np.arange(len(vertices)), np.asarray(other)
-    paired = (other[other] == own) & (distance < MIRROR_TOLERANCE * np.ptp(vertices[:, 1]))
+    paired = (other[other] == own) & (distance < MIRROR_TOLERANCE * body_length(bird))
     return np.where(paired, other, own)
 
 
@@ -68,7 +69,7 @@ def offset_directions(bird: Bird, modes: int, sd: float) -> Directions:
     """
     laplacian = _laplacian(bird)
     mirror = mirror_vertices(bird)
-    length = float(np.ptp(np.asarray(bird.vertices)[:, 1]))
+    length = body_length(bird)
     basis, variance = [], []
     for sign, axes in ((1, (1, 2)), (-1, (0,))):
         to_vertices = _symmetric_functions(mirror, sign)

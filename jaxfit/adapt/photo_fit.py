@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxfit.adapt.hierarchy import Data, Hierarchy, Parameters, Weights, initial_state, run_steps
+from jaxfit.adapt.hierarchy import PLACE_UNITS, Data, Hierarchy, Parameters, Weights, initial_state, run_steps
 from jaxfit.adapt.offsets import with_offsets
 from jaxfit.adapt.photographs import Photographs
-from jaxfit.adapt.species import species_bird, symmetric_bones, widened_bone_covariance
+from jaxfit.adapt.species import species_bird, symmetric_bone_precision, symmetric_bones
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.objective.posed_window import priors_of
@@ -57,7 +57,6 @@ class PhotoFit:
     """Final weight of each image, from 0 to 1."""
     individuals: int
     settings: PhotoSettings
-    fixed: tuple[str, ...]
 
     @property
     def disagreeing(self) -> list[int]:
@@ -97,30 +96,31 @@ def fit_photographs(
     weight, state = np.ones(len(photographs.names)), initial_state(p)
     step = _step_sizes(p, bird, fixed)
     with progress(f"Fitting {len(weight)} images", sum(settings.rounds)) as report_progress:
-        for number, steps in enumerate(settings.rounds):
+        # the first round has no steps: images that no pose of the base fits lose weight before they bend the species
+        for number, steps in enumerate((0, *settings.rounds)):
             weights = Weights(
                 image=jnp.asarray(weight, jnp.float32),
-                mask=jnp.float32(number > 0),
+                mask=jnp.float32(number > 1),
                 own_bones=jnp.asarray(np.linalg.inv(own_bones), jnp.float32),
                 own_shape=jnp.asarray(1 / own_shape, jnp.float32),
                 step=step,
             )
-            for done in range(0, steps, 30):
+            for done in range(0, max(steps, 1), 30):
                 some = min(30, steps - done)
                 p, state, losses = run_steps(model, data, weights, p, state, jnp.int32(some))
-                report_progress(some, "masks" if number else "keypoints")
-            deviations = np.asarray(p.own_bones, np.float64), np.asarray(p.own_shape, np.float64)
-            own_bones = _shrunk(first_bones, deviations[0].T @ deviations[0], individuals, settings)
-            own_shape = _shrunk(first_shape, (deviations[1] ** 2).sum(0), individuals, settings)
-            if number:
-                weight = _image_weights(photographs, *(np.asarray(loss) for loss in losses))
+                report_progress(some, "masks" if number > 1 else "keypoints")
+            if steps:
+                deviations = np.asarray(p.own_bones, np.float64), np.asarray(p.own_shape, np.float64)
+                own_bones = _shrunk(first_bones, deviations[0].T @ deviations[0], individuals, settings)
+                own_shape = _shrunk(first_shape, (deviations[1] ** 2).sum(0), individuals, settings)
+            weight = _image_weights(photographs, *(np.asarray(loss) for loss in losses))
     symmetric = symmetric_bones(bird)
     covariance = symmetric @ own_bones @ symmetric.T + 1e-4 * np.eye(len(symmetric))
     shift = np.tensordot(np.asarray(p.shape), np.asarray(extended.shape_basis), axes=1)
     bones = np.asarray(bird.bone_mean) + symmetric @ np.asarray(p.bones)
     adapted = species_bird(bird, name, bones, shift, covariance)
     adapted = replace(adapted, shape_variance=jnp.asarray(own_shape, jnp.float32))
-    return PhotoFit(adapted, weight, individuals, settings, tuple(fixed))
+    return PhotoFit(adapted, weight, individuals, settings)
 
 
 def _shrunk(first, scatter, individuals: int, settings: PhotoSettings):
@@ -129,16 +129,14 @@ def _shrunk(first, scatter, individuals: int, settings: PhotoSettings):
 
 
 def _model(bird: Bird) -> Hierarchy:
-    symmetric, priors = symmetric_bones(bird), priors_of(bird)
-    precision = symmetric.T @ np.linalg.inv(widened_bone_covariance(bird)) @ symmetric
     return Hierarchy(
         rig=fold_bird(bird),
         keypoint_weights=bird.keypoint_weights,
-        symmetric=jnp.asarray(symmetric, jnp.float32),
+        symmetric=jnp.asarray(symmetric_bones(bird), jnp.float32),
         bone_mean=bird.bone_mean,
         pose_mean=bird.pose_mean,
-        pose_whitener=priors.pose_whitener,
-        bone_precision=jnp.asarray(precision, jnp.float32),
+        pose_whitener=priors_of(bird).pose_whitener,
+        bone_precision=jnp.asarray(symmetric_bone_precision(bird), jnp.float32),
         shape_precision=1 / bird.shape_variance,
     )
 
@@ -160,7 +158,7 @@ def _start(photographs: Photographs, bird: Bird, extended: Bird, individuals: in
     return Parameters(
         orient=jnp.asarray(pose.global_orient),
         body_pose=jnp.asarray(pose.body_pose),
-        place=jnp.asarray(pose.transl / np.array([1, 1, 18], np.float32)),
+        place=jnp.asarray(pose.transl / PLACE_UNITS),
         own_bones=jnp.zeros((individuals, bones)),
         own_shape=jnp.zeros((individuals, bird.num_shapes)),
         bones=jnp.zeros(bones),

@@ -1,14 +1,13 @@
 """Fit of a bird model to a scan: pose, bone lengths, shape and a smooth displacement of the surface.
 
-The fit starts from the keypoints. Then model and surface are compared in both directions: points of the model with the
-closest points of the scan, and points of the scan with the closest points of the model. The correspondences and the
-weights are renewed before every Gauss-Newton step.
+The fit starts from the keypoints. Then model and surface are compared in both directions (`surface_rows`). The
+correspondences and the weights are renewed before every Gauss-Newton step.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,17 +18,15 @@ from jaxfit.adapt.gauss_newton import Linear, PosedFit, Rows
 from jaxfit.adapt.offsets import with_offsets
 from jaxfit.adapt.rigid_start import Similarity, robust_similarity
 from jaxfit.adapt.species import body_length, mean_keypoints, species_bird
-from jaxfit.adapt.surface import Samples, boundary_faces, closest_points, sample_surface, search_samples, visible_faces
+from jaxfit.adapt.surface_rows import ModelSamples, ScanSurface, surface_rows
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.raster.zbuffer import vertex_normals
 
 __all__ = ["ScanFit", "ScanSettings", "fit_scan"]
 
-
-REACH = 0.06
-"""Width of the robust weights of points of the scan, as a share of the length: the model can grow to such points."""
+LEAST_COARSE = 0.02
+"""Largest σ of the surface in the last step, as a share of the length: no scan has more noise."""
 
 
 class ScanSettings(NamedTuple):
@@ -44,7 +41,7 @@ class ScanSettings(NamedTuple):
     keypoint_sd: float = 0.01
     """Expected error of annotated keypoints, as a share of the bird's length."""
     surface_weight: float = 800.0
-    """Number of independent measurements that count as much as all compared points of one direction together.
+    """Number of independent measurements that count as much as all compared points of the scan together.
     Neighbouring points of a surface have similar errors, so their number says little."""
     steps: tuple[int, int, int] = (10, 25, 15)
     """Number of steps on the keypoints alone, on the surface without the offset, and on the surface with the offset."""
@@ -115,7 +112,7 @@ def fit_scan(
     index = np.array([bird.keypoint_names.index(key) for key in keypoints])
     annotated = np.array(list(keypoints.values()), np.float64)
     start, _ = robust_similarity(mean_keypoints(bird)[index], annotated, up=up)
-    scan = _Scan(start.invert(vertices), faces, settings.samples)
+    scan = ScanSurface(start.invert(vertices), faces, settings.samples)
     targets = _Targets(index, start.invert(annotated), settings.keypoint_sd * body_length(bird))
     extended = with_offsets(bird, settings.modes, settings.offset_sd)
     steps = sum(settings.steps if settings.modes else settings.steps[:2])
@@ -133,14 +130,7 @@ def fit_scan(
     pose, last = fit.pose(x), fit.linearise(x)
     shift = np.tensordot(pose.betas, np.asarray(fit.bird.shape_basis), axes=1)
     adapted = species_bird(bird, name, pose.bone_length, shift)
-    own_pose = Pose(
-        pose.global_orient,
-        pose.body_pose,
-        pose.transl,
-        pose.scale,
-        pose.bone_length,
-        np.zeros(bird.num_shapes, np.float32),
-    )
+    own_pose = replace(pose, betas=np.zeros(bird.num_shapes, np.float32))
     return ScanFit(adapted, own_pose, start, start.apply(last.vertices), start.apply(last.keypoints))
 
 
@@ -160,80 +150,26 @@ class _Targets(NamedTuple):
         return Rows(residual.ravel(), jacobian, weight)
 
 
-class _Scan:
-    """The scan in the frame of the model, with the samples that are compared."""
-
-    def __init__(self, vertices: Float[np.ndarray, "P 3"], faces: Int[np.ndarray, "Q 3"], count: int):
-        self.vertices, self.faces = vertices, faces
-        self.search = search_samples(vertices, faces, 4 * count)
-        self.points = sample_surface(vertices, faces, count, seed=1).points(vertices, faces)
-        self.boundary = boundary_faces(faces)
-
-
-def _surface_steps(fit, x, scan, targets, settings: ScanSettings, steps: int, report_progress, coarse=0.1):
-    """Take Gauss-Newton steps on keypoints and surface. The scale of the robust weights decreases from `coarse`."""
+def _surface_steps(
+    fit: PosedFit,
+    x,
+    scan: ScanSurface,
+    targets: _Targets,
+    settings: ScanSettings,
+    steps: int,
+    report_progress,
+    coarse=0.1,
+) -> Float[np.ndarray, "P"]:
+    """Take Gauss-Newton steps on keypoints and surface. The largest σ of the surface decreases from `coarse`."""
     faces, length = np.asarray(fit.bird.faces), body_length(fit.bird)
-    outer, search, samples = faces, *[sample_surface(np.asarray(fit.bird.vertices), faces, 1)] * 2  # renewed at step 0
+    model: ModelSamples | None = None
     for step in range(steps):
         posed = fit.linearise(x)
-        vertices = posed.vertices.astype(np.float64)
-        if step % 8 == 0:  # the visible part changes slowly
-            outer = faces[visible_faces(vertices, faces)]
-            search = search_samples(vertices, outer, 10_000)
-            samples = sample_surface(vertices, outer, settings.samples, seed=2)
-        largest = length * (coarse * (1 - step / steps) + 0.005)
+        if model is None or step % 8 == 0:  # the visible part changes slowly
+            model = ModelSamples.of(posed.vertices.astype(np.float64), faces, settings.samples)
+        largest = coarse * (1 - step / steps) + LEAST_COARSE
         rows = [targets.rows(posed)]
-        rows += _both_directions(
-            posed, vertices, outer, scan, search, samples, largest, settings.surface_weight, REACH * length
-        )
+        rows += surface_rows(posed, model, scan, length, largest, settings.surface_weight)
         x = fit.step(x, Rows(*(np.concatenate(parts) for parts in zip(*rows, strict=True))))
         report_progress(1, "surface")
     return x
-
-
-def _both_directions(
-    posed: Linear,
-    vertices,
-    outer,
-    scan: _Scan,
-    search: Samples,
-    samples: Samples,
-    largest: float,
-    surface_weight,
-    reach: float,
-) -> list[Rows]:
-    """Return the rows of points of the model against the scan, and of points of the scan against the model."""
-    normals = vertex_normals(vertices, outer).astype(np.float64)
-    own = samples.points(vertices, outer)
-    to_scan = closest_points(own, scan.vertices, scan.faces, scan.search)
-    from_scan = closest_points(scan.points, vertices, outer, search)
-    # a point of the model far from the border of a hole has no counterpart; without the near points, the model grows
-    whole = ~scan.boundary[to_scan.face] | (to_scan.distance < reach / 3)
-    corners = np.concatenate([outer[samples.face], outer[from_scan.face]])
-    weights = np.concatenate([samples.barycentric, from_scan.barycentric])
-    points = np.concatenate([own, from_scan.point])
-    targets = np.concatenate([to_scan.point, scan.points])
-    valid = np.concatenate([whole, np.ones(len(scan.points), bool)])
-    side = np.repeat([0, 1], [len(own), len(scan.points)])
-    normal = np.einsum("pk,pkc->pc", weights, normals[corners])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    gap = points - targets
-    distance = np.linalg.norm(gap, axis=1)
-    spread = np.median(distance[valid]) * 1.5 if valid.any() else largest
-    scale = min(max(spread, 0.003 * largest), largest)
-    # a part of the scan beyond the end of the model, such as a longer tail, is no outlier, and no normal points to it
-    width = np.where(side == 0, 2 * scale, max(2 * scale, reach))
-    robust = 1 / (1 + (distance / width) ** 2) ** 2 * valid
-    normal = np.where((side == 1)[:, None], gap / np.maximum(distance, 1e-9)[:, None], normal)
-    jacobian = np.einsum("pk,pkcx->pcx", weights.astype(np.float32), posed.by_vertices[corners], optimize=True)
-    rows = []
-    for number in (0, 1):
-        at = np.flatnonzero(side == number)
-        weight = 0.9 * surface_weight / len(at) * robust[at] / scale**2
-        along = np.einsum("pc,pcx->px", normal[at].astype(np.float32), jacobian[at])
-        rows.append(Rows((gap[at] * normal[at]).sum(1), along, weight))
-        # a little of the whole distance, at some points: the distance along the normal alone lets the surface slide
-        some = at[::5]
-        weight = 0.1 * surface_weight / len(some) * robust[some] / scale**2
-        rows.append(Rows(gap[some].ravel(), jacobian[some].reshape(3 * len(some), -1), np.repeat(weight, 3)))
-    return rows

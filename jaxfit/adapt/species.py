@@ -25,6 +25,7 @@ __all__ = [
     "provenance_notes",
     "rest_surface",
     "species_bird",
+    "symmetric_bone_precision",
     "symmetric_bones",
     "widened_bone_covariance",
 ]
@@ -56,6 +57,12 @@ def symmetric_bones(bird: Bird) -> Float[np.ndarray, "bones Q"]:
 def widened_bone_covariance(bird: Bird, sd: float = BONE_SD) -> Float[np.ndarray, "bones bones"]:
     """Return the covariance of the mean bone lengths of species: the covariance of the model, and `sd`² per bone."""
     return np.asarray(bird.bone_covariance, np.float64) + sd**2 * np.eye(bird.num_joints - 1)
+
+
+def symmetric_bone_precision(bird: Bird) -> Float[np.ndarray, "Q Q"]:
+    """Return the inverse of `widened_bone_covariance` for the lengths of `symmetric_bones`."""
+    symmetric = symmetric_bones(bird)
+    return symmetric.T @ np.linalg.inv(widened_bone_covariance(bird)) @ symmetric
 
 
 def absolute_bones(bird: Bird, bone_length: Any = None) -> Float[np.ndarray, "bones"]:

@@ -8,11 +8,12 @@ import numpy as np
 
 from jaxfit.cli.tables import counted, right_aligned, show
 from jaxfit.errors import InputError
+from jaxfit.model.bird import Bird
 from jaxfit.model.files import find_bird, save_bird
 from jaxfit.progress import terminal
 from jaxfit.storage.files import check_writable
 
-__all__ = ["adapt_photos", "adapt_scan", "show_bones"]
+__all__ = ["adapt_photos", "adapt_scan"]
 
 FEW_INDIVIDUALS = 5
 """A warning says that fewer individuals than these do not represent a species."""
@@ -56,7 +57,7 @@ def adapt_scan(options: argparse.Namespace) -> None:
     facts |= {"free": "pose, size, bone lengths, shape" + (", vertex offset" if options.offset else "")}
     facts |= {f"error_{key}": round(value, 5) for key, value in errors.summary.items()}
     save_bird(fit.bird, options.out, provenance_notes(bird, facts) | fit.pose_notes())
-    show_bones(bird, fit.bird)
+    _show_bones(bird, fit.bird)
     summary = errors.summary
     show(
         f"length of the bird from bill to tail, in its rest pose: {errors.length:.4g} {options.unit}; its size is free"
@@ -106,7 +107,7 @@ def adapt_photos(options: argparse.Namespace) -> None:
     facts |= {f"setting_{key}": value for key, value in fit.settings._asdict().items()}
     facts |= {"images_that_disagree": len(fit.disagreeing)}
     save_bird(fit.bird, options.out, provenance_notes(bird, facts))
-    show_bones(bird, fit.bird)
+    _show_bones(bird, fit.bird)
     for i in fit.disagreeing:
         show(f"disagrees with the other images, weight {fit.weight[i]:.2f}: {photographs.names[i]}")
     if fit.individuals < FEW_INDIVIDUALS:
@@ -114,7 +115,7 @@ def adapt_photos(options: argparse.Namespace) -> None:
     show(f"{counted(count, 'image')} of {counted(fit.individuals, 'individual')} → {options.out}")
 
 
-def show_bones(base, adapted) -> None:
+def _show_bones(base: Bird, adapted: Bird) -> None:
     """Print the change of the mean bone lengths, in per cent of the bones of the base."""
     from jaxfit.adapt.species import absolute_bones
 

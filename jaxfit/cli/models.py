@@ -6,7 +6,7 @@ import argparse
 
 from jaxfit.cli.tables import counted, right_aligned, show, show_facts
 from jaxfit.errors import InputError
-from jaxfit.model.files import find_bird, save_bird
+from jaxfit.model.files import find_bird, read_provenance, save_bird
 from jaxfit.storage.json_values import json_text
 
 __all__ = ["model_import", "model_info", "model_view", "prior_learn"]
@@ -25,11 +25,14 @@ def model_info(options: argparse.Namespace) -> None:
     """Print a description of a model."""
     from jaxfit.model.describe import describe_bird
 
-    facts = describe_bird(find_bird(options.file))
+    facts, provenance = describe_bird(find_bird(options.file)), read_provenance(options.file)
     if options.json:
-        print(json_text(facts))  # noqa: T201
-    else:
-        show_facts(facts)
+        print(json_text(facts | ({"provenance": provenance} if provenance else {})))  # noqa: T201
+        return
+    show_facts(facts)
+    if provenance:
+        show("how the model was made:")
+        show_facts(provenance)
 
 
 def model_view(options: argparse.Namespace) -> None:

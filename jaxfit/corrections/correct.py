@@ -100,9 +100,10 @@ def correct_tracks(
     config = _fit_config(folder / _CONFIG, config_text)
     done = refit(tracks.solution, tracks.observations, corrected, tracks.bird, config, progress, folder)
     summary: dict[str, Any] = summarise(done.solution, tracks.bird, {"fit": time.perf_counter() - start})
-    summary |= {key: value for key, value in _summary(folder).items() if key in _KEPT}
+    earlier = _summary(folder)
+    summary |= {key: value for key, value in earlier.items() if key in _KEPT}
     summary["quality"] = {row.track_id: row._asdict() for row in track_quality(corrected)}
-    summary["corrections"] = [*_summary(folder).get("corrections", []), *map(str, edits)]
+    summary["corrections"] = [*earlier.get("corrections", []), *map(str, edits)]
     with new_folder(out, overwrite, marker=_MARKER) as part:
         write_coco(corrected, part / _OBSERVATIONS)
         write_solution(done.solution, tracks.bird, config_text, summary, part)

@@ -31,10 +31,9 @@ class Edit(NamedTuple):
 
     def __str__(self) -> str:
         tracks = ",".join(map(str, self.tracks))
-        if self.start is None and self.stop is None:
-            return f"{self.kind} {tracks}"
-        ends = "" if self.start is None else str(self.start), "" if self.stop is None else str(self.stop)
-        return f"{self.kind} {tracks}@{ends[0]}" if self.stop is None else f"{self.kind} {tracks}@{ends[0]}:{ends[1]}"
+        start = "" if self.start is None else str(self.start)
+        stop = "" if self.stop is None else f":{self.stop}"
+        return f"{self.kind} {tracks}@{start}{stop}" if start or stop else f"{self.kind} {tracks}"
 
 
 def apply_edits(observations: Observations, edits: Sequence[Edit], source: object) -> Observations:

@@ -111,12 +111,8 @@ def _continuous(quaternions: Float[np.ndarray, "M *B 4"]) -> Float[np.ndarray, "
 def four_weights(bird: Bird) -> tuple[Int[np.ndarray, "V 4"], Float[np.ndarray, "V 4"]]:
     """Return the four joints with the largest weights of every vertex, and their weights, scaled to a sum of 1."""
     weights = np.asarray(bird.skin_weights, np.float64)
+    weights = np.pad(weights, ((0, 0), (0, max(FOUR - bird.num_joints, 0))))
     joints = np.argsort(-weights, axis=1, kind="stable")[:, :FOUR]
-    if joints.shape[1] < FOUR:  # fewer than four joints
-        joints = np.pad(joints, ((0, 0), (0, FOUR - joints.shape[1])))
-        kept = np.zeros(joints.shape)
-        kept[:, : weights.shape[1]] = np.take_along_axis(weights, joints[:, : weights.shape[1]], axis=1)
-    else:
-        kept = np.take_along_axis(weights, joints, axis=1)
+    kept = np.take_along_axis(weights, joints, axis=1)
     kept /= kept.sum(axis=1, keepdims=True)
     return np.where(kept > 0, joints, 0), kept

@@ -22,13 +22,14 @@ from jaxfit.model.checks import ARRAY_FIELDS, check_bird
 from jaxfit.storage.files import write_whole
 from jaxfit.storage.npz import load_npz
 
-__all__ = ["FORMAT_VERSION", "MURRE_PATH", "find_bird", "load_bird", "load_murre", "save_bird"]
+__all__ = ["FORMAT_VERSION", "MURRE_PATH", "find_bird", "load_bird", "load_murre", "read_provenance", "save_bird"]
 
 FORMAT_VERSION = 1
 MURRE_PATH = Path(__file__).with_name("murre.npz")
 """The model file that comes with jaxfit; `jaxfit.model.murre.build` writes this file."""
 OPTIONAL_FIELDS = ("vertex_colours", "joint_limits")
 _UNIT = "metres_per_unit"
+_PROVENANCE = "provenance"
 STATIC_FIELDS = {
     "parents": "J",
     "joint_names": "J",
@@ -118,6 +119,21 @@ def load_bird(path: Path | str) -> Bird:
         metres_per_unit=float(content[_UNIT]) if _UNIT in content else None,
     )
     return check_bird(bird, path)
+
+
+def read_provenance(name_or_path: Path | str) -> dict[str, str]:
+    """Return how an adapted model was made, from the note `provenance` of its file; empty for other models.
+
+    Raises:
+        InputError: the file cannot be read, or the note is not a list of texts.
+    """
+    if str(name_or_path) == "murre":
+        return {}
+    content = load_npz(name_or_path, {}, optional={_PROVENANCE: "lines"}, most_bytes=MODEL_BYTES)
+    lines = content.get(_PROVENANCE, np.zeros(0, np.str_))
+    if lines.dtype.kind != "U":
+        raise InputError(name_or_path, f"{_PROVENANCE}: {lines.dtype} array, expected text", "adapt the model again")
+    return {key: value for key, _, value in (line.partition(": ") for line in map(str, lines))}
 
 
 def load_murre() -> Bird:

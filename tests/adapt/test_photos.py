@@ -1,13 +1,14 @@
-"""`jaxfit adapt photos`: covariances, fixed parts, images without masks, tracks, wrong arguments."""
+"""`jaxfit adapt photos`: a known species, a bad image, fixed parts, images without masks, tracks, wrong arguments."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from jaxfit.adapt.compare import compare_birds
 from jaxfit.adapt.photo_fit import PhotoSettings, fit_photographs
 from jaxfit.adapt.photographs import MOST_FRAMES, _few_frames, read_photographs
-from jaxfit.adapt.species import symmetric_bones
+from jaxfit.adapt.species import absolute_bones, symmetric_bones
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.model.files import load_bird, load_murre, save_bird
@@ -22,11 +23,11 @@ def photographs():
     """A species near the murre, photographs with one bad image (the first) and one without a mask (the last)."""
     bird = load_murre()
     species = random_species(bird, 2)
-    observations = simulate_photographs(species, 6, 2)
-    points, confidence = observations.keypoints_px.copy(), np.ones_like(observations.confidence)
+    observations = simulate_photographs(species, 6, 2, seen=1.0)
+    points = observations.keypoints_px.copy()
     points[0] = points[0, :, ::-1]  # every keypoint has the name of another keypoint
     masks = {key: mask for key, mask in observations.masks.items() if key[0] != 5}
-    observations = replace(observations.with_keypoints(points, confidence), masks=masks)
+    observations = replace(observations.with_keypoints(points, observations.confidence), masks=masks)
     return bird, species, observations
 
 
@@ -35,6 +36,29 @@ def fitted(photographs):
     bird, _, observations = photographs
     images = read_photographs([("photographs", observations)], bird)
     return images, fit_photographs(images, bird, QUICK)
+
+
+def bone_error(bird, species):
+    """Return the mean error of the bones up to one common factor."""
+    ratio = absolute_bones(bird) / absolute_bones(species)
+    return np.abs(ratio / np.median(ratio) - 1).mean()
+
+
+@pytest.mark.extended
+def test_a_bad_image_among_six_loses_its_weight_and_is_listed(photographs, fitted):
+    images, fit = fitted
+    assert fit.disagreeing == [0]
+    assert fit.weight[0] < 0.1
+    first = fit_photographs(images, photographs[0], QUICK._replace(rounds=(30,)))
+    assert first.disagreeing == [0]  # found before masks are compared, and before the image bends the species
+
+
+@pytest.mark.extended
+def test_the_species_is_nearer_to_the_truth_than_the_base_in_spite_of_the_bad_image(photographs, fitted):
+    bird, species, _ = photographs
+    assert bone_error(fitted[1].bird, species) < 0.9 * bone_error(bird, species)
+    error = compare_birds(species, fitted[1].bird).of_first.mean()
+    assert error < 0.6 * compare_birds(species, bird).of_first.mean()
 
 
 @pytest.mark.extended

@@ -26,9 +26,17 @@ SMALL = {
     "03_new_prior": SMALL_SCENE | {"WEIGHTS": [0, 10]},
     "04_from_video": SMALL_SCENE,
     "05_your_own_footage": SMALL_SCENE | {"BIRDS": 2, "FRAMES": 30, "LABELLED": 8, "SCENES": 1, "STEPS": 10},
+    "06_your_own_species": SMALL_SCENE | {"PHOTOGRAPHS": 5, "ROUNDS": (2, 2)},
 }
 """Parameters that keep the run of every notebook short."""
-PICTURES = {"01_fit_a_window": 3, "02_ablation": 1, "03_new_prior": 1, "04_from_video": 3, "05_your_own_footage": 2}
+PICTURES = {
+    "01_fit_a_window": 3,
+    "02_ablation": 1,
+    "03_new_prior": 1,
+    "04_from_video": 3,
+    "05_your_own_footage": 2,
+    "06_your_own_species": 2,
+}
 """Number of pictures that every notebook shows."""
 every_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
