@@ -12,7 +12,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.solution import LAYOUT, Solution
 from jaxfit.fitting.collect import track_status
 from jaxfit.fitting.fit import check_observations, fit_runs, windows_of
-from jaxfit.fitting.windows import Windows
+from jaxfit.fitting.windows import Windows, window_content
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 
@@ -64,8 +64,8 @@ def refit(
     """
     before, after = (check_observations(each, bird, source) for each in (before, after))
     old, new = windows_of(before, config, source), windows_of(after, config, source)
-    rows = {_key(old, w): w for w in range(len(old))}
-    source_row = np.array([rows.get(_key(new, w), -1) for w in range(len(new))])
+    rows = {window_content(old, w): w for w in range(len(old))}
+    source_row = np.array([rows.get(window_content(new, w), -1) for w in range(len(new))])
     touched = np.flatnonzero(source_row < 0)
     result = _empty(solution, after)
     if len(touched):
@@ -126,10 +126,3 @@ def _row_of(solution: Solution, track: int) -> int:
 def _ends(observations: Observations, windows: Windows, w: int) -> tuple[int, int]:
     at = windows.frame[w][windows.present[w]]
     return int(observations.frame_index[at[0]]), int(observations.frame_index[at[-1]])
-
-
-def _key(windows: Windows, w: int) -> tuple:
-    """Return the content of a window, which determines its fit."""
-    arrays = (windows.frame, windows.present, windows.crop, windows.keypoints_px, windows.confidence)
-    masks = tuple(None if rle is None else (tuple(rle["size"]), rle["counts"]) for rle in windows.mask_rle[w])
-    return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), masks

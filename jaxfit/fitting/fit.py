@@ -21,13 +21,14 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
-from jaxfit.fitting.collect import FittedWindow, collect_windows, window_of_batch
+from jaxfit.fitting.collect import collect_windows, window_of_batch
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.distant import distant_birds, report_distant_birds
 from jaxfit.fitting.initial_pose_file import InitialPoses
 from jaxfit.fitting.initial_pose_search import search_initial_poses
 from jaxfit.fitting.memory import check_fit_memory
 from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
+from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
 from jaxfit.fitting.windows import Windows, cut_windows, load_targets, windows_key
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
@@ -45,6 +46,7 @@ def fit(
     initial_poses: InitialPoses | None = None,
     progress: ProgressTask = silent,
     source: object = "observations",
+    stored: StoredWindows | None = None,
 ) -> Solution:
     """Fit the poses of all birds of a video (or of a set of photographs).
 
@@ -55,6 +57,7 @@ def fit(
         initial_poses: initial poses from a file. None: a search with the settings `config.initialise`.
         progress: shows progress.
         source: name of the observations in error messages.
+        stored: receives every fitted window, and holds the windows of an interrupted fit, which are not fitted again.
 
     Returns:
         The poses, and the status of every track: `ok`, `partly diverged`, `diverged` or `no usable frame`.
@@ -63,7 +66,7 @@ def fit(
         InputError: no bird, other keypoints than the model's, no track with a usable frame, unusable crop settings, an
             unusable term, initial poses that do not match the windows, or a fit that needs too much memory.
     """
-    return fit_runs(observations, bird, [config], initial_poses, progress, source)[0]
+    return fit_runs(observations, bird, [config], initial_poses, progress, source, stored=stored)[0]
 
 
 def fit_runs(
@@ -74,13 +77,14 @@ def fit_runs(
     progress: ProgressTask = silent,
     source: object = "observations",
     select: Int[np.ndarray, "rows"] | None = None,
+    stored: StoredWindows | None = None,
 ) -> list[Solution]:
     """Fit the same birds under several configs at once, with one compiled program.
 
     Args:
         configs: configs with an equal `stages.compiled_part`.
         select: rows of the windows (`windows_of`) that are fitted; None fits all. Other windows have no valid pose.
-        observations, bird, initial_poses, progress, source: as for `fit`.
+        observations, bird, initial_poses, progress, source, stored: as for `fit`; `stored` is for one config.
 
     Returns:
         The solution of every config.
@@ -105,22 +109,30 @@ def fit_runs(
     prepare_poses = partial(_initial_poses, model, initial_poses)
     # each problem is one window of one run
     problems = [(r, w) for r, run in enumerate(runs) for w in range(len(run.windows))]
-    size = min(max(frames_per_batch(bird, configs[0]) // configs[0].window, 1), len(problems))
-    batches = [problems[first : first + size] for first in range(0, len(problems), size)]
+    results = {} if stored is None else {(0, w): result for w, result in stored.find(runs[0].windows).items()}
+    missing = [problem for problem in problems if problem not in results]
+    size = max(min(frames_per_batch(bird, configs[0]) // configs[0].window, len(problems)), 1)
+    if stored is not None:
+        # from the first frame on, because an interruption costs one batch
+        missing.sort(key=lambda problem: runs[0].windows.frame[problem[1], 0])
+        size = min(size, windows_per_part(observations.num_tracks, configs[0].window))
+    batches = [missing[first : first + size] for first in range(0, len(missing), size)]
     birds = len(np.unique(runs[0].windows.track))
     subject = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
     _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), configs[0].window, len(batches))
     steps = sum(stage.steps for stage in configs[0].stages)
-    results: list[list[FittedWindow]] = [[] for _ in runs]
     with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
         for batch in batches:
             report_progress(0, "initial poses")
             fitted = fit_batch(model, configs, _gather(runs, batch, prepare_poses), report_progress)
-            for i, (r, _) in enumerate(batch):
-                results[r].append(window_of_batch(fitted, i))
+            results |= {problem: window_of_batch(fitted, i) for i, problem in enumerate(batch)}
+            if stored is not None:
+                stored.add(runs[0].windows, {w: results[0, w] for _, w in batch})
     return [
-        collect_windows(observations, run.windows, result, bird, model.camera, skipped)
-        for run, result in zip(runs, results, strict=True)
+        collect_windows(
+            observations, run.windows, [results[r, w] for w in range(len(run.windows))], bird, model.camera, skipped
+        )
+        for r, run in enumerate(runs)
     ]
 
 

@@ -22,7 +22,7 @@ from jaxfit.limits import TABLE_GB
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets
 
-__all__ = ["Windows", "cut_windows", "filter_observations", "load_targets", "windows_key"]
+__all__ = ["Windows", "cut_windows", "filter_observations", "load_targets", "window_content", "windows_key"]
 
 FILTER_BYTES = 500_000_000
 """Memory for the birds that are filtered at once."""
@@ -59,6 +59,13 @@ class Windows:
 def windows_key(config: FitConfig) -> tuple:
     """Return the part of the config that determines the windows and their targets."""
     return config.filter_window, config.window, config.min_keypoints, config.crop
+
+
+def window_content(windows: Windows, w: int) -> tuple:
+    """Return the content of a window, which determines its fit under one config and model."""
+    arrays = (windows.frame, windows.present, windows.crop, windows.keypoints_px, windows.confidence)
+    masks = tuple(None if rle is None else (tuple(rle["size"]), rle["counts"]) for rle in windows.mask_rle[w])
+    return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), masks
 
 
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:
