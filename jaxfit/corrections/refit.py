@@ -44,7 +44,8 @@ def refit(
 
     Two windows are equal if they have the same frames, crops, filtered keypoints, confidences and masks. The fit of a
     window does not depend on other windows, so the result is that of a fit of all corrected observations. The poses of
-    an equal window are copied bit by bit, also if its track has another number now.
+    an equal window are copied bit by bit, also if its track has another number now. Where windows share frames
+    (`overlap`), only tracks whose windows are all equal are copied.
 
     Args:
         solution: the earlier result.
@@ -66,6 +67,8 @@ def refit(
     old, new = windows_of(before, config, source), windows_of(after, config, source)
     rows = {window_content(old, w): w for w in range(len(old))}
     source_row = np.array([rows.get(window_content(new, w), -1) for w in range(len(new))])
+    if config.overlap:
+        source_row = _whole_tracks(source_row, old, new)
     touched = np.flatnonzero(source_row < 0)
     result = _empty(solution, after)
     if len(touched):
@@ -105,6 +108,19 @@ def refit(
     )
     fitted = [(int(new.track_id[w]), *_ends(after, new, w)) for w in touched.tolist()]
     return Refit(merged, fitted, len(new))
+
+
+def _whole_tracks(source_row: np.ndarray, old: Windows, new: Windows) -> np.ndarray:
+    """Keep the rows of tracks whose windows are all windows of one earlier track, −1 for others.
+
+    Where windows share frames, the poses of a window depend on its neighbours.
+    """
+    kept = np.full(len(source_row), -1)
+    for n in np.unique(new.track):
+        rows = source_row[new.track == n]
+        if (rows >= 0).all() and np.array_equal(rows, np.flatnonzero(old.track == old.track[rows[0]])):
+            kept[new.track == n] = rows
+    return kept
 
 
 def _empty(solution: Solution, observations: Observations) -> Solution:

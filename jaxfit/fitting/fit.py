@@ -6,7 +6,7 @@ The data passes each step once: observations → windows → targets and initial
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -21,12 +21,13 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
-from jaxfit.fitting.collect import collect_windows, window_of_batch
+from jaxfit.fitting.collect import FittedWindow, collect_windows, window_of_batch
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.distant import distant_birds, report_distant_birds
 from jaxfit.fitting.initial_pose_file import InitialPoses
 from jaxfit.fitting.initial_pose_search import search_initial_poses
 from jaxfit.fitting.memory import check_fit_memory
+from jaxfit.fitting.seams import blend_seams
 from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
 from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
 from jaxfit.fitting.windows import Windows, cut_windows, load_targets, windows_key
@@ -129,11 +130,17 @@ def fit_runs(
             if stored is not None:
                 stored.add(runs[0].windows, {w: results[0, w] for _, w in batch})
     return [
-        collect_windows(
-            observations, run.windows, [results[r, w] for w in range(len(run.windows))], bird, model.camera, skipped
-        )
+        collect_windows(observations, run.windows, _final_results(r, run, results, model), bird, model.camera, skipped)
         for r, run in enumerate(runs)
     ]
+
+
+def _final_results(
+    r: int, run: _Run, results: Mapping[tuple[int, int], FittedWindow], model: FitModel
+) -> list[FittedWindow]:
+    """Return the result of every window of run `r`, blended where windows share frames."""
+    own = [results[r, w] for w in range(len(run.windows))]
+    return blend_seams(run.windows, own, model) if run.config.overlap else own
 
 
 def _without_mask_stages(configs: Sequence[FitConfig], source: object) -> list[FitConfig]:
@@ -193,6 +200,11 @@ def _cut_runs(
         if key not in windows:
             windows[key] = windows_of(observations, config, source)
             if initial_poses is not None:
+                if config.overlap and initial_poses.crop is not None:
+                    problem = "holds one crop for every frame, but windows that share a frame have two"
+                    raise InputError(
+                        initial_poses.source, problem, "set `overlap: 0` in the config, or leave out --init"
+                    )
                 initial_poses.check_crops(windows[key])
     return [_Run(config, windows[windows_key(config)]) for config in configs]
 
