@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
-from importlib import metadata
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,14 +17,18 @@ from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.track_quality import track_quality
 from jaxfit.errors import InputError
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.summary import summarise
+from jaxfit.fitting.stored_windows import StoredWindows
+from jaxfit.fitting.summary import library_versions, summarise
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.track import TrackingResult, network_files, open_keypoint_detector, run_tracking
 from jaxfit.perception.tracking import TrackRecorder
+from jaxfit.pipeline_record import TRACKING_LIBRARIES, file_hashes, fit_record, tracking_record
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_replaceable, new_folder
+from jaxfit.storage.parts import Parts
+from jaxfit.storage.unfinished import unfinished_folder, unfinished_work
 from jaxfit.video.reader import VideoInfo, probe_video
 from jaxfit.view.checks import check_outputs, is_inside
 from jaxfit.view.overlay import overlay
@@ -32,7 +36,6 @@ from jaxfit.view.overlay import overlay
 __all__ = ["OBSERVATIONS", "OVERLAY", "Reconstruction", "reconstruct"]
 
 OBSERVATIONS, OVERLAY, MARKER = "observations.json", "overlay.mp4", "poses.npz"
-LIBRARIES = ("onnxruntime", "opencv-python-headless", "av", "scipy")
 
 _logger = logging.getLogger(__name__)
 
@@ -64,6 +67,11 @@ def reconstruct(
     config in `config.yaml`, and with the quality of tracks and the hashes of networks in `summary.json`; `overlay.mp4`
     and its contact sheet `overlay.png`. The folder is written completely or not at all.
 
+    Until then, `FOLDER.unfinished` beside the folder holds the tracked frames and the fitted windows. After an
+    interruption or a failure, a call with the same arguments continues there. The files of the result are then those of
+    an uninterrupted call, bit by bit, on the same machine; durations and drawn videos may differ. With networks of the
+    caller (`segmenter`, `keypoints`), tracking begins again and only fitted windows are kept.
+
     Args:
         video: a video, or a folder of frames.
         folder: folder for the result.
@@ -78,7 +86,8 @@ def reconstruct(
 
     Raises:
         InputError: no video; an unusable network or tracker; keypoints that differ from the model's; a folder that
-            cannot be written, holds the video or holds other files; a video without birds.
+            cannot be written, holds the video or holds other files; a video without birds; unfinished work of another
+            video, config, model or version; another process that works on the same result.
     """
     video, folder, clock = Path(video), Path(folder), Clock()
     replaced = {"segmenter": segmenter is not None, "keypoints": keypoints is not None}
@@ -94,20 +103,39 @@ def reconstruct(
         networks = {kind: files for kind, files in network_files(config.track).items() if not replaced[kind]}
         empty = TrackRecorder(keypoints.keypoint_names).observations()
         check_keypoints(empty, bird.keypoint_names, config.track.keypoints.file)
-    with new_folder(folder, overwrite, marker=MARKER) as part:
+    with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
-            tracking = run_tracking(video, config.track, segmenter, keypoints, progress=progress)
+            stored = None
+            if not any(replaced.values()):
+                stored = Parts(unfinished / "frames", tracking_record(config.track, video, networks))
+            tracking = run_tracking(video, config.track, segmenter, keypoints, progress=progress, parts=stored)
         if tracking.failure is not None:
+            if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
+                stored.keep(0)  # without a bird, only other settings of tracking help
             raise tracking.failure
         observations = tracking.observations
         with clock("fit"):
-            solution = fit(observations, bird, config.fit, progress=progress, source=video)
-        write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
-        with clock("overlay"):
-            _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
-        summary = _summary(tracking, solution, bird, networks, video, info, clock)
-        write_solution(solution, bird, config_to_yaml(config), summary, part)
+            windows = StoredWindows(Parts(unfinished / "windows", fit_record(config.fit, bird)))
+            solution = fit(observations, bird, config.fit, progress=progress, source=video, stored=windows)
+        with new_folder(folder, overwrite, marker=MARKER) as part:
+            write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
+            with clock("overlay"):
+                _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
+            summary = _summary(tracking, solution, bird, networks, video, info, clock)
+            write_solution(solution, bird, config_to_yaml(config), summary, part)
     return Reconstruction(tracking, solution, summary)
+
+
+@contextmanager
+def _announced(folder: Path) -> Iterator[None]:
+    """Log one line if the body fails and unfinished work is kept."""
+    unfinished = unfinished_folder(folder)
+    try:
+        yield
+    except BaseException as error:
+        if unfinished.is_dir() and not (isinstance(error, InputError) and error.source.startswith(str(unfinished))):
+            _logger.warning("%s holds the work so far; the same command continues there", unfinished)
+        raise
 
 
 def _draw(
@@ -149,7 +177,7 @@ def _summary(
 ) -> dict[str, Any]:
     """Return the content of `summary.json`; `networks` maps each kind of network to its files."""
     summary = summarise(solution, bird, clock.seconds)
-    summary["versions"] |= {name: metadata.version(name) for name in LIBRARIES}
+    summary["versions"] |= library_versions(TRACKING_LIBRARIES)
     return summary | {
         "video": {"file": str(video), **info._asdict(), "damaged": tracking.damaged_frames},
         "quality": {row.track_id: row._asdict() for row in track_quality(tracking.observations)},
@@ -159,8 +187,5 @@ def _summary(
         "trust_reasons": list(tracking.trust.reasons),
         "trust_signals": tracking.trust.signals._asdict(),
         "seconds_of_tracking": {part: round(value, 3) for part, value in tracking.seconds.items()},
-        "networks": {
-            kind: {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
-            for kind, files in networks.items()
-        },
+        "networks": file_hashes(networks),
     }

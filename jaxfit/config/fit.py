@@ -144,6 +144,10 @@ class FitConfig:
     window: int = 100
     """Number of frames that are fitted together; longer tracks are cut into windows, and 1 fits every frame alone;
     at most 10,000."""
+    overlap: int = 0
+    """Number of frames that consecutive windows of a track share, at most half of `window`. The poses of these frames
+    pass gradually from one window to the next, so that a bird does not jump from window to window. 0: windows follow
+    each other."""
     common_size: bool = True
     """Whether one scale holds for the whole window, instead of one scale per frame."""
     filter_window: int = 5
@@ -161,6 +165,8 @@ class FitConfig:
 
     def __post_init__(self):
         require_within(self, 1, limits.WINDOW_FRAMES, "window")
+        problem = f"is {self.overlap}, and `window` is {self.window}"
+        require(0 <= self.overlap <= self.window // 2, "overlap", problem, "expected 0 to half of `window`")
         require_within(self, 1, limits.KEYPOINTS, "min_keypoints")
         require_within(self, 1, limits.FILTER_FRAMES, "filter_window")
         odd = self.filter_window % 2 == 1

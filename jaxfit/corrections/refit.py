@@ -12,7 +12,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.solution import LAYOUT, Solution
 from jaxfit.fitting.collect import track_status
 from jaxfit.fitting.fit import check_observations, fit_runs, windows_of
-from jaxfit.fitting.windows import Windows
+from jaxfit.fitting.windows import Windows, window_content
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 
@@ -44,7 +44,8 @@ def refit(
 
     Two windows are equal if they have the same frames, crops, filtered keypoints, confidences and masks. The fit of a
     window does not depend on other windows, so the result is that of a fit of all corrected observations. The poses of
-    an equal window are copied bit by bit, also if its track has another number now.
+    an equal window are copied bit by bit, also if its track has another number now. Where windows share frames
+    (`overlap`), only tracks whose windows are all equal are copied.
 
     Args:
         solution: the earlier result.
@@ -64,8 +65,10 @@ def refit(
     """
     before, after = (check_observations(each, bird, source) for each in (before, after))
     old, new = windows_of(before, config, source), windows_of(after, config, source)
-    rows = {_key(old, w): w for w in range(len(old))}
-    source_row = np.array([rows.get(_key(new, w), -1) for w in range(len(new))])
+    rows = {window_content(old, w): w for w in range(len(old))}
+    source_row = np.array([rows.get(window_content(new, w), -1) for w in range(len(new))])
+    if config.overlap:
+        source_row = _whole_tracks(source_row, old, new)
     touched = np.flatnonzero(source_row < 0)
     result = _empty(solution, after)
     if len(touched):
@@ -107,6 +110,19 @@ def refit(
     return Refit(merged, fitted, len(new))
 
 
+def _whole_tracks(source_row: np.ndarray, old: Windows, new: Windows) -> np.ndarray:
+    """Keep the rows of tracks whose windows are all windows of one earlier track, −1 for others.
+
+    Where windows share frames, the poses of a window depend on its neighbours.
+    """
+    kept = np.full(len(source_row), -1)
+    for n in np.unique(new.track):
+        rows = source_row[new.track == n]
+        if (rows >= 0).all() and np.array_equal(rows, np.flatnonzero(old.track == old.track[rows[0]])):
+            kept[new.track == n] = rows
+    return kept
+
+
 def _empty(solution: Solution, observations: Observations) -> Solution:
     """Return a result without poses for the tracks of the observations."""
     count = observations.num_tracks
@@ -126,10 +142,3 @@ def _row_of(solution: Solution, track: int) -> int:
 def _ends(observations: Observations, windows: Windows, w: int) -> tuple[int, int]:
     at = windows.frame[w][windows.present[w]]
     return int(observations.frame_index[at[0]]), int(observations.frame_index[at[-1]])
-
-
-def _key(windows: Windows, w: int) -> tuple:
-    """Return the content of a window, which determines its fit."""
-    arrays = (windows.frame, windows.present, windows.crop, windows.keypoints_px, windows.confidence)
-    masks = tuple(None if rle is None else (tuple(rle["size"]), rle["counts"]) for rle in windows.mask_rle[w])
-    return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), masks

@@ -6,7 +6,7 @@ The data passes each step once: observations → windows → targets and initial
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -27,7 +27,9 @@ from jaxfit.fitting.distant import distant_birds, report_distant_birds
 from jaxfit.fitting.initial_pose_file import InitialPoses
 from jaxfit.fitting.initial_pose_search import search_initial_poses
 from jaxfit.fitting.memory import check_fit_memory
+from jaxfit.fitting.seams import blend_seams
 from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
+from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
 from jaxfit.fitting.windows import Windows, cut_windows, load_targets, windows_key
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
@@ -45,6 +47,7 @@ def fit(
     initial_poses: InitialPoses | None = None,
     progress: ProgressTask = silent,
     source: object = "observations",
+    stored: StoredWindows | None = None,
 ) -> Solution:
     """Fit the poses of all birds of a video (or of a set of photographs).
 
@@ -55,6 +58,7 @@ def fit(
         initial_poses: initial poses from a file. None: a search with the settings `config.initialise`.
         progress: shows progress.
         source: name of the observations in error messages.
+        stored: receives every fitted window, and holds the windows of an interrupted fit, which are not fitted again.
 
     Returns:
         The poses, and the status of every track: `ok`, `partly diverged`, `diverged` or `no usable frame`.
@@ -63,7 +67,7 @@ def fit(
         InputError: no bird, other keypoints than the model's, no track with a usable frame, unusable crop settings, an
             unusable term, initial poses that do not match the windows, or a fit that needs too much memory.
     """
-    return fit_runs(observations, bird, [config], initial_poses, progress, source)[0]
+    return fit_runs(observations, bird, [config], initial_poses, progress, source, stored=stored)[0]
 
 
 def fit_runs(
@@ -74,13 +78,14 @@ def fit_runs(
     progress: ProgressTask = silent,
     source: object = "observations",
     select: Int[np.ndarray, "rows"] | None = None,
+    stored: StoredWindows | None = None,
 ) -> list[Solution]:
     """Fit the same birds under several configs at once, with one compiled program.
 
     Args:
         configs: configs with an equal `stages.compiled_part`.
         select: rows of the windows (`windows_of`) that are fitted; None fits all. Other windows have no valid pose.
-        observations, bird, initial_poses, progress, source: as for `fit`.
+        observations, bird, initial_poses, progress, source, stored: as for `fit`; `stored` is for one config.
 
     Returns:
         The solution of every config.
@@ -105,23 +110,37 @@ def fit_runs(
     prepare_poses = partial(_initial_poses, model, initial_poses)
     # each problem is one window of one run
     problems = [(r, w) for r, run in enumerate(runs) for w in range(len(run.windows))]
-    size = min(max(frames_per_batch(bird, configs[0]) // configs[0].window, 1), len(problems))
-    batches = [problems[first : first + size] for first in range(0, len(problems), size)]
+    results = {} if stored is None else {(0, w): result for w, result in stored.find(runs[0].windows).items()}
+    missing = [problem for problem in problems if problem not in results]
+    size = max(min(frames_per_batch(bird, configs[0]) // configs[0].window, len(problems)), 1)
+    if stored is not None:
+        # from the first frame on, because an interruption costs one batch
+        missing.sort(key=lambda problem: runs[0].windows.frame[problem[1], 0])
+        size = min(size, windows_per_part(observations.num_tracks, configs[0].window))
+    batches = [missing[first : first + size] for first in range(0, len(missing), size)]
     birds = len(np.unique(runs[0].windows.track))
     subject = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
     _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), configs[0].window, len(batches))
     steps = sum(stage.steps for stage in configs[0].stages)
-    results: list[list[FittedWindow]] = [[] for _ in runs]
     with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
         for batch in batches:
             report_progress(0, "initial poses")
             fitted = fit_batch(model, configs, _gather(runs, batch, prepare_poses), report_progress)
-            for i, (r, _) in enumerate(batch):
-                results[r].append(window_of_batch(fitted, i))
+            results |= {problem: window_of_batch(fitted, i) for i, problem in enumerate(batch)}
+            if stored is not None:
+                stored.add(runs[0].windows, {w: results[0, w] for _, w in batch})
     return [
-        collect_windows(observations, run.windows, result, bird, model.camera, skipped)
-        for run, result in zip(runs, results, strict=True)
+        collect_windows(observations, run.windows, _final_results(r, run, results, model), bird, model.camera, skipped)
+        for r, run in enumerate(runs)
     ]
+
+
+def _final_results(
+    r: int, run: _Run, results: Mapping[tuple[int, int], FittedWindow], model: FitModel
+) -> list[FittedWindow]:
+    """Return the result of every window of run `r`, blended where windows share frames."""
+    own = [results[r, w] for w in range(len(run.windows))]
+    return blend_seams(run.windows, own, model) if run.config.overlap else own
 
 
 def _without_mask_stages(configs: Sequence[FitConfig], source: object) -> list[FitConfig]:
@@ -181,6 +200,11 @@ def _cut_runs(
         if key not in windows:
             windows[key] = windows_of(observations, config, source)
             if initial_poses is not None:
+                if config.overlap and initial_poses.crop is not None:
+                    problem = "holds one crop for every frame, but windows that share a frame have two"
+                    raise InputError(
+                        initial_poses.source, problem, "set `overlap: 0` in the config, or leave out --init"
+                    )
                 initial_poses.check_crops(windows[key])
     return [_Run(config, windows[windows_key(config)]) for config in configs]
 

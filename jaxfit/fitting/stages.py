@@ -137,6 +137,7 @@ def compiled_part(config: FitConfig) -> FitConfig:
         config,
         stages=stages,
         terms={},
+        overlap=0,
         filter_window=1,
         min_keypoints=1,
         crop=replace(config.crop, padding=0.0),

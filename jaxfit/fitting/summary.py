@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
+from collections.abc import Sequence
 from importlib import metadata
 from typing import Any
 
@@ -13,7 +14,7 @@ from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
 
-__all__ = ["summarise"]
+__all__ = ["LIBRARIES", "library_versions", "summarise"]
 
 LIBRARIES = ("jaxfit", "jax", "jaxlib", "equinox", "optimistix", "optax", "numpy")
 
@@ -37,5 +38,10 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         "loss": {name: np.asarray(value).tolist() for name, value in solution.loss.items()},
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "model": {"name": bird.name, "hash": model_hash(bird)},
-        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in LIBRARIES},
+        "versions": {"python": platform.python_version()} | library_versions(LIBRARIES),
     }
+
+
+def library_versions(names: Sequence[str]) -> dict[str, str]:
+    """Return the versions of some installed packages."""
+    return {name: metadata.version(name) for name in names}

@@ -22,7 +22,7 @@ from jaxfit.limits import TABLE_GB
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets
 
-__all__ = ["Windows", "cut_windows", "filter_observations", "load_targets", "windows_key"]
+__all__ = ["Windows", "cut_windows", "filter_observations", "load_targets", "window_content", "windows_key"]
 
 FILTER_BYTES = 500_000_000
 """Memory for the birds that are filtered at once."""
@@ -58,11 +58,20 @@ class Windows:
 
 def windows_key(config: FitConfig) -> tuple:
     """Return the part of the config that determines the windows and their targets."""
-    return config.filter_window, config.window, config.min_keypoints, config.crop
+    return config.filter_window, config.window, config.overlap, config.min_keypoints, config.crop
+
+
+def window_content(windows: Windows, w: int) -> tuple:
+    """Return the content of a window, which determines its fit under one config and model."""
+    arrays = (windows.frame, windows.present, windows.crop, windows.keypoints_px, windows.confidence)
+    masks = tuple(None if rle is None else (tuple(rle["size"]), rle["counts"]) for rle in windows.mask_rle[w])
+    return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), masks
 
 
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:
-    """Cut every track into consecutive windows of `config.window` frames, from its first usable frame on.
+    """Cut every track into windows of `config.window` frames, from its first usable frame on.
+
+    Consecutive windows share `config.overlap` frame numbers.
 
     Frames with a box or a keypoint far outside the image (`distant_birds`) are not usable. Then the keypoints are
     filtered. The frames of a window have consecutive frame numbers: if the file skips frame
@@ -77,8 +86,10 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
         at = np.flatnonzero((line >= 0) & usable[n, np.maximum(line, 0)])
         if len(at) == 0:
             continue
-        # only windows with a usable frame
-        starts += [(n, int(at[0]) + w * config.window, int(at[-1])) for w in np.unique((at - at[0]) // config.window)]
+        stride = config.window - config.overlap
+        # only windows with a usable frame that no earlier window has
+        wanted = np.unique(np.maximum(at - at[0] - config.overlap, 0) // stride)
+        starts += [(n, int(at[0]) + w * stride, int(at[-1])) for w in wanted.tolist()]
     needed = len(starts) * config.window * (80 + 60 * observations.num_keypoints)
     what = f"the arrays of {len(starts):,} windows of {config.window:,} frames"
     check_memory("observations", what, needed, "lower `window` in the config", max(TABLE_GB, config.memory_gb))

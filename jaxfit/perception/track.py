@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
-
-import cv2
 
 from jaxfit.clock import Clock
 from jaxfit.config.checks import require
 from jaxfit.config.perception import TrackConfig
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError, one_line
+from jaxfit.errors import InputError
 from jaxfit.model.anatomy import mirror_pairs, skeleton_pairs
+from jaxfit.perception.frame_loop import expected_frames, process_frames
 from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.keypoints.detector import BUILTIN_PATH
@@ -32,7 +28,8 @@ from jaxfit.perception.tracking import (
 )
 from jaxfit.perception.trust import Trust, footage_signals, judge
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.video.reader import FrameReader, read_frames
+from jaxfit.storage.parts import Parts
+from jaxfit.video.reader import read_frames
 
 __all__ = ["TrackingResult", "network_files", "open_keypoint_detector", "open_segmenter", "run_tracking", "track_video"]
 
@@ -148,46 +145,33 @@ def run_tracking(
     keypoints: KeypointDetector | None = None,
     tracker: Tracker | None = None,
     progress: ProgressTask = silent,
+    parts: Parts | None = None,
 ) -> TrackingResult:
-    """Track a video as `track_video` does, and return short tracks, damaged frames and durations too."""
-    settings, frames, has_own_segmenter = config.tracker, config.frames, segmenter is not None
-    reader = read_frames(source, frames.start, frames.stop, frames.step)
-    tracker = tracker or load_tracker(
-        settings.name,
-        memory=settings.memory,
-        min_iou=settings.min_iou,
-        min_score=settings.min_score,
-        step=frames.step,
-    )
+    """Track a video as `track_video` does, and return short tracks, damaged frames and durations too.
+
+    Args:
+        source, config, segmenter, keypoints, tracker, progress: as for `track_video`.
+        parts: stores the frames while they are processed, and holds the frames of an interrupted call; None stores
+            nothing. A `tracker` of the caller must not be given too.
+    """
+    frames, has_own_segmenter = config.frames, segmenter is not None
+    reader, given_tracker = read_frames(source, frames.start, frames.stop, frames.step), tracker
     keypoints = keypoints or open_keypoint_detector(config)
     segmenter = segmenter or open_segmenter(config)
-    monitors = [getattr(network, "activations", None) for network in (segmenter, keypoints)]
-    for monitor in monitors:
-        if monitor is not None:
-            monitor.take()  # distances of an earlier video
     recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names), reader.info.fps)
-    clock, best_score, frame_count, start = Clock(), 0.0, 0, time.perf_counter()
-    with _single_opencv_thread(), progress("Tracking", _expected_frames(reader, config)) as report_progress:
-        for number, picture, time_s in clock.each("decode", reader):
-            with clock("segment"):
-                instances = segmenter(picture)
-            with clock("track"):
-                identities = tracker.update(number, instances, picture)
-            tracked = [
-                (bird, identity) for bird, identity in zip(instances, identities, strict=True) if identity is not None
-            ]
-            birds = [bird for bird, _ in tracked]
-            with clock("keypoints"):
-                points_px, confidence = keypoints(picture, birds)
-            name = f"{one_line(reader.path.name)}#{number}"  # a name on the disk may be no text
-            size_px = (picture.shape[1], picture.shape[0])
-            with clock("record"):
-                identities = [identity for _, identity in tracked]
-                recorder.add(number, name, size_px, birds, identities, points_px, confidence, time_s)
-            best_score, frame_count = max([best_score, *(bird.score for bird in instances)]), frame_count + 1
-            noun = "bird" if len(birds) == 1 else "birds"
-            report_progress(1, f"{frame_count / (time.perf_counter() - start):.1f} frames/s, {len(birds)} {noun}")
-    if not frame_count:
+    clock = Clock()
+    processed = process_frames(
+        reader,
+        frames,
+        segmenter,
+        keypoints,
+        lambda: given_tracker or _tracker_of(config),
+        recorder,
+        clock,
+        progress,
+        parts,
+    )
+    if not processed.frames:
         raise InputError(source, f"has no frame from {frames.start} on", "begin with an earlier frame")
     with clock("clean up"):
         all_tracks = recorder.observations()
@@ -200,18 +184,33 @@ def run_tracking(
     short_tracks = {track: length for track, length in lengths.items() if track not in long_tracks.track_id}
     scores = dict(zip(long_tracks.track_id.tolist(), mean_scores(long_tracks).tolist(), strict=True))
     low_score_tracks = {track: score for track, score in scores.items() if track not in observations.track_id}
-    distances = [() if monitor is None else monitor.take().tolist() for monitor in monitors]
     is_calibrated = getattr(keypoints, "curve", None) is not None
+    distances = [each.tolist() for each in processed.distances]
     trust = judge(footage_signals(all_tracks, short_tracks, distances, is_calibrated))
     failure = None
     if not observations.num_tracks:
         if low_score_tracks:
             failure = _only_low_scores(source, low_score_tracks, least)
         elif short_tracks:
+            best_score = max(float(frame.score.max(initial=0.0)) for frame in processed.frames)
             failure = _only_short_tracks(source, config, short_tracks, best_score)
         else:
-            failure = _no_bird(source, config, frame_count, has_own_segmenter)
-    return TrackingResult(observations, short_tracks, low_score_tracks, reader.damaged, failure, trust, clock.seconds)
+            failure = _no_bird(source, config, len(processed.frames), has_own_segmenter)
+    return TrackingResult(
+        observations, short_tracks, low_score_tracks, processed.damaged, failure, trust, clock.seconds
+    )
+
+
+def _tracker_of(config: TrackConfig) -> Tracker:
+    """Create the tracker of a config."""
+    settings = config.tracker
+    return load_tracker(
+        settings.name,
+        memory=settings.memory,
+        min_iou=settings.min_iou,
+        min_score=settings.min_score,
+        step=config.frames.step,
+    )
 
 
 def _only_low_scores(source: str | Path, low_score_tracks: dict[int, float], least: float) -> InputError:
@@ -248,28 +247,8 @@ def _highest_score(source: str | Path, config: TrackConfig) -> float:
     """Return the highest score in RETRY_FRAMES frames, evenly spaced if the number of frames is known."""
     frames, segmenter = config.frames, open_segmenter(config, RETRY_MIN_SCORE)
     reader = read_frames(source, frames.start, frames.stop, frames.step)
-    count = _expected_frames(reader, config) or RETRY_FRAMES
+    count = expected_frames(reader, frames) or RETRY_FRAMES
     stride = frames.step * max(int(count) // RETRY_FRAMES, 1)
     stop = frames.start + RETRY_FRAMES * stride
     retried = read_frames(source, frames.start, stop if frames.stop is None else min(stop, frames.stop), stride)
     return max((instance.score for frame in retried for instance in segmenter(frame.picture)), default=0.0)
-
-
-def _expected_frames(reader: FrameReader, config: TrackConfig) -> int | None:
-    """Return the number of frames to process; None if the container does not say its length."""
-    frames, total = config.frames, reader.info.frames
-    if total is None and frames.stop is None:
-        return None
-    ends = [end for end in (total, frames.stop) if end is not None]
-    return max(0, -((frames.start - min(ends)) // frames.step))  # `len` of a range is limited to 64 bits
-
-
-@contextmanager
-def _single_opencv_thread() -> Iterator[None]:
-    """Restrict OpenCV to one thread: the networks use all cores, and OpenCV's threads would slow them down."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

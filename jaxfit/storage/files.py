@@ -18,8 +18,11 @@ __all__ = [
     "check_new_file",
     "check_replaceable",
     "check_writable",
+    "created_parents",
     "new_file",
     "new_folder",
+    "resolved",
+    "write_errors",
     "write_whole",
 ]
 
@@ -47,7 +50,7 @@ _REMEDIES = {
 
 
 @contextmanager
-def _write_errors(path: Path) -> Iterator[None]:
+def write_errors(path: Path) -> Iterator[None]:
     """Convert errors of the operating system in the body to an InputError that names ``path``."""
     try:
         yield
@@ -70,9 +73,9 @@ def _own_name(part: Path, path: Path) -> Iterator[None]:
         raise InputError(source, error.problem.replace(str(part), str(path)), error.remedy) from error
 
 
-def _resolved(path: Path) -> Path:
+def resolved(path: Path) -> Path:
     """Return the absolute path without symbolic links; a path that cannot exist is an InputError."""
-    with _write_errors(path):
+    with write_errors(path):
         try:
             names = [os.fsencode(name) for name in path.parts]
         except UnicodeEncodeError:
@@ -87,7 +90,7 @@ def _resolved(path: Path) -> Path:
 
 
 @contextmanager
-def _parents(path: Path) -> Iterator[None]:
+def created_parents(path: Path) -> Iterator[None]:
     """Create the missing folders above ``path``; if the body fails, remove these folders again."""
     missing = [parent for parent in path.parents if not parent.exists()]
     try:
@@ -152,10 +155,10 @@ def new_file(path: str | Path) -> Iterator[Path]:
             read-only, permissions).
     """
     named = Path(path)
-    path = _resolved(named)  # a symbolic link stays a link, and its target is replaced
+    path = resolved(named)  # a symbolic link stays a link, and its target is replaced
     if path.exists() and not path.is_file():
         raise InputError(named, "is a folder or a device, not a file", "choose another name")
-    with _write_errors(named), _parents(path), temporary(path) as names:
+    with write_errors(named), created_parents(path), temporary(path) as names:
         with _own_name(names.part, named):
             yield names.part
         _sync(names.part)
@@ -185,8 +188,8 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
     """
     named = Path(path)
     check_replaceable(named, overwrite, marker)
-    path = _resolved(named)
-    with _write_errors(named), _parents(path), temporary(path) as names:
+    path = resolved(named)
+    with write_errors(named), created_parents(path), temporary(path) as names:
         names.part.mkdir()
         with _own_name(names.part, named):
             yield names.part
@@ -199,7 +202,7 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
 
 def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = None) -> None:
     """Raise the InputError that `new_folder` would raise for ``path``; call this function before long work."""
-    named, path = Path(path), _resolved(Path(path))
+    named, path = Path(path), resolved(Path(path))
     if _contains_current(path):  # a replacement would leave the shell in a removed folder
         raise InputError(named, "is the folder you are in, or one above it", "name a folder inside it")
     check_writable(named)
@@ -208,7 +211,7 @@ def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = No
     if not path.is_dir():
         raise InputError(named, "is a file, not a folder", "choose another --out")
     remove_leftovers(path)
-    with _write_errors(named):
+    with write_errors(named):
         if not any(path.iterdir()):
             return
     if not overwrite:
@@ -220,7 +223,7 @@ def check_replaceable(path: str | Path, overwrite: bool, marker: str | None = No
 
 def check_new_file(path: Path, overwrite: bool) -> None:
     """Raise InputError if ``path`` exists and a new file must not replace it."""
-    target = _resolved(path)
+    target = resolved(path)
     if target.exists() and not target.is_file():
         raise InputError(path, "is a folder or a device, not a file", "choose another --out")
     if target.exists() and not overwrite:
@@ -230,8 +233,8 @@ def check_new_file(path: Path, overwrite: bool) -> None:
 def check_writable(path: str | Path) -> None:
     """Raise InputError if the folder of ``path`` is not writable; call this function before long work."""
     path = Path(path)
-    target = _resolved(path)
-    with _write_errors(path):  # permissions alone are not sufficient information, so try a write
+    target = resolved(path)
+    with write_errors(path):  # permissions alone are not sufficient information, so try a write
         existing = next(parent for parent in target.parents if parent.exists())
         with temporary(existing / target.name) as names:
             names.part.mkdir()

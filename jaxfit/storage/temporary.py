@@ -31,7 +31,7 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-__all__ = ["Temporary", "remove_leftovers", "temporary"]
+__all__ = ["NoLocksError", "Temporary", "is_open", "remove_leftovers", "temporary", "try_lock"]
 
 _LOCK = re.compile(r"\..*\.[0-9a-f]{8}\.lock", re.DOTALL)
 _MARK = b"jaxfit"
@@ -110,37 +110,37 @@ def _locked(target: Path) -> tuple[Path, int | None]:
         lock = _lock_of(stem)
         descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            if not _try_lock(descriptor) or not _is_open(lock, descriptor):
+            if not try_lock(descriptor) or not is_open(lock, descriptor):
                 os.close(descriptor)  # another process has just taken the new file for a leftover
                 continue
             os.write(descriptor, b"\n".join((_MARK, os.fsencode(platform.node()), os.fsencode(target.name))))
         except OSError as error:
             os.close(descriptor)
             lock.unlink(missing_ok=True)
-            if isinstance(error, _NoLocksError):
+            if isinstance(error, NoLocksError):
                 return stem, None
             raise
         return stem, descriptor
 
 
-class _NoLocksError(OSError):
+class NoLocksError(OSError):
     """The file system or the operating system has no locks."""
 
 
-def _try_lock(descriptor: int) -> bool:
+def try_lock(descriptor: int) -> bool:
     """Lock an open file; False if another process has locked the file."""
     if fcntl is None:
-        raise _NoLocksError
+        raise NoLocksError
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError as error:
-        raise _NoLocksError from error
+        raise NoLocksError from error
     return True
 
 
-def _is_open(path: Path, descriptor: int) -> bool:
+def is_open(path: Path, descriptor: int) -> bool:
     """Return whether a path still names the open file."""
     try:
         return os.path.samestat(path.lstat(), os.fstat(descriptor))
@@ -167,7 +167,7 @@ def _remove_group(lock: Path) -> None:
     """Remove a lock file and its temporary names if no living process owns them."""
     descriptor = os.open(lock, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
     try:
-        if not _try_lock(descriptor) or not _is_open(lock, descriptor):
+        if not try_lock(descriptor) or not is_open(lock, descriptor):
             return
         content = os.read(descriptor, 4096).split(b"\n", 2)
         stem = lock.with_name(lock.name.removesuffix(".lock"))

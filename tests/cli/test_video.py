@@ -147,14 +147,15 @@ def test_a_reconstruction(inputs, tmp_path, networks, capsys):
 
 
 @pytest.mark.usefixtures("networks")
-def test_an_interrupt_leaves_no_files(inputs, tmp_path, monkeypatch, capsys):
+def test_an_interrupt_leaves_no_incomplete_result(inputs, tmp_path, monkeypatch, capsys):
     def stopped(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(pipeline, "overlay", stopped)
     assert main(command(inputs, "reconstruct", tmp_path / "result")) == 130
     assert "no incomplete files" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == []
+    assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == ["result.unfinished"]
+    assert sorted(path.name for path in (tmp_path / "result.unfinished").iterdir()) == ["frames", "lock", "windows"]
 
 
 @pytest.mark.usefixtures("networks")

@@ -59,7 +59,7 @@ class ExternalTracker:
             self._tracker = trackers.BoTSORTTracker(
                 minimum_iou_threshold_first_assoc=min_iou, track_activation_threshold=min_score, **settings
             )
-        self._uses_picture = name == "botsort"  # to estimate the motion of the camera
+        self.uses_pictures = name == "botsort"  # to estimate the motion of the camera
         self._frame_index: int | None = None
 
     def update(
@@ -79,7 +79,7 @@ class ExternalTracker:
             confidence=np.array([instance.score for instance in instances], np.float32),
             data={"instance": np.arange(len(instances))},
         )
-        tracked = self._tracker.update(detections, frame if self._uses_picture else None)
+        tracked = self._tracker.update(detections, frame if self.uses_pictures else None)
         identities: list[int | None] = [None] * len(instances)
         if len(tracked):  # the package changes the order, and BoT-SORT drops detections
             for instance, tracker_id in zip(tracked.data["instance"], tracked.tracker_id, strict=True):

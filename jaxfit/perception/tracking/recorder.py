@@ -6,30 +6,32 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfit.data.observations import Observations
 from jaxfit.perception.instances import Instance
 
-__all__ = ["TrackRecorder"]
+__all__ = ["RecordedFrame", "TrackRecorder"]
 
 
-class _Frame(NamedTuple):
+class RecordedFrame(NamedTuple):
+    """One frame with M instances, of which m have a track; K keypoints."""
+
     frame_index: int
     file_name: str
     size_px: tuple[int, int]
-    time_s: float | None
-
-
-class _TrackedInstance(NamedTuple):
-    """One instance of a track."""
-
-    t: int
-    box_px: np.ndarray
-    score: float
-    rle: dict[str, Any]
-    keypoints_px: np.ndarray
-    confidence: np.ndarray
+    """Width and height."""
+    time_s: float
+    """Presentation time of the frame in seconds; NaN if unknown."""
+    box_px: Float[np.ndarray, "M 4"]
+    """Tight box of every instance: x, y, width, height; image pixels."""
+    score: Float[np.ndarray, "M"]
+    identity: Int[np.ndarray, "M"]
+    """Identity of every instance; 0 without a track."""
+    masks: tuple[dict[str, Any], ...]
+    """Run lengths of the mask of each of the m tracked instances over the frame."""
+    keypoints_px: Float[np.ndarray, "m K 2"]
+    confidence: Float[np.ndarray, "m K"]
 
 
 class TrackRecorder:
@@ -41,12 +43,14 @@ class TrackRecorder:
         fps: mean frame rate of the video in frames per second; None if unknown.
     """
 
+    frames: list[RecordedFrame]
+    """The frames so far."""
+
     def __init__(
         self, keypoint_names: Sequence[str], skeleton: Sequence[tuple[int, int]] = (), fps: float | None = None
     ):
         self._names, self._skeleton, self._fps = tuple(keypoint_names), tuple(skeleton), fps
-        self._frames: list[_Frame] = []
-        self._tracks: dict[int, list[_TrackedInstance]] = {}
+        self.frames = []
 
     def add(
         self,
@@ -66,7 +70,7 @@ class TrackRecorder:
             file_name: name of the frame.
             size_px: width and height of the frame.
             instances: M instances.
-            identities: the tracker's identity of each instance; instances with None are skipped.
+            identities: the tracker's identity of each instance; instances with None are in no observations.
             keypoints_px: x, y in image pixels.
             confidence: within [0, 1]; 0 where a keypoint was not detected.
             time_s: presentation time of the frame in seconds; None if unknown.
@@ -74,10 +78,10 @@ class TrackRecorder:
         Raises:
             ValueError: `frame_index` does not increase, an identity occurs twice, or an array has the wrong shape.
         """
-        if self._frames and frame_index <= self._frames[-1].frame_index:
-            raise ValueError(f"frame_index must increase, but {frame_index} follows {self._frames[-1].frame_index}")
-        tracked = [identity for identity in identities if identity is not None]
-        if len(set(tracked)) < len(tracked):
+        if self.frames and frame_index <= self.frames[-1].frame_index:
+            raise ValueError(f"frame_index must increase, but {frame_index} follows {self.frames[-1].frame_index}")
+        tracked = [i for i, identity in enumerate(identities) if identity is not None]
+        if len({identities[i] for i in tracked}) < len(tracked):
             raise ValueError(f"identities must contain each bird once, not {list(identities)}")
         shape = (len(instances), len(self._names))
         if np.shape(keypoints_px) != (*shape, 2) or np.shape(confidence) != shape:
@@ -85,45 +89,49 @@ class TrackRecorder:
                 f"keypoints_px and confidence must have shapes {(*shape, 2)} and {shape}, "
                 f"not {np.shape(keypoints_px)} and {np.shape(confidence)}"
             )
-        t = len(self._frames)
-        self._frames.append(_Frame(int(frame_index), file_name, size_px, time_s))
-        for instance, identity, points_px, point_confidence in zip(
-            instances, identities, keypoints_px, confidence, strict=True
-        ):
-            if identity is not None:
-                rle = instance.encode(*size_px)
-                self._tracks.setdefault(identity, []).append(
-                    _TrackedInstance(
-                        t, instance.box_px, instance.score, rle, np.array(points_px), np.array(point_confidence)
-                    )
-                )
+        self.frames.append(
+            RecordedFrame(
+                int(frame_index),
+                file_name,
+                size_px,
+                np.nan if time_s is None else time_s,
+                np.array([instance.box_px for instance in instances], np.float32).reshape(-1, 4),
+                np.array([instance.score for instance in instances], np.float64),
+                np.array([identity or 0 for identity in identities], np.int64),
+                tuple(instances[i].encode(*size_px) for i in tracked),
+                np.asarray(keypoints_px, np.float32)[tracked],
+                np.asarray(confidence, np.float32)[tracked],
+            )
+        )
 
     def observations(self) -> Observations:
         """Return the observations of all frames so far; tracks are sorted by identity, and there may be no track."""
-        tracks = sorted(self._tracks)
-        N, T, K = len(tracks), len(self._frames), len(self._names)
+        tracks = sorted({identity for frame in self.frames for identity in frame.identity.tolist() if identity})
+        row = {identity: n for n, identity in enumerate(tracks)}
+        N, T, K = len(tracks), len(self.frames), len(self._names)
         present, score = np.zeros((N, T), bool), np.zeros((N, T), np.float32)
         keypoints_px, confidence = np.zeros((N, T, K, 2), np.float32), np.zeros((N, T, K), np.float32)
         box_px = np.zeros((N, T, 4), np.float32)
         masks = {}
-        for n, identity in enumerate(tracks):
-            for tracked in self._tracks[identity]:
-                at = n, tracked.t
-                present[at], score[at], box_px[at], masks[at] = True, tracked.score, tracked.box_px, tracked.rle
-                keypoints_px[at], confidence[at] = tracked.keypoints_px, tracked.confidence
+        for t, frame in enumerate(self.frames):
+            tracked = frame.identity > 0
+            rows = [row[identity] for identity in frame.identity[tracked].tolist()]
+            present[rows, t], score[rows, t], box_px[rows, t] = True, frame.score[tracked], frame.box_px[tracked]
+            keypoints_px[rows, t], confidence[rows, t] = frame.keypoints_px, frame.confidence
+            masks |= {(n, t): mask for n, mask in zip(rows, frame.masks, strict=True)}
         return Observations(
             track_id=np.array(tracks, int),
-            frame_index=np.array([frame.frame_index for frame in self._frames], int),
+            frame_index=np.array([frame.frame_index for frame in self.frames], int),
             present=present,
             keypoints_px=keypoints_px,
             confidence=confidence,
             box_px=box_px,
-            image_size_px=np.array([frame.size_px for frame in self._frames], int).reshape(T, 2),
-            file_name=np.array([frame.file_name for frame in self._frames], str),
+            image_size_px=np.array([frame.size_px for frame in self.frames], int).reshape(T, 2),
+            file_name=np.array([frame.file_name for frame in self.frames], str),
             keypoint_names=self._names,
             skeleton=self._skeleton,
-            masks=masks,
+            masks=dict(sorted(masks.items())),
             score=score,
-            timestamp_s=np.array([np.nan if frame.time_s is None else frame.time_s for frame in self._frames], float),
+            timestamp_s=np.array([frame.time_s for frame in self.frames], float),
             fps=self._fps,
         )

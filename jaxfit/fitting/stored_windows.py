@@ -1,0 +1,112 @@
+"""Fitted windows as files, so that an interrupted fit continues after its last stored windows."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import fields
+
+import numpy as np
+
+from jaxfit.fitting.collect import FittedWindow
+from jaxfit.fitting.tiles import tile_size
+from jaxfit.fitting.windows import Windows, window_content
+from jaxfit.model.pose import Pose
+from jaxfit.storage.parts import Parts
+
+__all__ = ["StoredWindows", "windows_per_part"]
+
+LEAST_FRAMES = 100
+"""Frames of every bird between two writes, for windows of fewer frames."""
+
+_POSE = {
+    "global_orient": "W T 3",
+    "body_pose": "W T J-1 3",
+    "transl": "W T 3",
+    "scale": "W Z",  # T, or 1 for a common size
+    "bone_length": "W J-1",
+    "betas": "W S",
+}
+_LAYOUT = {
+    "content": "W",  # hash of the content of the window
+    "failure": "W",
+    "loss": "W L",
+    "loss_terms": "L",
+    "keypoints_cam": "W T K 3",
+    "keypoints_px": "W T K 2",
+    **_POSE,
+}
+
+
+class StoredWindows:
+    """Fitted windows of one config and one model, found by the content of the window.
+
+    Args:
+        parts: the files. The record of the parts must hold the config and the model.
+    """
+
+    def __init__(self, parts: Parts):
+        self._parts = parts
+
+    def find(self, windows: Windows) -> dict[int, FittedWindow]:
+        """Return row → result of the windows that are stored.
+
+        Raises:
+            InputError: a file is damaged.
+        """
+        rows: dict[str, list[int]] = {}
+        for w in range(len(windows)):
+            rows.setdefault(_hash(windows, w), []).append(w)
+        found = {}
+        for number in self._parts.numbers:
+            arrays = self._parts.load(number, _LAYOUT)
+            terms = arrays["loss_terms"].tolist()
+            for i, content in enumerate(arrays["content"].tolist()):
+                result = FittedWindow(
+                    Pose(**{name: arrays[name][i] for name in _POSE}),
+                    dict(zip(terms, arrays["loss"][i].tolist(), strict=True)),
+                    arrays["keypoints_cam"][i],
+                    arrays["keypoints_px"][i],
+                    str(arrays["failure"][i]),
+                )
+                found |= {w: result for w in rows.get(content, ())}
+        return found
+
+    def add(self, windows: Windows, results: Mapping[int, FittedWindow]) -> None:
+        """Store the results of some windows, by row.
+
+        Raises:
+            InputError: the disk is full, or the folder cannot be written.
+        """
+        some = list(results.values())
+        poses = {each.name: np.stack([getattr(result.pose, each.name) for result in some]) for each in fields(Pose)}
+        self._parts.add(
+            {
+                "content": np.array([_hash(windows, w) for w in results]),
+                "failure": np.array([result.failure for result in some]),
+                "loss": np.array([list(result.loss.values()) for result in some], np.float64),
+                "loss_terms": np.array(list(some[0].loss)),
+                "keypoints_cam": np.stack([result.keypoints_cam for result in some]),
+                "keypoints_px": np.stack([result.keypoints_px for result in some]),
+                **poses,
+            }
+        )
+
+
+def windows_per_part(birds: int, frames: int) -> int:
+    """Return the number of windows that are fitted between two writes.
+
+    An interruption costs at most so many windows: about one window of every bird, or `LEAST_FRAMES` frames. Tiles are
+    full.
+
+    Args:
+        birds: number of tracks.
+        frames: frames of a window.
+    """
+    size = tile_size(frames)
+    return -(-birds * -(-LEAST_FRAMES // frames) // size) * size
+
+
+def _hash(windows: Windows, w: int) -> str:
+    """Return the SHA-256 hash of the content of a window."""
+    return hashlib.sha256(repr(window_content(windows, w)).encode()).hexdigest()

@@ -1,0 +1,108 @@
+"""Parts of a long computation: numbered `.npz` files in one folder, with a record of what they depend on.
+
+Every file appears whole or not at all. The record `record.json` is written with the first file. A computation that
+depends on something else is refused as long as the folder holds files.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxfit.errors import InputError
+from jaxfit.limits import CONFIG_BYTES
+from jaxfit.storage.files import write_whole
+from jaxfit.storage.json_file import read_json_file
+from jaxfit.storage.npz import load_npz
+from jaxfit.storage.temporary import remove_leftovers
+
+__all__ = ["Parts"]
+
+_RECORD = "record.json"
+_SHOWN = 3
+"""Number of differences that a message names."""
+
+
+class Parts:
+    """The parts of one computation. One process at a time may use the folder (`jaxfit.storage.unfinished`).
+
+    Args:
+        folder: the folder, which may be absent.
+        record: name → JSON value that the content of the parts depends on; values may be mappings.
+
+    Raises:
+        InputError: the folder holds parts with another record; the message names the differences.
+    """
+
+    numbers: list[int]
+    """Numbers of the stored parts, in increasing order."""
+
+    def __init__(self, folder: Path, record: Mapping[str, Any]):
+        self._folder, self._record = folder, json.loads(json.dumps(record))
+        remove_leftovers(folder)
+        self.numbers = sorted(int(file.stem) for file in folder.glob("*.npz") if file.stem.isdigit())
+        if self.numbers:
+            self._check_record()
+
+    def add(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Store the next part.
+
+        Raises:
+            InputError: the disk is full, or the folder cannot be written.
+        """
+        if not self.numbers:
+            write_whole(self._folder / _RECORD, json.dumps(self._record, indent=1).encode())
+        number = self.numbers[-1] + 1 if self.numbers else 0
+        write_whole(self._path(number), lambda file: np.savez_compressed(file, **dict[str, Any](arrays)))
+        self.numbers.append(number)
+
+    def load(self, number: int, layout: Mapping[str, str]) -> dict[str, np.ndarray]:
+        """Return the arrays of a part.
+
+        Args:
+            number: number of the part.
+            layout: name → shape, as the argument `required` of `jaxfit.storage.npz.load_npz`.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        path = self._path(number)
+        try:
+            return load_npz(path, layout)
+        except InputError as error:
+            raise self.damaged(number, error.problem) from error
+
+    def damaged(self, number: int, problem: str) -> InputError:
+        """Return the error about a part that cannot be used."""
+        return InputError(self._path(number), problem, "remove this file; the same command computes its content again")
+
+    def keep(self, count: int) -> None:
+        """Remove all parts except the first `count` parts."""
+        for number in self.numbers[count:]:
+            self._path(number).unlink(missing_ok=True)
+        del self.numbers[count:]
+
+    def _path(self, number: int) -> Path:
+        return self._folder / f"{number:06d}.npz"
+
+    def _check_record(self) -> None:
+        held = read_json_file(self._folder / _RECORD, CONFIG_BYTES)
+        differences = list(_differences(held, self._record))
+        if differences:
+            more = f" and {len(differences) - _SHOWN} more" if len(differences) > _SHOWN else ""
+            problem = f"was begun with another {', '.join(differences[:_SHOWN])}{more}"
+            remedy = "repeat the earlier command to continue, or remove this folder to begin again"
+            raise InputError(self._folder, problem, remedy)
+
+
+def _differences(held: Any, own: Any, name: str = "") -> Iterator[str]:
+    """Yield the paths, such as `track.frames.stop`, of the values that differ."""
+    if isinstance(held, dict) and isinstance(own, dict):
+        for key in dict.fromkeys([*own, *held]):
+            yield from _differences(held.get(key), own.get(key), f"{name}.{key}" if name else key)
+    elif held != own:
+        yield name or "record"

@@ -1,0 +1,125 @@
+"""Frames as parts: what is stored is what is read, and a tracker continues."""
+
+import numpy as np
+import pytest
+from support.toy_footage import BIRDS, FRAMES, Footage, TrueKeypoints, TrueSegmenter
+
+from jaxfit.config.perception import FramesConfig, TrackConfig, TrackerConfig
+from jaxfit.errors import InputError
+from jaxfit.perception import frame_loop, track
+from jaxfit.perception.track import run_tracking
+from jaxfit.perception.tracking.stored_frames import load_frames
+from jaxfit.perception.tracking.tracker import load_tracker
+from jaxfit.storage.parts import Parts
+
+FOOTAGE = Footage()
+MISSED = [(t, n) for t in (3, 4, 9) for n in range(BIRDS) if t != 4 or n != 1]
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    folder = FOOTAGE.write(tmp_path_factory.mktemp("toy") / "frames")
+    (folder / "6.png").write_bytes(b"damaged")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def small_parts(monkeypatch):
+    monkeypatch.setattr(frame_loop, "FRAMES_PER_PART", 4)
+
+
+class StoppedError(Exception):
+    pass
+
+
+class Stopping(TrueSegmenter):
+    """Stops before a frame; its activations have the number of the frame as distance."""
+
+    def __init__(self, stop=None):
+        super().__init__(FOOTAGE, MISSED)
+        self.stop, self.activations, self.distances = stop, self, []
+
+    def __call__(self, frame):
+        if int(frame[0, 0, 0]) == self.stop:
+            raise StoppedError
+        self.distances.append(float(frame[0, 0, 0]))
+        return super().__call__(frame)
+
+    def take(self):
+        taken, self.distances = np.array(self.distances), []
+        return taken
+
+
+def run(video, parts=None, stop=None, **settings):
+    config = TrackConfig(min_track_frames=2, **settings)
+    segmenter = Stopping(stop)
+    return run_tracking(video, config, segmenter, TrueKeypoints(FOOTAGE), parts=parts), segmenter.frames
+
+
+def same(one, other):
+    """Compare two results of tracking, except their durations."""
+    for name, value in vars(one.observations).items():
+        np.testing.assert_equal(value, getattr(other.observations, name))
+    assert one[1:-1] == other[1:-1]
+
+
+@pytest.mark.parametrize("frames", [FramesConfig(), FramesConfig(1, 9, 1), FramesConfig(0, None, 2)])
+def test_a_tracking_that_stops_at_every_frame(video, tmp_path, frames):
+    whole, all_frames = run(video, frames=frames)
+    assert whole.damaged_frames == ([6] if 6 in range(FRAMES)[frames.start : frames.stop : frames.step] else [])
+    done = []
+    for stop in all_frames[1:]:
+        with pytest.raises(StoppedError):
+            run(video, Parts(tmp_path / "p", {}), stop, frames=frames)
+    parts = Parts(tmp_path / "p", {})
+    assert parts.numbers == list(range((len(all_frames) - 1) // 4))
+    resumed, done = run(video, parts, frames=frames)
+    assert done == all_frames[4 * ((len(all_frames) - 1) // 4) :]
+    same(resumed, whole)
+    again, done = run(video, Parts(tmp_path / "p", {}), frames=frames)
+    assert done == []
+    same(again, whole)
+
+
+def test_a_missing_part_and_a_damaged_part(video, tmp_path):
+    whole, _ = run(video, Parts(tmp_path / "p", {}))
+    file = tmp_path / "p" / "000001.npz"
+    content = file.read_bytes()
+    file.write_bytes(content[:-9])
+    with pytest.raises(InputError, match=r"000001\.npz: is not a readable .*remove this file"):
+        run(video, Parts(tmp_path / "p", {}))
+    file.unlink()
+    resumed, done = run(video, Parts(tmp_path / "p", {}))
+    assert done == [4, 5, 7, 8, 9, 10, 11]
+    same(resumed, whole)
+
+
+def test_numbers_of_birds_that_do_not_agree(video, tmp_path):
+    run(video, Parts(tmp_path / "p", {}))
+    path = tmp_path / "p" / "000000.npz"
+    for name in ("birds", "mask_length"):
+        arrays = dict(np.load(path))
+        arrays[name] = arrays[name] + 1
+        np.savez(path.with_name("000007.npz"), **arrays)
+        with pytest.raises(InputError, match=r"000007\.npz: holds frames whose numbers of birds do not agree"):
+            load_frames(Parts(tmp_path / "p", {}), 7)
+
+
+@pytest.mark.parametrize("uses_pictures", [True, False])
+def test_a_tracker_that_cannot_continue_begins_again(video, tmp_path, monkeypatch, caplog, uses_pictures):
+    """A tracker needs pictures, or gives other identities than before."""
+    made = []
+
+    def load(*_, **__):
+        made.append(load_tracker("iou"))
+        made[-1].uses_pictures = uses_pictures
+        made[-1]._next_identity = 1 if uses_pictures else len(made)
+        return made[-1]
+
+    monkeypatch.setattr(track, "load_tracker", load)
+    with pytest.raises(StoppedError):
+        run(video, Parts(tmp_path / "p", {}), 9, tracker=TrackerConfig("iou"))
+    resumed, done = run(video, Parts(tmp_path / "p", {}), tracker=TrackerConfig("iou"))
+    assert done[0] == 0
+    assert "tracking begins again" in caplog.text
+    assert resumed.observations.num_frames == FRAMES - 1
