@@ -80,6 +80,13 @@ int64_t size_of(const char* name, Dimensions dims) {
   return size;
 }
 
+void check_indices(const char* name, const int32_t* indices, int64_t count, int64_t end) {
+  bool inside = true;
+  for (int64_t i = 0; i < count; ++i) inside &= indices[i] >= 0 && indices[i] < end;
+  if (!inside)
+    throw std::invalid_argument(std::string(name) + ": an index is not in [0, " + std::to_string(end) + ")");
+}
+
 struct Meshes {
   const float* vertices;
   const int32_t* faces;
@@ -93,10 +100,7 @@ struct Meshes {
         faces_at(bind("faces", faces.dimensions(), batch, {kAny, 3})),
         num_vertices(vertices_at.item / 3),
         num_faces(faces_at.item / 3) {
-    const int64_t n = faces_at.items * faces_at.item;
-    bool inside = true;
-    for (int64_t i = 0; i < n; ++i) inside &= this->faces[i] >= 0 && this->faces[i] < num_vertices;
-    if (!inside) throw std::invalid_argument("faces: an index is not in [0, " + std::to_string(num_vertices) + ")");
+    check_indices("faces", this->faces, faces_at.items * faces_at.item, num_vertices);
   }
 
   Mesh of(const Batch& batch, int64_t image) const {
@@ -152,6 +156,32 @@ ffi::Error silhouette_gradient(ffi::ThreadPool pool, Floats vertices, Indices fa
   return ffi::Error::Success();
 }
 
+// The masks of a batch, with bytes or floats.
+struct Targets {
+  const char* pixels;
+  bool bytes;
+  int64_t size;
+  Operand at;
+
+  Targets(const ffi::AnyBuffer& target, const Batch& batch)
+      : pixels(static_cast<const char*>(target.untyped_data())), size(size_of("target", target.dimensions())) {
+    const auto type = target.element_type();
+    bytes = type == ffi::U8 || type == ffi::PRED;
+    if (!bytes && type != ffi::F32) throw std::invalid_argument("target: expected bool, uint8 or float32");
+    at = bind("target", target.dimensions(), batch, {size, size});
+  }
+
+  Target of(const Batch& batch, int64_t image) const {
+    Target out{};
+    const int64_t offset = at.offset(batch, image);
+    if (bytes)
+      out.bytes = reinterpret_cast<const uint8_t*>(pixels) + offset;
+    else
+      out.floats = reinterpret_cast<const float*>(pixels) + offset;
+    return out;
+  }
+};
+
 // If `gradient` is null, only the loss is computed.
 ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const Indices& faces,
                          const ffi::AnyBuffer& target, const Floats& weight, ffi::Result<Floats>& loss,
@@ -161,18 +191,13 @@ ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const In
   const LossKind kind = checked_kind(kind_number);
   const Meshes meshes(vertices, faces, batch);
   if (gradient) check_result("gradient", (*gradient)->dimensions(), batch, {meshes.num_vertices, 3});
-  const int64_t size = size_of("target", target.dimensions());
-  const Operand target_at = bind("target", target.dimensions(), batch, {size, size});
+  const Targets targets(target, batch);
   const Operand weight_at = bind("weight", weight.dimensions(), batch, {});
-  const auto type = target.element_type();
-  const bool bytes = type == ffi::U8 || type == ffi::PRED;
-  if (!bytes && type != ffi::F32) throw std::invalid_argument("target: expected bool, uint8 or float32");
-  const auto* pixels = static_cast<const char*>(target.untyped_data());
   const Kernels& kernels = current_kernels();
   const float* weights = weight.typed_data();
   float* out = loss->typed_data();
   float* slopes = gradient ? (*gradient)->typed_data() : nullptr;
-  for_each_task(pool, batch.count, [=, &batch, &meshes, &target_at, &weight_at, &kernels](int64_t i) {
+  for_each_task(pool, batch.count, [=, &batch, &meshes, &targets, &weight_at, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
     float* slope = slopes ? slopes + i * 3 * mesh.num_vertices : nullptr;
     if (weights[weight_at.offset(batch, i)] == 0) {  // a missing frame: nothing is rendered
@@ -180,13 +205,8 @@ ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const In
       if (slope) std::fill(slope, slope + 3 * mesh.num_vertices, 0.f);
       return;
     }
-    const int64_t at = target_at.offset(batch, i);
-    Target image{};
-    if (bytes)
-      image.bytes = reinterpret_cast<const uint8_t*>(pixels) + at;
-    else
-      image.floats = reinterpret_cast<const float*>(pixels) + at;
-    kernels.mask_loss(mesh, blur, size, scratch(kernels.workspace(mesh, size)), image, kind, out + i, slope);
+    void* memory = scratch(kernels.workspace(mesh, targets.size));
+    kernels.mask_loss(mesh, blur, targets.size, memory, targets.of(batch, i), kind, out + i, slope);
   });
   return ffi::Error::Success();
 }
@@ -200,6 +220,47 @@ ffi::Error mask_loss_and_gradient(ffi::ThreadPool pool, Floats vertices, Indices
                                   Floats weight, ffi::Result<Floats> loss, ffi::Result<Floats> gradient, float sigma,
                                   float radius, int32_t kind) {
   return run_mask_loss(pool, vertices, faces, target, weight, loss, &gradient, sigma, radius, kind);
+}
+
+// The Gauss-Newton blocks of the mask loss. `slope` is (J, 3, 4, D) with D a multiple of 16.
+ffi::Error mask_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target, Floats weight,
+                             Floats rest, Indices joint, Floats skin_weight, Floats slope, ffi::Result<Floats> block,
+                             float sigma, float radius, int32_t kind_number, float focal, float centre) {
+  const Batch batch(block->dimensions(), 2);
+  const Blur blur = checked_blur(sigma, radius);
+  const LossKind kind = checked_kind(kind_number);
+  const Meshes meshes(vertices, faces, batch);
+  const int64_t parameters = block->dimensions()[block->dimensions().size() - 1];
+  if (parameters < 1 || parameters % 16)
+    throw std::invalid_argument("block: expected a multiple of 16 parameters, got " + std::to_string(parameters));
+  check_result("block", block->dimensions(), batch, {parameters, parameters});
+  const Targets targets(target, batch);
+  const Operand weight_at = bind("weight", weight.dimensions(), batch, {});
+  const Operand rest_at = bind("rest", rest.dimensions(), batch, {meshes.num_vertices, 3});
+  const Operand joint_at = bind("joint", joint.dimensions(), batch, {meshes.num_vertices, kAny});
+  const int64_t per_vertex = meshes.num_vertices ? joint_at.item / meshes.num_vertices : 0;
+  const Operand skin_weight_at = bind("skin_weight", skin_weight.dimensions(), batch, {meshes.num_vertices, per_vertex});
+  const Operand slope_at = bind("slope", slope.dimensions(), batch, {kAny, 3, 4, parameters});
+  const int64_t num_joints = slope_at.item / (12 * parameters);
+  check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, num_joints);
+  const Kernels& kernels = current_kernels();
+  const Skin first{rest.typed_data(), joint.typed_data(), skin_weight.typed_data(), slope.typed_data(),
+                   per_vertex,        parameters,         focal,                    centre};
+  const float* weights = weight.typed_data();
+  float* out = block->typed_data();
+  for_each_task(pool, batch.count,
+                [=, &batch, &meshes, &targets, &weight_at, &rest_at, &joint_at, &skin_weight_at, &slope_at,
+                 &kernels](int64_t i) {
+    float* own = out + i * parameters * parameters;
+    if (weights[weight_at.offset(batch, i)] == 0) return static_cast<void>(std::fill(own, own + parameters * parameters, 0.f));
+    Skin skin = first;
+    skin.rest += rest_at.offset(batch, i), skin.joint += joint_at.offset(batch, i);
+    skin.weight += skin_weight_at.offset(batch, i), skin.slope += slope_at.offset(batch, i);
+    const Mesh mesh = meshes.of(batch, i);
+    void* memory = scratch(kernels.gauss_newton_workspace(mesh, skin, targets.size));
+    kernels.mask_gauss_newton(mesh, skin, blur, targets.size, memory, targets.of(batch, i), kind, own);
+  });
+  return ffi::Error::Success();
 }
 
 auto with_mesh() { return ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Arg<Floats>().Arg<Indices>(); }
@@ -251,6 +312,25 @@ XLA_FFI_Error* mask_loss_and_gradient_handler(XLA_FFI_CallFrame* frame) {
                                      .Attr<float>("radius")
                                      .Attr<int32_t>("kind")
                                      .To(mask_loss_and_gradient)
+                                     .release();
+    return handler->Call(frame);
+  });
+}
+
+XLA_FFI_Error* mask_gauss_newton_handler(XLA_FFI_CallFrame* frame) {
+  return call_guarded(frame->api, [frame] {
+    static const auto* handler = with_mesh_and_target()
+                                     .Arg<Floats>()
+                                     .Arg<Indices>()
+                                     .Arg<Floats>()
+                                     .Arg<Floats>()
+                                     .Ret<Floats>()
+                                     .Attr<float>("sigma")
+                                     .Attr<float>("radius")
+                                     .Attr<int32_t>("kind")
+                                     .Attr<float>("focal")
+                                     .Attr<float>("centre")
+                                     .To(mask_gauss_newton)
                                      .release();
     return handler->Call(frame);
   });

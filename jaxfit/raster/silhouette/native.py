@@ -6,13 +6,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfit.raster.kernels import available_isas, choose_isa, current_isa, kernels_available, require_kernels
-from jaxfit.raster.silhouette.reference import KINDS, Blur
+from jaxfit.raster.silhouette.reference import KINDS, Blur, Skin
+
+LANES = 16
+"""The kernels need a number of parameters that is a multiple of this."""
 
 __all__ = [
     "available_isas",
     "choose_isa",
     "current_isa",
     "kernels_available",
+    "mask_gauss_newton",
     "mask_loss",
     "mask_loss_and_gradient",
     "silhouette",
@@ -69,3 +73,25 @@ def mask_loss_and_gradient(
     results = (jax.ShapeDtypeStruct((), jnp.float32), _shape_like(vertices))
     operands = (vertices, faces, target, weight)
     return _call("jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))
+
+
+def mask_gauss_newton(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    target: Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"],
+    weight: Float[Array, ""],
+    skin: Skin,
+    camera_px: tuple[float, float],
+    kind: str,
+    blur: Blur,
+) -> Float[Array, "D D"]:
+    """Return the unweighted Gauss-Newton block of the mask loss. A weight of 0 gives a block of 0."""
+    parameters = skin.slope.shape[-1]
+    padding = -parameters % LANES
+    slope = jnp.pad(skin.slope, ((0, 0), (0, 0), (0, 0), (0, padding)))
+    padded = parameters + padding
+    block = jax.ShapeDtypeStruct((padded, padded), jnp.float32)
+    operands = (vertices, faces, target, weight, skin.rest, skin.joint, skin.weight, slope)
+    focal, centre = (np.float32(x) for x in camera_px)
+    attributes = {"kind": np.int32(KINDS.index(kind)), "focal": focal, "centre": centre}
+    return _call("jaxfit_mask_gauss_newton", block, *operands, blur=blur, **attributes)[:parameters, :parameters]

@@ -5,6 +5,7 @@ The reference runs on any platform and JAX derives its gradients. It is a few hu
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,8 @@ KINDS = ("l1", "smooth_l1")
 MIN_DEPTH = 1e-8  # a face with a vertex at or behind this depth is skipped
 MIN_AREA = 1e-8  # a face with at most this |2·area|, in units of half the image, is skipped
 FAR_AWAY = 2.0**20  # px; coordinates are clamped to ± this, so that their squares stay finite
+BAND_EDGE = 0.01  # the Gauss-Newton block sums over the pixels whose silhouette is this far from 0 and from 1
+LEAST_ERROR = 0.2  # least error in the weight 1/|error| of the L1 norm
 _FACES_AT_ONCE = 16
 
 
@@ -41,6 +44,20 @@ class Blur:
         """Return the usual blur of a square image: s = 1e-4 (size/2)², radius = (size/2) √(1e-4 ln(1e4 − 1))."""
         half = size / 2
         return Blur(sigma=1e-4 * half**2, radius=half * math.sqrt(1e-4 * math.log(1e4 - 1)))
+
+
+class Skin(NamedTuple):
+    """A mesh posed by linear blend skinning. Vertex v lies at Σ_m weight[v, m] · B[joint[v, m]] · (rest[v], 1) in the
+    camera frame, where the transforms B (J, 3, 4) depend on D parameters."""
+
+    rest: Float[Array, "V 3"]
+    """Vertices at rest."""
+    joint: Int[Array, "V M"]
+    """The joints that move each vertex."""
+    weight: Float[Array, "V M"]
+    """Their skinning weights; 0 for entries that are not used."""
+    slope: Float[Array, "J 3 4 D"]
+    """Derivatives of B."""
 
 
 def _segment_distance_squared(x, y, a, b):
@@ -128,3 +145,34 @@ def mask_loss(
     if kind == "smooth_l1":
         magnitude = jnp.where(magnitude < 1, 0.5 * error**2, magnitude - 0.5)
     return jnp.where(missing, 0.0, jnp.sum(magnitude))
+
+
+def mask_gauss_newton(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    target: Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"],
+    weight: Float[Array, ""],
+    skin: Skin,
+    camera_px: tuple[float, float],
+    kind: str,
+    blur: Blur,
+) -> Float[Array, "D D"]:
+    """Return the unweighted Gauss-Newton block of the mask loss, over all pixels of the band. See
+    `jaxfit.raster.silhouette.mask_gauss_newton`."""
+    focal, centre = camera_px
+    missing = weight == 0
+    vertices = jnp.where(missing, 1.0, vertices)
+    rest = jnp.concatenate([skin.rest, jnp.ones_like(skin.rest[:, :1])], axis=1)
+    moved = jnp.einsum("vm,vmicd,vc->dvi", skin.weight, skin.slope[skin.joint], rest)  # (D, V, 3) camera frame
+    zoom, offset = focal / vertices[:, 2:], (vertices[:, :2] - centre) / vertices[:, 2:]
+    moved_px = jnp.concatenate([zoom * moved[..., :2] - offset * moved[..., 2:], moved[..., 2:]], axis=-1)
+
+    def image(v):
+        return silhouette(v, faces, target.shape[-1], blur)
+
+    value = image(vertices)
+    rows = jax.vmap(lambda tangent: jax.jvp(image, (vertices,), (tangent,))[1])(moved_px)  # (D, size, size)
+    mask = target if jnp.issubdtype(target.dtype, jnp.floating) else (target != 0).astype(value.dtype)
+    pixel_weight = 1 / jnp.maximum(jnp.abs(value - mask), LEAST_ERROR) if kind == "l1" else jnp.ones_like(value)
+    band = (value > BAND_EDGE) & (value < 1 - BAND_EDGE) & ~missing
+    return jnp.einsum("dxy,exy,xy->de", rows, rows, jnp.where(band, pixel_weight, 0.0))
