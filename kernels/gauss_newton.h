@@ -1,7 +1,7 @@
-// The Gauss-Newton block of the mask loss of one image. Part of silhouette.cc.
+// The Gauss-Newton block of the silhouette of one image. Part of silhouette.cc.
 //
-// The block is Jᵀ·W·J with one row of J = d silhouette / d parameters for each pixel of the band in which the silhouette
-// is neither 0 nor 1. Of a band with more than kMostRows pixels, a pseudo-random part enters with a larger weight.
+// The block is Jᵀ·J with one row of J = d silhouette / d parameters for each pixel of the band in which the silhouette
+// is neither 0 nor 1. Of a band with more than kMostRows pixels, an evenly spread part enters with a larger weight.
 // A row is the sum over the faces near the pixel: d silhouette / d vertex, times d vertex / d parameters. The second
 // factor is computed once for each vertex that some row needs.
 #pragma once
@@ -11,22 +11,22 @@
 namespace jaxfit {
 namespace {
 
-constexpr int64_t kMostRows = 1024;
+constexpr int64_t kMostRows = 256;
 constexpr float kBandEdge = 0.01f;    // the band holds the pixels whose silhouette is this far from 0 and from 1
-constexpr float kLeastError = 0.2f;   // least error in the weight 1 / |error| of the L1 norm
 
 struct Rows {
   float* values;        // (kMostRows, D)
-  int32_t* of_pixel;    // for each pixel of each block the index of its row, or -1
+  int32_t* of_pixel;    // for each chosen pixel of each block the index of its row
   float* of_vertex;     // (V, 2, D): d vertex / d parameters in px, for the vertices that are ready
   uint8_t* ready;       // (V)
+  uint16_t* chosen;     // for each block the pixels that have a row, as bits
   int64_t count;
 };
 
 size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, int64_t size) {
   const Layout l(mesh, size);
   const int64_t floats = kMostRows * skin.parameters + l.products + 2 * mesh.num_vertices * skin.parameters;
-  return workspace(mesh, size) + sizeof(float) * (floats + l.vertices);
+  return workspace(mesh, size) + sizeof(float) * (floats + l.vertices) + sizeof(uint16_t) * l.blocks * l.blocks;
 }
 
 INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, int64_t size, void* memory) {
@@ -35,15 +35,15 @@ INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, int64_t size, void* m
   rows.values = reinterpret_cast<float*>(static_cast<char*>(memory) + workspace(mesh, size));
   rows.of_vertex = rows.values + kMostRows * skin.parameters;
   rows.of_pixel = reinterpret_cast<int32_t*>(rows.of_vertex + 2 * mesh.num_vertices * skin.parameters);
-  rows.ready = reinterpret_cast<uint8_t*>(rows.of_pixel + l.products);
+  rows.chosen = reinterpret_cast<uint16_t*>(rows.of_pixel + l.products);
+  rows.ready = reinterpret_cast<uint8_t*>(rows.chosen + l.blocks * l.blocks);
   for (int64_t i = 0; i < mesh.num_vertices; ++i) rows.ready[i] = 0;
   rows.count = 0;
   return rows;
 }
 
-// Replaces the products by the factors √weight · d silhouette / d (p's exponent). Returns the pixels in the band.
-template <LossKind kind, typename Pixel>
-int64_t set_row_factors(const Pixel* target, int64_t size, Scale scale, Workspace& ws) {
+// Replaces the products by the factors of p · (pixel - nearest point) in d silhouette. Returns the pixels in the band.
+int64_t set_row_factors(Scale scale, Workspace& ws) {
   const Vec one = all(1.f), low = all(kBandEdge), high = all(1 - kBandEdge);
   int64_t count = 0;
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
@@ -51,45 +51,39 @@ int64_t set_row_factors(const Pixel* target, int64_t size, Scale scale, Workspac
     const Mask band = (transmitted > low) & (high > transmitted);
     if (!bits(band)) {
       close(ws, column, row);
-      store(place, all(0.f));
       return;
     }
-    Vec root = one;
-    if (kind == LossKind::kL1) {
-      const Vec error = (one - transmitted) - load_block(target, size, column, row, static_cast<Pixel>(1));
-      root = one / sqrt(max(abs(error), all(kLeastError)));
-    }
-    store(place, keep(band, root * transmitted * all(scale.slope)));
+    store(place, keep(band, transmitted * all(scale.slope)));
     count += __builtin_popcount(bits(band));
   });
   return count;
 }
 
-// Gives rows to the pixels of the band: to all, or to a pseudo-random part whose factors grow by √(band / part).
+// Gives rows to the pixels of the band: to all, or to a part whose factors grow by √(band / part).
 void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
   const bool every = band <= kMostRows;
-  const double part = every ? 1 : 0.95 * kMostRows / static_cast<double>(band);  // 0.95: the number of rows varies
+  const double part = every ? 1 : 0.95 * kMostRows / static_cast<double>(band);  // 0.95, because the number of chosen pixels varies
   const uint32_t threshold = static_cast<uint32_t>(part * 4294967295.0);
   const Vec grown = all(every ? 1.f : __builtin_sqrtf(static_cast<float>(1 / part)));
-  uint32_t place_number = 0;
+  uint32_t number = 0;
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) {
     int32_t* of_pixel = rows.of_pixel + (place - ws.products);
     if (!(ws.open[row * ws.row_bytes + column / 8] >> column % 8 & 1)) return;
-    bool any = false;
+    uint16_t mine = 0;
     for (int i = 0; i < kLanes; ++i) {
-      of_pixel[i] = -1;
       if (place[i] == 0) continue;
       // steps of the golden ratio spread the chosen pixels evenly along the band
-      const bool chosen = every || place_number * 2654435769u < threshold;
-      ++place_number;
-      if (chosen && rows.count < kMostRows) of_pixel[i] = static_cast<int32_t>(rows.count++), any = true;
+      const bool chosen = every || number * 2654435769u < threshold;
+      ++number;
+      if (chosen && rows.count < kMostRows) of_pixel[i] = static_cast<int32_t>(rows.count++), mine |= 1u << i;
     }
+    rows.chosen[(place - ws.products) / kLanes] = mine;
     store(place, load(place) * grown);
-    if (!any) close(ws, column, row);
+    if (!mine) close(ws, column, row);
   });
 }
 
-// Returns d vertex / d parameters in px: D derivatives of x, then D of y. `depth` is that of the posed vertex.
+// Returns d vertex / d parameters in px: D derivatives of x, then D of y.
 INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, Rows& rows) {
   const int64_t D = skin.parameters;
   float* out = rows.of_vertex + 2 * v * D;
@@ -125,14 +119,16 @@ void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, R
                      [&](const Distances& at, const Nearest& n, float* place, int64_t, int64_t)
                          __attribute__((always_inline)) {
         const int32_t* of_pixel = rows.of_pixel + (place - ws.products);
+        const uint32_t chosen = rows.chosen[(place - ws.products) / kLanes];
         const Mask in = outside > n.d;
+        if (!(bits(in) & chosen)) return;
         const Vec pull = flip_sign(load(place) * reciprocal(all(1.f) + exp2(n.d)), n.d);
         Mask mine[3];
         mine[0] = in & (n.square[0] <= n.smallest);
         mine[1] = without(in & (n.square[1] <= n.smallest), mine[0]);
         mine[2] = without(without(in, mine[0]), mine[1]);
         for (int i = 0; i < 3; ++i) {
-          uint32_t pixels = bits(mine[i]);
+          uint32_t pixels = bits(mine[i]) & chosen;
           if (!pixels) continue;
           const Vec tx = all(f.tx[i][lane]), ty = all(f.ty[i][lane]);
           alignas(64) float pull_x[kLanes], pull_y[kLanes], place_along[kLanes];
@@ -143,7 +139,6 @@ void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, R
           const float* b = nullptr;
           for (; pixels; pixels &= pixels - 1) {
             const int k = __builtin_ctz(pixels);
-            if (of_pixel[k] < 0) continue;
             if (!a) {
               a = vertex_rows(mesh, skin, f.vertex[i][lane], rows);
               b = vertex_rows(mesh, skin, f.vertex[(i + 1) % 3][lane], rows);
@@ -181,27 +176,14 @@ void multiply_rows(const Rows& rows, int64_t D, float* block) {
     for (int64_t d = 0; d < i; ++d) block[i * D + d] = block[d * D + i];
 }
 
-void mask_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory, Target target,
-                       LossKind kind, float* block) {
-  const int64_t D = skin.parameters;
+void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory, float* block) {
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
-  if (!render(mesh, size, scale, ws)) {
-    for (int64_t i = 0; i < D * D; ++i) block[i] = __builtin_nanf("");
-    return;
-  }
-  const bool l1 = kind == LossKind::kL1;
-  int64_t band;
-  if (target.bytes)
-    band = l1 ? set_row_factors<LossKind::kL1>(target.bytes, size, scale, ws)
-              : set_row_factors<LossKind::kSmoothL1>(target.bytes, size, scale, ws);
-  else
-    band = l1 ? set_row_factors<LossKind::kL1>(target.floats, size, scale, ws)
-              : set_row_factors<LossKind::kSmoothL1>(target.floats, size, scale, ws);
+  if (!render(mesh, size, scale, ws)) return fill(block, skin.parameters * skin.parameters, __builtin_nanf(""));
   Rows rows = carve_rows(mesh, skin, size, memory);
-  choose_rows(band, ws, rows);
+  choose_rows(set_row_factors(scale, ws), ws, rows);
   fill_rows(mesh, skin, scale, ws, rows);
-  multiply_rows(rows, D, block);
+  multiply_rows(rows, skin.parameters, block);
 }
 
 }  // namespace

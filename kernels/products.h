@@ -44,26 +44,8 @@ INLINE void for_each_place(const Workspace& ws, Visit visit) {
       visit(ws.products + (row * ws.blocks + column) * kLanes, column, row);
 }
 
-// Returns a 4×4 block of a row-major image, with `fill` outside the image.
-INLINE Vec load_block(const float* image, int64_t size, int64_t column, int64_t row, float fill) {
-  const int64_t x0 = column * kBlock, y0 = row * kBlock;
-  alignas(64) float values[kLanes];
-  for (int i = 0; i < kLanes; ++i) {
-    const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
-    values[i] = x < size && y < size ? image[y * size + x] : fill;
-  }
-  return load(values);
-}
-
-INLINE Vec load_block(const uint8_t* image, int64_t size, int64_t column, int64_t row, uint8_t fill) {
-  const int64_t x0 = column * kBlock, y0 = row * kBlock;
-  if (x0 + kBlock <= size && y0 + kBlock <= size) return from_bytes(image + y0 * size + x0, size);
-  uint8_t values[kLanes];
-  for (int i = 0; i < kLanes; ++i) {
-    const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
-    values[i] = x < size && y < size ? image[y * size + x] : fill;
-  }
-  return from_bytes(values, kBlock);
+void fill(float* p, int64_t n, float value) {
+  for (int64_t i = 0; i < n; ++i) p[i] = value;
 }
 
 // Computes `products`. Returns false if a coordinate is not finite.

@@ -70,6 +70,28 @@ void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
   }
 }
 
+// Returns a 4×4 block of a row-major image, with `fill` outside the image.
+INLINE Vec load_block(const float* image, int64_t size, int64_t column, int64_t row, float fill) {
+  const int64_t x0 = column * kBlock, y0 = row * kBlock;
+  alignas(64) float values[kLanes];
+  for (int i = 0; i < kLanes; ++i) {
+    const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
+    values[i] = x < size && y < size ? image[y * size + x] : fill;
+  }
+  return load(values);
+}
+
+INLINE Vec load_block(const uint8_t* image, int64_t size, int64_t column, int64_t row, uint8_t fill) {
+  const int64_t x0 = column * kBlock, y0 = row * kBlock;
+  if (x0 + kBlock <= size && y0 + kBlock <= size) return from_bytes(image + y0 * size + x0, size);
+  uint8_t values[kLanes];
+  for (int i = 0; i < kLanes; ++i) {
+    const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
+    values[i] = x < size && y < size ? image[y * size + x] : fill;
+  }
+  return from_bytes(values, kBlock);
+}
+
 // Replaces the products by the factors of the gradient, given d loss / d silhouette. Closes blocks without gradient.
 INLINE void set_factor(Vec cotangent, Vec transmitted, Scale scale, const Workspace& ws, float* place, int64_t column,
                        int64_t row) {
@@ -100,10 +122,6 @@ float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, boo
     if (with_gradient) set_factor(slope, transmitted, scale, ws, place, column, row);
   });
   return static_cast<float>(total + sum(part));
-}
-
-void fill(float* p, int64_t n, float value) {
-  for (int64_t i = 0; i < n; ++i) p[i] = value;
 }
 
 void clear_gradient(float* gradient, int64_t vertices, float value) {
@@ -169,6 +187,7 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
 }  // namespace
 
 extern const Kernels KERNELS;
-const Kernels KERNELS = {workspace, silhouette, silhouette_gradient, mask_loss, gauss_newton_workspace, mask_gauss_newton};
+const Kernels KERNELS = {
+    workspace, silhouette, silhouette_gradient, mask_loss, gauss_newton_workspace, silhouette_gauss_newton};
 
 }  // namespace jaxfit

@@ -44,8 +44,8 @@ struct Kernels {
   void (*mask_loss)(const Mesh&, Blur, int64_t size, void* memory, Target, LossKind, float* loss,
                     float* gradient);
   size_t (*gauss_newton_workspace)(const Mesh&, const Skin&, int64_t size);
-  // Computes the Gauss-Newton block Jᵀ·W·J (D, D) of the mask loss, with J = d silhouette / d parameters.
-  void (*mask_gauss_newton)(const Mesh&, const Skin&, Blur, int64_t size, void* memory, Target, LossKind, float* block);
+  // Computes the block Jᵀ·J (D, D) with J = d silhouette / d parameters. The depths of the mesh are in the camera frame.
+  void (*silhouette_gauss_newton)(const Mesh&, const Skin&, Blur, int64_t size, void* memory, float* block);
 };
 
 }  // namespace jaxfit

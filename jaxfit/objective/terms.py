@@ -15,7 +15,7 @@ from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.curvature import Curvature, Rows
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.raster.silhouette import Kind, mask_gauss_newton, mask_loss
+from jaxfit.raster.silhouette import Kind, mask_loss, silhouette_gauss_newton
 
 __all__ = [
     "bone_prior",
@@ -76,26 +76,21 @@ def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Scalar
 
 
 def _mask_curvature(window: PosedWindow) -> Curvature:
-    """Return H = Jᵀ·W·J of the L1 norm, from the bound |r| ≤ ½(r²/n + n) with n = max(|r|, 0.2) at the current pose."""
-    return _mask_blocks(window, "l1")
+    """Return H = JᵀJ with J the derivative of the silhouette: the Gauss-Newton matrix of Σ ½e².
 
-
-def _mask_smooth_l1_curvature(window: PosedWindow) -> Curvature:
-    """Return H = Jᵀ·J."""
-    return _mask_blocks(window, "smooth_l1")
-
-
-def _mask_blocks(window: PosedWindow, kind: Kind) -> Curvature:
+    The L1 norm has the same H. Its quadratic bound is ½ Σ e²/n with n = |e| ≤ 1, so H is smaller than the curvature of
+    the bound. With the bound, the solver needs about twice as many steps, because few pixels end at e = 0.
+    """
     ratio = window.raster.size_px / window.camera.size_px
     camera_px = window.camera.focal_px * ratio, window.camera.centre_px * ratio
+    raster = {"blur": window.raster.blur, "backend": window.raster.backend}
 
-    def frame(vertices_screen, target, weight, slope):
+    def frame(vertices_screen, weight, slope):
         skin = window.skin._replace(slope=slope)
-        raster = {"blur": window.raster.blur, "backend": window.raster.backend}
-        return mask_gauss_newton(vertices_screen, window.faces, target, weight, skin, camera_px, kind=kind, **raster)
+        size = window.raster.size_px
+        return silhouette_gauss_newton(vertices_screen, window.faces, weight, skin, size, camera_px, **raster)
 
-    weight = _mask_weight(window)
-    blocks = jax.vmap(frame)(window.vertices_screen, window.targets.mask, weight, window.skin.slope)
+    blocks = jax.vmap(frame)(window.vertices_screen, _mask_weight(window), window.skin.slope)
     return Curvature(Partial(_blocks_product, blocks), jnp.diagonal(blocks, axis1=-2, axis2=-1))
 
 
@@ -114,7 +109,7 @@ def mask(window: PosedWindow) -> Scalar:
     return _mask(window, "l1")
 
 
-@term(compares_masks=True, curvature=_mask_smooth_l1_curvature)
+@term(compares_masks=True, curvature=_mask_curvature)
 def mask_smooth_l1(window: PosedWindow) -> Scalar:
     """Compare silhouette and mask by smooth-L1, as AVES does: Σ_t Σ_pixels ½e², e = soft silhouette − mask.
 

@@ -4,7 +4,7 @@
 """
 
 from jaxfit.raster.silhouette.native import available_isas, choose_isa, current_isa, kernels_available
-from jaxfit.raster.silhouette.operator import Backend, Kind, mask_gauss_newton, mask_loss, silhouette
+from jaxfit.raster.silhouette.operator import Backend, Kind, mask_loss, silhouette, silhouette_gauss_newton
 from jaxfit.raster.silhouette.reference import Blur, Skin
 
 __all__ = [
@@ -16,7 +16,7 @@ __all__ = [
     "choose_isa",
     "current_isa",
     "kernels_available",
-    "mask_gauss_newton",
     "mask_loss",
     "silhouette",
+    "silhouette_gauss_newton",
 ]

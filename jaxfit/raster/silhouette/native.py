@@ -16,10 +16,10 @@ __all__ = [
     "choose_isa",
     "current_isa",
     "kernels_available",
-    "mask_gauss_newton",
     "mask_loss",
     "mask_loss_and_gradient",
     "silhouette",
+    "silhouette_gauss_newton",
     "silhouette_gradient",
 ]
 
@@ -75,23 +75,21 @@ def mask_loss_and_gradient(
     return _call("jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))
 
 
-def mask_gauss_newton(
+def silhouette_gauss_newton(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
-    target: Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"],
     weight: Float[Array, ""],
     skin: Skin,
+    size: int,
     camera_px: tuple[float, float],
-    kind: str,
     blur: Blur,
 ) -> Float[Array, "D D"]:
-    """Return the unweighted Gauss-Newton block of the mask loss. A weight of 0 gives a block of 0."""
+    """Return the unweighted Gauss-Newton block. A weight of 0 gives a block of 0 and skips the rendering."""
     parameters = skin.slope.shape[-1]
     padding = -parameters % LANES
     slope = jnp.pad(skin.slope, ((0, 0), (0, 0), (0, 0), (0, padding)))
-    padded = parameters + padding
-    block = jax.ShapeDtypeStruct((padded, padded), jnp.float32)
-    operands = (vertices, faces, target, weight, skin.rest, skin.joint, skin.weight, slope)
+    block = jax.ShapeDtypeStruct((parameters + padding, parameters + padding), jnp.float32)
+    operands = (vertices, faces, weight, skin.rest, skin.joint, skin.weight, slope)
     focal, centre = (np.float32(x) for x in camera_px)
-    attributes = {"kind": np.int32(KINDS.index(kind)), "focal": focal, "centre": centre}
-    return _call("jaxfit_mask_gauss_newton", block, *operands, blur=blur, **attributes)[:parameters, :parameters]
+    attributes = {"size": np.int32(size), "focal": focal, "centre": centre}
+    return _call("jaxfit_silhouette_gauss_newton", block, *operands, blur=blur, **attributes)[:parameters, :parameters]

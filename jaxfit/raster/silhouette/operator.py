@@ -55,8 +55,7 @@ def silhouette(
     of faces per pixel.
     """
     _check_mesh(vertices_screen, faces)
-    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not 0 < size <= 2**14:
-        raise ValueError(f"size: expected an integer from 1 to {2**14}, got {size!r}")
+    _check_size(size)
     blur = Blur.for_size(size) if blur is None else blur
     vertices, faces = _as_operands(vertices_screen, faces)
     image: Any = _silhouette(vertices, faces, int(size), blur, _choose(backend))
@@ -99,65 +98,6 @@ def mask_loss(
 
     Source: Hägerlind et al., "Temporally-consistent 3D Reconstruction of Seabirds" (2024), the term E_msk.
     """
-    target, blur, weight = _check_mask(vertices_screen, faces, target, weight, kind, blur)
-    vertices, faces = _as_operands(vertices_screen, faces)
-    switch = jax.lax.stop_gradient(weight)
-    loss: Any = _mask_loss(vertices, faces, target, switch, kind, blur, _choose(backend))
-    return (weight * loss).astype(vertices_screen.dtype)
-
-
-def mask_gauss_newton(
-    vertices_screen: Float[Array, "V 3"],
-    faces: Int[Array, "F 3"],
-    target: Target,
-    weight: Float[Array, ""] | float,
-    skin: Skin,
-    camera_px: tuple[float, float],
-    *,
-    kind: Kind = "l1",
-    blur: Blur | None = None,
-    backend: Backend = "auto",
-) -> Float[Array, "D D"]:
-    """Return the Gauss-Newton block of `mask_loss` for the D parameters of a skinned mesh.
-
-    H = w · Σ u · j·jᵀ over the pixels with 0.01 < S < 0.99, with j = dS / d parameters. u is the weight of iteratively
-    reweighted least squares: u = 1 / max(|S − target|, 0.2) for "l1", and u = 1 for "smooth_l1".
-
-    The kernels sum over at most 1,024 pixels. Of more pixels they take an evenly spread part, and scale the sum. H has
-    no gradient.
-
-    Args:
-        vertices_screen, faces, target, kind, blur, backend: as for `mask_loss`. The depth is that of the camera frame
-            of `skin`.
-        weight: w, as for `mask_loss`.
-        skin: rest vertices, skinning weights and derivatives of the joint transforms.
-        camera_px: focal length and centre of the square silhouette in pixels; the camera is a pinhole with
-            pixel = focal · (x, y) / z + centre.
-
-    Returns:
-        H, positive semi-definite, px² per unit of each of two parameters.
-
-    Raises:
-        ValueError: the shape, type or value of an argument is not as described.
-        RuntimeError: backend="native" without kernels.
-
-    Source: Green 1984, Iteratively reweighted least squares (the weights); the silhouette as for `mask_loss`.
-    """
-    target, blur, weight = _check_mask(vertices_screen, faces, target, weight, kind, blur)
-    vertices, faces = _as_operands(vertices_screen, faces)
-    chosen = _choose(backend)
-    operands = jax.lax.stop_gradient((vertices, faces, target, weight, skin))
-    block: Any = _dispatch(
-        chosen,
-        lambda *o: native.mask_gauss_newton(*o, camera_px, kind, blur),
-        lambda *o: reference.mask_gauss_newton(*o, camera_px, kind, blur),
-        *operands,
-    )
-    return weight * block
-
-
-def _check_mask(vertices_screen, faces, target, weight, kind, blur):
-    """Check the arguments of a comparison with a mask. Return target, blur and weight as the kernels take them."""
     _check_mesh(vertices_screen, faces)
     target = jnp.asarray(target)
     if target.ndim != 2 or target.shape[0] != target.shape[1] or target.shape[0] == 0:
@@ -171,7 +111,64 @@ def _check_mask(vertices_screen, faces, target, weight, kind, blur):
     if jnp.shape(weight) != ():
         raise ValueError(f"weight: expected a scalar, got shape {jnp.shape(weight)}")
     blur = Blur.for_size(target.shape[0]) if blur is None else blur
-    return target, blur, jnp.asarray(weight, jnp.float32)
+    vertices, faces = _as_operands(vertices_screen, faces)
+    weight = jnp.asarray(weight, jnp.float32)
+    switch = jax.lax.stop_gradient(weight)
+    loss: Any = _mask_loss(vertices, faces, target, switch, kind, blur, _choose(backend))
+    return (weight * loss).astype(vertices_screen.dtype)
+
+
+def silhouette_gauss_newton(
+    vertices_screen: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    weight: Float[Array, ""] | float,
+    skin: Skin,
+    size: int,
+    camera_px: tuple[float, float],
+    *,
+    blur: Blur | None = None,
+    backend: Backend = "auto",
+) -> Float[Array, "D D"]:
+    """Return the Gauss-Newton block of the soft silhouette for the D parameters of a skinned mesh.
+
+    H = w · Σ j·jᵀ over the pixels with 0.01 < S < 0.99, where S is `silhouette` and j = dS / d parameters. H is the
+    curvature of ½ Σ (S − target)², and the solver uses H for both mask losses.
+
+    The kernels sum over at most 256 pixels. Of more pixels they take an evenly spread part, and scale the sum. H has no
+    gradient.
+
+    Args:
+        vertices_screen, faces, size, blur, backend: as for `silhouette`. The depth is that of the camera frame of
+            `skin`, in the unit of its rest vertices.
+        weight: w. An image of weight 0 is not rendered, and its H is 0.
+        skin: rest vertices, skinning weights and derivatives of the joint transforms.
+        camera_px: focal length and centre of the image in pixels of the silhouette, for the pinhole camera
+            pixel = focal · (x, y) / z + centre.
+
+    Returns:
+        H, positive semi-definite, px² per unit of each of two parameters.
+
+    Raises:
+        ValueError: the shape, type or value of an argument is not as described.
+        RuntimeError: backend="native" without kernels.
+    """
+    _check_mesh(vertices_screen, faces)
+    _check_size(size)
+    blur = Blur.for_size(size) if blur is None else blur
+    vertices, faces = _as_operands(vertices_screen, faces)
+    weight = jnp.asarray(weight, jnp.float32)
+    block: Any = _dispatch(
+        _choose(backend),
+        lambda *operands: native.silhouette_gauss_newton(*operands, int(size), camera_px, blur),
+        lambda *operands: reference.silhouette_gauss_newton(*operands, int(size), camera_px, blur),
+        *jax.lax.stop_gradient((vertices, faces, weight, skin)),
+    )
+    return weight * block
+
+
+def _check_size(size) -> None:
+    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not 0 < size <= 2**14:
+        raise ValueError(f"size: expected an integer from 1 to {2**14}, got {size!r}")
 
 
 def _check_mesh(vertices, faces) -> None:

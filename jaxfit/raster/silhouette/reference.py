@@ -16,7 +16,6 @@ MIN_DEPTH = 1e-8  # a face with a vertex at or behind this depth is skipped
 MIN_AREA = 1e-8  # a face with at most this |2·area|, in units of half the image, is skipped
 FAR_AWAY = 2.0**20  # px; coordinates are clamped to ± this, so that their squares stay finite
 BAND_EDGE = 0.01  # the Gauss-Newton block sums over the pixels whose silhouette is this far from 0 and from 1
-LEAST_ERROR = 0.2  # least error in the weight 1/|error| of the L1 norm
 _FACES_AT_ONCE = 16
 
 
@@ -147,32 +146,30 @@ def mask_loss(
     return jnp.where(missing, 0.0, jnp.sum(magnitude))
 
 
-def mask_gauss_newton(
+def silhouette_gauss_newton(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
-    target: Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"],
     weight: Float[Array, ""],
     skin: Skin,
+    size: int,
     camera_px: tuple[float, float],
-    kind: str,
     blur: Blur,
 ) -> Float[Array, "D D"]:
-    """Return the unweighted Gauss-Newton block of the mask loss, over all pixels of the band. See
-    `jaxfit.raster.silhouette.mask_gauss_newton`."""
+    """Return the unweighted Gauss-Newton block over all pixels of the band. A weight of 0 gives a block of 0."""
     focal, centre = camera_px
     missing = weight == 0
     vertices = jnp.where(missing, 1.0, vertices)
     rest = jnp.concatenate([skin.rest, jnp.ones_like(skin.rest[:, :1])], axis=1)
-    moved = jnp.einsum("vm,vmicd,vc->dvi", skin.weight, skin.slope[skin.joint], rest)  # (D, V, 3) camera frame
-    zoom, offset = focal / vertices[:, 2:], (vertices[:, :2] - centre) / vertices[:, 2:]
-    moved_px = jnp.concatenate([zoom * moved[..., :2] - offset * moved[..., 2:], moved[..., 2:]], axis=-1)
+    moved_cam = jnp.einsum("vm,vmicd,vc->dvi", skin.weight, skin.slope[skin.joint], rest)  # (D, V, 3)
+    depth = vertices[:, 2:]
+    moved_px = (focal * moved_cam[..., :2] - (vertices[:, :2] - centre) * moved_cam[..., 2:]) / depth
+    tangents = jnp.concatenate([moved_px, moved_cam[..., 2:]], axis=-1)
 
     def image(v):
-        return silhouette(v, faces, target.shape[-1], blur)
+        return silhouette(v, faces, size, blur)
 
     value = image(vertices)
-    rows = jax.vmap(lambda tangent: jax.jvp(image, (vertices,), (tangent,))[1])(moved_px)  # (D, size, size)
-    mask = target if jnp.issubdtype(target.dtype, jnp.floating) else (target != 0).astype(value.dtype)
-    pixel_weight = 1 / jnp.maximum(jnp.abs(value - mask), LEAST_ERROR) if kind == "l1" else jnp.ones_like(value)
-    band = (value > BAND_EDGE) & (value < 1 - BAND_EDGE) & ~missing
-    return jnp.einsum("dxy,exy,xy->de", rows, rows, jnp.where(band, pixel_weight, 0.0))
+    rows = jax.vmap(lambda tangent: jax.jvp(image, (vertices,), (tangent,))[1])(tangents)  # (D, size, size)
+    band = (value > BAND_EDGE) & (value < 1 - BAND_EDGE)
+    block = jnp.einsum("dyx,eyx->de", jnp.where(band, rows, 0.0), rows)
+    return jnp.where(missing, 0.0, block)
