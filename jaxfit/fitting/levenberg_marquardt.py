@@ -97,7 +97,9 @@ def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tupl
         return rows.at[:, -1].set(rows[:, -1].mean()) if scales < frames else rows
 
     gradient = frame_rows(state.gradient)
-    gradient = allowed(gradient.at[:, -1].divide(frames // scales))  # that of a common scale is split between the frames
+    gradient = allowed(
+        gradient.at[:, -1].divide(frames // scales)
+    )  # that of a common scale is split between the frames
     diagonal = allowed(curvature.diagonal)
     # a parameter without curvature has no gradient and does not change
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)

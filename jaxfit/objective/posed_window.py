@@ -209,7 +209,8 @@ class PosedWindow:
 
     @cached_property
     def skin(self) -> Skin:
-        """How the parameters of a frame move its vertices. Only `slope` (T, J, 3, 4, 3J + 4) has a leading frame axis."""
+        """Derivatives of the vertices with respect to the pose, in factors. Only `slope` (T, J, 3, 4, 3J + 4) has a
+        leading frame axis."""
         rest = self._rig.vertices + jnp.tensordot(self.pose.betas, self._rig.shape_basis, axes=1)
         slope = window_transform_derivatives(self._rig, self._transforms, self.pose)
         return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope)

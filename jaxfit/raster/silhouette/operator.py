@@ -159,8 +159,8 @@ def silhouette_gauss_newton(
     weight = jnp.asarray(weight, jnp.float32)
     block: Any = _dispatch(
         _choose(backend),
-        lambda *operands: native.silhouette_gauss_newton(*operands, int(size), camera_px, blur),
-        lambda *operands: reference.silhouette_gauss_newton(*operands, int(size), camera_px, blur),
+        lambda v, f, w, s: native.silhouette_gauss_newton(v, f, w, s, int(size), camera_px, blur),
+        lambda v, f, w, s: reference.silhouette_gauss_newton(v, f, w, s, int(size), camera_px, blur),
         *jax.lax.stop_gradient((vertices, faces, weight, skin)),
     )
     return weight * block
