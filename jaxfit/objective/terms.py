@@ -131,7 +131,7 @@ def _mask(window: PosedWindow, kind: Kind) -> Scalar:
 
 def _mask_weight(window: PosedWindow) -> Float[Array, "T"]:
     """Return the area of a pixel of the silhouette in crop pixels, 0 for frames without a mask."""
-    return window.targets.has_mask.astype(jnp.float32) * (window.camera.size_px / window.raster.size_px) ** 2
+    return jnp.asarray(window.targets.has_mask, jnp.float32) * (window.camera.size_px / window.raster.size_px) ** 2
 
 
 def _pose_prior_curvature(window: PosedWindow) -> Curvature:
