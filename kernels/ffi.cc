@@ -7,103 +7,14 @@
 #include <algorithm>
 #include <stdexcept>
 #include <string>
-#include <vector>
 
 #include "guard.h"
 #include "instruction_set.h"
+#include "operands.h"
 #include "parallel.h"
-#include "shapes.h"
 
 namespace jaxfit {
 namespace {
-
-namespace ffi = xla::ffi;
-
-using Dimensions = ffi::AnyBuffer::Dimensions;
-using Floats = ffi::Buffer<ffi::F32>;
-using Indices = ffi::Buffer<ffi::S32>;
-
-// The dimensions of the batch: the leading dimensions of a result whose items have `item_rank` dimensions.
-struct Batch {
-  std::vector<int64_t> dims;
-  int64_t count = 1;
-
-  Batch(Dimensions result, size_t item_rank) {
-    for (size_t i = 0; i + item_rank < result.size(); ++i) dims.push_back(result[i]), count *= result[i];
-  }
-};
-
-// The place of each image's part in an operand.
-struct Operand {
-  std::vector<int64_t> strides;  // in items; 0 where all images share one item
-  int64_t item = 1, items = 1;   // numbers in an item, items in the operand
-
-  int64_t offset(const Batch& batch, int64_t image) const {
-    int64_t at = 0;
-    for (size_t i = batch.dims.size(); i-- > 0; image /= batch.dims[i]) at += image % batch.dims[i] * strides[i];
-    return at * item;
-  }
-};
-
-// Throws std::invalid_argument where `dims` does not fit the batch and the shape of an item.
-Operand bind(const char* name, Dimensions dims, const Batch& batch, std::vector<int64_t> item) {
-  const size_t leading = batch.dims.size();
-  bool fits = dims.size() == leading + item.size();
-  for (size_t i = 0; fits && i < leading; ++i) fits = dims[i] == 1 || dims[i] == batch.dims[i];
-  for (size_t i = 0; fits && i < item.size(); ++i) fits = item[i] == kAny || dims[leading + i] == item[i];
-  if (!fits)
-    throw std::invalid_argument(std::string(name) + ": expected the batch dimensions " + text_of(batch.dims) +
-                                " (or 1 in place of any of them) followed by " + text_of(item) + ", got " +
-                                text_of(dims));
-  Operand out;
-  for (size_t i = leading; i < dims.size(); ++i) out.item *= dims[i];
-  out.strides.assign(leading, 0);
-  for (size_t i = leading; i-- > 0; out.items *= dims[i])
-    if (dims[i] != 1) out.strides[i] = out.items;
-  return out;
-}
-
-void check_result(const char* name, Dimensions dims, const Batch& batch, const std::vector<int64_t>& item) {
-  std::vector<int64_t> expected = batch.dims;
-  expected.insert(expected.end(), item.begin(), item.end());
-  if (!std::equal(dims.begin(), dims.end(), expected.begin(), expected.end()))
-    throw std::invalid_argument(std::string(name) + ": expected shape " + text_of(expected) + ", got " +
-                                text_of(dims));
-}
-
-// Returns the width and height of a square image, which the last dimension gives.
-int64_t size_of(const char* name, Dimensions dims) {
-  const int64_t size = dims.size() ? dims[dims.size() - 1] : 0;
-  if (size < 1 || size > kMaxSize)
-    throw std::invalid_argument(std::string(name) + ": expected a square image of 1 to " + std::to_string(kMaxSize) +
-                                " pixels a side, got shape " + text_of(dims));
-  return size;
-}
-
-struct Meshes {
-  const float* vertices;
-  const int32_t* faces;
-  Operand vertices_at, faces_at;
-  int64_t num_vertices = 0, num_faces = 0;
-
-  Meshes(const Floats& vertices, const Indices& faces, const Batch& batch)
-      : vertices(vertices.typed_data()),
-        faces(faces.typed_data()),
-        vertices_at(bind("vertices", vertices.dimensions(), batch, {kAny, 3})),
-        faces_at(bind("faces", faces.dimensions(), batch, {kAny, 3})),
-        num_vertices(vertices_at.item / 3),
-        num_faces(faces_at.item / 3) {
-    const int64_t n = faces_at.items * faces_at.item;
-    bool inside = true;
-    for (int64_t i = 0; i < n; ++i) inside &= this->faces[i] >= 0 && this->faces[i] < num_vertices;
-    if (!inside) throw std::invalid_argument("faces: an index is not in [0, " + std::to_string(num_vertices) + ")");
-  }
-
-  Mesh of(const Batch& batch, int64_t image) const {
-    return {vertices + vertices_at.offset(batch, image), faces + faces_at.offset(batch, image), num_vertices,
-            num_faces};
-  }
-};
 
 Blur checked_blur(float sigma, float radius) {
   if (!(sigma > 0) || !(radius >= 0))
@@ -202,6 +113,47 @@ ffi::Error mask_loss_and_gradient(ffi::ThreadPool pool, Floats vertices, Indices
   return run_mask_loss(pool, vertices, faces, target, weight, loss, &gradient, sigma, radius, kind);
 }
 
+// `slope` is (J, 3, 4, D) with D a multiple of 16.
+ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indices faces, Floats weight, Floats rest,
+                                   Indices joint, Floats skin_weight, Floats slope, ffi::Result<Floats> block,
+                                   int32_t size, float sigma, float radius, float focal, float centre) {
+  const Batch batch(block->dimensions(), 2);
+  const Blur blur = checked_blur(sigma, radius);
+  const Meshes meshes(vertices, faces, batch);
+  const int64_t parameters = block->dimensions()[block->dimensions().size() - 1];
+  if (parameters < 1 || parameters % 16)
+    throw std::invalid_argument("block: expected a multiple of 16 parameters, got " + std::to_string(parameters));
+  check_result("block", block->dimensions(), batch, {parameters, parameters});
+  if (size < 1 || size > kMaxSize)
+    throw std::invalid_argument("size: expected 1 to " + std::to_string(kMaxSize) + ", got " + std::to_string(size));
+  const Operand weight_at = bind("weight", weight.dimensions(), batch, {});
+  const Operand rest_at = bind("rest", rest.dimensions(), batch, {meshes.num_vertices, 3});
+  const Operand joint_at = bind("joint", joint.dimensions(), batch, {meshes.num_vertices, kAny});
+  const int64_t joints = meshes.num_vertices ? joint_at.item / meshes.num_vertices : 0;
+  const Operand skin_at = bind("skin_weight", skin_weight.dimensions(), batch, {meshes.num_vertices, joints});
+  const Operand slope_at = bind("slope", slope.dimensions(), batch, {kAny, 3, 4, parameters});
+  check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, slope_at.item / (12 * parameters));
+  const Kernels& kernels = current_kernels();
+  float* out = block->typed_data();
+  for_each_task(pool, batch.count, [&](int64_t i) {
+    float* own = out + i * parameters * parameters;
+    std::fill(own, own + parameters * parameters, 0.f);
+    if (weight.typed_data()[weight_at.offset(batch, i)] == 0) return;  // a missing frame: nothing is rendered
+    const Skin skin{rest.typed_data() + rest_at.offset(batch, i),
+                    joint.typed_data() + joint_at.offset(batch, i),
+                    skin_weight.typed_data() + skin_at.offset(batch, i),
+                    slope.typed_data() + slope_at.offset(batch, i),
+                    joints,
+                    parameters,
+                    focal,
+                    centre};
+    const Mesh mesh = meshes.of(batch, i);
+    void* memory = scratch(kernels.gauss_newton_workspace(mesh, skin, size));
+    kernels.silhouette_gauss_newton(mesh, skin, blur, size, memory, own);
+  });
+  return ffi::Error::Success();
+}
+
 auto with_mesh() { return ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Arg<Floats>().Arg<Indices>(); }
 
 auto with_mesh_and_target() { return with_mesh().Arg<ffi::AnyBuffer>().Arg<Floats>(); }
@@ -251,6 +203,26 @@ XLA_FFI_Error* mask_loss_and_gradient_handler(XLA_FFI_CallFrame* frame) {
                                      .Attr<float>("radius")
                                      .Attr<int32_t>("kind")
                                      .To(mask_loss_and_gradient)
+                                     .release();
+    return handler->Call(frame);
+  });
+}
+
+XLA_FFI_Error* silhouette_gauss_newton_handler(XLA_FFI_CallFrame* frame) {
+  return call_guarded(frame->api, [frame] {
+    static const auto* handler = with_mesh()
+                                     .Arg<Floats>()
+                                     .Arg<Floats>()
+                                     .Arg<Indices>()
+                                     .Arg<Floats>()
+                                     .Arg<Floats>()
+                                     .Ret<Floats>()
+                                     .Attr<int32_t>("size")
+                                     .Attr<float>("sigma")
+                                     .Attr<float>("radius")
+                                     .Attr<float>("focal")
+                                     .Attr<float>("centre")
+                                     .To(silhouette_gauss_newton)
                                      .release();
     return handler->Call(frame);
   });

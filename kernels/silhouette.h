@@ -21,6 +21,18 @@ struct Target {
   const float* floats;
 };
 
+// A mesh posed by linear blend skinning: vertex v lies at Σ_m weight[v, m] · B[joint[v, m]] · (rest[v], 1) in the camera
+// frame, where B (J, 3, 4) depends on D parameters.
+struct Skin {
+  const float* rest;      // (V, 3)
+  const int32_t* joint;   // (V, M)
+  const float* weight;    // (V, M); entries of weight 0 are skipped
+  const float* slope;     // (J, 3, 4, D): derivatives of B; D is a multiple of 16
+  int64_t per_vertex;     // M
+  int64_t parameters;     // D
+  float focal, centre;    // px of the silhouette
+};
+
 // The entry points of one instruction set. `gradient` is (V, 3) and is overwritten. Its depth column is 0.
 struct Kernels {
   // Returns the size of `memory` in bytes for one image. `memory` is 64-byte aligned.
@@ -31,6 +43,9 @@ struct Kernels {
   // If `gradient` is null, only the loss is computed.
   void (*mask_loss)(const Mesh&, Blur, int64_t size, void* memory, Target, LossKind, float* loss,
                     float* gradient);
+  size_t (*gauss_newton_workspace)(const Mesh&, const Skin&, int64_t size);
+  // Computes the block Jᵀ·J (D, D) with J = d silhouette / d parameters. The depths of the mesh are in the camera frame.
+  void (*silhouette_gauss_newton)(const Mesh&, const Skin&, Blur, int64_t size, void* memory, float* block);
 };
 
 }  // namespace jaxfit

@@ -1,4 +1,4 @@
-"""Benchmark of the solvers: loss over time in a stage without masks."""
+"""Benchmark of the solvers: loss over time in a stage of the paper's config."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from jaxfit.config.fit import load_config
+from jaxfit.config.fit import StageConfig, load_config
 from jaxfit.data.observations import Observations
 from jaxfit.fitting.adam import ADAM
 from jaxfit.fitting.fit import check_observations, initial_poses_of, windows_of
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import Problem, Program, Solver, problem_loss
 from jaxfit.fitting.solve import Report, advance, begin, report
-from jaxfit.fitting.stages import fit_model, stage_hyperparameters, stage_program
+from jaxfit.fitting.stages import fit_model, needs_mask, stage_hyperparameters, stage_program
 from jaxfit.fitting.windows import load_targets
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose
@@ -72,52 +72,67 @@ def _outcome(state: Any) -> tuple[Float[Array, ""], Int[Array, ""]]:
 LBFGS = Solver(_init, _step, _outcome)
 """L-BFGS, only for this comparison: it is not fast enough for `stages.SOLVERS`."""
 
-SCHEDULES = {"adam": (ADAM, 600, 25), "lbfgs": (LBFGS, 400, 25), "levenberg_marquardt": (LEVENBERG_MARQUARDT, 25, 1)}
-"""Solver, largest number of steps, and number of steps between two reports of the loss."""
+SCHEDULES = {
+    "keypoints": {
+        "adam": (ADAM, 600, 25),
+        "lbfgs": (LBFGS, 400, 25),
+        "levenberg_marquardt": (LEVENBERG_MARQUARDT, 25, 1),
+    },
+    "mask": {"adam": (ADAM, 400, 10), "levenberg_marquardt": (LEVENBERG_MARQUARDT, 25, 1)},
+}
+"""For each stage and solver, largest number of steps, and number of steps between two reports of the loss. In the mask
+stage, the line search of L-BFGS renders many silhouettes a step, so L-BFGS is slower than Adam there."""
 
 
 def bench_solvers(
     observations: Observations,
     bird: Bird,
+    stage_name: str = "keypoints",
     limit: int | None = None,
     repeats: int = 5,
     progress: ProgressTask = silent,
 ) -> dict[str, Any]:
-    """Minimise the keypoint stage of the paper's config with each solver, all windows as one batch.
+    """Minimise a stage of the paper's config with each solver, all windows as one batch.
+
+    The mask stage begins where Adam ends the keypoint stage.
 
     The solvers run alternately, and times are medians. Times exclude compilation and the reports of the loss.
 
     Args:
         observations: the birds of the fit.
         bird: the model.
+        stage_name: `keypoints` or `mask`.
         limit: largest number of steps of a solver. None: the number in `SCHEDULES`.
         repeats: number of runs of each solver.
         progress: shows the progress of all runs.
 
     Returns:
         For each solver, a dictionary with its curve: `steps`, `seconds` and `loss` (the objective, summed over all
-        windows). Also `birds` and `windows`; `adam_s`, the seconds of Adam's whole stage; for each other solver `…_s`,
-        the seconds until its loss is at most Adam's final loss (None: never), and `…_ratio`, these seconds over
-        `adam_s`; for every solver `…_loss`, its final loss.
+        windows). Also `stage`, `birds` and `windows`; `adam_s`, the seconds of Adam's whole stage; for each other
+        solver `…_s`, the seconds until its loss is at most Adam's final loss (None: never), and `…_ratio`, these
+        seconds over `adam_s`; for every solver `…_loss`, its final loss.
     """
-    config = load_config("paper")
-    stage = config.stages[0]
+    config, schedules = load_config("paper"), SCHEDULES[stage_name]
     observations = check_observations(observations, bird, "observations")
     windows, model = windows_of(observations, config, "observations"), fit_model(bird, config)
     count = len(windows)
     initial_pose = initial_poses_of(windows, config, model)
-    hyperparameters = stage_hyperparameters(config, stage, bird.keypoint_names)
-    problems = Problem(
-        hyperparameters=jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * count), hyperparameters),
-        anchor=jax.tree.map(lambda x: x[:, 0], initial_pose),
-        targets=jax.tree.map(jnp.asarray, load_targets(windows, mask_px=0)),
-    )
-    program = stage_program(config, stage, model)
-    result: dict[str, Any] = {"birds": len(np.unique(windows.track)), "windows": count}
-    step_counts = {name: min(steps, limit or steps) for name, (_, steps, _) in SCHEDULES.items()}
+
+    def problems_of(stage: StageConfig, anchor: Pose) -> tuple[Program, Problem]:
+        hyperparameters = stage_hyperparameters(config, stage, bird.keypoint_names)
+        repeated = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * count), hyperparameters)
+        targets = load_targets(windows, mask_px=config.crop.size_px if needs_mask(stage) else 0)
+        return stage_program(config, stage, model), Problem(repeated, anchor, jax.tree.map(jnp.asarray, targets))
+
+    program, problems = problems_of(config.stages[0], jax.tree.map(lambda x: x[:, 0], initial_pose))
+    if stage_name == "mask":
+        state, _, _ = advance((program, problems, jnp.int32(config.stages[0].steps)), begin(program, problems, None))
+        program, problems = problems_of(config.stages[1], state.pose)
+    result: dict[str, Any] = {"stage": stage_name, "birds": len(np.unique(windows.track)), "windows": count}
+    step_counts = {name: min(steps, limit or steps) for name, (_, steps, _) in schedules.items()}
 
     def run(name: str, report_progress: ReportProgress) -> tuple[list[int], list[float], list[float]]:
-        solver, _, interval = SCHEDULES[name]
+        solver, _, interval = schedules[name]
         solver_program = program._replace(solver=solver)
         state = begin(solver_program, problems, None)
         steps, seconds, loss = [0], [0.0], [_total_loss(report(solver_program, problems, problems.anchor))]
@@ -132,10 +147,10 @@ def bench_solvers(
             report_progress(take, f"{name}: loss {loss[-1]:.5g}")
         return steps, seconds, loss
 
-    seconds_of_runs: dict[str, list[list[float]]] = {name: [] for name in SCHEDULES}
+    seconds_of_runs: dict[str, list[list[float]]] = {name: [] for name in schedules}
     with progress("Minimising", (repeats + 1) * sum(step_counts.values())) as report_progress:
         for repeat in range(repeats + 1):
-            for name in SCHEDULES:
+            for name in schedules:
                 steps, seconds, loss = run(name, report_progress)
                 if repeat:  # the first run compiles
                     seconds_of_runs[name].append(seconds)
@@ -144,7 +159,7 @@ def bench_solvers(
         result[name]["seconds"] = np.median(seconds, axis=0).tolist()
     target, adam_s = result["adam"]["loss"][-1], result["adam"]["seconds"][-1]
     result |= {"adam_s": adam_s, "adam_loss": target}
-    for name in list(SCHEDULES)[1:]:
+    for name in list(schedules)[1:]:
         result[f"{name}_loss"] = result[name]["loss"][-1]
         reached = [s for s, loss in zip(result[name]["seconds"], result[name]["loss"], strict=True) if loss <= target]
         result[f"{name}_s"] = reached[0] if reached else None
@@ -163,7 +178,7 @@ def plot_solvers(result: dict[str, Any], path: Path) -> None:
 
     figure = Figure(figsize=(7, 4.2), layout="constrained")
     panel = figure.subplots()
-    for name in SCHEDULES:
+    for name in SCHEDULES[result["stage"]]:
         curve = result[name]
         marker = "o" if len(curve["steps"]) <= 30 else None
         label = f"{name.replace('_', '-')}, {curve['steps'][-1]} steps"
@@ -173,7 +188,7 @@ def plot_solvers(result: dict[str, Any], path: Path) -> None:
         xlabel="time in s (median)",
         ylabel="objective, sum over all windows",
         yscale="log",
-        title="Keypoint stage: loss over time",
+        title=f"Stage {result['stage']}: loss over time",
     )
     panel.grid(True, which="both", alpha=0.2)
     panel.legend(frameon=False)

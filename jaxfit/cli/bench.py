@@ -21,6 +21,7 @@ def bench(options: argparse.Namespace) -> None:
     from jaxfit.benchmarks.render import bench_render
     from jaxfit.benchmarks.silhouette import bench_silhouette
     from jaxfit.benchmarks.solvers import bench_solvers, plot_solvers
+    from jaxfit.config.fit import load_config
 
     bird = find_bird(options.model) if options.model else None
     if options.what == "silhouette":
@@ -34,11 +35,12 @@ def bench(options: argparse.Namespace) -> None:
             check_writable(options.plot)
         path = options.observations
         observations = read_coco(path) if path else noisy_scene(bird, options.birds, options.frames)[1]
-        result = bench_solvers(observations, bird, progress=terminal)
+        result = bench_solvers(observations, bird, options.stage, progress=terminal)
         if options.plot:
             plot_solvers(result, options.plot)
     else:
-        result = bench_fit(bird or find_bird("murre"), options.birds, options.frames, progress=terminal)
+        config = load_config(options.config)
+        result = bench_fit(bird or find_bird("murre"), options.birds, options.frames, config, progress=terminal)
     if options.json:
         print(json_text(result))  # noqa: T201
     else:

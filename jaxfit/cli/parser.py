@@ -230,6 +230,9 @@ def _bench(commands: Any) -> None:
     bench.add_argument("--model", help=f"model to measure with, instead of the default: {MODEL}")
     bench.add_argument("--birds", type=int, default=9, help="fit, solvers: number of birds (default %(default)s)")
     bench.add_argument("--frames", type=int, default=100, help="fit, solvers: frames per bird (default %(default)s)")
+    bench.add_argument("--config", default="paper", help="fit: config to measure (default %(default)s)")
+    text = "solvers: stage of the paper's config to minimise (default %(default)s)"
+    bench.add_argument("--stage", choices=("keypoints", "mask"), default="keypoints", help=text)
     text = "solvers: fit this COCO file instead of a simulation"
     bench.add_argument("--observations", type=Path, metavar="OBS.json", help=text)
     bench.add_argument("--plot", type=Path, metavar="PNG", help="solvers: plot the loss over time (extra `report`)")

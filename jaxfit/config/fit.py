@@ -84,7 +84,8 @@ class StageConfig:
     """Optimised parameters: global_orient, body_pose, transl, scale, bone_length, betas."""
     solver: Literal["adam", "levenberg_marquardt"] = "adam"
     """`adam`: for all terms. `levenberg_marquardt`: needs 10 to 20 steps instead of hundreds, but only for terms with a
-    known curvature (keypoints, pose_prior, velocity, acceleration) and with fixed bone lengths and shape."""
+    known curvature (keypoints, mask, mask_smooth_l1, pose_prior, velocity, acceleration) and with fixed bone lengths
+    and shape."""
     learning_rate: float = 0.01
     """Adam's step size, in each parameter's own unit."""
     step_scale: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)

@@ -25,6 +25,10 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-5, 1e8
 DAMPING_DECREASE, DAMPING_INCREASE = 0.2, 5.0
 """Factors on the damping after a step that lowered the loss, and after a step that did not lower the loss."""
 
+MOST_RELAXATION, MOMENTUM, PESSIMISTIC = 1.5, 0.4, 0.9
+"""Where the true curvature along the last step was less than `PESSIMISTIC` times that of H, the next step is longer by
+at most the factor `MOST_RELAXATION`, and continues the last step by the share `MOMENTUM`."""
+
 
 class _State(NamedTuple):
     loss: Float[Array, ""]
@@ -34,6 +38,10 @@ class _State(NamedTuple):
     moved: Bool[Array, ""]
     """Whether the pose changed since the curvature was computed."""
     damping: Float[Array, ""]
+    change: Rows
+    """The last step; 0 if the last step was not taken."""
+    curvature_ratio: Float[Array, ""]
+    """Curvature of the objective along the last step, over the curvature of H; 1 if the last step was not taken."""
     rejected: Int[Array, ""]
     """Number of steps from a pose whose loss or gradient is not finite."""
 
@@ -46,18 +54,32 @@ def _init(program: Program, problem: Problem, carried: Any) -> _State:
     loss, gradient = _loss_and_gradient(program, problem, problem.anchor)
     shapes = jax.eval_shape(lambda: _curvature(program, problem, problem.anchor))
     not_computed = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return _State(loss, gradient, not_computed, jnp.bool_(True), jnp.float32(FIRST_DAMPING), jnp.int32(0))
+    return _State(
+        loss=loss,
+        gradient=gradient,
+        curvature=not_computed,
+        moved=jnp.bool_(True),
+        damping=jnp.float32(FIRST_DAMPING),
+        change=jnp.zeros_like(frame_rows(problem.anchor)),
+        curvature_ratio=jnp.float32(1.0),
+        rejected=jnp.int32(0),
+    )
 
 
 def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tuple[Pose, _State]:
-    """Return x + d with (H + μ·diag H)·d = −g if this lowers the objective, else x.
+    """Return x + c with c = ω·d + β·c_last and (H + μ·diag H)·d = −g if this lowers the objective, else x.
 
     The damping μ decreases after a step that lowered the objective, and increases otherwise. H is the curvature of
     the terms' quadratic bounds: JᵀJ within a frame, and one band between frames. Conjugate gradients need only products
     with H, so that the matrix itself is not computed. If the last step did not change the pose, H is not computed
     again.
 
-    Source: Marquardt 1963, An algorithm for least-squares estimation of nonlinear parameters.
+    H is too large where it bounds an unsquared norm or leaves out second derivatives. The ratio κ of the true curvature
+    along the last step to that of H measures this. For κ ≥ 0.9, ω = 1 and β = 0: a plain step. Else ω = 1/κ, at most
+    1.5, and β = 0.4.
+
+    Source: Marquardt 1963, An algorithm for least-squares estimation of nonlinear parameters; Polyak 1964, Some methods
+    of speeding up the convergence of iteration methods (momentum).
     """
     # one condition for the whole batch: under `vmap`, a condition per problem would compute both branches
     curvature = jax.lax.cond(
@@ -75,29 +97,43 @@ def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tupl
         return rows.at[:, -1].set(rows[:, -1].mean()) if scales < frames else rows
 
     gradient = frame_rows(state.gradient)
-    gradient = gradient.at[:, -1].divide(frames // scales)  # the gradient of a common scale is split between the frames
+    gradient = allowed(
+        gradient.at[:, -1].divide(frames // scales)
+    )  # that of a common scale is split between the frames
     diagonal = allowed(curvature.diagonal)
     # a parameter without curvature has no gradient and does not change
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
-    change, _ = cg(
+    newton, _ = cg(
         lambda d: allowed(curvature.product(d)) + state.damping * diagonal * d,
-        -allowed(gradient),
+        -gradient,
         M=lambda d: d / diagonal,
         tol=CG_TOLERANCE,
         maxiter=CG_STEPS,
     )
+    pessimistic = state.curvature_ratio < PESSIMISTIC
+    relaxation = jnp.clip(1 / jnp.maximum(state.curvature_ratio, 1 / MOST_RELAXATION), 1.0, MOST_RELAXATION)
+    change = jnp.where(pessimistic, relaxation * newton + MOMENTUM * state.change, newton)
     new_pose = _add_rows(pose, change)
     loss, new_gradient = _loss_and_gradient(program, problem, new_pose)
     not_finite = ~(jnp.isfinite(state.loss) & _finite(state.gradient))
     lower = ~not_finite & (loss < state.loss) & _finite(new_gradient)
+    bend = jnp.vdot(change, curvature.product(change))
+    ratio = 2 * (loss - state.loss - jnp.vdot(gradient, change)) / jnp.where(bend > 0, bend, 1.0)
 
     def choose(new: Any, old: Any) -> Any:
         return jax.tree.map(lambda a, b: jnp.where(lower, a, b), new, old)
 
     factor = jnp.where(lower, DAMPING_DECREASE, DAMPING_INCREASE)
-    damping = jnp.clip(state.damping * factor, LEAST_DAMPING, MOST_DAMPING)
-    loss, gradient = choose((loss, new_gradient), (state.loss, state.gradient))
-    return choose(new_pose, pose), _State(loss, gradient, curvature, lower, damping, state.rejected + not_finite)
+    return choose(new_pose, pose), _State(
+        loss=choose(loss, state.loss),
+        gradient=choose(new_gradient, state.gradient),
+        curvature=curvature,
+        moved=lower,
+        damping=jnp.clip(state.damping * factor, LEAST_DAMPING, MOST_DAMPING),
+        change=choose(change, jnp.zeros_like(change)),
+        curvature_ratio=choose(ratio, jnp.float32(1.0)),
+        rejected=state.rejected + not_finite,
+    )
 
 
 def _curvature(program: Program, problem: Problem, pose: Pose) -> Curvature:

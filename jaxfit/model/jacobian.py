@@ -10,7 +10,7 @@ from jaxfit.model.kinematics import Rig, each_frame, unit_joints
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import right_jacobian
 
-__all__ = ["keypoint_rotation_rows", "window_keypoint_rows"]
+__all__ = ["keypoint_rotation_rows", "transform_derivatives", "window_keypoint_rows", "window_transform_derivatives"]
 
 
 def keypoint_rotation_rows(
@@ -59,9 +59,44 @@ def window_keypoint_rows(
     return each_frame(frame_rows, pose, A, directions)
 
 
+def transform_derivatives(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "J 3 4 D"]:
+    """Return the derivatives of the joint transforms in the camera frame, B_d = [s·R_d | s·t_d + τ].
+
+    A rest point v is posed at Σ_d w_d · B_d·(v, 1). The columns are the axis-angles of all joints, root first (3J),
+    the translation τ (3) and the scale s (1). A rotation of joint j by ω rotates the transforms of joint j and of its
+    descendants about the posed position p_j of the joint, with ω = R_j·Jr(θ_j)·dθ_j.
+
+    Args:
+        rig: the folded bird.
+        A: unit-scale joint transforms [R_d | t_d] of this pose, one frame.
+        pose: pose of the same frame.
+
+    Returns:
+        The derivatives, model units per radian, per model unit, and per unit of scale.
+
+    Source: the geometric Jacobian, Siciliano et al. 2009, Robotics, section 3.1.
+    """
+    count = len(rig.parents)
+    descendants = jnp.asarray(_descendants(rig.parents), jnp.float32)
+    angles = jnp.concatenate([pose.global_orient[None], pose.body_pose])
+    turn = jnp.sum(A[..., :3, None] * right_jacobian(angles)[:, None], axis=-2)  # (J, 3, 3)
+    centre = jnp.pad(unit_joints(rig, A).T[:, None], ((0, 0), (3, 0), (0, 0)))  # (3, 4, J): 0 but for the last column
+    arm = pose.scale * descendants[:, None, None] * (A[..., None] - centre)  # (J, 3, 4, J)
+    (ax, ay, az), (tx, ty, tz) = jnp.moveaxis(arm[..., None], 1, 0), jnp.moveaxis(turn, 1, 0)
+    by_angles = jnp.stack([ty * az - tz * ay, tz * ax - tx * az, tx * ay - ty * ax], axis=1)  # (J, 3, 4, J, 3)
+    last = jnp.array([0.0, 0.0, 0.0, 1.0])
+    by_transl = jnp.broadcast_to(jnp.eye(3)[:, None] * last[:, None], (count, 3, 4, 3))
+    return jnp.concatenate([by_angles.reshape(count, 3, 4, -1), by_transl, A[..., None]], axis=-1)
+
+
 def _descendants(parents: tuple[int, ...]) -> np.ndarray:
     """Return a (J, J) matrix: entry (d, j) is true if joint d is joint j or a descendant of joint j."""
     descendants = np.eye(len(parents), dtype=bool)
     for d, parent in enumerate(parents[1:], start=1):
         descendants[d] |= descendants[parent]
     return descendants
+
+
+def window_transform_derivatives(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T J 3 4 D"]:
+    """Return `transform_derivatives` of every frame of a window."""
+    return each_frame(lambda frame, A: transform_derivatives(rig, A, frame), pose, A)

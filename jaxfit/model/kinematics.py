@@ -46,6 +46,10 @@ class Rig(eqx.Module):
     vertices: Float[Array, "3 V"]
     """Rest vertices. V is the last axis here and below, so that products run along contiguous memory."""
     skin_weights: Float[Array, "J V"]
+    vertex_joints: Int[Array, "V M"]
+    """The joints that move each vertex, for M joints or fewer."""
+    vertex_weights: Float[Array, "V M"]
+    """Skinning weights of these joints; 0 for entries that are not used."""
     shape_basis: Float[Array, "S 3 V"]
     faces: Int[Array, "F 3"]
     parents: tuple[int, ...] = eqx.field(static=True)
@@ -63,12 +67,16 @@ def fold_bird(bird: Bird) -> Rig:
     def on_keypoints(points):  # Σ_v keypoint_weights · skin_weights · point
         return jnp.asarray(np.einsum("kv,vj,...vc->...kjc", to_keypoints, weights, points, optimize=True), jnp.float32)
 
+    most = max(int((weights != 0).sum(axis=1).max(initial=0)), 1)
+    vertex_joints = np.argsort(weights == 0, axis=1, kind="stable")[:, :most]  # the joints with a weight first
     return Rig(
         joints=jnp.asarray(bird.joints, jnp.float32),
         keypoint_map=on_keypoints(homogeneous),
         keypoint_shape_map=on_keypoints(basis),
         vertices=jnp.asarray(bird.vertices, jnp.float32).T,
         skin_weights=jnp.asarray(weights.T, jnp.float32),
+        vertex_joints=jnp.asarray(vertex_joints, jnp.int32),
+        vertex_weights=jnp.asarray(np.take_along_axis(weights, vertex_joints, axis=1), jnp.float32),
         shape_basis=jnp.asarray(basis.transpose(0, 2, 1), jnp.float32),
         faces=jnp.asarray(bird.faces, jnp.int32),
         parents=bird.parents,

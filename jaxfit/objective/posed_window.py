@@ -14,11 +14,11 @@ from jaxtyping import Array, Bool, Float, UInt8
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird, unlimited_joints
 from jaxfit.model.camera import Camera, project, to_screen
-from jaxfit.model.jacobian import window_keypoint_rows
+from jaxfit.model.jacobian import window_keypoint_rows, window_transform_derivatives
 from jaxfit.model.kinematics import Rig, window_joints, window_keypoints, window_transforms, window_vertices
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
-from jaxfit.raster.silhouette import Blur
+from jaxfit.raster.silhouette import Blur, Skin
 
 __all__ = ["PosedWindow", "Priors", "Raster", "Targets", "priors_of"]
 
@@ -206,6 +206,14 @@ class PosedWindow:
         screen = to_screen(window_vertices(self._rig, self._transforms, self.pose), self.camera)
         ratio = self.raster.size_px / self.camera.size_px
         return screen if ratio == 1 else screen * jnp.array([ratio, ratio, 1.0])
+
+    @cached_property
+    def skin(self) -> Skin:
+        """Derivatives of the vertices with respect to the pose, in factors. Only `slope` (T, J, 3, 4, 3J + 4) has a
+        leading frame axis."""
+        rest = self._rig.vertices + jnp.tensordot(self.pose.betas, self._rig.shape_basis, axes=1)
+        slope = window_transform_derivatives(self._rig, self._transforms, self.pose)
+        return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope)
 
     @property
     def faces(self):

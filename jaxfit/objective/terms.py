@@ -6,8 +6,6 @@ traced, so a sweep over them needs one compiled program.
 
 from __future__ import annotations
 
-from typing import Literal
-
 import jax
 import jax.numpy as jnp
 from jax.tree_util import Partial
@@ -17,7 +15,7 @@ from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.curvature import Curvature, Rows
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.raster.silhouette import mask_loss
+from jaxfit.raster.silhouette import Kind, mask_loss, silhouette_gauss_newton
 
 __all__ = [
     "bone_prior",
@@ -77,7 +75,30 @@ def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Scalar
     return jnp.sum(window.targets.confidence * robust)
 
 
-@term(compares_masks=True)
+def _mask_curvature(window: PosedWindow) -> Curvature:
+    """Return H = JᵀJ with J the derivative of the silhouette: the Gauss-Newton matrix of Σ ½e².
+
+    The L1 norm has the same H. Its quadratic bound is ½ Σ e²/n with n = |e| ≤ 1, so H is smaller than the curvature of
+    the bound. With the bound, the solver needs about twice as many steps, because few pixels end at e = 0.
+    """
+    ratio = window.raster.size_px / window.camera.size_px
+    camera_px = window.camera.focal_px * ratio, window.camera.centre_px * ratio
+    raster = {"blur": window.raster.blur, "backend": window.raster.backend}
+
+    def frame(vertices_screen, weight, slope):
+        skin = window.skin._replace(slope=slope)
+        size = window.raster.size_px
+        return silhouette_gauss_newton(vertices_screen, window.faces, weight, skin, size, camera_px, **raster)
+
+    blocks = jax.vmap(frame)(window.vertices_screen, _mask_weight(window), window.skin.slope)
+    return Curvature(Partial(_blocks_product, blocks), jnp.diagonal(blocks, axis1=-2, axis2=-1))
+
+
+def _blocks_product(blocks: Float[Array, "T D D"], d: Rows) -> Rows:
+    return jnp.einsum("tij,tj->ti", blocks, d)
+
+
+@term(compares_masks=True, curvature=_mask_curvature)
 def mask(window: PosedWindow) -> Scalar:
     """Compare silhouette and mask by the L1 norm: E_msk = Σ_t Σ_pixels |soft silhouette − mask|.
 
@@ -88,7 +109,7 @@ def mask(window: PosedWindow) -> Scalar:
     return _mask(window, "l1")
 
 
-@term(compares_masks=True)
+@term(compares_masks=True, curvature=_mask_curvature)
 def mask_smooth_l1(window: PosedWindow) -> Scalar:
     """Compare silhouette and mask by smooth-L1, as AVES does: Σ_t Σ_pixels ½e², e = soft silhouette − mask.
 
@@ -99,15 +120,18 @@ def mask_smooth_l1(window: PosedWindow) -> Scalar:
     return _mask(window, "smooth_l1")
 
 
-def _mask(window: PosedWindow, kind: Literal["l1", "smooth_l1"]) -> Scalar:
-    # a sum over crop pixels, whatever the size of the silhouette
-    weight = window.targets.has_mask.astype(jnp.float32) * (window.camera.size_px / window.raster.size_px) ** 2
+def _mask(window: PosedWindow, kind: Kind) -> Scalar:
     raster = {"blur": window.raster.blur, "backend": window.raster.backend}
 
     def frame(vertices_screen, target, weight):
         return mask_loss(vertices_screen, window.faces, target, weight, kind=kind, **raster)
 
-    return jnp.sum(jax.vmap(frame)(window.vertices_screen, window.targets.mask, weight))
+    return jnp.sum(jax.vmap(frame)(window.vertices_screen, window.targets.mask, _mask_weight(window)))
+
+
+def _mask_weight(window: PosedWindow) -> Float[Array, "T"]:
+    """Return the area of a pixel of the silhouette in crop pixels, 0 for frames without a mask."""
+    return jnp.asarray(window.targets.has_mask, jnp.float32) * (window.camera.size_px / window.raster.size_px) ** 2
 
 
 def _pose_prior_curvature(window: PosedWindow) -> Curvature:

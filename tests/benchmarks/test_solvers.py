@@ -10,16 +10,16 @@ from jaxfit.benchmarks.solvers import SCHEDULES, bench_solvers, plot_solvers
 pytestmark = pytest.mark.extended
 
 
-@pytest.fixture(scope="module")
-def result():
+@pytest.fixture(scope="module", params=SCHEDULES)
+def result(request):
     bird = toy_bird(shapes=0)
-    return bench_solvers(noisy_scene(bird, 2, 5)[1], bird, limit=12, repeats=2)
+    return bench_solvers(noisy_scene(bird, 2, 5)[1], bird, request.param, limit=12, repeats=2)
 
 
 def test_curves(result):
     assert (result["birds"], result["windows"]) == (2, 2)
-    assert len({result[name]["loss"][0] for name in SCHEDULES}) == 1
-    for name in SCHEDULES:
+    assert len({result[name]["loss"][0] for name in SCHEDULES[result["stage"]]}) == 1
+    for name in SCHEDULES[result["stage"]]:
         steps, seconds, loss = (result[name][key] for key in ("steps", "seconds", "loss"))
         assert len(steps) == len(seconds) == len(loss)
         assert (steps[0], steps[-1]) == (0, 12)

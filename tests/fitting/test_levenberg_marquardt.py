@@ -11,7 +11,14 @@ from support.stages import BIRD, FIRST, B, T, case, problems, program, solve, to
 from jaxfit.config.fit import load_config
 from jaxfit.fitting import levenberg_marquardt
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.levenberg_marquardt import DAMPING_DECREASE, DAMPING_INCREASE, FIRST_DAMPING, LEVENBERG_MARQUARDT
+from jaxfit.fitting.levenberg_marquardt import (
+    DAMPING_DECREASE,
+    DAMPING_INCREASE,
+    FIRST_DAMPING,
+    LEVENBERG_MARQUARDT,
+    MOMENTUM,
+    MOST_RELAXATION,
+)
 from jaxfit.fitting.problem import BATCH_AXIS, problem_window
 from jaxfit.objective.curvature import frame_rows
 from jaxfit.objective.objective import evaluate_curvature
@@ -104,6 +111,40 @@ def test_a_step_solves_the_equation(monkeypatch):
     np.testing.assert_allclose(after.loss, total_of(stage, pose, problem), rtol=1e-5)
 
 
+def test_a_step_is_longer_where_the_curvature_was_too_large(monkeypatch):
+    """c = ω·d + β·c_last with ω = 1/κ."""
+    monkeypatch.setattr(levenberg_marquardt, "CG_TOLERANCE", 1e-6)
+    stage = dataclasses.replace(NEWTON, optimised=FEW)
+    problem = first_problem(stage)
+    newton = dense_step(stage, problem, DAMPING)
+    for ratio, relaxation, momentum in ((0.8, 1.25, MOMENTUM), (0.1, MOST_RELAXATION, MOMENTUM), (0.95, 1.0, 0.0)):
+        state = {"damping": DAMPING, "curvature_ratio": ratio, "change": 0.2 * newton}
+        state = {name: jnp.asarray(value, jnp.float32) for name, value in state.items()}
+        _, [(pose, after)] = take_steps(stage, problem, **state)
+        change = np.asarray(frame_rows(pose) - frame_rows(problem.anchor))
+        expected = (relaxation + 0.2 * momentum) * newton
+        np.testing.assert_allclose(change, expected, atol=2e-3 * np.abs(expected).max())
+        np.testing.assert_array_equal(after.change, np.where(change == 0, 0, after.change))
+
+
+def test_the_curvature_ratio_compares_the_objective_with_its_quadratic(monkeypatch):
+    """κ = 2·(E(x + c) − E(x) − g·c) / c·H·c."""
+    problem = first_problem(NEWTON)
+    _, [(pose, after)] = take_steps(NEWTON, problem, damping=jnp.float32(DAMPING))
+    own, anchor, c = program(NEWTON), problem.anchor, after.change
+
+    @jax.jit
+    def parts(pose, c):
+        H = evaluate_curvature(problem_window(own, problem, anchor), own.terms, problem.hyperparameters.settings)
+        loss, gradient = jax.value_and_grad(lambda pose: total_of(NEWTON, pose, problem))(anchor)
+        g = frame_rows(gradient)
+        slope = jnp.vdot(g.at[:, -1].divide(T), c)
+        return total_of(NEWTON, pose, problem) - loss - slope, jnp.vdot(c, H.product(c))
+
+    difference, bend = parts(pose, c)
+    assert after.curvature_ratio == pytest.approx(float(2 * difference / bend), rel=2e-2)
+
+
 def test_a_step_that_increases_the_loss_is_not_taken():
     """The loss in the state is 0, so that every step increases the loss."""
     problem = first_problem(NEWTON)
@@ -114,6 +155,8 @@ def test_a_step_that_increases_the_loss_is_not_taken():
     assert after.damping == pytest.approx(FIRST_DAMPING * DAMPING_INCREASE)
     assert after.rejected == 0
     assert not after.moved
+    assert after.curvature_ratio == 1
+    assert not np.any(after.change)
 
 
 @pytest.mark.parametrize("loss", [np.inf, np.nan])
@@ -186,3 +229,23 @@ def test_a_fit_of_single_frames():
         assert result.status.tolist() == ["ok"]
         loss[solver] = sum(x.sum() for x in result.loss.values())
     assert loss["levenberg_marquardt"] < 1.001 * loss["adam"]
+
+
+@pytest.mark.extended
+def test_fast_reaches_the_loss_of_paper():
+    """In both stages, with masks, for birds that miss a mask or a frame."""
+    configs = {name: load_config(name) for name in ("paper", "fast")}
+    observed = detect(BIRD, [smooth_motion(BIRD, 4, seed) for seed in (3, 4)], 1.0, 0.0)
+    masks = {key: mask for key, mask in observed.masks.items() if key != (0, 1)}
+    confidence = np.where(np.arange(4)[:, None] == 2, 0, observed.confidence)
+    observed = dataclasses.replace(observed.with_keypoints(observed.keypoints_px, confidence), masks=masks)
+    loss = {}
+    for name, config in configs.items():
+        steps = {"paper": (150, 150), "fast": (12, 16)}[name]
+        stages = tuple(dataclasses.replace(stage, steps=n) for stage, n in zip(config.stages, steps, strict=True))
+        assert name == "paper" or config.stages == stages, "the steps of the shipped config"
+        small = dataclasses.replace(config, stages=stages, window=4, crop=dataclasses.replace(config.crop, size_px=96))
+        result = fit(observed, BIRD, small)
+        assert result.status.tolist() == ["ok", "ok"]
+        loss[name] = sum(result.loss.values())
+    assert (loss["fast"] <= 1.01 * loss["paper"]).all(), loss

@@ -4,16 +4,19 @@
 """
 
 from jaxfit.raster.silhouette.native import available_isas, choose_isa, current_isa, kernels_available
-from jaxfit.raster.silhouette.operator import Backend, mask_loss, silhouette
-from jaxfit.raster.silhouette.reference import Blur
+from jaxfit.raster.silhouette.operator import Backend, Kind, mask_loss, silhouette, silhouette_gauss_newton
+from jaxfit.raster.silhouette.reference import Blur, Skin
 
 __all__ = [
     "Backend",
     "Blur",
+    "Kind",
+    "Skin",
     "available_isas",
     "choose_isa",
     "current_isa",
     "kernels_available",
     "mask_loss",
     "silhouette",
+    "silhouette_gauss_newton",
 ]

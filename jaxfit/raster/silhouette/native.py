@@ -6,7 +6,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfit.raster.kernels import available_isas, choose_isa, current_isa, kernels_available, require_kernels
-from jaxfit.raster.silhouette.reference import KINDS, Blur
+from jaxfit.raster.silhouette.reference import KINDS, Blur, Skin
+
+LANES = 16
+"""The kernels need a number of parameters that is a multiple of this."""
 
 __all__ = [
     "available_isas",
@@ -16,6 +19,7 @@ __all__ = [
     "mask_loss",
     "mask_loss_and_gradient",
     "silhouette",
+    "silhouette_gauss_newton",
     "silhouette_gradient",
 ]
 
@@ -69,3 +73,23 @@ def mask_loss_and_gradient(
     results = (jax.ShapeDtypeStruct((), jnp.float32), _shape_like(vertices))
     operands = (vertices, faces, target, weight)
     return _call("jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))
+
+
+def silhouette_gauss_newton(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    weight: Float[Array, ""],
+    skin: Skin,
+    size: int,
+    camera_px: tuple[float, float],
+    blur: Blur,
+) -> Float[Array, "D D"]:
+    """Return the unweighted Gauss-Newton block. A weight of 0 gives a block of 0 and skips the rendering."""
+    parameters = skin.slope.shape[-1]
+    padding = -parameters % LANES
+    slope = jnp.pad(skin.slope, ((0, 0), (0, 0), (0, 0), (0, padding)))
+    block = jax.ShapeDtypeStruct((parameters + padding, parameters + padding), jnp.float32)
+    operands = (vertices, faces, weight, skin.rest, skin.joint, skin.weight, slope)
+    focal, centre = (np.float32(x) for x in camera_px)
+    attributes = {"size": np.int32(size), "focal": focal, "centre": centre}
+    return _call("jaxfit_silhouette_gauss_newton", block, *operands, blur=blur, **attributes)[:parameters, :parameters]

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfit.raster.silhouette import native, reference
-from jaxfit.raster.silhouette.reference import Blur
+from jaxfit.raster.silhouette.reference import Blur, Skin
 
 Backend = Literal["auto", "native", "reference"]
 Kind = Literal["l1", "smooth_l1"]
@@ -55,8 +55,7 @@ def silhouette(
     of faces per pixel.
     """
     _check_mesh(vertices_screen, faces)
-    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not 0 < size <= 2**14:
-        raise ValueError(f"size: expected an integer from 1 to {2**14}, got {size!r}")
+    _check_size(size)
     blur = Blur.for_size(size) if blur is None else blur
     vertices, faces = _as_operands(vertices_screen, faces)
     image: Any = _silhouette(vertices, faces, int(size), blur, _choose(backend))
@@ -117,6 +116,59 @@ def mask_loss(
     switch = jax.lax.stop_gradient(weight)
     loss: Any = _mask_loss(vertices, faces, target, switch, kind, blur, _choose(backend))
     return (weight * loss).astype(vertices_screen.dtype)
+
+
+def silhouette_gauss_newton(
+    vertices_screen: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    weight: Float[Array, ""] | float,
+    skin: Skin,
+    size: int,
+    camera_px: tuple[float, float],
+    *,
+    blur: Blur | None = None,
+    backend: Backend = "auto",
+) -> Float[Array, "D D"]:
+    """Return the Gauss-Newton block of the soft silhouette for the D parameters of a skinned mesh.
+
+    H = w · Σ j·jᵀ over the pixels with 0.01 < S < 0.99, where S is `silhouette` and j = dS / d parameters. H is the
+    curvature of ½ Σ (S − target)², and the solver uses H for both mask losses.
+
+    The kernels sum over at most 256 pixels. Of more pixels they take an evenly spread part, and scale the sum. H has no
+    gradient.
+
+    Args:
+        vertices_screen, faces, size, blur, backend: as for `silhouette`. The depth is that of the camera frame of
+            `skin`, in the unit of its rest vertices.
+        weight: w. An image of weight 0 is not rendered, and its H is 0.
+        skin: rest vertices, skinning weights and derivatives of the joint transforms.
+        camera_px: focal length and centre of the image in pixels of the silhouette, for the pinhole camera
+            pixel = focal · (x, y) / z + centre.
+
+    Returns:
+        H, positive semi-definite, px² per unit of each of two parameters.
+
+    Raises:
+        ValueError: the shape, type or value of an argument is not as described.
+        RuntimeError: backend="native" without kernels.
+    """
+    _check_mesh(vertices_screen, faces)
+    _check_size(size)
+    blur = Blur.for_size(size) if blur is None else blur
+    vertices, faces = _as_operands(vertices_screen, faces)
+    weight = jnp.asarray(weight, jnp.float32)
+    block: Any = _dispatch(
+        _choose(backend),
+        lambda v, f, w, s: native.silhouette_gauss_newton(v, f, w, s, int(size), camera_px, blur),
+        lambda v, f, w, s: reference.silhouette_gauss_newton(v, f, w, s, int(size), camera_px, blur),
+        *jax.lax.stop_gradient((vertices, faces, weight, skin)),
+    )
+    return weight * block
+
+
+def _check_size(size) -> None:
+    if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not 0 < size <= 2**14:
+        raise ValueError(f"size: expected an integer from 1 to {2**14}, got {size!r}")
 
 
 def _check_mesh(vertices, faces) -> None:

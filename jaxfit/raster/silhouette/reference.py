@@ -5,6 +5,7 @@ The reference runs on any platform and JAX derives its gradients. It is a few hu
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ KINDS = ("l1", "smooth_l1")
 MIN_DEPTH = 1e-8  # a face with a vertex at or behind this depth is skipped
 MIN_AREA = 1e-8  # a face with at most this |2·area|, in units of half the image, is skipped
 FAR_AWAY = 2.0**20  # px; coordinates are clamped to ± this, so that their squares stay finite
+BAND_EDGE = 0.01  # the Gauss-Newton block sums over the pixels whose silhouette is this far from 0 and from 1
 _FACES_AT_ONCE = 16
 
 
@@ -41,6 +43,20 @@ class Blur:
         """Return the usual blur of a square image: s = 1e-4 (size/2)², radius = (size/2) √(1e-4 ln(1e4 − 1))."""
         half = size / 2
         return Blur(sigma=1e-4 * half**2, radius=half * math.sqrt(1e-4 * math.log(1e4 - 1)))
+
+
+class Skin(NamedTuple):
+    """A mesh posed by linear blend skinning. Vertex v lies at Σ_m weight[v, m] · B[joint[v, m]] · (rest[v], 1) in the
+    camera frame, where the transforms B (J, 3, 4) depend on D parameters."""
+
+    rest: Float[Array, "V 3"]
+    """Vertices at rest."""
+    joint: Int[Array, "V M"]
+    """The joints that move each vertex."""
+    weight: Float[Array, "V M"]
+    """Their skinning weights; 0 for entries that are not used."""
+    slope: Float[Array, "J 3 4 D"]
+    """Derivatives of B."""
 
 
 def _segment_distance_squared(x, y, a, b):
@@ -128,3 +144,32 @@ def mask_loss(
     if kind == "smooth_l1":
         magnitude = jnp.where(magnitude < 1, 0.5 * error**2, magnitude - 0.5)
     return jnp.where(missing, 0.0, jnp.sum(magnitude))
+
+
+def silhouette_gauss_newton(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    weight: Float[Array, ""],
+    skin: Skin,
+    size: int,
+    camera_px: tuple[float, float],
+    blur: Blur,
+) -> Float[Array, "D D"]:
+    """Return the unweighted Gauss-Newton block over all pixels of the band. A weight of 0 gives a block of 0."""
+    focal, centre = camera_px
+    missing = weight == 0
+    vertices = jnp.where(missing, 1.0, vertices)
+    rest = jnp.concatenate([skin.rest, jnp.ones_like(skin.rest[:, :1])], axis=1)
+    moved_cam = jnp.einsum("vm,vmicd,vc->dvi", skin.weight, skin.slope[skin.joint], rest)  # (D, V, 3)
+    depth = vertices[:, 2:]
+    moved_px = (focal * moved_cam[..., :2] - (vertices[:, :2] - centre) * moved_cam[..., 2:]) / depth
+    tangents = jnp.concatenate([moved_px, moved_cam[..., 2:]], axis=-1)
+
+    def image(v):
+        return silhouette(v, faces, size, blur)
+
+    value = image(vertices)
+    rows = jax.vmap(lambda tangent: jax.jvp(image, (vertices,), (tangent,))[1])(tangents)  # (D, size, size)
+    band = (value > BAND_EDGE) & (value < 1 - BAND_EDGE)
+    block = jnp.einsum("dyx,eyx->de", jnp.where(band, rows, 0.0), rows)
+    return jnp.where(missing, 0.0, block)

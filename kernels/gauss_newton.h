@@ -1,0 +1,190 @@
+// The Gauss-Newton block of the silhouette of one image. Part of silhouette.cc.
+//
+// The block is Jᵀ·J with one row of J = d silhouette / d parameters for each pixel of the band in which the silhouette
+// is neither 0 nor 1. Of a band with more than kMostRows pixels, an evenly spread part enters with a larger weight.
+// A row is the sum over the faces near the pixel: d silhouette / d vertex, times d vertex / d parameters. The second
+// factor is computed once for each vertex that some row needs.
+#pragma once
+
+#include "products.h"
+
+namespace jaxfit {
+namespace {
+
+constexpr int64_t kMostRows = 256;
+constexpr float kBandEdge = 0.01f;    // the band holds the pixels whose silhouette is this far from 0 and from 1
+
+struct Rows {
+  float* values;        // (kMostRows, D)
+  int32_t* of_pixel;    // for each chosen pixel of each block the index of its row
+  float* of_vertex;     // (V, 2, D): d vertex / d parameters in px, for the vertices that are ready
+  uint8_t* ready;       // (V)
+  uint16_t* chosen;     // for each block the pixels that have a row, as bits
+  int64_t count;
+};
+
+size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, int64_t size) {
+  const Layout l(mesh, size);
+  const int64_t floats = kMostRows * skin.parameters + l.products + 2 * mesh.num_vertices * skin.parameters;
+  return workspace(mesh, size) + sizeof(float) * (floats + l.vertices) + sizeof(uint16_t) * l.blocks * l.blocks;
+}
+
+INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, int64_t size, void* memory) {
+  const Layout l(mesh, size);
+  Rows rows;
+  rows.values = reinterpret_cast<float*>(static_cast<char*>(memory) + workspace(mesh, size));
+  rows.of_vertex = rows.values + kMostRows * skin.parameters;
+  rows.of_pixel = reinterpret_cast<int32_t*>(rows.of_vertex + 2 * mesh.num_vertices * skin.parameters);
+  rows.chosen = reinterpret_cast<uint16_t*>(rows.of_pixel + l.products);
+  rows.ready = reinterpret_cast<uint8_t*>(rows.chosen + l.blocks * l.blocks);
+  for (int64_t i = 0; i < mesh.num_vertices; ++i) rows.ready[i] = 0;
+  rows.count = 0;
+  return rows;
+}
+
+// Replaces the products by the factors of p · (pixel - nearest point) in d silhouette. Returns the pixels in the band.
+int64_t set_row_factors(Scale scale, Workspace& ws) {
+  const Vec one = all(1.f), low = all(kBandEdge), high = all(1 - kBandEdge);
+  int64_t count = 0;
+  for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
+    const Vec transmitted = one / load(place);
+    const Mask band = (transmitted > low) & (high > transmitted);
+    if (!bits(band)) {
+      close(ws, column, row);
+      return;
+    }
+    store(place, keep(band, transmitted * all(scale.slope)));
+    count += __builtin_popcount(bits(band));
+  });
+  return count;
+}
+
+// Gives rows to the pixels of the band: to all, or to a part whose factors grow by √(band / part).
+void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
+  const bool every = band <= kMostRows;
+  const double part = every ? 1 : 0.95 * kMostRows / static_cast<double>(band);  // 0.95, because the number of chosen pixels varies
+  const uint32_t threshold = static_cast<uint32_t>(part * 4294967295.0);
+  const Vec grown = all(every ? 1.f : __builtin_sqrtf(static_cast<float>(1 / part)));
+  uint32_t number = 0;
+  for_each_place(ws, [&](float* place, int64_t column, int64_t row) {
+    int32_t* of_pixel = rows.of_pixel + (place - ws.products);
+    if (!(ws.open[row * ws.row_bytes + column / 8] >> column % 8 & 1)) return;
+    uint16_t mine = 0;
+    for (int i = 0; i < kLanes; ++i) {
+      if (place[i] == 0) continue;
+      // steps of the golden ratio spread the chosen pixels evenly along the band
+      const bool chosen = every || number * 2654435769u < threshold;
+      ++number;
+      if (chosen && rows.count < kMostRows) of_pixel[i] = static_cast<int32_t>(rows.count++), mine |= 1u << i;
+    }
+    rows.chosen[(place - ws.products) / kLanes] = mine;
+    store(place, load(place) * grown);
+    if (!mine) close(ws, column, row);
+  });
+}
+
+// Returns d vertex / d parameters in px: D derivatives of x, then D of y.
+INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, Rows& rows) {
+  const int64_t D = skin.parameters;
+  float* out = rows.of_vertex + 2 * v * D;
+  if (rows.ready[v]) return out;
+  rows.ready[v] = 1;
+  const float* at = mesh.vertices + 3 * v;
+  const float* rest = skin.rest + 3 * v;
+  const float zoom = skin.focal / at[2];
+  const float by_depth[2] = {(skin.centre - at[0]) / at[2], (skin.centre - at[1]) / at[2]};
+  for (int64_t d = 0; d < D; d += kLanes) {
+    Vec x[3] = {all(0.f), all(0.f), all(0.f)};  // d position / d parameters, camera frame
+    for (int64_t m = 0; m < skin.per_vertex; ++m) {
+      const float w = skin.weight[v * skin.per_vertex + m];
+      if (w == 0) continue;
+      const float* slope = skin.slope + skin.joint[v * skin.per_vertex + m] * 12 * D + d;
+      for (int i = 0; i < 3; ++i, slope += 4 * D)
+        for (int c = 0; c < 4; ++c) x[i] = fma(all(c < 3 ? w * rest[c] : w), load(slope + c * D), x[i]);
+    }
+    for (int i = 0; i < 2; ++i) store(out + i * D + d, fma(all(zoom), x[i], all(by_depth[i]) * x[2]));
+  }
+  return out;
+}
+
+void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, Rows& rows) {
+  const int64_t D = skin.parameters;
+  const Vec outside = all(scale.radius * scale.radius);
+  for (int64_t i = 0; i < rows.count * D; ++i) rows.values[i] = 0;
+  for (int64_t c = 0; c < ws.num_chunks; ++c) {
+    const Faces& f = ws.faces[c];
+    for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
+      const int lane = __builtin_ctz(todo);
+      for_each_block(f, lane, scale, ws,
+                     [&](const Distances& at, const Nearest& n, float* place, int64_t, int64_t)
+                         __attribute__((always_inline)) {
+        const int32_t* of_pixel = rows.of_pixel + (place - ws.products);
+        const uint32_t chosen = rows.chosen[(place - ws.products) / kLanes];
+        const Mask in = outside > n.d;
+        if (!(bits(in) & chosen)) return;
+        const Vec pull = flip_sign(load(place) * reciprocal(all(1.f) + exp2(n.d)), n.d);
+        Mask mine[3];
+        mine[0] = in & (n.square[0] <= n.smallest);
+        mine[1] = without(in & (n.square[1] <= n.smallest), mine[0]);
+        mine[2] = without(without(in, mine[0]), mine[1]);
+        for (int i = 0; i < 3; ++i) {
+          uint32_t pixels = bits(mine[i]) & chosen;
+          if (!pixels) continue;
+          const Vec tx = all(f.tx[i][lane]), ty = all(f.ty[i][lane]);
+          alignas(64) float pull_x[kLanes], pull_y[kLanes], place_along[kLanes];
+          store(pull_x, pull * fms(tx, n.beyond[i], ty * at.across[i]));
+          store(pull_y, pull * fma(ty, n.beyond[i], tx * at.across[i]));
+          store(place_along, n.clamped[i] * all(0.5f / f.half[i][lane]));
+          const float* a = nullptr;
+          const float* b = nullptr;
+          for (; pixels; pixels &= pixels - 1) {
+            const int k = __builtin_ctz(pixels);
+            if (!a) {
+              a = vertex_rows(mesh, skin, f.vertex[i][lane], rows);
+              b = vertex_rows(mesh, skin, f.vertex[(i + 1) % 3][lane], rows);
+            }
+            const float to_a = 0.5f - place_along[k], to_b = 0.5f + place_along[k];
+            const Vec ax = all(to_a * pull_x[k]), ay = all(to_a * pull_y[k]);
+            const Vec bx = all(to_b * pull_x[k]), by = all(to_b * pull_y[k]);
+            float* row = rows.values + of_pixel[k] * D;
+            for (int64_t d = 0; d < D; d += kLanes) {
+              Vec sum = load(row + d);
+              sum = fma(ax, load(a + d), fma(ay, load(a + D + d), sum));
+              sum = fma(bx, load(b + d), fma(by, load(b + D + d), sum));
+              store(row + d, sum);
+            }
+          }
+        }
+      });
+    }
+  }
+}
+
+// block = rowsᵀ · rows, four lines of the block at a time.
+void multiply_rows(const Rows& rows, int64_t D, float* block) {
+  for (int64_t i = 0; i < D; i += 4)
+    for (int64_t d = i / kLanes * kLanes; d < D; d += kLanes) {
+      Vec sums[4] = {all(0.f), all(0.f), all(0.f), all(0.f)};
+      for (int64_t r = 0; r < rows.count; ++r) {
+        const float* row = rows.values + r * D;
+        const Vec right = load(row + d);
+        for (int k = 0; k < 4; ++k) sums[k] = fma(all(row[i + k]), right, sums[k]);
+      }
+      for (int k = 0; k < 4; ++k) store(block + (i + k) * D + d, sums[k]);
+    }
+  for (int64_t i = 0; i < D; ++i)
+    for (int64_t d = 0; d < i; ++d) block[i * D + d] = block[d * D + i];
+}
+
+void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory, float* block) {
+  Workspace ws = carve(mesh, size, memory);
+  const Scale scale = scale_of(blur, size);
+  if (!render(mesh, size, scale, ws)) return fill(block, skin.parameters * skin.parameters, __builtin_nanf(""));
+  Rows rows = carve_rows(mesh, skin, size, memory);
+  choose_rows(set_row_factors(scale, ws), ws, rows);
+  fill_rows(mesh, skin, scale, ws, rows);
+  multiply_rows(rows, skin.parameters, block);
+}
+
+}  // namespace
+}  // namespace jaxfit

@@ -1,0 +1,173 @@
+"""The Gauss-Newton block of the silhouette: JᵀJ with J from automatic differentiation of the reference."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from support.birds import toy_bird
+
+from jaxfit.model.camera import Camera, to_screen
+from jaxfit.model.jacobian import transform_derivatives
+from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_vertices
+from jaxfit.model.pose import Pose
+from jaxfit.raster import silhouette as raster
+from jaxfit.raster.silhouette import reference
+
+ISAS = raster.available_isas()
+BIRD = toy_bird()
+RIG = fold_bird(BIRD)
+SIZE = 40
+BLUR = raster.Blur(sigma=1.0, radius=3.0)
+"""So sharp that all pixels of the band fit into the rows of the kernels."""
+BONES, BETAS = jnp.linspace(0.9, 1.1, 7), jnp.asarray([0.5, -0.3])
+
+
+@pytest.fixture(params=ISAS or [None])
+def native(request):
+    if request.param is None:
+        pytest.skip("no compiled kernels here")
+    raster.choose_isa(request.param)
+    yield "native"
+    raster.choose_isa("auto")
+
+
+def pose_of(row) -> Pose:
+    return Pose(row[:3], row[3:-4].reshape(-1, 3), row[-4:-1], row[-1], BONES, BETAS)
+
+
+def row_of(transl=(0.3, -0.2, 180.0), seed=0):
+    rng = np.random.default_rng(seed)
+    angles = [1.2, 0.3, 0.5, *rng.normal(scale=0.2, size=21)]
+    return jnp.asarray([*angles, *transl, 1.1], jnp.float32)
+
+
+@functools.partial(jax.jit, static_argnames="size")
+def on_screen(row, size=SIZE):
+    pose, ratio = pose_of(row), size / Camera().size_px
+    screen = to_screen(posed_vertices(RIG, joint_transforms(RIG, pose), pose), Camera())
+    return screen * jnp.array([ratio, ratio, 1.0])
+
+
+@jax.jit
+def skin_of(row):
+    pose = pose_of(row)
+    rest = (RIG.vertices + jnp.tensordot(BETAS, RIG.shape_basis, axes=1)).T
+    slope = transform_derivatives(RIG, joint_transforms(RIG, pose), pose)
+    return raster.Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope)
+
+
+def block(row, backend, weight=1.0, vertices=None, faces=RIG.faces, blur=BLUR, size=SIZE):
+    vertices = on_screen(row, size) if vertices is None else vertices
+    return compiled_block(vertices, faces, weight, skin_of(row), backend, blur, size)
+
+
+@functools.partial(jax.jit, static_argnames=("backend", "blur", "size"))
+def compiled_block(vertices, faces, weight, skin, backend, blur, size):
+    ratio = size / Camera().size_px
+    camera_px = Camera().focal_px * ratio, Camera().centre_px * ratio
+    return raster.silhouette_gauss_newton(vertices, faces, weight, skin, size, camera_px, blur=blur, backend=backend)
+
+
+@jax.jit
+def by_autodiff(row):
+    """JᵀJ over the band, and the number of pixels in the band."""
+
+    def image(row):
+        return reference.silhouette(on_screen(row), RIG.faces, SIZE, BLUR)
+
+    value, J = image(row), jax.jacfwd(image)(row)
+    band = (value > 0.01) & (value < 0.99)
+    return jnp.einsum("yxd,yxe->de", jnp.where(band[..., None], J, 0.0), J), band.sum()
+
+
+def test_transform_derivatives():
+    def transforms(row):
+        pose = pose_of(row)
+        A = joint_transforms(RIG, pose)
+        return jnp.concatenate([pose.scale * A[..., :3], (pose.scale * A[..., 3] + pose.transl)[..., None]], axis=-1)
+
+    row = row_of()
+    pose = pose_of(row)
+    actual = transform_derivatives(RIG, joint_transforms(RIG, pose), pose)
+    expected = jax.jacfwd(transforms)(row)
+    np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
+
+
+PLACES = {"inside": (0.3, -0.2, 180.0), "at the border": (9.0, 4.0, 180.0), "partly behind the camera": (0.0, 0.0, 3.0)}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_reference_is_the_square_of_the_jacobian(place):
+    row = row_of(PLACES[place])
+    expected, band = by_autodiff(row)
+    assert 10 < band <= 256
+    np.testing.assert_allclose(block(row, "reference"), expected, atol=1e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_kernels_equal_the_reference(native, place):
+    row = row_of(PLACES[place])
+    expected = block(row, "reference")
+    np.testing.assert_allclose(block(row, native), expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_a_bird_outside_the_image_has_no_curvature(native):
+    for backend in (native, "reference"):
+        assert not np.any(block(row_of((60.0, 0.0, 180.0)), backend))
+
+
+def test_degenerate_faces_are_skipped(native):
+    row = row_of()
+    more = jnp.concatenate([RIG.faces, jnp.asarray([[0, 0, 1], [5, 5, 5]], jnp.int32)])
+    for backend in (native, "reference"):
+        expected = block(row, backend)
+        np.testing.assert_allclose(block(row, backend, faces=more), expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_weights(native):
+    row = row_of()
+    broken = jnp.full_like(on_screen(row), jnp.nan)
+    for backend in (native, "reference"):
+        np.testing.assert_allclose(block(row, backend, 2.5), 2.5 * block(row, backend), rtol=1e-6)
+        assert not np.any(block(row, backend, 0.0, vertices=broken)), "an image of weight 0 is not rendered"
+        assert np.isnan(block(row, backend, vertices=broken)).any()
+
+
+def test_many_pixels_are_sampled_evenly(native):
+    """With a wide band, the kernels sum over a part of the pixels, and scale the sum."""
+    row, blur = row_of(), raster.Blur(sigma=12.0, radius=12.0)
+    image = raster.silhouette(on_screen(row, 64), RIG.faces, 64, blur=blur)
+    assert ((image > 0.01) & (image < 0.99)).sum() > 2 * 256
+    exact, sampled = (
+        np.asarray(block(row, backend, blur=blur, size=64), np.float64) for backend in ("reference", native)
+    )
+    np.testing.assert_allclose(np.trace(sampled), np.trace(exact), rtol=0.1)
+    assert np.linalg.norm(sampled - exact) < 0.15 * np.linalg.norm(exact)
+    np.testing.assert_array_equal(sampled, sampled.T)
+
+
+def test_a_batch_equals_single_images(native):
+    rows = jnp.stack([row_of(seed=n) for n in range(3)])
+    weights = jnp.asarray([1.0, 0.0, 2.0])
+    together = jax.jit(jax.vmap(lambda row, weight: block(row, native, weight)))(rows, weights)
+    for n in range(3):
+        alone = block(rows[n], native, weights[n])
+        np.testing.assert_allclose(together[n], alone, atol=1e-5 * max(float(np.abs(alone).max()), 1))
+
+
+def test_wrong_arguments(native):
+    row = row_of()
+    with pytest.raises(ValueError, match="size: expected an integer"):
+        block(row, native, size=0)
+    wrong = skin_of(row)._replace(joint=skin_of(row).joint + 100)
+    with pytest.raises(Exception, match=r"joint: an index is not in \[0, 8\)"):
+        compiled_block(on_screen(row), RIG.faces, 1.0, wrong, native, BLUR, SIZE).block_until_ready()
+
+
+def test_the_rig_lists_the_joints_of_every_vertex():
+    dense = np.zeros(np.shape(BIRD.skin_weights))
+    np.put_along_axis(dense, np.asarray(RIG.vertex_joints), np.asarray(RIG.vertex_weights), axis=1)
+    np.testing.assert_allclose(dense, BIRD.skin_weights, atol=1e-7)
+    assert RIG.vertex_joints.shape[1] == 2, "no vertex of this bird has more joints"
