@@ -94,15 +94,19 @@ def photographs(bird: Bird, reference: Path) -> Iterator[Metric]:
 
 
 def windows(bird: Bird) -> Iterator[Metric]:
-    """Measure the paper's setting against single frames on 2 simulated birds × 100 frames."""
+    """Measure the paper's setting against single frames and against `fast` on 2 simulated birds × 100 frames."""
     results = {
         name: bench_fit(bird, birds=2, frames=100, config=load_config(name), seed=7, progress=terminal)
-        for name in ("paper", "baseline")
+        for name in ("paper", "baseline", "fast")
     }
     for name in ("me_p", "me_v", "pa_mpjpe"):
         ratio = results["paper"][name] / results["baseline"][name]
         yield Metric(f"windows: {name}, paper", results["paper"][name], "1", "less", 0.1)
         yield Metric(f"windows: {name}, paper over baseline", ratio, "1", "less", 0.1)
+        ratio = results["fast"][name] / results["paper"][name]
+        yield Metric(f"windows: {name}, fast over paper", ratio, "1", "less", 0.05)
+    ratio = results["fast"]["minutes"] / results["paper"]["minutes"]
+    yield Metric("windows: time, fast over paper", ratio, "1", "less", 0.5)
 
 
 def scene(bird: Bird) -> Iterator[Metric]:
