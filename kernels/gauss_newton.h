@@ -12,7 +12,7 @@ namespace jaxfit {
 namespace {
 
 constexpr int64_t kMostRows = 256;
-constexpr float kBandEdge = 0.01f;    // the band holds the pixels whose silhouette is this far from 0 and from 1
+constexpr float kBandEdge = 0.01f;  // the band holds the pixels whose silhouette is this far from 0 and from 1
 
 struct Rows {
   float* values;        // (kMostRows, D)
@@ -62,7 +62,8 @@ int64_t set_row_factors(Scale scale, Workspace& ws) {
 // Gives rows to the pixels of the band: to all, or to a part whose factors grow by √(band / part).
 void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
   const bool every = band <= kMostRows;
-  const double part = every ? 1 : 0.95 * kMostRows / static_cast<double>(band);  // 0.95, because the number of chosen pixels varies
+  // fewer than kMostRows, because the number of chosen pixels varies
+  const double part = every ? 1 : 0.95 * kMostRows / static_cast<double>(band);
   const uint32_t threshold = static_cast<uint32_t>(part * 4294967295.0);
   const Vec grown = all(every ? 1.f : __builtin_sqrtf(static_cast<float>(1 / part)));
   uint32_t number = 0;
