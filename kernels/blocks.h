@@ -31,6 +31,13 @@ INLINE Nearest nearest_edge(const Distances& at, const Vec half[3]) {
   return n;
 }
 
+// Divides the pixels `in` between the edges by the nearest edge. On a tie the first edge takes the pixel.
+INLINE void divide_pixels(const Nearest& n, Mask in, Mask of_edge[3]) {
+  of_edge[0] = in & (n.square[0] <= n.smallest);
+  of_edge[1] = without(in & (n.square[1] <= n.smallest), of_edge[0]);
+  of_edge[2] = without(without(in, of_edge[0]), of_edge[1]);
+}
+
 // Row and column of the sixteen blocks of a window, for each width of the window from 1 to 16 blocks.
 struct Windows {
   alignas(64) float column[kLanes + 1][kLanes], row[kLanes + 1][kLanes];

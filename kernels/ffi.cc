@@ -137,8 +137,10 @@ ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indice
   float* out = block->typed_data();
   for_each_task(pool, batch.count, [&](int64_t i) {
     float* own = out + i * parameters * parameters;
-    std::fill(own, own + parameters * parameters, 0.f);
-    if (weight.typed_data()[weight_at.offset(batch, i)] == 0) return;  // a missing frame: nothing is rendered
+    if (weight.typed_data()[weight_at.offset(batch, i)] == 0) {  // a missing frame: nothing is rendered
+      std::fill(own, own + parameters * parameters, 0.f);
+      return;
+    }
     const Skin skin{rest.typed_data() + rest_at.offset(batch, i),
                     joint.typed_data() + joint_at.offset(batch, i),
                     skin_weight.typed_data() + skin_at.offset(batch, i),

@@ -26,7 +26,8 @@ struct Rows {
 size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, int64_t size) {
   const Layout l(mesh, size);
   const int64_t floats = kMostRows * skin.parameters + l.products + 2 * mesh.num_vertices * skin.parameters;
-  return workspace(mesh, size) + sizeof(float) * (floats + l.vertices) + sizeof(uint16_t) * l.blocks * l.blocks;
+  const int64_t bytes = sizeof(float) * floats + sizeof(uint16_t) * l.blocks * l.blocks + mesh.num_vertices;
+  return workspace(mesh, size) + bytes;
 }
 
 INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, int64_t size, void* memory) {
@@ -124,12 +125,10 @@ void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, R
         const Mask in = outside > n.d;
         if (!(bits(in) & chosen)) return;
         const Vec pull = flip_sign(load(place) * reciprocal(all(1.f) + exp2(n.d)), n.d);
-        Mask mine[3];
-        mine[0] = in & (n.square[0] <= n.smallest);
-        mine[1] = without(in & (n.square[1] <= n.smallest), mine[0]);
-        mine[2] = without(without(in, mine[0]), mine[1]);
+        Mask of_edge[3];
+        divide_pixels(n, in, of_edge);
         for (int i = 0; i < 3; ++i) {
-          uint32_t pixels = bits(mine[i]) & chosen;
+          uint32_t pixels = bits(of_edge[i]) & chosen;
           if (!pixels) continue;
           const Vec tx = all(f.tx[i][lane]), ty = all(f.ty[i][lane]);
           alignas(64) float pull_x[kLanes], pull_y[kLanes], place_along[kLanes];

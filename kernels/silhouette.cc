@@ -41,12 +41,10 @@ void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
         const Mask in = outside > n.d;
         const Vec p = reciprocal(all(1.f) + exp2(n.d));
         const Vec pull = flip_sign(load(place) * p, n.d);
-        Mask mine[3];
-        mine[0] = in & (n.square[0] <= n.smallest);
-        mine[1] = without(in & (n.square[1] <= n.smallest), mine[0]);
-        mine[2] = without(without(in, mine[0]), mine[1]);
+        Mask of_edge[3];
+        divide_pixels(n, in, of_edge);
         for (int i = 0; i < 3; ++i) {
-          const Vec g = keep(mine[i], pull), gt = g * n.clamped[i];
+          const Vec g = keep(of_edge[i], pull), gt = g * n.clamped[i];
           sums[4 * i + 0] = fma(g, at.across[i], sums[4 * i + 0]);
           sums[4 * i + 1] = fma(g, n.beyond[i], sums[4 * i + 1]);
           sums[4 * i + 2] = fma(gt, at.across[i], sums[4 * i + 2]);

@@ -97,9 +97,8 @@ def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tupl
         return rows.at[:, -1].set(rows[:, -1].mean()) if scales < frames else rows
 
     gradient = frame_rows(state.gradient)
-    gradient = allowed(
-        gradient.at[:, -1].divide(frames // scales)
-    )  # that of a common scale is split between the frames
+    # the gradient of a common scale is divided between the frames
+    gradient = allowed(gradient.at[:, -1].divide(frames // scales))
     diagonal = allowed(curvature.diagonal)
     # a parameter without curvature has no gradient and does not change
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
@@ -111,7 +110,7 @@ def _step(program: Program, problem: Problem, pose: Pose, state: _State) -> tupl
         maxiter=CG_STEPS,
     )
     pessimistic = state.curvature_ratio < PESSIMISTIC
-    relaxation = jnp.clip(1 / jnp.maximum(state.curvature_ratio, 1 / MOST_RELAXATION), 1.0, MOST_RELAXATION)
+    relaxation = 1 / jnp.maximum(state.curvature_ratio, 1 / MOST_RELAXATION)
     change = jnp.where(pessimistic, relaxation * newton + MOMENTUM * state.change, newton)
     new_pose = _add_rows(pose, change)
     loss, new_gradient = _loss_and_gradient(program, problem, new_pose)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from jaxfit.fitting.collect import FittedWindow
 from jaxfit.fitting.stages import FitModel
 from jaxfit.fitting.windows import Windows
-from jaxfit.model.camera import project
+from jaxfit.model.camera import crop_to_image, image_to_crop, project
 from jaxfit.model.kinematics import window_keypoints, window_transforms
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix, matrix_to_axis_angle, unwrap_axis_angle
@@ -88,7 +88,7 @@ class _InImage(NamedTuple):
     rotations: Float[np.ndarray, "m J 3"]
     """Axis-angle of the root and of the other joints."""
     root_px: Float[np.ndarray, "m 2"]
-    """Root joint in the image, from the principal point of the crop: image pixels."""
+    """Root joint, image pixels."""
     size: Float[np.ndarray, "m"]
     """Image pixels per model unit at the root."""
     depth: Float[np.ndarray, "m"]
@@ -98,19 +98,24 @@ class _InImage(NamedTuple):
 def _in_image(pose: Pose, crop: np.ndarray, at: np.ndarray, model: FitModel) -> _InImage:
     scale = np.broadcast_to(pose.scale, len(pose.transl))[at]
     root_cam = np.asarray(pose.transl)[at] + scale[:, None] * np.asarray(model.rig.joints)[0]
-    pixels = crop[at, 2] / model.camera.size_px * model.camera.focal_px / root_cam[:, 2]
-    centre_px = crop[at, :2] + model.camera.centre_px / model.camera.size_px * crop[at, 2:]
+    root_crop_px = np.asarray(project(root_cam, model.camera))
+    root_px = np.asarray(crop_to_image(root_crop_px[:, None], crop[at], model.camera.size_px))[:, 0]
     rotations = np.concatenate([np.asarray(pose.global_orient)[at, None], np.asarray(pose.body_pose)[at]], axis=1)
-    return _InImage(rotations, centre_px + pixels[:, None] * root_cam[:, :2], scale * pixels, root_cam[:, 2])
+    return _InImage(rotations, root_px, scale * _px_per_unit(crop[at], root_cam[:, 2], model), root_cam[:, 2])
+
+
+def _px_per_unit(crop: np.ndarray, depth: np.ndarray, model: FitModel) -> np.ndarray:
+    """Return the image pixels of one model unit at a depth in the crop camera."""
+    return crop[:, 2] / model.camera.size_px * model.camera.focal_px / depth
 
 
 def _with_poses(result: FittedWindow, crop: np.ndarray, at: np.ndarray, new: _InImage, model: FitModel) -> FittedWindow:
     """Return a result with other poses in the frames `at`, in the crops of its window."""
     old = result.pose
-    pixels = crop[at, 2] / model.camera.size_px * model.camera.focal_px / new.depth
-    centre_px = crop[at, :2] + model.camera.centre_px / model.camera.size_px * crop[at, 2:]
-    scale = new.size / pixels
-    root_cam = np.concatenate([(new.root_px - centre_px) / pixels[:, None], new.depth[:, None]], axis=1)
+    scale = new.size / _px_per_unit(crop[at], new.depth, model)
+    root_crop_px = image_to_crop(new.root_px[:, None], crop[at], model.camera.size_px)[:, 0]
+    xy_cam = (root_crop_px - model.camera.centre_px) / model.camera.focal_px * new.depth[:, None]
+    root_cam = np.concatenate([xy_cam, new.depth[:, None]], axis=1)
 
     def changed(values: Any, frames: np.ndarray) -> np.ndarray:
         values = np.array(values, np.float32)

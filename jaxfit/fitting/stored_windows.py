@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import fields
 
 import numpy as np
 
@@ -79,7 +78,7 @@ class StoredWindows:
             InputError: the disk is full, or the folder cannot be written.
         """
         some = list(results.values())
-        poses = {each.name: np.stack([getattr(result.pose, each.name) for result in some]) for each in fields(Pose)}
+        poses = {name: np.stack([getattr(result.pose, name) for result in some]) for name in _POSE}
         self._parts.add(
             {
                 "content": np.array([_hash(windows, w) for w in results]),

@@ -42,8 +42,7 @@ def keypoint_rotation_rows(
     lever = pose.scale * (moved - weight[:, None] * unit_joints(rig, A).T)  # (K, 3, J)
     (lx, ly, lz), (nx, ny, nz) = jnp.moveaxis(lever[:, :, None], 1, 0), jnp.moveaxis(directions[..., None], 2, 0)
     cross = (ly * nz - lz * ny, lz * nx - lx * nz, lx * ny - ly * nx)  # l × n, each component (K, R, J)
-    angles = jnp.concatenate([pose.global_orient[None], pose.body_pose])
-    turn = jnp.sum(A[..., :3, None] * right_jacobian(angles)[:, None], axis=-2)  # (J, 3, 3)
+    turn = _turns(A, pose)
     return cross[0][..., None] * turn[:, 0] + cross[1][..., None] * turn[:, 1] + cross[2][..., None] * turn[:, 2]
 
 
@@ -78,8 +77,7 @@ def transform_derivatives(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Flo
     """
     count = len(rig.parents)
     descendants = jnp.asarray(_descendants(rig.parents), jnp.float32)
-    angles = jnp.concatenate([pose.global_orient[None], pose.body_pose])
-    turn = jnp.sum(A[..., :3, None] * right_jacobian(angles)[:, None], axis=-2)  # (J, 3, 3)
+    turn = _turns(A, pose)
     centre = jnp.pad(unit_joints(rig, A).T[:, None], ((0, 0), (3, 0), (0, 0)))  # (3, 4, J): 0 but for the last column
     arm = pose.scale * descendants[:, None, None] * (A[..., None] - centre)  # (J, 3, 4, J)
     (ax, ay, az), (tx, ty, tz) = jnp.moveaxis(arm[..., None], 1, 0), jnp.moveaxis(turn, 1, 0)
@@ -89,14 +87,20 @@ def transform_derivatives(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Flo
     return jnp.concatenate([by_angles.reshape(count, 3, 4, -1), by_transl, A[..., None]], axis=-1)
 
 
+def window_transform_derivatives(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T J 3 4 D"]:
+    """Return `transform_derivatives` of every frame of a window."""
+    return each_frame(lambda frame, A: transform_derivatives(rig, A, frame), pose, A)
+
+
+def _turns(A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "J 3 3"]:
+    """Return R_j·Jr(θ_j): the rotation (camera frame) of each joint per change of its axis-angle."""
+    angles = jnp.concatenate([pose.global_orient[None], pose.body_pose])
+    return jnp.sum(A[..., :3, None] * right_jacobian(angles)[:, None], axis=-2)
+
+
 def _descendants(parents: tuple[int, ...]) -> np.ndarray:
     """Return a (J, J) matrix: entry (d, j) is true if joint d is joint j or a descendant of joint j."""
     descendants = np.eye(len(parents), dtype=bool)
     for d, parent in enumerate(parents[1:], start=1):
         descendants[d] |= descendants[parent]
     return descendants
-
-
-def window_transform_derivatives(rig: Rig, A: Float[Array, "T J 3 4"], pose: Pose) -> Float[Array, "T J 3 4 D"]:
-    """Return `transform_derivatives` of every frame of a window."""
-    return each_frame(lambda frame, A: transform_derivatives(rig, A, frame), pose, A)

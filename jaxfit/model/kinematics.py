@@ -24,6 +24,7 @@ __all__ = [
     "posed_joints",
     "posed_keypoints",
     "posed_vertices",
+    "shaped_vertices",
     "unit_joints",
     "window_joints",
     "window_keypoints",
@@ -129,10 +130,15 @@ def posed_keypoints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Arr
 def posed_vertices(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "V 3"]:
     """Return the posed vertices of one frame by linear blend skinning, camera frame, model units."""
     T = (A.reshape(-1, 12).T @ rig.skin_weights).reshape(3, 4, -1)
-    v = rig.vertices + jnp.tensordot(pose.betas, rig.shape_basis, axes=1)
+    v = shaped_vertices(rig, pose)
     # written as a sum, because XLA needs ten times as long for the same contraction
     unit = jnp.stack([T[d, 0] * v[0] + T[d, 1] * v[1] + T[d, 2] * v[2] + T[d, 3] for d in range(3)], axis=-1)
     return unit * pose.scale + pose.transl
+
+
+def shaped_vertices(rig: Rig, pose: Pose) -> Float[Array, "3 V"]:
+    """Return the rest vertices of the shape of a pose, model units."""
+    return rig.vertices + jnp.tensordot(pose.betas, rig.shape_basis, axes=1)
 
 
 def posed_joints(rig: Rig, A: Float[Array, "J 3 4"], pose: Pose) -> Float[Array, "J 3"]:

@@ -15,7 +15,14 @@ from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird, unlimited_joints
 from jaxfit.model.camera import Camera, project, to_screen
 from jaxfit.model.jacobian import window_keypoint_rows, window_transform_derivatives
-from jaxfit.model.kinematics import Rig, window_joints, window_keypoints, window_transforms, window_vertices
+from jaxfit.model.kinematics import (
+    Rig,
+    shaped_vertices,
+    window_joints,
+    window_keypoints,
+    window_transforms,
+    window_vertices,
+)
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
 from jaxfit.raster.silhouette import Blur, Skin
@@ -211,7 +218,7 @@ class PosedWindow:
     def skin(self) -> Skin:
         """Derivatives of the vertices with respect to the pose, in factors. Only `slope` (T, J, 3, 4, 3J + 4) has a
         leading frame axis."""
-        rest = self._rig.vertices + jnp.tensordot(self.pose.betas, self._rig.shape_basis, axes=1)
+        rest = shaped_vertices(self._rig, self.pose)
         slope = window_transform_derivatives(self._rig, self._transforms, self.pose)
         return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope)
 

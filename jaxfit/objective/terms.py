@@ -79,7 +79,7 @@ def _mask_curvature(window: PosedWindow) -> Curvature:
     """Return H = JᵀJ with J the derivative of the silhouette: the Gauss-Newton matrix of Σ ½e².
 
     The L1 norm has the same H. Its quadratic bound is ½ Σ e²/n with n = |e| ≤ 1, so H is smaller than the curvature of
-    the bound. With the bound, the solver needs about twice as many steps, because few pixels end at e = 0.
+    the bound. With the bound, the solver needs about twice as many steps.
     """
     ratio = window.raster.size_px / window.camera.size_px
     camera_px = window.camera.focal_px * ratio, window.camera.centre_px * ratio

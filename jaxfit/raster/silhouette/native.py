@@ -8,9 +8,6 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from jaxfit.raster.kernels import available_isas, choose_isa, current_isa, kernels_available, require_kernels
 from jaxfit.raster.silhouette.reference import KINDS, Blur, Skin
 
-LANES = 16
-"""The kernels need a number of parameters that is a multiple of this."""
-
 __all__ = [
     "available_isas",
     "choose_isa",
@@ -22,6 +19,9 @@ __all__ = [
     "silhouette_gauss_newton",
     "silhouette_gradient",
 ]
+
+PARAMETER_MULTIPLE = 16
+"""The kernels need a number of parameters that is a multiple of this."""
 
 
 def _call(name: str, results, *operands, blur: Blur, **attributes):
@@ -86,7 +86,7 @@ def silhouette_gauss_newton(
 ) -> Float[Array, "D D"]:
     """Return the unweighted Gauss-Newton block. A weight of 0 gives a block of 0 and skips the rendering."""
     parameters = skin.slope.shape[-1]
-    padding = -parameters % LANES
+    padding = -parameters % PARAMETER_MULTIPLE
     slope = jnp.pad(skin.slope, ((0, 0), (0, 0), (0, 0), (0, padding)))
     block = jax.ShapeDtypeStruct((parameters + padding, parameters + padding), jnp.float32)
     operands = (vertices, faces, weight, skin.rest, skin.joint, skin.weight, slope)
