@@ -113,16 +113,19 @@ ffi::Error mask_loss_and_gradient(ffi::ThreadPool pool, Floats vertices, Indices
   return run_mask_loss(pool, vertices, faces, target, weight, loss, &gradient, sigma, radius, kind);
 }
 
-// `slope` is (J, 3, 4, D) with D a multiple of 16.
+// `slope` is (J, 3, 4, P) and `shape` is (V, 3, S), with P and S multiples of 16 and D = P + S.
 ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indices faces, Floats weight, Floats rest,
-                                   Indices joint, Floats skin_weight, Floats slope, ffi::Result<Floats> block,
-                                   int32_t size, float sigma, float radius, float focal, float centre) {
+                                   Indices joint, Floats skin_weight, Floats slope, Floats shape,
+                                   ffi::Result<Floats> block, int32_t size, float sigma, float radius, float focal, float centre) {
   const Batch batch(block->dimensions(), 2);
   const Blur blur = checked_blur(sigma, radius);
   const Meshes meshes(vertices, faces, batch);
   const int64_t parameters = block->dimensions()[block->dimensions().size() - 1];
-  if (parameters < 1 || parameters % 16)
-    throw std::invalid_argument("block: expected a multiple of 16 parameters, got " + std::to_string(parameters));
+  const int64_t shapes = shape.dimensions().size() ? shape.dimensions()[shape.dimensions().size() - 1] : 0;
+  const int64_t transforming = parameters - shapes;
+  if (transforming < 1 || transforming % 16 || shapes % 16)
+    throw std::invalid_argument("block: expected a multiple of 16 parameters, got " + std::to_string(transforming) +
+                                " and " + std::to_string(shapes));
   check_result("block", block->dimensions(), batch, {parameters, parameters});
   if (size < 1 || size > kMaxSize)
     throw std::invalid_argument("size: expected 1 to " + std::to_string(kMaxSize) + ", got " + std::to_string(size));
@@ -131,8 +134,9 @@ ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indice
   const Operand joint_at = bind("joint", joint.dimensions(), batch, {meshes.num_vertices, kAny});
   const int64_t joints = meshes.num_vertices ? joint_at.item / meshes.num_vertices : 0;
   const Operand skin_at = bind("skin_weight", skin_weight.dimensions(), batch, {meshes.num_vertices, joints});
-  const Operand slope_at = bind("slope", slope.dimensions(), batch, {kAny, 3, 4, parameters});
-  check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, slope_at.item / (12 * parameters));
+  const Operand slope_at = bind("slope", slope.dimensions(), batch, {kAny, 3, 4, transforming});
+  const Operand shape_at = bind("shape", shape.dimensions(), batch, {meshes.num_vertices, 3, shapes});
+  check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, slope_at.item / (12 * transforming));
   const Kernels& kernels = current_kernels();
   float* out = block->typed_data();
   for_each_task(pool, batch.count, [&](int64_t i) {
@@ -145,7 +149,9 @@ ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indice
                     joint.typed_data() + joint_at.offset(batch, i),
                     skin_weight.typed_data() + skin_at.offset(batch, i),
                     slope.typed_data() + slope_at.offset(batch, i),
+                    shape.typed_data() + shape_at.offset(batch, i),
                     joints,
+                    transforming,
                     parameters,
                     focal,
                     centre};
@@ -216,6 +222,7 @@ XLA_FFI_Error* silhouette_gauss_newton_handler(XLA_FFI_CallFrame* frame) {
                                      .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Arg<Indices>()
+                                     .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Ret<Floats>()

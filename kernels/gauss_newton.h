@@ -87,7 +87,7 @@ void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
 
 // Returns d vertex / d parameters in px: D derivatives of x, then D of y.
 INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, Rows& rows) {
-  const int64_t D = skin.parameters;
+  const int64_t D = skin.parameters, P = skin.transforming;
   float* out = rows.of_vertex + 2 * v * D;
   if (rows.ready[v]) return out;
   rows.ready[v] = 1;
@@ -97,13 +97,14 @@ INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, R
   const float by_depth[2] = {(skin.centre - at[0]) / at[2], (skin.centre - at[1]) / at[2]};
   for (int64_t d = 0; d < D; d += kLanes) {
     Vec x[3] = {all(0.f), all(0.f), all(0.f)};  // d position / d parameters, camera frame
-    for (int64_t m = 0; m < skin.per_vertex; ++m) {
+    for (int64_t m = 0; d < P && m < skin.per_vertex; ++m) {
       const float w = skin.weight[v * skin.per_vertex + m];
       if (w == 0) continue;
-      const float* slope = skin.slope + skin.joint[v * skin.per_vertex + m] * 12 * D + d;
-      for (int i = 0; i < 3; ++i, slope += 4 * D)
-        for (int c = 0; c < 4; ++c) x[i] = fma(all(c < 3 ? w * rest[c] : w), load(slope + c * D), x[i]);
+      const float* slope = skin.slope + skin.joint[v * skin.per_vertex + m] * 12 * P + d;
+      for (int i = 0; i < 3; ++i, slope += 4 * P)
+        for (int c = 0; c < 4; ++c) x[i] = fma(all(c < 3 ? w * rest[c] : w), load(slope + c * P), x[i]);
     }
+    for (int i = 0; d >= P && i < 3; ++i) x[i] = load(skin.shape + (3 * v + i) * (D - P) + d - P);
     for (int i = 0; i < 2; ++i) store(out + i * D + d, fma(all(zoom), x[i], all(by_depth[i]) * x[2]));
   }
   return out;

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from jaxfit.model.camera import Camera, project, to_screen
 from jaxfit.model.kinematics import Rig, joint_transforms, posed_vertices
 from jaxfit.model.pose import Pose
-from jaxfit.objective.terms import geman_mcclure
+from jaxfit.objective.residuals import geman_mcclure
 from jaxfit.raster.silhouette import Blur, mask_loss
 
 __all__ = ["PLACE_UNITS", "Data", "Hierarchy", "Parameters", "Weights", "initial_state", "run_steps"]
@@ -111,7 +111,7 @@ class Hierarchy(eqx.Module):
         def image(pose: Pose, keypoints_px, confidence, mask, weight):
             vertices = posed_vertices(rig, joint_transforms(rig, pose), pose)
             error_px = project(self.keypoint_weights @ vertices, camera) - keypoints_px
-            keypoints = jnp.sum(confidence[:, None] * geman_mcclure(error_px, SIGMA_PX))
+            keypoints = jnp.sum(confidence[:, None] * geman_mcclure(SIGMA_PX).value(error_px**2))
             ratio = size / camera.size_px
             screen = to_screen(vertices, camera) * jnp.array([ratio, ratio, 1.0])
             return keypoints, mask_loss(screen, rig.faces, mask, weight, kind="smooth_l1", blur=blur) / ratio**2

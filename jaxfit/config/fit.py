@@ -83,9 +83,8 @@ class StageConfig:
     optimised: tuple[str, ...] = ("global_orient", "body_pose", "transl", "scale")
     """Optimised parameters: global_orient, body_pose, transl, scale, bone_length, betas."""
     solver: Literal["adam", "levenberg_marquardt"] = "adam"
-    """`adam`: for all terms. `levenberg_marquardt`: needs 10 to 20 steps instead of hundreds, but only for terms with a
-    known curvature (keypoints, mask, mask_smooth_l1, pose_prior, velocity, acceleration) and with fixed bone lengths
-    and shape."""
+    """`adam`: for all terms. `levenberg_marquardt`: needs 10 to 30 steps instead of hundreds; all terms of the library,
+    and terms of others that return residuals (docs/terms.md)."""
     learning_rate: float = 0.01
     """Adam's step size, in each parameter's own unit."""
     step_scale: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
@@ -118,17 +117,6 @@ class StageConfig:
             expected = "expected a number, 0 or more; `transl` may have three"
             require(valid and all(map(is_number, factors)), f"step_scale.{name}", f"is {factor!r}", expected)
         check_terms("override", self.override)
-        if self.solver == "levenberg_marquardt":
-            self._check_curvature()
-
-    def _check_curvature(self) -> None:
-        for name in self.terms:
-            problem = f"is levenberg_marquardt, but the curvature of the term {name!r} is unknown"
-            remedy = "use adam, or only terms with a curvature such as keypoints, pose_prior, velocity, acceleration"
-            require(find_term(name).curvature is not None, "solver", problem, remedy)
-        fixed = [name for name in self.optimised if name in ("bone_length", "betas")]
-        problem = f"is levenberg_marquardt, which cannot optimise {' and '.join(fixed)}"
-        require(not fixed, "solver", problem, "use adam, or remove them from `optimised`")
 
 
 @dataclass(frozen=True)

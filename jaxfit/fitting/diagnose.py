@@ -16,7 +16,7 @@ from jaxfit.errors import InputError
 from jaxfit.fitting.problem import Problem, Program, problem_window
 from jaxfit.fitting.stages import FitModel, needs_mask, stage_hyperparameters, stage_program
 from jaxfit.model.pose import Pose, rest_pose
-from jaxfit.objective.objective import weighted_sum
+from jaxfit.objective.objective import evaluate_curvature, weighted_sum
 from jaxfit.objective.posed_window import Targets
 from jaxfit.objective.registry import Term
 
@@ -46,6 +46,8 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
         problem = Problem(stage_hyperparameters(config, stage, model.bird.keypoint_names), pose, targets)
         for name in stage.terms:
             _trace(program.terms[name], jax.grad(_share_of(program, name)), pose, problem)
+            if stage.solver == "levenberg_marquardt":
+                _trace(program.terms[name], _curvature_of(program, name), pose, problem)
 
 
 def _trace(term: Term, function: Callable[..., object], *arguments: object) -> None:
@@ -124,3 +126,13 @@ def _share_of(program: Program, name: str) -> Callable[[Pose, Problem], Array]:
         return weighted_sum(problem_window(program, problem, pose), program.terms, settings)
 
     return share
+
+
+def _curvature_of(program: Program, name: str) -> Callable[[Pose, Problem], Array]:
+    """Return the diagonal of the curvature of one term as a function of pose and problem."""
+
+    def diagonal(pose: Pose, problem: Problem) -> Array:
+        settings = {name: problem.hyperparameters.settings[name]}
+        return evaluate_curvature(problem_window(program, problem, pose), program.terms, settings).diagonal
+
+    return diagonal

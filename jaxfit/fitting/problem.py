@@ -18,10 +18,7 @@ from jaxfit.objective.objective import weighted_sum
 from jaxfit.objective.posed_window import PosedWindow, Priors, Raster, Targets
 from jaxfit.objective.registry import Term
 
-__all__ = ["BATCH_AXIS", "Hyperparameters", "Problem", "Program", "Solver", "problem_loss", "problem_window"]
-
-BATCH_AXIS = "problems"
-"""Name of the axis of the problems of a batch, over which a solver is mapped."""
+__all__ = ["Hyperparameters", "Problem", "Program", "Solver", "problem_loss", "problem_window"]
 
 
 class Program(NamedTuple):
@@ -34,6 +31,8 @@ class Program(NamedTuple):
     terms: Mapping[str, Term]
     """The stage's active terms, by name."""
     solver: Solver
+    shared: tuple[str, ...] = ()
+    """The parameters of `curvature.SHARED_PARAMETERS` that a solver with curvature optimises."""
 
 
 class Hyperparameters(NamedTuple):
@@ -60,7 +59,7 @@ class Problem(NamedTuple):
 class Solver(NamedTuple):
     """A method that improves the pose of one problem. All three functions are pure.
 
-    A batch maps the functions over its problems along the axis `BATCH_AXIS`.
+    A batch maps the functions over its problems.
     """
 
     init: Callable[[Program, Problem, Any], Any]
@@ -78,7 +77,8 @@ def problem_window(program: Program, problem: Problem, pose: Pose) -> PosedWindo
     targets = problem.targets
     active = targets.confidence * problem.hyperparameters.keypoints_on
     targets = eqx.tree_at(lambda t: t.confidence, targets, active)
-    return PosedWindow(pose, problem.anchor, targets, program.rig, program.priors, program.camera, program.raster)
+    rig, priors, camera, raster = program.rig, program.priors, program.camera, program.raster
+    return PosedWindow(pose, problem.anchor, targets, rig, priors, camera, raster, program.shared)
 
 
 def problem_loss(program: Program, problem: Problem, pose: Pose) -> Float[Array, ""]:

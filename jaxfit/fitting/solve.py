@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxfit.fitting.problem import BATCH_AXIS, Problem, Program, problem_window
+from jaxfit.fitting.problem import Problem, Program, problem_window
 from jaxfit.model.pose import Pose
 from jaxfit.objective.objective import evaluate_terms
 
@@ -37,7 +37,7 @@ def begin(program: Program, problems: Problem, carried: Any) -> StageState:
     def one(problem: Problem, carried: Any) -> Any:
         return program.solver.init(program, problem, carried)
 
-    solver = jax.vmap(one, axis_name=BATCH_AXIS)(problems, carried)
+    solver = jax.vmap(one)(problems, carried)
     # `advance` reuses the memory of its state, so the state must not share memory with the anchor
     return StageState(*jax.tree.map(jnp.copy, (problems.anchor, solver)))
 
@@ -63,7 +63,7 @@ def advance(
 
         return jax.lax.fori_loop(0, steps, step, state)
 
-    state = jax.vmap(one, axis_name=BATCH_AXIS)(problems, state)
+    state = jax.vmap(one)(problems, state)
     return state, *jax.vmap(program.solver.outcome)(state.solver)
 
 

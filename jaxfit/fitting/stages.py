@@ -16,6 +16,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX, Camera
 from jaxfit.model.kinematics import Rig, fold_bird
 from jaxfit.model.pose import Pose
+from jaxfit.objective.curvature import SHARED_PARAMETERS
 from jaxfit.objective.posed_window import Priors, Raster, priors_of
 from jaxfit.objective.registry import find_terms
 from jaxfit.raster.silhouette import Blur
@@ -95,7 +96,22 @@ def stage_program(config: FitConfig, stage: StageConfig, model: FitModel) -> Pro
     paper_blur = Blur.for_size(config.crop.size_px)
     blur = Blur(paper_blur.sigma * stage.blur**2, paper_blur.radius * stage.blur)
     raster = Raster(blur, config.crop.size_px, config.backend)
-    return Program(model.rig, model.priors, model.camera, raster, find_terms(stage.terms), SOLVERS[stage.solver])
+    return Program(
+        model.rig,
+        model.priors,
+        model.camera,
+        raster,
+        find_terms(stage.terms),
+        SOLVERS[stage.solver],
+        _shared_columns(stage),
+    )
+
+
+def _shared_columns(stage: StageConfig) -> tuple[str, ...]:
+    """Return the shared parameters that Levenberg-Marquardt optimises; Adam does not need their names."""
+    if stage.solver == "adam":
+        return ()
+    return tuple(name for name in SHARED_PARAMETERS if name in stage.optimised)
 
 
 def stage_hyperparameters(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[str]) -> Hyperparameters:
@@ -124,8 +140,9 @@ def compiled_part(config: FitConfig) -> FitConfig:
     stages = tuple(
         replace(
             stage,
-            # `betas` sets the number of shape coefficients; the other names only set step sizes
-            optimised=tuple(name for name in stage.optimised if name == "betas"),
+            # `betas` sets the number of shape coefficients, and the solver may need columns for shared parameters; the
+            # other names only set step sizes
+            optimised=tuple(sorted({*_shared_columns(stage), *({"betas"} & set(stage.optimised))})),
             learning_rate=1.0,
             step_scale={},
             keypoints_off=(),

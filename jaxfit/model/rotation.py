@@ -12,6 +12,7 @@ __all__ = [
     "geodesic_distance",
     "matrix_to_axis_angle",
     "right_jacobian",
+    "rotation_between",
     "safe_norm",
     "unwrap_axis_angle",
     "view_grid",
@@ -94,16 +95,26 @@ def _matrix_to_quaternion(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 4"]:
     return jnp.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 
 
-def geodesic_distance(Ra: Float[Array, "*B 3 3"], Rb: Float[Array, "*B 3 3"]) -> Float[Array, "*B"]:
-    """Return the angle between rotations, in radians within [0, π].
+def rotation_between(Ra: Float[Array, "*B 3 3"], Rb: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3"]:
+    """Return an axis-angle whose norm is the angle between two rotations, in radians within [0, π].
 
-    θ = atan2(½‖Σ_k a_k × b_k‖, 1 − ¼‖Rb − Ra‖²) with a_k and b_k the rows of Ra and Rb. The first argument is sin θ,
-    the second is cos θ. In contrast to the arccos of the trace, this formula is precise at small angles and near π,
-    and its gradient is finite everywhere: 0 at θ = 0 and θ = π, where the angle is not differentiable.
+    θ = atan2(‖v‖, 1 − ¼‖Rb − Ra‖²) with v = ½ Σ_k a_k × b_k, a_k and b_k the rows of Ra and Rb: ‖v‖ = sin θ, and v has
+    the direction of the axis, in the frame of Ra's columns. In contrast to the arccos of the trace, this formula is
+    precise at small angles and near π, and its gradient is finite everywhere.
     """
     difference = Rb - Ra  # used instead of Rb, so that the cross product of equal rotations is exactly 0
-    sine = safe_norm(jnp.sum(jnp.cross(Ra, difference), axis=-2)) / 2
-    return jnp.arctan2(sine, 1 - jnp.sum(difference**2, axis=(-2, -1)) / 4)
+    v = jnp.sum(jnp.cross(Ra, difference), axis=-2) / 2
+    sine, cosine = safe_norm(v), 1 - jnp.sum(difference**2, axis=(-2, -1)) / 4
+    theta = jnp.arctan2(sine, cosine)
+    no_axis = sine == 0
+    ratio = jnp.where(no_axis, 1.0, theta / jnp.where(no_axis, 1.0, sine))
+    any_axis = jnp.where(no_axis, theta, 0.0)[..., None] * jnp.array([1.0, 0.0, 0.0])  # for θ = 0 and θ = π
+    return ratio[..., None] * v + any_axis
+
+
+def geodesic_distance(Ra: Float[Array, "*B 3 3"], Rb: Float[Array, "*B 3 3"]) -> Float[Array, "*B"]:
+    """Return the angle between rotations, in radians within [0, π]; the gradient is 0 where it is not defined."""
+    return safe_norm(rotation_between(Ra, Rb))
 
 
 def safe_norm(x: Float[Array, "*B D"]) -> Float[Array, "*B"]:

@@ -1,4 +1,4 @@
-"""The curvature of a term: the matrix H that a Gauss-Newton step needs beside the gradient.
+"""The curvature of the objective: the matrix H that a Gauss-Newton step needs beside the gradient.
 
 At the current pose, the quadratic E + g·d + ½ d·H·d is an upper bound of a term E for a change d of the pose, where g
 is the gradient of E. The bound is exact if the residuals are linear in the pose, and holds to first order otherwise.
@@ -7,48 +7,102 @@ Robust errors and unsquared norms become weighted squares: this is iteratively r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax.tree_util import Partial
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from jaxfit.model.pose import Pose
 
-__all__ = ["Curvature", "Rows", "frame_rows", "weighted_curvature"]
+__all__ = [
+    "SHARED_PARAMETERS",
+    "Curvature",
+    "Rows",
+    "add_rows",
+    "frame_rows",
+    "shared_columns",
+    "split_rows",
+    "weighted_curvature",
+]
+
+SHARED_PARAMETERS = ("bone_length", "betas")
+"""The parameters that all frames of a window share, beside a common scale."""
 
 Rows = Float[Array, "T D"]
 """A change of the pose, or a gradient, one row per frame: global orientation (3), body pose (3(J−1)), translation (3),
-scale (1)."""
+scale (1), and the shared parameters that are optimised: bone lengths (J−1), shape coefficients (S).
+
+A change of a parameter that all frames share is the mean of its rows. Its gradient is divided evenly between the rows.
+"""
 
 
 class Curvature(NamedTuple):
-    """A positive semi-definite H on rows of frames. It is a pytree, so that a solver can keep it between steps."""
+    """A positive semi-definite H on rows of frames."""
 
-    product: Partial
-    """d ↦ H·d: a `jax.tree_util.Partial` of a function at the top level of a module, and the arrays that it needs."""
+    product: Callable[[Rows], Rows]
+    """d ↦ H·d, for a d whose rows agree in the shared parameters. Only the mean over the rows of the result counts for
+    these parameters."""
     diagonal: Rows
-    """Diagonal of H."""
+    """Diagonal of H. For a shared parameter, only the mean over the rows counts."""
 
 
 def weighted_curvature(weights: Sequence[Float[Array, ""]], curvatures: Sequence[Curvature]) -> Curvature:
     """Return Σ λ · H of some curvatures."""
+
+    def product(d: Rows) -> Rows:
+        products = (w * H.product(d) for w, H in zip(weights, curvatures, strict=True))
+        return sum(products, start=jnp.zeros_like(d))
+
     diagonal = sum((w * H.diagonal for w, H in zip(weights, curvatures, strict=True)), start=jnp.zeros(()))
-    return Curvature(Partial(_weighted_product, list(weights), [H.product for H in curvatures]), diagonal)
+    return Curvature(product, diagonal)
 
 
-def _weighted_product(weights: list[Float[Array, ""]], products: list[Partial], d: Rows) -> Rows:
-    return sum((w * product(d) for w, product in zip(weights, products, strict=True)), start=jnp.zeros_like(d))
+def frame_rows(pose: Pose, shared: Sequence[str] = ()) -> Rows:
+    """Return the pose of a window as one row per frame, with the parameters `shared` of `SHARED_PARAMETERS`.
 
-
-def frame_rows(pose: Pose) -> Rows:
-    """Return the pose of a window as one row per frame, without bone lengths and shape.
-
-    A scale that all frames share is repeated in every row.
+    A parameter that all frames share is repeated in every row.
     """
     frames = pose.global_orient.shape[0]
     scale = jnp.broadcast_to(pose.scale, (frames,))
-    return jnp.concatenate(
-        [pose.global_orient, pose.body_pose.reshape(frames, -1), pose.transl, scale[:, None]], axis=1
+    columns = [pose.global_orient, pose.body_pose.reshape(frames, -1), pose.transl, scale[:, None]]
+    for name in SHARED_PARAMETERS:
+        if name in shared:
+            values = jnp.asarray(getattr(pose, name))
+            columns.append(jnp.broadcast_to(values, (frames, values.shape[-1])))
+    return jnp.concatenate(columns, axis=1)
+
+
+def add_rows(pose: Pose, rows: Rows, shared: Sequence[str] = ()) -> Pose:
+    """Return the pose plus a change, which has one row per frame in the layout of `frame_rows`."""
+    angles, transl, scale, *others = split_rows(pose, rows, shared)
+    names = [name for name in SHARED_PARAMETERS if name in shared]
+    is_common = pose.scale.shape[0] < len(rows)
+    return replace(
+        pose,
+        global_orient=pose.global_orient + angles[:, :3],
+        body_pose=pose.body_pose + angles[:, 3:].reshape(pose.body_pose.shape),
+        transl=pose.transl + transl,
+        scale=pose.scale + (scale.mean(axis=0) if is_common else scale[:, 0]),
+        **{name: getattr(pose, name) + each.mean(axis=0) for name, each in zip(names, others, strict=True)},
     )
+
+
+def split_rows(pose: Pose, rows: Rows, shared: Sequence[str] = ()) -> list[Float[Array, "T part"]]:
+    """Return the columns of the angles (3J), the translation, the scale, and each of the parameters `shared`."""
+    sizes = [3 + 3 * pose.body_pose.shape[-2], 3, 1]
+    sizes += [getattr(pose, name).shape[-1] for name in SHARED_PARAMETERS if name in shared]
+    ends = [sum(sizes[: i + 1]) for i in range(len(sizes))]
+    assert rows.shape[1] == ends[-1], (rows.shape, sizes)
+    return [rows[:, end - size : end] for size, end in zip(sizes, ends, strict=True)]
+
+
+def shared_columns(pose: Pose, shared: Sequence[str] = ()) -> Bool[np.ndarray, "D"]:
+    """Return, for each column of `frame_rows`, whether all frames share the parameter."""
+    frames = pose.global_orient.shape[0]
+    is_common = pose.scale.shape[0] < frames
+    values = [getattr(pose, name) for name in SHARED_PARAMETERS if name in shared]
+    framewise = 6 + 3 * pose.body_pose.shape[-2]
+    return np.repeat([False, is_common, True], [framewise, 1, sum(each.shape[-1] for each in values)])

@@ -13,6 +13,7 @@ from jaxfit.errors import InputError
 from jaxfit.objective.curvature import Curvature, weighted_curvature
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import Term
+from jaxfit.objective.residuals import Residuals, as_list, residual_curvature, residual_sum
 
 __all__ = ["evaluate_curvature", "evaluate_terms", "weighted_sum"]
 
@@ -47,18 +48,30 @@ def weighted_sum(window: PosedWindow, terms: Mapping[str, Term], settings: Setti
 
 
 def evaluate_curvature(window: PosedWindow, terms: Mapping[str, Term], settings: Settings) -> Curvature:
-    """Return Σ λ · H_term over the active terms. All active terms must have a curvature.
+    """Return Σ λ · H_term over the active terms, from their own curvature or from their residuals.
 
     Args:
         window: one bird in one window.
         terms, settings: as for `evaluate_terms`.
+
+    Raises:
+        InputError: a term has no curvature and does not return residuals; the error names the term.
     """
-    weights, curvatures = [], []
+
+    def residuals_of(window: PosedWindow) -> list[Residuals]:
+        found = []
+        for name, values in settings.items():
+            if terms[name].curvature is None:
+                parts = _checked_residuals(name, terms[name].function(window, **_without_weight(values)))
+                found += [part._replace(weight=jnp.asarray(values["weight"]) * part.weight) for part in parts]
+        return found
+
+    weights, curvatures = [jnp.ones(())], [residual_curvature(window, residuals_of)]
     for name, values in settings.items():
         curvature = terms[name].curvature
-        assert curvature is not None, name  # `StageConfig` checks this
-        weights.append(jnp.asarray(values["weight"]))
-        curvatures.append(curvature(window, **_without_weight(values)))
+        if curvature is not None:
+            weights.append(jnp.asarray(values["weight"]))
+            curvatures.append(curvature(window, **_without_weight(values)))
     return weighted_curvature(weights, curvatures)
 
 
@@ -66,10 +79,24 @@ def _without_weight(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if name != "weight"}
 
 
+def _checked_residuals(name: str, value: Any) -> list[Residuals]:
+    """Return the residuals of a term after a check that the term returns residuals."""
+    if _is_residuals(value):
+        return as_list(value)
+    problem = "returns a number, but the solver levenberg_marquardt needs its residuals"
+    raise InputError(f"term {name!r}", problem, "return Residuals (docs/terms.md), or use the solver adam")
+
+
+def _is_residuals(value: Any) -> bool:
+    if isinstance(value, Residuals):
+        return True
+    return isinstance(value, tuple | list) and len(value) > 0 and all(isinstance(each, Residuals) for each in value)
+
+
 def _checked_scalar(name: str, value: Any) -> Float[Array, ""]:
-    """Return the value of a term as an array after a check that the value is one real number."""
+    """Return the value of a term as an array after a check that the value is one real number, or residuals."""
     try:
-        array = jnp.asarray(value)
+        array = residual_sum(value) if _is_residuals(value) else jnp.asarray(value)
     except (TypeError, ValueError):
         array = None
     if array is not None and array.shape == () and jnp.issubdtype(array.dtype, jnp.floating):

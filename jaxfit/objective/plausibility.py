@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
+from jaxfit.objective.residuals import Residuals, geman_mcclure
 from jaxfit.objective.temporal import complete_runs
-from jaxfit.objective.terms import Scalar, geman_mcclure
+from jaxfit.objective.terms import Scalar
 
 __all__ = ["feet_on_ground", "joint_limits"]
 
 
 @term
-def joint_limits(window: PosedWindow) -> Scalar:
+def joint_limits(window: PosedWindow) -> Residuals:
     """Penalise angles outside the joint limits, rad².
 
     E = Σ_t Σ_i max(l_i − θ_i, 0)² + max(θ_i − u_i, 0)², over the components i of the body pose.
@@ -26,12 +26,12 @@ def joint_limits(window: PosedWindow) -> Scalar:
     """
     lower, upper = window.joint_limits[..., 0], window.joint_limits[..., 1]
     angles = window.pose.body_pose
-    excess = jnp.maximum(lower - angles, 0) ** 2 + jnp.maximum(angles - upper, 0) ** 2
-    return jnp.sum(jnp.where(window.present, jnp.sum(excess, axis=(-2, -1)), 0.0))
+    excess = jnp.maximum(lower - angles, 0) + jnp.maximum(angles - upper, 0)  # one of the two is 0
+    return Residuals(excess, jnp.asarray(window.present, jnp.float32)[:, None])
 
 
 @term(positive=["sigma_units"])
-def feet_on_ground(window: PosedWindow, *, sigma_units: Scalar | float = 0.5) -> Scalar:
+def feet_on_ground(window: PosedWindow, *, sigma_units: Scalar | float = 0.5) -> Residuals:
     """Penalise slow motion of the feet: standing feet do not slide.
 
     E = Σ_i Σ_f ρ(‖x_f,i+1 − x_f,i‖) over frames i and feet f (left, right), with ρ Geman-McClure, in model units per
@@ -46,6 +46,6 @@ def feet_on_ground(window: PosedWindow, *, sigma_units: Scalar | float = 0.5) ->
     predicted contacts.
     """
     feet = window.keypoint_indices("left_foot", "right_foot")
-    displacement = safe_norm(jnp.diff(window.keypoints_static_cam[:, feet], axis=0))
-    cost = jnp.sum(geman_mcclure(displacement, sigma_units), axis=-1)
-    return jnp.sum(jnp.where(complete_runs(window.present, 1), cost, 0.0))
+    displacement = jnp.diff(window.keypoints_static_cam[:, feet], axis=0)
+    complete = jnp.asarray(complete_runs(window.present, 1), jnp.float32)[:, None]
+    return Residuals(displacement, complete, geman_mcclure(sigma_units))

@@ -14,7 +14,12 @@ from jaxtyping import Array, Bool, Float, UInt8
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird, unlimited_joints
 from jaxfit.model.camera import Camera, project, to_screen
-from jaxfit.model.jacobian import window_keypoint_rows, window_transform_derivatives
+from jaxfit.model.jacobian import (
+    window_keypoint_derivatives,
+    window_keypoint_rows,
+    window_shape_derivatives,
+    window_transform_derivatives,
+)
 from jaxfit.model.kinematics import (
     Rig,
     shaped_vertices,
@@ -25,6 +30,7 @@ from jaxfit.model.kinematics import (
 )
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
+from jaxfit.objective.curvature import SHARED_PARAMETERS, Rows, add_rows
 from jaxfit.raster.silhouette import Blur, Skin
 
 __all__ = ["PosedWindow", "Priors", "Raster", "Targets", "priors_of"]
@@ -107,6 +113,7 @@ class PosedWindow:
         priors: Priors,
         camera: Camera,
         raster: Raster,
+        shared: tuple[str, ...] = (),
     ):
         self.pose = pose
         """The optimised pose: `global_orient` (T, 3), `body_pose` (T, J−1, 3), `transl` (T, 3), `scale`, …"""
@@ -117,7 +124,15 @@ class PosedWindow:
         self.priors = priors
         self.camera = camera
         self.raster = raster
+        self.shared = shared
+        """The names of optimised parameters of `curvature.SHARED_PARAMETERS`, which have columns in derivatives."""
         self._rig = rig
+
+    def moved(self, rows: Rows) -> PosedWindow:
+        """Return the window with its pose plus a change, one row per frame (`curvature.frame_rows`)."""
+        pose = add_rows(self.pose, rows, self.shared)
+        others = self.anchor, self.targets, self._rig, self.priors, self.camera, self.raster, self.shared
+        return PosedWindow(pose, *others)
 
     @property
     def present(self) -> Bool[Array | np.ndarray, "T"]:
@@ -194,9 +209,12 @@ class PosedWindow:
         return project(self.keypoints_cam, self.camera)
 
     @cached_property
-    def keypoint_jacobian_px(self) -> tuple[Float[Array, "T rows angles"], Float[Array, "T rows 4"]]:
-        """Derivatives of `keypoints_px` of each frame, (T, 2K, …): with respect to the 3J angles, and with respect to
-        translation and scale."""
+    def keypoint_jacobian_px(self) -> tuple[Float[Array, "T rows part"], ...]:
+        """Derivatives of `keypoints_px` of each frame, (T, 2K, …), in the columns of `curvature.frame_rows`.
+
+        The parts are the derivatives with respect to the 3J angles, to translation and scale (4), and to each of the
+        parameters `shared`.
+        """
         scale = jnp.broadcast_to(self.pose.scale, self.pose.global_orient.shape[:1])
         points = self.keypoints_cam
         by_point = jax.vmap(jax.vmap(jax.jacfwd(lambda point_cam: project(point_cam, self.camera))))(points)
@@ -204,8 +222,13 @@ class PosedWindow:
         unit = (points - self.pose.transl[:, None]) / scale[:, None, None]
         by_scale = jnp.sum(by_point * unit[..., None, :], axis=-1, keepdims=True)
         by_place = jnp.concatenate([by_point, by_scale], axis=-1)
+        by_shared = (
+            by_point @ window_keypoint_derivatives(self._rig, self._transforms, self.pose, name)
+            for name in SHARED_PARAMETERS
+            if name in self.shared
+        )
         rows = len(points), 2 * points.shape[1]
-        return by_angles.reshape(*rows, -1), by_place.reshape(*rows, -1)
+        return tuple(block.reshape(*rows, -1) for block in (by_angles, by_place, *by_shared))
 
     @cached_property
     def vertices_screen(self) -> Float[Array, "T V 3"]:
@@ -216,11 +239,14 @@ class PosedWindow:
 
     @cached_property
     def skin(self) -> Skin:
-        """Derivatives of the vertices with respect to the pose, in factors. Only `slope` (T, J, 3, 4, 3J + 4) has a
-        leading frame axis."""
+        """Derivatives of the vertices with respect to a row of `curvature.frame_rows`, in factors. Only `slope`
+        (T, J, 3, 4, D) and `shape_slope` (T, V, 3, S) have a leading frame axis."""
         rest = shaped_vertices(self._rig, self.pose)
-        slope = window_transform_derivatives(self._rig, self._transforms, self.pose)
-        return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope)
+        slope = window_transform_derivatives(self._rig, self._transforms, self.pose, "bone_length" in self.shared)
+        shape_slope = jnp.zeros((*self.vertices_screen.shape, 0))
+        if "betas" in self.shared:
+            shape_slope = window_shape_derivatives(self._rig, self._transforms, self.pose)
+        return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope, shape_slope)
 
     @property
     def faces(self):

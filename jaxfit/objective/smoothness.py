@@ -12,13 +12,14 @@ import jax.scipy.fft
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfit.model.rotation import geodesic_distance, safe_norm
+from jaxfit.model.rotation import rotation_between
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
+from jaxfit.objective.residuals import NORM, Residuals, huber
 from jaxfit.objective.temporal import complete_runs
 from jaxfit.objective.terms import Scalar
 
-__all__ = ["geodesic_velocity", "huber", "huber_velocity", "low_pass"]
+__all__ = ["geodesic_velocity", "huber_velocity", "low_pass"]
 
 BUTTERWORTH_ORDER = 4
 
@@ -26,7 +27,7 @@ BUTTERWORTH_ORDER = 4
 @term
 def geodesic_velocity(
     window: PosedWindow, *, beta_global: Scalar | float = 10.0, beta_pose: Scalar | float = 1.0
-) -> Scalar:
+) -> tuple[Residuals, Residuals]:
     """Penalise the geodesic distance between the poses of consecutive frames.
 
     E = Σ_i β_g · d(G_i, G_i+1) + β_p · √(Σ_j d(R_j,i, R_j,i+1)²), with d the angle between two rotations, G the global
@@ -38,9 +39,9 @@ def geodesic_velocity(
 
     Source: Huynh 2009, *Metrics for 3D Rotations*, Φ₆; the sums as in Hägerlind et al. 2024, velocity term.
     """
-    orient, joints = _angles_between_frames(window)
-    cost = beta_global * orient + beta_pose * safe_norm(joints)
-    return jnp.sum(jnp.where(complete_runs(window.present, 1), cost, 0.0))
+    orient, joints, complete = _rotations_between_frames(window)
+    joints = joints.reshape(len(joints), 3 * joints.shape[1])
+    return Residuals(orient, beta_global * complete, NORM), Residuals(joints, beta_pose * complete, NORM)
 
 
 @term(positive=["delta_rad"])
@@ -50,7 +51,7 @@ def huber_velocity(
     delta_rad: Scalar | float = 0.1,
     beta_global: Scalar | float = 10.0,
     beta_pose: Scalar | float = 1.0,
-) -> Scalar:
+) -> tuple[Residuals, Residuals]:
     """Penalise the rotation of every joint between consecutive frames by Huber's loss.
 
     E = Σ_i β_g · h(d(G_i, G_i+1)) + β_p · Σ_j h(d(R_j,i, R_j,i+1)), with h Huber's loss and δ in radians per frame.
@@ -60,21 +61,20 @@ def huber_velocity(
 
     Source: Huber 1964, *Robust Estimation of a Location Parameter*.
     """
-    orient, joints = _angles_between_frames(window)
-    cost = beta_global * huber(orient, delta_rad) + beta_pose * jnp.sum(huber(joints, delta_rad), axis=-1)
-    return jnp.sum(jnp.where(complete_runs(window.present, 1), cost, 0.0))
+    orient, joints, complete = _rotations_between_frames(window)
+    kernel = huber(delta_rad)
+    orient_part = Residuals(orient, beta_global * complete, kernel)
+    return orient_part, Residuals(joints, beta_pose * complete[:, None], kernel)
 
 
-def huber(x: Float[Array, "*B"], delta: Scalar | float) -> Float[Array, "*B"]:
-    """Return Huber's loss of x ≥ 0: x²/2 for x ≤ δ, else δ (x − δ/2)."""
-    clipped = jnp.minimum(x, delta)
-    return clipped * (x - clipped / 2)
-
-
-def _angles_between_frames(window: PosedWindow) -> tuple[Float[Array, "pairs"], Float[Array, "pairs bones"]]:
-    """Return the angles between consecutive frames of the global orientation and of each joint, radians."""
-    orient = geodesic_distance(window.R_camera_root[:-1], window.R_camera_root[1:])
-    return orient, geodesic_distance(window.R_parent_child[:-1], window.R_parent_child[1:])
+def _rotations_between_frames(
+    window: PosedWindow,
+) -> tuple[Float[Array, "pairs 3"], Float[Array, "pairs bones 3"], Float[Array, "pairs"]]:
+    """Return the rotations between consecutive frames of the global orientation and of each joint, as axis-angles, and
+    1 for the pairs of frames that are both present, else 0."""
+    orient = rotation_between(window.R_camera_root[:-1], window.R_camera_root[1:])
+    joints = rotation_between(window.R_parent_child[:-1], window.R_parent_child[1:])
+    return orient, joints, jnp.asarray(complete_runs(window.present, 1), jnp.float32)
 
 
 @term(positive=["cutoff_cycles_per_frame"])
@@ -84,7 +84,7 @@ def low_pass(
     cutoff_cycles_per_frame: Scalar | float = 0.15,
     beta_global: Scalar | float = 1.0,
     beta_pose: Scalar | float = 1.0,
-) -> Scalar:
+) -> tuple[Residuals, Residuals]:
     """Penalise the energy of motion above a cut-off frequency, rad².
 
     E = Σ_k w_k (β_g ‖ĝ_k‖² + β_p ‖θ̂_k‖²), where ĝ_k and θ̂_k are the coefficients of the orthonormal DCT-II over the
@@ -102,12 +102,12 @@ def low_pass(
     response = jax.nn.sigmoid(2 * BUTTERWORTH_ORDER * (log_frequency - jnp.log(cutoff_cycles_per_frame)))
     fill = _interpolation(window.present)
 
-    def energy(trajectory: Float[Array, "T D"]) -> Scalar:
-        coefficients = jax.scipy.fft.dct(fill @ trajectory, axis=0, norm="ortho")[1:]
-        return jnp.sum(response[:, None] * coefficients**2)
+    def coefficients(trajectory: Float[Array, "T D"]) -> Float[Array, "T-1 D"]:
+        return jax.scipy.fft.dct(fill @ trajectory, axis=0, norm="ortho")[1:]
 
-    body = jnp.asarray(window.pose.body_pose).reshape(frames, -1)
-    return beta_global * energy(jnp.asarray(window.pose.global_orient)) + beta_pose * energy(body)
+    orient = coefficients(jnp.asarray(window.pose.global_orient))
+    body = coefficients(jnp.asarray(window.pose.body_pose).reshape(frames, -1))
+    return Residuals(orient, beta_global * response), Residuals(body, beta_pose * response)
 
 
 def _interpolation(present: Bool[Array | np.ndarray, "T"]) -> Float[Array, "T T"]:

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jax.tree_util import Partial
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.curvature import Curvature, Rows
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
+from jaxfit.objective.residuals import NORM, Residuals, geman_mcclure
 from jaxfit.raster.silhouette import Kind, mask_loss, silhouette_gauss_newton
 
 __all__ = [
     "bone_prior",
-    "geman_mcclure",
     "keypoints",
     "mask",
     "mask_smooth_l1",
@@ -32,38 +30,8 @@ __all__ = [
 Scalar = Float[Array, ""]
 
 
-def geman_mcclure(error: Float[Array, "*B"], sigma: Float[Array, ""] | float) -> Float[Array, "*B"]:
-    """Return the Geman-McClure error σ²e² / (σ² + e²), which is quadratic near zero and bounded by σ²."""
-    squared = error**2
-    return sigma**2 * squared / (sigma**2 + squared)
-
-
-def _keypoints_curvature(window: PosedWindow, *, sigma_px: Scalar | float) -> Curvature:
-    """Return H = Jᵀ·diag(w)·J with w = 2c·σ⁴/(σ² + e²)².
-
-    This H gives an upper bound, because Geman-McClure is concave in e² and therefore lies below its tangent in e².
-    """
-    # without the barrier, XLA computes the Jacobian again for every use
-    by_angles, by_place = jax.lax.optimization_barrier(window.keypoint_jacobian_px)
-    error_px = window.keypoints_px - window.targets.keypoints_px
-    weight = 2 * window.targets.confidence[..., None] * (sigma_px**2 / (sigma_px**2 + error_px**2)) ** 2
-    weight = weight.reshape(by_angles.shape[:2])
-    diagonal = [jnp.einsum("tri,tr->ti", J**2, weight) for J in (by_angles, by_place)]
-    return Curvature(Partial(_keypoints_product, by_angles, by_place, weight), jnp.concatenate(diagonal, axis=1))
-
-
-def _keypoints_product(
-    by_angles: Float[Array, "T rows angles"],
-    by_place: Float[Array, "T rows 4"],
-    weight: Float[Array, "T rows"],
-    d: Rows,
-) -> Rows:
-    moved_px = jnp.einsum("tri,ti->tr", by_angles, d[:, :-4]) + jnp.einsum("tri,ti->tr", by_place, d[:, -4:])
-    return jnp.concatenate([jnp.einsum("tri,tr->ti", J, weight * moved_px) for J in (by_angles, by_place)], axis=1)
-
-
-@term(positive=["sigma_px"], curvature=_keypoints_curvature)
-def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Scalar:
+@term(positive=["sigma_px"])
+def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Residuals:
     """Compare projected and observed keypoints: E_kpt = Σ_t Σ_i c_i · (ρ(e_x) + ρ(e_y)), ρ Geman-McClure.
 
     The error e is in crop pixels, as is its scale σ = `sigma_px`; c is the confidence of the keypoint.
@@ -71,8 +39,10 @@ def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Scalar
     Source: Hägerlind et al. 2024, keypoint term; x and y separately as in Badger et al. 2020.
     """
     error_px = window.keypoints_px - window.targets.keypoints_px
-    robust = jnp.sum(geman_mcclure(error_px, sigma_px), axis=-1)
-    return jnp.sum(window.targets.confidence * robust)
+    confidence = window.targets.confidence[..., None]
+    return Residuals(
+        error_px[..., None], confidence, geman_mcclure(sigma_px), jacobian=lambda: window.keypoint_jacobian_px
+    )
 
 
 def _mask_curvature(window: PosedWindow) -> Curvature:
@@ -85,17 +55,18 @@ def _mask_curvature(window: PosedWindow) -> Curvature:
     camera_px = window.camera.focal_px * ratio, window.camera.centre_px * ratio
     raster = {"blur": window.raster.blur, "backend": window.raster.backend}
 
-    def frame(vertices_screen, weight, slope):
-        skin = window.skin._replace(slope=slope)
+    def frame(vertices_screen, weight, slope, shape_slope):
+        skin = window.skin._replace(slope=slope, shape_slope=shape_slope)
         size = window.raster.size_px
         return silhouette_gauss_newton(vertices_screen, window.faces, weight, skin, size, camera_px, **raster)
 
-    blocks = jax.vmap(frame)(window.vertices_screen, _mask_weight(window), window.skin.slope)
-    return Curvature(Partial(_blocks_product, blocks), jnp.diagonal(blocks, axis1=-2, axis2=-1))
+    framewise = window.vertices_screen, _mask_weight(window), window.skin.slope, window.skin.shape_slope
+    blocks = jax.vmap(frame)(*framewise)
 
+    def product(d: Rows) -> Rows:
+        return jnp.einsum("tij,tj->ti", blocks, d)
 
-def _blocks_product(blocks: Float[Array, "T D D"], d: Rows) -> Rows:
-    return jnp.einsum("tij,tj->ti", blocks, d)
+    return Curvature(product, jnp.diagonal(blocks, axis1=-2, axis2=-1))
 
 
 @term(compares_masks=True, curvature=_mask_curvature)
@@ -134,68 +105,52 @@ def _mask_weight(window: PosedWindow) -> Float[Array, "T"]:
     return jnp.asarray(window.targets.has_mask, jnp.float32) * (window.camera.size_px / window.raster.size_px) ** 2
 
 
-def _pose_prior_curvature(window: PosedWindow) -> Curvature:
-    """Return H = 2·Σ⁻¹ on the body pose of every present frame; the bound is exact, because the term is quadratic."""
-    precision = window.priors.pose_whitener.T @ window.priors.pose_whitener
-    present = jnp.asarray(window.present)
-    diagonal = jnp.broadcast_to(jnp.diagonal(precision), (len(present), len(precision)))
-    return Curvature(Partial(_pose_prior_product, precision, present), _body_rows(present, diagonal))
-
-
-def _pose_prior_product(precision: Float[Array, "angles angles"], present: Bool[Array, "T"], d: Rows) -> Rows:
-    return _body_rows(present, d[:, 3:-4] @ precision)
-
-
-def _body_rows(present: Bool[Array, "T"], rows: Float[Array, "T angles"]) -> Rows:
-    return jnp.pad(2 * jnp.where(present[:, None], rows, 0.0), ((0, 0), (3, 4)))
-
-
-@term(curvature=_pose_prior_curvature)
-def pose_prior(window: PosedWindow) -> Scalar:
+@term
+def pose_prior(window: PosedWindow) -> Residuals:
     """Penalise improbable body poses: E_pp = Σ_t (x − μ)ᵀ Σ⁻¹ (x − μ), with x the flattened body pose.
 
     Source: Badger et al. 2020, pose prior.
     """
     present = window.targets.present
     offset = window.pose.body_pose.reshape(present.shape[0], -1) - window.priors.pose_mean
-    distance = jnp.sum((offset @ window.priors.pose_whitener.T) ** 2, axis=-1)
-    return jnp.sum(jnp.where(present, distance, 0.0))
+    return Residuals(offset @ window.priors.pose_whitener.T, jnp.asarray(present, jnp.float32))
 
 
 @term
-def bone_prior(window: PosedWindow) -> Scalar:
+def bone_prior(window: PosedWindow) -> Residuals:
     """Penalise improbable bone lengths b: E = (b − μ_b)ᵀ Σ_b⁻¹ (b − μ_b).
 
     Source: Badger et al. 2020, bone-length prior.
     """
-    return jnp.sum((window.priors.bone_whitener @ (window.pose.bone_length - window.priors.bone_mean)) ** 2)
+    return Residuals(window.priors.bone_whitener @ (window.pose.bone_length - window.priors.bone_mean))
 
 
 @term
-def shape_prior(window: PosedWindow) -> Scalar:
+def shape_prior(window: PosedWindow) -> Residuals:
     """Penalise improbable shapes by the squared Mahalanobis distance of the shape coefficients: E = Σ (β / sd)²."""
-    return jnp.sum((window.pose.betas / window.priors.shape_sd) ** 2)
+    return Residuals(window.pose.betas / window.priors.shape_sd)
 
 
 @term
-def shape_norm(window: PosedWindow) -> Scalar:
+def shape_norm(window: PosedWindow) -> Residuals:
     """Penalise the norm of the shape coefficients, E = ‖β‖₂.
 
     The norm is not squared, so a bird keeps the mean shape unless the other terms gain more than the norm costs.
 
     Source: Wang et al. 2021, shape regularisation.
     """
-    return safe_norm(jnp.asarray(window.pose.betas))
+    return Residuals(jnp.asarray(window.pose.betas), kernel=NORM)
 
 
 @term
-def stage_anchor(window: PosedWindow) -> Scalar:
+def stage_anchor(window: PosedWindow) -> tuple[Residuals, Residuals]:
     """Keep body pose θ_p and bone lengths b close to their values at the start of the stage.
 
     E = Σ_t ‖θ_p − θ_p,anchor‖₁ + ‖b − b_anchor‖₁, with `window.anchor` the pose at the start of the stage.
 
     Source: Wang et al. 2021, section 4 (third stage).
     """
-    moved = jnp.sum(jnp.abs(window.pose.body_pose - window.anchor.body_pose), axis=(-2, -1))
-    stretched = jnp.sum(jnp.abs(window.pose.bone_length - window.anchor.bone_length))
-    return jnp.sum(jnp.where(window.targets.present, moved, 0.0)) + stretched
+    present = jnp.asarray(window.targets.present, jnp.float32)[:, None, None]
+    moved = window.pose.body_pose - window.anchor.body_pose
+    stretched = window.pose.bone_length - window.anchor.bone_length
+    return Residuals(moved[..., None], present, NORM), Residuals(stretched[:, None], kernel=NORM)

@@ -178,8 +178,6 @@ LEAST_SQUARES = STAGE.replace("steps: 1", "steps: 1, solver: levenberg_marquardt
         ((STAGE % "").replace("steps: 1", "steps: 0"), ["`stages[0].steps`", "0"]),
         (STAGE % ", learning_rate: 0", ["`stages[0].learning_rate`", "0"]),
         (STAGE % ", solver: newton", ["`stages[0].solver`", "newton", "levenberg_marquardt"]),
-        (LEAST_SQUARES.replace("keypoints", "low_pass") % "", ["`stages[0].solver`", "'low_pass'", "adam", "velocity"]),
-        (LEAST_SQUARES % ", optimised: [transl, betas]", ["`stages[0].solver`", "betas", "`optimised`"]),
         (LEAST_SQUARES % ", carry_moments: true", ["`stages[0].carry_moments`", "Adam"]),
         (STAGE % ", blur: 0", ["`stages[0].blur`", "0"]),
         ("window: 3\n", ["`stages`", "missing", "base: paper"]),

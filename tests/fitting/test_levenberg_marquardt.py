@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.stages import BIRD, FIRST, B, T, case, problems, program, solve, total
+from support.stages import BIRD, CONFIG, FIRST, MODEL, B, T, case, problems, program, solve, total
 
 from jaxfit.config.fit import load_config
+from jaxfit.errors import InputError
 from jaxfit.fitting import levenberg_marquardt
+from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.levenberg_marquardt import (
     DAMPING_DECREASE,
@@ -19,8 +21,9 @@ from jaxfit.fitting.levenberg_marquardt import (
     MOMENTUM,
     MOST_RELAXATION,
 )
-from jaxfit.fitting.problem import BATCH_AXIS, problem_window
-from jaxfit.objective.curvature import frame_rows
+from jaxfit.fitting.problem import problem_window
+from jaxfit.objective import registry
+from jaxfit.objective.curvature import add_rows, frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature
 from jaxfit.simulation.detections import detect
 from jaxfit.simulation.motion import smooth_motion
@@ -55,7 +58,7 @@ def solver_of(stage):
         def step(problem, pose, state):
             return LEVENBERG_MARQUARDT.step(own, problem, pose, state)
 
-        compiled[key] = tuple(jax.jit(jax.vmap(f, axis_name=BATCH_AXIS)) for f in (init, step))
+        compiled[key] = tuple(jax.jit(jax.vmap(f)) for f in (init, step))
     return compiled[key]
 
 
@@ -72,39 +75,42 @@ def take_steps(stage, problem, count=1, **changes):
 
 
 def dense_step(stage, problem, damping):
-    """Solve (H + μ·diag H)·d = −g with a dense H, over the optimised parameters: orientation, x, y, common size."""
+    """Solve (H + μ·D)·d = −g with a dense H and its diagonal D, over the optimised parameters."""
     own, anchor = program(stage), problem.anchor
-    zero = frame_rows(anchor)
+    zero = jnp.zeros_like(frame_rows(anchor, own.shared))
+    size = jax.tree.map(lambda x, step: jnp.broadcast_to(step, x.shape), anchor, problem.hyperparameters.step_size)
+    optimised = np.asarray(frame_rows(size, own.shared)) > 0
+    is_shared = shared_columns(anchor, own.shared)
 
     @jax.jit
     def derivatives():
         H = evaluate_curvature(problem_window(own, problem, anchor), own.terms, problem.hyperparameters.settings)
         units = jnp.eye(zero.size).reshape(-1, *zero.shape)
-        return jax.vmap(H.product)(units), jax.grad(lambda pose: total_of(stage, pose, problem))(anchor)
+        gradient = jax.grad(lambda rows: total_of(stage, add_rows(anchor, rows, own.shared), problem))(zero)
+        return jax.vmap(H.product)(units), H.diagonal, gradient
 
-    product, gradient = derivatives()
-    dense, g = np.asarray(product, np.float64).reshape(zero.size, -1), np.array(frame_rows(gradient), np.float64)
-    g[:, -1] /= T
-    per_frame, size = np.zeros(zero.shape), np.zeros(zero.shape)
-    per_frame[:, :3] = per_frame[:, -4:-2] = size[:, -1] = 1
-    basis = np.column_stack([np.diag(per_frame.ravel())[:, per_frame.ravel() > 0], size.ravel()])
-    reduced = basis.T @ dense @ basis
-    d = np.linalg.solve(reduced + damping * np.diag(np.diag(reduced)), -basis.T @ g.ravel())
-    return (basis @ d).reshape(zero.shape)
+    product, diagonal, gradient = (np.asarray(x, np.float64) for x in derivatives())
+    units = np.eye(zero.size).reshape(*zero.shape, -1)
+    basis = np.column_stack([units[optimised & ~is_shared].T, units[:, optimised[0] & is_shared].sum(axis=0).T])
+    H, D = product.reshape(zero.size, -1), np.diag(diagonal.ravel())
+    reduced = basis.T @ (H + damping * D) @ basis
+    return (basis @ np.linalg.solve(reduced, -basis.T @ gradient.ravel())).reshape(zero.shape)
 
 
 def total_of(stage, pose, problem):
     return total(pose, problem.anchor, problem.targets, stage)
 
 
-def test_a_step_solves_the_equation(monkeypatch):
+@pytest.mark.parametrize("optimised", [FEW, (*FEW, "bone_length", "betas")], ids=["place", "bones and shape"])
+def test_a_step_solves_the_equation(optimised, monkeypatch):
     monkeypatch.setattr(levenberg_marquardt, "CG_TOLERANCE", 1e-6)
-    stage = dataclasses.replace(NEWTON, optimised=FEW)
+    stage = dataclasses.replace(NEWTON, optimised=optimised, terms=(*NEWTON.terms, "bone_prior", "shape_prior"))
     problem = first_problem(stage)
     before, [(pose, after)] = take_steps(stage, problem, damping=jnp.float32(DAMPING))
     expected = dense_step(stage, problem, DAMPING)
-    change = np.asarray(frame_rows(pose) - frame_rows(problem.anchor))
-    assert np.abs(expected).max() > 0.05
+    shared = program(stage).shared
+    change = np.asarray(frame_rows(pose, shared) - frame_rows(problem.anchor, shared))
+    assert (np.abs(expected).max(axis=0) > 1e-3)[-1], "the last parameter changes"
     np.testing.assert_allclose(change, expected, atol=2e-3 * np.abs(expected).max())
     assert after.loss < before.loss
     assert after.damping == pytest.approx(DAMPING * DAMPING_DECREASE)
@@ -136,10 +142,8 @@ def test_the_curvature_ratio_compares_the_objective_with_its_quadratic(monkeypat
     @jax.jit
     def parts(pose, c):
         H = evaluate_curvature(problem_window(own, problem, anchor), own.terms, problem.hyperparameters.settings)
-        loss, gradient = jax.value_and_grad(lambda pose: total_of(NEWTON, pose, problem))(anchor)
-        g = frame_rows(gradient)
-        slope = jnp.vdot(g.at[:, -1].divide(T), c)
-        return total_of(NEWTON, pose, problem) - loss - slope, jnp.vdot(c, H.product(c))
+        loss, g = jax.value_and_grad(lambda rows: total_of(NEWTON, add_rows(anchor, rows), problem))(jnp.zeros_like(c))
+        return total_of(NEWTON, pose, problem) - loss - jnp.vdot(g, c), jnp.vdot(c, H.product(c))
 
     difference, bend = parts(pose, c)
     assert after.curvature_ratio == pytest.approx(float(2 * difference / bend), rel=2e-2)
@@ -154,7 +158,6 @@ def test_a_step_that_increases_the_loss_is_not_taken():
     assert after.loss == 0
     assert after.damping == pytest.approx(FIRST_DAMPING * DAMPING_INCREASE)
     assert after.rejected == 0
-    assert not after.moved
     assert after.curvature_ratio == 1
     assert not np.any(after.change)
 
@@ -167,27 +170,6 @@ def test_a_loss_that_is_not_finite_stops_the_bird(loss):
     assert [int(state.rejected) for _, state in steps] == [1, 2, 3]
     for name in vars(problem.anchor):
         np.testing.assert_array_equal(getattr(steps[-1][0], name), getattr(problem.anchor, name), err_msg=name)
-
-
-def test_the_curvature_is_computed_once_for_each_pose(monkeypatch):
-    """A step that is not taken changes neither the pose nor the curvature."""
-    computed = []
-    evaluate = levenberg_marquardt.evaluate_curvature
-
-    def counting(window, *rest):
-        jax.debug.callback(lambda _: computed.append(None), window.pose.scale)
-        return evaluate(window, *rest)
-
-    monkeypatch.setattr(levenberg_marquardt, "evaluate_curvature", counting)
-    problem = first_problem(NEWTON)
-    _, steps = take_steps(NEWTON, problem, 3, loss=jnp.float32(0.0))
-    jax.effects_barrier()
-    assert [bool(state.moved) for _, state in steps] == [False] * 3
-    assert len(computed) == 1
-    computed.clear()
-    _, steps = take_steps(NEWTON, problem, 3, damping=jnp.float32(DAMPING))
-    jax.effects_barrier()
-    assert len(computed) == 1 + sum(bool(state.moved) for _, state in steps[:2]) > 1
 
 
 def test_few_steps_reach_a_lower_loss_than_many_steps_of_adam():
@@ -216,6 +198,30 @@ def test_a_common_size_stays_common():
     pose, loss, _ = solve([NEWTON], own, targets, (10,))
     assert (np.ptp(pose.scale, axis=1) > 1e-5).all()
     assert np.isfinite(loss).all()
+
+
+def test_a_term_without_residuals_is_rejected_before_the_fit(monkeypatch):
+    monkeypatch.setattr(registry, "_terms", dict(registry._terms))
+    registry.term(name="number")(lambda window: jnp.sum(window.pose.transl))
+    stage = dataclasses.replace(NEWTON, terms=("keypoints", "number"))
+    config = dataclasses.replace(CONFIG, stages=(stage,))
+    with pytest.raises(InputError, match=r"'number': returns a number.*solver adam"):
+        check_terms(config, MODEL)
+    check_terms(dataclasses.replace(CONFIG, stages=(dataclasses.replace(stage, solver="adam"),)), MODEL)
+
+
+def test_bones_and_shape_are_optimised_like_by_adam():
+    start, targets = case()
+    stage = dataclasses.replace(
+        NEWTON,
+        optimised=(*NEWTON.optimised, "bone_length", "betas"),
+        terms=(*NEWTON.terms, "bone_prior", "shape_norm"),
+    )
+    adam = dataclasses.replace(stage, solver="adam")
+    _, slow, _ = solve([adam], start, targets, (300,))
+    pose, fast, _ = solve([stage], start, targets, (20,))
+    assert (fast <= 1.001 * slow).all()
+    assert (np.abs(pose.bone_length - start.bone_length).max(axis=1) > 1e-2).all()
 
 
 @pytest.mark.extended

@@ -16,7 +16,8 @@ from jaxfit.errors import InputError
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.objective.plausibility import feet_on_ground, joint_limits
 from jaxfit.objective.posed_window import PosedWindow, priors_of
-from jaxfit.objective.smoothness import geodesic_velocity, huber, huber_velocity, low_pass
+from jaxfit.objective.residuals import huber, residual_sum
+from jaxfit.objective.smoothness import geodesic_velocity, huber_velocity, low_pass
 
 BONES, L = 4, 8
 
@@ -148,7 +149,7 @@ def test_huber_limits_the_gradient_of_fast_joints():
         assert gradient(0.02, others) == pytest.approx(0.02, rel=1e-3)
         assert gradient(0.4, others) == pytest.approx(0.1, rel=1e-3)
         assert gradient(1.5, others) == pytest.approx(0.1, rel=1e-3)
-    np.testing.assert_allclose(huber(jnp.array([0.0, 1.0, 3.0]), 1.0), [0, 0.5, 2.5])
+    np.testing.assert_allclose(huber(1.0).value(jnp.array([0.0, 1.0, 3.0]) ** 2), [0, 0.5, 2.5])
 
 
 def test_low_pass_separates_slow_from_fast_motion():
@@ -184,7 +185,7 @@ def test_joint_limits():
 
     def limits(body, targets=targets):
         moved = replace(pose, body_pose=body)
-        return joint_limits(make_window(LIMITED, moved, targets))
+        return residual_sum(joint_limits(make_window(LIMITED, moved, targets)))
 
     assert float(limits(inside)) == 0
     assert float(limits(outside)) == pytest.approx(0.3**2 + 0.2**2 + 2.0**2, rel=1e-5)
@@ -211,7 +212,7 @@ def test_feet_on_ground():
 
     @jax.jit
     def slip(pose, targets):
-        return feet_on_ground(make_window(bird, pose, targets))
+        return residual_sum(feet_on_ground(make_window(bird, pose, targets)))
 
     # displacement in the world of a bird at rest in the crop, if the crop moves by these pixels
     d = np.hypot([3.0, 3.0], [1.0, 1.0])[:, None] * z / CAMERA.focal_px

@@ -9,8 +9,8 @@ import pytest
 from support.birds import toy_bird
 
 from jaxfit.model.camera import Camera, to_screen
-from jaxfit.model.jacobian import transform_derivatives
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_vertices
+from jaxfit.model.jacobian import shape_derivatives, transform_derivatives
+from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_vertices, shaped_vertices
 from jaxfit.model.pose import Pose
 from jaxfit.raster import silhouette as raster
 from jaxfit.raster.silhouette import reference
@@ -21,7 +21,8 @@ RIG = fold_bird(BIRD)
 SIZE = 40
 BLUR = raster.Blur(sigma=1.0, radius=3.0)
 """So sharp that all pixels of the band fit into the rows of the kernels."""
-BONES, BETAS = jnp.linspace(0.9, 1.1, 7), jnp.asarray([0.5, -0.3])
+PLACED = 3 * 8 + 4
+"""Columns before the lengths of the bones: 8 joints, translation, scale."""
 
 
 @pytest.fixture(params=ISAS or [None])
@@ -34,13 +35,16 @@ def native(request):
 
 
 def pose_of(row) -> Pose:
-    return Pose(row[:3], row[3:-4].reshape(-1, 3), row[-4:-1], row[-1], BONES, BETAS)
+    bones, betas = row[PLACED : PLACED + 7], row[PLACED + 7 :]
+    return Pose(
+        row[:3], row[3 : PLACED - 4].reshape(-1, 3), row[PLACED - 4 : PLACED - 1], row[PLACED - 1], bones, betas
+    )
 
 
 def row_of(transl=(0.3, -0.2, 180.0), seed=0):
     rng = np.random.default_rng(seed)
     angles = [1.2, 0.3, 0.5, *rng.normal(scale=0.2, size=21)]
-    return jnp.asarray([*angles, *transl, 1.1], jnp.float32)
+    return jnp.asarray([*angles, *transl, 1.1, *np.linspace(0.9, 1.1, 7), 0.5, -0.3], jnp.float32)
 
 
 @functools.partial(jax.jit, static_argnames="size")
@@ -53,9 +57,9 @@ def on_screen(row, size=SIZE):
 @jax.jit
 def skin_of(row):
     pose = pose_of(row)
-    rest = (RIG.vertices + jnp.tensordot(BETAS, RIG.shape_basis, axes=1)).T
-    slope = transform_derivatives(RIG, joint_transforms(RIG, pose), pose)
-    return raster.Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope)
+    A, rest = joint_transforms(RIG, pose), shaped_vertices(RIG, pose).T
+    slope = transform_derivatives(RIG, A, pose, with_bones=True)
+    return raster.Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope, shape_derivatives(RIG, A, pose))
 
 
 def block(row, backend, weight=1.0, vertices=None, faces=RIG.faces, blur=BLUR, size=SIZE):
@@ -90,8 +94,8 @@ def test_transform_derivatives():
 
     row = row_of()
     pose = pose_of(row)
-    actual = transform_derivatives(RIG, joint_transforms(RIG, pose), pose)
-    expected = jax.jacfwd(transforms)(row)
+    actual = transform_derivatives(RIG, joint_transforms(RIG, pose), pose, with_bones=True)
+    expected = jax.jacfwd(transforms)(row)[..., : PLACED + 7]
     np.testing.assert_allclose(actual, expected, atol=1e-5 * np.abs(expected).max())
 
 

@@ -17,6 +17,7 @@ from jaxfit.model.rotation import axis_angle_to_matrix
 from jaxfit.objective.objective import evaluate_terms
 from jaxfit.objective.posed_window import PosedWindow, Raster, Targets, priors_of
 from jaxfit.objective.registry import find_term, find_terms, known_terms
+from jaxfit.objective.residuals import residual_sum
 from jaxfit.raster.silhouette import Blur
 from support.birds import random_pose, skin_by_hand, toy_bird
 
@@ -79,8 +80,8 @@ def without_frame(targets, t):
     )
 
 
-def posed_window(pose, targets, anchor=None):
-    return PosedWindow(pose, pose if anchor is None else anchor, targets, RIG, PRIORS, CAMERA, RASTER)
+def posed_window(pose, targets, anchor=None, shared=()):
+    return PosedWindow(pose, pose if anchor is None else anchor, targets, RIG, PRIORS, CAMERA, RASTER, shared)
 
 
 def random_motion(frames, seed=0, missing=(), spread=1.0, bones=4):
@@ -100,7 +101,7 @@ def term_value(term, orient, body, present, **settings):
         R_parent_child=axis_angle_to_matrix(body),
         present=jnp.asarray(present),
     )
-    return term(window, **settings)
+    return residual_sum(term(window, **settings))
 
 
 def all_settings():

@@ -85,11 +85,19 @@ def silhouette_gauss_newton(
     blur: Blur,
 ) -> Float[Array, "D D"]:
     """Return the unweighted Gauss-Newton block. A weight of 0 gives a block of 0 and skips the rendering."""
-    parameters = skin.slope.shape[-1]
-    padding = -parameters % PARAMETER_MULTIPLE
-    slope = jnp.pad(skin.slope, ((0, 0), (0, 0), (0, 0), (0, padding)))
-    block = jax.ShapeDtypeStruct((parameters + padding, parameters + padding), jnp.float32)
-    operands = (vertices, faces, weight, skin.rest, skin.joint, skin.weight, slope)
+    slope, shape_slope = _padded(skin.slope), _padded(skin.shape_slope)
+    size_of_block = slope.shape[-1] + shape_slope.shape[-1]
+    block = jax.ShapeDtypeStruct((size_of_block, size_of_block), jnp.float32)
+    operands = (vertices, faces, weight, skin.rest, skin.joint, skin.weight, slope, shape_slope)
     focal, centre = (np.float32(x) for x in camera_px)
     attributes = {"size": np.int32(size), "focal": focal, "centre": centre}
-    return _call("jaxfit_silhouette_gauss_newton", block, *operands, blur=blur, **attributes)[:parameters, :parameters]
+    result = _call("jaxfit_silhouette_gauss_newton", block, *operands, blur=blur, **attributes)
+    parameters, shapes = skin.slope.shape[-1], skin.shape_slope.shape[-1]
+    kept = np.r_[:parameters, slope.shape[-1] : slope.shape[-1] + shapes]
+    return result[kept][:, kept] if shapes else result[:parameters, :parameters]
+
+
+def _padded(derivatives: Float[Array, "... P"]) -> Float[Array, "... M"]:
+    """Return derivatives with columns of zeros up to a multiple of `PARAMETER_MULTIPLE`."""
+    padding = -derivatives.shape[-1] % PARAMETER_MULTIPLE
+    return jnp.pad(derivatives, ((0, 0),) * (derivatives.ndim - 1) + ((0, padding),))

@@ -55,8 +55,10 @@ class Skin(NamedTuple):
     """The joints that move each vertex."""
     weight: Float[Array, "V M"]
     """Their skinning weights; 0 for entries that are not used."""
-    slope: Float[Array, "J 3 4 D"]
-    """Derivatives of B."""
+    slope: Float[Array, "J 3 4 P"]
+    """Derivatives of B with respect to P parameters."""
+    shape_slope: Float[Array, "V 3 S"]
+    """Derivatives of the vertices with respect to S further parameters, which follow the P parameters; D = P + S."""
 
 
 def _segment_distance_squared(x, y, a, b):
@@ -160,7 +162,8 @@ def silhouette_gauss_newton(
     missing = weight == 0
     vertices = jnp.where(missing, 1.0, vertices)
     rest = jnp.concatenate([skin.rest, jnp.ones_like(skin.rest[:, :1])], axis=1)
-    moved_cam = jnp.einsum("vm,vmicd,vc->dvi", skin.weight, skin.slope[skin.joint], rest)  # (D, V, 3)
+    by_transforms = jnp.einsum("vm,vmicd,vc->dvi", skin.weight, skin.slope[skin.joint], rest)
+    moved_cam = jnp.concatenate([by_transforms, jnp.moveaxis(skin.shape_slope, -1, 0)])  # (D, V, 3)
     depth = vertices[:, 2:]
     moved_px = (focal * moved_cam[..., :2] - (vertices[:, :2] - centre) * moved_cam[..., 2:]) / depth
     tangents = jnp.concatenate([moved_px, moved_cam[..., 2:]], axis=-1)

@@ -1,0 +1,180 @@
+"""Residuals: one definition gives the value, the gradient and the curvature of a term.
+
+A term E = Σ w·ρ(‖r‖²) sums over groups of residuals r. ρ is a robust kernel: concave, increasing, with ρ(0) = 0. Then
+½ Jᵀ·diag(2w·ρ′)·J bounds E from above, with J the derivatives of the residuals, which JAX computes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxfit.objective.curvature import Curvature, Rows, frame_rows, shared_columns, weighted_curvature
+from jaxfit.objective.posed_window import PosedWindow
+
+__all__ = [
+    "NORM",
+    "SQUARE",
+    "Residuals",
+    "RobustKernel",
+    "as_list",
+    "geman_mcclure",
+    "huber",
+    "residual_curvature",
+    "residual_sum",
+]
+
+Scalar = Float[Array, ""]
+
+SHORTEST, AT_REST = 1e-4, 0.05
+"""Lengths for the curvature of a norm, which is infinite at zero: residuals shorter than `SHORTEST` count as
+`SHORTEST`, and residuals of exactly zero count as `AT_REST`. `AT_REST` is a typical change of a pose from frame to
+frame in radians; with a smaller value, a fit that starts with the same pose in all frames would hardly move."""
+
+PROBES = 16
+"""Number of random signs from which the diagonal of H is estimated."""
+
+
+class RobustKernel(NamedTuple):
+    """A robust kernel ρ(s) of the squared norm s of a residual."""
+
+    value: Callable[[Float[Array, "*G"]], Float[Array, "*G"]]
+    """s ↦ ρ(s), with a finite derivative at s = 0."""
+    slope: Callable[[Float[Array, "*G"]], Float[Array, "*G"]]
+    """s ↦ ρ′(s), or a finite number where ρ′ is infinite."""
+
+
+def _safe_sqrt(s: Float[Array, "*G"]) -> Float[Array, "*G"]:
+    return jnp.where(s == 0, 0.0, jnp.sqrt(jnp.where(s == 0, 1.0, s)))
+
+
+def _norm_slope(s: Float[Array, "*G"]) -> Float[Array, "*G"]:
+    norm = _safe_sqrt(s)
+    return 0.5 / jnp.where(norm == 0, AT_REST, jnp.maximum(norm, SHORTEST))
+
+
+SQUARE = RobustKernel(lambda s: s, jnp.ones_like)
+"""ρ = ‖r‖²."""
+NORM = RobustKernel(_safe_sqrt, _norm_slope)
+"""ρ = ‖r‖; for groups of one residual, this is |r|."""
+
+
+def geman_mcclure(sigma: Scalar | float) -> RobustKernel:
+    """Return Geman-McClure's kernel ρ = σ²s/(σ² + s), which is quadratic near zero and bounded by σ²."""
+    return RobustKernel(lambda s: sigma**2 * s / (sigma**2 + s), lambda s: (sigma**2 / (sigma**2 + s)) ** 2)
+
+
+def huber(delta: Scalar | float) -> RobustKernel:
+    """Return Huber's kernel: ρ = s/2 for ‖r‖ ≤ δ, else δ(‖r‖ − δ/2)."""
+
+    def value(s):
+        clipped = jnp.minimum(_safe_sqrt(s), delta)
+        return clipped * (_safe_sqrt(s) - clipped / 2)
+
+    return RobustKernel(value, lambda s: 0.5 * delta / jnp.maximum(_safe_sqrt(s), delta))
+
+
+class Residuals(NamedTuple):
+    """A sum E = Σ w·ρ(‖r‖²) over groups of residuals."""
+
+    values: Float[Array | np.ndarray, "*G n"]
+    """The residuals r, in groups along the last axis."""
+    weight: Any = 1.0
+    """Weight w ≥ 0 of each group, an array that broadcasts to the leading axes of `values`. It must not depend on the
+    pose."""
+    kernel: RobustKernel = SQUARE
+    jacobian: Callable[[], Sequence[Float[Array, "T R part"]]] | None = None
+    """Optional: returns the derivatives of the R residuals of each frame with respect to the row of the frame
+    (`frame_rows`), in blocks of columns. Only for speed, where a formula is faster than automatic differentiation. The
+    first axis of `values` is then that of the frames, and no residual depends on other frames."""
+
+
+def residual_sum(residuals: Residuals | Sequence[Residuals]) -> Scalar:
+    """Return Σ w·ρ(‖r‖²)."""
+    parts = [each.weight * each.kernel.value(_squared(each)) for each in as_list(residuals)]
+    return sum((jnp.sum(part) for part in parts), start=jnp.zeros(()))
+
+
+def residual_curvature(
+    window: PosedWindow, residuals_of: Callable[[PosedWindow], Residuals | Sequence[Residuals]]
+) -> Curvature:
+    """Return H = Jᵀ·diag(2w·ρ′)·J of the residuals of a window.
+
+    If the residuals have no `jacobian`, the product with H is exact and its diagonal is an estimate: the mean of
+    (Jᵀ·√(2w·ρ′)·u)² over `PROBES` vectors u of random signs, which are always the same.
+
+    Args:
+        window: one bird in one window.
+        residuals_of: returns the residuals of a window.
+
+    Source: Holland and Welsch 1977, Robust regression using iteratively reweighted least-squares; Hutchinson 1990, A
+    stochastic estimator of the trace of the influence matrix (random signs).
+    """
+    current = as_list(residuals_of(window))
+    factors = []
+    for each in current:
+        factor = 2 * each.weight * each.kernel.slope(_squared(each))
+        factors.append(jnp.broadcast_to(jax.lax.stop_gradient(factor)[..., None], each.values.shape))
+    by_formula = [i for i, each in enumerate(current) if each.jacobian is not None]
+    by_jax = [i for i in range(len(current)) if i not in by_formula]
+    curvatures = [_from_jacobian(current[i], factors[i]) for i in by_formula]
+    if by_jax:
+
+        def values_at(d: Rows) -> list[Float[Array, "..."]]:
+            moved = as_list(residuals_of(window.moved(d)))
+            return [jnp.asarray(moved[i].values) for i in by_jax]
+
+        curvatures.append(_from_jax(window, values_at, [factors[i] for i in by_jax]))
+    return weighted_curvature([jnp.ones(())] * len(curvatures), curvatures)
+
+
+def _from_jacobian(residuals: Residuals, factor: Float[Array, "..."]) -> Curvature:
+    """Return the curvature of residuals of single frames from their Jacobian."""
+    assert residuals.jacobian is not None
+    # without the barrier, XLA computes the Jacobian again for every use
+    blocks = jax.lax.optimization_barrier(tuple(residuals.jacobian()))
+    factor = factor.reshape(blocks[0].shape[:2])
+    ends = [sum(block.shape[-1] for block in blocks[: i + 1]) for i in range(len(blocks))]
+    starts = [0, *ends[:-1]]
+
+    def product(d: Rows) -> Rows:
+        parts = (jnp.einsum("tri,ti->tr", J, d[:, a:b]) for J, a, b in zip(blocks, starts, ends, strict=True))
+        change = factor * sum(parts, start=jnp.zeros(()))
+        return jnp.concatenate([jnp.einsum("tri,tr->ti", J, change) for J in blocks], axis=1)
+
+    diagonal = [jnp.einsum("tri,tr->ti", J**2, factor) for J in blocks]
+    return Curvature(product, jnp.concatenate(diagonal, axis=1))
+
+
+def _from_jax(window: PosedWindow, values_at: Callable[[Rows], list], factors: list[Float[Array, "..."]]) -> Curvature:
+    """Return the curvature of residuals, as functions of a change of the pose."""
+    zero = jnp.zeros_like(frame_rows(window.pose, window.shared))
+    _, forward = jax.linearize(values_at, zero)
+    backward = jax.linear_transpose(forward, zero)
+
+    def product(d: Rows) -> Rows:
+        return backward([factor * change for factor, change in zip(factors, forward(d), strict=True)])[0]
+
+    def probe(key: Array) -> Rows:
+        keys = jax.random.split(key, len(factors))
+        signs = [jax.random.rademacher(k, factor.shape, jnp.float32) for k, factor in zip(keys, factors, strict=True)]
+        return backward([jnp.sqrt(factor) * sign for factor, sign in zip(factors, signs, strict=True)])[0] ** 2
+
+    diagonal = jax.vmap(probe)(jax.random.split(jax.random.key(0), PROBES)).mean(axis=0)
+    # the gradient of a shared parameter is divided between the rows, so its square is too small
+    rows = jnp.where(shared_columns(window.pose, window.shared), len(zero), 1)
+    return Curvature(product, rows * diagonal)
+
+
+def as_list(residuals: Residuals | Sequence[Residuals]) -> list[Residuals]:
+    """Return residuals as a list."""
+    return [residuals] if isinstance(residuals, Residuals) else list(residuals)
+
+
+def _squared(residuals: Residuals) -> Float[Array, "*G"]:
+    return jnp.sum(residuals.values**2, axis=-1)
