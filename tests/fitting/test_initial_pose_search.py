@@ -15,6 +15,7 @@ from support.birds import exp_map, toy_bird
 from jaxfit.config.fit import InitialiseConfig
 from jaxfit.fitting.initial_pose_search import (
     LEAST_SEPARATION_RAD,
+    LEAST_SPAN,
     candidate_orientations,
     choose_sequence,
     match_candidates,
@@ -52,6 +53,14 @@ def turns(rng, frames):
     """Return orientations of a bird, seen from above, that rotates by about 10° per frame."""
     heading = rng.uniform(-np.pi, np.pi) + np.cumsum(rng.normal(scale=0.17, size=frames))
     return exp_map(heading[:, None] * [0, 0, 1]) @ FROM_ABOVE
+
+
+def test_keypoints_that_match_no_orientation_give_a_moderate_depth():
+    """All keypoints in one point: the scale of every candidate is almost 0."""
+    keypoints_px = np.full((3, BIRD.num_keypoints, 2), 100.0)
+    pose = search(keypoints_px, ABOVE)
+    span = np.ptp(np.asarray(BIRD.keypoints), axis=0).max()
+    assert np.all(pose.transl[..., 2] < 1.1 * CAMERA.focal_px * span / (LEAST_SPAN * CAMERA.size_px))
 
 
 def test_the_papers_candidates():
