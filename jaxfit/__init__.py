@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.evaluation.matching import match_tracks
     from jaxfit.evaluation.truth import Truth, read_truth
     from jaxfit.export.export import export_result
+    from jaxfit.fitting.cluster import open_cluster
     from jaxfit.fitting.fit import fit
     from jaxfit.labelling.suggest import suggest
     from jaxfit.model.bird import Bird
@@ -67,6 +68,7 @@ __all__ = [
     "load_solution",
     "map_keypoints",
     "match_tracks",
+    "open_cluster",
     "overlay",
     "overlay_frame",
     "propose_names",
@@ -106,6 +108,7 @@ _HOMES = {
     "evaluation.matching": ("match_tracks",),
     "evaluation.truth": ("Truth", "read_truth"),
     "export.export": ("export_result",),
+    "fitting.cluster": ("open_cluster",),
     "fitting.fit": ("fit",),
     "labelling.suggest": ("suggest",),
     "model.bird": ("Bird",),

@@ -28,6 +28,10 @@ class InputError(ValueError):
         source_text, problem_text, remedy_text = _fitted(parts, MESSAGE_CHARACTERS - len(_PREFIX) - punctuation)
         super().__init__(f"{source_text}: {problem_text}" + (f" ({remedy_text})" if remedy else ""))
 
+    def __reduce__(self) -> tuple:
+        """Return the constructor and its arguments, so that an error can pass between processes."""
+        return type(self), (self.source, self.problem, self.remedy)
+
 
 def one_line(text: object) -> str:
     """Return a text without line breaks: control characters, and bytes that are not UTF-8, become escapes as `\\n`."""

@@ -36,6 +36,8 @@ OPTIONAL_PACKAGES = {
     "torch": OptionalPackage("torch", "2.9", "train", "`jaxfit train`"),
     "onnx": OptionalPackage("onnx", "1.18", "train", "`jaxfit train`"),
     "onnxscript": OptionalPackage("onnxscript", "0.5", "train", "`jaxfit train`"),
+    "dask": OptionalPackage("dask", "2026.8", "cluster", "`--workers`, `--scheduler`"),
+    "distributed": OptionalPackage("distributed", "2026.8", "cluster", "`--workers`, `--scheduler`"),
     "trackers": OptionalPackage("trackers", "2.6", "trackers", "trackers other than the paper's tracker"),
 }
 """Name in the package index → package."""

@@ -16,6 +16,7 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.track_quality import track_quality
 from jaxfit.errors import InputError
+from jaxfit.fitting.cluster import Cluster
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.summary import library_versions, summarise
@@ -60,6 +61,7 @@ def reconstruct(
     keypoints: KeypointDetector | None = None,
     overwrite: bool = False,
     progress: ProgressTask = silent,
+    cluster: Cluster | None = None,
 ) -> Reconstruction:
     """Track the birds of a video, fit their poses and draw them on the video.
 
@@ -80,6 +82,7 @@ def reconstruct(
         segmenter, keypoints: networks that replace the networks of `config`.
         overwrite: replace an earlier result in the folder.
         progress: receives the progress of every part.
+        cluster: worker processes that fit the windows. None: this process.
 
     Returns:
         The result. A failed fit of one bird appears in the bird's status and does not affect other birds.
@@ -87,7 +90,7 @@ def reconstruct(
     Raises:
         InputError: no video; an unusable network or tracker; keypoints that differ from the model's; a folder that
             cannot be written, holds the video or holds other files; a video without birds; unfinished work of another
-            video, config, model or version; another process that works on the same result.
+            video, config, model or version; another process that works on the same result; a cluster that ends.
     """
     video, folder, clock = Path(video), Path(folder), Clock()
     replaced = {"segmenter": segmenter is not None, "keypoints": keypoints is not None}
@@ -116,7 +119,8 @@ def reconstruct(
         observations = tracking.observations
         with clock("fit"):
             windows = StoredWindows(Parts(unfinished / "windows", fit_record(config.fit, bird)))
-            solution = fit(observations, bird, config.fit, progress=progress, source=video, stored=windows)
+            more = {"stored": windows, "cluster": cluster}
+            solution = fit(observations, bird, config.fit, progress=progress, source=video, **more)
         with new_folder(folder, overwrite, marker=MARKER) as part:
             write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
             with clock("overlay"):

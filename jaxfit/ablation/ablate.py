@@ -14,6 +14,7 @@ from jaxfit.ablation.runs import fit_grid
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.truth import read_truth
 from jaxfit.extras import require_extra
+from jaxfit.fitting.cluster import Cluster
 from jaxfit.fitting.fit import check_observations
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
@@ -42,6 +43,7 @@ def ablate(
     matching: Literal["auto", "ids", "overlap"] = "auto",
     progress: ProgressTask = silent,
     allow_import: Collection[str] = (),
+    cluster: Cluster | None = None,
 ) -> Ablation:
     """Fit the same birds under every config of a grid, measure the results, and write tables, a plot and a report.
 
@@ -59,6 +61,7 @@ def ablate(
         progress: shows the progress of every part.
         allow_import: terms `package.module:function` that the record of the folder may name, beside the terms of the
             grid. The record is only compared with the grid; its terms are never imported.
+        cluster: worker processes that fit the windows. None: this process.
 
     Raises:
         InputError: Matplotlib or tabulate is missing (extra `report`), a file cannot be read, the grid or a config is
@@ -75,7 +78,7 @@ def ablate(
     check_observations(observed, bird, observations)
     inputs = {"observations": observations, "truth": truth}
     claim_folder(folder, crossed.runs, inputs, bird, allow_import)
-    fitted = fit_grid(observed, bird, crossed.runs, folder, progress, observations)
+    fitted = fit_grid(observed, bird, crossed.runs, folder, progress, observations, cluster)
     results = measure_grid(crossed.runs, folder, true, matching, progress)
     verdicts = judge(crossed.claims, results)
     write_report(results, verdicts, folder, inputs, bird.name)

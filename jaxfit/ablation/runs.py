@@ -14,6 +14,7 @@ from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.fitting.batch import frames_per_batch
+from jaxfit.fitting.cluster import Cluster
 from jaxfit.fitting.fit import fit_runs, windows_of
 from jaxfit.fitting.stages import compiled_part
 from jaxfit.fitting.summary import summarise
@@ -70,6 +71,7 @@ def fit_batches(
     progress: ProgressTask = silent,
     stored: Collection[int] = (),
     source: object = "observations",
+    cluster: Cluster | None = None,
 ) -> Iterator[FittedBatch]:
     """Fit the runs of a grid, batch by batch.
 
@@ -83,12 +85,13 @@ def fit_batches(
         progress: shows the progress of every part.
         stored: positions of the runs that are stored already.
         source: name of the observations in error messages.
+        cluster: worker processes that fit the windows. None: this process.
     """
     for batch in plan_batches(observations, bird, runs, source):
         if not all(r in stored for r in batch):
             began = time.perf_counter()
             configs = [runs[r].config for r in batch]
-            solutions = fit_runs(observations, bird, configs, None, progress, source)
+            solutions = fit_runs(observations, bird, configs, None, progress, source, cluster=cluster)
             yield FittedBatch(batch, solutions, (time.perf_counter() - began) / len(batch))
 
 
@@ -99,6 +102,7 @@ def fit_grid(
     folder: Path,
     progress: ProgressTask = silent,
     source: object = "observations",
+    cluster: Cluster | None = None,
 ) -> int:
     """Fit and store every run that the folder lacks.
 
@@ -111,7 +115,7 @@ def fit_grid(
     for ready in sorted(folder.glob(f"{_READY}*")):  # an interruption between two moves leaves this folder
         _move_in(ready, folder)
     stored = {r for r, run in enumerate(runs) if run_folder(folder, run).is_dir()}
-    for b, batch in enumerate(fit_batches(observations, bird, runs, progress, stored, source)):
+    for b, batch in enumerate(fit_batches(observations, bird, runs, progress, stored, source, cluster)):
         ready = folder / f"{_READY}{b}"
         with new_folder(ready) as part:
             for r, solution in zip(batch.runs, batch.solutions, strict=True):

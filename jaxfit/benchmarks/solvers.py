@@ -16,11 +16,12 @@ from jaxtyping import Array, Float, Int
 from jaxfit.config.fit import StageConfig, load_config
 from jaxfit.data.observations import Observations
 from jaxfit.fitting.adam import ADAM
-from jaxfit.fitting.fit import check_observations, initial_poses_of, windows_of
+from jaxfit.fitting.fit import check_observations, windows_of
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import Problem, Program, Solver, problem_loss
 from jaxfit.fitting.solve import Report, advance, begin, report
 from jaxfit.fitting.stages import fit_model, needs_mask, stage_hyperparameters, stage_program
+from jaxfit.fitting.tasks import initial_poses_of
 from jaxfit.fitting.windows import load_targets
 from jaxfit.model.bird import Bird
 from jaxfit.model.pose import Pose

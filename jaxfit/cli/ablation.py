@@ -19,18 +19,13 @@ def ablate(options: argparse.Namespace) -> None:
     from jaxfit.ablation.ablate import ablate
     from jaxfit.ablation.report import FILES
     from jaxfit.ablation.table import CAPTION, claims_table, results_table
+    from jaxfit.fitting.cluster import open_cluster
 
     start = time.perf_counter()
-    done = ablate(
-        options.observations,
-        options.truth,
-        options.out,
-        options.grid,
-        find_bird(options.model),
-        options.match,
-        terminal,
-        options.allow_import,
-    )
+    bird = find_bird(options.model)
+    given = (options.observations, options.truth, options.out, options.grid, bird, options.match, terminal)
+    with open_cluster(options.workers, options.scheduler) as cluster:
+        done = ablate(*given, allow_import=options.allow_import, cluster=cluster)
     show(results_table(done.results, "simple"))
     show(CAPTION)
     if done.verdicts:

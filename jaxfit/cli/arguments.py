@@ -15,6 +15,7 @@ __all__ = [
     "MODEL",
     "OBSERVATIONS",
     "Parser",
+    "add_cluster",
     "add_codec",
     "add_command",
     "add_model",
@@ -89,6 +90,15 @@ def add_observation_options(command: argparse.ArgumentParser, video: bool = True
         command.add_argument("--size", metavar="WxH", help="size of the images in pixels, in place of --video")
     else:
         command.set_defaults(size=None)
+
+
+def add_cluster(command: argparse.ArgumentParser) -> None:
+    """Add the options that fit windows in worker processes."""
+    group = command.add_mutually_exclusive_group()
+    text = "fit windows in N worker processes, which share the cores of this machine (extra `cluster`)"
+    group.add_argument("--workers", type=int, metavar="N", help=text)
+    text = "fit windows on the workers of a Dask cluster: address of its scheduler, or scheduler file (extra `cluster`)"
+    group.add_argument("--scheduler", metavar="ADDRESS", help=text)
 
 
 def add_codec(command: argparse.ArgumentParser) -> None:

@@ -32,6 +32,7 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.config.fit import load_config
     from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import save_solution
+    from jaxfit.fitting.cluster import open_cluster
     from jaxfit.fitting.fit import fit
     from jaxfit.fitting.initial_pose_file import load_initial_poses
     from jaxfit.fitting.summary import summarise
@@ -45,7 +46,9 @@ def fit(options: argparse.Namespace) -> None:
     config = _fewer_keypoints(config, names, options)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
     read = time.perf_counter()
-    solution = fit(observations, bird, config, initial_poses, terminal, source=options.observations)
+    with open_cluster(options.workers, options.scheduler) as cluster:
+        source = options.observations
+        solution = fit(observations, bird, config, initial_poses, terminal, source=source, cluster=cluster)
     seconds = {"read": read - start, "fit": time.perf_counter() - read}
     summary = summarise(solution, bird, seconds)
     save_solution(solution, bird, config_to_yaml(config), summary, options.out, options.overwrite)

@@ -16,6 +16,7 @@ from jaxfit.cli.arguments import (
     MODEL,
     OBSERVATIONS,
     Parser,
+    add_cluster,
     add_codec,
     add_command,
     add_model,
@@ -73,6 +74,7 @@ def _perception(commands: Any) -> None:
         add_tracking_options(command)
     add_out(track, "OBS.json", "COCO file to write", overwrite="an existing file")
     add_model(reconstruct)
+    add_cluster(reconstruct)
     add_out(reconstruct, "DIR", "folder for the result", overwrite="an earlier result in the folder")
 
 
@@ -85,6 +87,7 @@ def _fitting(commands: Any) -> None:
     fit.add_argument("--config", default="paper", help=text)
     text = "initial poses: the output of a pose regressor, or an earlier poses.npz"
     fit.add_argument("--init", type=Path, metavar="POSES.npz", help=text)
+    add_cluster(fit)
     add_out(fit, "DIR", "folder for the result", overwrite="an earlier result in the folder")
 
     text = "compare a result, or observations, with annotations or with the ground truth of a simulated scene"
@@ -105,6 +108,7 @@ def _fitting(commands: Any) -> None:
     text = "`ablation` (34 runs, after the paper) or a YAML file (default %(default)s)"
     ablate.add_argument("--grid", default="ablation", help=text)
     add_model(ablate)
+    add_cluster(ablate)
     add_out(ablate, "DIR", "folder for runs, tables and report; an interrupted ablation continues")
     text = "accept a record in DIR that names this term (package.module:function), although the grid does not"
     ablate.add_argument("--allow-import", action="append", default=[], metavar="NAME", help=text)

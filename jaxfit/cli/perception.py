@@ -48,12 +48,15 @@ def track(options: argparse.Namespace) -> None:
 
 def reconstruct(options: argparse.Namespace) -> None:
     """Track the birds of a video, fit their poses and draw them."""
+    from jaxfit.fitting.cluster import open_cluster
     from jaxfit.pipeline import OBSERVATIONS, OVERLAY, reconstruct
 
     start = time.perf_counter()
     config = reconstruct_config(options)
     bird = find_bird(options.model)
-    done = reconstruct(options.video, options.out, bird, config, overwrite=options.overwrite, progress=terminal)
+    settings = {"overwrite": options.overwrite, "progress": terminal}
+    with open_cluster(options.workers, options.scheduler) as cluster:
+        done = reconstruct(options.video, options.out, bird, config, **settings, cluster=cluster)
     show(done.tracking.trust.sentence())
     show(track_table(done.tracking.observations, done.solution))
     _show_skipped_tracks(done.tracking, config.track.min_track_frames)

@@ -82,7 +82,7 @@ def test_every_interruption_continues(folder, expected, caplog):
 
 @pytest.mark.extended
 def test_a_failed_fit_keeps_the_tracking_and_accepts_other_settings(folder, expected, caplog):
-    with mock.patch("jaxfit.fitting.fit.fit_batch", side_effect=InputError("config", "needs memory", "lower it")):
+    with mock.patch("jaxfit.fitting.tasks.fit_batch", side_effect=InputError("config", "needs memory", "lower it")):
         assert run(folder)[0] == 2
     text = (folder / "quick.yaml").read_text()
     (folder / "quick.yaml").write_text(

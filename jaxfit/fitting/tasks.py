@@ -1,0 +1,154 @@
+"""Tasks of a fit: some windows under some configs, which any process can fit in any order.
+
+The result of a window does not depend on the other windows of its task, so tasks of any size give the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from jaxfit.config.fit import FitConfig
+from jaxfit.fitting.batch import Batch, fit_batch
+from jaxfit.fitting.collect import FittedWindow, window_of_batch
+from jaxfit.fitting.initial_pose_file import InitialPoses
+from jaxfit.fitting.initial_pose_search import search_initial_poses
+from jaxfit.fitting.stages import FitModel, needs_mask
+from jaxfit.fitting.windows import Windows, load_targets, windows_key
+from jaxfit.model.pose import Pose, rest_pose
+from jaxfit.progress import ReportProgress
+
+__all__ = ["FitShared", "FitTask", "Run", "cut_task", "failed_windows", "fit_task", "initial_poses_of"]
+
+
+class Run(NamedTuple):
+    """One config, with windows of the video."""
+
+    config: FitConfig
+    windows: Windows
+
+
+class FitShared(NamedTuple):
+    """The data that all tasks of a fit share."""
+
+    model: FitModel
+    initial_poses: InitialPoses | None
+    """Initial poses of all tracks and frames, from a file. None: a search."""
+
+
+class FitTask(NamedTuple):
+    """Some problems of a fit, with their own data."""
+
+    runs: list[Run]
+    """The runs, with the windows of the problems only."""
+    problems: list[tuple[int, int]]
+    """Run and row of the window in the windows of the run."""
+
+
+def _no_report(_steps: float, _note: str) -> None:
+    """Report nothing, as in a worker process."""
+
+
+def cut_task(runs: Sequence[Run], problems: Sequence[tuple[int, int]]) -> FitTask:
+    """Return a task with the windows that some problems (run, window) need."""
+    rows = [sorted({w for other, w in problems if other == r}) for r in range(len(runs))]
+    cut = [run._replace(windows=run.windows[np.array(own, int)]) for run, own in zip(runs, rows, strict=True)]
+    return FitTask(cut, [(r, rows[r].index(w)) for r, w in problems])
+
+
+def fit_task(shared: FitShared, task: FitTask, report_progress: ReportProgress = _no_report) -> list[FittedWindow]:
+    """Fit the problems of a task.
+
+    Args:
+        shared: the model and initial poses of the fit.
+        task: the problems.
+        report_progress: called with the number of new steps.
+
+    Returns:
+        The result of every problem.
+    """
+    batch = _gather(shared, task)
+    fitted = fit_batch(shared.model, [run.config for run in task.runs], batch, report_progress)
+    return [window_of_batch(fitted, i) for i in range(len(task.problems))]
+
+
+def failed_windows(model: FitModel, config: FitConfig, count: int, failure: str) -> list[FittedWindow]:
+    """Return the results of windows that could not be computed."""
+
+    def nothing(*shape: int) -> np.ndarray:
+        return np.full(shape, np.nan, np.float32)
+
+    T, K = config.window, model.bird.num_keypoints
+    pose = jax.tree.map(lambda x: nothing(*np.shape(x)), rest_pose(model.bird, T, config.common_size))
+    loss = dict.fromkeys(sorted(config.stages[-1].terms), float("nan"))
+    return [FittedWindow(pose, loss, nothing(T, K, 3), nothing(T, K, 2), failure)] * count
+
+
+def initial_poses_of(windows: Windows, config: FitConfig, model: FitModel) -> Pose:
+    """Search the initial poses of some windows as `config.initialise` says; leading axes W, H (hypotheses)."""
+    return search_initial_poses(
+        model.bird,
+        model.rig,
+        jnp.asarray(windows.keypoints_px),
+        jnp.asarray(windows.confidence),
+        config.initialise,
+        model.camera,
+        config.common_size,
+    )
+
+
+def _initial_poses(shared: FitShared, run: Run, windows: Windows) -> Pose:
+    """Return the initial poses of some windows of a run, with leading axes W, H (hypotheses)."""
+    if shared.initial_poses is not None:
+        return shared.initial_poses.window_poses(shared.model.bird, windows, run.config.common_size)
+    return initial_poses_of(windows, run.config, shared.model)
+
+
+def _pose_key(config: FitConfig) -> Hashable:
+    """Return the part of the config that determines the windows and their initial poses."""
+    return *windows_key(config), config.initialise, config.common_size
+
+
+def _gather(shared: FitShared, task: FitTask) -> Batch:
+    """Return the batch of the problems of a task."""
+    config = task.runs[0].config
+    mask_px = config.crop.size_px if any(needs_mask(stage) for stage in config.stages) else 0
+    targets, targets_row = _prepare_rows(task, windows_key, lambda _, windows: load_targets(windows, mask_px))
+    poses, pose_row = _prepare_rows(task, _pose_key, partial(_initial_poses, shared))
+    return Batch(
+        targets=jax.tree.map(lambda *x: np.concatenate(x), *targets),
+        initial_pose=jax.tree.map(lambda *x: jnp.concatenate(x), *poses),
+        config=np.array([r for r, _ in task.problems]),
+        targets_row=targets_row,
+        pose_row=pose_row,
+    )
+
+
+def _prepare_rows(
+    task: FitTask, key_of: Callable[[FitConfig], Hashable], prepare: Callable[[Run, Windows], Any]
+) -> tuple[list[Any], Int[np.ndarray, "B"]]:
+    """Prepare the windows of the B problems of a task. Runs with an equal key share the rows of their windows.
+
+    Args:
+        task: the problems.
+        key_of: returns the part of a config that determines the result of `prepare`.
+        prepare: takes a run and some of its windows, and returns a pytree with one row for each window.
+
+    Returns:
+        The pytree of every key, and the row of each problem in their concatenation.
+    """
+    pairs = [(key_of(task.runs[r].config), w) for r, w in task.problems]
+    run_of = {key: task.runs[r] for (key, _), (r, _) in zip(pairs, task.problems, strict=True)}
+    prepared: list[Any] = []
+    row: dict[tuple[Hashable, int], int] = {}
+    for key, run in run_of.items():
+        windows = list(dict.fromkeys(w for other, w in pairs if other == key))
+        row |= {(key, w): len(row) + i for i, w in enumerate(windows)}
+        prepared.append(prepare(run, run.windows[np.array(windows)]))
+    return prepared, np.array([row[pair] for pair in pairs])
