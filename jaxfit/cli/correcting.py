@@ -1,4 +1,4 @@
-"""The command that lists and corrects the tracks of a result."""
+"""Commands that list, correct and join the tracks of results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxfit.corrections.edits import Edit
 from jaxfit.errors import InputError
 from jaxfit.progress import terminal
 
-__all__ = ["tracks"]
+__all__ = ["join", "tracks"]
 
 _TRACKS = {"swap": 2, "cut": 1, "join": 2, "delete": None}
 """Kind of an edit → number of its tracks; None is any number."""
@@ -37,6 +37,24 @@ def tracks(options: argparse.Namespace) -> None:
         show(f"fitted again: track {track}, frames {first} to {last}")
     show(f"{len(done.fitted)} of {counted(done.windows, 'window')} fitted again → {options.out}")
     show(f"jaxfit overlay {options.out} --video VIDEO --out overlay.mp4 draws the new result")
+
+
+def join(options: argparse.Namespace) -> None:
+    """Join the results of ranges of one video."""
+    from jaxfit.corrections.join import join_results
+
+    solution, table = join_results(options.results, options.out, options.bridge, options.overwrite)
+    shown = right_aligned("track", "first frame", "last frame", "becomes", "frames missing", "confidence")
+    shown.add_column("of")
+    for row in table:
+        continued = ("–", "–") if row.confidence is None else (str(row.missing), f"{row.confidence:.3f}")
+        shown.add_row(
+            str(row.track), str(row.first_frame), str(row.last_frame), str(row.joined), *continued, row.folder
+        )
+    shown.title = "confidence: that the track continues a track of an earlier range"
+    show(shown)
+    birds, frames = counted(len(solution.track_id), "bird"), counted(len(solution.frame_index), "frame")
+    show(f"{birds} over {frames} → {options.out}")
 
 
 def _list(options: argparse.Namespace) -> None:

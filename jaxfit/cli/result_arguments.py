@@ -1,4 +1,4 @@
-"""The arguments of `export`, `tracks` and `doctor`."""
+"""The arguments of `export`, `tracks`, `join` and `doctor`."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ def add_result_commands(commands: Any) -> None:
     """Add the commands."""
     _export(commands)
     _tracks(commands)
+    _join(commands)
     text = "check the installation: kernels, FFmpeg, codecs, networks, optional packages, cache"
     add_command(commands, "doctor", "doctor.doctor", text)
 
@@ -72,3 +73,13 @@ def _tracks(commands: Any) -> None:
     tracks.add_argument("--out", type=Path, metavar="DIR", help="folder for the corrected result")
     text = "replace an earlier result in the folder of --out"
     tracks.add_argument("--overwrite", action="store_true", help=text)
+
+
+def _join(commands: Any) -> None:
+    text = "join the results of ranges of one video, and continue tracks across the cuts by place and size"
+    join = add_command(commands, "join", "correcting.join", text)
+    text = "folders of `jaxfit reconstruct --start A --stop B`, in any order"
+    join.add_argument("results", type=Path, nargs="+", metavar="RESULT", help=text)
+    text = "a track may continue after so many frames without the bird (default: the memory of the tracker)"
+    join.add_argument("--bridge", type=int, metavar="FRAMES", help=text)
+    add_out(join, "DIR", "folder for the joined result", overwrite="an earlier result in the folder")

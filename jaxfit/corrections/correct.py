@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfit.config.fit import FitConfig, load_config
-from jaxfit.config.reconstruct import load_reconstruct_config
+from jaxfit.config.reconstruct import ReconstructConfig, load_reconstruct_config
 from jaxfit.corrections.edits import Edit, apply_edits
 from jaxfit.corrections.refit import Refit, refit
 from jaxfit.data.formats.coco import write_coco
@@ -27,9 +27,19 @@ from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_replaceable, new_folder
 from jaxfit.storage.reading import read_file
 
-__all__ = ["Tracks", "correct_tracks", "read_tracks"]
+__all__ = [
+    "CONFIG",
+    "MARKER",
+    "OBSERVATIONS",
+    "Tracks",
+    "correct_tracks",
+    "read_config",
+    "read_summary",
+    "read_tracks",
+]
 
-_OBSERVATIONS, _CONFIG, _SUMMARY, _MARKER = "observations.json", "config.yaml", "summary.json", "poses.npz"
+OBSERVATIONS, CONFIG, MARKER = "observations.json", "config.yaml", "poses.npz"
+_SUMMARY = "summary.json"
 _KEPT = ("video", "trust", "trust_reasons", "networks")
 """Entries of the summary that corrections do not change."""
 
@@ -54,9 +64,9 @@ def read_tracks(result: str | Path, observations: str | Path | None = None) -> T
     """
     folder = Path(result)
     solution, bird = load_solution(folder)
-    path = folder / _OBSERVATIONS if observations is None else Path(observations)
+    path = folder / OBSERVATIONS if observations is None else Path(observations)
     if observations is None and not path.is_file():
-        problem = f"holds no {_OBSERVATIONS}, because `jaxfit fit` does not copy the observations"
+        problem = f"holds no {OBSERVATIONS}, because `jaxfit fit` does not copy the observations"
         raise InputError(folder, problem, "give the observations of the fit by --observations")
     read = check_keypoints(read_observations(path), bird.keypoint_names, path)
     same = np.array_equal(read.frame_index, solution.frame_index)
@@ -93,31 +103,33 @@ def correct_tracks(
     folder, out, start = Path(result), Path(out), time.perf_counter()
     if out.resolve() == folder.resolve():
         raise InputError(out, "is the result itself, which corrections keep", "choose another --out")
-    check_replaceable(out, overwrite, _MARKER)
+    check_replaceable(out, overwrite, MARKER)
     tracks = read_tracks(folder, observations)
     corrected = apply_edits(tracks.observations, edits, folder)
-    config_text = read_file(folder / _CONFIG, CONFIG_BYTES, "a config").decode("utf-8", "replace")
-    config = _fit_config(folder / _CONFIG, config_text)
-    done = refit(tracks.solution, tracks.observations, corrected, tracks.bird, config, progress, folder)
+    config, config_text = read_config(folder)
+    fit_config = config.fit if isinstance(config, ReconstructConfig) else config
+    done = refit(tracks.solution, tracks.observations, corrected, tracks.bird, fit_config, progress, folder)
     summary: dict[str, Any] = summarise(done.solution, tracks.bird, {"fit": time.perf_counter() - start})
-    earlier = _summary(folder)
+    earlier = read_summary(folder)
     summary |= {key: value for key, value in earlier.items() if key in _KEPT}
     summary["quality"] = {row.track_id: row._asdict() for row in track_quality(corrected)}
     summary["corrections"] = [*earlier.get("corrections", []), *map(str, edits)]
-    with new_folder(out, overwrite, marker=_MARKER) as part:
-        write_coco(corrected, part / _OBSERVATIONS)
+    with new_folder(out, overwrite, marker=MARKER) as part:
+        write_coco(corrected, part / OBSERVATIONS)
         write_solution(done.solution, tracks.bird, config_text, summary, part)
     return done
 
 
-def _fit_config(path: Path, text: str) -> FitConfig:
-    """Return the config of the fit from the config of a fit or of a reconstruction."""
-    if any(line.startswith("fit:") for line in text.splitlines()):
-        return load_reconstruct_config(path).fit
-    return load_config(path)
+def read_config(folder: Path) -> tuple[FitConfig | ReconstructConfig, str]:
+    """Return the config of a result, of a fit or of a reconstruction, and the text of its file."""
+    path = folder / CONFIG
+    text = read_file(path, CONFIG_BYTES, "a config").decode("utf-8", "replace")
+    is_reconstruction = any(line.startswith("fit:") for line in text.splitlines())
+    return (load_reconstruct_config(path) if is_reconstruction else load_config(path)), text
 
 
-def _summary(folder: Path) -> dict[str, Any]:
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Return the content of `summary.json` of a result; empty if the file is absent."""
     path = folder / _SUMMARY
     value = read_json(path).value if path.is_file() else {}
     return value if isinstance(value, dict) else {}

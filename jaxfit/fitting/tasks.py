@@ -46,7 +46,7 @@ class FitTask(NamedTuple):
     """Some problems of a fit, with their own data."""
 
     runs: list[Run]
-    """The runs, with the windows of the problems only."""
+    """The runs, with the windows of the problems only; runs with an equal `windows_key` have the same windows."""
     problems: list[tuple[int, int]]
     """Run and row of the window in the windows of the run."""
 
@@ -56,8 +56,15 @@ def _no_report(_steps: float, _note: str) -> None:
 
 
 def cut_task(runs: Sequence[Run], problems: Sequence[tuple[int, int]]) -> FitTask:
-    """Return a task with the windows that some problems (run, window) need."""
-    rows = [sorted({w for other, w in problems if other == r}) for r in range(len(runs))]
+    """Return a task with the windows that some problems (run, window) need.
+
+    Runs with an equal `windows_key` have the same rows of windows, because `_prepare_rows` shares these rows.
+    """
+    keys = [windows_key(run.config) for run in runs]
+    wanted: dict[Hashable, set[int]] = {key: set() for key in keys}
+    for r, w in problems:
+        wanted[keys[r]].add(w)
+    rows = [sorted(wanted[key]) for key in keys]
     cut = [run._replace(windows=run.windows[np.array(own, int)]) for run, own in zip(runs, rows, strict=True)]
     return FitTask(cut, [(r, rows[r].index(w)) for r, w in problems])
 

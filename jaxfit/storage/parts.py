@@ -20,7 +20,7 @@ from jaxfit.storage.json_file import read_json_file
 from jaxfit.storage.npz import load_npz
 from jaxfit.storage.temporary import remove_leftovers
 
-__all__ = ["Parts"]
+__all__ = ["Parts", "differences"]
 
 _RECORD = "record.json"
 _SHOWN = 3
@@ -91,18 +91,18 @@ class Parts:
 
     def _check_record(self) -> None:
         held = read_json_file(self._folder / _RECORD, CONFIG_BYTES)
-        differences = list(_differences(held, self._record))
-        if differences:
-            more = f" and {len(differences) - _SHOWN} more" if len(differences) > _SHOWN else ""
-            problem = f"was begun with another {', '.join(differences[:_SHOWN])}{more}"
+        changed = list(differences(held, self._record))
+        if changed:
+            more = f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else ""
+            problem = f"was begun with another {', '.join(changed[:_SHOWN])}{more}"
             remedy = "repeat the earlier command to continue, or remove this folder to begin again"
             raise InputError(self._folder, problem, remedy)
 
 
-def _differences(held: Any, own: Any, name: str = "") -> Iterator[str]:
+def differences(held: Any, own: Any, name: str = "") -> Iterator[str]:
     """Yield the paths, such as `track.frames.stop`, of the values that differ."""
     if isinstance(held, dict) and isinstance(own, dict):
         for key in dict.fromkeys([*own, *held]):
-            yield from _differences(held.get(key), own.get(key), f"{name}.{key}" if name else key)
+            yield from differences(held.get(key), own.get(key), f"{name}.{key}" if name else key)
     elif held != own:
         yield name or "record"

@@ -14,8 +14,10 @@ from support.worker_tasks import add, attempts, deadly, failing, quick_fit, refu
 from jaxfit.errors import InputError
 from jaxfit.fitting import cluster as module
 from jaxfit.fitting.cluster import Cluster, FailedTask, open_cluster
-from jaxfit.fitting.fit import fit, fit_runs
+from jaxfit.fitting.fit import fit, fit_runs, windows_of
 from jaxfit.fitting.stored_windows import StoredWindows
+from jaxfit.fitting.tasks import Run, cut_task
+from jaxfit.fitting.windows import window_content
 from jaxfit.model.pose import Pose
 from jaxfit.simulation.detections import detect
 from jaxfit.storage.parts import Parts
@@ -115,6 +117,21 @@ def test_a_failed_task_is_a_status_of_its_birds(tmp_path, caplog):
     assert solution.failures == {0: (text,), 1: (text,)}
     assert "not computed" in caplog.text
     assert len(list(tmp_path.glob("*.npz"))) == BIRDS - 1  # the failed windows are computed again after a restart
+
+
+def test_runs_that_share_windows_share_the_rows_of_a_task():
+    """Run 0 and run 1 have equal windows, and the task holds other windows of run 0 than of run 1."""
+    configs = [settings(), replace(settings(), terms=settings().terms | {"pose_prior": 1.0}), settings(min_keypoints=5)]
+    observed = observe()
+    runs = [Run(each, windows_of(observed, each, "observations")) for each in configs]
+    problems = [(0, 0), (0, 4), (1, 3), (2, 5)]
+    task = cut_task(runs, problems)
+    for (r, w), (same, row) in zip(problems, task.problems, strict=True):
+        assert r == same
+        assert window_content(task.runs[r].windows, row) == window_content(runs[r].windows, w)
+    assert task.problems == [(0, 0), (0, 2), (1, 1), (2, 0)]
+    assert [len(run.windows) for run in task.runs] == [3, 3, 1]
+    np.testing.assert_array_equal(task.runs[0].windows.keypoints_px, task.runs[1].windows.keypoints_px)
 
 
 def test_tasks_are_taken_as_they_are_needed(workers):

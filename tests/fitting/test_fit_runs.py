@@ -10,7 +10,7 @@ from support.birds import toy_bird
 
 from jaxfit.config.fit import load_config
 from jaxfit.config.paths import with_values
-from jaxfit.fitting import batch
+from jaxfit.fitting import batch, tasks
 from jaxfit.fitting import fit as fit_module
 from jaxfit.fitting.fit import fit, fit_runs
 from jaxfit.model.camera import Camera
@@ -137,14 +137,15 @@ def test_hypotheses_of_different_runs_are_not_mixed(observed, monkeypatch):
 
 def test_shared_data_is_prepared_once(observed, monkeypatch):
     counts = {}
-    for name in ("cut_windows", "load_targets", "search_initial_poses"):
-        original = getattr(fit_module, name)
+    modules = {"cut_windows": fit_module, "load_targets": tasks, "search_initial_poses": tasks}
+    for name, module in modules.items():
+        original = getattr(module, name)
 
         def counting(*given, name=name, original=original):
             counts[name] = counts.get(name, 0) + 1
             return original(*given)
 
-        monkeypatch.setattr(fit_module, name, counting)
+        monkeypatch.setattr(module, name, counting)
     fit_runs(observed, BIRD, SWEEP)
     # once without the filter, and once with the filter
     assert counts == {"cut_windows": 2, "load_targets": 2, "search_initial_poses": 2}
