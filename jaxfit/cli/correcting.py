@@ -45,7 +45,7 @@ def join(options: argparse.Namespace) -> None:
 
     solution, table = join_results(options.results, options.out, options.bridge, options.overwrite)
     shown = right_aligned("track", "first frame", "last frame", "becomes", "frames missing", "confidence")
-    shown.add_column("of")
+    shown.add_column("of", overflow="fold")
     for row in table:
         continued = ("–", "–") if row.confidence is None else (str(row.missing), f"{row.confidence:.3f}")
         shown.add_row(
