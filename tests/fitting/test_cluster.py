@@ -8,9 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.cli_files import arguments, rejected
 from support.fits import BIRD, CAMERA, T, config, truths
 from support.worker_tasks import add, attempts, deadly, failing, quick_fit, refusing
 
+from jaxfit.cli.main import main
 from jaxfit.errors import InputError
 from jaxfit.fitting import cluster as module
 from jaxfit.fitting.cluster import Cluster, FailedTask, open_cluster
@@ -193,6 +195,23 @@ def test_no_scheduler_answers(monkeypatch, tmp_path):
     refused(tmp_path / "absent.json", "absent.json: does not exist")
     (tmp_path / "list.json").write_text("[]")
     refused(tmp_path / "list.json", "list.json: is not a scheduler")
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_the_command(inputs, scheduler, tmp_path, monkeypatch, capsys):
+    """A scheduler that is not there is refused, and the files of a result on workers are those of one process."""
+    monkeypatch.setattr("jaxfit.fitting.fit.fit_task", quick_fit)
+    options = arguments(inputs, tmp_path / "out")
+    rejected(capsys, [*options, "--scheduler", "nowhere"], "--scheduler nowhere: is not a scheduler")
+    with pytest.raises(SystemExit):
+        main([*options, "--scheduler", scheduler, "--workers", "2"])
+    assert "not allowed with argument --scheduler" in capsys.readouterr().err
+    assert main([*options, "--scheduler", scheduler]) == 0
+    assert main([*options[:-1], str(tmp_path / "alone")]) == 0
+    names = "poses.npz", "config.yaml", "model.npz"
+    assert [(tmp_path / "out" / name).read_bytes() for name in names] == [
+        (tmp_path / "alone" / name).read_bytes() for name in names
+    ]
 
 
 def test_a_scheduler_file(scheduler, tmp_path):
