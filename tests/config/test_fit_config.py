@@ -89,6 +89,17 @@ def test_a_file_beside_wins_over_a_shipped_name(tmp_path):
     assert load_config(written(tmp_path, "base: baseline\n")).window == 1
 
 
+def test_a_config_may_override_weights_alone():
+    """The stages of `fast` take the weights of `balanced`."""
+    fast, balanced = load_config("fast"), load_config("balanced")
+    assert balanced.stages == fast.stages
+    stage = balanced.stages[-1]
+    weights = {"pose_prior": 30, "velocity": 50}
+    settings = fast.stage_settings(stage)
+    changed = {name: settings[name] | {"weight": weight} for name, weight in weights.items()}
+    assert balanced.stage_settings(stage) == settings | changed
+
+
 def test_stage_settings_override_defaults_then_terms():
     stage = StageConfig("s", 1, ("keypoints", "velocity"), override={"keypoints": {"sigma_px": 5}, "velocity": 2})
     config = FitConfig((stage,), {"keypoints": {"weight": 3, "sigma_px": 7}})

@@ -22,7 +22,7 @@ def written(tmp_path, text, name="mine.yaml"):
 
 def test_the_shipped_file_holds_no_defaults():
     config = load_reconstruct_config()
-    assert (config.track, config.overlay, config.fit) == (TrackConfig(), OverlayConfig(), load_config("fast"))
+    assert (config.track, config.overlay, config.fit) == (TrackConfig(), OverlayConfig(), load_config("balanced"))
     assert set(_parse("reconstruct").values) == {"fit"}
     assert not config.track.repair_left_right_flips  # the paper's setting
 
@@ -66,7 +66,7 @@ def test_round_trip(tmp_path):
     [
         ("fit: baseline", "baseline", {}),
         ("fit: {base: baseline, window: 3}", "baseline", {"window": 3}),
-        ("base: reconstruct\nfit: {window: 3}", "fast", {"window": 3}),
+        ("base: reconstruct\nfit: {window: 3}", "balanced", {"window": 3}),
         ("base: reconstruct\nfit: own.yaml", "baseline", {"window": 4}),
         ("base: middle.yaml\nfit: {common_size: true}", "baseline", {"window": 4, "common_size": True}),
     ],
