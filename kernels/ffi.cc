@@ -114,9 +114,9 @@ ffi::Error mask_loss_and_gradient(ffi::ThreadPool pool, Floats vertices, Indices
 }
 
 // `slope` is (J, 3, 4, P) and `shape` is (V, 3, S), with P and S multiples of 16 and D = P + S.
-ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indices faces, Floats weight, Floats rest,
-                                   Indices joint, Floats skin_weight, Floats slope, Floats shape,
-                                   ffi::Result<Floats> block, int32_t size, float sigma, float radius, float focal, float centre) {
+ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indices faces, Bytes target, Floats weight,
+                                   Floats rest, Indices joint, Floats skin_weight, Floats slope, Floats shape,
+                                   ffi::Result<Floats> block, float sigma, float radius, float focal, float centre) {
   const Batch batch(block->dimensions(), 2);
   const Blur blur = checked_blur(sigma, radius);
   const Meshes meshes(vertices, faces, batch);
@@ -127,8 +127,8 @@ ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indice
     throw std::invalid_argument("block: expected a multiple of 16 parameters, got " + std::to_string(transforming) +
                                 " and " + std::to_string(shapes));
   check_result("block", block->dimensions(), batch, {parameters, parameters});
-  if (size < 1 || size > kMaxSize)
-    throw std::invalid_argument("size: expected 1 to " + std::to_string(kMaxSize) + ", got " + std::to_string(size));
+  const int64_t size = size_of("target", target.dimensions());
+  const Operand target_at = bind("target", target.dimensions(), batch, {size, size});
   const Operand weight_at = bind("weight", weight.dimensions(), batch, {});
   const Operand rest_at = bind("rest", rest.dimensions(), batch, {meshes.num_vertices, 3});
   const Operand joint_at = bind("joint", joint.dimensions(), batch, {meshes.num_vertices, kAny});
@@ -157,7 +157,8 @@ ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indice
                     centre};
     const Mesh mesh = meshes.of(batch, i);
     void* memory = scratch(kernels.gauss_newton_workspace(mesh, skin, size));
-    kernels.silhouette_gauss_newton(mesh, skin, blur, size, memory, own);
+    const uint8_t* pixels = target.typed_data() + target_at.offset(batch, i);
+    kernels.silhouette_gauss_newton(mesh, skin, blur, size, memory, pixels, own);
   });
   return ffi::Error::Success();
 }
@@ -219,6 +220,7 @@ XLA_FFI_Error* mask_loss_and_gradient_handler(XLA_FFI_CallFrame* frame) {
 XLA_FFI_Error* silhouette_gauss_newton_handler(XLA_FFI_CallFrame* frame) {
   return call_guarded(frame->api, [frame] {
     static const auto* handler = with_mesh()
+                                     .Arg<Bytes>()
                                      .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Arg<Indices>()
@@ -226,7 +228,6 @@ XLA_FFI_Error* silhouette_gauss_newton_handler(XLA_FFI_CallFrame* frame) {
                                      .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Ret<Floats>()
-                                     .Attr<int32_t>("size")
                                      .Attr<float>("sigma")
                                      .Attr<float>("radius")
                                      .Attr<float>("focal")

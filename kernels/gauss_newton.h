@@ -1,7 +1,7 @@
 // The Gauss-Newton block of the silhouette of one image. Part of silhouette.cc.
 //
 // The block is Jᵀ·J with one row of J = d silhouette / d parameters for each pixel of the band in which the silhouette
-// is neither 0 nor 1. Of a band with more than kMostRows pixels, an evenly spread part enters with a larger weight.
+// is neither 0 nor 1, and the mask is not unknown. Of a band with more than kMostRows pixels, an evenly spread part enters with a larger weight.
 // A row is the sum over the faces near the pixel: d silhouette / d vertex, times d vertex / d parameters. The second
 // factor is computed once for each vertex that some row needs.
 #pragma once
@@ -44,12 +44,13 @@ INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, int64_t size, void* m
 }
 
 // Replaces the products by the factors of p · (pixel - nearest point) in d silhouette. Returns the pixels in the band.
-int64_t set_row_factors(Scale scale, Workspace& ws) {
+int64_t set_row_factors(const uint8_t* target, int64_t size, Scale scale, Workspace& ws) {
   const Vec one = all(1.f), low = all(kBandEdge), high = all(1 - kBandEdge);
   int64_t count = 0;
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     const Vec transmitted = one / load(place);
-    const Mask band = (transmitted > low) & (high > transmitted);
+    const Vec known = load_unequal(target, size, column, row, kUnknown, kBird);
+    const Mask band = (transmitted > low) & (high > transmitted) & (known > all(0.f));
     if (!bits(band)) {
       close(ws, column, row);
       return;
@@ -177,12 +178,13 @@ void multiply_rows(const Rows& rows, int64_t D, float* block) {
     for (int64_t d = 0; d < i; ++d) block[i * D + d] = block[d * D + i];
 }
 
-void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory, float* block) {
+void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory,
+                             const uint8_t* target, float* block) {
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
   if (!render(mesh, size, scale, ws)) return fill(block, skin.parameters * skin.parameters, __builtin_nanf(""));
   Rows rows = carve_rows(mesh, skin, size, memory);
-  choose_rows(set_row_factors(scale, ws), ws, rows);
+  choose_rows(set_row_factors(target, size, scale, ws), ws, rows);
   fill_rows(mesh, skin, scale, ws, rows);
   multiply_rows(rows, skin.parameters, block);
 }

@@ -44,6 +44,18 @@ INLINE void for_each_place(const Workspace& ws, Visit visit) {
       visit(ws.products + (row * ws.blocks + column) * kLanes, column, row);
 }
 
+// Returns 1 where a byte of a 4×4 block is not `value`, else 0. The bytes outside the image are `fill`.
+INLINE Vec load_unequal(const uint8_t* image, int64_t size, int64_t column, int64_t row, uint8_t value, uint8_t fill) {
+  const int64_t x0 = column * kBlock, y0 = row * kBlock;
+  if (x0 + kBlock <= size && y0 + kBlock <= size) return unequal(image + y0 * size + x0, size, value);
+  uint8_t bytes[kLanes];
+  for (int i = 0; i < kLanes; ++i) {
+    const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
+    bytes[i] = x < size && y < size ? image[y * size + x] : fill;
+  }
+  return unequal(bytes, kBlock, value);
+}
+
 void fill(float* p, int64_t n, float value) {
   for (int64_t i = 0; i < n; ++i) p[i] = value;
 }

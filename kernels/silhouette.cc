@@ -79,15 +79,14 @@ INLINE Vec load_block(const float* image, int64_t size, int64_t column, int64_t 
   return load(values);
 }
 
-INLINE Vec load_block(const uint8_t* image, int64_t size, int64_t column, int64_t row, uint8_t fill) {
-  const int64_t x0 = column * kBlock, y0 = row * kBlock;
-  if (x0 + kBlock <= size && y0 + kBlock <= size) return from_bytes(image + y0 * size + x0, size);
-  uint8_t values[kLanes];
-  for (int i = 0; i < kLanes; ++i) {
-    const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
-    values[i] = x < size && y < size ? image[y * size + x] : fill;
-  }
-  return from_bytes(values, kBlock);
+// Returns silhouette - target, 0 at unknown pixels. Outside the image the target is the bird.
+INLINE Vec error_of(Vec silhouette, const float* target, int64_t size, int64_t column, int64_t row) {
+  return silhouette - load_block(target, size, column, row, 1.f);
+}
+
+INLINE Vec error_of(Vec silhouette, const uint8_t* target, int64_t size, int64_t column, int64_t row) {
+  const Vec known = load_unequal(target, size, column, row, kUnknown, kBird);
+  return known * (silhouette - load_unequal(target, size, column, row, kBackground, kBird));
 }
 
 // Replaces the products by the factors of the gradient, given d loss / d silhouette. Closes blocks without gradient.
@@ -105,7 +104,7 @@ float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, boo
   const Vec one = all(1.f);
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     const Vec transmitted = one / load(place);
-    const Vec error = (one - transmitted) - load_block(target, size, column, row, static_cast<Pixel>(1));
+    const Vec error = error_of(one - transmitted, target, size, column, row);
     const Vec magnitude = abs(error);
     Vec slope;
     if (kind == LossKind::kL1) {

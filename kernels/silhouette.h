@@ -15,7 +15,10 @@ struct Blur {
 
 enum class LossKind : int32_t { kL1 = 0, kSmoothL1 = 1 };
 
-// A mask with one byte (zero or not zero) or one float (in [0, 1]) per pixel. Exactly one pointer is set.
+constexpr uint8_t kBackground = 0, kBird = 1, kUnknown = 2;
+
+// A mask with one byte or one float (in [0, 1]) per pixel. Exactly one pointer is set. A byte is kBackground or
+// kUnknown; any other value is kBird. Unknown pixels have no loss, no gradient and no curvature.
 struct Target {
   const uint8_t* bytes;
   const float* floats;
@@ -46,8 +49,10 @@ struct Kernels {
   void (*mask_loss)(const Mesh&, Blur, int64_t size, void* memory, Target, LossKind, float* loss,
                     float* gradient);
   size_t (*gauss_newton_workspace)(const Mesh&, const Skin&, int64_t size);
-  // Computes the block Jᵀ·J (D, D) with J = d silhouette / d parameters. The depths of the mesh are in the camera frame.
-  void (*silhouette_gauss_newton)(const Mesh&, const Skin&, Blur, int64_t size, void* memory, float* block);
+  // Computes the block Jᵀ·J (D, D) with J = d silhouette / d parameters, without the unknown pixels of the mask `target`.
+  // The depths of the mesh are in the camera frame.
+  void (*silhouette_gauss_newton)(const Mesh&, const Skin&, Blur, int64_t size, void* memory, const uint8_t* target,
+                                  float* block);
 };
 
 }  // namespace jaxfit

@@ -31,7 +31,7 @@ constexpr float kExpRound[5] = {0.9999992847442627f, 0.6931217908859253f, 0.2402
 //   negate_if_any_negative(d, …)  -d where one of the other three has a minus sign, else d; for d ≥ 0
 //   flip_sign(a, s)               a, negated where s has a minus sign
 //   grow(product, e, m)           product · (1 + e) where m, never NaN
-//   from_bytes(p, stride)         a 4×4 block of bytes as floats: 1 where the byte is not 0, else 0
+//   unequal(p, stride, value)     a 4×4 block of bytes as floats: 1 where the byte is not `value`, else 0
 //   reduce12(sums, total)         for each of twelve vectors the sum over its lanes
 #if defined(JAXFIT_AVX512)
 #include "simd_avx512.h"

@@ -78,13 +78,14 @@ INLINE float sum(Vec x) {
   const __m128 p = _mm_add_ps(q, _mm_movehl_ps(q, q));
   return _mm_cvtss_f32(_mm_add_ss(p, _mm_shuffle_ps(p, p, 1)));
 }
-INLINE Vec from_bytes(const uint8_t* p, int64_t stride) {
+INLINE Vec unequal(const uint8_t* p, int64_t stride, uint8_t value) {
   int32_t r[4];
   for (int i = 0; i < 4; ++i) __builtin_memcpy(&r[i], p + i * stride, 4);
   const __m128i zero = _mm_setzero_si128();
-  const __m128i set = _mm_andnot_si128(_mm_cmpeq_epi8(_mm_set_epi32(r[3], r[2], r[1], r[0]), zero), _mm_set1_epi8(1));
-  return {_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(set)),
-          _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_unpackhi_epi64(set, zero)))};
+  const __m128i equal = _mm_cmpeq_epi8(_mm_set_epi32(r[3], r[2], r[1], r[0]), _mm_set1_epi8(static_cast<char>(value)));
+  const __m128i other = _mm_andnot_si128(equal, _mm_set1_epi8(1));
+  return {_mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(other)),
+          _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_unpackhi_epi64(other, zero)))};
 }
 INLINE void reduce12(const Vec sums[12], float total[16]) {
   for (int i = 0; i < 3; ++i) {

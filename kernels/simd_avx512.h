@@ -63,11 +63,12 @@ INLINE Vec reciprocal(Vec a) {  // with one Newton step, to a relative error of 
   return r * Vec{_mm512_fnmadd_ps(a.v, r.v, _mm512_set1_ps(2.0f))};
 }
 INLINE float sum(Vec a) { return _mm512_reduce_add_ps(a.v); }
-INLINE Vec from_bytes(const uint8_t* p, int64_t stride) {  // a 4×4 block of bytes: 1 where the byte is not 0
+INLINE Vec unequal(const uint8_t* p, int64_t stride, uint8_t value) {
   int32_t r[4];
   for (int i = 0; i < 4; ++i) __builtin_memcpy(&r[i], p + i * stride, 4);
   const __m128i b = _mm_set_epi32(r[3], r[2], r[1], r[0]);
-  return {_mm512_maskz_mov_ps(_mm_test_epi8_mask(b, b), _mm512_set1_ps(1.0f))};
+  const __mmask16 other = _mm_cmpneq_epi8_mask(b, _mm_set1_epi8(static_cast<char>(value)));
+  return {_mm512_maskz_mov_ps(other, _mm512_set1_ps(1.0f))};
 }
 INLINE __m512 fold_quarters(__m512 a, __m512 b) {  // quarters of the result: a0 + a2, a1 + a3, b0 + b2, b1 + b3
   return _mm512_add_ps(_mm512_shuffle_f32x4(a, b, 0x44), _mm512_shuffle_f32x4(a, b, 0xEE));

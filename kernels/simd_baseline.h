@@ -90,10 +90,10 @@ INLINE Vec grow(Vec product, Vec e, Mask m) {
   return min(fma_where(m, product, e, product), all(kFull));
 }
 INLINE Vec reciprocal(Vec a) { return all(1.0f) / a; }
-INLINE Vec from_bytes(const uint8_t* p, int64_t stride) {
+INLINE Vec unequal(const uint8_t* p, int64_t stride, uint8_t value) {
   float r[16];
   for (int i = 0; i < 4; ++i)
-    for (int j = 0; j < 4; ++j) r[4 * i + j] = p[i * stride + j] ? 1.0f : 0.0f;
+    for (int j = 0; j < 4; ++j) r[4 * i + j] = p[i * stride + j] != value ? 1.0f : 0.0f;
   return load(r);
 }
 INLINE void reduce12(const Vec sums[12], float total[16]) {

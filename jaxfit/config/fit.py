@@ -141,6 +141,9 @@ class FitConfig:
     """Whether one scale holds for the whole window, instead of one scale per frame."""
     filter_window: int = 5
     """Number of frames of the weighted median filter over detected keypoints; 1 switches the filter off."""
+    unknown_pixels: bool = False
+    """Whether the mask terms skip the pixels that may or may not show the bird: pixels outside its mask, but in the
+    masks of other birds or close to them, or beyond the border of the image. False: these pixels are background."""
     min_keypoints: int = 4
     """Number of confident keypoints that a frame needs to be fitted."""
     crop: CropConfig = CropConfig()

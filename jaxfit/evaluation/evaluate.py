@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.data.masks import decode_mask
+from jaxfit.data.neighbours import masks_of_others
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.data.solution import Solution
@@ -20,6 +22,7 @@ from jaxfit.evaluation.keypoint_errors import correct_keypoints, squared_errors,
 from jaxfit.evaluation.matching import match
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.evaluation.truth import Truth
+from jaxfit.limits import IMAGE_SIDE_PX
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.raster.zbuffer import hard_mask
@@ -42,7 +45,8 @@ def evaluate(
 
     PCK counts annotated keypoints, hidden ones included, within 5 and 10 % of the longer side of the annotated mask
     (of the box where there is no mask). IoU compares the hard mask of the mesh with the annotated mask, which is the
-    mask of the whole bird where that is known. me_p and me_v are RMS errors of the same keypoints, relative to the
+    mask of the whole bird where that is known; otherwise the pixels of other birds' masks do not count, because the
+    mesh may be hidden there. me_p and me_v are RMS errors of the same keypoints, relative to the
     longer side of the mask of the mesh; me_v is per frame of the result's file (see `metrics.me_v`). True poses add
     3D errors, also for birds and frames without an annotation.
 
@@ -165,6 +169,7 @@ def _compare_masks(
     iou, true_side, predicted_side = np.full((3, *measured.shape), np.nan)
     posed = PosedBirds(solution, bird)
     faces = np.asarray(posed.faces)
+    others = _masks_of_others(seen, measured, at)
     with progress("Measuring", int(measured.sum())) as report_progress:
         for n, t in np.argwhere(measured).tolist():
             n_truth, t_truth = int(at[0][n, 0]), int(at[1][t])
@@ -175,9 +180,20 @@ def _compare_masks(
                 true_side[n, t] = seen.box_px[n_truth, t_truth, 2:].max()
             else:
                 true_side[n, t] = metrics.longest_side_of_mask(true)
+                if others[n, t] is not None:
+                    predicted &= true | ~decode_mask(others[n, t])
                 iou[n, t] = metrics.iou(predicted, true)
             report_progress(1, "")
     return _MaskComparison(iou, true_side, predicted_side)
+
+
+def _masks_of_others(seen: Observations, measured: np.ndarray, at: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the masks of all other birds, (N, T) run lengths or None, for birds whose whole mask is not known."""
+    needed = measured.copy()
+    for n, t in np.argwhere(measured).tolist():
+        needed[n, t] = (int(at[0][n, 0]), int(at[1][t])) not in seen.amodal_masks
+    frame = np.where(needed, at[1], -1)
+    return masks_of_others(seen, at[0][:, 0], frame, np.full((*frame.shape, 3), [0.0, 0.0, IMAGE_SIDE_PX]))
 
 
 def _behaviour_of_frames(

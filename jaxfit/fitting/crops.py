@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.limits import CROP_IMAGE_SIDES, IMAGE_SIDE_PX
+from jaxfit.model.camera import CROP_PX
+from jaxfit.raster.silhouette import UNKNOWN
 
-__all__ = ["crop_squares", "cut_mask"]
+__all__ = ["crop_squares", "cut_mask", "mark_unknown"]
 
 LEAST_SIZE_PX = 16.0
 """Smallest side of a crop, in image pixels."""
+MARGIN_PX = 3.0
+"""Pixels this close to another bird's mask are unknown, in pixels of a 256-pixel crop: masks are ragged, and the edge
+of a silhouette is soft."""
 
 
 def crop_squares(
@@ -93,3 +98,28 @@ def cut_mask(mask: Bool[np.ndarray, "H W"], crop: Float[np.ndarray, "3"], mask_p
         method = cv2.INTER_AREA if size > mask_px else cv2.INTER_LINEAR
         cut = cv2.resize(cut, (mask_px, mask_px), interpolation=method)
     return (cut >= 128).astype(np.uint8)
+
+
+def mark_unknown(
+    cut: UInt8[np.ndarray, "S S"],
+    others: Bool[np.ndarray, "H W"] | None,
+    shape: tuple[int, int],
+    crop: Float[np.ndarray, "3"],
+) -> None:
+    """Mark the unknown pixels of the crop of a mask: the background near other birds and beyond the image's border.
+
+    Args:
+        cut: the crop of the mask, 0 or 1; it is changed in place.
+        others: mask of the other birds in the image; None without them.
+        shape: height and width of the image.
+        crop: x0, y0 and size in image pixels.
+    """
+    mask_px = len(cut)
+    centre = (np.arange(mask_px) + 0.5) * crop[2] / mask_px
+    x, y = crop[0] + centre, crop[1] + centre
+    unknown = ((y < 0) | (y > shape[0]))[:, None] | (x < 0) | (x > shape[1])
+    if others is not None:
+        radius = round(MARGIN_PX * mask_px / CROP_PX)
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
+        unknown |= cv2.dilate(cut_mask(others, crop, mask_px), disc) > 0
+    cut[unknown & (cut == 0)] = UNKNOWN

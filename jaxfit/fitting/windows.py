@@ -12,10 +12,11 @@ from jaxtyping import Bool, Float, Int
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.masks import decode_mask
+from jaxfit.data.neighbours import masks_of_others
 from jaxfit.data.observations import Observations
 from jaxfit.data.tables import check_memory
 from jaxfit.errors import InputError
-from jaxfit.fitting.crops import crop_squares, cut_mask
+from jaxfit.fitting.crops import crop_squares, cut_mask, mark_unknown
 from jaxfit.fitting.distant import without_distant_birds
 from jaxfit.fitting.filtering import weighted_median_filter
 from jaxfit.limits import TABLE_GB
@@ -48,6 +49,9 @@ class Windows:
     """In [0, 1]; 0 where a keypoint is missing."""
     mask_rle: np.ndarray
     """(W, T) objects: run lengths of the bird's mask in its image, or None. `load_targets` decodes them."""
+    others_rle: np.ndarray
+    """(W, T) objects: run lengths of the masks of all other birds that reach into the crop, or None without them;
+    False where the pixels outside the bird's mask are background."""
 
     def __len__(self) -> int:
         return len(self.track)
@@ -58,14 +62,16 @@ class Windows:
 
 def windows_key(config: FitConfig) -> tuple:
     """Return the part of the config that determines the windows and their targets."""
-    return config.filter_window, config.window, config.overlap, config.min_keypoints, config.crop
+    settings = config.filter_window, config.window, config.overlap, config.min_keypoints, config.unknown_pixels
+    return *settings, config.crop
 
 
 def window_content(windows: Windows, w: int) -> tuple:
     """Return the content of a window, which determines its fit under one config and model."""
     arrays = (windows.frame, windows.present, windows.crop, windows.keypoints_px, windows.confidence)
-    masks = tuple(None if rle is None else (tuple(rle["size"]), rle["counts"]) for rle in windows.mask_rle[w])
-    return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), masks
+    masks = (*windows.mask_rle[w], *windows.others_rle[w])
+    lengths = tuple((tuple(rle["size"]), rle["counts"]) if rle else rle for rle in masks)
+    return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), lengths
 
 
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:
@@ -106,6 +112,9 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     mask_rle = np.full(frame.shape, None, object)
     for w, t in zip(*np.nonzero(present), strict=True):
         mask_rle[w, t] = observations.masks.get((int(track[w]), int(frame[w, t])))
+    others_rle = np.full(frame.shape, False, object)
+    if config.unknown_pixels:
+        others_rle = masks_of_others(observations, track, np.where(present, frame, -1), crop)
     return Windows(
         track=track,
         track_id=observations.track_id[track],
@@ -115,6 +124,7 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
         keypoints_px=np.where(confidence[..., None] > 0, keypoints_px, 0).astype(np.float32),
         confidence=confidence,
         mask_rle=mask_rle,
+        others_rle=others_rle,
     )
 
 
@@ -150,6 +160,10 @@ def load_targets(windows: Windows, mask_px: int) -> Targets:
     for w, t in zip(*np.nonzero(has_mask & (mask_px > 0)), strict=True):
         full = decode_mask(cast(Any, windows.mask_rle[w, t]))
         mask[w, t] = cut_mask(full, windows.crop[w, t], mask_px)
+        others = cast(Any, windows.others_rle[w, t])
+        if others is not False:
+            others = None if others is None else decode_mask(others)
+            mark_unknown(mask[w, t], others, cast(Any, full.shape), windows.crop[w, t])
     return Targets(
         keypoints_px=windows.keypoints_px,
         confidence=windows.confidence,

@@ -44,7 +44,8 @@ class Targets(eqx.Module):
     confidence: Float[Array | np.ndarray, "*T K"]
     """Confidence of each keypoint in [0, 1]; 0 where the keypoint was not observed."""
     mask: UInt8[Array | np.ndarray, "*T H W"]
-    """0 or 1; of the silhouette's size, or empty in a stage that compares no masks."""
+    """0, 1, or 2 where it is unknown whether the pixel shows the bird; of the silhouette's size, or empty in a stage
+    that compares no masks."""
     has_mask: Bool[Array | np.ndarray, "*T"]
     """False where the frame has no mask; the mask terms skip such frames."""
     present: Bool[Array | np.ndarray, "*T"]

@@ -55,13 +55,12 @@ def _mask_curvature(window: PosedWindow) -> Curvature:
     camera_px = window.camera.focal_px * ratio, window.camera.centre_px * ratio
     raster = {"blur": window.raster.blur, "backend": window.raster.backend}
 
-    def frame(vertices_screen, weight, slope, shape_slope):
+    def frame(vertices_screen, target, weight, slope, shape_slope):
         skin = window.skin._replace(slope=slope, shape_slope=shape_slope)
-        size = window.raster.size_px
-        return silhouette_gauss_newton(vertices_screen, window.faces, weight, skin, size, camera_px, **raster)
+        return silhouette_gauss_newton(vertices_screen, window.faces, target, weight, skin, camera_px, **raster)
 
-    framewise = window.vertices_screen, _mask_weight(window), window.skin.slope, window.skin.shape_slope
-    blocks = jax.vmap(frame)(*framewise)
+    skin = window.skin.slope, window.skin.shape_slope
+    blocks = jax.vmap(frame)(window.vertices_screen, window.targets.mask, _mask_weight(window), *skin)
 
     def product(d: Rows) -> Rows:
         return jnp.einsum("tij,tj->ti", blocks, d)
@@ -73,7 +72,7 @@ def _mask_curvature(window: PosedWindow) -> Curvature:
 def mask(window: PosedWindow) -> Scalar:
     """Compare silhouette and mask by the L1 norm: E_msk = Σ_t Σ_pixels |soft silhouette − mask|.
 
-    The sum is over crop pixels, whatever the size of the silhouette.
+    The sum is over crop pixels, whatever the size of the silhouette, without the unknown pixels of the mask.
 
     Source: Hägerlind et al. 2024, mask term.
     """

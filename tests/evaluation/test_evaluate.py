@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, sides, solution, truth
 
+from jaxfit.data.masks import encode_mask
 from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import COLUMNS, evaluate
@@ -70,9 +71,29 @@ def test_overlap_of_a_shifted_mesh():
     for n in range(N):
         for t in range(T):
             mask = seen.mask(n, t)
-            there = np.roll(mask, 7, axis=1)
+            others = np.any([seen.mask(other, t) for other in range(N) if other != n], axis=0)
+            there = np.roll(mask, 7, axis=1) & (mask | ~others)  # another bird may hide the mesh
             overlap.append((mask & there).sum() / (mask | there).sum())
     assert evaluate(moved, BIRD, seen).overall["iou"] == pytest.approx(np.mean(overlap), abs=1e-3)
+
+
+def test_pixels_of_other_birds_do_not_count():
+    """Bird 1 hides the right half of bird 0. Without the whole mask, only the left half can be compared."""
+    seen = truth()
+    masks, whole = dict(seen.masks), {}
+    for t in range(T):
+        whole[0, t], left = seen.masks[0, t], seen.mask(0, t)
+        middle = int(seen.box_px[0, t, 0] + seen.box_px[0, t, 2] / 2)
+        left[:, middle:] = False
+        masks[0, t] = encode_mask(left)
+        masks[1, t] = encode_mask(seen.mask(1, t) | (seen.mask(0, t) & ~left))
+    hidden = dataclasses.replace(seen, masks=masks)
+    track = int(seen.track_id[0])
+    assert evaluate(solution(), BIRD, hidden).tracks[track]["iou"] == pytest.approx(1)
+    alone = hidden.select(tracks=[0])
+    assert evaluate(solution(), BIRD, alone).tracks[track]["iou"] < 0.7
+    known = dataclasses.replace(alone, amodal_masks=whole)
+    assert evaluate(solution(), BIRD, known).tracks[track]["iou"] == pytest.approx(1)
 
 
 def test_poses_that_are_missing():

@@ -62,27 +62,28 @@ def skin_of(row):
     return raster.Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope, shape_derivatives(RIG, A, pose))
 
 
-def block(row, backend, weight=1.0, vertices=None, faces=RIG.faces, blur=BLUR, size=SIZE):
+def block(row, backend, weight=1.0, vertices=None, faces=RIG.faces, blur=BLUR, size=SIZE, target=None):
     vertices = on_screen(row, size) if vertices is None else vertices
-    return compiled_block(vertices, faces, weight, skin_of(row), backend, blur, size)
+    target = jnp.zeros((size, size), jnp.uint8) if target is None else target
+    return compiled_block(vertices, faces, target, weight, skin_of(row), backend, blur)
 
 
-@functools.partial(jax.jit, static_argnames=("backend", "blur", "size"))
-def compiled_block(vertices, faces, weight, skin, backend, blur, size):
-    ratio = size / Camera().size_px
+@functools.partial(jax.jit, static_argnames=("backend", "blur"))
+def compiled_block(vertices, faces, target, weight, skin, backend, blur):
+    ratio = target.shape[0] / Camera().size_px
     camera_px = Camera().focal_px * ratio, Camera().centre_px * ratio
-    return raster.silhouette_gauss_newton(vertices, faces, weight, skin, size, camera_px, blur=blur, backend=backend)
+    return raster.silhouette_gauss_newton(vertices, faces, target, weight, skin, camera_px, blur=blur, backend=backend)
 
 
 @jax.jit
-def by_autodiff(row):
-    """JᵀJ over the band, and the number of pixels in the band."""
+def by_autodiff(row, known=True):
+    """JᵀJ over the known pixels of the band, and their number."""
 
     def image(row):
         return reference.silhouette(on_screen(row), RIG.faces, SIZE, BLUR)
 
     value, J = image(row), jax.jacfwd(image)(row)
-    band = (value > 0.01) & (value < 0.99)
+    band = (value > 0.01) & (value < 0.99) & known
     return jnp.einsum("yxd,yxe->de", jnp.where(band[..., None], J, 0.0), J), band.sum()
 
 
@@ -115,6 +116,22 @@ def test_kernels_equal_the_reference(native, place):
     row = row_of(PLACES[place])
     expected = block(row, "reference")
     np.testing.assert_allclose(block(row, native), expected, atol=1e-5 * np.abs(expected).max())
+
+
+def random_target(size):
+    """A mask of background, bird and unknown pixels, and one other byte, which is bird."""
+    return jnp.asarray(np.random.default_rng(3).choice([0, 1, raster.UNKNOWN, 255], (size, size)), jnp.uint8)
+
+
+def test_unknown_pixels_have_no_curvature(native):
+    row, target = row_of(), random_target(SIZE)
+    expected, band = by_autodiff(row, target != raster.UNKNOWN)
+    assert 10 < band < 0.9 * by_autodiff(row)[1]
+    for backend in (native, "reference"):
+        found = block(row, backend, target=target)
+        np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+        assert not np.any(block(row, backend, target=jnp.full_like(target, raster.UNKNOWN)))
+        np.testing.assert_array_equal(block(row, backend, target=target == 1), block(row, backend))
 
 
 def test_a_bird_outside_the_image_has_no_curvature(native):
@@ -163,11 +180,13 @@ def test_a_batch_equals_single_images(native):
 
 def test_wrong_arguments(native):
     row = row_of()
-    with pytest.raises(ValueError, match="size: expected an integer"):
-        block(row, native, size=0)
+    with pytest.raises(ValueError, match=r"target: expected shape \(size, size\)"):
+        block(row, native, target=jnp.zeros((3, 4), jnp.uint8))
+    with pytest.raises(ValueError, match="target: expected bool or uint8, got float32"):
+        block(row, native, target=jnp.zeros((SIZE, SIZE)))
     wrong = skin_of(row)._replace(joint=skin_of(row).joint + 100)
     with pytest.raises(Exception, match=r"joint: an index is not in \[0, 8\)"):
-        compiled_block(on_screen(row), RIG.faces, 1.0, wrong, native, BLUR, SIZE).block_until_ready()
+        compiled_block(on_screen(row), RIG.faces, random_target(SIZE), 1.0, wrong, native, BLUR).block_until_ready()
 
 
 def test_the_rig_lists_the_joints_of_every_vertex():

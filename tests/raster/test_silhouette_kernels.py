@@ -44,7 +44,8 @@ def random_target(seed, size, dtype):
     rng = np.random.default_rng(seed)
     if dtype == np.float32:
         return jnp.asarray(rng.random((size, size), np.float32))
-    return jnp.asarray((rng.random((size, size)) < 0.5).astype(dtype))
+    values = [False, True] if dtype is bool else [0, 1, raster.UNKNOWN, 255]
+    return jnp.asarray(rng.choice(values, (size, size)), dtype)
 
 
 # Compiled once for all meshes and instruction sets.

@@ -145,13 +145,33 @@ def test_weight(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_any_byte_but_zero_is_inside(backend):
+def test_other_bytes_are_inside(backend):
     losses = {
         float(raster.mask_loss(quad(), FACES, mask().astype(dtype) * factor, backend=backend))
         for dtype, factor in ((bool, True), (jnp.uint8, 1), (jnp.uint8, 255), (jnp.float32, 1))
     }
     assert max(losses) - min(losses) <= 1e-3
     assert min(losses) > 100
+
+
+@pytest.mark.parametrize("kind", ["l1", "smooth_l1"])
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_unknown_pixels_cost_nothing(backend, kind):
+    target = mask().astype(jnp.uint8)
+    known = np.random.default_rng(4).random((SIZE, SIZE)) < 0.6
+    both = jax.jit(jax.value_and_grad(lambda v, t: raster.mask_loss(v, FACES, t, kind=kind, backend=backend)))
+
+    def by_hand(vertices):
+        e = jnp.abs(raster.silhouette(vertices, FACES, SIZE, backend="reference") - target)[known]
+        return jnp.sum(e if kind == "l1" else 0.5 * e**2)
+
+    value, gradient = both(quad(), jnp.where(known, target, raster.UNKNOWN))
+    expected = jax.value_and_grad(by_hand)(quad())
+    assert value == pytest.approx(float(expected[0]), rel=1e-4)
+    np.testing.assert_allclose(gradient, expected[1], rtol=1e-3, atol=1e-3 * np.abs(expected[1]).max())
+    nothing = both(quad(), jnp.full_like(target, raster.UNKNOWN))
+    assert nothing[0] == 0
+    assert not np.any(nothing[1])
 
 
 @pytest.mark.parametrize("backend", BACKENDS)

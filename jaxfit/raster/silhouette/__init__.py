@@ -5,9 +5,10 @@
 
 from jaxfit.raster.silhouette.native import available_isas, choose_isa, current_isa, kernels_available
 from jaxfit.raster.silhouette.operator import Backend, Kind, mask_loss, silhouette, silhouette_gauss_newton
-from jaxfit.raster.silhouette.reference import Blur, Skin
+from jaxfit.raster.silhouette.reference import UNKNOWN, Blur, Skin
 
 __all__ = [
+    "UNKNOWN",
     "Backend",
     "Blur",
     "Kind",

@@ -78,9 +78,9 @@ def mask_loss_and_gradient(
 def silhouette_gauss_newton(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
+    target: UInt8[Array, "size size"],
     weight: Float[Array, ""],
     skin: Skin,
-    size: int,
     camera_px: tuple[float, float],
     blur: Blur,
 ) -> Float[Array, "D D"]:
@@ -88,10 +88,9 @@ def silhouette_gauss_newton(
     slope, shape_slope = _padded(skin.slope), _padded(skin.shape_slope)
     size_of_block = slope.shape[-1] + shape_slope.shape[-1]
     block = jax.ShapeDtypeStruct((size_of_block, size_of_block), jnp.float32)
-    operands = (vertices, faces, weight, skin.rest, skin.joint, skin.weight, slope, shape_slope)
+    operands = (vertices, faces, target, weight, skin.rest, skin.joint, skin.weight, slope, shape_slope)
     focal, centre = (np.float32(x) for x in camera_px)
-    attributes = {"size": np.int32(size), "focal": focal, "centre": centre}
-    result = _call("jaxfit_silhouette_gauss_newton", block, *operands, blur=blur, **attributes)
+    result = _call("jaxfit_silhouette_gauss_newton", block, *operands, blur=blur, focal=focal, centre=centre)
     parameters, shapes = skin.slope.shape[-1], skin.shape_slope.shape[-1]
     kept = np.r_[:parameters, slope.shape[-1] : slope.shape[-1] + shapes]
     return result[kept][:, kept] if shapes else result[:parameters, :parameters]

@@ -74,7 +74,8 @@ def mask_loss(
 ) -> Float[Array, ""]:
     """Return the difference between the soft silhouette of a mesh and a mask, summed over the pixels.
 
-    L = w · Σ ρ(S − target). For "l1", ρ(e) = |e|. For "smooth_l1", ρ(e) = e²/2 if |e| < 1, else |e| − 1/2.
+    L = w · Σ ρ(S − target) over the known pixels. For "l1", ρ(e) = |e|. For "smooth_l1", ρ(e) = e²/2 if |e| < 1, else
+    |e| − 1/2.
 
     The loss is differentiable in reverse mode with respect to the weight and to x and y of the vertices. The target is
     a constant. One pass of the kernel computes loss and gradient. Without differentiation it computes only the loss.
@@ -82,7 +83,8 @@ def mask_loss(
     Args:
         vertices_screen: as for `silhouette`.
         faces: as for `silhouette`.
-        target: a square image of bool or uint8, where any value but 0 is inside, or of floats in [0, 1].
+        target: a square image of floats in [0, 1], of bool, or of uint8: 0 is outside, `UNKNOWN` (2) is unknown, any
+            other value is inside.
         weight: w. An image of weight 0 is not rendered. Its loss and all its gradients are 0, also the gradient with
             respect to the weight, and even if its vertices are not finite.
         kind: "l1" or "smooth_l1".
@@ -99,13 +101,7 @@ def mask_loss(
     Source: Hägerlind et al., "Temporally-consistent 3D Reconstruction of Seabirds" (2024), the term E_msk.
     """
     _check_mesh(vertices_screen, faces)
-    target = jnp.asarray(target)
-    if target.ndim != 2 or target.shape[0] != target.shape[1] or target.shape[0] == 0:
-        raise ValueError(f"target: expected shape (size, size), got {target.shape}")
-    if jnp.issubdtype(target.dtype, jnp.floating):
-        target = target.astype(jnp.float32)
-    elif target.dtype not in (jnp.bool_, jnp.uint8):
-        raise ValueError(f"target: expected bool, uint8 or floats, got {target.dtype}")
+    target = _check_target(target)
     if kind not in reference.KINDS:
         raise ValueError(f"kind: expected one of {reference.KINDS}, got {kind!r}")
     if jnp.shape(weight) != ():
@@ -121,9 +117,9 @@ def mask_loss(
 def silhouette_gauss_newton(
     vertices_screen: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
+    target: Bool[Array, "size size"] | UInt8[Array, "size size"],
     weight: Float[Array, ""] | float,
     skin: Skin,
-    size: int,
     camera_px: tuple[float, float],
     *,
     blur: Blur | None = None,
@@ -131,15 +127,16 @@ def silhouette_gauss_newton(
 ) -> Float[Array, "D D"]:
     """Return the Gauss-Newton block of the soft silhouette for the D parameters of a skinned mesh.
 
-    H = w · Σ j·jᵀ over the pixels with 0.01 < S < 0.99, where S is `silhouette` and j = dS / d parameters. H is the
-    curvature of ½ Σ (S − target)², and the solver uses H for both mask losses.
+    H = w · Σ j·jᵀ over the known pixels with 0.01 < S < 0.99, where S is `silhouette` and j = dS / d parameters. H is
+    the curvature of ½ Σ (S − target)², and the solver uses H for both mask losses.
 
     The kernels sum over at most 256 pixels. Of more pixels they take an evenly spread part, and scale the sum. H has no
     gradient.
 
     Args:
-        vertices_screen, faces, size, blur, backend: as for `silhouette`. The depth is that of the camera frame of
+        vertices_screen, faces, blur, backend: as for `silhouette`. The depth is that of the camera frame of
             `skin`, in the unit of its rest vertices.
+        target: the mask, as for `mask_loss`; only its size and its unknown pixels matter.
         weight: w. An image of weight 0 is not rendered, and its H is 0.
         skin: rest vertices, skinning weights and derivatives of the joint transforms.
         camera_px: focal length and centre of the image in pixels of the silhouette, for the pinhole camera
@@ -153,15 +150,17 @@ def silhouette_gauss_newton(
         RuntimeError: backend="native" without kernels.
     """
     _check_mesh(vertices_screen, faces)
-    _check_size(size)
-    blur = Blur.for_size(size) if blur is None else blur
+    target = _check_target(target)
+    if jnp.issubdtype(target.dtype, jnp.floating):
+        raise ValueError(f"target: expected bool or uint8, got {target.dtype}")
+    blur = Blur.for_size(target.shape[0]) if blur is None else blur
     vertices, faces = _as_operands(vertices_screen, faces)
     weight = jnp.asarray(weight, jnp.float32)
     block: Any = _dispatch(
         _choose(backend),
-        lambda v, f, w, s: native.silhouette_gauss_newton(v, f, w, s, int(size), camera_px, blur),
-        lambda v, f, w, s: reference.silhouette_gauss_newton(v, f, w, s, int(size), camera_px, blur),
-        *jax.lax.stop_gradient((vertices, faces, weight, skin)),
+        lambda v, f, t, w, s: native.silhouette_gauss_newton(v, f, t, w, s, camera_px, blur),
+        lambda v, f, t, w, s: reference.silhouette_gauss_newton(v, f, t, w, s, camera_px, blur),
+        *jax.lax.stop_gradient((vertices, faces, target.astype(jnp.uint8), weight, skin)),
     )
     return weight * block
 
@@ -169,6 +168,17 @@ def silhouette_gauss_newton(
 def _check_size(size) -> None:
     if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or not 0 < size <= 2**14:
         raise ValueError(f"size: expected an integer from 1 to {2**14}, got {size!r}")
+
+
+def _check_target(target) -> Array:
+    target = jnp.asarray(target)
+    if target.ndim != 2 or target.shape[0] != target.shape[1] or target.shape[0] == 0:
+        raise ValueError(f"target: expected shape (size, size), got {target.shape}")
+    if jnp.issubdtype(target.dtype, jnp.floating):
+        return target.astype(jnp.float32)
+    if target.dtype not in (jnp.bool_, jnp.uint8):
+        raise ValueError(f"target: expected bool, uint8 or floats, got {target.dtype}")
+    return target
 
 
 def _check_mesh(vertices, faces) -> None:

@@ -16,6 +16,7 @@ MIN_DEPTH = 1e-8  # a face with a vertex at or behind this depth is skipped
 MIN_AREA = 1e-8  # a face with at most this |2·area|, in units of half the image, is skipped
 FAR_AWAY = 2.0**20  # px; coordinates are clamped to ± this, so that their squares stay finite
 BAND_EDGE = 0.01  # the Gauss-Newton block sums over the pixels whose silhouette is this far from 0 and from 1
+UNKNOWN = 2  # this value of a uint8 mask marks the pixels that may or may not show the bird
 _FACES_AT_ONCE = 16
 
 
@@ -129,6 +130,11 @@ def silhouette(
     return image + jnp.sum(vertices[:, :2] * jnp.where(finite, 0.0, jnp.nan))
 
 
+def _known(target):
+    """Return the pixels of a mask that are not unknown; float and bool masks have no unknown pixels."""
+    return target != UNKNOWN if target.dtype == jnp.uint8 else jnp.ones(target.shape, bool)
+
+
 def mask_loss(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
@@ -141,7 +147,7 @@ def mask_loss(
     missing = weight == 0
     image = silhouette(jnp.where(missing, 0.0, vertices), faces, target.shape[-1], blur)
     mask = target if jnp.issubdtype(target.dtype, jnp.floating) else (target != 0).astype(image.dtype)
-    error = image - mask
+    error = jnp.where(_known(target), image - mask, 0.0)
     magnitude = jnp.abs(error)
     if kind == "smooth_l1":
         magnitude = jnp.where(magnitude < 1, 0.5 * error**2, magnitude - 0.5)
@@ -151,13 +157,13 @@ def mask_loss(
 def silhouette_gauss_newton(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
+    target: UInt8[Array, "size size"],
     weight: Float[Array, ""],
     skin: Skin,
-    size: int,
     camera_px: tuple[float, float],
     blur: Blur,
 ) -> Float[Array, "D D"]:
-    """Return the unweighted Gauss-Newton block over all pixels of the band. A weight of 0 gives a block of 0."""
+    """Return the unweighted Gauss-Newton block over all known pixels of the band. A weight of 0 gives a block of 0."""
     focal, centre = camera_px
     missing = weight == 0
     vertices = jnp.where(missing, 1.0, vertices)
@@ -169,10 +175,10 @@ def silhouette_gauss_newton(
     tangents = jnp.concatenate([moved_px, moved_cam[..., 2:]], axis=-1)
 
     def image(v):
-        return silhouette(v, faces, size, blur)
+        return silhouette(v, faces, target.shape[-1], blur)
 
     value = image(vertices)
     rows = jax.vmap(lambda tangent: jax.jvp(image, (vertices,), (tangent,))[1])(tangents)  # (D, size, size)
-    band = (value > BAND_EDGE) & (value < 1 - BAND_EDGE)
+    band = (value > BAND_EDGE) & (value < 1 - BAND_EDGE) & _known(target)
     block = jnp.einsum("dyx,eyx->de", jnp.where(band, rows, 0.0), rows)
     return jnp.where(missing, 0.0, block)
