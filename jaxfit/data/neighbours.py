@@ -36,7 +36,7 @@ def masks_of_others(
         if (n, t) not in observations.own_images:
             birds.setdefault(t, []).append(n)
     rles = {t: [cast(Any, observations.masks[n, t]) for n in rows] for t, rows in birds.items()}
-    boxes = {t: np.asarray(coco_mask.toBbox(rles[t])).reshape(-1, 4) for t in birds}
+    boxes = {t: np.asarray(coco_mask.toBbox(cast(Any, rles[t]))).reshape(-1, 4) for t in birds}
     union = np.full(frame.shape, None, object)
     for w, i in np.argwhere(frame >= 0).tolist():
         n, t = int(track[w]), int(frame[w, i])
