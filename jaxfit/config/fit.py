@@ -144,6 +144,9 @@ class FitConfig:
     unknown_pixels: bool = False
     """Whether the mask terms skip the pixels that may or may not show the bird: pixels outside its mask, but in the
     masks of other birds or close to them, or beyond the border of the image. False: these pixels are background."""
+    grow_masks_px: float = 0.0
+    """Pixels of a 256-pixel crop by which masks are enlarged before they are compared with silhouettes. The 0.5 level
+    of a soft silhouette lies outside the mesh (murre, blur 1: 2.3 pixels), so birds are fitted too small without it."""
     min_keypoints: int = 4
     """Number of confident keypoints that a frame needs to be fitted."""
     crop: CropConfig = CropConfig()
@@ -159,6 +162,7 @@ class FitConfig:
         require_within(self, 1, limits.WINDOW_FRAMES, "window")
         problem = f"is {self.overlap}, and `window` is {self.window}"
         require(0 <= self.overlap <= self.window // 2, "overlap", problem, "expected 0 to half of `window`")
+        require_within(self, 0, limits.GROW_MASKS_PX, "grow_masks_px")
         require_within(self, 1, limits.KEYPOINTS, "min_keypoints")
         require_within(self, 1, limits.FILTER_FRAMES, "filter_window")
         odd = self.filter_window % 2 == 1

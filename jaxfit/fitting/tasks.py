@@ -22,6 +22,7 @@ from jaxfit.fitting.initial_pose_search import search_initial_poses
 from jaxfit.fitting.stages import FitModel, needs_mask
 from jaxfit.fitting.windows import Windows, load_targets, windows_key
 from jaxfit.model.pose import Pose, rest_pose
+from jaxfit.objective.posed_window import Targets
 from jaxfit.progress import ReportProgress
 
 __all__ = ["FitShared", "FitTask", "Run", "cut_task", "failed_windows", "fit_task", "initial_poses_of"]
@@ -126,7 +127,11 @@ def _gather(shared: FitShared, task: FitTask) -> Batch:
     """Return the batch of the problems of a task."""
     config = task.runs[0].config
     mask_px = config.crop.size_px if any(needs_mask(stage) for stage in config.stages) else 0
-    targets, targets_row = _prepare_rows(task, windows_key, lambda _, windows: load_targets(windows, mask_px))
+
+    def targets_of(run: Run, windows: Windows) -> Targets:
+        return load_targets(windows, mask_px, run.config.grow_masks_px)
+
+    targets, targets_row = _prepare_rows(task, windows_key, targets_of)
     poses, pose_row = _prepare_rows(task, _pose_key, partial(_initial_poses, shared))
     return Batch(
         targets=jax.tree.map(lambda *x: np.concatenate(x), *targets),

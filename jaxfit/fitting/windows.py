@@ -16,7 +16,7 @@ from jaxfit.data.neighbours import masks_of_others
 from jaxfit.data.observations import Observations
 from jaxfit.data.tables import check_memory
 from jaxfit.errors import InputError
-from jaxfit.fitting.crops import crop_squares, cut_mask, mark_unknown
+from jaxfit.fitting.crops import crop_squares, cut_mask, grow_mask, mark_unknown
 from jaxfit.fitting.distant import without_distant_birds
 from jaxfit.fitting.filtering import weighted_median_filter
 from jaxfit.limits import TABLE_GB
@@ -62,8 +62,8 @@ class Windows:
 
 def windows_key(config: FitConfig) -> tuple:
     """Return the part of the config that determines the windows and their targets."""
-    settings = config.filter_window, config.window, config.overlap, config.min_keypoints, config.unknown_pixels
-    return *settings, config.crop
+    frames = config.filter_window, config.window, config.overlap, config.min_keypoints
+    return *frames, config.crop, config.unknown_pixels, config.grow_masks_px
 
 
 def window_content(windows: Windows, w: int) -> tuple:
@@ -148,12 +148,13 @@ def filter_observations(observations: Observations, window: int) -> Observations
     return observations.with_keypoints(filtered, observations.confidence)
 
 
-def load_targets(windows: Windows, mask_px: int) -> Targets:
+def load_targets(windows: Windows, mask_px: int, grow_px: float = 0.0) -> Targets:
     """Decode the masks of some windows, and return the targets as NumPy arrays with a leading axis W.
 
     Args:
         windows: the windows. All their masks must fit into memory.
         mask_px: side of the masks in pixels. 0: the masks are empty and nothing is decoded.
+        grow_px: distance by which the masks are enlarged, in pixels of a 256-pixel crop.
     """
     mask = np.zeros((*windows.frame.shape, mask_px, mask_px), np.uint8)
     has_mask = windows.mask_rle != np.array(None)
@@ -164,6 +165,8 @@ def load_targets(windows: Windows, mask_px: int) -> Targets:
         if others is not False:
             others = None if others is None else decode_mask(others)
             mark_unknown(mask[w, t], others, cast(Any, full.shape), windows.crop[w, t])
+        if grow_px:
+            grow_mask(mask[w, t], grow_px)
     return Targets(
         keypoints_px=windows.keypoints_px,
         confidence=windows.confidence,

@@ -92,8 +92,8 @@ def test_a_file_beside_wins_over_a_shipped_name(tmp_path):
 def test_a_config_may_override_weights_alone():
     """The stages of `fast` take the weights of `balanced`."""
     fast, balanced = load_config("fast"), load_config("balanced")
-    assert balanced.unknown_pixels
-    assert not fast.unknown_pixels
+    assert (balanced.unknown_pixels, balanced.grow_masks_px) == (True, 2.3)
+    assert (fast.unknown_pixels, fast.grow_masks_px) == (False, 0)  # the paper's objective
     assert balanced.stages == fast.stages
     stage = balanced.stages[-1]
     weights = {"pose_prior": 30, "velocity": 50}
