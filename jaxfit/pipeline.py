@@ -27,6 +27,7 @@ from jaxfit.perception.track import TrackingResult, network_files, open_keypoint
 from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.pipeline_record import TRACKING_LIBRARIES, file_hashes, fit_record, tracking_record
 from jaxfit.progress import ProgressTask, silent
+from jaxfit.report.write import REPORT, write_report
 from jaxfit.storage.files import check_replaceable, new_folder
 from jaxfit.storage.parts import Parts
 from jaxfit.storage.unfinished import unfinished_folder, unfinished_work
@@ -67,7 +68,7 @@ def reconstruct(
 
     The function writes to the folder: `observations.json` as `jaxfit track`; the files of `jaxfit fit`, with the whole
     config in `config.yaml`, and with the quality of tracks and the hashes of networks in `summary.json`; `overlay.mp4`
-    and its contact sheet `overlay.png`. The folder is written completely or not at all.
+    and its contact sheet `overlay.png`; `report.html`. The folder is written completely or not at all.
 
     Until then, `FOLDER.unfinished` beside the folder holds the tracked frames and the fitted windows. After an
     interruption or a failure, a call with the same arguments continues there. The files of the result are then those of
@@ -126,7 +127,9 @@ def reconstruct(
             with clock("overlay"):
                 _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
-            write_solution(solution, bird, config_to_yaml(config), summary, part)
+            settings = config_to_yaml(config)
+            write_solution(solution, bird, settings, summary, part)
+            write_report(part / REPORT, solution, bird, observations, summary, settings, folder, video)
     return Reconstruction(tracking, solution, summary)
 
 

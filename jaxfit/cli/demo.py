@@ -18,6 +18,7 @@ from jaxfit.export.export import export_result
 from jaxfit.model.files import load_murre
 from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.progress import terminal
+from jaxfit.report.write import REPORT
 from jaxfit.simulation.scene import simulate
 from jaxfit.storage.files import check_replaceable, check_writable, write_whole
 from jaxfit.storage.json_values import json_text
@@ -69,6 +70,7 @@ def run_demo(folder: Path) -> Evaluation:
     parts = ", ".join(f"{name} {seconds[name]:.0f}" for name in ("track", "fit", "overlay"))
     show(f"done in {time.perf_counter() - start:.0f} s ({parts}). Files:")
     for path, text in (
+        (result_folder / REPORT, "warnings, quality and pictures: open it in a browser"),
         (result_folder / OVERLAY, "the posed birds on the footage, and every bird from its side"),
         ((result_folder / OVERLAY).with_suffix(".png"), "a contact sheet"),
         (result_folder, "observations.json, poses.npz, summary.json"),

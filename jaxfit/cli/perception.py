@@ -50,6 +50,7 @@ def reconstruct(options: argparse.Namespace) -> None:
     """Track the birds of a video, fit their poses and draw them."""
     from jaxfit.fitting.cluster import open_cluster
     from jaxfit.pipeline import OBSERVATIONS, OVERLAY, reconstruct
+    from jaxfit.report.write import REPORT
 
     start = time.perf_counter()
     config = reconstruct_config(options)
@@ -63,6 +64,7 @@ def reconstruct(options: argparse.Namespace) -> None:
     birds = counted(done.summary["tracks"], "bird")
     show(f"{counted(done.summary['poses'], 'pose')} of {birds} in {time.perf_counter() - start:.0f} s. Files:")
     for name, text in (
+        (REPORT, "warnings, quality and pictures: open it in a browser"),
         (OVERLAY, "the posed birds on the footage"),
         (OVERLAY.replace(".mp4", ".png"), "a contact sheet"),
         (OBSERVATIONS, "the tracked keypoints and masks"),

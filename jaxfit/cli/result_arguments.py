@@ -1,4 +1,4 @@
-"""The arguments of `export`, `tracks`, `join` and `doctor`."""
+"""The arguments of `report`, `export`, `tracks`, `join` and `doctor`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,23 @@ __all__ = ["add_result_commands"]
 
 def add_result_commands(commands: Any) -> None:
     """Add the commands."""
+    _report(commands)
     _export(commands)
     _tracks(commands)
     _join(commands)
     text = "check the installation: kernels, FFmpeg, codecs, networks, optional packages, cache"
     add_command(commands, "doctor", "doctor.doctor", text)
+
+
+def _report(commands: Any) -> None:
+    text = "write a report of a result as one HTML page: quality, warnings, pictures, timeline"
+    report = add_command(commands, "report", "reporting.report", text)
+    report.add_argument("result", type=Path, metavar="RESULT", help="folder of a result")
+    text = "the footage, if the result does not name the footage, or the footage was moved"
+    report.add_argument("--video", type=Path, help=text)
+    text = "file to write (default: report.html in the folder of the result, which replaces an earlier report)"
+    report.add_argument("--out", type=Path, metavar="HTML", help=text)
+    report.add_argument("--overwrite", action="store_true", help="replace an existing file of --out")
 
 
 def _export(commands: Any) -> None:

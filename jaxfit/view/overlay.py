@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,7 +30,7 @@ from jaxfit.view.detected import Detected
 from jaxfit.view.legend import Legend
 from jaxfit.view.side_views import SideViews
 
-__all__ = ["Overlay", "overlay", "overlay_frame"]
+__all__ = ["Overlay", "overlay", "overlay_frame", "overlay_pictures"]
 
 CHUNK = 32  # frames posed in one call, so that the memory does not depend on the length of the video
 FOLDER_FPS = 25.0
@@ -157,22 +158,52 @@ def overlay_frame(
         InputError: as for `overlay`; or the result lacks the frame, or `out` has another suffix.
     """
     video, out = Path(video), Path(out)
-    info = probe_video(video)
+    probe_video(video)  # reports a missing video
     check_outputs([out], video, overwrite)
-    check_belongs(solution, observations, video, info)
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(out, f"an image cannot end in {out.suffix!r}", "give a name that ends in .png or .jpg")
-    if frame_index not in solution.frame_index:
-        problem = f"has no frame {frame_index}: its frames are {solution.frame_index[0]} to {solution.frame_index[-1]}"
-        raise InputError("result", problem, "give one of these frames")
-    drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
-    for number, picture, time_s in read_frames(video, frame_index, frame_index + 1):
-        t = int(np.searchsorted(solution.frame_index, number))
-        seconds = number / FOLDER_FPS if time_s is None else time_s
-        _, encoded = cv2.imencode(out.suffix, drawing.frame(picture, number, t, seconds))
+    drawn = overlay_pictures(
+        solution, bird, video, [frame_index], observations=observations, side_views=side_views, max_width=max_width
+    )
+    for _, image in drawn:
+        _, encoded = cv2.imencode(out.suffix, image)
         write_whole(out, encoded.tobytes())
-        return
-    raise too_short(video, solution, 0)
+
+
+def overlay_pictures(
+    solution: Solution,
+    bird: Bird,
+    video: str | Path,
+    frames: Sequence[int],
+    *,
+    observations: Observations | None = None,
+    side_views: bool = False,
+    max_width: int | None = 1920,
+) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
+    """Draw some frames as `overlay` does, and yield the number and the image (blue, green, red) of each frame.
+
+    Args:
+        frames: numbers of frames in the video, in increasing order.
+        solution, bird, video, observations, side_views, max_width: as for `overlay`.
+
+    Raises:
+        InputError: as for `overlay`; or the result or the video lacks a frame.
+    """
+    video = Path(video)
+    info = probe_video(video)
+    check_belongs(solution, observations, video, info)
+    for frame in frames:
+        if frame not in solution.frame_index:
+            problem = f"has no frame {frame}: its frames are {solution.frame_index[0]} to {solution.frame_index[-1]}"
+            raise InputError("result", problem, "give one of these frames")
+    drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
+    for frame in frames:
+        found = next(iter(read_frames(video, frame, frame + 1)), None)
+        if found is None:
+            raise too_short(video, solution, 0)
+        number, picture, time_s = found
+        t = int(np.searchsorted(solution.frame_index, number))
+        yield number, drawing.frame(picture, number, t, number / FOLDER_FPS if time_s is None else time_s)
 
 
 class _Drawing:

@@ -1,0 +1,228 @@
+"""What a report shows, read from a result and its summary."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxfit.data.formats.fields import Field
+from jaxfit.data.frame_numbers import frame_step
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
+from jaxfit.data.track_quality import TrackQuality, track_quality
+
+__all__ = ["Report", "Track", "gather"]
+
+
+@dataclass(frozen=True)
+class Track:
+    """One bird of a report; T frames of the result."""
+
+    position: int
+    """Position of the track in the result, which determines its colour in overlays."""
+    track_id: int
+    status: str
+    poses: int
+    objective: float | None
+    """Final objective of each pose; None without a pose."""
+    frames: tuple[int, int] | None
+    """Numbers of the first and the last frame with a detection; None without a detection."""
+    quality: TrackQuality | None
+    """Quality of the detections; None without observations."""
+    present: Bool[np.ndarray, "T"]
+    """Where the bird was detected; without observations, where the bird has a pose."""
+    valid: Bool[np.ndarray, "T"]
+    """Where the bird has a pose."""
+    confidence: Float[np.ndarray, "T"] | None
+    """Mean confidence of the keypoints in every frame; None without observations."""
+    size: Float[np.ndarray, "T"]
+    """Size in the image relative to the median of the track; NaN without a pose."""
+    problems: tuple[str, ...]
+    """Texts about skipped frames and diverged windows."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The content of a report."""
+
+    folder: str
+    """Path of the result, for commands."""
+    title: str
+    video: str | None
+    """Path of the footage; None if unknown."""
+    frames: np.ndarray
+    """(T,) numbers of the frames."""
+    step: int
+    """Distance of the frame numbers."""
+    times_s: Float[np.ndarray, "T"]
+    """Time of every frame in seconds; NaN if unknown."""
+    size_px: tuple[int, int] | None
+    """Width and height of the footage."""
+    fps: float | None
+    tracks: tuple[Track, ...]
+    """In the order in which the birds appear."""
+    damaged: tuple[int, ...]
+    """Numbers of the frames that could not be decoded."""
+    short_tracks: Mapping[str, str]
+    """Skipped track → number of frames."""
+    low_score_tracks: Mapping[str, str]
+    """Skipped track → mean score."""
+    trust: str | None
+    """`high`, `low`, or None if the tracking was not judged."""
+    trust_reasons: tuple[str, ...]
+    seconds: Mapping[str, float]
+    """Part of the work → seconds."""
+    facts: Mapping[str, str]
+    """Model, networks and versions."""
+    corrections: tuple[str, ...]
+    config: str
+    """The config as YAML."""
+
+    @property
+    def has_detections(self) -> bool:
+        """Whether the detections of the birds are known, besides their poses."""
+        return any(track.quality is not None for track in self.tracks)
+
+    @property
+    def poses(self) -> int:
+        """Number of poses of all birds."""
+        return sum(track.poses for track in self.tracks)
+
+    @property
+    def detections(self) -> int:
+        """Number of detections of all birds; without observations, the number of poses."""
+        return sum(int(track.present.sum()) for track in self.tracks)
+
+    @property
+    def duration_s(self) -> float | None:
+        """Time from the first to the end of the last frame; None if unknown."""
+        if self.fps is None:
+            return None
+        return float(self.frames[-1] - self.frames[0] + self.step) / self.fps if len(self.frames) else 0.0
+
+
+def gather(
+    solution: Solution, observations: Observations | None, summary: Mapping[str, Any], config: str, folder: Path
+) -> Report:
+    """Return the content of the report of a result.
+
+    Args:
+        solution: the poses.
+        observations: the detections of the same tracks and frames; None if they are unknown.
+        summary: content of `summary.json`, in the types of JSON.
+        config: the config as YAML.
+        folder: folder of the result.
+
+    Raises:
+        InputError: an entry of the summary has another type than jaxfit writes.
+    """
+    field = Field(folder / "summary.json", "", summary)
+    video = field["video"] if field.has("video") else None
+    named = video["file"].text() if video is not None and video.has("file") else None
+    sizes = solution.image_size_px[solution.valid]
+    times_s = np.full(len(solution.frame_index), np.nan) if solution.timestamp_s is None else solution.timestamp_s
+    if solution.fps and not np.isfinite(times_s).all():
+        times_s = solution.frame_index / solution.fps
+    tracks = _tracks(solution, observations, _texts_of(field, "failures"))
+    return Report(
+        folder=str(folder),
+        title=Path(named).name or named if named else folder.name,
+        video=named,
+        frames=solution.frame_index,
+        step=frame_step(solution.frame_index),
+        times_s=times_s,
+        size_px=(int(sizes[0, 0]), int(sizes[0, 1])) if len(sizes) else None,
+        fps=solution.fps,
+        tracks=tuple(sorted(tracks, key=lambda track: (_first(track), track.position))),
+        damaged=tuple(_integers(video, "damaged")) if video is not None else (),
+        short_tracks={track: f"{each.integer()}" for track, each in _entries(field, "short_tracks")},
+        low_score_tracks={
+            track: f"{each.number(0, 1, 'run the reconstruction again'):.2f}"
+            for track, each in _entries(field, "low_score_tracks")
+        },
+        trust=field["trust"].text() if field.has("trust") else None,
+        trust_reasons=tuple(_texts(field, "trust_reasons")),
+        seconds={
+            name: each.number(0, 1e12, "run the reconstruction again") for name, each in _entries(field, "seconds")
+        },
+        facts=_facts(field),
+        corrections=tuple(_texts(field, "corrections")),
+        config=config,
+    )
+
+
+def _first(track: Track) -> int:
+    at = np.flatnonzero(track.present)
+    return int(at[0]) if len(at) else len(track.present)
+
+
+def _tracks(
+    solution: Solution, observations: Observations | None, problems: Mapping[str, tuple[str, ...]]
+) -> list[Track]:
+    quality = {} if observations is None else {row.track_id: row for row in track_quality(observations)}
+    rows = {} if observations is None else {track: n for n, track in enumerate(observations.track_id.tolist())}
+    size = _image_size(solution)
+    total = np.sum(list(solution.loss.values()), axis=0) if solution.loss else np.full(len(solution.track_id), np.nan)
+    tracks = []
+    for n, track_id in enumerate(solution.track_id.tolist()):
+        valid, present, confidence = solution.valid[n], solution.valid[n], None
+        if observations is not None and track_id in rows:
+            present = observations.present[rows[track_id]]
+            confidence = observations.confidence[rows[track_id]].mean(-1) if observations.num_keypoints else None
+        median = np.median(size[n, valid]) if valid.any() else 1.0
+        poses, at = int(valid.sum()), solution.frame_index[present]
+        tracks.append(
+            Track(
+                position=n,
+                track_id=track_id,
+                status=str(solution.status[n]),
+                poses=poses,
+                objective=float(total[n]) / poses if poses and np.isfinite(total[n]) else None,
+                frames=(int(at[0]), int(at[-1])) if len(at) else None,
+                quality=quality.get(track_id),
+                present=present,
+                valid=valid,
+                confidence=confidence,
+                size=np.where(valid, size[n] / median, np.nan),
+                problems=problems.get(str(track_id), ()),
+            )
+        )
+    return tracks
+
+
+def _image_size(solution: Solution) -> Float[np.ndarray, "N T"]:
+    """Return the size of every bird in the image, in image pixels per model unit; NaN without a pose."""
+    depth = np.where(solution.valid, solution.transl[..., 2], np.nan)
+    return solution.scale * (solution.focal_px / solution.crop_px) * solution.crop[..., 2] / depth
+
+
+def _facts(field: Field) -> dict[str, str]:
+    """Return the model, the networks and the versions as texts."""
+    facts = {}
+    if field.has("model"):
+        model = field["model"]
+        facts["model"] = f"{model['name'].text()} ({model['hash'].text()[:12]})"
+    for kind, files in _entries(field, "networks"):
+        facts[f"network: {kind}"] = ", ".join(f"{name} ({each.text()[:12]})" for name, each in files.entries())
+    return facts | {name: each.text() for name, each in _entries(field, "versions")}
+
+
+def _entries(field: Field, key: str) -> list[tuple[str, Field]]:
+    return list(field[key].entries()) if field.has(key) else []
+
+
+def _texts(field: Field, key: str) -> list[str]:
+    return [each.text() for each in field[key]] if field.has(key) else []
+
+
+def _integers(field: Field, key: str) -> list[int]:
+    return [each.integer() for each in field[key]] if field.has(key) else []
+
+
+def _texts_of(field: Field, key: str) -> dict[str, tuple[str, ...]]:
+    return {name: tuple(each.text() for each in texts) for name, texts in _entries(field, key)}

@@ -1,0 +1,219 @@
+"""The HTML page of a report."""
+
+from __future__ import annotations
+
+import base64
+import shlex
+from collections.abc import Sequence
+from importlib import resources
+
+from jaxfit.report.advice import Step, Warned, counted, next_steps, warnings_of
+from jaxfit.report.contents import Report, Track
+from jaxfit.report.html import Html, element, joined
+from jaxfit.report.pictures import Picture
+from jaxfit.report.timeline import duration, size_curve, swatch, timeline
+
+__all__ = ["page"]
+
+_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
+"""The browser loads nothing from elsewhere and runs no script."""
+_MARKS = {"ok": "✓", "partly diverged": "▲", "diverged": "✕", "no usable frame": "–"}
+_MEANINGS = (
+    ("Pose", "Position, orientation, joint angles and size of a bird in one frame."),
+    ("Status", "Whether the fit of every window of frames succeeded (ok), of some windows, or of no window."),
+    ("Coverage", "Share of the frames between the first and the last detection of a bird that have a detection."),
+    ("Gaps", "Number of interruptions between the first and the last detection of a bird."),
+    ("Confidence", "Mean confidence of all keypoints. A keypoint that was not detected counts as 0."),
+    (
+        "Jitter",
+        "Median second difference of the detected keypoints, in per cent of the longer side of the box of the bird. "
+        "A bird at constant speed has 0 %.",
+    ),
+    (
+        "Size in the image",
+        "Size of the fitted bird in the image over time, relative to its median. The curve ends at ±30 %. One camera "
+        "cannot tell a larger bird from a nearer bird. A sudden change is a sign of a wrong fit.",
+    ),
+    ("Objective", "Final value of the objective of the fit for each pose. Compare birds of one result only."),
+    (
+        "Trust",
+        "A comparison of this footage with the footage that the networks were trained on. High trust is no proof: "
+        "look at the overlay.",
+    ),
+)
+
+
+def page(report: Report, pictures: Sequence[Picture]) -> str:
+    """Return the page.
+
+    Args:
+        report: the content.
+        pictures: frames with drawn birds; may be empty.
+    """
+    warned = warnings_of(report)
+    title = f"Birds in {report.title}"
+    style = resources.files("jaxfit.report").joinpath("style.css").read_text("utf-8")
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("title", title),
+        element("style", Html(style)),
+    )
+    body = element(
+        "body",
+        element("header", element("p", "jaxfit report", class_="kind"), element("h1", title), _footage(report)),
+        element(
+            "main",
+            _answer(report, warned),
+            _section("What to do next", _steps(next_steps(report))),
+            _section("Warnings", _warnings(warned)),
+            _section("Pictures", _strip(report, pictures)),
+            _section("Birds over time", timeline(report) if len(report.frames) else None),
+            _section("Quality of each bird", _table(report)),
+            _section("What the words mean", _definitions(_MEANINGS)),
+            _section("How the result was made", _details(report)),
+        ),
+    )
+    return f"<!DOCTYPE html>\n{element('html', head, body, lang='en')}\n"
+
+
+def _section(title: str, *content: Html | None) -> Html:
+    return element("section", element("h2", title), *content)
+
+
+def _footage(report: Report) -> Html:
+    parts = [counted(len(report.frames), "frame")]
+    if len(report.frames):
+        parts[0] += f" ({report.frames[0]:,} to {report.frames[-1]:,})"
+    if report.step > 1:
+        parts.append(f"every {report.step}th frame")
+    if report.size_px:
+        parts.append(f"{report.size_px[0]} × {report.size_px[1]} pixels")
+    parts.append("unknown frame rate" if report.fps is None else f"{report.fps:.4g} frames/s")
+    return element("p", " · ".join(parts), class_="footage")
+
+
+def _answer(report: Report, warned: Sequence[Warned]) -> Html:
+    """Return the cards with the most important numbers."""
+    length = counted(len(report.frames), "frame")
+    if report.duration_s is not None:
+        length += f", {duration(report.duration_s)}"
+    share = report.poses / max(report.detections, 1)
+    what = "detections" if report.has_detections else "frames of the birds"
+    cards = [
+        _card(f"{len(report.tracks):,}", "bird" if len(report.tracks) == 1 else "birds", f"in {length}"),
+        _card(f"{report.poses:,}", "poses", f"{100 * share:.1f} % of the {what}"),
+        _trust(report),
+        _card(f"{len(warned)}", "warning" if len(warned) == 1 else "warnings", "see below" if warned else "none"),
+    ]
+    return element("section", *cards, class_="cards")
+
+
+def _card(value: str, unit: str, text: str, kind: str = "") -> Html:
+    content = element("b", value), " ", element("span", unit), element("p", text)
+    return element("div", *content, class_=f"card {kind}".strip())
+
+
+def _trust(report: Report) -> Html:
+    if report.trust is None:
+        return _card("?", "trust", "the tracking was not judged, because the detections come from a file")
+    if report.trust == "high":
+        return _card("✓ high", "trust", "the networks work on this footage as on simulated footage", "good")
+    return _card("▲ " + report.trust, "trust", "the tracks and poses may be wrong: see the warnings", "bad")
+
+
+def _steps(steps: Sequence[Step]) -> Html:
+    items = [element("li", step.text, None if step.command is None else element("pre", step.command)) for step in steps]
+    return element("ol", *items, class_="steps")
+
+
+def _warnings(warned: Sequence[Warned]) -> Html:
+    if not warned:
+        return element("p", "There are no warnings.")
+    items = []
+    for each in warned:
+        listed = element("ul", *(element("li", text) for text in each.details)) if each.details else None
+        if len(each.details) > 3:
+            listed = element("details", element("summary", f"Show {len(each.details)}"), listed)
+        items.append(element("li", element("b", each.title), element("p", each.text), listed))
+    return element("ul", *items, class_="warnings")
+
+
+def _strip(report: Report, pictures: Sequence[Picture]) -> Html:
+    if not report.poses:
+        return element("p", "No bird has a pose, so there are no pictures.")
+    if not pictures:
+        command = f"jaxfit report {shlex.quote(report.folder)} --video VIDEO"
+        text = "The footage was not there. This command writes a report with pictures:"
+        return joined(element("p", text), element("pre", command))
+    figures = []
+    for picture in pictures:
+        data = base64.b64encode(picture.jpeg).decode()
+        text = f"frame {picture.frame:,}, {counted(picture.birds, 'bird')}"
+        image = element(
+            "img", src=f"data:image/jpeg;base64,{data}", alt=text, width=picture.width, height=picture.height
+        )
+        figures.append(element("figure", image, element("figcaption", text)))
+    return element("div", *figures, class_="strip")
+
+
+def _table(report: Report) -> Html:
+    detected = report.has_detections
+    names = [("Bird", ""), ("Status", ""), ("Frames", "first to last"), ("Poses", "number")]
+    if detected:
+        names += [("Detections", "number"), ("Coverage", "%"), ("Gaps", "number"), ("Confidence", "0 to 1")]
+        names += [("Jitter", "% of box")]
+    names += [("Objective", "per pose"), ("Size in the image", "±30 %")]
+    head = element("tr", *(element("th", name, element("small", unit)) for name, unit in names))
+    rows = [element("tr", *_cells(track, detected)) for track in report.tracks]
+    return element("div", element("table", element("thead", head), element("tbody", *rows)), class_="wide")
+
+
+def _cells(track: Track, detected: bool) -> list[Html]:
+    """Return the cells of a bird."""
+    quality = track.quality
+    frames = "–" if track.frames is None else f"{track.frames[0]:,} to {track.frames[1]:,}"
+    kind = "good" if track.status == "ok" else "bad"
+    cells = [
+        element("th", swatch(track.position), f"{track.track_id}"),
+        element("td", f"{_MARKS.get(track.status, '')} {track.status}", class_=f"status {kind}"),
+        element("td", frames),
+        element("td", f"{track.poses:,}"),
+    ]
+    if detected:
+        shown = ["–"] * 5
+        if quality is not None:
+            jitter = "–" if quality.jitter is None else f"{100 * quality.jitter:.1f}"
+            shown = [f"{quality.frames:,}", f"{100 * quality.coverage:.0f}", f"{quality.gaps}"]
+            shown += [f"{quality.mean_confidence:.2f}", jitter]
+        cells += [element("td", text) for text in shown]
+    cells.append(element("td", "–" if track.objective is None else f"{track.objective:,.1f}"))
+    return [*cells, element("td", size_curve(track))]
+
+
+def _definitions(pairs: Sequence[tuple[str, str]]) -> Html:
+    return element("dl", *(joined(element("dt", name), element("dd", text)) for name, text in pairs))
+
+
+def _details(report: Report) -> Html:
+    total = sum(report.seconds.values())
+    rows = [
+        element(
+            "tr",
+            element("th", name),
+            element("td", duration(seconds)),
+            element("td", element("i", class_="bar", style=f"width:{100 * seconds / max(total, 1e-9):.1f}%")),
+        )
+        for name, seconds in report.seconds.items()
+    ]
+    times = element("table", *rows, class_="times") if rows else None
+    facts = [("footage", report.video)] if report.video else []
+    facts = _definitions([*facts, ("result", report.folder), *report.facts.items()])
+    return joined(
+        element("h3", "Time") if rows else None,
+        times,
+        element("details", element("summary", "Files, model, networks and versions"), facts),
+        element("details", element("summary", "Settings (config.yaml)"), element("pre", report.config)),
+    )
