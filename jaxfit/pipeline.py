@@ -23,10 +23,16 @@ from jaxfit.fitting.summary import library_versions, summarise
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.perception.instances import KeypointDetector, Segmenter
-from jaxfit.perception.track import TrackingResult, network_files, open_keypoint_detector, run_tracking
+from jaxfit.perception.track import (
+    TrackingResult,
+    check_segmenter,
+    network_files,
+    open_keypoint_detector,
+    run_tracking,
+)
 from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.pipeline_record import TRACKING_LIBRARIES, file_hashes, fit_record, tracking_record
-from jaxfit.progress import ProgressTask, silent
+from jaxfit.progress import ProgressTask, annotated, silent
 from jaxfit.report.write import REPORT, write_report
 from jaxfit.storage.files import check_replaceable, new_folder
 from jaxfit.storage.parts import Parts
@@ -104,15 +110,19 @@ def reconstruct(
         check_replaceable(folder, overwrite, MARKER)
         bird = bird or load_murre()
         keypoints = keypoints or open_keypoint_detector(config.track)
-        networks = {kind: files for kind, files in network_files(config.track).items() if not replaced[kind]}
+        if not replaced["segmenter"]:
+            check_segmenter(config.track)
+        own_networks = {kind: files for kind, files in network_files(config.track).items() if not replaced[kind]}
+        networks = file_hashes(own_networks)
         empty = TrackRecorder(keypoints.keypoint_names).observations()
         check_keypoints(empty, bird.keypoint_names, config.track.keypoints.file)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
-            stored = None
+            stored, shown = None, progress
             if not any(replaced.values()):
-                stored = Parts(unfinished / "frames", tracking_record(config.track, video, networks))
-            tracking = run_tracking(video, config.track, segmenter, keypoints, progress=progress, parts=stored)
+                stored = Parts(unfinished / "frames", tracking_record(config.track, video, networks, progress))
+                shown = annotated(progress, lambda parts=stored: f"{parts.size_bytes / 1e6:.1f} MB stored")
+            tracking = run_tracking(video, config.track, segmenter, keypoints, progress=shown, parts=stored)
         if tracking.failure is not None:
             if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
                 stored.keep(0)  # without a bird, only other settings of tracking help
@@ -120,8 +130,9 @@ def reconstruct(
         observations = tracking.observations
         with clock("fit"):
             windows = StoredWindows(Parts(unfinished / "windows", fit_record(config.fit, bird)))
+            shown = annotated(progress, lambda: windows.state)
             more = {"stored": windows, "cluster": cluster}
-            solution = fit(observations, bird, config.fit, progress=progress, source=video, **more)
+            solution = fit(observations, bird, config.fit, progress=shown, source=video, **more)
         with new_folder(folder, overwrite, marker=MARKER) as part:
             write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
             with clock("overlay"):
@@ -177,12 +188,12 @@ def _summary(
     tracking: TrackingResult,
     solution: Solution,
     bird: Bird,
-    networks: dict[str, list[Path]],
+    networks: dict[str, dict[str, str]],
     video: Path,
     info: VideoInfo,
     clock: Clock,
 ) -> dict[str, Any]:
-    """Return the content of `summary.json`; `networks` maps each kind of network to its files."""
+    """Return the content of `summary.json`; `networks` holds the hashes of `file_hashes`."""
     summary = summarise(solution, bird, clock.seconds)
     summary["versions"] |= library_versions(TRACKING_LIBRARIES)
     return summary | {
@@ -194,5 +205,5 @@ def _summary(
         "trust_reasons": list(tracking.trust.reasons),
         "trust_signals": tracking.trust.signals._asdict(),
         "seconds_of_tracking": {part: round(value, 3) for part, value in tracking.seconds.items()},
-        "networks": file_hashes(networks),
+        "networks": networks,
     }

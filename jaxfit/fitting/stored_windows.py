@@ -45,7 +45,13 @@ class StoredWindows:
     """
 
     def __init__(self, parts: Parts):
-        self._parts = parts
+        self._parts, self._count = parts, 0
+
+    @property
+    def state(self) -> str:
+        """The number of windows that were found or added, and the size of all parts, for progress."""
+        noun = "window" if self._count == 1 else "windows"
+        return f"{self._count} {noun} fitted, {self._parts.size_bytes / 1e6:.1f} MB stored"
 
     def find(self, windows: Windows) -> dict[int, FittedWindow]:
         """Return row → result of the windows that are stored.
@@ -69,6 +75,7 @@ class StoredWindows:
                     str(arrays["failure"][i]),
                 )
                 found |= {w: result for w in rows.get(content, ())}
+        self._count = len(found)
         return found
 
     def add(self, windows: Windows, results: Mapping[int, FittedWindow]) -> None:
@@ -77,6 +84,7 @@ class StoredWindows:
         Raises:
             InputError: the disk is full, or the folder cannot be written.
         """
+        self._count += len(results)
         some = list(results.values())
         poses = {name: np.stack([getattr(result.pose, name) for result in some]) for name in _POSE}
         self._parts.add(

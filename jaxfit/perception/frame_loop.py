@@ -94,7 +94,7 @@ def process_frames(
                     end_part(is_last=False)
             rate = (len(recorder.frames) - begun) / (time.perf_counter() - start)
             noun = "bird" if len(tracked) == 1 else "birds"
-            report_progress(1, f"{rate:.1f} frames/s, {len(tracked)} {noun}")
+            report_progress(1, f"{len(recorder.frames)} frames, {rate:.1f} frames/s, {len(tracked)} {noun}")
     if not is_complete and recorder.frames:
         end_part(is_last=True)
     damaged = [number for part in done for number in part.damaged] if done else reader.damaged

@@ -31,7 +31,15 @@ from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.parts import Parts
 from jaxfit.video.reader import read_frames
 
-__all__ = ["TrackingResult", "network_files", "open_keypoint_detector", "open_segmenter", "run_tracking", "track_video"]
+__all__ = [
+    "TrackingResult",
+    "check_segmenter",
+    "network_files",
+    "open_keypoint_detector",
+    "open_segmenter",
+    "run_tracking",
+    "track_video",
+]
 
 _logger = logging.getLogger(__name__)
 
@@ -112,6 +120,15 @@ def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segme
         tile_overlap=settings.tile_overlap,
         threads=config.threads,
     )
+
+
+def check_segmenter(config: TrackConfig) -> None:
+    """Load the segmenter of a config and release it, to report an unusable segmenter before long work.
+
+    Raises:
+        InputError: the segmenter cannot be used.
+    """
+    open_segmenter(config)
 
 
 def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:

@@ -40,11 +40,14 @@ class Parts:
 
     numbers: list[int]
     """Numbers of the stored parts, in increasing order."""
+    size_bytes: int
+    """Size of the stored parts."""
 
     def __init__(self, folder: Path, record: Mapping[str, Any]):
         self._folder, self._record = folder, json.loads(json.dumps(record))
         remove_leftovers(folder)
         self.numbers = sorted(int(file.stem) for file in folder.glob("*.npz") if file.stem.isdigit())
+        self.size_bytes = sum(self._path(number).stat().st_size for number in self.numbers)
         if self.numbers:
             self._check_record()
 
@@ -59,6 +62,7 @@ class Parts:
         number = self.numbers[-1] + 1 if self.numbers else 0
         write_whole(self._path(number), lambda file: np.savez_compressed(file, **dict[str, Any](arrays)))
         self.numbers.append(number)
+        self.size_bytes += self._path(number).stat().st_size
 
     def load(self, number: int, layout: Mapping[str, str]) -> dict[str, np.ndarray]:
         """Return the arrays of a part.

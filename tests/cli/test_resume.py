@@ -103,9 +103,10 @@ def test_other_inputs_are_refused(folder, capsys):
     assert run(folder, "frame 7")[0] == 130
     with toy_networks(TrueSegmenter(FOOTAGE)):
         refused = "result.unfinished/frames: was begun with another "
-        rejected(capsys, command(folder, "--stop", "9"), refused + "track.frames.stop (", "remove this folder")
+        words = refused + "track.frames.stop (", "remove this folder"
+        rejected(capsys, command(folder, "--stop", "9"), *words, alone=False)
         (folder / "frames" / "11.png").unlink()
-        rejected(capsys, command(folder), refused + "video.content (")
+        rejected(capsys, command(folder), refused + "video.content (", alone=False)
         (folder / "frames").rename(folder / "others")
         FOOTAGE.write(folder / "frames")
         part = folder / "result.unfinished" / "frames" / "000000.npz"
