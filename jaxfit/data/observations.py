@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from jaxfit.data.lazy_masks import LazyMasks
 from jaxfit.data.masks import decode_mask
 from jaxfit.errors import InputError
 from jaxfit.storage.arrays import validate_arrays
@@ -114,7 +115,8 @@ class Observations:
         for name, value in (arrays | {"keypoint_names": names}).items():
             object.__setattr__(self, name, value)
         for name in ("masks", "amodal_masks"):
-            for (n, t), rle in getattr(self, name).items():
+            masks = getattr(self, name)
+            for (n, t), rle in () if isinstance(masks, LazyMasks) else masks.items():
                 width, height = self.image_size(n, t)
                 if tuple(rle["size"]) != (height, width):
                     problem = f"{name}[{n}, {t}] is {rle['size']}, its image {[height, width]} (height, width)"
@@ -194,6 +196,8 @@ class Observations:
         new_column = {old: new for new, old in enumerate(columns.tolist())}
 
         def moved(mapping):
+            if isinstance(mapping, LazyMasks):
+                return mapping.select(new_row, new_column)
             kept = ((n, t) for n, t in mapping if n in new_row and t in new_column)
             return {(new_row[n], new_column[t]): mapping[n, t] for n, t in kept}
 

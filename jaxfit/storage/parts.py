@@ -20,9 +20,10 @@ from jaxfit.storage.json_file import read_json_file
 from jaxfit.storage.npz import load_npz
 from jaxfit.storage.temporary import remove_leftovers
 
-__all__ = ["Parts", "differences"]
+__all__ = ["RECORD", "Parts", "differences", "read_record"]
 
-_RECORD = "record.json"
+RECORD = "record.json"
+"""Name of the file that holds the record."""
 _SHOWN = 3
 """Number of differences that a message names."""
 
@@ -58,7 +59,7 @@ class Parts:
             InputError: the disk is full, or the folder cannot be written.
         """
         if not self.numbers:
-            write_whole(self._folder / _RECORD, json.dumps(self._record, indent=1).encode())
+            write_whole(self._folder / RECORD, json.dumps(self._record, indent=1).encode())
         number = self.numbers[-1] + 1 if self.numbers else 0
         write_whole(self._path(number), lambda file: np.savez_compressed(file, **dict[str, Any](arrays)))
         self.numbers.append(number)
@@ -94,13 +95,22 @@ class Parts:
         return self._folder / f"{number:06d}.npz"
 
     def _check_record(self) -> None:
-        held = read_json_file(self._folder / _RECORD, CONFIG_BYTES)
+        held = read_record(self._folder)
         changed = list(differences(held, self._record))
         if changed:
             more = f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else ""
             problem = f"was begun with another {', '.join(changed[:_SHOWN])}{more}"
             remedy = "repeat the earlier command to continue, or remove this folder to begin again"
             raise InputError(self._folder, problem, remedy)
+
+
+def read_record(folder: Path) -> Any:
+    """Return the record of the parts in a folder.
+
+    Raises:
+        InputError: the file cannot be read, or is no JSON.
+    """
+    return read_json_file(folder / RECORD, CONFIG_BYTES)
 
 
 def differences(held: Any, own: Any, name: str = "") -> Iterator[str]:

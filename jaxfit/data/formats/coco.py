@@ -40,6 +40,7 @@ from typing import Any, cast
 import numpy as np
 
 from jaxfit.data.formats.coco_exports import complete_export
+from jaxfit.data.formats.coco_parts import read_coco_parts, write_coco_parts
 from jaxfit.data.formats.coco_records import (
     Annotation,
     Categories,
@@ -75,7 +76,9 @@ def read_coco(path: str | Path, video: Path | None = None) -> Observations:
     Raises:
         InputError: the file cannot be read, or its content is invalid; the message names file, field and remedy.
     """
-    return coco_observations(complete_export(read_json(Path(path)), video))
+    path = Path(path)
+    stored = read_coco_parts(path)
+    return coco_observations(complete_export(read_json(path), video)) if stored is None else stored
 
 
 def coco_observations(root: Field) -> Observations:
@@ -165,6 +168,7 @@ def _assemble(
 def write_coco(observations: Observations, path: str | Path, info: Mapping[str, str] | None = None) -> None:
     """Write observations as COCO json, completely or not at all.
 
+    Beside a long file, `jaxfit.data.formats.coco_parts` writes a binary copy that opens fast.
     ``read_coco`` reads the same observations, except that the tracks are sorted by ``track_id`` and tracks without a
     detection are missing.
 
@@ -233,7 +237,9 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
     about = dict(info or {}) | ({} if observations.fps is None else {"fps": observations.fps})
     if about:
         content = {"info": about, **content}
-    write_whole(path, json.dumps(content, allow_nan=False).encode())
+    encoded = json.dumps(content, allow_nan=False).encode()
+    write_whole(path, encoded)
+    write_coco_parts(observations, Path(path), encoded)
 
 
 def _shortest(values: np.ndarray) -> np.ndarray:
