@@ -71,7 +71,7 @@ def write_coco_parts(observations: Observations, path: Path, content: bytes) -> 
         InputError: the folder cannot be written.
     """
     folder = parts_folder(path)
-    if (folder / RECORD).is_file() and "coco_sha256" in read_record(folder):
+    if _has_record(folder) and "coco_sha256" in read_record(folder):
         shutil.rmtree(folder)
     if observations.present.sum() < PARTS_FROM or observations.own_images or folder.exists():
         return
@@ -98,13 +98,20 @@ def read_coco_parts(path: Path) -> Observations | None:
         InputError: the copy is damaged.
     """
     folder = parts_folder(path)
-    if not (folder / RECORD).is_file():
+    if not _has_record(folder):
         return None
     record = _record(_hash(path))
     try:
         return _observations(Parts(folder, record), folder) if read_record(folder) == record else None
     except InputError as error:
         raise _damaged(error) from error
+
+
+def _has_record(folder: Path) -> bool:
+    try:
+        return (folder / RECORD).is_file()
+    except OSError:  # the name with the other ending is too long
+        return False
 
 
 def _observations(parts: Parts, folder: Path) -> Observations:
