@@ -11,7 +11,7 @@ export JAXFIT_REFERENCE
 
 help:
 	@echo "make install    the package with its compiled kernels, in $(VENV)"
-	@echo "make test       the test suite (about ten minutes on two cores)"
+	@echo "make test       the test suite (under eight minutes on two cores)"
 	@echo "make extended   the slow tests, and those that install packages in environments of their own"
 	@echo "make lint       formatting, lint and types"
 	@echo "make bench      benchmarks against the committed baseline"
