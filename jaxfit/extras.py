@@ -42,23 +42,20 @@ OPTIONAL_PACKAGES = {
 }
 """Name in the package index → package."""
 
-_EXTRAS = {
-    "formats": ("h5py", ("h5py",)),
-    "report": ("Matplotlib and tabulate", ("matplotlib", "tabulate")),
-    "train": ("PyTorch and ONNX", ("torch", "onnx", "onnxscript")),
-}
 
-
-def require_extra(extra: str, source: str) -> None:
-    """Raise InputError if a package of an extra is missing.
+def require_extra(extra: str, source: str, *names: str) -> None:
+    """Raise InputError if a package of an extra is missing. All versions of the packages are accepted.
 
     Args:
         extra: name of the extra in `pip install "jaxfit[extra]"`.
         source: the command or function that needs the extra, for the message.
+        names: names of `OPTIONAL_PACKAGES` that are needed. Without names, all packages of the extra are needed.
     """
-    names, packages = _EXTRAS[extra]
-    if not all(find_spec(package) for package in packages):
-        raise InputError(source, f"needs {names}, which this installation lacks", f'run pip install "jaxfit[{extra}]"')
+    names = names or tuple(name for name, package in OPTIONAL_PACKAGES.items() if package.extra == extra)
+    missing = [name for name in names if find_spec(OPTIONAL_PACKAGES[name].module) is None]
+    if missing:
+        problem = f"needs {' and '.join(missing)}, which this installation lacks"
+        raise InputError(source, problem, f'run pip install "jaxfit[{extra}]"')
 
 
 def require_package(name: str, source: str) -> None:

@@ -1,9 +1,9 @@
 // The Gauss-Newton block of the silhouette of one image. Part of silhouette.cc.
 //
 // The block is Jᵀ·J with one row of J = d silhouette / d parameters for each pixel of the band in which the silhouette
-// is neither 0 nor 1, and the mask is not unknown. Of a band with more than kMostRows pixels, an evenly spread part enters with a larger weight.
-// A row is the sum over the faces near the pixel: d silhouette / d vertex, times d vertex / d parameters. The second
-// factor is computed once for each vertex that some row needs.
+// is neither 0 nor 1, and the mask is not unknown. Of a band with more than kMostRows pixels, an evenly spread part
+// enters with a larger weight. A row is the sum over the faces near the pixel: d silhouette / d vertex, times
+// d vertex / d parameters. The second factor is computed once for each vertex that some row needs.
 #pragma once
 
 #include "products.h"

@@ -104,11 +104,12 @@ def join_results(
         own_rows = [_solution_rows(part, row) for part, row in zip(parts, rows, strict=True)]
         solution = concatenate_solutions([part.tracks.solution for part in parts], own_rows, track_id)
     bird, first = parts[0].tracks.bird, parts[0].summary
+    trust = _trust(parts)
     summary: dict[str, Any] = summarise(solution, bird, clock.seconds)
-    summary |= {key: first[key] for key in ("video", "networks") if key in first} | _trust(parts)
+    summary |= {key: first[key] for key in ("video", "networks") if key in first} | trust
     summary["quality"] = {row.track_id: row._asdict() for row in track_quality(observations)}
     summary["joined"] = [row._asdict() for row in table]
-    info = {key: "; ".join(value) if isinstance(value, list) else value for key, value in _trust(parts).items()}
+    info = {key: "; ".join(value) if isinstance(value, list) else value for key, value in trust.items()}
     with new_folder(out, overwrite, marker=MARKER) as part:
         write_coco(observations, part / OBSERVATIONS, info)
         write_solution(solution, bird, config_to_yaml(_config(parts)), summary, part)

@@ -12,7 +12,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.solution import LAYOUT, Solution
 from jaxfit.fitting.collect import track_status
 from jaxfit.fitting.fit import check_observations, fit_runs, windows_of
-from jaxfit.fitting.windows import Windows, window_content
+from jaxfit.fitting.windows import Windows, window_hash
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 
@@ -65,8 +65,8 @@ def refit(
     """
     before, after = (check_observations(each, bird, source) for each in (before, after))
     old, new = windows_of(before, config, source), windows_of(after, config, source)
-    rows = {window_content(old, w): w for w in range(len(old))}
-    source_row = np.array([rows.get(window_content(new, w), -1) for w in range(len(new))])
+    rows = {window_hash(old, w): w for w in range(len(old))}
+    source_row = np.array([rows.get(window_hash(new, w), -1) for w in range(len(new))])
     if config.overlap:
         source_row = _whole_tracks(source_row, old, new)
     touched = np.flatnonzero(source_row < 0)

@@ -106,7 +106,7 @@ def suggest(
     video, out = Path(video), Path(out)
     if count < 1:
         raise InputError("--count", f"is {count}", "give 1 or more")
-    require_extra("formats", "jaxfit suggest")
+    require_extra("formats", "jaxfit suggest", "h5py")
     info = probe_video(video)
     if is_inside(video, out) or out.absolute() == video.absolute():
         raise InputError(out, "holds the video, which the suggestions would replace", "choose another --out")

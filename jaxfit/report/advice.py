@@ -107,7 +107,7 @@ def counted(count: int, noun: str) -> str:
     return f"{count:,} {noun}" + ("" if count == 1 else "s")
 
 
-def numbers(values: Sequence[int]) -> str:
+def numbers(values: Sequence[int | str]) -> str:
     """Return the first values as a list."""
     shown = [f"{value}" for value in values[:_NAMED]]
     return ", ".join(shown) + (f" and {len(values) - _NAMED:,} more" if len(values) > _NAMED else "")
@@ -118,5 +118,4 @@ def _birds(ids: Sequence[int]) -> str:
 
 
 def _pairs(skipped: Mapping[str, str]) -> str:
-    shown = [f"{track} ({value})" for track, value in list(skipped.items())[:_NAMED]]
-    return ", ".join(shown) + (f" and {len(skipped) - _NAMED:,} more" if len(skipped) > _NAMED else "")
+    return numbers([f"{track} ({value})" for track, value in skipped.items()])

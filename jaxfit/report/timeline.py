@@ -36,14 +36,14 @@ def timeline(report: Report) -> Html:
         states = np.zeros(length, int)
         states[at] = _states(track)
         label = element("span", swatch(track.position), f"{track.track_id}", class_="label")
-        rows.append(element("div", label, _lane(track, _binned(states, per_column)), class_="row"))
+        rows.append(element("div", label, _band(track, _binned(states, per_column)), class_="row"))
     if report.damaged:
         states = np.zeros(length, int)
         damaged = (np.array(report.damaged) - first) // report.step
         states[damaged[(damaged >= 0) & (damaged < length)]] = 1
         columns = np.pad(states, (0, -length % per_column)).reshape(-1, per_column).max(1)
-        lane = element("svg", _bars(columns, 1, 0.2, 0.6), class_="lane", **_stretched(len(columns)))
-        rows.append(element("div", element("span", "damaged", class_="label"), lane, class_="row"))
+        band = element("svg", _bars(columns, 1, 0.2, 0.6), class_="band", **_stretched(len(columns)))
+        rows.append(element("div", element("span", "damaged", class_="label"), band, class_="row"))
     note = None
     if per_column > 1:
         text = f"One column shows {per_column} frames: their most frequent state, and their mean confidence."
@@ -106,11 +106,11 @@ def _binned(states: Int[np.ndarray, "L"], per_column: int) -> Int[np.ndarray, "C
     return np.where(kinds.argmax(1) == _POSE, np.round(mean).astype(int), kinds.argmax(1))
 
 
-def _lane(track: Track, states: Int[np.ndarray, "C"]) -> Html:
+def _band(track: Track, states: Int[np.ndarray, "C"]) -> Html:
     """Return the row of a bird."""
     parts = [_bars(states, _NO_POSE, 0.3, 0.4)]
     parts += [_bars(states, _POSE + level, 0, 1) for level in range(len(LEVELS) + 1)]
-    return element("svg", element("title", f"bird {track.track_id}"), *parts, class_="lane", **_stretched(len(states)))
+    return element("svg", element("title", f"bird {track.track_id}"), *parts, class_="band", **_stretched(len(states)))
 
 
 def _bars(states: Int[np.ndarray, "C"], state: int, top: float, height: float) -> Html | None:
@@ -131,8 +131,8 @@ def _counts(report: Report, at: np.ndarray, length: int) -> Html:
     steps = "".join(f"V{1 - count / most:.3f}h1" for count in counts)
     area = element("path", class_="count", d=f"M0 1{steps}V1z")
     title = element("title", f"number of birds in a frame, at most {most}")
-    lane = element("svg", title, area, class_="lane counts", **_stretched(len(counts)))
-    return element("div", element("span", f"birds ≤ {most}", class_="label"), lane, class_="row")
+    band = element("svg", title, area, class_="band counts", **_stretched(len(counts)))
+    return element("div", element("span", f"birds ≤ {most}", class_="label"), band, class_="row")
 
 
 def _stretched(columns: int) -> dict[str, object]:

@@ -158,7 +158,7 @@ def states(svg, columns):
     return drawn.tolist()
 
 
-def lanes(text):
+def bands(text):
     return {int(track): svg for track, svg in re.findall(r"<title>bird (\d+)</title>(.*?)</svg>", text)}
 
 
@@ -166,14 +166,14 @@ def test_the_timeline_shows_poses_detections_and_confidences(folder, made):
     observations = read_coco(folder / "observations.json")
     report = gather(made, observations, {"video": {"damaged": [16]}}, "", folder)
     text = timeline(report)
-    rows = lanes(text)
+    rows = bands(text)
     assert list(rows) == list(TRACKS)
     # frame 16 is missing: six columns of two frames each
     assert states(rows[3], 6) == ["s2", "s2", "s2", "", "s2", "s2"]
     assert states(rows[7], 6) == ["s2", "s1", "s1", "", "s3", "s3"]
     assert states(rows[8], 6) == ["s1", "s1", "s1", "", "s1", "s1"]
     assert states(text.split("damaged</span>")[1], 6) == ["", "", "", "s1", "", ""]
-    without = lanes(timeline(gather(made, None, {}, "", folder)))
+    without = bands(timeline(gather(made, None, {}, "", folder)))
     assert states(without[7], 6) == ["s5", "", "", "", "s5", "s5"]
 
 
@@ -185,7 +185,7 @@ def test_long_footage_has_several_frames_in_a_column(folder, made):
     confidence = np.where(np.arange(2000) < 600, 0.95, 0.6)
     long = dataclasses.replace(track, valid=valid, present=valid, confidence=confidence, size=np.ones(2000))
     report = dataclasses.replace(report, frames=np.arange(2000), step=1, tracks=(long,))
-    assert states(lanes(timeline(report))[3], 500) == ["s5"] * 150 + ["s3"] * 100 + [""] * 250
+    assert states(bands(timeline(report))[3], 500) == ["s5"] * 150 + ["s3"] * 100 + [""] * 250
 
 
 def test_warnings_name_what_was_skipped(folder, made):

@@ -41,7 +41,7 @@ def open_hdf5(path: str | Path) -> Iterator[Hdf5Group]:
         InputError: the file cannot be read, is not an HDF5 file, or h5py is not installed.
     """
     path = check_readable(path, "an HDF5 file")
-    require_extra("formats", str(path))
+    require_extra("formats", str(path), "h5py")
     import h5py
 
     check_heaps(path)

@@ -35,7 +35,7 @@ def write_pandas_table(
     Raises:
         InputError: the extra `formats` is not installed, or the file cannot be written.
     """
-    require_extra("formats", str(path))
+    require_extra("formats", str(path), "h5py")
     import h5py
 
     content = io.BytesIO()

@@ -44,7 +44,7 @@ def write_sleap_project(observations: Observations, footage: Sequence[str] | str
     Raises:
         InputError: the extra `formats` is not installed, or the file cannot be written.
     """
-    require_extra("formats", str(path))
+    require_extra("formats", str(path), "h5py")
     import h5py
 
     content = io.BytesIO()
