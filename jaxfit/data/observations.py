@@ -102,12 +102,15 @@ class Observations:
                 raise ValueError(f"{name} must lie in [0, 1]")
         if confidence[~present].any():
             raise ValueError("confidence must be 0 where present is False")
-        arrays["occluded"] = arrays["occluded"] & (confidence > 0)
-        arrays["occluded"].flags.writeable = False
+        if (arrays["occluded"] & (confidence <= 0)).any():
+            arrays["occluded"] = arrays["occluded"] & (confidence > 0)
+            arrays["occluded"].flags.writeable = False
         needed = {"keypoints_px": confidence[..., None] > 0, "box_px": present[..., None], "score": present}
         for name, there in needed.items():
             # absent values become 0, so that a NaN among them cannot reach a sum
-            values = np.where(there, arrays[name], np.float32(0))
+            values = arrays[name]
+            if (~there & (values != 0)).any():
+                values = np.where(there, values, np.float32(0))
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite where it is not missing")
             values.flags.writeable = False
@@ -242,6 +245,8 @@ def reorder_keypoints(observations: Observations, names: Sequence[str]) -> Obser
     old = observations.keypoint_names
     if sorted(names) != sorted(old):
         raise ValueError(f"names must be a permutation of {list(old)}, not {list(names)}")
+    if tuple(names) == old:
+        return observations
     order = [old.index(name) for name in names]
     new = {k: position for position, k in enumerate(order)}
     return replace(

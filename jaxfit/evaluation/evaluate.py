@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
-from jaxfit.data.masks import decode_mask
-from jaxfit.data.neighbours import masks_of_others
 from jaxfit.data.observations import Observations, check_keypoints
-from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.evaluation import metrics
 from jaxfit.evaluation.aggregation import COLUMNS, COLUMNS_KEYPOINT, Evaluation, metrics_of
 from jaxfit.evaluation.bootstrap import BirdSums
 from jaxfit.evaluation.keypoint_errors import correct_keypoints, squared_errors, squared_velocity_errors
+from jaxfit.evaluation.mask_comparison import compare_masks
 from jaxfit.evaluation.matching import match
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.evaluation.truth import Truth
-from jaxfit.limits import IMAGE_SIDE_PX
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.raster.zbuffer import hard_mask
 
 __all__ = ["COLUMNS", "COLUMNS_3D", "Evaluation", "evaluate"]
 
@@ -79,7 +74,7 @@ def evaluate(
     behaviour = np.full(measured.shape, "")
     if truth.behaviours is not None:
         behaviour = _behaviour_of_frames(truth.behaviours, solution, either, source)
-    masks = _compare_masks(solution, bird, seen, measured, (n_truth, t_truth), progress)
+    masks = compare_masks(solution, bird, seen, measured, (n_truth, t_truth), progress)
     overlaps = masks.iou[np.isfinite(masks.iou)]
     if overlaps.size and np.median(overlaps) < _LEAST_MEDIAN_IOU:
         _logger.warning(
@@ -144,56 +139,6 @@ def evaluate(
         },
         sums=sums,
     )
-
-
-class _MaskComparison(NamedTuple):
-    """NaN where nothing is measured."""
-
-    iou: Float[np.ndarray, "N T"]
-    """Of the mask of the mesh and the annotated mask."""
-    true_side_px: Float[np.ndarray, "N T"]
-    """Longer side of the annotated mask, or of the annotated box where there is no mask."""
-    predicted_side_px: Float[np.ndarray, "N T"]
-    """Longer side of the mask of the mesh."""
-
-
-def _compare_masks(
-    solution: Solution,
-    bird: Bird,
-    seen: Observations,
-    measured: Bool[np.ndarray, "N T"],
-    at: tuple[np.ndarray, np.ndarray],
-    progress: ProgressTask,
-) -> _MaskComparison:
-    """Draw the mask of every measured mesh and compare it with the annotation at these positions of the truth."""
-    iou, true_side, predicted_side = np.full((3, *measured.shape), np.nan)
-    posed = PosedBirds(solution, bird)
-    faces = np.asarray(posed.faces)
-    others = _masks_of_others(seen, measured, at)
-    with progress("Measuring", int(measured.sum())) as report_progress:
-        for n, t in np.argwhere(measured).tolist():
-            n_truth, t_truth = int(at[0][n, 0]), int(at[1][t])
-            true = seen.whole_mask(n_truth, t_truth)
-            predicted = hard_mask(posed.vertices_screen(n, t), faces, *seen.image_size(n_truth, t_truth))
-            predicted_side[n, t] = metrics.longest_side_of_mask(predicted)
-            if true is None:
-                true_side[n, t] = seen.box_px[n_truth, t_truth, 2:].max()
-            else:
-                true_side[n, t] = metrics.longest_side_of_mask(true)
-                if others[n, t] is not None:
-                    predicted &= true | ~decode_mask(others[n, t])
-                iou[n, t] = metrics.iou(predicted, true)
-            report_progress(1, "")
-    return _MaskComparison(iou, true_side, predicted_side)
-
-
-def _masks_of_others(seen: Observations, measured: np.ndarray, at: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Return the masks of all other birds, (N, T) run lengths or None, for birds whose whole mask is not known."""
-    needed = measured.copy()
-    for n, t in np.argwhere(measured).tolist():
-        needed[n, t] = (int(at[0][n, 0]), int(at[1][t])) not in seen.amodal_masks
-    frame = np.where(needed, at[1], -1)
-    return masks_of_others(seen, at[0][:, 0], frame, np.full((*frame.shape, 3), [0.0, 0.0, IMAGE_SIDE_PX]))
 
 
 def _behaviour_of_frames(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -38,7 +38,8 @@ class FittedWindow(NamedTuple):
 
 def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
     """Return the result of problem `i` of a batch."""
-    pose, report = jax.tree.map(lambda x: x[i], (fitted.pose, fitted.report))
+    # copies, so that a window does not keep the arrays of its batch
+    pose, report = jax.tree.map(lambda x: x[i].copy(), (fitted.pose, fitted.report))
     loss = {name: float(value) for name, value in report.loss.items()}
     failure = str(fitted.failure[i])
     if not failure and not (pose.scale > 0).all():  # a solver may step across 0
@@ -49,7 +50,7 @@ def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
 def collect_windows(
     observations: Observations,
     windows: Windows,
-    results: Sequence[FittedWindow],
+    results: list[FittedWindow],
     bird: Bird,
     camera: Camera,
     skipped: Mapping[int, tuple[str, ...]],
@@ -63,7 +64,8 @@ def collect_windows(
     Args:
         observations: the observations that the windows were cut from.
         windows: W windows.
-        results: the result of each window.
+        results: the result of each window. The list is emptied, so that results and solution never lie in memory
+            together.
         bird: the model.
         camera: the crop camera.
         skipped: track → text about its skipped frames, for `Solution.failures`.
@@ -87,7 +89,9 @@ def collect_windows(
     fitted, diverged = np.zeros(birds, int), np.zeros(birds, int)
     loss = {name: np.full(birds, np.nan) for name in results[0].loss}
     failures = dict(skipped)
-    for w, result in enumerate(results):
+    results.reverse()
+    for w in range(len(results)):
+        result = results.pop()
         n, present = int(windows.track[w]), windows.present[w]
         at = windows.frame[w][present]
         if result.failure:
@@ -104,6 +108,8 @@ def collect_windows(
         image_size_px[n, at] = [observations.image_size(n, int(t)) for t in at]
         for name, value in _frame_values(result, windows.crop[w], present, bird, camera).items():
             arrays[name][n, at] = value
+    for array in (valid, image_size_px, *arrays.values()):
+        array.flags.writeable = False  # so that `Solution` needs no copy
     counts = zip(fitted.tolist(), diverged.tolist(), strict=True)
     return Solution(
         track_id=observations.track_id,

@@ -46,6 +46,7 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
             has_mask=np.zeros(T, bool),
             present=np.zeros(T, bool),
             corner_px=np.zeros((T, 2), np.float32),
+            frame_s=np.ones((), np.float32),
         )
         problem = Problem(stage_hyperparameters(config, stage, model.bird.keypoint_names), pose, targets)
         for name in stage.terms:

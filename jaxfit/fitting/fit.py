@@ -6,7 +6,7 @@ The data passes each step once: observations → windows → targets and initial
 from __future__ import annotations
 
 import logging
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -114,13 +114,13 @@ def fit_runs(
     results = {} if stored is None else {(0, w): result for w, result in stored.find(runs[0].windows).items()}
     missing = [problem for problem in problems if problem not in results]
     size = max(min(frames_per_batch(bird, configs[0]) // configs[0].window, len(problems)), 1)
+    # by time, because masks of a frame lie together in files; problems of one window share their initial poses
+    missing.sort(key=lambda problem: (int(runs[problem[0]].windows.frame[problem[1]].max()), problem[::-1]))
     if cluster is not None:
-        # a small task costs little if its worker ends; problems of one window share their initial poses
-        missing.sort(key=lambda problem: problem[::-1])
+        # a small task costs little if its worker ends
         size = min(size, tile_size(configs[0].window) * len(configs))
     if stored is not None:
-        # from the first frame on, because an interruption costs one batch
-        missing.sort(key=lambda problem: runs[0].windows.frame[problem[1], 0])
+        # an interruption costs one batch
         size = min(size, windows_per_part(observations.num_tracks, configs[0].window))
     batches = [missing[first : first + size] for first in range(0, len(missing), size)]
     birds = len(np.unique(runs[0].windows.track))
@@ -157,10 +157,10 @@ def _fit_tasks(
 
 
 def _final_results(
-    r: int, run: Run, results: Mapping[tuple[int, int], FittedWindow], model: FitModel
+    r: int, run: Run, results: dict[tuple[int, int], FittedWindow], model: FitModel
 ) -> list[FittedWindow]:
-    """Return the result of every window of run `r`, blended where windows share frames."""
-    own = [results[r, w] for w in range(len(run.windows))]
+    """Take the result of every window of run `r` out of `results`, blended where windows share frames."""
+    own = [results.pop((r, w)) for w in range(len(run.windows))]
     return blend_seams(run.windows, own, model) if run.config.overlap else own
 
 

@@ -32,7 +32,7 @@ class Program(NamedTuple):
     """The stage's active terms, by name."""
     solver: Solver
     shared: tuple[str, ...] = ()
-    """The parameters of `curvature.SHARED_PARAMETERS` that a solver with curvature optimises."""
+    """The parameters of `curvature.SHARED_PARAMETERS` that a solver with curvature optimises, in that order."""
 
 
 class Hyperparameters(NamedTuple):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 
 import numpy as np
 
 from jaxfit.fitting.collect import FittedWindow
 from jaxfit.fitting.tiles import tile_size
-from jaxfit.fitting.windows import Windows, window_content
+from jaxfit.fitting.windows import Windows, window_hash
 from jaxfit.model.pose import Pose
 from jaxfit.storage.parts import Parts
 
@@ -60,8 +59,8 @@ class StoredWindows:
             InputError: a file is damaged.
         """
         rows: dict[str, list[int]] = {}
-        for w in range(len(windows)):
-            rows.setdefault(_hash(windows, w), []).append(w)
+        for w in np.argsort(windows.frame.max(1), kind="stable").tolist() if self._parts.numbers else ():
+            rows.setdefault(window_hash(windows, w), []).append(w)
         found = {}
         for number in self._parts.numbers:
             arrays = self._parts.load(number, _LAYOUT)
@@ -89,7 +88,7 @@ class StoredWindows:
         poses = {name: np.stack([getattr(result.pose, name) for result in some]) for name in _POSE}
         self._parts.add(
             {
-                "content": np.array([_hash(windows, w) for w in results]),
+                "content": np.array([window_hash(windows, w) for w in results]),
                 "failure": np.array([result.failure for result in some]),
                 "loss": np.array([list(result.loss.values()) for result in some], np.float64),
                 "loss_terms": np.array(list(some[0].loss)),
@@ -112,8 +111,3 @@ def windows_per_part(birds: int, frames: int) -> int:
     """
     size = tile_size(frames)
     return -(-birds * -(-LEAST_FRAMES // frames) // size) * size
-
-
-def _hash(windows: Windows, w: int) -> str:
-    """Return the SHA-256 hash of the content of a window."""
-    return hashlib.sha256(repr(window_content(windows, w)).encode()).hexdigest()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -10,22 +11,31 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfit.config.fit import FitConfig
-from jaxfit.data.frame_numbers import frame_step
+from jaxfit.data.frame_numbers import UNKNOWN_FPS, frame_interval_s, frame_step
 from jaxfit.data.masks import decode_mask
-from jaxfit.data.neighbours import masks_of_others
+from jaxfit.data.neighbours import FrameMasks
 from jaxfit.data.observations import Observations
 from jaxfit.data.tables import check_memory
 from jaxfit.errors import InputError
 from jaxfit.fitting.crops import crop_squares, cut_mask, grow_mask, mark_unknown
 from jaxfit.fitting.distant import without_distant_birds
 from jaxfit.fitting.filtering import weighted_median_filter
+from jaxfit.fitting.window_masks import LoadedMasks, WindowMasks
 from jaxfit.limits import TABLE_GB
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets
 
-__all__ = ["Windows", "cut_windows", "filter_observations", "load_targets", "window_content", "windows_key"]
+__all__ = [
+    "Windows",
+    "cut_windows",
+    "filter_observations",
+    "load_targets",
+    "window_content",
+    "window_hash",
+    "windows_key",
+]
 
-FILTER_BYTES = 500_000_000
+FILTER_BYTES = 50_000_000
 """Memory for the birds that are filtered at once."""
 
 
@@ -47,11 +57,12 @@ class Windows:
     """Crop pixels; 0 where the confidence is 0."""
     confidence: Float[np.ndarray, "W T K"]
     """In [0, 1]; 0 where a keypoint is missing."""
-    mask_rle: np.ndarray
-    """(W, T) objects: run lengths of the bird's mask in its image, or None. `load_targets` decodes them."""
-    others_rle: np.ndarray
-    """(W, T) objects: run lengths of the masks of all other birds that reach into the crop, or None without them;
-    False where the pixels outside the bird's mask are background."""
+    has_mask: Bool[np.ndarray, "W T"]
+    """Whether the bird has a mask in the frame."""
+    masks: np.ndarray
+    """(W,) objects: the `WindowMasks` of each window. `load_targets` reads and decodes the masks."""
+    frame_s: Float[np.ndarray, "W"]
+    """Time between consecutive frames of the window, in seconds; of a video of 25 frames/s if the rate is unknown."""
 
     def __len__(self) -> int:
         return len(self.track)
@@ -68,10 +79,15 @@ def windows_key(config: FitConfig) -> tuple:
 
 def window_content(windows: Windows, w: int) -> tuple:
     """Return the content of a window, which determines its fit under one config and model."""
-    arrays = (windows.frame, windows.present, windows.crop, windows.keypoints_px, windows.confidence)
-    masks = (*windows.mask_rle[w], *windows.others_rle[w])
-    lengths = tuple((tuple(rle["size"]), rle["counts"]) if rle else rle for rle in masks)
+    arrays = windows.frame, windows.present, windows.crop, windows.keypoints_px, windows.confidence, windows.frame_s
+    masks: LoadedMasks = cast(Any, windows.masks[w]).load()
+    lengths = tuple((tuple(rle["size"]), rle["counts"]) if rle else rle for rle in (*masks.own, *masks.others))
     return *(np.ascontiguousarray(each[w]).tobytes() for each in arrays), lengths
+
+
+def window_hash(windows: Windows, w: int) -> str:
+    """Return the SHA-256 hash of the content of a window."""
+    return hashlib.sha256(repr(window_content(windows, w)).encode()).hexdigest()
 
 
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:
@@ -109,12 +125,11 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     crop = crop_squares(observations, track, frame, present, config.crop)
     confidence = (observations.confidence[rows, columns] * present[..., None]).astype(np.float32)
     keypoints_px = image_to_crop(observations.keypoints_px[rows, columns], crop)
-    mask_rle = np.full(frame.shape, None, object)
-    for w, t in zip(*np.nonzero(present), strict=True):
-        mask_rle[w, t] = observations.masks.get((int(track[w]), int(frame[w, t])))
-    others_rle = np.full(frame.shape, False, object)
-    if config.unknown_pixels:
-        others_rle = masks_of_others(observations, track, np.where(present, frame, -1), crop)
+    frames, masks = FrameMasks(observations), np.empty(len(track), object)
+    for w, n in enumerate(track.tolist()):
+        masks[w] = WindowMasks.of(frames, n, frame[w], present[w], crop[w], config.unknown_pixels)
+    numbers = observations.frame_index
+    frame_s = frame_interval_s(numbers, observations.timestamp_s, observations.fps)
     return Windows(
         track=track,
         track_id=observations.track_id[track],
@@ -123,9 +138,24 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
         crop=crop,
         keypoints_px=np.where(confidence[..., None] > 0, keypoints_px, 0).astype(np.float32),
         confidence=confidence,
-        mask_rle=mask_rle,
-        others_rle=others_rle,
+        has_mask=_has_mask(observations, track, frame, present),
+        masks=masks,
+        frame_s=np.full(len(starts), frame_s or frame_step(numbers) / UNKNOWN_FPS, np.float32),
     )
+
+
+def _has_mask(
+    observations: Observations,
+    track: Int[np.ndarray, "W"],
+    frame: Int[np.ndarray, "W T"],
+    present: Bool[np.ndarray, "W T"],
+) -> Bool[np.ndarray, "W T"]:
+    """Return whether a bird has a mask, for the frames of some windows."""
+    has_mask = np.zeros(frame.shape, bool)
+    if observations.masks:
+        for w, t in np.argwhere(present).tolist():
+            has_mask[w, t] = (int(track[w]), int(frame[w, t])) in observations.masks
+    return has_mask
 
 
 def filter_observations(observations: Observations, window: int) -> Observations:
@@ -157,23 +187,26 @@ def load_targets(windows: Windows, mask_px: int, grow_px: float = 0.0) -> Target
         grow_px: distance by which the masks are enlarged, in pixels of a 256-pixel crop.
     """
     mask = np.zeros((*windows.frame.shape, mask_px, mask_px), np.uint8)
-    has_mask = windows.mask_rle != np.array(None)
-    for w, t in zip(*np.nonzero(has_mask & (mask_px > 0)), strict=True):
-        full = decode_mask(cast(Any, windows.mask_rle[w, t]))
-        mask[w, t] = cut_mask(full, windows.crop[w, t], mask_px)
-        others = cast(Any, windows.others_rle[w, t])
-        if others is not False:
-            others = None if others is None else decode_mask(others)
-            mark_unknown(mask[w, t], others, cast(Any, full.shape), windows.crop[w, t])
-        if grow_px:
-            grow_mask(mask[w, t], grow_px)
+    needed = np.flatnonzero(windows.has_mask.any(1) & (mask_px > 0))
+    for w in needed[np.argsort(windows.frame[needed].max(1), kind="stable")]:  # masks of a frame lie together in files
+        masks: LoadedMasks = cast(Any, windows.masks[w]).load()
+        for t in np.flatnonzero(windows.has_mask[w]).tolist():
+            full = decode_mask(cast(Any, masks.own[t]))
+            mask[w, t] = cut_mask(full, windows.crop[w, t], mask_px)
+            others = masks.others[t]
+            if others is not False:
+                others = None if others is None else decode_mask(others)
+                mark_unknown(mask[w, t], others, cast(Any, full.shape), windows.crop[w, t])
+            if grow_px:
+                grow_mask(mask[w, t], grow_px)
     return Targets(
         keypoints_px=windows.keypoints_px,
         confidence=windows.confidence,
         mask=mask,
-        has_mask=has_mask,
+        has_mask=windows.has_mask,
         present=windows.present,
         corner_px=(windows.crop[..., :2] * CROP_PX / windows.crop[..., 2:]).astype(np.float32),
+        frame_s=windows.frame_s,
     )
 
 

@@ -96,9 +96,9 @@ def transform_derivatives(
     """Return the derivatives of the joint transforms in the camera frame, B_d = [s·R_d | s·t_d + τ].
 
     A rest point v is posed at Σ_d w_d · B_d·(v, 1). The columns are the axis-angles of all joints, root first (3J),
-    the translation τ (3), the scale s (1) and, with `with_bones`, the lengths of the bones (J−1).
-    A rotation of joint j by ω rotates the transforms of joint j and of its
-    descendants about the posed position p_j of the joint, with ω = R_j·Jr(θ_j)·dθ_j.
+    the translation τ (3), the scale s (1) and, with `with_bones`, the lengths of the bones (J−1). A rotation of joint j
+    by ω rotates the transforms of joint j and of its descendants about the posed position p_j of the joint, with
+    ω = R_j·Jr(θ_j)·dθ_j.
 
     Args:
         rig: the folded bird.

@@ -24,7 +24,6 @@ __all__ = [
     "add_rows",
     "frame_rows",
     "shared_columns",
-    "split_rows",
     "weighted_curvature",
 ]
 
@@ -61,48 +60,47 @@ def weighted_curvature(weights: Sequence[Float[Array, ""]], curvatures: Sequence
 
 
 def frame_rows(pose: Pose, shared: Sequence[str] = ()) -> Rows:
-    """Return the pose of a window as one row per frame, with the parameters `shared` of `SHARED_PARAMETERS`.
+    """Return the pose of a window as one row per frame, with the parameters `shared`.
 
-    A parameter that all frames share is repeated in every row.
+    `shared` holds names of `SHARED_PARAMETERS`, in that order. A parameter that all frames share is repeated in every
+    row.
     """
     frames = pose.global_orient.shape[0]
     scale = jnp.broadcast_to(pose.scale, (frames,))
     columns = [pose.global_orient, pose.body_pose.reshape(frames, -1), pose.transl, scale[:, None]]
-    for name in SHARED_PARAMETERS:
-        if name in shared:
-            values = jnp.asarray(getattr(pose, name))
-            columns.append(jnp.broadcast_to(values, (frames, values.shape[-1])))
+    for name in shared:
+        values = jnp.asarray(getattr(pose, name))
+        columns.append(jnp.broadcast_to(values, (frames, values.shape[-1])))
     return jnp.concatenate(columns, axis=1)
 
 
 def add_rows(pose: Pose, rows: Rows, shared: Sequence[str] = ()) -> Pose:
     """Return the pose plus a change, which has one row per frame in the layout of `frame_rows`."""
-    angles, transl, scale, *others = split_rows(pose, rows, shared)
-    names = [name for name in SHARED_PARAMETERS if name in shared]
-    is_common = pose.scale.shape[0] < len(rows)
+    sizes = _sizes(pose, shared)
+    assert rows.shape[1] == sum(sizes), (rows.shape, sizes)
+    ends = np.cumsum(sizes).tolist()  # slices: with jnp.split, compiled fits round differently
+    angles, transl, scale, *others = (rows[:, end - size : end] for size, end in zip(sizes, ends, strict=True))
     return replace(
         pose,
         global_orient=pose.global_orient + angles[:, :3],
         body_pose=pose.body_pose + angles[:, 3:].reshape(pose.body_pose.shape),
         transl=pose.transl + transl,
-        scale=pose.scale + (scale.mean(axis=0) if is_common else scale[:, 0]),
-        **{name: getattr(pose, name) + each.mean(axis=0) for name, each in zip(names, others, strict=True)},
+        scale=pose.scale + (scale.mean(axis=0) if _has_common_scale(pose) else scale[:, 0]),
+        **{name: getattr(pose, name) + each.mean(axis=0) for name, each in zip(shared, others, strict=True)},
     )
-
-
-def split_rows(pose: Pose, rows: Rows, shared: Sequence[str] = ()) -> list[Float[Array, "T part"]]:
-    """Return the columns of the angles (3J), the translation, the scale, and each of the parameters `shared`."""
-    sizes = [3 + 3 * pose.body_pose.shape[-2], 3, 1]
-    sizes += [getattr(pose, name).shape[-1] for name in SHARED_PARAMETERS if name in shared]
-    ends = [sum(sizes[: i + 1]) for i in range(len(sizes))]
-    assert rows.shape[1] == ends[-1], (rows.shape, sizes)
-    return [rows[:, end - size : end] for size, end in zip(sizes, ends, strict=True)]
 
 
 def shared_columns(pose: Pose, shared: Sequence[str] = ()) -> Bool[np.ndarray, "D"]:
     """Return, for each column of `frame_rows`, whether all frames share the parameter."""
-    frames = pose.global_orient.shape[0]
-    is_common = pose.scale.shape[0] < frames
-    values = [getattr(pose, name) for name in SHARED_PARAMETERS if name in shared]
-    framewise = 6 + 3 * pose.body_pose.shape[-2]
-    return np.repeat([False, is_common, True], [framewise, 1, sum(each.shape[-1] for each in values)])
+    is_shared = [False, False, _has_common_scale(pose), *(True for _ in shared)]
+    return np.repeat(is_shared, _sizes(pose, shared))
+
+
+def _sizes(pose: Pose, shared: Sequence[str]) -> list[int]:
+    """Return the numbers of columns of the angles (3J), the translation, the scale, and each parameter in `shared`."""
+    return [3 + 3 * pose.body_pose.shape[-2], 3, 1, *(getattr(pose, name).shape[-1] for name in shared)]
+
+
+def _has_common_scale(pose: Pose) -> bool:
+    """Return whether all frames of a window have one scale."""
+    return pose.scale.shape[0] < pose.global_orient.shape[0]

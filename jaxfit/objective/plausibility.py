@@ -6,9 +6,8 @@ import jax.numpy as jnp
 
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.objective.residuals import Residuals, geman_mcclure
+from jaxfit.objective.residuals import Residuals, Scalar, geman_mcclure
 from jaxfit.objective.temporal import complete_runs
-from jaxfit.objective.terms import Scalar
 
 __all__ = ["feet_on_ground", "joint_limits"]
 

@@ -30,7 +30,7 @@ from jaxfit.model.kinematics import (
 )
 from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
-from jaxfit.objective.curvature import SHARED_PARAMETERS, Rows, add_rows
+from jaxfit.objective.curvature import Rows, add_rows
 from jaxfit.raster.silhouette import Blur, Skin
 
 __all__ = ["PosedWindow", "Priors", "Raster", "Targets", "priors_of"]
@@ -53,6 +53,8 @@ class Targets(eqx.Module):
     corner_px: Float[Array | np.ndarray, "*T 2"]
     """Upper left corner of the crop in the image, in crop pixels. The crop follows the bird, so the corner differs
     between frames."""
+    frame_s: Float[Array | np.ndarray, "*windows"]
+    """Time between consecutive frames in seconds. A traced value: windows of any frame rate share a program."""
 
 
 class Priors(NamedTuple):
@@ -126,7 +128,8 @@ class PosedWindow:
         self.camera = camera
         self.raster = raster
         self.shared = shared
-        """The names of optimised parameters of `curvature.SHARED_PARAMETERS`, which have columns in derivatives."""
+        """The names of optimised parameters of `curvature.SHARED_PARAMETERS`, in that order. These parameters have
+        columns in derivatives."""
         self._rig = rig
 
     def moved(self, rows: Rows) -> PosedWindow:
@@ -140,6 +143,11 @@ class PosedWindow:
         """False in frames without an observation of the bird; poses of these frames are meaningless, and terms must
         skip them."""
         return self.targets.present
+
+    @property
+    def frame_s(self) -> Float[Array | np.ndarray, ""]:
+        """Time between consecutive frames in seconds; 1/25 s if the frame rate is unknown."""
+        return self.targets.frame_s
 
     @property
     def joint_limits(self) -> Float[Array, "bones 3 2"]:
@@ -224,9 +232,7 @@ class PosedWindow:
         by_scale = jnp.sum(by_point * unit[..., None, :], axis=-1, keepdims=True)
         by_place = jnp.concatenate([by_point, by_scale], axis=-1)
         by_shared = (
-            by_point @ window_keypoint_derivatives(self._rig, self._transforms, self.pose, name)
-            for name in SHARED_PARAMETERS
-            if name in self.shared
+            by_point @ window_keypoint_derivatives(self._rig, self._transforms, self.pose, name) for name in self.shared
         )
         rows = len(points), 2 * points.shape[1]
         return tuple(block.reshape(*rows, -1) for block in (by_angles, by_place, *by_shared))

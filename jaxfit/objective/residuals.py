@@ -22,11 +22,13 @@ __all__ = [
     "SQUARE",
     "Residuals",
     "RobustKernel",
+    "Scalar",
     "as_list",
     "geman_mcclure",
     "huber",
     "residual_curvature",
     "residual_sum",
+    "student_t",
 ]
 
 Scalar = Float[Array, ""]
@@ -77,6 +79,12 @@ def huber(delta: Scalar | float) -> RobustKernel:
         return clipped * (_safe_sqrt(s) - clipped / 2)
 
     return RobustKernel(value, lambda s: 0.5 * delta / jnp.maximum(_safe_sqrt(s), delta))
+
+
+def student_t(dof: Scalar | float, size: int) -> RobustKernel:
+    """Return Student's t: ρ = (ν + n)/2 · log(1 + s/ν), the negative log-density of n residuals of scale 1, in nats."""
+    half = (dof + size) / 2
+    return RobustKernel(lambda s: half * jnp.log1p(s / dof), lambda s: half / (dof + s))
 
 
 class Residuals(NamedTuple):
@@ -139,12 +147,11 @@ def _from_jacobian(residuals: Residuals, factor: Float[Array, "..."]) -> Curvatu
     # without the barrier, XLA computes the Jacobian again for every use
     blocks = jax.lax.optimization_barrier(tuple(residuals.jacobian()))
     factor = factor.reshape(blocks[0].shape[:2])
-    ends = [sum(block.shape[-1] for block in blocks[: i + 1]) for i in range(len(blocks))]
-    starts = [0, *ends[:-1]]
+    ends = np.cumsum([block.shape[-1] for block in blocks])
 
     def product(d: Rows) -> Rows:
-        parts = (jnp.einsum("tri,ti->tr", J, d[:, a:b]) for J, a, b in zip(blocks, starts, ends, strict=True))
-        change = factor * sum(parts, start=jnp.zeros(()))
+        parts = zip(blocks, jnp.split(d, ends[:-1], axis=1), strict=True)
+        change = factor * sum((jnp.einsum("tri,ti->tr", J, part) for J, part in parts), start=jnp.zeros(()))
         return jnp.concatenate([jnp.einsum("tri,tr->ti", J, change) for J in blocks], axis=1)
 
     diagonal = [jnp.einsum("tri,tr->ti", J**2, factor) for J in blocks]

@@ -15,9 +15,8 @@ from jaxtyping import Array, Bool, Float
 from jaxfit.model.rotation import rotation_between
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.objective.residuals import NORM, Residuals, huber
+from jaxfit.objective.residuals import NORM, Residuals, Scalar, huber
 from jaxfit.objective.temporal import complete_runs
-from jaxfit.objective.terms import Scalar
 
 __all__ = ["geodesic_velocity", "huber_velocity", "low_pass"]
 

@@ -8,8 +8,7 @@ from jaxtyping import Array, Bool
 
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.objective.residuals import NORM, Residuals
-from jaxfit.objective.terms import Scalar
+from jaxfit.objective.residuals import NORM, Residuals, Scalar
 
 __all__ = ["acceleration", "complete_runs", "velocity"]
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from jaxfit.objective.curvature import Curvature, Rows
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
-from jaxfit.objective.residuals import NORM, Residuals, geman_mcclure
+from jaxfit.objective.residuals import NORM, Residuals, Scalar, geman_mcclure
 from jaxfit.raster.silhouette import Kind, mask_loss, silhouette_gauss_newton
 
 __all__ = [
@@ -26,8 +26,6 @@ __all__ = [
     "shape_prior",
     "stage_anchor",
 ]
-
-Scalar = Float[Array, ""]
 
 
 @term(positive=["sigma_px"])

@@ -19,7 +19,7 @@ def validate_arrays(values: Mapping[str, Any], layout: Mapping[str, tuple[str, A
             any other word, such as ``T`` or ``J-1``, stands for one size in all arrays of the layout.
 
     Returns:
-        Name → a read-only copy with that dtype.
+        Name → a read-only array with that dtype: a copy, or the given array if it is read-only and owns its memory.
 
     Raises:
         ValueError: an array has another type or shape. The message names the array, the expected layout and the
@@ -37,7 +37,8 @@ def validate_arrays(values: Mapping[str, Any], layout: Mapping[str, tuple[str, A
     for name, (_, dtype) in layout.items():
         dtype = arrays[name].dtype if np.dtype(dtype).kind == "U" else dtype
         with np.errstate(over="ignore"):  # a number too large for the type becomes infinite
-            arrays[name] = arrays[name].astype(dtype)
+            fixed = not arrays[name].flags.writeable and arrays[name].base is None
+            arrays[name] = arrays[name].astype(dtype, copy=not fixed)
         arrays[name].flags.writeable = False
     return arrays
 

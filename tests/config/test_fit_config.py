@@ -280,3 +280,11 @@ def test_every_term_has_a_docstring():
         assert documented, name
         assert len(documented.strip()) > 20, name
         assert "Source:" in documented or name == "shape_prior", name
+
+
+def test_map_starts_with_a_wide_scale_of_motion():
+    """With the scale of the last stage in the first stage, wingbeats would be rounded off from the start."""
+    config = load_config("map")
+    scales = [config.stage_settings(stage)["motion_likelihood"]["sd_rad_s2"] for stage in config.stages]
+    assert scales == [62.5, 6.25]
+    assert (config.filter_window, config.unknown_pixels, config.grow_masks_px) == (1, True, 2.3)

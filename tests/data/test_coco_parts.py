@@ -148,7 +148,7 @@ def test_every_damage_is_one_error_with_a_remedy(path):
     assert not [text for text in errors if "birds.parts" not in text or "(remove this .parts folder" not in text]
     for content in (whole[:-40], whole[: len(whole) // 2], b""):
         part.write_bytes(content)
-        with pytest.raises(InputError, match=r"000001\.npz: .*remove this \.parts folder"):
+        with pytest.raises(InputError, match=r"000001\.npz: .*\.parts folder; jaxfit then reads the COCO file"):
             all_values(path)
     part.unlink()
     with pytest.raises(InputError, match=r"birds\.parts: lacks parts: it holds 2 of 3 .*remove this \.parts folder"):

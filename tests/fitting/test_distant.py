@@ -128,7 +128,7 @@ def test_one_distant_frame_is_skipped(wrong, boxes, mode, filter_window):
     windows, expected = cut_windows(far, settings), cut_windows(lacking, settings)
     assert windows.present.sum() == 2 * T - 1
     for name in vars(windows):
-        if name != "mask_rle":
+        if name != "masks":
             np.testing.assert_array_equal(getattr(windows, name), getattr(expected, name), err_msg=name)
     np.testing.assert_array_equal(load_targets(windows, 16).mask, load_targets(expected, 16).mask)
 

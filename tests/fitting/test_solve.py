@@ -173,6 +173,22 @@ def test_steps_weights_and_learning_rates_share_one_program(caplog):
         assert len(compiled(caplog, "advance")) == 1  # another batch size compiles: the count works
 
 
+def test_frame_rates_share_one_program(caplog):
+    start, targets = case()
+    stage = dataclasses.replace(FIRST, terms=(*FIRST.terms, "motion_likelihood"))
+    settings = dataclasses.replace(CONFIG, terms={"motion_likelihood": {"sd_rad_s2": 1.0}})
+
+    def poses(targets):
+        own = program(stage, settings), problems(start, targets, stage, settings)
+        return np.asarray(advance((*own, jnp.int32(3)), begin(*own, None))[0].pose.body_pose)
+
+    slow = poses(targets)
+    with caplog.at_level(logging.WARNING), jax.log_compiles():
+        fast = poses(dataclasses.replace(targets, frame_s=targets.frame_s / 4))
+    assert not compiled(caplog, "advance")
+    assert np.abs(fast - slow).max() > 1e-4
+
+
 def compiled(caplog, name):
     messages = [record.getMessage() for record in caplog.records]
     return [m for m in messages if m.startswith("Compiling") and name in m.split("with")[0]]

@@ -4,49 +4,18 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support.walking import HEIGHT, WIDTH, K, walk
 
 from jaxfit.config.fit import CropConfig, load_config
-from jaxfit.data.masks import encode_mask
-from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.fitting.crops import cut_mask
 from jaxfit.fitting.filtering import weighted_median_filter
-from jaxfit.fitting.windows import cut_windows, filter_observations, load_targets
+from jaxfit.fitting.windows import cut_windows, filter_observations, load_targets, window_content
 from jaxfit.model.camera import CROP_PX, crop_to_image
-
-K, WIDTH, HEIGHT = 5, 400, 300
 
 
 def config(window=4, **changes):
     return dataclasses.replace(load_config("paper"), window=window, filter_window=1, **changes)
-
-
-def walk(numbers, birds=2, seed=0):
-    """Return birds that walk to the right by about 4 px per frame number. Frame t has the number `numbers[t]`."""
-    rng = np.random.default_rng(seed)
-    T = len(numbers)
-    centre = np.stack([np.array([60 + 50 * n, 90 + 60 * n]) + np.outer(numbers, [4, 1]) for n in range(birds)])
-    keypoints = centre[:, :, None] + rng.uniform(-18, 18, (birds, T, K, 2))
-    low, high = keypoints.min(2) - 2, keypoints.max(2) + 2
-    masks = {}
-    for n in range(birds):
-        for t in range(T):
-            mask = np.zeros((HEIGHT, WIDTH), bool)
-            (x0, y0), (x1, y1) = low[n, t].astype(int), high[n, t].astype(int)
-            mask[max(y0, 0) : y1, max(x0, 0) : x1] = True
-            masks[n, t] = encode_mask(mask)
-    return Observations(
-        track_id=np.arange(birds) + 7,
-        frame_index=np.array(numbers),
-        present=np.ones((birds, T), bool),
-        keypoints_px=keypoints,
-        confidence=rng.uniform(0.5, 1, (birds, T, K)),
-        box_px=np.concatenate([low, high - low], -1),
-        image_size_px=np.full((T, 2), [WIDTH, HEIGHT]),
-        file_name=np.array([f"{t}.png" for t in numbers]),
-        keypoint_names=tuple("abcde"),
-        masks=masks,
-    )
 
 
 def changed(observations, absent=(), **changes):
@@ -214,3 +183,22 @@ def test_the_filter_runs_over_frame_numbers(numbers):
     np.testing.assert_array_equal(filtered.confidence, observations.confidence)
     assert np.abs(filtered.keypoints_px - observations.keypoints_px).max() > 1
     assert filter_observations(observations, 1) is observations
+
+
+@pytest.mark.parametrize(
+    ("numbers", "times", "frame_s"),
+    [
+        (range(6), {"fps": 50.0}, 0.02),
+        (range(0, 12, 2), {"fps": 50.0}, 0.04),
+        (range(6), {"timestamp_s": np.arange(6) / 10}, 0.1),
+        (range(6), {}, 0.04),
+        (range(0, 18, 3), {}, 0.12),  # an unknown rate counts as 25 frames/s, of which the file has every third
+    ],
+)
+def test_windows_hold_the_time_between_frames(numbers, times, frame_s):
+    windows = cut_windows(dataclasses.replace(walk(numbers), **times), config(window=4))
+    assert len(windows) == 4
+    targets = load_targets(windows, 0)
+    assert targets.frame_s.dtype == np.float32
+    np.testing.assert_allclose(targets.frame_s, [frame_s] * 4, rtol=1e-6)
+    assert window_content(windows, 0) != window_content(dataclasses.replace(windows, frame_s=2 * windows.frame_s), 0)

@@ -13,11 +13,12 @@ from jaxfit.model.rotation import axis_angle_to_matrix, right_jacobian
 from jaxfit.objective.curvature import SHARED_PARAMETERS, add_rows, frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature, residual_sum
 from jaxfit.objective.registry import Term, find_term, find_terms
-from jaxfit.objective.residuals import NORM, Residuals, as_list, geman_mcclure, huber
+from jaxfit.objective.residuals import NORM, Residuals, as_list, geman_mcclure, huber, student_t
 
 T = terms_by_hand.T
 TERMS = terms_by_hand.TERMS
 MASKS = ["mask", "mask_smooth_l1"]
+KEYPOINTS = ["keypoints", "keypoint_likelihood"]
 RESIDUALS = [name for name in TERMS if name not in MASKS]
 LINEAR = [
     "pose_prior",
@@ -131,7 +132,7 @@ def test_keypoint_jacobian():
         frames = dataclasses.replace(pose, bone_length=None, betas=None)
         return jax.vmap(one)(frames, rows)
 
-    bones, betas, first = pose.bone_length, pose.betas, jax.tree.map(lambda x: x[:1], targets)
+    bones, betas, first = pose.bone_length, pose.betas, jax.tree.map(lambda x: x[:1] if x.ndim else x, targets)
     expected = jax.jit(jax.jacfwd(points))(jnp.zeros((T, D)))
     actual = jnp.concatenate(jax.jit(lambda: window_of(pose, targets).keypoint_jacobian_px)(), axis=-1)
     for t in range(T):
@@ -169,7 +170,7 @@ def test_product_and_diagonal_belong_to_one_positive_semidefinite_matrix(name):
     np.testing.assert_allclose(H, H.T, atol=1e-5 * scale)
     assert np.linalg.eigvalsh(H).min() > -1e-4 * scale
     assert (diagonal[np.diagonal(H) > 1e-6 * scale] > 0).all()
-    if name in [*MASKS, "keypoints"]:
+    if name in [*MASKS, *KEYPOINTS]:
         np.testing.assert_allclose(diagonal, np.diagonal(H), atol=1e-5 * scale)
     else:  # an estimate from random signs, with a relative standard deviation of at most √(2/16)
         used = np.diagonal(H) > 1e-6 * scale
@@ -199,7 +200,7 @@ def test_the_quadratic_is_above_the_term(name):
             assert after == pytest.approx(float(bound), rel=1e-4)
 
 
-@pytest.mark.parametrize("kernel", [geman_mcclure(2.0), huber(0.7), NORM])
+@pytest.mark.parametrize("kernel", [geman_mcclure(2.0), huber(0.7), NORM, student_t(3.0, 2)])
 def test_a_kernel_lies_below_its_tangent(kernel):
     """So the weighted squares are an upper bound. At 0, the slope of the norm is replaced by a finite number."""
     s = jnp.asarray([0.01, 0.3, 1.0, 9.0])
@@ -213,8 +214,9 @@ def test_a_kernel_lies_below_its_tangent(kernel):
     assert 0 < kernel.slope(zero) < 1e3
 
 
-def test_keypoint_term_does_not_couple_frames():
-    H = np.array(curvatures(*case())["keypoints"][0])
+@pytest.mark.parametrize("name", KEYPOINTS)
+def test_keypoint_terms_do_not_couple_frames(name):
+    H = np.array(curvatures(*case())[name][0])
     framewise = int((~IS_SHARED).sum())
     H = H[: T * framewise, : T * framewise].reshape(T, framewise, T, framewise)
     for t in range(T):

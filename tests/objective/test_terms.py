@@ -83,8 +83,10 @@ def test_missing_observations_have_no_effect():
     # the position of a keypoint with confidence 0 has no effect
     faint = dataclasses.replace(random_targets(), confidence=random_targets().confidence.at[0, 2].set(0))
     astray = dataclasses.replace(faint, keypoints_px=faint.keypoints_px.at[0, 2].set(1e4))
-    both = [float(every_term(pose, start, e, all_settings())["keypoints"]) for e in (faint, astray)]
-    assert both[0] == both[1]
+    both = [every_term(pose, start, e, all_settings()) for e in (faint, astray)]
+    for name in ("keypoints", "keypoint_likelihood"):
+        assert float(both[0][name]) == float(both[1][name])
+        assert float(both[0][name]) < float(every_term(pose, start, random_targets(), all_settings())[name])
 
 
 def test_mask_terms_skip_frames_without_mask():
@@ -118,6 +120,7 @@ def edges():
         "at the camera": (dataclasses.replace(pose, transl=jnp.zeros((T, 3))), targets),
         "scale 0": (dataclasses.replace(pose, scale=jnp.zeros(T)), targets),
         "no observations": (pose, none_present),
+        "confidence 0": (pose, dataclasses.replace(targets, confidence=jnp.zeros_like(targets.confidence))),
     }
 
 

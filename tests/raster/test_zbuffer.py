@@ -263,7 +263,6 @@ def test_wrong_arguments():
         (lambda: render.zbuffer(good, HALVES - 1, 40, 40), "faces: expected indices"),
         (lambda: render.zbuffer(good, HALVES, 0, 40), "width: expected an integer from 1"),
         (lambda: render.hard_mask(good, HALVES, 40, 40.0), "height: expected an integer"),
-        (lambda: render.hard_mask(good[None], HALVES, 40, 40), r"vertices_screen: expected shape \(V, 3\)"),
         (lambda: render.interpolate(good, HALVES, colours[:3], 40, 40), r"attributes: expected shape \(4, channels\)"),
         (lambda: render.interpolate(good, HALVES, colours, 40, 40, 9), "samples: expected an integer from 1 to 8"),
         (lambda: render.draw(image / 255, good, HALVES, colours), "image: expected uint8 of shape"),
@@ -286,3 +285,13 @@ def test_without_kernels_a_process_of_its_own_renders_and_says_so():
     expected = reference.raster(np.float32([[2, 2, 1], [12, 3, 1], [6, 13, 1]]), np.array([[0, 1, 2]]), 16, 16, 1)
     assert int(found.stdout) == (expected[0] >= 0).sum()
     assert found.stderr.count("renderings in NumPy") == 1
+
+
+def test_a_batch_of_masks_equals_single_masks():
+    rng = np.random.default_rng(3)
+    vertices = np.concatenate([rng.uniform(-5, 50, (2, 3, 8, 2)), rng.uniform(1, 2, (2, 3, 8, 1))], -1)
+    faces = rng.integers(0, 8, (5, 3))
+    masks = render.hard_mask(vertices, faces, 40, 30)
+    assert masks.shape == (2, 3, 30, 40)
+    for at in np.ndindex(2, 3):
+        np.testing.assert_array_equal(masks[at], render.hard_mask(vertices[at], faces, 40, 30))

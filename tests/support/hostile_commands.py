@@ -11,7 +11,10 @@ from jaxfit.cli.main import main
 from jaxfit.errors import InputError
 
 # The server imports these modules once, so that its children need neither the time nor the memory.
-for _name in ("ablation.ablate", "data.formats.coco", "evaluation.evaluate", "fitting.fit", "pipeline", "view.overlay"):
+for _name in (
+    *("ablation.ablate", "data.formats.coco", "evaluation.detection_noise", "evaluation.evaluate", "fitting.fit"),
+    *("pipeline", "view.overlay"),
+):
     importlib.import_module(f"jaxfit.{_name}")
 
 

@@ -59,6 +59,7 @@ def case(diverging=None):
                 has_mask=jnp.zeros(T, bool),
                 present=jnp.ones(T, bool),
                 corner_px=jnp.zeros((T, 2)),
+                frame_s=jnp.float32(0.04),
             )
         )
     rng = np.random.default_rng(0)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from types import SimpleNamespace
 
 import jax
@@ -22,6 +23,7 @@ from jaxfit.raster.silhouette import Blur
 from support.birds import random_pose, skin_by_hand, toy_bird
 
 T, SIZE = 3, 32
+FRAME_S = 1 / 30
 TERMS = tuple(known_terms())
 CAMERA = Camera(focal_px=240.0, centre_px=SIZE / 2, size_px=SIZE)
 RASTER = Raster(Blur.for_size(SIZE), SIZE)
@@ -67,6 +69,7 @@ def random_targets(seed=0):
         has_mask=jnp.ones(T, bool),
         present=jnp.ones(T, bool),
         corner_px=jnp.asarray(rng.uniform(0, 5, (T, 2)), jnp.float32),
+        frame_s=jnp.float32(FRAME_S),
     )
 
 
@@ -92,7 +95,7 @@ def random_motion(frames, seed=0, missing=(), spread=1.0, bones=4):
     return spread * rng.normal(size=(frames, 3)), spread * rng.normal(size=(frames, bones, 3)), present
 
 
-def term_value(term, orient, body, present, **settings):
+def term_value(term, orient, body, present, frame_s=FRAME_S, **settings):
     """A temporal term of a motion, in a window that has only rotations."""
     orient, body = jnp.asarray(orient, jnp.float32), jnp.asarray(body, jnp.float32)
     window = SimpleNamespace(
@@ -100,6 +103,7 @@ def term_value(term, orient, body, present, **settings):
         R_camera_root=axis_angle_to_matrix(orient),
         R_parent_child=axis_angle_to_matrix(body),
         present=jnp.asarray(present),
+        frame_s=jnp.float32(frame_s),
     )
     return residual_sum(term(window, **settings))
 
@@ -175,6 +179,29 @@ def angles_between(one, other):
     return (Rotation.from_rotvec(a.astype(float)).inv() * Rotation.from_rotvec(b.astype(float))).magnitude()
 
 
+def student_t(squared, dof, size):
+    """Negative log-density of `size` residuals of scale 1, without the value at 0."""
+    return (dof + size) / 2 * np.log1p(np.asarray(squared) / dof)
+
+
+def accelerations(rotvec):
+    """Changes of the rotation between consecutive frames, (T − 2, …, 3) radians per frame², by scipy."""
+    R = [Rotation.from_rotvec(np.reshape(frame, (-1, 3)).astype(float)) for frame in rotvec]
+    steps = [(a.inv() * b).as_rotvec() for a, b in itertools.pairwise(R)]
+    return np.diff(steps, axis=0).reshape(-1, *np.shape(rotvec)[1:])
+
+
+def motion_by_hand(orient, body, present, frame_s=FRAME_S, sd_rad_s2=6.25, dof=1.0):
+    """The term `motion_likelihood` by its equation."""
+    total = 0.0
+    for theta in (orient, body):
+        for i in range(len(theta) - 2):
+            if all(present[i : i + 3]):
+                a = accelerations(theta[i : i + 3]) / frame_s**2
+                total += student_t((a**2).sum(-1) / sd_rad_s2**2, dof, 3).sum()
+    return total
+
+
 def oracle(name, pose, anchor, targets, seed):
     """A term by its equation, frame by frame in double precision."""
     total = 0.0
@@ -183,6 +210,12 @@ def oracle(name, pose, anchor, targets, seed):
             points = np.asarray(BIRD.keypoint_weights) @ skin_by_hand(BIRD, frame(pose, t))[0]
             e2 = (pixels(points) - np.asarray(targets.keypoints_px[t])) ** 2
             total += (np.asarray(targets.confidence[t])[:, None] * (50**2 * e2 / (50**2 + e2))).sum()
+        elif name == "keypoint_likelihood":
+            points = np.asarray(BIRD.keypoint_weights) @ skin_by_hand(BIRD, frame(pose, t))[0]
+            c = np.asarray(targets.confidence[t], np.float64)
+            s = np.exp(c * np.log(1.2) + (1 - c) * np.log(6))
+            e2 = ((pixels(points) - np.asarray(targets.keypoints_px[t])) ** 2).sum(-1)
+            total += student_t(e2 / s**2, 4, 2)[c > 0].sum()
         elif name in ("mask", "mask_smooth_l1"):
             e = np.abs(soft_silhouettes(seed)[t] - np.asarray(targets.mask[t]))
             total += e.sum() if name == "mask" else (0.5 * e**2).sum()
@@ -210,6 +243,14 @@ def oracle(name, pose, anchor, targets, seed):
                 total += 10 * turned + np.sqrt(np.square(bent).sum())
             else:
                 total += 10 * huber(0.1, turned) + huber(0.1, bent).sum()
+    elif name == "place_likelihood":
+        place = pixels(np.asarray(pose.transl, np.float64)) + np.asarray(targets.corner_px, np.float64)
+        for i in range(T - 2):
+            if all(targets.present[i : i + 3]):
+                a = (place[i] - 2 * place[i + 1] + place[i + 2]) / FRAME_S**2
+                total += student_t((a**2).sum() / 300**2, 1, 2)
+    elif name == "motion_likelihood":
+        total += motion_by_hand(pose.global_orient, pose.body_pose, targets.present)
     elif name == "low_pass":
         for theta in (pose.global_orient, pose.body_pose.reshape(T, -1)):
             for k, coefficients in enumerate(dct(np.asarray(theta, np.float64), axis=0, norm="ortho")[1:], start=1):

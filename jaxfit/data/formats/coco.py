@@ -51,7 +51,7 @@ from jaxfit.data.formats.coco_records import (
     read_images,
 )
 from jaxfit.data.formats.fields import Field, read_json
-from jaxfit.data.formats.rle import run_lengths
+from jaxfit.data.formats.rle import mask_areas
 from jaxfit.data.observations import Observations, check_keypoints, reorder_keypoints
 from jaxfit.data.tables import check_memory, observations_bytes
 from jaxfit.data.track_quality import track_quality
@@ -194,6 +194,9 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         # the image of the frame comes before other images of the same frame
         image_id(t, str(observations.file_name[t]), width, height)
     annotations = []
+    # masks that are read when they are needed are read here once, in the order of their file
+    read = {name: dict(getattr(observations, name)) for name in ("masks", "amodal_masks")}
+    areas = dict(zip(read["masks"], mask_areas([*read["masks"].values()]), strict=True))
     scores = cast(np.ndarray, observations.score)
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
         confidence = observations.confidence[n, t]
@@ -213,13 +216,13 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         }
         if scores[n, t] != 1:
             annotation["score"] = float(_shortest(scores[n, t]))
-        for key, masks in (("segmentation", observations.masks), ("amodal_segmentation", observations.amodal_masks)):
+        for key, masks in (("segmentation", read["masks"]), ("amodal_segmentation", read["amodal_masks"])):
             if (n, t) in masks:
                 size, counts = masks[n, t]["size"], masks[n, t]["counts"]
                 counts = counts.decode("ascii") if isinstance(counts, bytes) else counts
                 annotation[key] = {"size": [int(side) for side in size], "counts": counts}
-        if "segmentation" in annotation:
-            annotation["area"] = sum(run_lengths(annotation["segmentation"]["counts"])[1::2])
+        if (n, t) in areas:
+            annotation["area"] = areas[n, t]
         annotations.append(annotation)
     skeleton = [[a + 1, b + 1] for a, b in observations.skeleton]
     category = {"id": 1, "name": "bird", "keypoints": list(observations.keypoint_names), "skeleton": skeleton}
@@ -239,7 +242,7 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         content = {"info": about, **content}
     encoded = json.dumps(content, allow_nan=False).encode()
     write_whole(path, encoded)
-    write_coco_parts(observations, Path(path), encoded)
+    write_coco_parts(observations, read, Path(path), encoded)
 
 
 def _shortest(values: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 
 from jaxfit.data.formats.fields import Field
-from jaxfit.data.formats.rle import read_segmentation
+from jaxfit.data.formats.rle import read_segmentation, valid_texts
 from jaxfit.data.lazy_masks import LazyMasks
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
@@ -59,11 +59,14 @@ def parts_folder(path: Path) -> Path:
     return path.with_suffix(".parts")
 
 
-def write_coco_parts(observations: Observations, path: Path, content: bytes) -> None:
+def write_coco_parts(
+    observations: Observations, masks: Mapping[str, Mapping[tuple[int, int], Any]], path: Path, content: bytes
+) -> None:
     """Write the copy of a COCO file that has just been written, if the file is long; remove an earlier copy.
 
     Args:
         observations: the observations of the file.
+        masks: the `masks` and `amodal_masks` of the observations, in memory.
         path: the COCO file.
         content: the bytes of the COCO file.
 
@@ -88,7 +91,7 @@ def write_coco_parts(observations: Observations, path: Path, content: bytes) -> 
     with new_folder(folder) as part_folder:
         parts = Parts(part_folder, _record(hashlib.sha256(content).hexdigest()))
         for start in starts:
-            parts.add(_arrays(observations, rows, start) | (head if start == 0 else {}))
+            parts.add(_arrays(observations, masks, rows, start) | (head if start == 0 else {}))
 
 
 def read_coco_parts(path: Path) -> Observations | None:
@@ -145,7 +148,16 @@ def _observations(parts: Parts, folder: Path) -> Observations:
             cells[name].append(np.stack(at, -1)[has])
             sizes = arrays["image_size_px"][frame[has]]
             texts[name].append(np.column_stack([np.full(has.sum(), number), (ends - length)[has], ends[has], sizes]))
-    load = lru_cache(_LOADED)(lambda number, name: parts.load(number, {name: "bytes"})[name].tobytes())
+    firsts = {name: np.cumsum([0, *map(len, texts[name])]) for name in _MASKS}
+
+    @lru_cache(_LOADED)
+    def load(number: int, name: str) -> tuple[bytes, np.ndarray]:
+        """Return the texts of the masks of a part, and which of them are valid."""
+        text, at = parts.load(number, {name: "bytes"})[name], texts[name][number]
+        whole = len(text) == (at[-1, 2] if len(at) else 0)
+        return text.tobytes(), valid_texts(text, at[:, 2] - at[:, 1], at[:, 3] * at[:, 4]) if whole else whole * at[
+            :, 0
+        ]
 
     def lazy(name: str) -> LazyMasks | dict:
         places = np.concatenate(texts[name])
@@ -153,14 +165,19 @@ def _observations(parts: Parts, folder: Path) -> Observations:
         def read(i: int) -> Mapping[str, Any]:
             number, start, end, width, height = places[i].tolist()
             try:
-                text = load(number, name)[start:end].decode("ascii", "replace")
-                rle = Field(folder, name, {"size": [height, width], "counts": text})
+                text, valid = load(number, name)
+                counts = text[start:end]
+                if valid[i - firsts[name][number]]:
+                    return {"size": [height, width], "counts": counts}
+                rle = Field(folder, name, {"size": [height, width], "counts": counts.decode("ascii", "replace")})
                 return cast(Any, read_segmentation(rle, height, width))
             except InputError as error:
                 raise _damaged(error) from error
 
         return LazyMasks(np.concatenate(cells[name]), read) if len(places) else {}
 
+    for array in (present, *values.values(), *frames.values()):
+        array.flags.writeable = False  # so that `Observations` needs no copy
     try:
         return Observations(
             track_id=head["track_id"],
@@ -177,7 +194,9 @@ def _observations(parts: Parts, folder: Path) -> Observations:
         raise InputError(folder, str(error)) from error
 
 
-def _arrays(observations: Observations, rows: np.ndarray, start: int) -> dict[str, np.ndarray]:
+def _arrays(
+    observations: Observations, masks: Mapping[str, Any], rows: np.ndarray, start: int
+) -> dict[str, np.ndarray]:
     """Return the arrays of the part that begins at the frame with position `start`."""
     frames = slice(start, start + _FRAMES)
     track, frame = np.nonzero(observations.present[rows, frames])
@@ -187,8 +206,7 @@ def _arrays(observations: Observations, rows: np.ndarray, start: int) -> dict[st
     arrays = {"track": track, "frame": frame} | {name: getattr(observations, name)[at] for name in _VALUES}
     arrays |= {name: getattr(observations, name)[frames] for name in _FRAME_VALUES}
     for name in _MASKS:
-        masks = getattr(observations, name)
-        texts = [_text(masks.get(cell)) for cell in zip(*(axis.tolist() for axis in at), strict=True)]
+        texts = [_text(masks[name].get(cell)) for cell in zip(*(axis.tolist() for axis in at), strict=True)]
         arrays[f"{name}_length"] = np.array([len(text) for text in texts], np.int64)
         arrays[name] = np.frombuffer(b"".join(texts), np.uint8)
     return arrays
@@ -210,4 +228,5 @@ def _hash(path: Path) -> str:
 
 
 def _damaged(error: InputError) -> InputError:
-    return InputError(error.source, error.problem, "remove this .parts folder; the COCO file beside it is read instead")
+    remedy = "remove this .parts folder; jaxfit then reads the COCO file of the same name"
+    return InputError(error.source, error.problem, remedy)

@@ -7,16 +7,32 @@ image, so the length of polygons is bounded.
 
 from __future__ import annotations
 
-from typing import Any, cast
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, cast
 
 import numpy as np
+from jaxtyping import Bool, Int, UInt8
 
 from jaxfit.data.formats.fields import Field
 from jaxfit.limits import POLYGON_LENGTH_PX, POLYGONS
 
-__all__ = ["read_segmentation", "run_lengths"]
+__all__ = ["ColumnRuns", "foreground_runs", "mask_areas", "read_segmentation", "run_lengths", "valid_texts"]
 
+_MASKS_AT_ONCE = 500
+"""Masks that are checked at once, which bounds the memory."""
 _REMEDY = "write the mask again with pycocotools, or leave segmentation out"
+
+
+class ColumnRuns(NamedTuple):
+    """R runs of pixels of some masks; every run lies in one column of its image."""
+
+    mask: Int[np.ndarray, "R"]
+    """Position of the mask."""
+    column: Int[np.ndarray, "R"]
+    top: Int[np.ndarray, "R"]
+    """First row."""
+    bottom: Int[np.ndarray, "R"]
+    """Row after the last row."""
 
 
 def read_segmentation(segmentation: Field, height: int, width: int) -> dict[str, Any] | None:
@@ -117,14 +133,107 @@ def run_lengths(text: str) -> list[int]:
         return []
     if not codes.size or codes.min() < 0 or codes.max() > 63 or codes[-1] & 32:
         return []
-    last = (codes & 32) == 0
-    starts = np.flatnonzero(np.concatenate([[True], last[:-1]]))
-    lengths = np.diff(np.append(starts, codes.size))
+    values, lengths = _differences(codes)
     if lengths.max() > 7:  # 35 bits hold every 32-bit number
         return []
-    shift = 5 * (np.arange(codes.size) - np.repeat(starts, lengths))
-    values = np.add.reduceat((codes & 31) << shift, starts)
-    values -= ((codes[last] & 16) != 0).astype(np.int64) << (5 * lengths)
     for start in (1, 2):
         values[start::2] = np.cumsum(values[start::2])
     return values.tolist() if values.min() >= 0 else []
+
+
+def foreground_runs(masks: Sequence[Mapping[str, Any]]) -> ColumnRuns:
+    """Return the runs of the pixels of many masks, all at once.
+
+    Args:
+        masks: run lengths in the format of ``Observations.masks``, which are valid.
+    """
+    texts = [rle["counts"] if isinstance(rle["counts"], bytes) else rle["counts"].encode() for rle in masks]
+    height = np.array([rle["size"][0] for rle in masks], np.int64)
+    codes = np.frombuffer(b"".join(texts), np.uint8).astype(np.int64) - 48
+    values, owner, place, _ = _run_lengths(codes, np.array([len(text) for text in texts], np.int64))
+    end = _sums_within(values, owner)
+    run = (place % 2 == 1) & (values > 0)
+    owner, start, last = owner[run], (end - values)[run], end[run] - 1
+    tall = height[owner]
+    column, spans = start // tall, last // tall - start // tall + 1
+    which = np.repeat(np.arange(len(column)), spans)  # a run that reaches into further columns is split
+    column = column[which] + np.arange(len(which)) - (np.cumsum(spans) - spans)[which]
+    top = np.maximum(start[which] - column * tall[which], 0)
+    bottom = np.minimum(last[which] + 1 - column * tall[which], tall[which])
+    return ColumnRuns(owner[which], column, top, bottom)
+
+
+def mask_areas(masks: Sequence[Mapping[str, Any]]) -> list[int]:
+    """Return the number of pixels of each mask; the masks are as for ``foreground_runs``."""
+    areas = []
+    for first in range(0, len(masks), _MASKS_AT_ONCE):
+        some = masks[first : first + _MASKS_AT_ONCE]
+        runs = foreground_runs(some)
+        areas += np.bincount(runs.mask, runs.bottom - runs.top, len(some)).astype(np.int64).tolist()
+    return areas
+
+
+def valid_texts(
+    text: UInt8[np.ndarray, "C"], lengths: Int[np.ndarray, "M"], pixels: Int[np.ndarray, "M"]
+) -> Bool[np.ndarray, "M"]:
+    """Return which of many compressed masks are valid, all at once: their runs cover their images.
+
+    Args:
+        text: the characters of all masks, one mask after the other.
+        lengths: number of characters of each mask, above 0.
+        pixels: pixels of the image of each mask.
+
+    Returns:
+        False for every mask where any mask has characters that are no run lengths; ``run_lengths`` tells them apart.
+    """
+    valid = np.zeros(len(lengths), bool)
+    ends = np.cumsum(lengths)
+    for first in range(0, len(lengths), _MASKS_AT_ONCE):
+        some = slice(first, first + _MASKS_AT_ONCE)
+        codes = text[ends[first] - lengths[first] : ends[some][-1]].astype(np.int64) - 48
+        if codes.min() < 0 or codes.max() > 63 or (codes[np.cumsum(lengths[some]) - 1] & 32).any():
+            return np.zeros(len(lengths), bool)
+        values, owner, _, characters = _run_lengths(codes, lengths[some])
+        wrong = np.bincount(owner, (values < 0) | (characters > 7), len(lengths[some]))  # 35 bits hold 32-bit numbers
+        valid[some] = (np.bincount(owner, values, len(lengths[some])) == pixels[some]) & (wrong == 0)
+    return valid
+
+
+def _run_lengths(codes: Int[np.ndarray, "C"], lengths: Int[np.ndarray, "M"]) -> tuple[np.ndarray, ...]:
+    """Return the run lengths of many masks, with the mask and the place in the mask of each.
+
+    Args:
+        codes: the characters of all masks, offset by "0".
+        lengths: number of characters of each mask.
+
+    Returns:
+        Run lengths, positions of their masks, positions in their masks, and numbers of their characters; (R,) each.
+    """
+    values, characters = _differences(codes)
+    owner = np.repeat(np.arange(len(lengths)), lengths)[np.cumsum(characters) - 1]
+    place = np.arange(len(values)) - np.searchsorted(owner, np.arange(len(lengths)))[owner]
+    for start in (1, 2):
+        some = np.flatnonzero((place >= start) & (place % 2 == start % 2))
+        values[some] = _sums_within(values[some], owner[some])
+    return values, owner, place, characters
+
+
+def _differences(codes: Int[np.ndarray, "C"]) -> tuple[Int[np.ndarray, "R"], Int[np.ndarray, "R"]]:
+    """Return the numbers that some characters stand for, and the number of characters of each number."""
+    last = (codes & 32) == 0
+    starts = np.flatnonzero(np.concatenate([[True], last[:-1]])[: len(codes)])
+    lengths = np.diff(np.append(starts, codes.size))
+    if not codes.size:
+        return codes, lengths
+    shift = 5 * (np.arange(codes.size) - np.repeat(starts, lengths))
+    values = np.add.reduceat((codes & 31) << shift, starts)
+    values -= ((codes[last] & 16) != 0).astype(np.int64) << (5 * lengths)
+    return values, lengths
+
+
+def _sums_within(values: Int[np.ndarray, "R"], owner: Int[np.ndarray, "R"]) -> Int[np.ndarray, "R"]:
+    """Return the cumulative sums of the values of each owner; the owners increase."""
+    sums = np.cumsum(values)
+    counts = np.bincount(owner)
+    before = np.concatenate([[0], sums])[np.cumsum(counts) - counts]  # of each owner: the sum of the earlier owners
+    return sums - before[owner]

@@ -65,24 +65,23 @@ def zbuffer(
 
 
 def hard_mask(
-    vertices_screen: Float[Array | np.ndarray, "V 3"], faces: Int[Array | np.ndarray, "F 3"], width: int, height: int
-) -> Bool[np.ndarray, "{height} {width}"]:
-    """Return the mask of the pixels whose centre lies inside the projection of a face or on its edge.
+    vertices_screen: Float[Array | np.ndarray, "*B V 3"], faces: Int[Array | np.ndarray, "F 3"], width: int, height: int
+) -> Bool[np.ndarray, "*B {height} {width}"]:
+    """Return the masks of the pixels whose centre lies inside the projection of a face or on its edge.
 
-    The time depends on the area that the mesh covers, not on the size of the image.
+    The time depends on the area that a mesh covers, not on the size of the image.
 
-    Arguments, skipped faces and errors are those of `zbuffer`, for one mesh.
+    Arguments, skipped faces and errors are those of `zbuffer`.
     """
     vertices, faces, batch = _mesh(vertices_screen, faces)
-    if batch:
-        raise ValueError(f"vertices_screen: expected shape (V, 3), got {np.shape(vertices_screen)}")
     _check_size(width, height)
-    mask = np.zeros((height, width), bool)
+    mask = np.zeros((len(vertices), height, width), bool)
     if kernels_available():
-        require_kernels().hard_mask(vertices, faces, mask[None])
+        require_kernels().hard_mask(vertices, faces, mask)
     else:
-        mask |= reference.raster(vertices[0], faces, width, height, 1)[0] >= 0
-    return mask
+        for i, one in enumerate(vertices):
+            mask[i] = reference.raster(one, faces, width, height, 1)[0] >= 0
+    return mask.reshape(*batch, height, width)
 
 
 def interpolate(
