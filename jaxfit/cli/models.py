@@ -1,4 +1,4 @@
-"""Commands that import, describe and draw bird models, and learn pose priors."""
+"""Commands that import, describe and draw bird models, and learn priors of poses and of motion."""
 
 from __future__ import annotations
 
@@ -49,7 +49,10 @@ def model_view(options: argparse.Namespace) -> None:
 
 
 def prior_learn(options: argparse.Namespace) -> None:
-    """Learn a pose prior from results, write a model with this prior and print how the prior changed."""
+    """Learn a pose prior from results, write a model with this prior and print how the prior changed.
+
+    With `--motion`, learn the term `motion_likelihood`, write a config and print the accelerations of the results.
+    """
     import numpy as np
 
     from jaxfit.data.solution import load_solution
@@ -57,6 +60,9 @@ def prior_learn(options: argparse.Namespace) -> None:
     from jaxfit.storage.files import check_writable
 
     check_writable(options.out)  # before the long work
+    if options.motion:
+        _motion_learn(options)
+        return
     learnt = learn_prior([(folder, *load_solution(folder)) for folder in options.results])
     counts = {"poses": learnt.poses, "birds": learnt.birds, "effective_poses": learnt.effective_poses}
     notes = {f"prior_{name}": value for name, value in counts.items()} | {"prior_shrinkage": learnt.shrinkage}
@@ -75,3 +81,40 @@ def prior_learn(options: argparse.Namespace) -> None:
     bones = "learnt" if learnt.bones_learnt else "from the model, because the results have equal bone lengths"
     show(f"correlations shrunk by {100 * learnt.shrinkage:.0f} % (100 %: no correlations); bone lengths: {bones}")
     show(f"{learnt.bird.name} with this prior → {options.out}; use the model with `--model {options.out}`")
+
+
+def _motion_learn(options: argparse.Namespace) -> None:
+    """Learn the settings of `motion_likelihood` from results, and write a config with these settings."""
+    import numpy as np
+
+    from jaxfit.data.solution import load_solution
+    from jaxfit.fitting.learn_motion import learn_motion, motion_config
+    from jaxfit.storage.files import write_whole
+
+    if options.out.suffix not in (".yaml", ".yml"):
+        raise InputError(options.out, "is not the name of a config", "choose a name that ends in .yaml")
+    learnt = learn_motion([(folder, load_solution(folder)[0]) for folder in options.results])
+    write_whole(options.out, motion_config(learnt).encode())
+    table = right_aligned("median rad/s²", "95 % quantile rad/s²", title="angular acceleration")
+    table.add_column("joints")
+    for name, norms in sorted(learnt.groups.items(), key=lambda group: -np.median(group[1])):
+        table.add_row(*(f"{value:.3g}" for value in np.quantile(norms, [0.5, 0.95])), name)
+    show(table)
+    table = right_aligned("sd_rad_s2", "dof", "held-out nats", title="cost per joint and frame")
+    table.add_column("settings")
+    costs = {"learnt": (learnt.prior, learnt.cost), "shipped": (learnt.shipped, learnt.shipped_cost)}
+    for name, (prior, cost) in costs.items():
+        table.add_row(*(f"{value:.3g}" for value in prior), "–" if cost is None else f"{cost:.3f}", name)
+    show(table)
+    show("held-out: the cost of each bird, with settings learnt from all other birds; a lower cost is better")
+    if learnt.unknown_rates:
+        results = counted(learnt.unknown_rates, "result")
+        show(f"the frame rate of {results} is not known and is taken as 25 frames/s")
+    skipped = f" ({counted(learnt.diverged, 'diverged bird')} skipped)" if learnt.diverged else ""
+    birds, runs = counted(learnt.birds, "bird"), counted(learnt.frames, "run")
+    show(
+        f"{runs} of three frames of {birds}{skipped}, equivalent to {learnt.effective_birds:.1f} birds of equal length"
+    )
+    maximum = ", ".join(f"{name} {value:.3g}" for name, value in learnt.unshrunk._asdict().items())
+    show(f"maximum of likelihood: {maximum}; share of the shipped settings {100 * learnt.shrinkage:.0f} %")
+    show(f"config → {options.out}; use the config with `--config {options.out}`")
