@@ -100,6 +100,14 @@ def _fitting(commands: Any) -> None:
     text = "print JSON instead of tables, with the metrics by behaviour and keypoint"
     evaluate.add_argument("--json", action="store_true", help=text)
 
+    text = "estimate the errors of detections from labelled frames, and write a config of a fit that holds them"
+    calibrate = add_command(commands, "calibrate", "calibrating.calibrate", text)
+    calibrate.add_argument("detections", type=Path, metavar="OBS", help=OBSERVATIONS)
+    text = "labels of some frames of the same video (formats as of OBS), or a scene"
+    calibrate.add_argument("--truth", type=Path, required=True, metavar="LABELS", help=text)
+    add_observation_options(calibrate)
+    add_out(calibrate, "NOISE.yaml", "config to write, for `jaxfit fit --config`", overwrite="an existing file")
+
     text = "fit the same birds with a grid of configs and compare the results (needs the extra `report`)"
     ablate = add_command(commands, "ablate", "ablation.ablate", text)
     text = "COCO file with the keypoint names of the model; `jaxfit import` writes it from other files"
@@ -213,12 +221,14 @@ def _models(commands: Any) -> None:
     view.add_argument("--posture", help=text)
     add_model_commands(actions)
 
-    prior = commands.add_parser("prior", help="learn a pose prior from results")
+    prior = commands.add_parser("prior", help="learn a prior of poses or of motion from results")
     actions = prior.add_subparsers(required=True, metavar="ACTION")
-    text = "learn a pose prior from the poses of results and write a model with this prior"
+    text = "learn a pose prior from the poses of results and write a model with this prior, or learn a term of motion"
     learn = add_command(actions, "learn", "models.prior_learn", text)
     learn.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="result folders of fits of one model")
-    add_out(learn, "P.npz", "model file to write, for `--model`")
+    text = "learn the term `motion_likelihood` from the angular accelerations of results, and write a config"
+    learn.add_argument("--motion", action="store_true", help=text)
+    add_out(learn, "P.npz|M.yaml", "model file to write, for `--model`; with --motion: config to write, for `--config`")
 
 
 def _configs(commands: Any) -> None:

@@ -42,6 +42,10 @@ def ablate(inputs, out, grid):
     return ["ablate", inputs / "birds.json", *known, "--grid", grid, "--out", out]
 
 
+def calibrate(folder, detections, labels):
+    return ["calibrate", detections, "--truth", labels, "--out", folder / "noise.yaml"]
+
+
 def small_grid(folder):
     quick = files.yaml_file(folder, QUICK).rename(folder / "fit.yaml")
     return files.yaml_file(folder, f"config: {quick}\ncrosses: [{{cross: {{terms.keypoints: [1, 2]}}}}]\n")
@@ -82,6 +86,8 @@ OPTIONS = {
     "--init": lambda i, f, file: [*fit(i, f / "out"), "--init", file],
     "--config": lambda i, f, file: fit(i, f / "out", config=file),
     "--truth": lambda i, f, file: ["evaluate", i / "birds.json", "--truth", file],
+    "--truth of calibrate": lambda i, f, file: calibrate(f, i / "birds.json", file),
+    "detections": lambda i, f, file: calibrate(f, file, i / "birds.json"),
     "--segmenter": lambda i, f, file: ["track", pictures(f), "--segmenter", file, "--out", f / "o.json"],
     "--keypoints": lambda i, f, file: ["track", pictures(f), "--keypoints", file, "--out", f / "o.json"],
     "observations": lambda i, f, file: fit(i, f / "out", obs=file),
