@@ -8,6 +8,8 @@ from dataclasses import replace
 
 from jaxfit.cli.observation_files import image_size, keypoint_map
 from jaxfit.cli.tables import EscapedTable, counted, right_aligned, show, show_facts
+from jaxfit.config.yaml_values import rounded
+from jaxfit.progress import terminal
 
 __all__ = ["calibrate"]
 
@@ -17,7 +19,7 @@ def calibrate(options: argparse.Namespace) -> None:
     from jaxfit.data.formats.recognise import read_observations
     from jaxfit.data.keypoint_names import map_keypoints
     from jaxfit.evaluation.detection_noise import estimate_noise
-    from jaxfit.evaluation.noise_config import facts, noise_yaml, rounded
+    from jaxfit.evaluation.noise_config import facts, noise_yaml
     from jaxfit.evaluation.truth import read_truth
     from jaxfit.storage.files import check_new_file, check_writable, write_whole
 
@@ -29,7 +31,7 @@ def calibrate(options: argparse.Namespace) -> None:
     if true_names != names:
         mapped = keypoint_map(true_names, options.truth, names, options.names)
         truth = replace(truth, observations=map_keypoints(truth.observations, mapped, names))
-    noise = estimate_noise(detected, truth, options.detections)
+    noise = estimate_noise(detected, truth, options.detections, terminal)
     check_new_file(options.out, options.overwrite)  # again, because the estimate may have taken minutes
     write_whole(options.out, noise_yaml(noise, options.detections, options.truth).encode())
     table = right_aligned("setting", "value", "from", "to")

@@ -87,6 +87,7 @@ def _motion_learn(options: argparse.Namespace) -> None:
     """Learn the settings of `motion_likelihood` from results, and write a config with these settings."""
     import numpy as np
 
+    from jaxfit.data.frame_numbers import UNKNOWN_FPS
     from jaxfit.data.solution import load_solution
     from jaxfit.fitting.learn_motion import learn_motion, motion_config
     from jaxfit.storage.files import write_whole
@@ -109,7 +110,7 @@ def _motion_learn(options: argparse.Namespace) -> None:
     show("held-out: the cost of each bird, with settings learnt from all other birds; a lower cost is better")
     if learnt.unknown_rates:
         results = counted(learnt.unknown_rates, "result")
-        show(f"the frame rate of {results} is not known and is taken as 25 frames/s")
+        show(f"the frame rate of {results} is not known and is taken as {UNKNOWN_FPS:g} frames/s")
     skipped = f" ({counted(learnt.diverged, 'diverged bird')} skipped)" if learnt.diverged else ""
     birds, runs = counted(learnt.birds, "bird"), counted(learnt.frames, "run")
     show(

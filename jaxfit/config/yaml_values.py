@@ -12,13 +12,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
+import numpy as np
 import yaml
 
 from jaxfit.config.checks import first_key
 from jaxfit.errors import InputError
 from jaxfit.limits import CONFIG_DIGITS, CONFIG_KEY_CHARACTERS, CONFIG_LEVELS, CONFIG_VALUES
 
-__all__ = ["Lines", "YamlMapping", "line_of", "read_yaml"]
+__all__ = ["Lines", "YamlMapping", "line_of", "read_yaml", "rounded"]
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _TAG = "tag:yaml.org,2002:"
@@ -243,6 +244,11 @@ def line_of(lines: Lines, path: str) -> int | None:
             break
         line, lines = lines[key]
     return line
+
+
+def rounded(value: float, digits: int = 3) -> str:
+    """Return a number with some significant digits and without an exponent, because YAML reads 1e-05 as text."""
+    return np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
 
 
 def _copied(value: Any) -> Any:

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 
 from jaxfit.limits import FRAMES_PER_S, SECONDS_PER_FRAME
 
-__all__ = ["UNKNOWN_FPS", "consecutive", "frame_interval_s", "frame_step"]
+__all__ = ["UNKNOWN_FPS", "assumed_interval_s", "consecutive", "frame_interval_s", "frame_step"]
 
 UNKNOWN_FPS = 25.0
 """Assumed frame rate of a video whose rate is not known, in frames per second."""
@@ -65,3 +65,12 @@ def frame_interval_s(frame_index: Any, timestamp_s: Any = None, fps: float | Non
         between = between[np.isfinite(between)]
         interval = float(np.median(between)) if len(between) else 0.0
     return min(max(interval, 1 / FRAMES_PER_S), SECONDS_PER_FRAME) if interval > 0 else None
+
+
+def assumed_interval_s(frame_index: Any) -> float:
+    """Return the time in seconds between consecutive frames of a file whose frame rate is unknown.
+
+    Args:
+        frame_index: (T,) increasing frame numbers.
+    """
+    return frame_step(frame_index) / UNKNOWN_FPS

@@ -74,3 +74,10 @@ class FrameMasks:
         x, y, width, height = birds.boxes_px.T
         near = (x < x0 + w) & (x + width > x0) & (y < y0 + h) & (y + height > y0)
         return [birds.masks[i] for i in np.flatnonzero(near).tolist() if birds.tracks[i] != n]
+
+    def union_of_others(self, n: int, t: int, box_px: Real[np.ndarray, "4"]) -> Mapping[str, Any] | None:
+        """Return the union of the masks of `others`; None without such a mask."""
+        from pycocotools import mask as coco_mask
+
+        masks = self.others(n, t, box_px)
+        return cast(Any, coco_mask.merge(cast(Any, masks))) if masks else None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from jaxfit.evaluation.labelled_pairs import labelled_pairs
 from jaxfit.evaluation.outline_noise import OutlineNoise, outline_errors, outline_noise
 from jaxfit.evaluation.truth import Truth
 from jaxfit.limits import GROW_MASKS_PX
+from jaxfit.progress import ProgressTask, silent
 
 __all__ = ["BASE", "DetectionNoise", "estimate_noise"]
 
@@ -70,7 +70,9 @@ class DetectionNoise:
     """Keypoint → factor between its scale and the scale of all keypoints."""
 
 
-def estimate_noise(detected: Observations, truth: Truth, source: object = "the detections") -> DetectionNoise:
+def estimate_noise(
+    detected: Observations, truth: Truth, source: object = "the detections", progress: ProgressTask = silent
+) -> DetectionNoise:
     """Estimate the statistics of the errors of detections.
 
     Detected and labelled birds are matched as in `evaluate_observations`. Hidden keypoints count where they are both
@@ -92,7 +94,7 @@ def estimate_noise(detected: Observations, truth: Truth, source: object = "the d
     unmoved = _checked(error_px, confidence, truth.source, source)
     prior = _prior(config)
     keypoint = fit_student_t(error_px, confidence, prior)
-    outlines = outline_errors(detected, truth.observations, pairs)
+    outlines = outline_errors(detected, truth.observations, pairs, progress)
     masks = [each for each in outlines if each is not None]
     outline = outline_noise(masks) if masks else None
     birds, row = np.unique(pairs.bird, return_inverse=True)
@@ -116,7 +118,7 @@ def estimate_noise(detected: Observations, truth: Truth, source: object = "the d
         keypoint=keypoint,
         outline=outline,
         settings=settings,
-        intervals=_intervals(resampled, len(birds), settings),
+        intervals=_intervals(resampled, len(birds), settings, progress),
         correlations={lag: keypoint_noise.frame_correlation(pairs, scaled, lag * step) for lag in LAGS},
         outlier_share=keypoint_noise.outlier_share(scaled),
         exchanged=keypoint_noise.exchanged_pairs(pairs),
@@ -146,8 +148,8 @@ def _checked(error_px: np.ndarray, confidence: np.ndarray, labels: object, sourc
 
 def _prior(config: FitConfig) -> KeypointNoise:
     """Return the settings of a config, as the centre of the prior."""
-    term: Any = config.terms["keypoint_likelihood"]
-    return KeypointNoise(*(float(term[name]) for name in KeypointNoise._fields))
+    term = config.stage_settings(config.stages[-1])["keypoint_likelihood"]
+    return KeypointNoise(*(term[name] for name in KeypointNoise._fields))
 
 
 def _settings(config: FitConfig, keypoint: KeypointNoise, outline: OutlineNoise | None) -> Mapping[str, float]:
@@ -160,12 +162,19 @@ def _settings(config: FitConfig, keypoint: KeypointNoise, outline: OutlineNoise 
 
 
 def _intervals(
-    resampled: Callable[[np.ndarray], Mapping[str, float]], birds: int, settings: Mapping[str, float]
+    resampled: Callable[[np.ndarray], Mapping[str, float]],
+    birds: int,
+    settings: Mapping[str, float],
+    progress: ProgressTask,
 ) -> Mapping[str, Interval]:
     """Return the percentile intervals of the settings over resamples of birds, drawn with replacement."""
     if birds < 2:
         return dict.fromkeys(settings, Interval(np.nan, np.nan))
     rng = np.random.default_rng(0)
-    draws = [resampled(np.bincount(rng.integers(birds, size=birds), minlength=birds)) for _ in range(RESAMPLES)]
+    draws = []
+    with progress("Resampling birds", RESAMPLES) as report_progress:
+        for _ in range(RESAMPLES):
+            draws.append(resampled(np.bincount(rng.integers(birds, size=birds), minlength=birds)))
+            report_progress(1, "")
     ends = (1 - LEVEL) / 2, (1 + LEVEL) / 2
     return {path: Interval(*np.quantile([draw[path] for draw in draws], ends).tolist()) for path in settings}

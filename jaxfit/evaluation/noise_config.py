@@ -6,14 +6,13 @@ import math
 import textwrap
 from collections.abc import Iterator
 
-import numpy as np
-
+from jaxfit.config.yaml_values import rounded
 from jaxfit.errors import one_line
 from jaxfit.evaluation.bootstrap import Interval
 from jaxfit.evaluation.detection_noise import BASE, DetectionNoise
 from jaxfit.evaluation.keypoint_noise import OUTLIER_SCALES
 
-__all__ = ["facts", "noise_yaml", "rounded"]
+__all__ = ["facts", "noise_yaml"]
 
 _MEANINGS = {
     "grow_masks_px": "enlargement of the masks, so that the fitted size is right on average",
@@ -63,11 +62,6 @@ def facts(noise: DetectionNoise) -> dict[str, str]:
         text = f"{noise.unmoved_share:.0%}: correct pre-filled labels, or the scales are too small"
         found["labels exactly on the detection"] = text
     return found
-
-
-def rounded(value: float) -> str:
-    """Return a number with three significant digits, without an exponent: YAML reads 1e-05 as text."""
-    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")
 
 
 def _comments(noise: DetectionNoise, detections: object, labels: object) -> Iterator[str]:

@@ -15,6 +15,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.evaluation.labelled_pairs import LabelledPairs
 from jaxfit.fitting.crops import cut_mask, mark_unknown
 from jaxfit.model.camera import CROP_PX
+from jaxfit.progress import ProgressTask, silent
 from jaxfit.raster.silhouette import UNKNOWN
 
 __all__ = ["OutlineErrors", "OutlineNoise", "outline_errors", "outline_noise", "outline_offsets"]
@@ -63,26 +64,28 @@ class OutlineErrors(NamedTuple):
     """Number of products."""
 
 
-def outline_errors(detected: Observations, labels: Observations, pairs: LabelledPairs) -> list[OutlineErrors | None]:
+def outline_errors(
+    detected: Observations, labels: Observations, pairs: LabelledPairs, progress: ProgressTask = silent
+) -> list[OutlineErrors | None]:
     """Return the errors of the outline of every pair; None where a mask is missing.
 
     The outline near unknown pixels (`mark_unknown`) does not count: the mask terms do not use it either.
     """
-    from pycocotools import mask as coco_mask
-
     masks_of_frame = FrameMasks(detected)
     found: list[OutlineErrors | None] = []
-    for p, crop in enumerate(pairs.crop):
-        (n, t), (m, s) = pairs.at_detected[p].tolist(), pairs.at_labelled[p].tolist()
-        own, true = detected.mask(n, t), labels.mask(m, s)
-        if own is None or true is None:
-            found.append(None)
-            continue
-        cut = cut_mask(own, crop, OUTLINE_PX)
-        near = masks_of_frame.others(n, t, crop[[0, 1, 2, 2]])
-        others = decode_mask(coco_mask.merge(cast(Any, near))) if near else None
-        mark_unknown(cut, others, cast(Any, own.shape), crop)
-        found.append(outline_offsets(cut, cut_mask(true, crop, OUTLINE_PX)))
+    with progress("Comparing outlines", len(pairs.crop)) as report_progress:
+        for p, crop in enumerate(pairs.crop):
+            (n, t), (m, s) = pairs.at_detected[p].tolist(), pairs.at_labelled[p].tolist()
+            own, true = detected.mask(n, t), labels.mask(m, s)
+            if own is None or true is None:
+                found.append(None)
+                report_progress(1, "")
+                continue
+            cut = cut_mask(own, crop, OUTLINE_PX)
+            others = masks_of_frame.union_of_others(n, t, crop[[0, 1, 2, 2]])
+            mark_unknown(cut, None if others is None else decode_mask(others), cast(Any, own.shape), crop)
+            found.append(outline_offsets(cut, cut_mask(true, crop, OUTLINE_PX)))
+            report_progress(1, "")
     return found
 
 

@@ -18,12 +18,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import gammaln
 
 from jaxfit.config.fit import load_config
-from jaxfit.config.term_checks import term_settings
-from jaxfit.data.frame_numbers import UNKNOWN_FPS, consecutive, frame_interval_s, frame_step
+from jaxfit.config.yaml_values import rounded
+from jaxfit.data.frame_numbers import UNKNOWN_FPS, assumed_interval_s, consecutive, frame_interval_s
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import joint_group
-from jaxfit.objective.registry import find_term
 
 __all__ = [
     "LearntMotion",
@@ -112,7 +111,7 @@ def learn_motion(results: Sequence[tuple[object, Solution]]) -> LearntMotion:
     for _, solution in results:
         frame_s = frame_interval_s(solution.frame_index, solution.timestamp_s, solution.fps)
         unknown += frame_s is None
-        frame_s = frame_s or frame_step(solution.frame_index) / UNKNOWN_FPS
+        frame_s = frame_s or assumed_interval_s(solution.frame_index)
         names = [joint_group(name) for name in solution.joint_names]
         for n, status in enumerate(solution.status):
             diverged += status == "diverged"
@@ -153,8 +152,8 @@ def learn_motion(results: Sequence[tuple[object, Solution]]) -> LearntMotion:
 
 def shipped_motion() -> MotionPrior:
     """Return the settings of `motion_likelihood` in the config `map`."""
-    settings = find_term("motion_likelihood").settings
-    settings = settings | term_settings(load_config("map").terms["motion_likelihood"])
+    config = load_config("map")
+    settings = config.stage_settings(config.stages[-1])["motion_likelihood"]
     return MotionPrior(settings["sd_rad_s2"], settings["dof"])
 
 
@@ -238,7 +237,7 @@ def _shrunk(learnt: MotionPrior, shipped: MotionPrior, effective: float) -> Moti
 
 def motion_config(learnt: LearntMotion) -> str:
     """Return the config of the learnt settings as YAML text, with the data behind the settings as comments."""
-    rates = ", ".join(f"{rate:g}" for rate in learnt.rates_fps)
+    rates, (sd_rad_s2, dof) = ", ".join(f"{rate:g}" for rate in learnt.rates_fps), learnt.prior
     lines = [
         "# Config of a fit with a learnt term motion_likelihood, written by `jaxfit prior learn --motion`.",
         f"# Learnt from birds: {learnt.birds}; runs of three frames: {learnt.frames}; frames per second: {rates}.",
@@ -251,6 +250,6 @@ def motion_config(learnt: LearntMotion) -> str:
         "# Simulated motion is smoother than real motion: a scale that is learnt from simulated scenes is too small.",
         "base: map",
         "terms:",
-        f"  motion_likelihood: {{weight: 1, sd_rad_s2: {learnt.prior.sd_rad_s2:.4g}, dof: {learnt.prior.dof:.4g}}}",
+        f"  motion_likelihood: {{weight: 1, sd_rad_s2: {rounded(sd_rad_s2, 4)}, dof: {rounded(dof, 4)}}}",
     ]
     return "\n".join(lines) + "\n"

@@ -6,7 +6,7 @@ The masks of a long video never lie in memory together.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -66,18 +66,11 @@ class WindowMasks:
             if not unknown_pixels:
                 return LoadedMasks(own, (False,) * len(at))
             boxes = crop[:, [0, 1, 2, 2]]
-            return LoadedMasks(
-                own, tuple(None if t < 0 else _union(frames.others(n, t, boxes[i])) for i, t in enumerate(at))
-            )
+            others = (None if t < 0 else frames.union_of_others(n, t, boxes[i]) for i, t in enumerate(at))
+            return LoadedMasks(own, tuple(others))
 
         return cls(load)
 
 
 def _loaded(masks: LoadedMasks) -> WindowMasks:
     return WindowMasks(lambda: masks)
-
-
-def _union(masks: list[Mapping[str, Any]]) -> Mapping[str, Any] | None:
-    from pycocotools import mask as coco_mask
-
-    return cast(Any, coco_mask.merge(cast(Any, masks))) if masks else None

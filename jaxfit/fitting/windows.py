@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfit.config.fit import FitConfig
-from jaxfit.data.frame_numbers import UNKNOWN_FPS, frame_interval_s, frame_step
+from jaxfit.data.frame_numbers import assumed_interval_s, frame_interval_s, frame_step
 from jaxfit.data.masks import decode_mask
 from jaxfit.data.neighbours import FrameMasks
 from jaxfit.data.observations import Observations
@@ -140,7 +140,7 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
         confidence=confidence,
         has_mask=_has_mask(observations, track, frame, present),
         masks=masks,
-        frame_s=np.full(len(starts), frame_s or frame_step(numbers) / UNKNOWN_FPS, np.float32),
+        frame_s=np.full(len(starts), frame_s or assumed_interval_s(numbers), np.float32),
     )
 
 

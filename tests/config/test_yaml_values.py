@@ -10,7 +10,7 @@ from support.hostile import Isolated, many_examples
 from support.mutations import damaged_bytes, damaged_tree
 
 from jaxfit.config.yaml_file import _shipped_folder, shipped_configs
-from jaxfit.config.yaml_values import line_of, read_yaml
+from jaxfit.config.yaml_values import line_of, read_yaml, rounded
 from jaxfit.errors import InputError
 from jaxfit.limits import CONFIG_LEVELS
 
@@ -162,3 +162,11 @@ def test_any_damage_is_one_error(tmp_path, readers, reader, valid):
         assert outcome.acceptable, outcome
 
     check()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.00001234, "0.0000123"), (12.3456, "12.3"), (1, "1"), (123456, "123000")]
+)
+def test_numbers_have_three_digits_and_no_exponent(value, text):
+    assert rounded(value) == text
+    assert isinstance(yaml.safe_load(rounded(value)), int | float)

@@ -8,11 +8,12 @@ import yaml
 from support.noisy_discs import BIRDS, RADIUS, SIDES, UNIT, K, detected, labelled, student_t
 
 from jaxfit.config.fit import load_config
+from jaxfit.config.yaml_values import rounded
 from jaxfit.data.masks import encode_mask
 from jaxfit.errors import InputError
 from jaxfit.evaluation import detection_noise
 from jaxfit.evaluation.detection_noise import SHIPPED_OFFSET_PX, estimate_noise
-from jaxfit.evaluation.noise_config import noise_yaml, rounded
+from jaxfit.evaluation.noise_config import noise_yaml
 from jaxfit.evaluation.truth import Truth
 
 SURE, UNSURE, DOF = 1.5, 8.0, 5.0
@@ -152,14 +153,6 @@ def test_labels_without_masks_leave_the_settings_of_masks_out():
     noise = estimate_noise(detected(range(4), error, confidence), Truth(labelled(range(4), masks=False)))
     assert noise.outline is None
     assert yaml.safe_load(noise_yaml(noise, "a", "b")).keys() == {"base", "terms"}
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(0.00001234, "0.0000123"), (12.3456, "12.3"), (1, "1"), (123456, "123000")]
-)
-def test_numbers_have_three_digits_and_no_exponent(value, text):
-    assert rounded(value) == text
-    assert isinstance(yaml.safe_load(rounded(value)), int | float)
 
 
 def without_birds(found, labels):

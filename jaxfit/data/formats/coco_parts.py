@@ -154,10 +154,10 @@ def _observations(parts: Parts, folder: Path) -> Observations:
     def load(number: int, name: str) -> tuple[bytes, np.ndarray]:
         """Return the texts of the masks of a part, and which of them are valid."""
         text, at = parts.load(number, {name: "bytes"})[name], texts[name][number]
-        whole = len(text) == (at[-1, 2] if len(at) else 0)
-        return text.tobytes(), valid_texts(text, at[:, 2] - at[:, 1], at[:, 3] * at[:, 4]) if whole else whole * at[
-            :, 0
-        ]
+        valid = np.zeros(len(at), bool)
+        if len(at) and len(text) == at[-1, 2]:
+            valid = valid_texts(text, at[:, 2] - at[:, 1], at[:, 3] * at[:, 4])
+        return text.tobytes(), valid
 
     def lazy(name: str) -> LazyMasks | dict:
         places = np.concatenate(texts[name])
