@@ -23,7 +23,6 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.evaluation.matching import match_tracks
     from jaxfit.evaluation.truth import Truth, read_truth
     from jaxfit.export.export import export_result
-    from jaxfit.fitting.cluster import open_cluster
     from jaxfit.fitting.fit import fit
     from jaxfit.labelling.suggest import suggest
     from jaxfit.model.bird import Bird
@@ -37,6 +36,7 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.simulation.scene import Scene, simulate, stage_scene
     from jaxfit.view.contact_sheet import contact_sheet
     from jaxfit.view.overlay import overlay, overlay_frame
+    from jaxfit.workers.cluster import open_cluster
 
 __version__ = metadata.version("jaxfit")
 
@@ -108,7 +108,7 @@ _HOMES = {
     "evaluation.matching": ("match_tracks",),
     "evaluation.truth": ("Truth", "read_truth"),
     "export.export": ("export_result",),
-    "fitting.cluster": ("open_cluster",),
+    "workers.cluster": ("open_cluster",),
     "fitting.fit": ("fit",),
     "labelling.suggest": ("suggest",),
     "model.bird": ("Bird",),

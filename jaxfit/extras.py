@@ -1,15 +1,30 @@
-"""Check of optional packages, which the extras of the installation add."""
+"""Installed packages: check of optional packages, which extras add, and versions of packages that results depend on."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from importlib import metadata
 from importlib.util import find_spec
 from typing import NamedTuple
 
 from jaxfit.errors import InputError
 
-__all__ = ["OPTIONAL_PACKAGES", "OptionalPackage", "package_problem", "require_extra", "require_package"]
+__all__ = [
+    "LIBRARIES",
+    "OPTIONAL_PACKAGES",
+    "TRACKING_LIBRARIES",
+    "OptionalPackage",
+    "library_versions",
+    "package_problem",
+    "require_extra",
+    "require_package",
+]
+
+LIBRARIES = ("jaxfit", "jax", "jaxlib", "equinox", "optimistix", "optax", "numpy")
+"""Packages that a fit depends on."""
+TRACKING_LIBRARIES = ("onnxruntime", "opencv-python-headless", "av", "scipy")
+"""Further packages that tracking depends on."""
 
 
 class OptionalPackage(NamedTuple):
@@ -89,3 +104,8 @@ def _numbers(version: str) -> tuple[int, ...]:
     """Return the leading numbers of a version: (2, 13, 0) for `2.13.0+cpu`."""
     match = re.match(r"\d+(\.\d+)*", version)
     return tuple(int(part) for part in match[0].split(".")) if match else ()
+
+
+def library_versions(names: Sequence[str]) -> dict[str, str]:
+    """Return the versions of some installed packages."""
+    return {name: metadata.version(name) for name in names}

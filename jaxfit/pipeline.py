@@ -16,22 +16,17 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.track_quality import track_quality
 from jaxfit.errors import InputError
-from jaxfit.fitting.cluster import Cluster
+from jaxfit.extras import TRACKING_LIBRARIES, library_versions
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.fitting.summary import library_versions, summarise
+from jaxfit.fitting.summary import summarise
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.perception.instances import KeypointDetector, Segmenter
-from jaxfit.perception.track import (
-    TrackingResult,
-    check_segmenter,
-    network_files,
-    open_keypoint_detector,
-    run_tracking,
-)
+from jaxfit.perception.opening import check_segmenter, network_files, open_keypoint_detector
+from jaxfit.perception.track import TrackingResult, run_tracking
 from jaxfit.perception.tracking import TrackRecorder
-from jaxfit.pipeline_record import TRACKING_LIBRARIES, file_hashes, fit_record, tracking_record
+from jaxfit.pipeline_record import file_hashes, fit_record, tracking_record
 from jaxfit.progress import ProgressTask, annotated, silent
 from jaxfit.report.write import REPORT, write_report
 from jaxfit.storage.files import check_replaceable, new_folder
@@ -40,6 +35,7 @@ from jaxfit.storage.unfinished import unfinished_folder, unfinished_work
 from jaxfit.video.reader import VideoInfo, probe_video
 from jaxfit.view.checks import check_outputs, is_inside
 from jaxfit.view.overlay import overlay
+from jaxfit.workers.cluster import Cluster
 
 __all__ = ["OBSERVATIONS", "OVERLAY", "Reconstruction", "reconstruct"]
 
@@ -89,7 +85,7 @@ def reconstruct(
         segmenter, keypoints: networks that replace the networks of `config`.
         overwrite: replace an earlier result in the folder.
         progress: receives the progress of every part.
-        cluster: worker processes that fit the windows. None: this process.
+        cluster: worker processes that run the networks of `config` and fit the windows. None: this process.
 
     Returns:
         The result. A failed fit of one bird appears in the bird's status and does not affect other birds.
@@ -122,7 +118,9 @@ def reconstruct(
             if not any(replaced.values()):
                 stored = Parts(unfinished / "frames", tracking_record(config.track, video, networks, progress))
                 shown = annotated(progress, lambda parts=stored: f"{parts.size_bytes / 1e6:.1f} MB stored")
-            tracking = run_tracking(video, config.track, segmenter, keypoints, progress=shown, parts=stored)
+            workers = None if any(replaced.values()) else cluster
+            more = {"progress": shown, "parts": stored, "cluster": workers}
+            tracking = run_tracking(video, config.track, segmenter, keypoints, **more)
         if tracking.failure is not None:
             if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
                 stored.keep(0)  # without a bird, only other settings of tracking help

@@ -10,15 +10,14 @@ from typing import Any
 from jaxfit.config.build import plain_config
 from jaxfit.config.fit import FitConfig
 from jaxfit.config.perception import TrackConfig
-from jaxfit.fitting.summary import LIBRARIES, library_versions
+from jaxfit.extras import LIBRARIES, TRACKING_LIBRARIES, library_versions
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.video.pictures import image_files
 
-__all__ = ["TRACKING_LIBRARIES", "file_hashes", "fit_record", "tracking_record"]
+__all__ = ["file_hashes", "fit_record", "tracking_record"]
 
-TRACKING_LIBRARIES = ("onnxruntime", "opencv-python-headless", "av", "scipy")
 _AFTER_TRACKING = ("min_track_frames", "min_track_score", "repair_left_right_flips")
 """Settings of tracking that are applied to the stored frames."""
 _FORMAT_VERSION = 1

@@ -14,11 +14,11 @@ from jaxfit.ablation.runs import fit_grid
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.truth import read_truth
 from jaxfit.extras import require_extra
-from jaxfit.fitting.cluster import Cluster
 from jaxfit.fitting.fit import check_observations
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.progress import ProgressTask, silent
+from jaxfit.workers.cluster import Cluster
 
 __all__ = ["Ablation", "ablate"]
 

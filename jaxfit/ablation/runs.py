@@ -14,13 +14,13 @@ from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.fitting.batch import frames_per_batch
-from jaxfit.fitting.cluster import Cluster
 from jaxfit.fitting.fit import fit_runs, windows_of
 from jaxfit.fitting.stages import compiled_part
 from jaxfit.fitting.summary import summarise
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import new_folder
+from jaxfit.workers.cluster import Cluster
 
 __all__ = ["FRAMES_AT_ONCE", "FittedBatch", "fit_batches", "fit_grid", "plan_batches", "run_folder"]
 

@@ -19,7 +19,7 @@ def ablate(options: argparse.Namespace) -> None:
     from jaxfit.ablation.ablate import ablate
     from jaxfit.ablation.report import FILES
     from jaxfit.ablation.table import CAPTION, claims_table, results_table
-    from jaxfit.fitting.cluster import open_cluster
+    from jaxfit.workers.cluster import open_cluster
 
     start = time.perf_counter()
     bird = find_bird(options.model)

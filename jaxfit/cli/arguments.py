@@ -92,12 +92,12 @@ def add_observation_options(command: argparse.ArgumentParser, video: bool = True
         command.set_defaults(size=None)
 
 
-def add_cluster(command: argparse.ArgumentParser) -> None:
-    """Add the options that fit windows in worker processes."""
+def add_cluster(command: argparse.ArgumentParser, work: str = "fit windows") -> None:
+    """Add the options that compute a part of the work in worker processes."""
     group = command.add_mutually_exclusive_group()
-    text = "fit windows in N worker processes, which share the cores of this machine (extra `cluster`)"
+    text = f"{work} in N worker processes, which share the cores of this machine (extra `cluster`)"
     group.add_argument("--workers", type=int, metavar="N", help=text)
-    text = "fit windows on the workers of a Dask cluster: address of its scheduler, or scheduler file (extra `cluster`)"
+    text = f"{work} on the workers of a Dask cluster: address of its scheduler, or scheduler file (extra `cluster`)"
     group.add_argument("--scheduler", metavar="ADDRESS", help=text)
 
 

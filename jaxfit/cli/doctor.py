@@ -110,8 +110,8 @@ def _networks() -> Iterator[Finding]:
     import onnxruntime
 
     from jaxfit.config.perception import TrackConfig
+    from jaxfit.perception.opening import open_keypoint_detector
     from jaxfit.perception.segmentation import load_segmenter
-    from jaxfit.perception.track import open_keypoint_detector
 
     yield Finding("ONNX Runtime", f"{onnxruntime.__version__}: {', '.join(onnxruntime.get_available_providers())}")
     for name, load in (

@@ -32,11 +32,11 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.config.fit import load_config
     from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import save_solution
-    from jaxfit.fitting.cluster import open_cluster
     from jaxfit.fitting.fit import fit
     from jaxfit.fitting.initial_pose_file import load_initial_poses
     from jaxfit.fitting.summary import summarise
     from jaxfit.storage.files import check_replaceable
+    from jaxfit.workers.cluster import open_cluster
 
     start = time.perf_counter()
     check_replaceable(options.out, options.overwrite, "poses.npz")  # before the long work

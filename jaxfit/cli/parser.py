@@ -74,7 +74,8 @@ def _perception(commands: Any) -> None:
         add_tracking_options(command)
     add_out(track, "OBS.json", "COCO file to write", overwrite="an existing file")
     add_model(reconstruct)
-    add_cluster(reconstruct)
+    add_cluster(track, "run the networks")
+    add_cluster(reconstruct, "run the networks and fit windows")
     add_out(reconstruct, "DIR", "folder for the result", overwrite="an earlier result in the folder")
 
 

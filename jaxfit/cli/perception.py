@@ -27,13 +27,15 @@ def track(options: argparse.Namespace) -> None:
     from jaxfit.perception.track import run_tracking
     from jaxfit.storage.files import check_writable
     from jaxfit.view.checks import check_outputs
+    from jaxfit.workers.cluster import open_cluster
 
     start = time.perf_counter()
     if options.video.exists():  # tracking reports a missing video
         check_outputs([options.out], options.video, options.overwrite)  # before the long work
     check_writable(options.out)
     config = reconstruct_config(options).track
-    tracking = run_tracking(options.video, config, progress=terminal)
+    with open_cluster(options.workers, options.scheduler) as cluster:
+        tracking = run_tracking(options.video, config, progress=terminal, cluster=cluster)
     write_coco(tracking.observations, options.out, tracking.trust.info())
     show(tracking.trust.sentence())
     if tracking.failure:
@@ -48,9 +50,9 @@ def track(options: argparse.Namespace) -> None:
 
 def reconstruct(options: argparse.Namespace) -> None:
     """Track the birds of a video, fit their poses and draw them."""
-    from jaxfit.fitting.cluster import open_cluster
     from jaxfit.pipeline import OBSERVATIONS, OVERLAY, reconstruct
     from jaxfit.report.write import REPORT
+    from jaxfit.workers.cluster import open_cluster
 
     start = time.perf_counter()
     config = reconstruct_config(options)

@@ -17,7 +17,6 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.fitting.batch import frames_per_batch
-from jaxfit.fitting.cluster import Cluster, FailedTask
 from jaxfit.fitting.collect import FittedWindow, collect_windows
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.distant import distant_birds, report_distant_birds
@@ -31,6 +30,7 @@ from jaxfit.fitting.tiles import tile_size
 from jaxfit.fitting.windows import Windows, cut_windows, windows_key
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask, ReportProgress, silent
+from jaxfit.workers.cluster import Cluster, FailedTask
 
 __all__ = ["check_observations", "fit", "fit_runs", "windows_of"]
 

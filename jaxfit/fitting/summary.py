@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import platform
 from collections import Counter
-from collections.abc import Sequence
-from importlib import metadata
 from typing import Any
 
 import numpy as np
 
 from jaxfit.data.solution import Solution
+from jaxfit.extras import LIBRARIES, library_versions
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
 
-__all__ = ["LIBRARIES", "library_versions", "summarise"]
-
-LIBRARIES = ("jaxfit", "jax", "jaxlib", "equinox", "optimistix", "optax", "numpy")
+__all__ = ["summarise"]
 
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
@@ -40,8 +37,3 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         "model": {"name": bird.name, "hash": model_hash(bird)},
         "versions": {"python": platform.python_version()} | library_versions(LIBRARIES),
     }
-
-
-def library_versions(names: Sequence[str]) -> dict[str, str]:
-    """Return the versions of some installed packages."""
-    return {name: metadata.version(name) for name in names}

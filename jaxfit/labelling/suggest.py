@@ -18,7 +18,8 @@ from jaxfit.labelling.results import Result, read_result
 from jaxfit.labelling.selection import choose, shortlist, thumbnail
 from jaxfit.labelling.signals import combine, frame_signals
 from jaxfit.perception.instances import KeypointDetector, Segmenter
-from jaxfit.perception.track import open_keypoint_detector, run_tracking
+from jaxfit.perception.opening import open_keypoint_detector
+from jaxfit.perception.track import run_tracking
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_replaceable, new_folder
 from jaxfit.video.reader import probe_video, read_frames

@@ -1,24 +1,23 @@
-"""The networks and the tracker on every frame of a video; an interrupted loop continues after its last stored frame."""
+"""The tracker on every frame of a video; an interrupted loop continues after its last stored frame."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import closing
 
-import cv2
 import numpy as np
 
 from jaxfit.clock import Clock
 from jaxfit.config.perception import FramesConfig
 from jaxfit.errors import one_line
-from jaxfit.perception.instances import KeypointDetector, Segmenter
+from jaxfit.perception.detections import Detections
 from jaxfit.perception.tracking import Tracker, TrackRecorder
 from jaxfit.perception.tracking.stored_frames import FRAMES_PER_PART, FramePart, load_frames, replay, store_frames
 from jaxfit.progress import ProgressTask
 from jaxfit.storage.parts import Parts
-from jaxfit.video.reader import FrameReader, read_frames
+from jaxfit.video.reader import FrameReader
 
 __all__ = ["expected_frames", "process_frames"]
 
@@ -26,22 +25,23 @@ _logger = logging.getLogger(__name__)
 
 
 def process_frames(
-    reader: FrameReader,
+    detections_from: Callable[[int], Detections],
+    name: str,
+    total: int | None,
     frames: FramesConfig,
-    segmenter: Segmenter,
-    keypoints: KeypointDetector,
     new_tracker: Callable[[], Tracker],
     recorder: TrackRecorder,
     clock: Clock,
     progress: ProgressTask,
     parts: Parts | None,
 ) -> FramePart:
-    """Segment every frame, assign identities and detect keypoints.
+    """Assign identities to the instances of every frame, and detect the keypoints of the birds with a track.
 
     Args:
-        reader: all frames of the video that `frames` selects.
-        frames: the selection.
-        segmenter, keypoints: the networks.
+        detections_from: returns the detections of the selected frames from a frame number on.
+        name: name of the video.
+        total: number of frames; None if it is unknown.
+        frames: the selection of frames.
         new_tracker: creates a tracker that has seen no frame.
         recorder: receives the frames; it must be new.
         clock: measures the parts of the work.
@@ -54,42 +54,37 @@ def process_frames(
     Raises:
         InputError: the video cannot be read, a network cannot be used, or frames cannot be stored.
     """
-    monitors = [getattr(network, "activations", None) for network in (segmenter, keypoints)]
-    _take_distances(monitors)  # distances of an earlier video
     done, tracker = _continued(parts, new_tracker)
     recorder.frames += [frame for part in done for frame in part.frames]
-    stored, seen_damaged, total = len(recorder.frames), 0, expected_frames(reader, frames)
-    if stored:
-        reader = read_frames(reader.path, recorder.frames[-1].frame_index + frames.step, frames.stop, frames.step)
+    stored, seen_damaged = len(recorder.frames), 0
+    detections = detections_from(recorder.frames[-1].frame_index + frames.step if stored else frames.start)
 
     def end_part(is_last: bool) -> None:
         nonlocal stored, seen_damaged
-        distances = _take_distances(monitors)
-        part = FramePart(recorder.frames[stored:], reader.damaged[seen_damaged:], distances, is_last)
-        stored, seen_damaged = len(recorder.frames), len(reader.damaged)
+        distances = detections.take_distances()
+        part = FramePart(recorder.frames[stored:], detections.damaged[seen_damaged:], distances, is_last)
+        stored, seen_damaged = len(recorder.frames), len(detections.damaged)
         if parts is not None:
-            store_frames(parts, part, len(keypoints.keypoint_names))
+            store_frames(parts, part, recorder.num_keypoints)
         done.append(part)
 
     begun, start = stored, time.perf_counter()
-    with _single_opencv_thread(), progress("Tracking", total) as report_progress:
+    is_complete = bool(done) and done[-1].is_last
+    with progress("Tracking", total) as report_progress, closing(iter(detections)) as found:
         if begun:
             report_progress(begun, "stored frames")
-        is_complete = bool(done) and done[-1].is_last
-        for number, picture, time_s in () if is_complete else clock.each("decode", reader):
-            with clock("segment"):
-                instances = segmenter(picture)
+        for frame in () if is_complete else found:
+            instances = frame.instances
             with clock("track"):
-                identities = tracker.update(number, instances, picture)
+                identities = tracker.update(frame.frame_index, instances, frame.picture)
             tracked = [i for i, identity in enumerate(identities) if identity is not None]
-            points_px = np.zeros((len(instances), len(keypoints.keypoint_names), 2), np.float32)
+            points_px = np.zeros((len(instances), recorder.num_keypoints, 2), np.float32)
             confidence = np.zeros(points_px.shape[:2], np.float32)
-            with clock("keypoints"):
-                points_px[tracked], confidence[tracked] = keypoints(picture, [instances[i] for i in tracked])
-            name = f"{one_line(reader.path.name)}#{number}"  # a name on the disk may be no text
-            size_px = (picture.shape[1], picture.shape[0])
+            points_px[tracked], confidence[tracked] = frame.keypoints(tracked)
+            own_name = f"{one_line(name)}#{frame.frame_index}"  # a name on the disk may be no text
             with clock("record"):
-                recorder.add(number, name, size_px, instances, identities, points_px, confidence, time_s)
+                given = (frame.frame_index, own_name, frame.size_px, instances, identities, points_px, confidence)
+                recorder.add(*given, frame.time_s)
                 if parts is not None and len(recorder.frames) - stored == FRAMES_PER_PART:
                     end_part(is_last=False)
             rate = (len(recorder.frames) - begun) / (time.perf_counter() - start)
@@ -97,7 +92,7 @@ def process_frames(
             report_progress(1, f"{len(recorder.frames)} frames, {rate:.1f} frames/s, {len(tracked)} {noun}")
     if not is_complete and recorder.frames:
         end_part(is_last=True)
-    damaged = [number for part in done for number in part.damaged] if done else reader.damaged
+    damaged = [number for part in done for number in part.damaged] if done else detections.damaged
     distances = (np.concatenate([np.zeros(0), *(part.distances[i] for part in done)]) for i in range(2))
     return FramePart(recorder.frames, damaged, (next(distances), next(distances)), True)
 
@@ -123,12 +118,6 @@ def _continued(parts: Parts | None, new_tracker: Callable[[], Tracker]) -> tuple
     return [], new_tracker()
 
 
-def _take_distances(monitors: list) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances since the last call of the two monitors; a network without monitor has none."""
-    segmenter, keypoints = (np.zeros(0) if monitor is None else np.asarray(monitor.take()) for monitor in monitors)
-    return segmenter, keypoints
-
-
 def expected_frames(reader: FrameReader, frames: FramesConfig) -> int | None:
     """Return the number of frames to process; None if the container does not say its length."""
     total = reader.info.frames
@@ -136,14 +125,3 @@ def expected_frames(reader: FrameReader, frames: FramesConfig) -> int | None:
         return None
     ends = [end for end in (total, frames.stop) if end is not None]
     return max(0, -((frames.start - min(ends)) // frames.step))  # `len` of a range is limited to 64 bits
-
-
-@contextmanager
-def _single_opencv_thread() -> Iterator[None]:
-    """Restrict OpenCV to one thread: the networks use all cores, and OpenCV's threads would slow them down."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

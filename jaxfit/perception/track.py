@@ -7,16 +7,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxfit.clock import Clock
-from jaxfit.config.checks import require
 from jaxfit.config.perception import TrackConfig
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import mirror_pairs, skeleton_pairs
+from jaxfit.perception.detections import Detections, LocalDetections
 from jaxfit.perception.frame_loop import expected_frames, process_frames
 from jaxfit.perception.instances import KeypointDetector, Segmenter
-from jaxfit.perception.keypoints import load_keypoint_detector
-from jaxfit.perception.keypoints.detector import BUILTIN_PATH
-from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
+from jaxfit.perception.opening import open_keypoint_detector, open_segmenter
 from jaxfit.perception.tracking import (
     Tracker,
     TrackRecorder,
@@ -27,16 +25,14 @@ from jaxfit.perception.tracking import (
     repair_left_right_flips,
 )
 from jaxfit.perception.trust import Trust, footage_signals, judge
+from jaxfit.perception.worker_detections import WorkerDetections
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.parts import Parts
 from jaxfit.video.reader import read_frames
+from jaxfit.workers.cluster import Cluster
 
 __all__ = [
     "TrackingResult",
-    "check_segmenter",
-    "network_files",
-    "open_keypoint_detector",
-    "open_segmenter",
     "run_tracking",
     "track_video",
 ]
@@ -63,7 +59,7 @@ class TrackingResult(NamedTuple):
     trust: Trust
     """Whether tracking worked as it works on simulated footage, and the reasons if not."""
     seconds: dict[str, float]
-    """Duration of each part; for decoding, only the time that the other parts waited."""
+    """Duration of each part; for decoding and for workers (`detect`), only the time that the other parts waited."""
 
 
 def track_video(
@@ -98,63 +94,6 @@ def track_video(
     return tracking.observations
 
 
-def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segmenter:
-    """Load the segmenter of a config.
-
-    Args:
-        config: the whole config of tracking.
-        min_score: replaces the score of the config; None keeps the score of the config.
-
-    Raises:
-        InputError: the segmenter cannot be used.
-    """
-    settings = config.segmenter
-    require(settings.kind in KINDS, "track.segmenter.kind", f"is {settings.kind!r}", f"one of {', '.join(KINDS)}")
-    return load_segmenter(
-        settings.file,
-        kind=settings.kind,
-        names=settings.names or None,
-        classes=settings.classes or None,
-        min_score=settings.min_score if min_score is None else min_score,
-        tile_px=settings.tile_px,
-        tile_overlap=settings.tile_overlap,
-        threads=config.threads,
-    )
-
-
-def check_segmenter(config: TrackConfig) -> None:
-    """Load the segmenter of a config and release it, to report an unusable segmenter before long work.
-
-    Raises:
-        InputError: the segmenter cannot be used.
-    """
-    open_segmenter(config)
-
-
-def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
-    """Load the keypoint detector of a config.
-
-    Raises:
-        InputError: the keypoint detector cannot be used.
-    """
-    settings = config.keypoints
-    return load_keypoint_detector(
-        settings.file,
-        kind=settings.kind,
-        names=settings.names or None,
-        pad_px=settings.pad_px,
-        dilate_px=settings.dilate_px,
-        batch=settings.batch,
-        threads=config.threads,
-    )
-
-
-def network_files(config: TrackConfig) -> dict[str, list[Path]]:
-    """Return the files of the networks of a config, under the keys `segmenter` and `keypoints`."""
-    keypoints = BUILTIN_PATH if config.keypoints.file == "builtin" else Path(config.keypoints.file)
-    return {"segmenter": segmenter_files(config.segmenter.file), "keypoints": [keypoints]}
-
-
 def run_tracking(
     source: str | Path,
     config: TrackConfig = TrackConfig(),
@@ -163,6 +102,7 @@ def run_tracking(
     tracker: Tracker | None = None,
     progress: ProgressTask = silent,
     parts: Parts | None = None,
+    cluster: Cluster | None = None,
 ) -> TrackingResult:
     """Track a video as `track_video` does, and return short tracks, damaged frames and durations too.
 
@@ -170,6 +110,9 @@ def run_tracking(
         source, config, segmenter, keypoints, tracker, progress: as for `track_video`.
         parts: stores the frames while they are processed, and holds the frames of an interrupted call; None stores
             nothing. A `tracker` of the caller must not be given too.
+        cluster: worker processes that run the networks of `config`, in place of `segmenter` and `keypoints`. They read
+            the video and the files of the networks under the same paths. If the tracker uses pictures, or the video
+            does not say its length, the networks run in this process. None: this process.
     """
     frames, has_own_segmenter = config.frames, segmenter is not None
     reader, given_tracker = read_frames(source, frames.start, frames.stop, frames.step), tracker
@@ -177,16 +120,24 @@ def run_tracking(
     segmenter = segmenter or open_segmenter(config)
     recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names), reader.info.fps)
     clock = Clock()
+    total = expected_frames(reader, frames)
+    end = None if total is None else frames.start + total * frames.step
+
+    def new_tracker() -> Tracker:
+        return given_tracker or _tracker_of(config)
+
+    if cluster is not None and (reason := _no_workers(new_tracker(), end)):
+        _logger.warning("%s: the networks run in this process, because %s", source, reason)
+        cluster = None
+
+    def detections_from(start: int) -> Detections:
+        if cluster is not None and end is not None:
+            return WorkerDetections(cluster, reader.path, config, range(start, end, frames.step), clock)
+        remaining = read_frames(source, start, frames.stop, frames.step)
+        return LocalDetections(remaining, segmenter, keypoints, clock)
+
     processed = process_frames(
-        reader,
-        frames,
-        segmenter,
-        keypoints,
-        lambda: given_tracker or _tracker_of(config),
-        recorder,
-        clock,
-        progress,
-        parts,
+        detections_from, reader.path.name, total, frames, new_tracker, recorder, clock, progress, parts
     )
     if not processed.frames:
         raise InputError(source, f"has no frame from {frames.start} on", "begin with an earlier frame")
@@ -216,6 +167,13 @@ def run_tracking(
     return TrackingResult(
         observations, short_tracks, low_score_tracks, processed.damaged, failure, trust, clock.seconds
     )
+
+
+def _no_workers(tracker: Tracker, end: int | None) -> str | None:
+    """Return why the networks cannot run on workers; None if they can."""
+    if getattr(tracker, "uses_pictures", False):
+        return "the tracker uses the pictures of the video"
+    return "the file does not contain the number of its frames" if end is None else None
 
 
 def _tracker_of(config: TrackConfig) -> Tracker:

@@ -20,7 +20,7 @@ from jaxfit.video.opening import frame_count, frame_rate, opened
 from jaxfit.video.packets import first_picture
 from jaxfit.video.pictures import image_files, read_picture
 
-__all__ = ["Frame", "FrameReader", "VideoInfo", "probe_video", "read_frames"]
+__all__ = ["Frame", "FrameReader", "VideoInfo", "probe_video", "read_frames", "warn_of_damage"]
 
 _logger = logging.getLogger(__name__)
 
@@ -128,9 +128,7 @@ class FrameReader:
                     else:
                         self.damaged.append(item)
         finally:
-            if self.damaged:
-                count, spans = len(self.damaged), _spans(self.damaged, self._numbers.step)
-                _logger.warning("%s: %d damaged frames are skipped (%s)", self.path, count, spans)
+            warn_of_damage(self.path, self.damaged, self._numbers.step)
 
     def _read(self, stopped: Callable[[], bool]) -> Generator[Frame | int, None, None]:
         if not self.path.is_dir():
@@ -186,6 +184,12 @@ def _ahead(source: Callable[[Callable[[], bool]], Generator[Frame | int, None, N
 
 class _End(NamedTuple):
     error: BaseException | None
+
+
+def warn_of_damage(path: Path, damaged: list[int], step: int) -> None:
+    """Log one line with the numbers of the damaged frames of a video, if there are any."""
+    if damaged:
+        _logger.warning("%s: %d damaged frames are skipped (%s)", path, len(damaged), _spans(damaged, step))
 
 
 def _spans(numbers: list[int], step: int) -> str:

@@ -52,6 +52,11 @@ class TrackRecorder:
         self._names, self._skeleton, self._fps = tuple(keypoint_names), tuple(skeleton), fps
         self.frames = []
 
+    @property
+    def num_keypoints(self) -> int:
+        """Number of keypoints K."""
+        return len(self._names)
+
     def add(
         self,
         frame_index: int,

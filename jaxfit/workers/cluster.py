@@ -18,8 +18,7 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 from jaxfit.errors import InputError
-from jaxfit.extras import require_package
-from jaxfit.fitting.summary import LIBRARIES, library_versions
+from jaxfit.extras import LIBRARIES, TRACKING_LIBRARIES, library_versions, require_package
 from jaxfit.limits import CONFIG_BYTES
 from jaxfit.storage.json_file import read_json_file
 
@@ -31,7 +30,7 @@ CONNECT_S = 10
 """Longest time until the scheduler answers, seconds."""
 TASKS_PER_THREAD = 3
 """Number of tasks that are sent ahead for each thread of the workers. A low number bounds the memory."""
-_CHECKED = (*LIBRARIES, "dask", "distributed")
+_CHECKED = (*LIBRARIES, *TRACKING_LIBRARIES, "dask", "distributed")
 
 _logger = logging.getLogger(__name__)
 _one_task = threading.Lock()
@@ -151,7 +150,7 @@ def _local_client(workers: int) -> Iterator[Any]:
     from dask import config
     from distributed import Client, LocalCluster
 
-    from jaxfit.fitting.worker_cores import WorkerCores
+    from jaxfit.workers.cores import WorkerCores
 
     settings = {
         "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
@@ -206,7 +205,7 @@ def _remote_client(scheduler: str) -> Iterator[Any]:
         for worker, versions in found.items():
             _check_versions(f"worker {worker}", versions, own)
         if not found:
-            _logger.warning("%s: the cluster has no workers yet; the fit waits for workers", named)
+            _logger.warning("%s: the cluster has no workers yet; the command waits for workers", named)
         yield client
 
 

@@ -14,8 +14,6 @@ from support.worker_tasks import add, attempts, deadly, failing, quick_fit, refu
 
 from jaxfit.cli.main import main
 from jaxfit.errors import InputError
-from jaxfit.fitting import cluster as module
-from jaxfit.fitting.cluster import Cluster, FailedTask, open_cluster
 from jaxfit.fitting.fit import fit, fit_runs, windows_of
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.tasks import Run, cut_task
@@ -23,24 +21,12 @@ from jaxfit.fitting.windows import window_content
 from jaxfit.model.pose import Pose
 from jaxfit.simulation.detections import detect
 from jaxfit.storage.parts import Parts
+from jaxfit.workers import cluster as module
+from jaxfit.workers.cluster import Cluster, FailedTask, open_cluster
 
 distributed = pytest.importorskip("distributed")
 ARRAYS = [*Pose.__dataclass_fields__, "keypoints_cam", "keypoints_px", "valid", "status"]
 BIRDS = 3
-
-
-@pytest.fixture(scope="module")
-def scheduler():
-    """The address of a scheduler in this process, with one worker in this process."""
-    options = {"processes": False, "n_workers": 1, "threads_per_worker": 2, "dashboard_address": "127.0.0.1:0"}
-    with distributed.LocalCluster(protocol="tcp", host="127.0.0.1", **options) as cluster:
-        yield cluster.scheduler_address
-
-
-@pytest.fixture
-def workers(scheduler):
-    with open_cluster(scheduler=scheduler) as cluster:
-        yield cluster
 
 
 def settings(**changes):
@@ -228,7 +214,7 @@ def test_the_number_of_workers():
 
 
 def test_cores_are_shared():
-    from jaxfit.fitting.worker_cores import share_of_cores
+    from jaxfit.workers.cores import share_of_cores
 
     assert [share_of_cores([0, 2, 4, 6, 7], i, 2) for i in range(2)] == [[0, 2], [4, 6, 7]]
     assert [share_of_cores([3, 5], i, 3) for i in range(3)] == [[3], [5], [3]]
