@@ -4,11 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from support.toy_footage import BIRDS, FRAMES, Footage, TrueKeypoints, TrueSegmenter
+from support.interrupted import CONFIG as CONFIG_OF_A_COMMAND
+from support.interrupted import command, contents, toy_networks
+from support.toy_footage import BIRD, BIRDS, FRAMES, Footage, TrueKeypoints, TrueSegmenter
 
+from jaxfit.cli.main import main
 from jaxfit.config.perception import FramesConfig, SegmenterConfig, TrackConfig, TrackerConfig
 from jaxfit.errors import InputError
-from jaxfit.model.files import load_murre
+from jaxfit.model.files import load_murre, save_bird
 from jaxfit.perception import frame_loop, track, worker_detections
 from jaxfit.perception.detections import LocalDetections
 from jaxfit.perception.track import run_tracking
@@ -161,6 +164,25 @@ def test_networks_that_run_in_this_process(video, workers, monkeypatch, caplog, 
     run_tracking(video, CONFIG, *networks(), tracker, cluster=workers)
     assert used
     assert reason in caplog.text
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_the_commands(video, scheduler, tmp_path, monkeypatch):
+    """The files of tracking and of a reconstruction on workers are those of one process."""
+    FOOTAGE.write(tmp_path / "frames")
+    save_bird(BIRD, tmp_path / "toy.npz")
+    (tmp_path / "quick.yaml").write_text(CONFIG_OF_A_COMMAND + "overlay: {write: false}\n")
+    with toy_networks(TrueSegmenter(FOOTAGE)):
+        monkeypatch.setattr(worker_detections, "open_segmenter", lambda _: TrueSegmenter(FOOTAGE))
+        monkeypatch.setattr(worker_detections, "open_keypoint_detector", lambda _: TrueKeypoints(FOOTAGE))
+        monkeypatch.setattr(worker_detections, "network_files", lambda _: {})
+        assert main(command(tmp_path, out="alone")) == 0
+        assert main(command(tmp_path, "--scheduler", scheduler)) == 0
+        assert contents(tmp_path / "result") == contents(tmp_path / "alone")
+        track = ["track", str(tmp_path / "frames"), "--config", str(tmp_path / "quick.yaml"), "--out"]
+        assert main([*track, str(tmp_path / "alone.json")]) == 0
+        assert main([*track, str(tmp_path / "workers.json"), "--scheduler", scheduler]) == 0
+    assert (tmp_path / "workers.json").read_bytes() == (tmp_path / "alone.json").read_bytes()
 
 
 @pytest.mark.extended
