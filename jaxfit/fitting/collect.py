@@ -53,9 +53,14 @@ def collect_windows(
     results: list[FittedWindow],
     bird: Bird,
     camera: Camera,
+    common_size: bool,
     skipped: Mapping[int, tuple[str, ...]],
 ) -> Solution:
     """Return the solution of one run.
+
+    One camera cannot distinguish a small near bird from a large distant bird: a factor on size and position does not
+    change the projection, and the factors of fitted windows are arbitrary. Where the frames of a window share one size,
+    every bird therefore gets the size of the model, so that it has one size in the whole video.
 
     A window diverges or does not diverge by itself. Only windows that did not diverge have valid poses and contribute
     to the loss. The status of a track summarises its windows: `ok` (no window diverged), `partly diverged`, `diverged`
@@ -68,6 +73,7 @@ def collect_windows(
             together.
         bird: the model.
         camera: the crop camera.
+        common_size: as in the config.
         skipped: track → text about its skipped frames, for `Solution.failures`.
     """
     birds, frames = observations.num_tracks, observations.num_frames
@@ -106,7 +112,7 @@ def collect_windows(
         fitted[n] += 1
         valid[n, at] = True
         image_size_px[n, at] = [observations.image_size(n, int(t)) for t in at]
-        for name, value in _frame_values(result, windows.crop[w], present, bird, camera).items():
+        for name, value in _frame_values(result, windows.crop[w], present, bird, camera, common_size).items():
             arrays[name][n, at] = value
     for array in (valid, image_size_px, *arrays.values()):
         array.flags.writeable = False  # so that `Solution` needs no copy
@@ -130,20 +136,22 @@ def collect_windows(
 
 
 def _frame_values(
-    result: FittedWindow, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: Camera
+    result: FittedWindow, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: Camera, common_size: bool
 ) -> dict[str, Any]:
     """Return the arrays of a solution at the present frames of one window."""
     pose, crop = result.pose, crop[present].astype(np.float32)
     betas = np.zeros(bird.num_shapes, np.float32)  # for a fit without shape coefficients
     betas[: len(pose.betas)] = pose.betas
+    scale = np.broadcast_to(pose.scale, present.shape)[present]
+    factor = scale if common_size else np.ones_like(scale)
     return {
         "global_orient": pose.global_orient[present],
         "body_pose": pose.body_pose[present],
-        "transl": pose.transl[present],
-        "scale": np.broadcast_to(pose.scale, present.shape)[present],
+        "transl": pose.transl[present] / factor[:, None],
+        "scale": scale / factor,
         "bone_length": pose.bone_length,
         "betas": betas,
-        "keypoints_cam": result.keypoints_cam[present],
+        "keypoints_cam": result.keypoints_cam[present] / factor[:, None, None],
         "keypoints_px": crop_to_image(result.keypoints_px[present], crop, camera.size_px),
         "crop": crop,
     }

@@ -136,7 +136,15 @@ def fit_runs(
                 stored.add(runs[0].windows, {w: window for (_, w), window in zip(batches[i], windows, strict=True)})
             results |= dict(zip(batches[i], windows, strict=True))
     return [
-        collect_windows(observations, run.windows, _final_results(r, run, results, model), bird, model.camera, skipped)
+        collect_windows(
+            observations,
+            run.windows,
+            _final_results(r, run, results, model),
+            bird,
+            model.camera,
+            run.config.common_size,
+            skipped,
+        )
         for r, run in enumerate(runs)
     ]
 

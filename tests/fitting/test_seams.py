@@ -145,7 +145,7 @@ def test_a_window_that_diverged_has_no_part_in_a_seam(failed):
     blended = blend_seams(windows, results, MODEL)
     assert blended == results
     observed = observations().select(tracks=[0], frames=slice(0, 10))
-    solution = collect_windows(observed, windows, blended, BIRD, MODEL.camera, {})
+    solution = collect_windows(observed, windows, blended, BIRD, MODEL.camera, False, {})
     assert solution.valid[0].tolist() == [failed == 1 or t >= 4 for t in range(6)] + [failed == 0] * 4
     good = results[1 - failed].pose.global_orient
     shared = good[:2] if failed == 0 else good[4:]
