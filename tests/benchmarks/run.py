@@ -24,8 +24,9 @@ from rich.table import Table
 from jaxfit.benchmarks.fit import bench_fit
 from jaxfit.benchmarks.render import bench_render
 from jaxfit.benchmarks.silhouette import bench_silhouette
-from jaxfit.cli import load_config, read_coco
-from jaxfit.cli import main as cli
+from jaxfit.cli.main import use_cache
+from jaxfit.config.fit import load_config
+from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.initial_pose_file import load_initial_poses
@@ -124,7 +125,7 @@ def main() -> int:
     parser.add_argument("--full", action="store_true", help="also run the scene of 9 birds × 100 frames")
     parser.add_argument("--json", type=Path, help="also write the metrics to this file")
     options = parser.parse_args()
-    cli.use_cache()
+    use_cache()
     console = Console()
     reference, bird = reference_folder(), reference_bird()
     metrics = [*soft_silhouette(), *renderer()]
