@@ -164,6 +164,7 @@ def test_the_demo_writes_the_files_that_it_names(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "load_reconstruct_config", lambda: load_reconstruct_config(tmp_path / "quick.yaml"))
     monkeypatch.setattr(pipeline, "open_keypoint_detector", open_one)
     monkeypatch.setattr(track, "open_segmenter", lambda _: opened[-1])
+    monkeypatch.setattr(pipeline, "check_segmenter", lambda _: None)
     monkeypatch.setattr(pipeline, "network_files", lambda _: {})
     monkeypatch.setattr(demo, "BIRDS", 2)
     monkeypatch.setattr(demo, "FRAMES", 5)

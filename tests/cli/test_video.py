@@ -37,6 +37,7 @@ def networks(monkeypatch):
     """Replace the networks of a config; return the list of (frame, bird) pairs that the segmenter misses."""
     missed = []
     monkeypatch.setattr(track, "open_segmenter", lambda *_: TrueSegmenter(FOOTAGE, missed))
+    monkeypatch.setattr(pipeline, "check_segmenter", lambda _: None)
     for module in (track, pipeline):
         monkeypatch.setattr(module, "open_keypoint_detector", lambda _: TrueKeypoints(FOOTAGE))
     monkeypatch.setattr(pipeline, "network_files", lambda _: {})
