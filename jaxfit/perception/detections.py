@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -15,11 +15,19 @@ from jaxfit.clock import Clock
 from jaxfit.perception.instances import Instance, KeypointDetector, Segmenter
 from jaxfit.video.reader import FrameReader
 
-__all__ = ["Detections", "Distances", "FrameDetections", "Keypoints", "LocalDetections", "single_opencv_thread"]
+__all__ = [
+    "Detections",
+    "Distances",
+    "FrameDetections",
+    "Keypoints",
+    "LocalDetections",
+    "joined_distances",
+    "single_opencv_thread",
+]
 
-Keypoints = tuple[Float[np.ndarray, "m K 2"], Float[np.ndarray, "m K"]]
+Keypoints = tuple[Float[np.ndarray, "_ K 2"], Float[np.ndarray, "_ K"]]
 """Positions in image pixels and confidences, as `KeypointDetector` returns them."""
-Distances = tuple[Float[np.ndarray, "S"], Float[np.ndarray, "P"]]
+Distances = tuple[Float[np.ndarray, "_"], Float[np.ndarray, "_"]]
 """Distances of the activations of the segmenter and of the keypoint network; empty for networks without statistics."""
 
 
@@ -90,6 +98,12 @@ class LocalDetections:
         monitors = (getattr(network, "activations", None) for network in (self._segmenter, self._keypoints))
         segmenter, keypoints = (np.zeros(0) if monitor is None else np.asarray(monitor.take()) for monitor in monitors)
         return segmenter, keypoints
+
+
+def joined_distances(parts: Iterable[Distances]) -> Distances:
+    """Return the distances of some parts of a video as those of one part."""
+    segmenter, keypoints = zip(*parts, (np.zeros(0), np.zeros(0)), strict=True)
+    return np.concatenate(segmenter), np.concatenate(keypoints)
 
 
 @contextmanager

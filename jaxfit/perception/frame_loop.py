@@ -12,7 +12,7 @@ import numpy as np
 from jaxfit.clock import Clock
 from jaxfit.config.perception import FramesConfig
 from jaxfit.errors import one_line
-from jaxfit.perception.detections import Detections
+from jaxfit.perception.detections import Detections, joined_distances
 from jaxfit.perception.tracking import Tracker, TrackRecorder
 from jaxfit.perception.tracking.stored_frames import FRAMES_PER_PART, FramePart, load_frames, replay, store_frames
 from jaxfit.progress import ProgressTask
@@ -93,8 +93,7 @@ def process_frames(
     if not is_complete and recorder.frames:
         end_part(is_last=True)
     damaged = [number for part in done for number in part.damaged] if done else detections.damaged
-    distances = (np.concatenate([np.zeros(0), *(part.distances[i] for part in done)]) for i in range(2))
-    return FramePart(recorder.frames, damaged, (next(distances), next(distances)), True)
+    return FramePart(recorder.frames, damaged, joined_distances(part.distances for part in done), True)
 
 
 def _continued(parts: Parts | None, new_tracker: Callable[[], Tracker]) -> tuple[list[FramePart], Tracker]:

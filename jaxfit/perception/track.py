@@ -133,8 +133,8 @@ def run_tracking(
     def detections_from(start: int) -> Detections:
         if cluster is not None and end is not None:
             return WorkerDetections(cluster, reader.path, config, range(start, end, frames.step), clock)
-        remaining = read_frames(source, start, frames.stop, frames.step)
-        return LocalDetections(remaining, segmenter, keypoints, clock)
+        own = reader if start == frames.start else read_frames(source, start, frames.stop, frames.step)
+        return LocalDetections(own, segmenter, keypoints, clock)
 
     processed = process_frames(
         detections_from, reader.path.name, total, frames, new_tracker, recorder, clock, progress, parts

@@ -17,7 +17,7 @@ from jaxtyping import UInt8
 from jaxfit.clock import Clock
 from jaxfit.config.perception import FramesConfig, TrackConfig
 from jaxfit.errors import InputError
-from jaxfit.perception.detections import Distances, FrameDetections, Keypoints, LocalDetections
+from jaxfit.perception.detections import Distances, FrameDetections, Keypoints, LocalDetections, joined_distances
 from jaxfit.perception.instances import Instance, KeypointDetector, Segmenter
 from jaxfit.perception.opening import network_files, open_keypoint_detector, open_segmenter
 from jaxfit.video.pictures import image_files
@@ -94,7 +94,8 @@ class WorkerDetections:
     """Numbers of the frames so far that could not be read, or that no worker could compute."""
 
     def __init__(self, cluster: Cluster, video: Path, config: TrackConfig, frames: range, clock: Clock):
-        self._cluster, self._frames, self._clock = cluster, frames, clock
+        self._cluster, self._step, self._clock = cluster, frames.step, clock
+        self._ranges = [frames[i : i + FRAMES_PER_TASK] for i in range(0, len(frames), FRAMES_PER_TASK)]
         config = _with_absolute_paths(config)
         sizes = tuple(_state(file)[0] for file in _files(video, config))
         self._shared = DetectionShared(video, config, sizes)
@@ -106,7 +107,7 @@ class WorkerDetections:
         try:
             for number, part in enumerate(self._clock.each("detect", self._parts())):
                 if isinstance(part, FailedTask):
-                    self.damaged += self._ranges()[number]
+                    self.damaged += self._ranges[number]
                     _logger.warning("%s: no detections: %s", self._shared.video, part.reason)
                     continue
                 damaged = list(part.damaged)
@@ -119,16 +120,13 @@ class WorkerDetections:
                     yield FrameDetections(*frame[:3], instances, keypoints, None)
                 self.damaged += damaged
         finally:
-            warn_of_damage(self._shared.video, self.damaged, self._frames.step)
-
-    def _ranges(self) -> list[range]:
-        return [self._frames[i : i + FRAMES_PER_TASK] for i in range(0, len(self._frames), FRAMES_PER_TASK)]
+            warn_of_damage(self._shared.video, self.damaged, self._step)
 
     def _parts(self) -> Iterator[DetectedRange | FailedTask]:
         """Yield the results of the tasks in the order of the frames."""
         arrived: dict[int, DetectedRange | FailedTask] = {}
         wanted = 0
-        for number, part in self._cluster.run(detect_range, self._shared, self._ranges()):
+        for number, part in self._cluster.run(detect_range, self._shared, self._ranges):
             arrived[number] = part
             while wanted in arrived:
                 yield arrived.pop(wanted)
@@ -137,8 +135,7 @@ class WorkerDetections:
     def take_distances(self) -> Distances:
         """Return the distances of the frames since the last call."""
         taken, self._distances = self._distances, []
-        segmenter, keypoints = (np.concatenate([np.zeros(0), *(each[i] for each in taken)]) for i in range(2))
-        return segmenter, keypoints
+        return joined_distances(taken)
 
 
 def detect_range(shared: DetectionShared, frames: range) -> DetectedRange:

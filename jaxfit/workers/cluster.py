@@ -59,7 +59,7 @@ class Cluster:
     ) -> Iterator[tuple[int, Any | FailedTask]]:
         """Compute `function(shared, task)` for every task on the workers.
 
-        If a worker ends, its tasks are computed by other workers. The workers need no file: `shared` is sent once.
+        If a worker ends, its tasks are computed by other workers. `shared` is sent once.
 
         Args:
             function: a function of an importable module.

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.toy_footage import BIRDS, FRAMES, Footage, TrueKeypoints, TrueSegmenter
+from support.toy_footage import FRAMES, MISSED, Footage, MonitoredSegmenter, TrueKeypoints, assert_same_tracking
 
 from jaxfit.config.perception import FramesConfig, TrackConfig, TrackerConfig
 from jaxfit.errors import InputError
@@ -13,7 +13,6 @@ from jaxfit.perception.tracking.tracker import load_tracker
 from jaxfit.storage.parts import Parts
 
 FOOTAGE = Footage()
-MISSED = [(t, n) for t in (3, 4, 9) for n in range(BIRDS) if t != 4 or n != 1]
 
 
 @pytest.fixture(scope="module")
@@ -32,35 +31,23 @@ class StoppedError(Exception):
     pass
 
 
-class Stopping(TrueSegmenter):
-    """Stops before a frame; its activations have the number of the frame as distance."""
+class Stopping(MonitoredSegmenter):
+    """Stops before a frame."""
 
     def __init__(self, stop=None):
         super().__init__(FOOTAGE, MISSED)
-        self.stop, self.activations, self.distances = stop, self, []
+        self.stop = stop
 
     def __call__(self, frame):
         if int(frame[0, 0, 0]) == self.stop:
             raise StoppedError
-        self.distances.append(float(frame[0, 0, 0]))
         return super().__call__(frame)
-
-    def take(self):
-        taken, self.distances = np.array(self.distances), []
-        return taken
 
 
 def run(video, parts=None, stop=None, **settings):
     config = TrackConfig(min_track_frames=2, **settings)
     segmenter = Stopping(stop)
     return run_tracking(video, config, segmenter, TrueKeypoints(FOOTAGE), parts=parts), segmenter.frames
-
-
-def same(one, other):
-    """Compare two results of tracking, except their durations."""
-    for name, value in vars(one.observations).items():
-        np.testing.assert_equal(value, getattr(other.observations, name))
-    assert one[1:-1] == other[1:-1]
 
 
 @pytest.mark.parametrize("frames", [FramesConfig(), FramesConfig(1, 9, 1), FramesConfig(0, None, 2)])
@@ -75,10 +62,10 @@ def test_a_tracking_that_stops_at_every_frame(video, tmp_path, frames):
     assert parts.numbers == list(range((len(all_frames) - 1) // 4))
     resumed, done = run(video, parts, frames=frames)
     assert done == all_frames[4 * ((len(all_frames) - 1) // 4) :]
-    same(resumed, whole)
+    assert_same_tracking(resumed, whole)
     again, done = run(video, Parts(tmp_path / "p", {}), frames=frames)
     assert done == []
-    same(again, whole)
+    assert_same_tracking(again, whole)
 
 
 def test_a_missing_part_and_a_damaged_part(video, tmp_path):
@@ -91,7 +78,7 @@ def test_a_missing_part_and_a_damaged_part(video, tmp_path):
     file.unlink()
     resumed, done = run(video, Parts(tmp_path / "p", {}))
     assert done == [4, 5, 7, 8, 9, 10, 11]
-    same(resumed, whole)
+    assert_same_tracking(resumed, whole)
 
 
 def test_numbers_of_birds_that_do_not_agree(video, tmp_path):

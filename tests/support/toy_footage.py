@@ -11,6 +11,8 @@ from support.birds import toy_bird
 
 BIRD, FRAMES, SIDE = toy_bird(shapes=0), 12, 64
 BIRDS = 3
+MISSED = [(t, n) for t in (3, 4, 9) for n in range(BIRDS) if t != 4 or n != 1]
+"""Frames and birds that some tests hide from the segmenter."""
 QUICK = """
 base: reconstruct
 track: {min_track_frames: 3}
@@ -81,3 +83,34 @@ class TrueKeypoints:
         points = [self.footage.keypoints_px[t, instance.x0 // SIDE] for instance in instances]
         shape = (len(instances), len(self.keypoint_names))
         return np.array(points, np.float32).reshape(*shape, 2), np.full(shape, 0.8, np.float32)
+
+
+class Monitored:
+    """A part of a network whose activations have the number of the frame as distance."""
+
+    def __init__(self, *given):
+        super().__init__(*given)
+        self.activations, self.distances = self, []
+
+    def __call__(self, frame, *instances):
+        self.distances.append(float(frame[0, 0, 0]))
+        return super().__call__(frame, *instances)
+
+    def take(self):
+        taken, self.distances = np.array(self.distances), []
+        return taken
+
+
+class MonitoredSegmenter(Monitored, TrueSegmenter):
+    pass
+
+
+class MonitoredKeypoints(Monitored, TrueKeypoints):
+    pass
+
+
+def assert_same_tracking(one, other):
+    """Compare two results of tracking, except their durations."""
+    for name, value in vars(one.observations).items():
+        np.testing.assert_equal(value, getattr(other.observations, name), err_msg=name)
+    assert one[1:-1] == other[1:-1]

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 from support.interrupted import CONFIG as CONFIG_OF_A_COMMAND
 from support.interrupted import command, contents, toy_networks
-from support.toy_footage import BIRD, BIRDS, FRAMES, Footage, TrueKeypoints, TrueSegmenter
+from support.toy_footage import (
+    BIRD,
+    FRAMES,
+    MISSED,
+    Footage,
+    MonitoredKeypoints,
+    MonitoredSegmenter,
+    TrueKeypoints,
+    TrueSegmenter,
+    assert_same_tracking,
+)
 
 from jaxfit.cli.main import main
 from jaxfit.config.perception import FramesConfig, SegmenterConfig, TrackConfig, TrackerConfig
@@ -22,32 +32,7 @@ from jaxfit.workers.cluster import Cluster, open_cluster
 
 pytest.importorskip("distributed")
 FOOTAGE = Footage()
-MISSED = [(t, n) for t in (3, 4, 9) for n in range(BIRDS) if t != 4 or n != 1]
 CONFIG = TrackConfig(min_track_frames=2)
-
-
-class Monitored:
-    """A network whose activations have the number of the frame as distance."""
-
-    def __init__(self, *given):
-        super().__init__(*given)
-        self.activations, self.distances = self, []
-
-    def __call__(self, frame, *instances):
-        self.distances.append(float(frame[0, 0, 0]))
-        return super().__call__(frame, *instances)
-
-    def take(self):
-        taken, self.distances = np.array(self.distances), []
-        return taken
-
-
-class MonitoredSegmenter(Monitored, TrueSegmenter):
-    pass
-
-
-class MonitoredKeypoints(Monitored, TrueKeypoints):
-    pass
 
 
 def networks():
@@ -72,19 +57,12 @@ def _toy_networks(monkeypatch):
     worker_detections._networks.cache_clear()
 
 
-def same(one, other):
-    """Compare two results of tracking, except their durations."""
-    for name, value in vars(one.observations).items():
-        np.testing.assert_equal(value, getattr(other.observations, name), err_msg=name)
-    assert one[1:-1] == other[1:-1]
-
-
 @pytest.mark.parametrize("frames", [FramesConfig(), FramesConfig(1, 9, 1), FramesConfig(0, None, 2)])
 def test_tracks_are_those_of_one_process(video, workers, frames, tmp_path):
     config, stored = dataclasses.replace(CONFIG, frames=frames), (tmp_path / "a", tmp_path / "b")
     alone = run_tracking(video, config, *networks(), parts=Parts(stored[0], {}))
     together = run_tracking(video, config, *networks(), parts=Parts(stored[1], {}), cluster=workers)
-    same(together, alone)
+    assert_same_tracking(together, alone)
     assert [n in together.damaged_frames for n in (2, 6)] == [True, True]
     for file in sorted(stored[0].glob("*.npz")):
         one, other = np.load(file), np.load(stored[1] / file.name)
@@ -97,7 +75,7 @@ def test_an_interrupted_tracking_continues(video, workers, tmp_path):
     run_tracking(video, CONFIG, *networks(), parts=Parts(tmp_path / "p", {}), cluster=workers)
     parts = Parts(tmp_path / "p", {})
     parts.keep(1)
-    same(run_tracking(video, CONFIG, *networks(), parts=parts, cluster=workers), whole)
+    assert_same_tracking(run_tracking(video, CONFIG, *networks(), parts=parts, cluster=workers), whole)
 
 
 def test_results_that_arrive_in_another_order(video, workers):
@@ -105,7 +83,7 @@ def test_results_that_arrive_in_another_order(video, workers):
         def run(self, *given):
             return reversed(list(workers.run(*given)))
 
-    same(
+    assert_same_tracking(
         run_tracking(video, CONFIG, *networks(), cluster=Shuffled(lambda: None, "")),
         run_tracking(video, CONFIG, *networks()),
     )

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
+from jaxfit.perception.detections import Distances
 from jaxfit.perception.instances import Instance
 from jaxfit.perception.tracking.recorder import RecordedFrame
 from jaxfit.perception.tracking.tracker import Tracker
@@ -44,8 +44,7 @@ class FramePart(NamedTuple):
     frames: list[RecordedFrame]
     damaged: list[int]
     """Numbers of the damaged frames among these frames."""
-    distances: tuple[Float[np.ndarray, "S"], Float[np.ndarray, "P"]]
-    """Distances of the activations of the segmenter and of the keypoint network."""
+    distances: Distances
     is_last: bool
     """Whether the video ends with these frames."""
 
