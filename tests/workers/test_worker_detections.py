@@ -120,14 +120,16 @@ def test_files_that_a_worker_cannot_use(video, workers, tmp_path, monkeypatch):
         list(detections)
 
 
-def test_a_changed_network_is_loaded_again(tmp_path, monkeypatch):
+def test_a_changed_network_is_loaded_again(video, tmp_path, monkeypatch):
     """Workers of a cluster live long, and a training may write a network of the same name."""
     opened, file = [], tmp_path / "n.onnx"
-    monkeypatch.setattr(worker_detections, "open_segmenter", lambda config: opened.append(config))
+    monkeypatch.setattr(worker_detections, "network_files", lambda _: {"segmenter": [file]})
+    monkeypatch.setattr(worker_detections, "open_segmenter", lambda config: opened.append(config) or networks()[0])
     for content in (b"1", b"1", b"22"):
         if not file.exists() or file.read_bytes() != content:
             file.write_bytes(content)
-        worker_detections._networks(CONFIG, (worker_detections._state(file),))
+        detections = worker_detections.WorkerDetections(None, video, CONFIG, range(2), None)
+        assert len(worker_detections.detect_range(detections._shared, range(2)).frames) == 2
     assert len(opened) == 2
 
 
