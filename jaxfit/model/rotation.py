@@ -13,6 +13,7 @@ __all__ = [
     "matrix_to_axis_angle",
     "right_jacobian",
     "rotation_between",
+    "rotation_change",
     "safe_norm",
     "unwrap_axis_angle",
     "view_grid",
@@ -26,13 +27,7 @@ def axis_angle_to_matrix(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3
     R = I + a·[r]× + b·[r]×², a = sin θ/θ, b = (1 − cos θ)/θ².
     """
     a, b, _ = _rodrigues(axis_angle)
-    x, y, z = axis_angle[..., 0], axis_angle[..., 1], axis_angle[..., 2]
-    rows = [
-        [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-        [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
-        [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return _cross_polynomial(axis_angle, a, b)
 
 
 def right_jacobian(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
@@ -43,11 +38,19 @@ def right_jacobian(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
     Source: Solà et al. 2018, A micro Lie theory for state estimation in robotics, equation 143.
     """
     _, b, c = _rodrigues(axis_angle)
+    return _cross_polynomial(axis_angle, -b, c)
+
+
+def _cross_polynomial(
+    axis_angle: Float[Array, "*B 3"], linear: Float[Array, "*B"], quadratic: Float[Array, "*B"]
+) -> Float[Array, "*B 3 3"]:
+    """Return I + p·[r]× + q·[r]×² for an axis-angle r and the factors p and q."""
     x, y, z = axis_angle[..., 0], axis_angle[..., 1], axis_angle[..., 2]
+    p, q = linear, quadratic
     rows = [
-        [1 - c * (y * y + z * z), c * x * y + b * z, c * x * z - b * y],
-        [c * x * y - b * z, 1 - c * (x * x + z * z), c * y * z + b * x],
-        [c * x * z + b * y, c * y * z - b * x, 1 - c * (x * x + y * y)],
+        [1 - q * (y * y + z * z), q * x * y - p * z, q * x * z + p * y],
+        [q * x * y + p * z, 1 - q * (x * x + z * z), q * y * z - p * x],
+        [q * x * z - p * y, q * y * z + p * x, 1 - q * (x * x + y * y)],
     ]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
@@ -96,20 +99,57 @@ def _matrix_to_quaternion(R: Float[Array, "*B 3 3"]) -> Float[Array, "*B 4"]:
 
 
 def rotation_between(Ra: Float[Array, "*B 3 3"], Rb: Float[Array, "*B 3 3"]) -> Float[Array, "*B 3"]:
-    """Return an axis-angle whose norm is the angle between two rotations, in radians within [0, π].
+    """Return log(Raᵀ Rb): an axis-angle whose norm is the angle between two rotations, in radians within [0, π].
 
-    θ = atan2(‖v‖, 1 − ¼‖Rb − Ra‖²) with v = ½ Σ_k a_k × b_k, a_k and b_k the rows of Ra and Rb: ‖v‖ = sin θ, and v has
+    θ = atan2(‖v‖, 1 − ¼‖Rb − Ra‖²) with v = ½ Σ_k b_k × a_k, a_k and b_k the rows of Ra and Rb: ‖v‖ = sin θ, and v has
     the direction of the axis, in the frame of Ra's columns. In contrast to the arccos of the trace, this formula is
     precise at small angles and near π, and its gradient is finite everywhere.
     """
     difference = Rb - Ra  # used instead of Rb, so that the cross product of equal rotations is exactly 0
-    v = jnp.sum(jnp.cross(Ra, difference), axis=-2) / 2
+    v = jnp.sum(jnp.cross(difference, Ra), axis=-2) / 2
     sine, cosine = safe_norm(v), 1 - jnp.sum(difference**2, axis=(-2, -1)) / 4
     theta = jnp.arctan2(sine, cosine)
     no_axis = sine == 0
     ratio = jnp.where(no_axis, 1.0, theta / jnp.where(no_axis, 1.0, sine))
     any_axis = jnp.where(no_axis, theta, 0.0)[..., None] * jnp.array([1.0, 0.0, 0.0])  # for θ = 0 and θ = π
     return ratio[..., None] * v + any_axis
+
+
+@jax.custom_jvp
+def rotation_change(
+    before: Float[Array, "*B 3"] | np.ndarray, after: Float[Array, "*B 3"] | np.ndarray
+) -> Float[Array, "*B 3"]:
+    """Return log(R(a)ᵀ R(b)), the rotation from one axis-angle a to another b, as an axis-angle within [0, π].
+
+    The derivatives are two 3×3 matrices, −Jr⁻¹(−w)·Jr(a) and Jr⁻¹(w)·Jr(b) with the result w, in place of the chain of
+    the matrices and the logarithm: products with them cost half as much, and so does the compilation.
+
+    Source: Solà et al. 2018, A micro Lie theory for state estimation in robotics, equations 82 and 144.
+    """
+    return rotation_between(axis_angle_to_matrix(jnp.asarray(before)), axis_angle_to_matrix(jnp.asarray(after)))
+
+
+@rotation_change.defjvp
+def _rotation_change_jvp(primals, tangents):
+    before, after = primals
+    change = rotation_change(before, after)
+    of_before = -_inverse_right_jacobian(-change) @ right_jacobian(before)
+    of_after = _inverse_right_jacobian(change) @ right_jacobian(after)
+    pairs = zip((of_before, of_after), tangents, strict=True)
+    return change, sum(jnp.einsum("...ij,...j->...i", J, tangent) for J, tangent in pairs)
+
+
+def _inverse_right_jacobian(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
+    """Return Jr⁻¹ = I + ½·[r]× + d·[r]×² with d = 1/θ² − cot(θ/2)/(2θ), for θ within [0, π].
+
+    Source: Solà et al. 2018, equation 144, with (1 + cos θ)/sin θ = cot(θ/2), which is finite at π.
+    """
+    theta2 = jnp.sum(axis_angle**2, axis=-1)
+    small = theta2 < 0.06
+    theta = jnp.sqrt(jnp.where(small, 1.0, theta2))
+    series = 1 / 12 + theta2 / 720 + theta2**2 / 30240
+    d = jnp.where(small, series, (1 / theta - jnp.cos(theta / 2) / (2 * jnp.sin(theta / 2))) / theta)
+    return _cross_polynomial(axis_angle, jnp.full_like(d, 0.5), d)
 
 
 def geodesic_distance(Ra: Float[Array, "*B 3 3"], Rb: Float[Array, "*B 3 3"]) -> Float[Array, "*B"]:

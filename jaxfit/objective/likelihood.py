@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit.model.camera import project
-from jaxfit.model.rotation import rotation_between
+from jaxfit.model.rotation import rotation_change
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
 from jaxfit.objective.residuals import Residuals, Scalar, student_t
@@ -91,9 +91,9 @@ def motion_likelihood(
     complete = jnp.asarray(complete_runs(window.present, 2), jnp.float32)
     scale_rad = sd_rad_s2 * window.frame_s**2  # radians per frame²
 
-    def accelerations(rotations: Float[Array, "T *joints 3 3"]) -> Float[Array, "T-2 *joints 3"]:
-        return jnp.diff(rotation_between(rotations[:-1], rotations[1:]), axis=0) / scale_rad
+    def accelerations(axis_angles: Float[Array | np.ndarray, "T *joints 3"]) -> Float[Array, "T-2 *joints 3"]:
+        return jnp.diff(rotation_change(axis_angles[:-1], axis_angles[1:]), axis=0) / scale_rad
 
     kernel = student_t(dof, 3)
-    orient, joints = accelerations(window.R_camera_root), accelerations(window.R_parent_child)
+    orient, joints = accelerations(window.pose.global_orient), accelerations(window.pose.body_pose)
     return Residuals(orient, complete, kernel), Residuals(joints, complete[:, None], kernel)

@@ -12,7 +12,7 @@ import jax.scipy.fft
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfit.model.rotation import rotation_between
+from jaxfit.model.rotation import rotation_change
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
 from jaxfit.objective.residuals import NORM, Residuals, Scalar, huber
@@ -71,8 +71,8 @@ def _rotations_between_frames(
 ) -> tuple[Float[Array, "pairs 3"], Float[Array, "pairs bones 3"], Float[Array, "pairs"]]:
     """Return the rotations between consecutive frames of the global orientation and of each joint, as axis-angles, and
     1 for the pairs of frames that are both present, else 0."""
-    orient = rotation_between(window.R_camera_root[:-1], window.R_camera_root[1:])
-    joints = rotation_between(window.R_parent_child[:-1], window.R_parent_child[1:])
+    orient = rotation_change(window.pose.global_orient[:-1], window.pose.global_orient[1:])
+    joints = rotation_change(window.pose.body_pose[:-1], window.pose.body_pose[1:])
     return orient, joints, jnp.asarray(complete_runs(window.present, 1), jnp.float32)
 
 

@@ -12,6 +12,7 @@ from jaxfit.model.rotation import (
     axis_angle_to_matrix,
     geodesic_distance,
     matrix_to_axis_angle,
+    rotation_change,
     unwrap_axis_angle,
     view_grid,
     viewing_axis_rotations,
@@ -144,3 +145,22 @@ def test_the_view_grid_covers_so3(directions, turns):
     between = np.arccos(np.clip((np.einsum("aij,gij->ag", grid, grid) - 1) / 2, -1, 1))
     np.fill_diagonal(between, np.inf)
     assert between.min() > 0.5 * np.pi / turns, "two views are nearly equal"
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-4, 0.24, 0.25, 1.0, 3.0])
+@pytest.mark.parametrize("theta", [0.0, 0.7, 4.0])
+def test_changes_of_rotations_and_their_derivatives_agree_with_scipy(theta, angle):
+    before = theta * np.array([0.6, -0.48, 0.64])
+    start = Rotation.from_rotvec(before)
+    after = (start * Rotation.from_rotvec(angle * np.array([0.48, 0.6, 0.64]))).as_rotvec()
+
+    def change(both):
+        return (Rotation.from_rotvec(both[:, :3]).inv() * Rotation.from_rotvec(both[:, 3:])).as_rotvec()
+
+    step, both = 1e-5, np.concatenate([before, after])
+    ahead, behind = (change(both + sign * step * np.eye(6)) for sign in (1, -1))
+    given = jnp.asarray(before, jnp.float32), jnp.asarray(after, jnp.float32)
+    np.testing.assert_allclose(rotation_change(*given), change(both[None])[0], atol=3e-6)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        J = np.concatenate(derivative(rotation_change, (0, 1))(*given), axis=-1)
+        np.testing.assert_allclose(J, ((ahead - behind) / (2 * step)).T, atol=3e-4)
