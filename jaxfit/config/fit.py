@@ -134,9 +134,9 @@ class FitConfig:
     """Number of frames that are fitted together; longer tracks are cut into windows, and 1 fits every frame alone;
     at most 10,000."""
     overlap: int = 0
-    """Number of frames that consecutive windows of a track share, at most half of `window`. The poses of these frames
-    pass gradually from one window to the next, so that a bird does not jump from window to window. 0: windows follow
-    each other."""
+    """Number of frames that consecutive windows of a track share; never more than half of `window`. The poses of these
+    frames pass gradually from one window to the next, so that a bird does not jump from window to window. 0: windows
+    follow each other."""
     common_size: bool = True
     """Whether one scale holds for the whole window, instead of one scale per frame."""
     filter_window: int = 5
@@ -160,8 +160,7 @@ class FitConfig:
 
     def __post_init__(self):
         require_within(self, 1, limits.WINDOW_FRAMES, "window")
-        problem = f"is {self.overlap}, and `window` is {self.window}"
-        require(0 <= self.overlap <= self.window // 2, "overlap", problem, "expected 0 to half of `window`")
+        require_within(self, 0, limits.WINDOW_FRAMES, "overlap")
         require_within(self, 0, limits.GROW_MASKS_PX, "grow_masks_px")
         require_within(self, 1, limits.KEYPOINTS, "min_keypoints")
         require_within(self, 1, limits.FILTER_FRAMES, "filter_window")
@@ -178,6 +177,11 @@ class FitConfig:
                 adam = stage.solver == self.stages[max(i - 1, 0)].solver == "adam"
                 remedy = "this stage and the previous stage must both use Adam"
                 require(adam, f"stages[{i}].carry_moments", "is true", remedy)
+
+    @property
+    def overlap_frames(self) -> int:
+        """Number of frames that consecutive windows share: `overlap`, or half of a shorter window."""
+        return min(self.overlap, self.window // 2)
 
     def stage_settings(self, stage: StageConfig) -> dict[str, dict[str, float]]:
         """Return the weight and settings of each term of a stage: defaults, `terms`, then the stage's `override`."""

@@ -45,7 +45,7 @@ def refit(
     Two windows are equal if they have the same frames, crops, filtered keypoints, confidences and masks. The fit of a
     window does not depend on other windows, so the result is that of a fit of all corrected observations. The poses of
     an equal window are copied bit by bit, also if its track has another number now. Where windows share frames
-    (`overlap`), only tracks whose windows are all equal are copied.
+    (`overlap`), a window is copied only if its neighbours are equal too.
 
     Args:
         solution: the earlier result.
@@ -67,8 +67,8 @@ def refit(
     old, new = windows_of(before, config, source), windows_of(after, config, source)
     rows = {window_hash(old, w): w for w in range(len(old))}
     source_row = np.array([rows.get(window_hash(new, w), -1) for w in range(len(new))])
-    if config.overlap:
-        source_row = _whole_tracks(source_row, old, new)
+    if config.overlap_frames:
+        source_row = _with_equal_neighbours(source_row, old, new)
     touched = np.flatnonzero(source_row < 0)
     result = _empty(solution, after)
     if len(touched):
@@ -110,16 +110,22 @@ def refit(
     return Refit(merged, fitted, len(new))
 
 
-def _whole_tracks(source_row: np.ndarray, old: Windows, new: Windows) -> np.ndarray:
-    """Keep the rows of tracks whose windows are all windows of one earlier track, −1 for others.
+def _with_equal_neighbours(source_row: np.ndarray, old: Windows, new: Windows) -> np.ndarray:
+    """Keep the rows of windows whose neighbours in their track were their neighbours before; −1 for other windows.
 
     Where windows share frames, the poses of a window depend on its neighbours.
     """
-    kept = np.full(len(source_row), -1)
-    for n in np.unique(new.track):
-        rows = source_row[new.track == n]
-        if (rows >= 0).all() and np.array_equal(rows, np.flatnonzero(old.track == old.track[rows[0]])):
-            kept[new.track == n] = rows
+
+    def neighbour(windows: Windows, w: int, step: int) -> int:
+        inside = 0 <= w + step < len(windows)
+        return w + step if inside and windows.track[w + step] == windows.track[w] else -1
+
+    kept = source_row.copy()
+    for w in np.flatnonzero(source_row >= 0).tolist():
+        for step in (-1, 1):
+            before, now = neighbour(old, int(source_row[w]), step), neighbour(new, w, step)
+            if before != (source_row[now] if now >= 0 else -1) or (before < 0) != (now < 0):
+                kept[w] = -1
     return kept
 
 

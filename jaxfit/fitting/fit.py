@@ -169,7 +169,7 @@ def _final_results(
 ) -> list[FittedWindow]:
     """Take the result of every window of run `r` out of `results`, blended where windows share frames."""
     own = [results.pop((r, w)) for w in range(len(run.windows))]
-    return blend_seams(run.windows, own, model) if run.config.overlap else own
+    return blend_seams(run.windows, own, model) if run.config.overlap_frames else own
 
 
 def _without_mask_stages(configs: Sequence[FitConfig], source: object) -> list[FitConfig]:
@@ -222,7 +222,7 @@ def _cut_runs(
         if key not in windows:
             windows[key] = windows_of(observations, config, source)
             if initial_poses is not None:
-                if config.overlap and initial_poses.crop is not None:
+                if config.overlap_frames and initial_poses.crop is not None:
                     problem = "holds one crop for every frame, but windows that share a frame have two"
                     raise InputError(
                         initial_poses.source, problem, "set `overlap: 0` in the config, or leave out --init"

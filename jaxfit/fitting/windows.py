@@ -73,7 +73,7 @@ class Windows:
 
 def windows_key(config: FitConfig) -> tuple:
     """Return the part of the config that determines the windows and their targets."""
-    frames = config.filter_window, config.window, config.overlap, config.min_keypoints
+    frames = config.filter_window, config.window, config.overlap_frames, config.min_keypoints
     return *frames, config.crop, config.unknown_pixels, config.grow_masks_px
 
 
@@ -93,7 +93,7 @@ def window_hash(windows: Windows, w: int) -> str:
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     """Cut every track into windows of `config.window` frames, from its first usable frame on.
 
-    Consecutive windows share `config.overlap` frame numbers.
+    Consecutive windows share `config.overlap_frames` frame numbers.
 
     Frames with a box or a keypoint far outside the image (`distant_birds`) are not usable. Then the keypoints are
     filtered. The frames of a window have consecutive frame numbers: if the file skips frame
@@ -108,9 +108,9 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
         at = np.flatnonzero((line >= 0) & usable[n, np.maximum(line, 0)])
         if len(at) == 0:
             continue
-        stride = config.window - config.overlap
+        stride = config.window - config.overlap_frames
         # only windows with a usable frame that no earlier window has
-        wanted = np.unique(np.maximum(at - at[0] - config.overlap, 0) // stride)
+        wanted = np.unique(np.maximum(at - at[0] - config.overlap_frames, 0) // stride)
         starts += [(n, int(at[0]) + w * stride, int(at[-1])) for w in wanted.tolist()]
     needed = len(starts) * config.window * (80 + 60 * observations.num_keypoints)
     what = f"the arrays of {len(starts):,} windows of {config.window:,} frames"

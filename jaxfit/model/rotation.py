@@ -135,8 +135,10 @@ def _rotation_change_jvp(primals, tangents):
     change = rotation_change(before, after)
     of_before = -_inverse_right_jacobian(-change) @ right_jacobian(before)
     of_after = _inverse_right_jacobian(change) @ right_jacobian(after)
-    pairs = zip((of_before, of_after), tangents, strict=True)
-    return change, sum(jnp.einsum("...ij,...j->...i", J, tangent) for J, tangent in pairs)
+    d_before, d_after = tangents
+    return change, jnp.einsum("...ij,...j->...i", of_before, d_before) + jnp.einsum(
+        "...ij,...j->...i", of_after, d_after
+    )
 
 
 def _inverse_right_jacobian(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:

@@ -1,5 +1,6 @@
 """Corrections of tracks: only changed windows are fitted again, and the result is that of a fit of all windows."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -60,6 +61,28 @@ def test_only_changed_windows_are_fitted_again(folder, tmp_path, monkeypatch, ca
     assert summary["video"] == {"file": "clip.mp4"}
     stored = jaxfit.read_coco(tmp_path / "out" / "observations.json")
     np.testing.assert_array_equal(stored.keypoints_px, corrected.select(np.argsort(corrected.track_id)).keypoints_px)
+
+
+@pytest.mark.parametrize(
+    ("edit", "fitted"),
+    [
+        # windows begin at frames 100, 104, 108 and 112; the window beside a changed window is fitted again, too
+        (Edit("cut", (2,), 115), {(2, 108, 113), (2, 112, 114), (6, 115, 116)}),
+        # the second part begins where a window began that shared frames with an earlier window
+        pytest.param(Edit("cut", (4,), 108), None, marks=pytest.mark.extended),
+        pytest.param(Edit("swap", (2, 4)), set(), marks=pytest.mark.extended),
+    ],
+)
+def test_windows_that_share_frames_are_fitted_with_their_neighbours(tmp_path, edit, fitted):
+    shared = dataclasses.replace(CONFIG, overlap=2, filter_window=1)
+    write(tmp_path / "result", shared)
+    done = correct_tracks(tmp_path / "result", tmp_path / "out", [edit])
+    assert fitted is None or set(done.fitted) == fitted
+    assert len(done.fitted) < done.windows
+    read, _ = jaxfit.load_solution(tmp_path / "out")
+    expected = jaxfit.fit(apply_edits(observations(), [edit], "observations"), BIRD, shared)
+    for name in ("track_id", "status", *CELLS):
+        np.testing.assert_array_equal(getattr(read, name), getattr(expected, name), err_msg=name)
 
 
 def test_edits_move_birds():

@@ -42,10 +42,11 @@ def test_windows_share_frames():
 
 
 def test_the_overlap_is_at_most_half_of_the_window():
-    for overlap in (-1, 4):
-        with pytest.raises(ConfigKeyError, match="expected 0 to half of `window`"):
-            dataclasses.replace(CONFIG, overlap=overlap)
-    assert config(window=1).overlap == 0
+    half = cut_windows(observations(), dataclasses.replace(CONFIG, overlap=20))
+    assert half.frame[:5, 0].tolist() == [0, 3, 6, 9, 12]  # windows of 6 frames
+    assert config(window=1, overlap=20).overlap_frames == 0
+    with pytest.raises(ConfigKeyError, match="expected 0 to 10,000"):
+        dataclasses.replace(CONFIG, overlap=-1)
 
 
 def windows_of_two():

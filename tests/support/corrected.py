@@ -37,9 +37,9 @@ def observations() -> Observations:
     )
 
 
-def write(folder):
+def write(folder, settings=CONFIG):
     """Write the result folder of a fit of the observations."""
     observed = observations()
-    solution = jaxfit.fit(observed, BIRD, CONFIG)
-    jaxfit.save_solution(solution, BIRD, config_to_yaml(CONFIG), {"video": {"file": "clip.mp4"}}, folder)
+    solution = jaxfit.fit(observed, BIRD, settings)
+    jaxfit.save_solution(solution, BIRD, config_to_yaml(settings), {"video": {"file": "clip.mp4"}}, folder)
     jaxfit.write_coco(observed, folder / "observations.json")
