@@ -24,8 +24,9 @@ from jaxfit.storage.reading import check_folder
 
 __all__ = ["FORMAT_VERSION", "LAYOUT", "Solution", "check_poses", "load_solution", "save_solution", "write_solution"]
 
-FORMAT_VERSION = 3
-"""Version of ``poses.npz``; increased when its arrays change. Version 2 lacks `timestamp_s` and `fps`."""
+FORMAT_VERSION = 4
+"""Version of ``poses.npz``; increased when its arrays change. Version 3 lacks `ambiguity_deg`, version 2 also lacks
+`timestamp_s` and `fps`."""
 _OLDEST_VERSION = 2
 """Older versions are not read."""
 
@@ -54,6 +55,7 @@ LAYOUT = {
     "keypoint_names": ("K", np.str_),
     "joint_names": ("J", np.str_),
     "status": ("N", np.str_),
+    "ambiguity_deg": ("N T", np.float32),
 }
 
 
@@ -117,8 +119,14 @@ class Solution:
     fps: float | None = None
     """Mean frame rate of the whole video in frames per second, as its container states; None if unknown."""
 
+    ambiguity_deg: np.ndarray | None = None
+    """(N, T) float32: angle between the orientation and that of another pose that explains the keypoints almost as well
+    (at most 20 times less likely, median angle above 45°); 0 where the fit found no such pose. Only fits with more than
+    one hypothesis search for other poses. None means 0 everywhere."""
+
     def __post_init__(self):
-        arrays = validate_arrays(vars(self), LAYOUT)
+        ambiguity_deg = np.zeros(np.shape(self.valid), np.float32) if self.ambiguity_deg is None else self.ambiguity_deg
+        arrays = validate_arrays(vars(self) | {"ambiguity_deg": ambiguity_deg}, LAYOUT)
         if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
             bones = arrays["body_pose"].shape[2]
             raise ValueError(f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}")
@@ -253,8 +261,8 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     path = folder / _POSES
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
-    times = {name: shape for name, (shape, _) in _TIMES.items()}
-    arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=times)
+    optional = {name: shape for name, (shape, _) in _TIMES.items()} | {"ambiguity_deg": shapes.pop("ambiguity_deg")}
+    arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
     arrays |= {name: arrays[name].item() for name in _CAMERA}
     arrays |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays.pop("loss_terms"), arrays.pop("loss")

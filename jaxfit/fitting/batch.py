@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
+from scipy.spatial.transform import Rotation
 
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.diagnose import name_failures
@@ -25,6 +26,10 @@ from jaxfit.progress import ReportProgress
 
 __all__ = ["Batch", "Fitted", "bytes_per_frame", "fit_batch", "frames_per_batch"]
 
+LIKELIHOOD_RATIO = 20.0
+"""A hypothesis is reported if the best hypothesis is less than this many times as likely."""
+LEAST_ANGLE_DEG = 45.0
+"""Hypotheses whose orientations differ by a smaller angle (median over the frames) are one pose."""
 SECONDS_PER_CALL = 1.0
 """Target duration of some steps of all tiles. After these steps, progress is reported."""
 
@@ -65,6 +70,8 @@ class Fitted(NamedTuple):
     report: Report
     failure: np.ndarray
     """(B,) text: the terms that were not finite, and the step of the failure; empty without failure."""
+    ambiguity_deg: Float[np.ndarray, "B T"]
+    """As `Solution.ambiguity_deg`."""
 
 
 class _Rows(NamedTuple):
@@ -75,6 +82,8 @@ class _Rows(NamedTuple):
     """The solver's state after the previous stage; None before the first stage."""
     failure: np.ndarray
     """(R·H,) text as in `Fitted`."""
+    ambiguity_deg: Float[np.ndarray, "RH T"]
+    """As in `Fitted`; 0 before hypotheses are compared."""
     row: Int[np.ndarray, "B"]
     """Row of each problem of the batch."""
     hypotheses: int
@@ -116,17 +125,19 @@ def fit_batch(model: FitModel, configs: Sequence[FitConfig], batch: Batch, repor
         if i == last:
             step = np.where(np.isfinite(sum(final.loss.values())), 0, stage.steps)
             rows = _name_failures(program, tiles, rows, step, stage)
-        best = _best_hypotheses(final, rows.hypotheses)
-        kept = rows.pose, rows.solver, rows.failure, final
-        pose, solver, failure, final = jax.tree.map(lambda x, best=best: x[best], kept)
-        rows = _Rows(pose, solver, failure, rows.row, 1)
-    return Fitted(*jax.tree.map(lambda x: x[rows.row], (rows.pose, final, rows.failure)))
+        rows, best = _compare_hypotheses(rows, final)
+        kept = rows.pose, rows.solver, rows.failure, rows.ambiguity_deg, final
+        pose, solver, failure, ambiguity_deg, final = jax.tree.map(lambda x, best=best: x[best], kept)
+        rows = _Rows(pose, solver, failure, ambiguity_deg, rows.row, 1)
+    return Fitted(*jax.tree.map(lambda x: x[rows.row], (rows.pose, final, rows.failure, rows.ambiguity_deg)))
 
 
 def _initial_rows(batch: Batch) -> _Rows:
     count, hypotheses = batch.initial_pose.global_orient.shape[:2]
     pose = jax.tree.map(lambda x: np.asarray(x).reshape(count * hypotheses, *x.shape[2:]), batch.initial_pose)
-    return _Rows(pose, None, np.full(count * hypotheses, "", object), batch.pose_row, hypotheses)
+    failure = np.full(count * hypotheses, "", object)
+    ambiguity_deg = np.zeros(pose.global_orient.shape[:2], np.float32)
+    return _Rows(pose, None, failure, ambiguity_deg, batch.pose_row, hypotheses)
 
 
 def _split_rows(
@@ -145,8 +156,9 @@ def _split_rows(
     row = np.array([new_rows.setdefault((old_row, content[config]), len(new_rows)) for old_row, config in pairs])
     first = np.unique(row, return_index=True)[1]  # the first problem of each row
     source = (rows.row[first][:, None] * rows.hypotheses + np.arange(rows.hypotheses)).ravel()
-    pose, solver, failure = jax.tree.map(lambda x: x[source], (rows.pose, rows.solver, rows.failure))
-    return _Rows(pose, solver, failure, row, rows.hypotheses), batch.config[first], batch.targets_row[first]
+    split = rows.pose, rows.solver, rows.failure, rows.ambiguity_deg
+    split = _Rows(*jax.tree.map(lambda x: x[source], split), row, rows.hypotheses)
+    return split, batch.config[first], batch.targets_row[first]
 
 
 def _stage_tiles(
@@ -230,8 +242,26 @@ def _name_failures(
     return rows._replace(failure=failure)
 
 
-def _best_hypotheses(final: Report, hypotheses: int) -> Int[np.ndarray, "R"]:
-    """Return the position of the best hypothesis of every row. A hypothesis that is not finite is never the best."""
-    total = np.sum(list(final.loss.values()), axis=0).reshape(-1, hypotheses)
-    best = np.argmin(np.where(np.isfinite(total), total, np.inf), axis=1)
-    return np.arange(len(total)) * hypotheses + best
+def _compare_hypotheses(rows: _Rows, final: Report) -> tuple[_Rows, Int[np.ndarray, "R"]]:
+    """Return the rows with the ambiguity of their best hypothesis, and the position of each best hypothesis.
+
+    A hypothesis that is not finite is never the best.
+    """
+    total = np.sum(list(final.loss.values()), axis=0).reshape(-1, rows.hypotheses)
+    total = np.where(np.isfinite(total), total, np.inf)
+    of_row = np.argmin(total, axis=1)
+    best = np.arange(len(total)) * rows.hypotheses + of_row
+    if rows.hypotheses == 1:
+        return rows, best
+    orient = np.asarray(rows.pose.global_orient, np.float64)
+    pairs = orient.reshape(-1, 3), np.repeat(orient[best], rows.hypotheses, axis=0).reshape(-1, 3)
+    own, of_best = (Rotation.from_rotvec(each) for each in pairs)
+    angle_deg = np.rad2deg((own.inv() * of_best).magnitude()).reshape(orient.shape[:2])
+    is_other_pose = np.median(angle_deg, axis=1).reshape(total.shape) > LEAST_ANGLE_DEG
+    others = np.where(is_other_pose, total, np.inf)
+    second = np.argmin(others, axis=1)
+    with np.errstate(invalid="ignore"):  # no finite hypothesis
+        is_near = others.min(axis=1) - total.min(axis=1) < np.log(LIKELIHOOD_RATIO)
+    ambiguity_deg = rows.ambiguity_deg.copy()
+    ambiguity_deg[best[is_near]] = angle_deg[(best - of_row + second)[is_near]]
+    return rows._replace(ambiguity_deg=ambiguity_deg), best

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxfit.data.ambiguity import ambiguous_frames
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import Fitted
@@ -34,6 +35,8 @@ class FittedWindow(NamedTuple):
     """(T, K, 2) crop pixels."""
     failure: str
     """Reason why the fit diverged; empty if the fit did not diverge."""
+    ambiguity_deg: np.ndarray
+    """(T,) as `Solution.ambiguity_deg`."""
 
 
 def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
@@ -44,7 +47,8 @@ def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
     failure = str(fitted.failure[i])
     if not failure and not (pose.scale > 0).all():  # a solver may step across 0
         failure = "the size of the bird is not above 0"
-    return FittedWindow(pose, loss, report.keypoints_cam, report.keypoints_px, failure)
+    ambiguity_deg = fitted.ambiguity_deg[i].copy()
+    return FittedWindow(pose, loss, report.keypoints_cam, report.keypoints_px, failure, ambiguity_deg)
 
 
 def collect_windows(
@@ -88,6 +92,7 @@ def collect_windows(
         "keypoints_cam": (keypoints, 3),
         "keypoints_px": (keypoints, 2),
         "crop": (3,),
+        "ambiguity_deg": (),
     }
     arrays = {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
     valid = np.zeros((birds, frames), bool)
@@ -117,7 +122,7 @@ def collect_windows(
     for array in (valid, image_size_px, *arrays.values()):
         array.flags.writeable = False  # so that `Solution` needs no copy
     counts = zip(fitted.tolist(), diverged.tolist(), strict=True)
-    return Solution(
+    solution = Solution(
         track_id=observations.track_id,
         frame_index=observations.frame_index,
         valid=valid,
@@ -133,6 +138,10 @@ def collect_windows(
         timestamp_s=observations.timestamp_s,
         fps=observations.fps,
     )
+    for track, texts in ambiguous_frames(solution).items():
+        for text in texts:
+            _logger.warning("track %d, %s", track, text)
+    return solution
 
 
 def _frame_values(
@@ -154,6 +163,7 @@ def _frame_values(
         "keypoints_cam": result.keypoints_cam[present] / factor[:, None, None],
         "keypoints_px": crop_to_image(result.keypoints_px[present], crop, camera.size_px),
         "crop": crop,
+        "ambiguity_deg": result.ambiguity_deg[present],
     }
 
 

@@ -32,6 +32,7 @@ _LAYOUT = {
     "loss_terms": "L",
     "keypoints_cam": "W T K 3",
     "keypoints_px": "W T K 2",
+    "ambiguity_deg": "W T",
     **_POSE,
 }
 
@@ -72,6 +73,7 @@ class StoredWindows:
                     arrays["keypoints_cam"][i],
                     arrays["keypoints_px"][i],
                     str(arrays["failure"][i]),
+                    arrays["ambiguity_deg"][i],
                 )
                 found |= {w: result for w in rows.get(content, ())}
         self._count = len(found)
@@ -94,6 +96,7 @@ class StoredWindows:
                 "loss_terms": np.array(list(some[0].loss)),
                 "keypoints_cam": np.stack([result.keypoints_cam for result in some]),
                 "keypoints_px": np.stack([result.keypoints_px for result in some]),
+                "ambiguity_deg": np.stack([result.ambiguity_deg for result in some]),
                 **poses,
             }
         )

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.ambiguity import ambiguous_frames
 from jaxfit.data.solution import Solution
 from jaxfit.extras import LIBRARIES, library_versions
 from jaxfit.model.bird import Bird
@@ -17,7 +18,7 @@ __all__ = ["summarise"]
 
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
-    """Return the content of `summary.json`: counts, status, failures and loss of every track, timings, model, versions.
+    """Return the content of `summary.json`: counts, status, failures, second poses and loss of every track, timings, …
 
     Args:
         solution: the result.
@@ -32,6 +33,7 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         "status": dict(Counter(str(status) for status in solution.status)),
         "track_status": {int(t): str(s) for t, s in zip(solution.track_id, solution.status, strict=True)},
         "failures": solution.failures,
+        "ambiguous": ambiguous_frames(solution),
         "loss": {name: np.asarray(value).tolist() for name, value in solution.loss.items()},
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "model": {"name": bird.name, "hash": model_hash(bird)},

@@ -95,7 +95,7 @@ def failed_windows(model: FitModel, config: FitConfig, count: int, failure: str)
     T, K = config.window, model.bird.num_keypoints
     pose = jax.tree.map(lambda x: nothing(*np.shape(x)), rest_pose(model.bird, T, config.common_size))
     loss = dict.fromkeys(sorted(config.stages[-1].terms), float("nan"))
-    return [FittedWindow(pose, loss, nothing(T, K, 3), nothing(T, K, 2), failure)] * count
+    return [FittedWindow(pose, loss, nothing(T, K, 3), nothing(T, K, 2), failure, nothing(T))] * count
 
 
 def initial_poses_of(windows: Windows, config: FitConfig, model: FitModel) -> Pose:

@@ -52,6 +52,12 @@ def warnings_of(report: Report) -> list[Warned]:
     if problems:
         text = "Windows of frames whose fit diverged, and frames that were skipped, have no pose."
         warned.append(Warned(counted(len(problems), "problem") + " of the fit", text, problems))
+    ambiguous = tuple(f"bird {track.track_id}: {text}" for track in report.tracks for text in track.ambiguous)
+    if ambiguous:
+        text = (
+            "Two different poses explain the keypoints of these frames almost as well. The result holds the better one."
+        )
+        warned.append(Warned("Frames with a second pose", text, ambiguous))
     if report.damaged:
         text = f"{counted(len(report.damaged), 'frame')} of the video could not be decoded: {numbers(report.damaged)}."
         warned.append(Warned("Damaged frames", text))

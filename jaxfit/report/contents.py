@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.data.ambiguity import ambiguous_frames
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.observations import Observations
@@ -44,6 +45,8 @@ class Track:
     """Size in the image relative to the median of the track; NaN without a pose."""
     problems: tuple[str, ...]
     """Texts about skipped frames and diverged windows."""
+    ambiguous: tuple[str, ...]
+    """Texts about frames with a second pose (`ambiguous_frames`)."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,7 @@ def _tracks(
     rows = {} if observations is None else {track: n for n, track in enumerate(observations.track_id.tolist())}
     size = _image_size(solution)
     total = np.sum(list(solution.loss.values()), axis=0) if solution.loss else np.full(len(solution.track_id), np.nan)
+    ambiguous = ambiguous_frames(solution)
     tracks = []
     for n, track_id in enumerate(solution.track_id.tolist()):
         valid, present, confidence = solution.valid[n], solution.valid[n], None
@@ -190,6 +194,7 @@ def _tracks(
                 confidence=confidence,
                 size=np.where(valid, size[n] / median, np.nan),
                 problems=problems.get(str(track_id), ()),
+                ambiguous=ambiguous.get(track_id, ()),
             )
         )
     return tracks

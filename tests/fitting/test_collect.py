@@ -32,7 +32,7 @@ def results(common_size):
         changed = dataclasses.replace(motion, scale=sizes, transl=np.asarray(motion.transl) * size)
         pose = Pose(**{name: np.asarray(value, np.float32) for name, value in vars(changed).items()})
         points_cam, points_px = (np.asarray(each) for each in _keypoints(MODEL, pose))
-        found.append(FittedWindow(pose, {"keypoints": 1.0}, points_cam, points_px, ""))
+        found.append(FittedWindow(pose, {"keypoints": 1.0}, points_cam, points_px, "", np.zeros(6, np.float32)))
     return found
 
 

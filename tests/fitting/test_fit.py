@@ -261,22 +261,38 @@ def test_reported_progress_sums_to_the_total(observed):
     assert any(note.startswith("mask: loss ") for _, note in reports[1:])
 
 
+def fit_two_hypotheses(observed, settings, order):
+    """Fit one window from the correct initial pose and from the reversed pose."""
+    windows, truth = cut_windows(observed, settings)[:1], truths()[0]
+    reversed_R = Rotation.from_rotvec([0, 0, np.pi]) * Rotation.from_rotvec(truth.global_orient)
+    flipped = dataclasses.replace(truth, global_orient=reversed_R.as_rotvec().astype(np.float32))
+    initial_pose = jax.tree.map(lambda *x: np.stack(x)[None], *(truth, flipped)[::order])
+    batch = Batch(load_targets(windows, SIZE), initial_pose, *np.zeros((3, 1), int))
+    return fit_batch(fit_model(BIRD, settings), [settings], batch, lambda *_: None)
+
+
+def two_stages(keep_first):
+    keypoints_only = config(steps=(30, 5))
+    first = dataclasses.replace(keypoints_only.stages[0], keep_best=keep_first)
+    second = dataclasses.replace(first, name="on", steps=5, keep_best=False, carry_moments=True)
+    return dataclasses.replace(keypoints_only, stages=(first, second))
+
+
 @pytest.mark.parametrize("after_first", [True, False])
 def test_the_better_hypothesis_is_kept(observed, after_first):
     """One initial pose is correct, the other is reversed: the fit keeps the correct pose, in either order."""
-    keypoints_only = config(steps=(30, 5))
-    first = dataclasses.replace(keypoints_only.stages[0], keep_best=after_first)
-    second = dataclasses.replace(first, name="on", steps=5, keep_best=False, carry_moments=True)
-    settings = dataclasses.replace(keypoints_only, stages=(first, second))
-    windows = cut_windows(observed, settings)[:1]
-    targets, truth = load_targets(windows, SIZE), truths()[0]
-    reversed_R = Rotation.from_rotvec([0, 0, np.pi]) * Rotation.from_rotvec(truth.global_orient)
-    flipped = dataclasses.replace(truth, global_orient=reversed_R.as_rotvec().astype(np.float32))
-    for hypotheses in ((truth, flipped), (flipped, truth)):
-        initial_pose = jax.tree.map(lambda *x: np.stack(x)[None], *hypotheses)
-        batch = Batch(targets, initial_pose, *np.zeros((3, 1), int))
-        fitted = fit_batch(fit_model(BIRD, settings), [settings], batch, lambda *_: None)
+    for order in (1, -1):
+        fitted = fit_two_hypotheses(observed, two_stages(after_first), order)
         assert fitted.pose.global_orient.shape == (1, T, 3)
         assert not any(fitted.failure)
-        error_px = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of([truth]), axis=-1)
+        error_px = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of(truths()[:1]), axis=-1)
         assert error_px.mean() < 0.25
+        assert not fitted.ambiguity_deg.any()  # the reversed pose is much less likely
+
+
+@pytest.mark.parametrize("after_first", [True, False])
+def test_a_second_pose_that_is_almost_as_likely_is_reported(observed, after_first):
+    settings = two_stages(after_first)
+    weak = dataclasses.replace(settings, terms=dict.fromkeys(settings.terms, 1e-7))
+    for order in (1, -1):
+        assert fit_two_hypotheses(observed, weak, order).ambiguity_deg.min() > 150

@@ -62,7 +62,9 @@ def windows_of_two():
 def result_of(pose, failure=""):
     pose = Pose(**{name: np.asarray(value, np.float32) for name, value in vars(pose).items()})
     points_cam, points_px = (np.asarray(each) for each in _keypoints(MODEL, pose))
-    return FittedWindow(pose, {"keypoints": 1.0}, points_cam, points_px, failure)
+    return FittedWindow(
+        pose, {"keypoints": 1.0}, points_cam, points_px, failure, np.zeros(len(pose.transl), np.float32)
+    )
 
 
 def two_results(turn=None):

@@ -189,8 +189,8 @@ def test_long_footage_has_several_frames_in_a_column(folder, made):
 
 
 def test_warnings_name_what_was_skipped(folder, made):
-    def titles(**summary):
-        fitted = dataclasses.replace(made, status=np.full(3, "ok"))
+    def titles(ambiguity_deg=None, **summary):
+        fitted = dataclasses.replace(made, status=np.full(3, "ok"), ambiguity_deg=ambiguity_deg)
         return [(each.title, each.text) for each in warnings_of(gather(fitted, None, summary, "", folder))]
 
     assert titles() == []
@@ -199,6 +199,8 @@ def test_warnings_name_what_was_skipped(folder, made):
     assert text.endswith("10 (2), 11 (2) and 8 more.")
     assert titles(low_score_tracks={"6": 0.6})[0][1].endswith("6 (0.60).")
     assert titles(failures={"7": ["frames 12 to 14: not finite"]})[0][0] == "1 problem of the fit"
+    ((title, _),) = titles(ambiguity_deg=np.full(made.valid.shape, 170.0))
+    assert title == "Frames with a second pose"
     assert titles(video={"damaged": [3, 4]})[0][1] == "2 frames of the video could not be decoded: 3, 4."
 
 

@@ -31,7 +31,8 @@ def quick_fit(shared, task, _report_progress=None):
         (empty,) = failed_windows(shared.model, run.config, 1, "")
         filled = jax.tree.map(lambda x, value=value: np.full_like(x, value), empty.pose)
         points = np.full_like(empty.keypoints_cam, value), np.full_like(empty.keypoints_px, value)
-        results.append(FittedWindow(filled, dict.fromkeys(empty.loss, float(value)), *points, ""))
+        angle_deg = np.full_like(empty.ambiguity_deg, value)
+        results.append(FittedWindow(filled, dict.fromkeys(empty.loss, float(value)), *points, "", angle_deg))
     return results
 
 
