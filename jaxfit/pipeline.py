@@ -18,13 +18,14 @@ from jaxfit.data.track_quality import track_quality
 from jaxfit.errors import InputError
 from jaxfit.extras import TRACKING_LIBRARIES, library_versions
 from jaxfit.fitting.fit import fit
+from jaxfit.fitting.provisional import ProvisionalFit
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.summary import summarise
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.opening import check_segmenter, network_files, open_keypoint_detector
-from jaxfit.perception.track import TrackingResult, run_tracking
+from jaxfit.perception.track import ObservationsFrom, TrackingResult, run_tracking
 from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.pipeline_record import file_hashes, fit_record, tracking_record
 from jaxfit.progress import ProgressTask, annotated, silent
@@ -114,23 +115,37 @@ def reconstruct(
         check_keypoints(empty, bird.keypoint_names, config.track.keypoints.file)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
-            stored, shown = None, progress
+            stored, workers = None, None
             if not any(replaced.values()):
                 stored = Parts(unfinished / "frames", tracking_record(config.track, video, networks, progress))
-                shown = annotated(progress, lambda parts=stored: f"{parts.size_bytes / 1e6:.1f} MB stored")
-            workers = None if any(replaced.values()) else cluster
-            more = {"progress": shown, "parts": stored, "cluster": workers}
-            tracking = run_tracking(video, config.track, segmenter, keypoints, **more)
+                workers = cluster
+            window_parts = Parts(unfinished / "windows", fit_record(config.fit, bird))
+            windows = StoredWindows(window_parts)
+
+            def disk_used() -> str:
+                size_bytes = window_parts.size_bytes + (0 if stored is None else stored.size_bytes)
+                return f"{size_bytes / 1e6:.1f} MB stored"
+
+            fit_progress = annotated(progress, lambda: f"{windows.state}, {disk_used()}")
+            provisional = ProvisionalFit(bird, config.fit, windows, fit_progress, video, cluster)
+
+            def fit_complete_windows(observations_from: ObservationsFrom) -> None:
+                with clock("fit"):
+                    provisional(observations_from)
+
+            more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
+            with provisional:
+                tracking = run_tracking(
+                    video, config.track, segmenter, keypoints, **more, on_frame=fit_complete_windows
+                )
         if tracking.failure is not None:
             if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
                 stored.keep(0)  # without a bird, only other settings of tracking help
             raise tracking.failure
         observations = tracking.observations
         with clock("fit"):
-            windows = StoredWindows(Parts(unfinished / "windows", fit_record(config.fit, bird)))
-            shown = annotated(progress, lambda: windows.state)
             more = {"stored": windows, "cluster": cluster}
-            solution = fit(observations, bird, config.fit, progress=shown, source=video, **more)
+            solution = fit(observations, bird, config.fit, progress=fit_progress, source=video, **more)
         with new_folder(folder, overwrite, marker=MARKER) as part:
             write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
             with clock("overlay"):
