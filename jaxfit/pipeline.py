@@ -73,10 +73,11 @@ def reconstruct(
     config in `config.yaml`, and with the quality of tracks and the hashes of networks in `summary.json`; `overlay.mp4`
     and its contact sheet `overlay.png`; `report.html`. The folder is written completely or not at all.
 
-    Until then, `FOLDER.unfinished` beside the folder holds the tracked frames and the fitted windows. After an
-    interruption or a failure, a call with the same arguments continues there. The files of the result are then those of
-    an uninterrupted call, bit by bit, on the same machine; durations and drawn videos may differ. With networks of the
-    caller (`segmenter`, `keypoints`), tracking begins again and only fitted windows are kept.
+    A window is fitted as soon as its frames are tracked (`jaxfit.fitting.provisional`). Until the folder is written,
+    `FOLDER.unfinished` beside the folder holds the tracked frames and the fitted windows. After an interruption or a
+    failure, a call with the same arguments continues there. The files of the result are then those of an uninterrupted
+    call, bit by bit, on the same machine; durations and drawn videos may differ. With networks of the caller
+    (`segmenter`, `keypoints`), tracking begins again and only fitted windows are kept.
 
     Args:
         video: a video, or a folder of frames.
@@ -119,25 +120,21 @@ def reconstruct(
             if not any(replaced.values()):
                 stored = Parts(unfinished / "frames", tracking_record(config.track, video, networks, progress))
                 workers = cluster
-            window_parts = Parts(unfinished / "windows", fit_record(config.fit, bird))
-            windows = StoredWindows(window_parts)
+            fitted = Parts(unfinished / "windows", fit_record(config.fit, bird))
+            windows = StoredWindows(fitted)
 
             def disk_used() -> str:
-                size_bytes = window_parts.size_bytes + (0 if stored is None else stored.size_bytes)
-                return f"{size_bytes / 1e6:.1f} MB stored"
+                return f"{sum(parts.size_bytes for parts in (stored, fitted) if parts) / 1e6:.1f} MB stored"
 
             fit_progress = annotated(progress, lambda: f"{windows.state}, {disk_used()}")
-            provisional = ProvisionalFit(bird, config.fit, windows, fit_progress, video, cluster)
+            with ProvisionalFit(bird, config.fit, windows, fit_progress, video, cluster) as provisional_fit:
 
-            def fit_complete_windows(observations_from: ObservationsFrom) -> None:
-                with clock("fit"):
-                    provisional(observations_from)
+                def on_frame(observations_from: ObservationsFrom) -> None:
+                    with clock("fit"):
+                        provisional_fit(observations_from)
 
-            more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
-            with provisional:
-                tracking = run_tracking(
-                    video, config.track, segmenter, keypoints, **more, on_frame=fit_complete_windows
-                )
+                more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
+                tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
         if tracking.failure is not None:
             if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
                 stored.keep(0)  # without a bird, only other settings of tracking help

@@ -26,6 +26,8 @@ ProgressTask = Callable[[str, float | None], AbstractContextManager[ReportProgre
 
 _LINE_S = 30.0
 """Seconds between two lines where stderr is not a terminal."""
+_SPEED_S = 600.0
+"""Seconds over which a bar measures its speed. Work may pause for a minute, for example tracking during a fit."""
 
 
 @contextmanager
@@ -90,6 +92,7 @@ class _Bars:
             TimeRemainingColumn(),
             TextColumn("{task.fields[note]}", markup=False),
             console=console,
+            speed_estimate_period=_SPEED_S,
         )
         self._bars.start()
 

@@ -150,9 +150,8 @@ def window_starts(prepared: Observations, config: FitConfig, first_frame: Mappin
 
 def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray, "W 3"]) -> Windows:
     """Return the windows at some places, as `window_starts` returns them."""
-    observations, line = prepared, _timeline(prepared)
-    usable = observations.usable(config.min_keypoints)
-    needed = len(starts) * config.window * (80 + 60 * observations.num_keypoints)
+    line, usable = _timeline(prepared), prepared.usable(config.min_keypoints)
+    needed = len(starts) * config.window * (80 + 60 * prepared.num_keypoints)
     what = f"the arrays of {len(starts):,} windows of {config.window:,} frames"
     check_memory("observations", what, needed, "lower `window` in the config", max(TABLE_GB, config.memory_gb))
     track = starts[:, 0]
@@ -162,23 +161,23 @@ def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray
         frame[w, : len(piece)] = piece
     rows, columns = track[:, None], np.maximum(frame, 0)
     present = (frame >= 0) & usable[rows, columns]
-    crop = crop_squares(observations, track, frame, present, config.crop)
-    confidence = (observations.confidence[rows, columns] * present[..., None]).astype(np.float32)
-    keypoints_px = image_to_crop(observations.keypoints_px[rows, columns], crop)
-    frames, masks = FrameMasks(observations), np.empty(len(track), object)
+    crop = crop_squares(prepared, track, frame, present, config.crop)
+    confidence = (prepared.confidence[rows, columns] * present[..., None]).astype(np.float32)
+    keypoints_px = image_to_crop(prepared.keypoints_px[rows, columns], crop)
+    frames, masks = FrameMasks(prepared), np.empty(len(track), object)
     for w, n in enumerate(track.tolist()):
         masks[w] = WindowMasks.of(frames, n, frame[w], present[w], crop[w], config.unknown_pixels)
-    numbers = observations.frame_index
-    frame_s = frame_interval_s(numbers, observations.timestamp_s, observations.fps)
+    numbers = prepared.frame_index
+    frame_s = frame_interval_s(numbers, prepared.timestamp_s, prepared.fps)
     return Windows(
         track=track,
-        track_id=observations.track_id[track],
+        track_id=prepared.track_id[track],
         frame=frame,
         present=present,
         crop=crop,
         keypoints_px=np.where(confidence[..., None] > 0, keypoints_px, 0).astype(np.float32),
         confidence=confidence,
-        has_mask=_has_mask(observations, track, frame, present),
+        has_mask=_has_mask(prepared, track, frame, present),
         masks=masks,
         frame_s=np.full(len(starts), frame_s or assumed_interval_s(numbers), np.float32),
     )
