@@ -18,13 +18,14 @@ from jaxfit.data.track_quality import track_quality
 from jaxfit.errors import InputError
 from jaxfit.extras import TRACKING_LIBRARIES, library_versions
 from jaxfit.fitting.fit import fit
+from jaxfit.fitting.provisional import ProvisionalFit
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.summary import summarise
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.perception.instances import KeypointDetector, Segmenter
 from jaxfit.perception.opening import check_segmenter, network_files, open_keypoint_detector
-from jaxfit.perception.track import TrackingResult, run_tracking
+from jaxfit.perception.track import ObservationsFrom, TrackingResult, run_tracking
 from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.pipeline_record import file_hashes, fit_record, tracking_record
 from jaxfit.progress import ProgressTask, annotated, silent
@@ -72,10 +73,11 @@ def reconstruct(
     config in `config.yaml`, and with the quality of tracks and the hashes of networks in `summary.json`; `overlay.mp4`
     and its contact sheet `overlay.png`; `report.html`. The folder is written completely or not at all.
 
-    Until then, `FOLDER.unfinished` beside the folder holds the tracked frames and the fitted windows. After an
-    interruption or a failure, a call with the same arguments continues there. The files of the result are then those of
-    an uninterrupted call, bit by bit, on the same machine; durations and drawn videos may differ. With networks of the
-    caller (`segmenter`, `keypoints`), tracking begins again and only fitted windows are kept.
+    A window is fitted as soon as its frames are tracked (`jaxfit.fitting.provisional`). Until the folder is written,
+    `FOLDER.unfinished` beside the folder holds the tracked frames and the fitted windows. After an interruption or a
+    failure, a call with the same arguments continues there. The files of the result are then those of an uninterrupted
+    call, bit by bit, on the same machine; durations and drawn videos may differ. With networks of the caller
+    (`segmenter`, `keypoints`), tracking begins again and only fitted windows are kept.
 
     Args:
         video: a video, or a folder of frames.
@@ -114,23 +116,33 @@ def reconstruct(
         check_keypoints(empty, bird.keypoint_names, config.track.keypoints.file)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
-            stored, shown = None, progress
+            stored, workers = None, None
             if not any(replaced.values()):
                 stored = Parts(unfinished / "frames", tracking_record(config.track, video, networks, progress))
-                shown = annotated(progress, lambda parts=stored: f"{parts.size_bytes / 1e6:.1f} MB stored")
-            workers = None if any(replaced.values()) else cluster
-            more = {"progress": shown, "parts": stored, "cluster": workers}
-            tracking = run_tracking(video, config.track, segmenter, keypoints, **more)
+                workers = cluster
+            fitted = Parts(unfinished / "windows", fit_record(config.fit, bird))
+            windows = StoredWindows(fitted)
+
+            def disk_used() -> str:
+                return f"{sum(parts.size_bytes for parts in (stored, fitted) if parts) / 1e6:.1f} MB stored"
+
+            fit_progress = annotated(progress, lambda: f"{windows.state}, {disk_used()}")
+            with ProvisionalFit(bird, config.fit, windows, fit_progress, video, cluster) as provisional_fit:
+
+                def on_frame(observations_from: ObservationsFrom) -> None:
+                    with clock("fit"):
+                        provisional_fit(observations_from)
+
+                more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
+                tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
         if tracking.failure is not None:
             if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
                 stored.keep(0)  # without a bird, only other settings of tracking help
             raise tracking.failure
         observations = tracking.observations
         with clock("fit"):
-            windows = StoredWindows(Parts(unfinished / "windows", fit_record(config.fit, bird)))
-            shown = annotated(progress, lambda: windows.state)
             more = {"stored": windows, "cluster": cluster}
-            solution = fit(observations, bird, config.fit, progress=shown, source=video, **more)
+            solution = fit(observations, bird, config.fit, progress=fit_progress, source=video, **more)
         with new_folder(folder, overwrite, marker=MARKER) as part:
             write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
             with clock("overlay"):

@@ -8,7 +8,14 @@ from contextlib import AbstractContextManager, contextmanager
 from datetime import timedelta
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 __all__ = ["ProgressTask", "ReportProgress", "annotated", "silent", "terminal"]
 
@@ -19,6 +26,8 @@ ProgressTask = Callable[[str, float | None], AbstractContextManager[ReportProgre
 
 _LINE_S = 30.0
 """Seconds between two lines where stderr is not a terminal."""
+_SPEED_S = 600.0
+"""Seconds over which a bar measures its speed. Work may pause for a minute, for example tracking during a fit."""
 
 
 @contextmanager
@@ -27,29 +36,36 @@ def silent(_name: str, _total: float | None) -> Iterator[ReportProgress]:
     yield lambda _done, _note: None
 
 
-@contextmanager
-def terminal(name: str, total: float | None) -> Iterator[ReportProgress]:
-    """Show a bar with elapsed and remaining time on stderr.
+class _Terminal:
+    """Opens tasks on stderr; tasks that are open at the same time share one display."""
 
-    If stderr is not a terminal, such as in a log file, print a line every half minute and at the end.
-    """
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        with _lines(name, total, console) as report_progress:
-            yield report_progress
-        return
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(bar_width=16),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(),
-        TextColumn("+"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[note]}", markup=False),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task(name, total=total, note="")
-        yield lambda done, note: bar.update(task, advance=done, note=note)
+    def __init__(self):
+        self._display: _Bars | _Lines | None = None
+        self._open = 0
+
+    @contextmanager
+    def __call__(self, name: str, total: float | None) -> Iterator[ReportProgress]:
+        """Show a bar with elapsed and remaining time on stderr.
+
+        If stderr is not a terminal, such as in a log file, print a line for each open task every half minute, and a
+        line at the end of the task.
+        """
+        if self._display is None:
+            console = Console(stderr=True)
+            self._display = _Bars(console) if console.is_terminal else _Lines(console)
+        display = self._display
+        self._open += 1
+        try:
+            with display.task(name, total) as report_progress:
+                yield report_progress
+        finally:
+            self._open -= 1
+            if not self._open:
+                self._display = None
+                display.close()
+
+
+terminal: ProgressTask = _Terminal()
 
 
 def annotated(progress: ProgressTask, state: Callable[[], str]) -> ProgressTask:
@@ -63,30 +79,72 @@ def annotated(progress: ProgressTask, state: Callable[[], str]) -> ProgressTask:
     return task
 
 
-@contextmanager
-def _lines(name: str, total: float | None, console: Console) -> Iterator[ReportProgress]:
-    """Print a line every `_LINE_S` seconds, and one line at the end."""
-    start = printed = time.monotonic()
-    done, note = 0.0, ""
+class _Bars:
+    """Bars on a terminal, one for each task."""
 
-    def show() -> None:
-        elapsed = time.monotonic() - start
-        parts = []
-        if total is not None:
-            parts.append(f"{100 * done / total if total else 100:.0f} %")
-        parts.append(f"{timedelta(seconds=round(elapsed))}")
-        if total is not None and 0 < done < total:
-            parts[-1] += f" + {timedelta(seconds=round(elapsed * (total - done) / done))}"
-        console.print(
-            f"{name}: {', '.join([*parts, note] if note else parts)}", markup=False, highlight=False, soft_wrap=True
+    def __init__(self, console: Console):
+        self._bars = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=16),
+            TaskProgressColumn("{task.percentage:>3.0f} %", text_format_no_percentage=""),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[plus]}"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}", markup=False),
+            console=console,
+            speed_estimate_period=_SPEED_S,
         )
+        self._bars.start()
 
-    def report_progress(more: float, text: str) -> None:
-        nonlocal done, note, printed
-        done, note = done + more, text
-        if time.monotonic() - printed >= _LINE_S:
-            printed = time.monotonic()
-            show()
+    @contextmanager
+    def task(self, name: str, total: float | None) -> Iterator[ReportProgress]:
+        task = self._bars.add_task(name, total=total, note="", plus="" if total is None else "+")
+        try:
+            yield lambda done, note: self._bars.update(task, advance=done, note=note)
+        finally:
+            self._bars.stop_task(task)
 
-    yield report_progress
-    show()
+    def close(self) -> None:
+        self._bars.stop()
+
+
+class _Lines:
+    """Lines in a log: one for each open task every `_LINE_S` seconds."""
+
+    def __init__(self, console: Console):
+        self._console, self._printed = console, time.monotonic()
+        self._open: list[Callable[[], None]] = []  # each prints the line of a task
+
+    @contextmanager
+    def task(self, name: str, total: float | None) -> Iterator[ReportProgress]:
+        start = time.monotonic()
+        done, note = 0.0, ""
+
+        def show() -> None:
+            elapsed = time.monotonic() - start
+            parts = []
+            if total is not None:
+                parts.append(f"{100 * done / total if total else 100:.0f} %")
+            parts.append(f"{timedelta(seconds=round(elapsed))}")
+            if total is not None and 0 < done < total:
+                parts[-1] += f" + {timedelta(seconds=round(elapsed * (total - done) / done))}"
+            line = f"{name}: {', '.join([*parts, note] if note else parts)}"
+            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+        def report_progress(more: float, text: str) -> None:
+            nonlocal done, note
+            done, note = done + more, text
+            if time.monotonic() - self._printed >= _LINE_S:
+                self._printed = time.monotonic()
+                for show_task in self._open:
+                    show_task()
+
+        self._open.append(show)
+        try:
+            yield report_progress
+        finally:
+            self._open.remove(show)
+        show()
+
+    def close(self) -> None:
+        """Print nothing more; every task has printed its last line."""

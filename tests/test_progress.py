@@ -1,8 +1,11 @@
-"""Progress in a log file, where stderr is no terminal; notes with a state."""
+"""Progress in a log file and on a terminal, also of several tasks at once; notes with a state."""
 
+import io
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import pytest
+from rich.console import Console
 
 from jaxfit import progress
 
@@ -62,3 +65,45 @@ def test_notes_end_with_the_state():
         report_progress(1, "3 birds")
         report_progress(2, "")
     assert notes == [(1, "3 birds, 1 MB"), (2, "2 MB")]
+
+
+def test_open_tasks_share_their_lines(clock, capsys):
+    """A task may end after a task that was opened earlier."""
+    with ExitStack() as later, progress.terminal("Tracking", 100) as report_frames:
+        clock.now += 10
+        report_windows = later.enter_context(progress.terminal("Fitting", None))  # it ends after `Tracking`
+        report_windows(3, "2 windows fitted")
+        clock.now += 20
+        report_frames(25, "25 frames, 3 birds now")
+        assert capsys.readouterr().err.splitlines() == [
+            "Tracking: 25 %, 0:00:30 + 0:01:30, 25 frames, 3 birds now",
+            "Fitting: 0:00:20, 2 windows fitted",
+        ]
+        clock.now += 29
+        report_windows(3, "4 windows fitted")
+        assert capsys.readouterr().err == ""
+        report_frames(75, "100 frames, 2 birds now")
+    assert capsys.readouterr().err.splitlines() == [
+        "Tracking: 100 %, 0:00:59, 100 frames, 2 birds now",
+        "Fitting: 0:00:49, 4 windows fitted",
+    ]
+
+
+def test_open_tasks_share_one_display_on_a_terminal(monkeypatch):
+    screen = io.StringIO()
+    monkeypatch.setattr(
+        progress, "Console", lambda **_: Console(file=screen, force_terminal=True, width=120, color_system=None)
+    )
+    for _ in range(2):  # a second display begins when the first has ended
+        with ExitStack() as later, progress.terminal("Tracking", 100) as report_frames:
+            report_windows = later.enter_context(progress.terminal("Fitting", None))
+            report_frames(50, "50 frames, 3 birds now")
+            report_windows(1, "2 windows fitted")
+        first, second, end = screen.getvalue().splitlines()[-3:]
+        assert "Tracking " in first
+        assert " 50 % " in first
+        assert first.rstrip().endswith("50 frames, 3 birds now")
+        assert "Fitting " in second
+        assert "%" not in second
+        assert second.rstrip().endswith("2 windows fitted")
+        assert "ing" not in end

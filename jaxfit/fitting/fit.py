@@ -6,7 +6,7 @@ The data passes each step once: observations → windows → targets and initial
 from __future__ import annotations
 
 import logging
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Hashable, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -16,23 +16,22 @@ from jaxfit.config.fit import FitConfig
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
-from jaxfit.fitting.batch import frames_per_batch
 from jaxfit.fitting.collect import FittedWindow, collect_windows
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.distant import distant_birds, report_distant_birds
 from jaxfit.fitting.initial_pose_file import InitialPoses
 from jaxfit.fitting.memory import check_fit_memory
+from jaxfit.fitting.scheduling import fit_batches, in_batches, steps_per_batch
 from jaxfit.fitting.seams import blend_seams
 from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
-from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
-from jaxfit.fitting.tasks import FitShared, FitTask, Run, cut_task, failed_windows, fit_task
-from jaxfit.fitting.tiles import tile_size
+from jaxfit.fitting.stored_windows import StoredWindows
+from jaxfit.fitting.tasks import FitShared, Run
 from jaxfit.fitting.windows import Windows, cut_windows, windows_key
 from jaxfit.model.bird import Bird
-from jaxfit.progress import ProgressTask, ReportProgress, silent
-from jaxfit.workers.cluster import Cluster, FailedTask
+from jaxfit.progress import ProgressTask, silent
+from jaxfit.workers.cluster import Cluster
 
-__all__ = ["check_observations", "fit", "fit_runs", "windows_of"]
+__all__ = ["check_observations", "checked_model", "fit", "fit_runs", "windows_of"]
 
 _logger = logging.getLogger(__name__)
 
@@ -103,9 +102,7 @@ def fit_runs(
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
-    check_fit_memory(observations, bird, configs, source)
-    model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
-    check_terms(configs[0], model)
+    model = checked_model(observations, bird, configs, initial_poses, source)
     runs = _cut_runs(observations, configs, initial_poses, source)
     if select is not None:
         runs = [run._replace(windows=run.windows[select]) for run in runs]
@@ -113,28 +110,13 @@ def fit_runs(
     problems = [(r, w) for r, run in enumerate(runs) for w in range(len(run.windows))]
     results = {} if stored is None else {(0, w): result for w, result in stored.find(runs[0].windows).items()}
     missing = [problem for problem in problems if problem not in results]
-    size = max(min(frames_per_batch(bird, configs[0]) // configs[0].window, len(problems)), 1)
-    # by time, because masks of a frame lie together in files; problems of one window share their initial poses
-    missing.sort(key=lambda problem: (int(runs[problem[0]].windows.frame[problem[1]].max()), problem[::-1]))
-    if cluster is not None:
-        # a small task costs little if its worker ends
-        size = min(size, tile_size(configs[0].window) * len(configs))
-    if stored is not None:
-        # an interruption costs one batch
-        size = min(size, windows_per_part(observations.num_tracks, configs[0].window))
-    batches = [missing[first : first + size] for first in range(0, len(missing), size)]
+    shared = FitShared(model, initial_poses)
+    batches = in_batches(missing, runs, shared, observations.num_tracks, stored, cluster)
     birds = len(np.unique(runs[0].windows.track))
     subject = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
     _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), configs[0].window, len(batches))
-    steps, shared = sum(stage.steps for stage in configs[0].stages), FitShared(model, initial_poses)
-    with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
-        tasks = (cut_task(runs, batch) for batch in batches)
-        for i, windows in _fit_tasks(cluster, shared, tasks, steps, report_progress):
-            if isinstance(windows, FailedTask):
-                windows = failed_windows(model, configs[0], len(batches[i]), f"not computed: {windows.reason}")
-            elif stored is not None:
-                stored.add(runs[0].windows, {w: window for (_, w), window in zip(batches[i], windows, strict=True)})
-            results |= dict(zip(batches[i], windows, strict=True))
+    with progress(f"Fitting {subject}", steps_per_batch(configs[0]) * len(batches)) as report_progress:
+        results |= fit_batches(batches, runs, shared, stored, cluster, report_progress)
     return [
         collect_windows(
             observations,
@@ -149,19 +131,25 @@ def fit_runs(
     ]
 
 
-def _fit_tasks(
-    cluster: Cluster | None, shared: FitShared, tasks: Iterable[FitTask], steps: int, report_progress: ReportProgress
-) -> Iterator[tuple[int, list[FittedWindow] | FailedTask]]:
-    """Fit tasks in this process or on workers. Yield number and results of every task, in the order of arrival."""
-    if cluster is None:
-        for i, task in enumerate(tasks):
-            report_progress(0, "initial poses")
-            yield i, fit_task(shared, task, report_progress)
-        return
-    report_progress(0, "starting workers")
-    for i, windows in cluster.run(fit_task, shared, tasks):
-        report_progress(steps, "on workers")
-        yield i, windows
+def checked_model(
+    observations: Observations,
+    bird: Bird,
+    configs: Sequence[FitConfig],
+    initial_poses: InitialPoses | None,
+    source: object,
+) -> FitModel:
+    """Return the model of a fit, after checks of the memory and of the terms that the fit needs.
+
+    Args:
+        observations, bird, configs, initial_poses, source: as for `fit_runs`.
+
+    Raises:
+        InputError: the fit needs too much memory, or a term is unusable.
+    """
+    check_fit_memory(observations, bird, configs, source)
+    model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
+    check_terms(configs[0], model)
+    return model
 
 
 def _final_results(

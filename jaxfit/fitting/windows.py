@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -29,9 +30,13 @@ __all__ = [
     "Windows",
     "cut_windows",
     "filter_observations",
+    "first_frames",
     "load_targets",
+    "prepare_observations",
     "window_content",
     "window_hash",
+    "window_starts",
+    "windows_at",
     "windows_key",
 ]
 
@@ -93,52 +98,89 @@ def window_hash(windows: Windows, w: int) -> str:
 def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     """Cut every track into windows of `config.window` frames, from its first usable frame on.
 
-    Consecutive windows share `config.overlap_frames` frame numbers.
+    Consecutive windows share `config.overlap_frames` frame numbers. The frames of a window have consecutive frame numbers: if
+    the file skips frame numbers, the window has missing frames, so that distant frames are not neighbours in the
+    temporal terms. A track without a usable frame has no window.
+    """
+    prepared = prepare_observations(observations, config)
+    return windows_at(prepared, config, window_starts(prepared, config, first_frames(prepared, config)))
+
+
+def prepare_observations(observations: Observations, config: FitConfig) -> Observations:
+    """Return the observations that windows are cut from.
 
     Frames with a box or a keypoint far outside the image (`distant_birds`) are not usable. Then the keypoints are
-    filtered. The frames of a window have consecutive frame numbers: if the file skips frame
-    numbers, the window has missing frames, so that distant frames are not neighbours in the temporal terms. A track
-    without a usable frame has no window.
+    filtered.
     """
-    observations = filter_observations(without_distant_birds(observations), config.filter_window)
-    usable = observations.usable(config.min_keypoints)
-    line = _timeline(observations)
-    starts: list[tuple[int, int, int]] = []  # track, first and last position in the line
-    for n in range(observations.num_tracks):
+    return filter_observations(without_distant_birds(observations), config.filter_window)
+
+
+def first_frames(prepared: Observations, config: FitConfig) -> dict[int, int]:
+    """Return track → number of its first usable frame, for the tracks with such a frame."""
+    usable = prepared.usable(config.min_keypoints)
+    some = np.flatnonzero(usable.any(1))
+    first = prepared.frame_index[usable[some].argmax(1)]
+    return dict(zip(prepared.track_id[some].tolist(), first.tolist(), strict=True))
+
+
+def window_starts(prepared: Observations, config: FitConfig, first_frame: Mapping[int, int]) -> Int[np.ndarray, "W 3"]:
+    """Return where the windows lie: position of the track; first position, and last usable position of the track.
+
+    The two positions count the frame numbers from the first frame of the observations on, in the step of the file.
+
+    Args:
+        prepared: the result of `prepare_observations`.
+        config: the lengths of windows.
+        first_frame: track → frame number where its windows begin, which may lie before the observations. Other tracks
+            have no windows.
+    """
+    usable = prepared.usable(config.min_keypoints)
+    line, step = _timeline(prepared), frame_step(prepared.frame_index)
+    starts: list[tuple[int, int, int]] = []
+    for n, track in enumerate(prepared.track_id.tolist()):
         at = np.flatnonzero((line >= 0) & usable[n, np.maximum(line, 0)])
-        if len(at) == 0:
+        if len(at) == 0 or track not in first_frame:
             continue
-        stride = config.window - config.overlap_frames
+        begin, stride = (
+            (first_frame[track] - int(prepared.frame_index[0])) // step,
+            config.window - config.overlap_frames,
+        )
         # only windows with a usable frame that no earlier window has
-        wanted = np.unique(np.maximum(at - at[0] - config.overlap_frames, 0) // stride)
-        starts += [(n, int(at[0]) + w * stride, int(at[-1])) for w in wanted.tolist()]
-    needed = len(starts) * config.window * (80 + 60 * observations.num_keypoints)
+        wanted = np.unique(np.maximum(at - begin - config.overlap_frames, 0) // stride)
+        starts += [(n, begin + w * stride, int(at[-1])) for w in wanted.tolist()]
+    return np.array(starts, int).reshape(-1, 3)
+
+
+def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray, "W 3"]) -> Windows:
+    """Return the windows at some places, as `window_starts` returns them."""
+    line, usable = _timeline(prepared), prepared.usable(config.min_keypoints)
+    needed = len(starts) * config.window * (80 + 60 * prepared.num_keypoints)
     what = f"the arrays of {len(starts):,} windows of {config.window:,} frames"
     check_memory("observations", what, needed, "lower `window` in the config", max(TABLE_GB, config.memory_gb))
-    track = np.array([n for n, _, _ in starts], int)
+    track = starts[:, 0]
     frame = np.full((len(starts), config.window), -1)
-    for w, (_, first, last) in enumerate(starts):
+    for w, (_, first, last) in enumerate(starts.tolist()):
         piece = line[first : min(first + config.window, last + 1)]
         frame[w, : len(piece)] = piece
     rows, columns = track[:, None], np.maximum(frame, 0)
     present = (frame >= 0) & usable[rows, columns]
-    crop = crop_squares(observations, track, frame, present, config.crop)
-    confidence = (observations.confidence[rows, columns] * present[..., None]).astype(np.float32)
-    keypoints_px = image_to_crop(observations.keypoints_px[rows, columns], crop)
-    frames, masks = FrameMasks(observations), np.empty(len(track), object)
+    crop = crop_squares(prepared, track, frame, present, config.crop)
+    confidence = (prepared.confidence[rows, columns] * present[..., None]).astype(np.float32)
+    keypoints_px = image_to_crop(prepared.keypoints_px[rows, columns], crop)
+    frames, masks = FrameMasks(prepared), np.empty(len(track), object)
     for w, n in enumerate(track.tolist()):
         masks[w] = WindowMasks.of(frames, n, frame[w], present[w], crop[w], config.unknown_pixels)
-    numbers = observations.frame_index
-    frame_s = frame_interval_s(numbers, observations.timestamp_s, observations.fps)
+    numbers = prepared.frame_index
+    frame_s = frame_interval_s(numbers, prepared.timestamp_s, prepared.fps)
     return Windows(
         track=track,
-        track_id=observations.track_id[track],
+        track_id=prepared.track_id[track],
         frame=frame,
         present=present,
         crop=crop,
         keypoints_px=np.where(confidence[..., None] > 0, keypoints_px, 0).astype(np.float32),
         confidence=confidence,
-        has_mask=_has_mask(observations, track, frame, present),
+        has_mask=_has_mask(prepared, track, frame, present),
         masks=masks,
         frame_s=np.full(len(starts), frame_s or assumed_interval_s(numbers), np.float32),
     )

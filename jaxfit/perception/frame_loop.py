@@ -34,6 +34,7 @@ def process_frames(
     clock: Clock,
     progress: ProgressTask,
     parts: Parts | None,
+    on_frame: Callable[[], object],
 ) -> FramePart:
     """Assign identities to the instances of every frame, and detect the keypoints of the birds with a track.
 
@@ -47,6 +48,8 @@ def process_frames(
         clock: measures the parts of the work.
         progress: reports every frame.
         parts: stores the frames, and holds the frames of an interrupted loop; None stores nothing.
+        on_frame: called when the recorder has received a frame, also for each frame of an interrupted loop; not called
+            if the interrupted loop had processed all frames.
 
     Returns:
         All frames as one part.
@@ -55,9 +58,10 @@ def process_frames(
         InputError: the video cannot be read, a network cannot be used, or frames cannot be stored.
     """
     done, tracker = _continued(parts, new_tracker)
-    recorder.frames += [frame for part in done for frame in part.frames]
-    stored, seen_damaged = len(recorder.frames), 0
-    detections = detections_from(recorder.frames[-1].frame_index + frames.step if stored else frames.start)
+    is_complete = bool(done) and done[-1].is_last
+    earlier = [frame for part in done for frame in part.frames]
+    stored, seen_damaged = len(earlier), 0
+    detections = detections_from(earlier[-1].frame_index + frames.step if stored else frames.start)
 
     def end_part(is_last: bool) -> None:
         nonlocal stored, seen_damaged
@@ -69,10 +73,13 @@ def process_frames(
         done.append(part)
 
     begun, start = stored, time.perf_counter()
-    is_complete = bool(done) and done[-1].is_last
     with progress("Tracking", total) as report_progress, closing(iter(detections)) as found:
         if begun:
             report_progress(begun, "stored frames")
+        for frame in earlier:
+            recorder.frames.append(frame)
+            if not is_complete:
+                on_frame()
         for frame in () if is_complete else found:
             instances = frame.instances
             with clock("track"):
@@ -89,7 +96,8 @@ def process_frames(
                     end_part(is_last=False)
             rate = (len(recorder.frames) - begun) / (time.perf_counter() - start)
             noun = "bird" if len(tracked) == 1 else "birds"
-            report_progress(1, f"{len(recorder.frames)} frames, {rate:.1f} frames/s, {len(tracked)} {noun}")
+            report_progress(1, f"{len(recorder.frames)} frames, {rate:.1f} frames/s, {len(tracked)} {noun} now")
+            on_frame()
     if not is_complete and recorder.frames:
         end_part(is_last=True)
     damaged = [number for part in done for number in part.damaged] if done else detections.damaged

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +33,7 @@ from jaxfit.video.reader import read_frames
 from jaxfit.workers.cluster import Cluster
 
 __all__ = [
+    "ObservationsFrom",
     "TrackingResult",
     "run_tracking",
     "track_video",
@@ -41,6 +43,11 @@ _logger = logging.getLogger(__name__)
 
 RETRY_FRAMES, RETRY_MIN_SCORE = 8, 0.05
 """After a video without any bird: number of frames that are segmented again, and their least score."""
+
+
+ObservationsFrom = Callable[[int], Observations]
+"""Function of the position of a frame that returns the observations from this frame on. Short tracks and tracks of low
+scores are skipped, as at the end of the video, but only these frames count."""
 
 
 class TrackingResult(NamedTuple):
@@ -103,6 +110,7 @@ def run_tracking(
     progress: ProgressTask = silent,
     parts: Parts | None = None,
     cluster: Cluster | None = None,
+    on_frame: Callable[[ObservationsFrom], object] | None = None,
 ) -> TrackingResult:
     """Track a video as `track_video` does, and return short tracks, damaged frames and durations too.
 
@@ -113,6 +121,7 @@ def run_tracking(
         cluster: worker processes that run the networks of `config`, in place of `segmenter` and `keypoints`. They read
             the video and the files of the networks under the same paths. If the tracker uses pictures, or the video
             does not say its length, the networks run in this process. None: this process.
+        on_frame: called after each frame, with a function that returns the observations so far.
     """
     frames, has_own_segmenter = config.frames, segmenter is not None
     reader, given_tracker = read_frames(source, frames.start, frames.stop, frames.step), tracker
@@ -136,18 +145,30 @@ def run_tracking(
         own = reader if start == frames.start else read_frames(source, start, frames.stop, frames.step)
         return LocalDetections(own, segmenter, keypoints, clock)
 
+    least = getattr(segmenter, "min_track_score", 0.0) if config.min_track_score is None else config.min_track_score
+
+    def cleaned(long_tracks: Observations) -> Observations:
+        observations = drop_low_scores(long_tracks, least)
+        if config.repair_left_right_flips:
+            observations, _ = repair_left_right_flips(observations, mirror_pairs(observations.keypoint_names))
+        return observations
+
+    def observations_from(first: int) -> Observations:
+        return cleaned(drop_short_tracks(recorder.observations(first), config.min_track_frames))
+
+    def frame_added() -> None:
+        if on_frame is not None:
+            on_frame(observations_from)
+
     processed = process_frames(
-        detections_from, reader.path.name, total, frames, new_tracker, recorder, clock, progress, parts
+        detections_from, reader.path.name, total, frames, new_tracker, recorder, clock, progress, parts, frame_added
     )
     if not processed.frames:
         raise InputError(source, f"has no frame from {frames.start} on", "begin with an earlier frame")
     with clock("clean up"):
         all_tracks = recorder.observations()
         long_tracks = drop_short_tracks(all_tracks, config.min_track_frames)
-        least = getattr(segmenter, "min_track_score", 0.0) if config.min_track_score is None else config.min_track_score
-        observations = drop_low_scores(long_tracks, least)
-        if config.repair_left_right_flips:
-            observations, _ = repair_left_right_flips(observations, mirror_pairs(observations.keypoint_names))
+        observations = cleaned(long_tracks)
     lengths = dict(zip(all_tracks.track_id.tolist(), all_tracks.present.sum(1).tolist(), strict=True))
     short_tracks = {track: length for track, length in lengths.items() if track not in long_tracks.track_id}
     scores = dict(zip(long_tracks.track_id.tolist(), mean_scores(long_tracks).tolist(), strict=True))

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
@@ -16,6 +17,7 @@ from jaxfit import pipeline
 from jaxfit.cli.main import main
 from jaxfit.errors import InputError
 from jaxfit.fitting.stored_windows import StoredWindows
+from jaxfit.fitting.windows import window_hash
 from jaxfit.model.files import save_bird
 from jaxfit.storage import files
 
@@ -39,12 +41,26 @@ def run(folder, point="never", stop=KeyboardInterrupt, *more):
         return main(command(folder, *more)), segmenter.frames
 
 
+@contextmanager
+def counting():
+    """Return the hashes of the windows that are fitted and stored."""
+    fitted, add = [], StoredWindows.add
+
+    def added(self, windows, results):
+        fitted.extend(window_hash(windows, w) for w in results)
+        add(self, windows, results)
+
+    with mock.patch.object(StoredWindows, "add", added):
+        yield fitted
+
+
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory):
     """The content of an uninterrupted result."""
     folder = tmp_path_factory.mktemp("whole")
     prepare(folder)
-    assert run(folder) == (0, FRAME_NUMBERS)
+    with mock.patch.object(pipeline.ProvisionalFit, "__call__"):  # track first, then fit
+        assert run(folder) == (0, FRAME_NUMBERS)
     assert sorted(path.name for path in folder.iterdir()) == ["frames", "quick.yaml", "result", "toy.npz"]
     return contents(folder / "result")
 
@@ -57,25 +73,23 @@ def folder(tmp_path):
 
 def test_every_interruption_continues(folder, expected, caplog):
     """One run after the other stops later than the run before; what is stored is not computed again."""
-    assert run(folder, "frame 3")[0] == 130
-    assert not (folder / "result.unfinished").exists()  # nothing was stored yet
-    assert run(folder, "frame 7") == (130, [*range(7)])
-    assert "result.unfinished holds the work so far; the same command continues there" in caplog.text
-    assert run(folder, "part 1") == (130, [*range(5, 10)])
-    assert run(folder, "frame 11") == (130, [*range(5, 11)])
-    assert run(folder, "windows 1") == (130, [10, 11])
-    fitted = []
-    add = StoredWindows.add
-
-    def added(self, windows, results):
-        fitted.extend(results)
-        add(self, windows, results)
-
-    with mock.patch.object(StoredWindows, "add", added):
+    with counting() as fitted:
+        assert run(folder, "frame 3")[0] == 130
+        assert not (folder / "result.unfinished").exists()  # nothing was stored yet
+        assert run(folder, "frame 7") == (130, [*range(7)])
+        assert "result.unfinished holds the work so far; the same command continues there" in caplog.text
+        assert run(folder, "part 1") == (130, [*range(5, 10)])
+        assert not fitted
+        assert run(folder, "windows 1") == (130, [*range(5, 10)])
+        assert len(fitted) == 2  # of six windows; a tile holds two
+        assert run(folder, "frame 11") == (130, [10])
+        assert run(folder, "part 2") == (130, [10, 11])
+        assert len(fitted) == 2
+        assert run(folder, "windows 2") == (130, [10, 11])
         assert run(folder, "result") == (130, [])
-    assert len(fitted) == 2  # of six windows; a tile holds two
-    assert not (folder / "result").exists()
-    assert run(folder) == (0, [])
+        assert not (folder / "result").exists()
+        assert run(folder) == (0, [])
+    assert len(fitted) == len(set(fitted)) == 6
     assert contents(folder / "result") == expected
     assert not (folder / "result.unfinished").exists()
 
@@ -83,19 +97,19 @@ def test_every_interruption_continues(folder, expected, caplog):
 @pytest.mark.extended
 def test_a_failed_fit_keeps_the_tracking_and_accepts_other_settings(folder, expected, caplog):
     with mock.patch("jaxfit.fitting.tasks.fit_batch", side_effect=InputError("config", "needs memory", "lower it")):
-        assert run(folder)[0] == 2
+        assert run(folder) == (2, [*range(10)])  # the first windows are fitted before the last frames are tracked
     text = (folder / "quick.yaml").read_text()
     (folder / "quick.yaml").write_text(
         text.replace("pose_prior: 0.1", "pose_prior: 0.2").replace("frames: 3", "frames: 2")
     )
-    assert run(folder, "windows 1") == (130, [])
+    assert run(folder, "windows 1") == (130, [])  # for the frames that are stored
     caplog.clear()
     (folder / "quick.yaml").write_text(text.replace("pose_prior: 0.1", "pose_prior: 0.3"))
     assert run(folder)[0] == 2
     assert not caplog.messages
     shutil.rmtree(folder / "result.unfinished" / "windows")
     (folder / "quick.yaml").write_text(text)
-    assert run(folder) == (0, [])
+    assert run(folder) == (0, [10, 11])
     assert contents(folder / "result") == expected
 
 
@@ -165,7 +179,8 @@ def test_networks_of_the_caller_are_not_stored(folder):
     segmenter = TrueSegmenter(FOOTAGE)
     with toy_networks(segmenter), stopping("result", lambda: (_ for _ in ()).throw(KeyError)):
         for _ in range(2):
-            with pytest.raises(KeyError):
+            with pytest.raises(KeyError), counting() as fitted:
                 pipeline.reconstruct(folder / "frames", folder / "result", BIRD, config, segmenter)
     assert segmenter.frames == FRAME_NUMBERS * 2
+    assert not fitted  # in the second call
     assert not (folder / "result.unfinished" / "frames").exists()

@@ -157,8 +157,30 @@ def test_progress_reports_speed_and_birds(video):
     tracked(video, missed=[(11, 0), (11, 1)], progress=Task)
     assert reports[0] == ("Tracking", FRAMES)
     assert [done for done, _ in reports[1:]] == [1] * FRAMES
-    assert reports[1][1].endswith("frames/s, 3 birds")
-    assert reports[-1][1].endswith(" 1 bird")
+    assert reports[1][1].endswith("frames/s, 3 birds now")
+    assert reports[-1][1].endswith(" 1 bird now")
+
+
+def test_the_observations_after_each_frame(video):
+    """They end with the frame of the call, and are cleaned as those of the whole video."""
+    seen = []
+
+    def on_frame(observations_from):
+        seen.append([observations_from(first) for first in (0, len(seen) // 2)])
+
+    config = TrackConfig(min_track_frames=3, min_track_score=0.75)
+    tracking, _, _ = tracked(video, config, [(t, 0) for t in range(4, FRAMES)], on_frame=on_frame)
+    assert len(seen) == FRAMES
+    for t, (whole, part) in enumerate(seen):
+        assert whole.frame_index.tolist() == list(range(t + 1))
+        assert part.frame_index.tolist() == list(range(t // 2, t + 1))
+    assert [whole.num_tracks for whole, _ in seen[:4]] == [0, 0, 2, 2]  # the third bird has a low score
+    for name, value in vars(tracking.observations).items():
+        np.testing.assert_equal(getattr(seen[-1][0], name), value, err_msg=name)
+    last = seen[-1][1]  # from frame 5 on, where one bird is gone
+    assert last.track_id.tolist() == tracking.observations.track_id[tracking.observations.present[:, -1]].tolist()
+    assert last.masks.keys() == {(0, t) for t in range(FRAMES - 5)}
+    np.testing.assert_array_equal(last.keypoints_px[0], FOOTAGE.keypoints_px[5:, 1].astype(np.float32))
 
 
 def test_durations_of_all_parts(video):

@@ -41,7 +41,7 @@ def observe():
 @pytest.fixture
 def quick(monkeypatch):
     """Replace the solution of a task by poses that depend on the window and the config."""
-    monkeypatch.setattr("jaxfit.fitting.fit.fit_task", quick_fit)
+    monkeypatch.setattr("jaxfit.fitting.scheduling.fit_task", quick_fit)
 
 
 def assert_equal(actual, expected):
@@ -186,7 +186,7 @@ def test_no_scheduler_answers(monkeypatch, tmp_path):
 @pytest.mark.usefixtures("own_cache")
 def test_the_command(inputs, scheduler, tmp_path, monkeypatch, capsys):
     """A scheduler that is not there is refused, and the files of a result on workers are those of one process."""
-    monkeypatch.setattr("jaxfit.fitting.fit.fit_task", quick_fit)
+    monkeypatch.setattr("jaxfit.fitting.scheduling.fit_task", quick_fit)
     options = arguments(inputs, tmp_path / "out")
     rejected(capsys, [*options, "--scheduler", "nowhere"], "--scheduler nowhere: is not a scheduler")
     with pytest.raises(SystemExit):

@@ -109,16 +109,21 @@ class TrackRecorder:
             )
         )
 
-    def observations(self) -> Observations:
-        """Return the observations of all frames so far; tracks are sorted by identity, and there may be no track."""
-        tracks = sorted({identity for frame in self.frames for identity in frame.identity.tolist() if identity})
+    def observations(self, first: int = 0) -> Observations:
+        """Return the observations of the frames so far; tracks are sorted by identity, and there may be no track.
+
+        Args:
+            first: position of the first frame; tracks without a detection from this frame on are left out.
+        """
+        frames = self.frames[first:]
+        tracks = sorted({identity for frame in frames for identity in frame.identity.tolist() if identity})
         row = {identity: n for n, identity in enumerate(tracks)}
-        N, T, K = len(tracks), len(self.frames), len(self._names)
+        N, T, K = len(tracks), len(frames), len(self._names)
         present, score = np.zeros((N, T), bool), np.zeros((N, T), np.float32)
         keypoints_px, confidence = np.zeros((N, T, K, 2), np.float32), np.zeros((N, T, K), np.float32)
         box_px = np.zeros((N, T, 4), np.float32)
         masks = {}
-        for t, frame in enumerate(self.frames):
+        for t, frame in enumerate(frames):
             tracked = frame.identity > 0
             rows = [row[identity] for identity in frame.identity[tracked].tolist()]
             present[rows, t], score[rows, t], box_px[rows, t] = True, frame.score[tracked], frame.box_px[tracked]
@@ -126,17 +131,17 @@ class TrackRecorder:
             masks |= {(n, t): mask for n, mask in zip(rows, frame.masks, strict=True)}
         return Observations(
             track_id=np.array(tracks, int),
-            frame_index=np.array([frame.frame_index for frame in self.frames], int),
+            frame_index=np.array([frame.frame_index for frame in frames], int),
             present=present,
             keypoints_px=keypoints_px,
             confidence=confidence,
             box_px=box_px,
-            image_size_px=np.array([frame.size_px for frame in self.frames], int).reshape(T, 2),
-            file_name=np.array([frame.file_name for frame in self.frames], str),
+            image_size_px=np.array([frame.size_px for frame in frames], int).reshape(T, 2),
+            file_name=np.array([frame.file_name for frame in frames], str),
             keypoint_names=self._names,
             skeleton=self._skeleton,
             masks=dict(sorted(masks.items())),
             score=score,
-            timestamp_s=np.array([frame.time_s for frame in self.frames], float),
+            timestamp_s=np.array([frame.time_s for frame in frames], float),
             fps=self._fps,
         )
