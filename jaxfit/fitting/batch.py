@@ -29,7 +29,7 @@ __all__ = ["Batch", "Fitted", "bytes_per_frame", "fit_batch", "frames_per_batch"
 LIKELIHOOD_RATIO = 20.0
 """A hypothesis is reported if the best hypothesis is less than this many times as likely."""
 LEAST_ANGLE_DEG = 45.0
-"""Hypotheses whose orientations differ by a smaller angle (median over the frames) are one pose."""
+"""Hypotheses are one pose where their orientations differ by a smaller angle, and everywhere if the median does."""
 SECONDS_PER_CALL = 1.0
 """Target duration of some steps of all tiles. After these steps, progress is reported."""
 
@@ -263,5 +263,6 @@ def _compare_hypotheses(rows: _Rows, final: Report) -> tuple[_Rows, Int[np.ndarr
     with np.errstate(invalid="ignore"):  # no finite hypothesis
         is_near = others.min(axis=1) - total.min(axis=1) < np.log(LIKELIHOOD_RATIO)
     ambiguity_deg = rows.ambiguity_deg.copy()
-    ambiguity_deg[best[is_near]] = angle_deg[(best - of_row + second)[is_near]]
+    of_second = angle_deg[(best - of_row + second)[is_near]]
+    ambiguity_deg[best[is_near]] = np.where(of_second > LEAST_ANGLE_DEG, of_second, 0)
     return rows._replace(ambiguity_deg=ambiguity_deg), best

@@ -99,8 +99,8 @@ def cut_windows(observations: Observations, config: FitConfig) -> Windows:
     """Cut every track into windows of `config.window` frames, from its first usable frame on.
 
     Consecutive windows share `config.overlap_frames` frame numbers. The frames of a window have consecutive frame
-    numbers: if the file skips frame numbers, the window has missing frames, so that distant frames are not neighbours in
-    the temporal terms. A track without a usable frame has no window.
+    numbers: if the file skips frame numbers, the window has missing frames, so that distant frames are not neighbours
+    in the temporal terms. A track without a usable frame has no window.
     """
     prepared = prepare_observations(observations, config)
     return windows_at(prepared, config, window_starts(prepared, config, first_frames(prepared, config)))
