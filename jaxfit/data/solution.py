@@ -121,8 +121,8 @@ class Solution:
 
     ambiguity_deg: np.ndarray | None = None
     """(N, T) float32: angle between the orientation and that of another pose that explains the keypoints almost as well
-    (at most 20 times less likely, turned by more than 45°); 0 where the fit found no such pose. Only fits with more than
-    one hypothesis search for other poses. None means 0 everywhere."""
+    (at most 20 times less likely, turned by more than 45°); 0 where the fit found no such pose. Only fits with more
+    than one hypothesis search for other poses. None means 0 everywhere."""
 
     def __post_init__(self):
         ambiguity_deg = np.zeros(np.shape(self.valid), np.float32) if self.ambiguity_deg is None else self.ambiguity_deg
