@@ -156,8 +156,9 @@ def _split_rows(
     row = np.array([new_rows.setdefault((old_row, content[config]), len(new_rows)) for old_row, config in pairs])
     first = np.unique(row, return_index=True)[1]  # the first problem of each row
     source = (rows.row[first][:, None] * rows.hypotheses + np.arange(rows.hypotheses)).ravel()
-    split = rows.pose, rows.solver, rows.failure, rows.ambiguity_deg
-    split = _Rows(*jax.tree.map(lambda x: x[source], split), row, rows.hypotheses)
+    kept = rows.pose, rows.solver, rows.failure, rows.ambiguity_deg
+    pose, solver, failure, ambiguity_deg = jax.tree.map(lambda x: x[source], kept)
+    split = _Rows(pose, solver, failure, ambiguity_deg, row, rows.hypotheses)
     return split, batch.config[first], batch.targets_row[first]
 
 
