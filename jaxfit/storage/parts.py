@@ -88,7 +88,8 @@ class Parts:
     def keep(self, count: int) -> None:
         """Remove all parts except the first `count` parts."""
         for number in self.numbers[count:]:
-            self._path(number).unlink(missing_ok=True)
+            self.size_bytes -= self._path(number).stat().st_size
+            self._path(number).unlink()
         del self.numbers[count:]
 
     def _path(self, number: int) -> Path:

@@ -84,7 +84,8 @@ def test_parts_are_numbered_and_read_back(tmp_path):
     assert loaded["text"] == "é"
     again.keep(1)
     again.add({"x": np.zeros(0)})
-    assert Parts(tmp_path / "p", {"a": {"b": 1, "c": [2]}}).numbers == [0, 1]
+    read = Parts(tmp_path / "p", {"a": {"b": 1, "c": [2]}})
+    assert (read.numbers, read.size_bytes) == ([0, 1], again.size_bytes)
 
 
 def test_parts_of_another_computation_are_refused(tmp_path):
