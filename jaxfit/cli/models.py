@@ -80,6 +80,8 @@ def prior_learn(options: argparse.Namespace) -> None:
     show(f"{poses} of {birds}{skipped}, equivalent to {learnt.effective_poses:.0f} independent poses")
     bones = "learnt" if learnt.bones_learnt else "from the model, because the results have equal bone lengths"
     show(f"correlations shrunk by {100 * learnt.shrinkage:.0f} % (100 %: no correlations); bone lengths: {bones}")
+    weight = f"weight of `pose_prior` in `map` for this width: {learnt.pose_prior_weight:.2g}"
+    show(f"width of the poses: {learnt.width:.2g} times the covariance of the model's prior; {weight}")
     show(f"{learnt.bird.name} with this prior → {options.out}; use the model with `--model {options.out}`")
 
 

@@ -19,11 +19,14 @@ from jaxfit.data.frame_numbers import consecutive
 from jaxfit.data.solution import Solution
 from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
+from jaxfit.objective.posed_window import priors_of
 
 __all__ = ["LearntPrior", "effective_count", "learn_prior", "oas_shrinkage"]
 
 LEAST_SD_RAD = 0.02
 """Smallest standard deviation of a component of the pose, for components that hardly move in the results."""
+LEAST_WIDTH = 1e-3
+"""Smallest width of a prior, for results whose poses are all the model's mean."""
 LEAST_BONE_SD = 0.01
 """Smallest standard deviation of a bone's relative length."""
 
@@ -49,6 +52,14 @@ class LearntPrior:
     """Whether the prior of bone lengths is learnt. If all birds have equal bone lengths, the model's prior is kept."""
     mean_change_rad: Float[np.ndarray, "bones"]
     """Norm of the difference between the learnt and the model's mean axis-angle of each joint, in radians."""
+    width: float
+    """Factor on the covariance of the model with which the poses are most likely: their mean squared Mahalanobis
+    distance from the model's mean, per component."""
+
+    @property
+    def pose_prior_weight(self) -> float:
+        """Weight of `pose_prior` that is the negative log-density of that covariance, in nats."""
+        return 0.5 / self.width
 
 
 def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior:
@@ -101,7 +112,11 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
         )
     change = (mean - np.asarray(bird.pose_mean, np.float64)).reshape(-1, 3)
     mean_change_rad = np.linalg.norm(change, axis=1)
-    return LearntPrior(learnt, len(poses), len(tracks), diverged, effective, shrinkage, bones_learnt, mean_change_rad)
+    priors = priors_of(bird)
+    whitened = (poses - np.asarray(priors.pose_mean)) @ np.asarray(priors.pose_whitener).T
+    counts = len(poses), len(tracks), diverged, effective
+    width = max(float((whitened**2).mean()), LEAST_WIDTH)
+    return LearntPrior(learnt, *counts, shrinkage, bones_learnt, mean_change_rad, width)
 
 
 def effective_count(

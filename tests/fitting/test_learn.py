@@ -11,7 +11,7 @@ from support.birds import random_pose, solution_of, toy_bird
 from jaxfit.cli.main import main
 from jaxfit.data.solution import save_solution
 from jaxfit.errors import InputError
-from jaxfit.fitting.learn import LEAST_SD_RAD, effective_count, learn_prior, oas_shrinkage
+from jaxfit.fitting.learn import LEAST_SD_RAD, LEAST_WIDTH, effective_count, learn_prior, oas_shrinkage
 from jaxfit.model.checks import check_bird
 from jaxfit.model.files import load_bird
 
@@ -27,6 +27,17 @@ def posed(seeds, spread=0.3):
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *frames)
         windows.append(dataclasses.replace(stacked, bone_length=jnp.ones(7), betas=jnp.zeros(2)))
     return solution_of(BIRD, windows)
+
+
+def test_the_width_is_a_factor_on_the_covariance_of_the_model():
+    poses = np.random.default_rng(0).multivariate_normal(BIRD.pose_mean, 3.0 * BIRD.pose_covariance, 600)
+    result = posed(range(50))
+    drawn = poses.reshape(50, T, -1, 3).astype(np.float32)
+    learnt = learn_prior([("a", dataclasses.replace(result, body_pose=drawn), BIRD)])
+    assert learnt.width == pytest.approx(3, rel=0.1)
+    assert learnt.pose_prior_weight == pytest.approx(1 / 6, rel=0.1)
+    still = np.broadcast_to(np.asarray(BIRD.pose_mean, np.float32).reshape(-1, 3), drawn.shape)
+    assert learn_prior([("a", dataclasses.replace(result, body_pose=still), BIRD)]).width == LEAST_WIDTH
 
 
 def test_oas_by_hand():
