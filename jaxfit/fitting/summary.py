@@ -18,7 +18,7 @@ __all__ = ["summarise"]
 
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
-    """Return the content of `summary.json`: counts, status, failures, second poses and loss of every track, timings, …
+    """Return the content of `summary.json`: counts; status, failures, second poses and loss of every track; timings.
 
     Args:
         solution: the result.

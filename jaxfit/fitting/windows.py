@@ -141,10 +141,8 @@ def window_starts(prepared: Observations, config: FitConfig, first_frame: Mappin
         at = np.flatnonzero((line >= 0) & usable[n, np.maximum(line, 0)])
         if len(at) == 0 or track not in first_frame:
             continue
-        begin, stride = (
-            (first_frame[track] - int(prepared.frame_index[0])) // step,
-            config.window - config.overlap_frames,
-        )
+        begin = (first_frame[track] - int(prepared.frame_index[0])) // step
+        stride = config.window - config.overlap_frames
         # only windows with a usable frame that no earlier window has
         wanted = np.unique(np.maximum(at - begin - config.overlap_frames, 0) // stride)
         starts += [(n, begin + w * stride, int(at[-1])) for w in wanted.tolist()]
