@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxfit.config.fit import FitConfig, StageConfig
@@ -125,7 +125,7 @@ def fit_batch(model: FitModel, configs: Sequence[FitConfig], batch: Batch, repor
         if i == last:
             step = np.where(np.isfinite(sum(final.loss.values())), 0, stage.steps)
             rows = _name_failures(program, tiles, rows, step, stage)
-        rows, best = _compare_hypotheses(rows, final)
+        rows, best = _compare_hypotheses(rows, final, batch.targets.present[targets_row])
         kept = rows.pose, rows.solver, rows.failure, rows.ambiguity_deg, final
         pose, solver, failure, ambiguity_deg, final = jax.tree.map(lambda x, best=best: x[best], kept)
         rows = _Rows(pose, solver, failure, ambiguity_deg, rows.row, 1)
@@ -243,10 +243,12 @@ def _name_failures(
     return rows._replace(failure=failure)
 
 
-def _compare_hypotheses(rows: _Rows, final: Report) -> tuple[_Rows, Int[np.ndarray, "R"]]:
+def _compare_hypotheses(
+    rows: _Rows, final: Report, present: Bool[Array | np.ndarray, "R T"]
+) -> tuple[_Rows, Int[np.ndarray, "R"]]:
     """Return the rows with the ambiguity of their best hypothesis, and the position of each best hypothesis.
 
-    A hypothesis that is not finite is never the best.
+    A hypothesis that is not finite is never the best. Poses of frames without the bird are arbitrary and do not count.
     """
     total = np.sum(list(final.loss.values()), axis=0).reshape(-1, rows.hypotheses)
     total = np.where(np.isfinite(total), total, np.inf)
@@ -258,7 +260,8 @@ def _compare_hypotheses(rows: _Rows, final: Report) -> tuple[_Rows, Int[np.ndarr
     pairs = orient.reshape(-1, 3), np.repeat(orient[best], rows.hypotheses, axis=0).reshape(-1, 3)
     own, of_best = (Rotation.from_rotvec(each) for each in pairs)
     angle_deg = np.rad2deg((own.inv() * of_best).magnitude()).reshape(orient.shape[:2])
-    is_other_pose = np.median(angle_deg, axis=1).reshape(total.shape) > LEAST_ANGLE_DEG
+    angle_deg = np.where(np.repeat(present, rows.hypotheses, axis=0), angle_deg, np.nan)
+    is_other_pose = np.nanmedian(angle_deg, axis=1).reshape(total.shape) > LEAST_ANGLE_DEG
     others = np.where(is_other_pose, total, np.inf)
     second = np.argmin(others, axis=1)
     with np.errstate(invalid="ignore"):  # no finite hypothesis

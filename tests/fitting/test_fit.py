@@ -261,11 +261,12 @@ def test_reported_progress_sums_to_the_total(observed):
     assert any(note.startswith("mask: loss ") for _, note in reports[1:])
 
 
-def fit_two_hypotheses(observed, settings, order):
-    """Fit one window from the correct initial pose and from the reversed pose."""
-    windows, truth = cut_windows(observed, settings)[:1], truths()[0]
+def fit_two_hypotheses(observed, settings, order, windows=None, agreeing=False):
+    """Fit one window from the correct initial pose and from a pose that is reversed except in the frames `agreeing`."""
+    windows, truth = windows or cut_windows(observed, settings)[:1], truths()[0]
     reversed_R = Rotation.from_rotvec([0, 0, np.pi]) * Rotation.from_rotvec(truth.global_orient)
-    flipped = dataclasses.replace(truth, global_orient=reversed_R.as_rotvec().astype(np.float32))
+    orient = np.where(np.broadcast_to(agreeing, T)[:, None], truth.global_orient, reversed_R.as_rotvec())
+    flipped = dataclasses.replace(truth, global_orient=orient.astype(np.float32))
     initial_pose = jax.tree.map(lambda *x: np.stack(x)[None], *(truth, flipped)[::order])
     batch = Batch(load_targets(windows, SIZE), initial_pose, *np.zeros((3, 1), int))
     return fit_batch(fit_model(BIRD, settings), [settings], batch, lambda *_: None)
@@ -288,6 +289,20 @@ def test_the_better_hypothesis_is_kept(observed, after_first):
         error_px = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of(truths()[:1]), axis=-1)
         assert error_px.mean() < 0.25
         assert not fitted.ambiguity_deg.any()  # the reversed pose is much less likely
+
+
+def test_poses_of_frames_without_the_bird_are_no_second_pose(observed):
+    """The hypotheses differ everywhere, but agree in most frames without the bird."""
+    settings = two_stages(True)
+    weak = dataclasses.replace(settings, terms=dict.fromkeys(settings.terms, 1e-7))
+    absent = np.arange(T) >= 2
+    windows = cut_windows(observed, weak)[:1]
+    windows = dataclasses.replace(windows, present=windows.present & ~absent, has_mask=windows.has_mask & ~absent)
+    flipped = fit_two_hypotheses(observed, weak, 1, windows, agreeing=absent)
+    assert flipped.ambiguity_deg[0, :2].min() > 150
+    assert not flipped.ambiguity_deg[0, 2:].any()
+    same = fit_two_hypotheses(observed, weak, 1, windows, agreeing=~absent)
+    assert not same.ambiguity_deg.any()
 
 
 @pytest.mark.parametrize("after_first", [True, False])
