@@ -95,22 +95,24 @@ class Cluster:
             yield i, result
 
     def _result(self, future: Any) -> Any:
-        """Return the result of a finished task."""
+        """Return the result of a task that has finished.
+
+        Waits if a worker ended before its result was here: the task is computed again.
+        """
         from distributed.scheduler import KilledWorker
 
-        if future.status == "finished":
+        try:
             result = future.result()
-            if isinstance(result, InputError):
-                raise result
-            return result
-        if future.status == "error":
-            error = future.exception()
+        except Exception as error:
+            if future.status != "error":
+                problem, remedy = "the connection to the scheduler is lost", "start the cluster and repeat the command"
+                raise InputError(self._name, problem, remedy) from error
             if isinstance(error, KilledWorker):
                 return FailedTask(f"{error.allowed_failures + 1} workers ended during the task")
             return FailedTask(f"failed {ATTEMPTS} times on the workers: {type(error).__name__}: {error}")
-        raise InputError(
-            self._name, "the connection to the scheduler is lost", "start the cluster and repeat the command"
-        )
+        if isinstance(result, InputError):
+            raise result
+        return result
 
 
 @contextmanager

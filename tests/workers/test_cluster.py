@@ -3,6 +3,7 @@
 import os
 import signal
 import socket
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -244,6 +245,24 @@ def test_two_processes_of_which_one_is_killed():
     assert_equal(solution, fit(observed, BIRD, some))
     shares = list(map(tuple, cores.values()))
     assert len(os.sched_getaffinity(0)) < 2 or len(set(shares)) == len(shares)
+
+
+@pytest.mark.extended
+def test_workers_that_end_with_results_that_were_not_taken():
+    """All tasks are finished, and their results are in the workers, when both workers are killed."""
+    with open_cluster(workers=2) as cluster:
+        running = cluster.run(add, 100, range(6))
+        results = [next(running)]
+        client = cluster._connect()
+        with client.as_current():
+            distributed.wait([distributed.Future(key, client) for key in client.futures])
+        killed = set(client.run(os.getpid).values())
+        for process in killed:
+            os.kill(process, signal.SIGKILL)
+        while len(set(client.run(os.getpid, on_error="ignore").values()) - killed) < 2:
+            time.sleep(0.1)
+        results.extend(running)
+    assert sorted(results) == [(i, 100 + i) for i in range(6)]
 
 
 @pytest.mark.extended
