@@ -76,14 +76,26 @@ Frame frame_of(const Image& image, size_t height_at, int64_t samples) {
   return frame;
 }
 
+// Returns the mesh of the first image. The meshes of the other images have the same faces.
+Mesh first_mesh(const Vertices& vertices, const Faces& faces) {
+  const int64_t count = static_cast<int64_t>(vertices.shape(1));
+  const Mesh mesh{vertices.data(), faces.data(), count, static_cast<int64_t>(faces.shape(0))};
+  for (int64_t i = 0; i < 3 * mesh.num_faces; ++i)
+    if (mesh.faces[i] < 0 || mesh.faces[i] >= count)
+      throw std::invalid_argument("faces: an index is not in [0, " + std::to_string(count) + ")");
+  return mesh;
+}
+
+Mesh mesh_of(int64_t image, Mesh first) {
+  first.vertices += image * first.num_vertices * 3;
+  return first;
+}
+
 // Calls task(renderer, mesh, image, rows, scratch) for every strip of every image.
 template <typename Task>
 void for_each_strip(const Vertices& vertices, const Faces& faces, Frame frame, Task task) {
-  const int64_t images = static_cast<int64_t>(vertices.shape(0)), count = static_cast<int64_t>(vertices.shape(1));
-  const Mesh first{vertices.data(), faces.data(), count, static_cast<int64_t>(faces.shape(0))};
-  for (int64_t i = 0; i < 3 * first.num_faces; ++i)
-    if (first.faces[i] < 0 || first.faces[i] >= count)
-      throw std::invalid_argument("faces: an index is not in [0, " + std::to_string(count) + ")");
+  const int64_t images = static_cast<int64_t>(vertices.shape(0));
+  const Mesh first = first_mesh(vertices, faces);
   nb::gil_scoped_release unlocked;
   Threads threads;
   int64_t rows = std::max(kFewestRows, kStripBytes / (8 * frame.width * frame.samples * frame.samples));
@@ -93,8 +105,7 @@ void for_each_strip(const Vertices& vertices, const Faces& faces, Frame frame, T
   const Renderer& renderer = current_renderer();
   for_each_task(threads, images * strips, [=, &renderer, &task](int64_t i) {
     const int64_t image = i / strips, top = i % strips * rows;
-    Mesh mesh = first;
-    mesh.vertices += image * count * 3;
+    const Mesh mesh = mesh_of(image, first);
     const Rows strip{top, std::min(top + rows, frame.height)};
     task(renderer, mesh, image, strip, scratch(renderer.workspace(mesh, frame, strip)));
   });
@@ -120,6 +131,39 @@ void hard_mask(Vertices vertices, Faces faces, Shaped<bool, -1, -1, -1> mask) {
   uint8_t* at = reinterpret_cast<uint8_t*>(mask.data());
   for_each_strip(vertices, faces, frame, [=](const Renderer& r, const Mesh& mesh, int64_t i, Rows rows, void* memory) {
     r.mask(mesh, frame, rows, memory, at + i * frame.width * frame.height);
+  });
+}
+
+void mask_overlap(Vertices vertices, Faces faces, Shaped<const int32_t, -1, 2> sizes,
+                  Shaped<const int32_t, -1, 2> runs, Shaped<const int64_t, -1> run_ends, Shaped<int32_t, -1, 4> box,
+                  Shaped<int32_t, -1> area, Shaped<int32_t, -1> shared) {
+  const int64_t images = static_cast<int64_t>(vertices.shape(0)), count = static_cast<int64_t>(runs.shape(0));
+  check_shape("sizes", sizes, {images, 2});
+  check_shape("run_ends", run_ends, {images});
+  check_shape("box", box, {images, 4});
+  check_shape("area", area, {images});
+  check_shape("shared", shared, {count});
+  const int32_t* size_at = sizes.data();
+  const int64_t* end_at = run_ends.data();
+  for (int64_t i = 0; i < images; ++i) {
+    check_range("width", size_at[2 * i], kMaxSize);
+    check_range("height", size_at[2 * i + 1], kMaxSize);
+    if (end_at[i] < (i ? end_at[i - 1] : 0) || end_at[i] > count)
+      throw std::invalid_argument("run_ends: expected increasing numbers up to " + std::to_string(count));
+  }
+  const Mesh first = first_mesh(vertices, faces);
+  static_assert(sizeof(Run) == 2 * sizeof(int32_t));
+  const Run* runs_at = reinterpret_cast<const Run*>(runs.data());
+  int32_t *box_at = box.data(), *area_at = area.data(), *shared_at = shared.data();
+  nb::gil_scoped_release unlocked;
+  Threads threads;
+  const Renderer& renderer = current_renderer();
+  for_each_task(threads, images, [=, &renderer](int64_t i) {
+    const Mesh mesh = mesh_of(i, first);
+    const Frame frame{size_at[2 * i], size_at[2 * i + 1], 1};
+    const int64_t start = i ? end_at[i - 1] : 0;
+    renderer.overlap(mesh, frame, scratch(renderer.workspace(mesh, frame, Rows{0, 0})), runs_at + start,
+                     end_at[i] - start, box_at + 4 * i, area_at + i, shared_at + start);
   });
 }
 
@@ -162,6 +206,9 @@ void add_renderer(nb::module_& m) {
   m.def("zbuffer", &zbuffer, arg("vertices").noconvert(), arg("faces").noconvert(), arg("face").noconvert(),
         arg("barycentric").noconvert(), arg("depth").noconvert());
   m.def("hard_mask", &hard_mask, arg("vertices").noconvert(), arg("faces").noconvert(), arg("mask").noconvert());
+  m.def("mask_overlap", &mask_overlap, arg("vertices").noconvert(), arg("faces").noconvert(),
+        arg("sizes").noconvert(), arg("runs").noconvert(), arg("run_ends").noconvert(), arg("box").noconvert(),
+        arg("area").noconvert(), arg("shared").noconvert());
   m.def("interpolate", &interpolate, arg("vertices").noconvert(), arg("faces").noconvert(),
         arg("attributes").noconvert(), arg("samples"), arg("values").noconvert(), arg("coverage").noconvert(),
         arg("face").noconvert());

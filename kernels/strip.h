@@ -54,7 +54,7 @@ Strip lay_out(const Mesh& mesh, Frame frame, Rows rows, char* memory, size_t& by
   return s;
 }
 
-size_t workspace(const Mesh& mesh, Frame frame, Rows rows) {
+size_t strip_workspace(const Mesh& mesh, Frame frame, Rows rows) {
   size_t bytes;
   lay_out(mesh, frame, rows, nullptr, bytes);
   return bytes;

@@ -4,6 +4,8 @@
 // face at every sample. This requires -ffp-contract=off. First, every face writes its nearness (1/depth) and its number
 // to the samples where it is the nearest face so far. Then the weights of the nearest face are computed again at every
 // sample. Only tiles of columns that a face reaches are cleared and read, so the time depends on the covered area.
+// Masks need no depths: coverage.h draws them.
+#include "coverage.h"
 #include "strip.h"
 
 #if defined(JAXFIT_AVX512)
@@ -30,6 +32,11 @@ inline void for_each_pixel(const Strip& s, Visit visit, Empty empty) {
     }
 }
 
+size_t workspace(const Mesh& mesh, Frame frame, Rows rows) {
+  const size_t strip = strip_workspace(mesh, frame, rows), patch = patch_workspace(mesh);
+  return strip > patch ? strip : patch;
+}
+
 void fragments(const Mesh& mesh, Frame frame, Rows rows, void* memory, int32_t* face, float* barycentric,
                float* depth) {
   const Strip s = rasterise(mesh, frame, rows, memory);
@@ -53,13 +60,52 @@ void fragments(const Mesh& mesh, Frame frame, Rows rows, void* memory, int32_t* 
 }
 
 void mask(const Mesh& mesh, Frame frame, Rows rows, void* memory, uint8_t* mask) {
-  const Strip s = rasterise(mesh, frame, rows, memory);
-  for_each_pixel(
-      s,
-      [&](int64_t row, int64_t column) {
-        if (s.face[(row - rows.first) * s.columns + column] >= 0) mask[row * frame.width + column] = 1;
-      },
-      [](int64_t, int64_t) {});
+  for_each_patch(mesh, kX, frame.width, rows.first, rows.end, memory, [&](const Patch& p) {
+    for (int64_t row = p.first; row < p.end; ++row)
+      __builtin_memcpy(mask + row * frame.width + p.low, p.line(row), static_cast<size_t>(p.high - p.low));
+  });
+}
+
+int32_t sum(const uint8_t* bytes, int64_t first, int64_t end) {
+  int32_t total = 0;
+  for (int64_t i = first; i < end; ++i) total += bytes[i];
+  return total;
+}
+
+// Returns the number of covered pixels of a run. The lines of the patch are columns.
+int32_t sum(const Patch& p, int64_t height, Run run) {
+  int32_t total = 0;
+  const int64_t start = run.first / height;
+  for (int64_t column = start > p.first ? start : p.first; column < p.end && column * height < run.end; ++column) {
+    const int64_t top = run.first - column * height, bottom = run.end - column * height;
+    total += sum(p.line(column), (top > p.low ? top : p.low) - p.low, (bottom < p.high ? bottom : p.high) - p.low);
+  }
+  return total;
+}
+
+void overlap(const Mesh& mesh, Frame frame, void* memory, const Run* runs, int64_t num_runs, int32_t* box,
+             int32_t* area, int32_t* shared) {
+  int64_t left = frame.width, right = 0, top = frame.height, bottom = 0;
+  *area = 0;
+  for (int64_t i = 0; i < num_runs; ++i) shared[i] = 0;
+  for_each_patch(mesh, kY, frame.height, 0, frame.width, memory, [&](const Patch& p) {
+    for (int64_t i = 0; i < num_runs; ++i) shared[i] += sum(p, frame.height, runs[i]);
+    for (int64_t column = p.first; column < p.end; ++column) {
+      const uint8_t* line = p.line(column);
+      const int32_t covered = sum(line, 0, p.high - p.low);
+      if (!covered) continue;
+      *area += covered;
+      left = column < left ? column : left, right = column + 1;
+      // only rows beyond the box so far can enlarge it
+      for (int64_t row = p.low; row < top && row < p.high; ++row)
+        if (line[row - p.low]) top = row;
+      for (int64_t row = p.high; row > bottom && row > p.low; --row)
+        if (line[row - 1 - p.low]) bottom = row;
+    }
+  });
+  if (!*area) left = right = top = bottom = 0;
+  box[0] = static_cast<int32_t>(left), box[1] = static_cast<int32_t>(top);
+  box[2] = static_cast<int32_t>(right - left), box[3] = static_cast<int32_t>(bottom - top);
 }
 
 // The part of one face in a pixel: its weights, summed over the samples where the face is visible.
@@ -153,6 +199,6 @@ void draw(const Mesh& mesh, Frame frame, Rows rows, void* memory, const float* c
 }  // namespace
 
 extern const Renderer RENDERER;
-const Renderer RENDERER = {workspace, fragments, mask, interpolate, draw};
+const Renderer RENDERER = {workspace, fragments, mask, overlap, interpolate, draw};
 
 }  // namespace jaxfit

@@ -9,11 +9,19 @@ from jaxfit.raster import kernels as native
 
 pytestmark = pytest.mark.skipif(not native.kernels_available(), reason="built without the kernels")
 
-B, V, C, H, W = 2, 3, 4, 5, 6
+B, V, C, H, W, R = 2, 3, 4, 5, 6, 7
 FITTING_GRADIENT = r"gradient: expected shape \(2, 3, 3\), got "
 RENDERER = {
     "zbuffer": {"face": (B, H, W), "barycentric": (B, H, W, 3), "depth": (B, H, W)},
     "hard_mask": {"mask": (B, H, W)},
+    "mask_overlap": {
+        "sizes": np.full((B, 2), W, np.int32),
+        "runs": (R, 2),
+        "run_ends": np.array([3, R]),
+        "box": (B, 4),
+        "area": (B,),
+        "shared": (R,),
+    },
     "interpolate": {
         "attributes": (B, V, C),
         "samples": 2,
@@ -23,15 +31,15 @@ RENDERER = {
     },
     "draw": {"colours": (V, 3), "samples": 2, "image": (H, W, 3)},
 }
-TYPES = {"faces": np.int32, "face": np.int32, "mask": bool, "image": np.uint8}
+TYPES = dict.fromkeys(["faces", "face", "runs", "box", "area", "shared"], np.int32) | {"mask": bool, "image": np.uint8}
 
 
 def call_renderer(function, **changed):
-    """Calls a function of the renderer with arrays of zeros, of which some have another shape."""
+    """Calls a function of the renderer with arrays of zeros and the given values; some have another shape or value."""
     batch = 1 if function == "draw" else B
     shapes = {"vertices": (batch, V, 3), "faces": (1, 3)} | RENDERER[function] | changed
     arguments = {
-        name: shape if name == "samples" else np.zeros(shape, TYPES.get(name, np.float32))
+        name: np.zeros(shape, TYPES.get(name, np.float32)) if isinstance(shape, tuple) else shape
         for name, shape in shapes.items()
     }
     getattr(native.require_kernels(), function)(**arguments)
@@ -56,6 +64,17 @@ def test_the_renderer_accepts_shapes_that_fit(function):
         ("zbuffer", {"depth": (B, 1, W)}, r"depth: expected shape \(2, 5, 6\), got \(2, 1, 6\)"),
         ("hard_mask", {"mask": (1, H, W)}, r"mask: expected shape \(2, 5, 6\), got \(1, 5, 6\)"),
         ("hard_mask", {"vertices": (B, 0, 3)}, r"faces: an index is not in \[0, 0\)"),
+        ("mask_overlap", {"sizes": np.ones((1, 2), np.int32)}, r"sizes: expected shape \(2, 2\), got \(1, 2\)"),
+        ("mask_overlap", {"sizes": np.array([[1, 1], [0, 1]], np.int32)}, "width: expected 1 to 16384, got 0"),
+        ("mask_overlap", {"sizes": np.array([[1, 16385]] * 2, np.int32)}, "height: expected 1 to 16384, got 16385"),
+        ("mask_overlap", {"run_ends": np.array([R])}, r"run_ends: expected shape \(2\), got \(1\)"),
+        ("mask_overlap", {"run_ends": np.array([2, 1])}, "run_ends: expected increasing numbers up to 7"),
+        ("mask_overlap", {"run_ends": np.array([-1, 1])}, "run_ends: expected increasing numbers"),
+        ("mask_overlap", {"run_ends": np.array([R, R + 1])}, "run_ends: expected increasing numbers"),
+        ("mask_overlap", {"box": (1, 4)}, r"box: expected shape \(2, 4\), got \(1, 4\)"),
+        ("mask_overlap", {"area": (1,)}, r"area: expected shape \(2\), got \(1\)"),
+        ("mask_overlap", {"shared": (1,)}, r"shared: expected shape \(7\), got \(1\)"),
+        ("mask_overlap", {"vertices": (B, 0, 3)}, r"faces: an index is not in \[0, 0\)"),
         ("interpolate", {"attributes": (B, 1, C)}, r"attributes: expected shape \(2, 3, 4\), got \(2, 1, 4\)"),
         ("interpolate", {"values": (B, H, W, 1)}, r"values: expected shape \(2, 5, 6, 4\), got \(2, 5, 6, 1\)"),
         ("interpolate", {"coverage": (B, H, 1)}, r"coverage: expected shape \(2, 5, 6\), got \(2, 5, 1\)"),

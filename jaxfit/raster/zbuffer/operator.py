@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Float32, Int, Int32, UInt8
 from jaxfit.raster.kernels import kernels_available, require_kernels
 from jaxfit.raster.zbuffer import reference
 
-__all__ = ["Fragments", "draw", "hard_mask", "interpolate", "zbuffer"]
+__all__ = ["Fragments", "MaskOverlap", "draw", "hard_mask", "interpolate", "mask_overlap", "zbuffer"]
 
 MAX_SIZE, MAX_SAMPLES = 2**14, 8
 
@@ -25,6 +25,19 @@ class Fragments(NamedTuple):
 
     depth: Float32[np.ndarray, "*B H W"]
     """Depth in the camera frame, in the unit of the vertices. inf without a face."""
+
+
+class MaskOverlap(NamedTuple):
+    """The masks of meshes, and what they share with runs of pixels."""
+
+    box_px: Int32[np.ndarray, "B 4"]
+    """x, y, width and height of the tight box; 0 for an empty mask."""
+
+    area_px: Int32[np.ndarray, "B"]
+    """Number of pixels."""
+
+    shared_px: Int32[np.ndarray, "R"]
+    """Number of pixels that each run shares with the mask of its mesh."""
 
 
 def zbuffer(
@@ -82,6 +95,50 @@ def hard_mask(
         for i, one in enumerate(vertices):
             mask[i] = reference.raster(one, faces, width, height, 1)[0] >= 0
     return mask.reshape(*batch, height, width)
+
+
+def mask_overlap(
+    vertices_screen: Float[Array | np.ndarray, "B V 3"],
+    faces: Int[Array | np.ndarray, "F 3"],
+    sizes_px: Int[np.ndarray, "B 2"],
+    mesh: Int[np.ndarray, "R"],
+    runs: Int[np.ndarray, "R 2"],
+) -> MaskOverlap:
+    """Return the boxes and areas of the masks of `hard_mask`, and their overlap with runs, without the masks.
+
+    Each mesh has an image of its own. The time depends on the area that a mesh covers, not on the size of the image.
+
+    Args:
+        vertices_screen: as for `zbuffer`.
+        faces: as for `zbuffer`.
+        sizes_px: width and height of the image of each mesh, 1 to 16384.
+        mesh: position of the mesh that each run is compared with.
+        runs: first pixel of each run, and the pixel after its last. Pixels are counted from 0, column by column from
+            the left, and from the top in each column, as in the run lengths of COCO.
+
+    Raises:
+        ValueError: the shape, type or value of an argument is not as described.
+    """
+    vertices, faces, batch = _mesh(vertices_screen, faces)
+    if len(batch) != 1:
+        raise ValueError(f"vertices_screen: expected shape (B, V, 3), got {np.shape(vertices_screen)}")
+    sizes = _integers("sizes_px", sizes_px, (len(vertices), 2), 1, MAX_SIZE)
+    mesh = _integers("mesh", mesh, (np.size(mesh),), 0, len(vertices) - 1)
+    runs = _integers("runs", runs, (len(mesh), 2), 0, MAX_SIZE**2)
+    if (runs[:, 0] > runs[:, 1]).any() or (runs[:, 1] > sizes.prod(1)[mesh]).any():
+        raise ValueError("runs: expected first pixels that are not after the ends, and ends within the images")
+    box, area, shared = (np.zeros(shape, np.int32) for shape in ((len(vertices), 4), len(vertices), len(runs)))
+    if kernels_available():
+        order = np.argsort(mesh, kind="stable")
+        found = np.zeros(len(runs), np.int32)
+        ends = np.bincount(mesh, minlength=len(vertices)).cumsum()
+        require_kernels().mask_overlap(vertices, faces, sizes, runs[order], ends, box, area, found)
+        shared[order] = found
+    else:
+        for i, one in enumerate(vertices):
+            own = mesh == i
+            box[i], area[i], shared[own] = reference.mask_overlap(one, faces, *sizes[i].tolist(), runs[own])
+    return MaskOverlap(box, area, shared)
 
 
 def interpolate(
@@ -203,6 +260,18 @@ def _attributes(attributes: Any, batch: tuple[int, ...], count: int, name: str =
     if full is None or given.ndim < 2 or given.shape[-2] != count:
         raise ValueError(f"{name}: expected shape ({', '.join(map(str, leading))}, channels), got {given.shape}")
     return np.ascontiguousarray(full, np.float32).reshape(math.prod(batch), count, given.shape[-1])
+
+
+def _integers(name: str, given: Any, shape: tuple[int, ...], low: int, high: int) -> np.ndarray:
+    """Check an array of integers. Returns it as contiguous int32."""
+    array = np.asarray(given)
+    if array.shape != shape:
+        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+    if not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name}: expected integers, got {array.dtype}")
+    if array.size and not low <= array.min() <= array.max() <= high:
+        raise ValueError(f"{name}: expected integers in [{low}, {high}], got {array.min()} to {array.max()}")
+    return np.ascontiguousarray(array, np.int32)
 
 
 def _check_size(width: Any, height: Any) -> None:

@@ -56,6 +56,21 @@ def fragments(vertices: Float32[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"
     return face, barycentric.astype(np.float32), depth.astype(np.float32)
 
 
+def mask_overlap(
+    vertices: Float32[np.ndarray, "V 3"],
+    faces: Int[np.ndarray, "F 3"],
+    width: int,
+    height: int,
+    runs: Int[np.ndarray, "R 2"],
+) -> tuple[tuple[int, int, int, int], int, Int[np.ndarray, "R"]]:
+    """Return the box and area of the mask of one image, and its overlap. See `jaxfit.raster.zbuffer.mask_overlap`."""
+    mask = raster(vertices, faces, width, height, 1)[0] >= 0
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    before = np.append(0, np.cumsum(mask.T))  # the number of covered pixels before each pixel
+    box = (columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1) if len(rows) else (0, 0, 0, 0)
+    return box, before[-1], before[runs[:, 1]] - before[runs[:, 0]]
+
+
 def interpolate(
     vertices: Float32[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
