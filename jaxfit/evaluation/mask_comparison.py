@@ -1,35 +1,29 @@
-"""Comparison of the masks of meshes with annotated masks.
-
-A mesh is drawn into a patch of the image that is as large as the mesh, many meshes in one call. Annotated masks stay
-runs of pixels: sums over the drawn columns count the pixels that a run shares with a mesh.
-"""
+"""Comparison of the masks of meshes with annotated masks, which stay runs of pixels."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit.data.formats.rle import ColumnRuns, foreground_runs
+from jaxfit.data.formats.rle import foreground_runs
 from jaxfit.data.neighbours import FrameMasks
 from jaxfit.data.observations import Observations
 from jaxfit.data.posed_meshes import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.progress import ProgressTask
-from jaxfit.raster.zbuffer import hard_mask
+from jaxfit.raster.zbuffer import mask_overlap
 
 __all__ = ["MaskComparison", "compare_masks"]
 
 _FRAMES = 64
-"""Frames that are compared at once."""
-_PIXELS = 8_000_000
-"""Most pixels that are drawn at once, where one image has fewer."""
-_PATCH_PX = 32
-"""Sides of patches are multiples, so that many meshes have patches of the same size."""
+"""Frames that are posed at once."""
+_MESHES = 1000
+"""Meshes that are compared at once, which bounds the memory."""
 
 
 class MaskComparison(NamedTuple):
@@ -69,17 +63,13 @@ def compare_masks(
     with progress("Measuring", int(measured.sum())) as report_progress:
         for first in range(0, measured.shape[1], _FRAMES):
             cells = np.argwhere(measured[:, first : first + _FRAMES]) + np.array([0, first])
-            if not len(cells):
-                continue
-            true_cells = np.stack([at[0][cells[:, 0], 0], at[1][cells[:, 1]]], axis=-1)
-            sizes_px = np.array([seen.image_size(n, t) for n, t in true_cells.tolist()])
-            true = _true_masks(seen, frames, true_cells)
-            index = tuple(cells.T)
-            true_side[index] = true.side_px
-            for some, drawn in _draw(_pose(posed, cells, first), faces, sizes_px):
-                own = tuple(cells[some].T)
-                predicted_side[own] = drawn.side_px
-                iou[own] = _iou(drawn, some, true, frames, true_cells)
+            for some in (cells[i : i + _MESHES] for i in range(0, len(cells), _MESHES)):
+                true_cells = np.stack([at[0][some[:, 0], 0], at[1][some[:, 1]]], axis=-1)
+                sizes_px = np.array([seen.image_size(n, t) for n, t in true_cells.tolist()])
+                true, vertices = _true_masks(seen, frames, true_cells), _pose(posed, some, first)
+                index = tuple(some.T)
+                true_side[index] = true.side_px
+                iou[index], predicted_side[index] = _compare(vertices, faces, sizes_px, true, frames, true_cells)
                 done += len(some)
                 report_progress(len(some), f"{done / (time.perf_counter() - start):,.0f} poses/s")
     return MaskComparison(iou, true_side, predicted_side)
@@ -120,98 +110,39 @@ def _pose(posed: PosedBirds, cells: Int[np.ndarray, "D 2"], first: int) -> Float
     return np.concatenate(vertices)
 
 
-class _Drawn(NamedTuple):
-    """The masks of B meshes, each in a patch of its image."""
-
-    corner_px: Int[np.ndarray, "B 2"]
-    """x, y of the first pixel of the patch."""
-    box_px: Int[np.ndarray, "B 4"]
-    """x, y, width and height of the tight box in the image; width and height 0 for an empty mask."""
-    sums: Int[np.ndarray, "B H+1 W"]
-    """Number of the mask's pixels above each row, in each column of the patch."""
-
-    @property
-    def side_px(self) -> Float[np.ndarray, "B"]:
-        """Longer side of the tight box; NaN for an empty mask."""
-        longest = self.box_px[:, 2:].max(-1)
-        return np.where(longest > 0, longest, np.nan)
-
-    def shared(self, runs: ColumnRuns) -> Int[np.ndarray, "B"]:
-        """Return the number of pixels that each mesh shares with the mask of the same position."""
-        height, width = self.sums.shape[1] - 1, self.sums.shape[2]
-        column = runs.column - self.corner_px[runs.mask, 0]
-        inside = (column >= 0) & (column < width)
-        mesh, column = runs.mask[inside], column[inside]
-        top, bottom = (np.clip(rows[inside] - self.corner_px[mesh, 1], 0, height) for rows in (runs.top, runs.bottom))
-        counts = self.sums[mesh, bottom, column].astype(np.int64) - self.sums[mesh, top, column]
-        return np.bincount(mesh, counts, len(self.sums)).astype(np.int64)
-
-
-def _draw(
-    vertices: Float[np.ndarray, "D V 3"], faces: np.ndarray, sizes_px: Int[np.ndarray, "D 2"]
-) -> Iterator[tuple[Int[np.ndarray, "B"], _Drawn]]:
-    """Draw meshes into patches of their images. Yield the positions of some meshes, and their masks.
-
-    The corner of a patch is a whole number of pixels and not beyond the mesh, so the shifted vertices are exact and
-    the mask is that of the whole image.
-    """
-    finite = np.isfinite(vertices[..., :2])
-    low = np.where(finite, vertices[..., :2], np.inf).min(1)
-    high = np.where(finite, vertices[..., :2], -np.inf).max(1)
-    low, high = np.clip(np.floor(low), 0, sizes_px), np.clip(np.ceil(high), 0, sizes_px)
-    corner = low.astype(np.int64)
-    patch = np.maximum(-(-(high - low).astype(np.int64) // _PATCH_PX), 1) * _PATCH_PX
-    for width, height in np.unique(patch, axis=0).tolist():
-        same = np.flatnonzero((patch == [width, height]).all(1))
-        count = max(_PIXELS // (width * height), 1)
-        for some in (same[i : i + count] for i in range(0, len(same), count)):
-            moved = vertices[some].copy()
-            moved[..., :2] -= corner[some, None].astype(np.float32)
-            room = sizes_px[some] - corner[some]  # the patch may reach beyond the image
-            mask = hard_mask(moved, faces, width, height)
-            mask &= (np.arange(height) < room[:, 1:])[:, :, None] & (np.arange(width) < room[:, :1])[:, None]
-            sums = np.zeros((len(some), height + 1, width), np.uint16)
-            np.cumsum(mask, axis=1, dtype=np.uint16, out=sums[:, 1:])
-            spans = [_span(mask.any(axis)) for axis in (1, 2)]
-            firsts, lengths = (np.stack([span[i] for span in spans], axis=-1) for i in (0, 1))
-            yield some, _Drawn(corner[some], np.concatenate([firsts + corner[some], lengths], axis=-1), sums)
-
-
-def _span(there: Bool[np.ndarray, "B L"]) -> tuple[Int[np.ndarray, "B"], Int[np.ndarray, "B"]]:
-    """Return the first True of each row, and the length up to the last True; 0 and 0 without any."""
-    first, after = there.argmax(1), there.shape[1] - there[:, ::-1].argmax(1)
-    return first, np.where(there.any(1), after - first, 0)
-
-
-def _iou(
-    drawn: _Drawn,
-    some: Int[np.ndarray, "B"],
+def _compare(
+    vertices: Float[np.ndarray, "D V 3"],
+    faces: np.ndarray,
+    sizes_px: Int[np.ndarray, "D 2"],
     true: _TrueMasks,
     frames: FrameMasks,
     cells: Int[np.ndarray, "D 2"],
-) -> Float[np.ndarray, "B"]:
-    """Return the IoU of some meshes; NaN without an annotated mask, or where both masks are empty.
+) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D"]]:
+    """Return the IoU of meshes, and the longer sides of their masks.
 
-    With the mesh P, the true mask T and the other birds O, the mask of the mesh is P ∩ (T ∪ ¬O).
+    With the mesh P, the true mask T and the other birds O, the mask of the mesh is P ∩ (T ∪ ¬O). The IoU is NaN without
+    T, or where both masks are empty; the side is NaN for an empty P.
     """
     from pycocotools import mask as coco_mask
 
-    empty = {"size": [1, 1], "counts": b"1"}
-    owns, covers = [], {}  # T, and T ∪ O where birds are near
-    for b, (box_px, i) in enumerate(zip(drawn.box_px, some.tolist(), strict=True)):
-        own = true.masks[i]
-        others = [] if own is None or true.whole[i] else frames.others(int(cells[i, 0]), int(cells[i, 1]), box_px)
-        owns.append(empty if own is None else own)
+    x, y = vertices[..., 0], vertices[..., 1]  # numpy is slow for the minimum of both together
+    low, high = (np.stack([f.reduce(x, axis=1), f.reduce(y, axis=1)], axis=-1) for f in (np.fmin, np.fmax))
+    low, high = np.clip(low, 0, sizes_px), np.clip(high, 0, sizes_px)
+    box_px = np.concatenate([low, high - low], axis=-1)
+    own = {d: rle for d, rle in enumerate(true.masks) if rle is not None}  # T
+    covers = {}  # T ∪ O where birds are near
+    for d, rle in own.items():
+        others = [] if true.whole[d] else frames.others(int(cells[d, 0]), int(cells[d, 1]), box_px[d])
         if others:
-            covers[b] = coco_mask.merge(cast(Any, [own, *others]))
-    runs = foreground_runs(owns)
-    area = np.bincount(runs.mask, runs.bottom - runs.top, len(some)).astype(np.int64)
-    both, visible = drawn.shared(runs), drawn.sums[:, -1].sum(-1, dtype=np.int64)
-    if covers:
-        hidden = np.array(list(covers))
-        runs = foreground_runs(list(covers.values()))
-        covered = drawn.shared(runs._replace(mask=hidden[runs.mask]))
-        visible[hidden] += (both - covered)[hidden]
+            covers[d] = coco_mask.merge(cast(Any, [rle, *others]))
+    mesh, known, near = np.array([*own, *covers], np.int64), [*own], [*covers]
+    runs = foreground_runs([*own.values(), *covers.values()])
+    drawn = mask_overlap(vertices, faces, sizes_px, mesh[runs.mask], runs.pixels)
+    shared = np.bincount(runs.mask, drawn.shared_px, len(mesh))
+    both, area = np.full((2, len(vertices)), np.nan)
+    both[known], area[known] = shared[: len(own)], runs.areas[: len(own)]
+    visible = drawn.area_px.astype(np.float64)
+    visible[near] += both[near] - shared[len(own) :]
     union = visible + area - both
-    known = np.array([true.masks[i] is not None for i in some.tolist()])
-    return np.where(known & (union > 0), both / np.maximum(union, 1), np.nan)
+    side = drawn.box_px[:, 2:].max(-1).astype(np.float64)
+    return np.where(union > 0, both / np.maximum(union, 1), np.nan), np.where(side > 0, side, np.nan)

@@ -27,12 +27,13 @@ def test_runs_and_areas(masks):
     encoded[0] = {"size": encoded[0]["size"], "counts": encoded[0]["counts"].decode()}  # text is allowed
     runs = rle.foreground_runs(encoded)
     for i, mask in enumerate(masks):
-        drawn = np.zeros(mask.shape, int)
-        for n, column, top, bottom in zip(*runs, strict=True):
+        drawn = np.zeros(mask.size, int)
+        for n, (first, end) in zip(runs.mask, runs.pixels, strict=True):
             if n == i:
-                assert bottom > top
-                drawn[top:bottom, column] += 1
-        np.testing.assert_array_equal(drawn, mask)
+                assert end > first
+                drawn[first:end] += 1
+        np.testing.assert_array_equal(drawn.reshape(mask.shape, order="F"), mask)
+        assert runs.areas[i] == mask.sum()
         np.testing.assert_array_equal(decode_mask(encode_mask(mask)), mask)
     assert rle.mask_areas(encoded) == [int(mask.sum()) for mask in masks]
 

@@ -1,10 +1,10 @@
-"""Sides and IoU from patches and runs equal those of whole images."""
+"""Sides and IoU from meshes and runs equal those of masks of whole images."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, solution, truth
+from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, known, solution, truth
 
 from jaxfit.data.masks import decode_mask, encode_mask
 from jaxfit.data.posed_meshes import PosedBirds
@@ -51,7 +51,7 @@ def random_masks(seed):
 @pytest.mark.parametrize("frames", [1, 3, 64])
 def test_it_equals_the_comparison_of_whole_images(monkeypatch, seed, frames):
     monkeypatch.setattr(mask_comparison, "_FRAMES", frames)
-    monkeypatch.setattr(mask_comparison, "_PIXELS", 20_000)
+    monkeypatch.setattr(mask_comparison, "_MESHES", 3)
     rng = np.random.default_rng(seed)
     shift = np.concatenate([rng.integers(-250, 250, (N, T, 2)), np.zeros((N, T, 1), int)], -1)
     result = solution(crop=(solution().crop + shift).astype(np.float32))
@@ -82,6 +82,14 @@ def test_photographs_and_meshes_that_reach_behind_the_camera():
     np.testing.assert_allclose(found.predicted_side_px, expected[2], atol=1)
     assert np.isnan(found.predicted_side_px[0, 1])
     assert found.iou[0, 1] == 0
+
+
+def test_annotations_without_masks():
+    seen, measured = dataclasses.replace(truth(), masks={}), np.ones((N, T), bool)
+    found, expected = compare_masks(known(), BIRD, seen, measured, AT, silent), by_whole_images(known(), seen, measured)
+    assert np.isnan(found.iou).all()
+    np.testing.assert_array_equal(found.true_side_px, expected[1])
+    np.testing.assert_array_equal(found.predicted_side_px, expected[2])
 
 
 def test_masks_of_one_chunk_of_frames_are_in_memory(monkeypatch):

@@ -16,23 +16,22 @@ from jaxtyping import Bool, Int, UInt8
 from jaxfit.data.formats.fields import Field
 from jaxfit.limits import POLYGON_LENGTH_PX, POLYGONS
 
-__all__ = ["ColumnRuns", "foreground_runs", "mask_areas", "read_segmentation", "run_lengths", "valid_texts"]
+__all__ = ["MaskRuns", "foreground_runs", "mask_areas", "read_segmentation", "run_lengths", "valid_texts"]
 
 _MASKS_AT_ONCE = 500
 """Masks that are checked at once, which bounds the memory."""
 _REMEDY = "write the mask again with pycocotools, or leave segmentation out"
 
 
-class ColumnRuns(NamedTuple):
-    """R runs of pixels of some masks; every run lies in one column of its image."""
+class MaskRuns(NamedTuple):
+    """R runs of pixels of some masks."""
 
     mask: Int[np.ndarray, "R"]
     """Position of the mask."""
-    column: Int[np.ndarray, "R"]
-    top: Int[np.ndarray, "R"]
-    """First row."""
-    bottom: Int[np.ndarray, "R"]
-    """Row after the last row."""
+    pixels: Int[np.ndarray, "R 2"]
+    """First pixel, and the pixel after the last; pixels are counted column by column."""
+    areas: Int[np.ndarray, "M"]
+    """Number of pixels of each mask."""
 
 
 def read_segmentation(segmentation: Field, height: int, width: int) -> dict[str, Any] | None:
@@ -141,35 +140,27 @@ def run_lengths(text: str) -> list[int]:
     return values.tolist() if values.min() >= 0 else []
 
 
-def foreground_runs(masks: Sequence[Mapping[str, Any]]) -> ColumnRuns:
+def foreground_runs(masks: Sequence[Mapping[str, Any]]) -> MaskRuns:
     """Return the runs of the pixels of many masks, all at once.
 
     Args:
         masks: run lengths in the format of ``Observations.masks``, which are valid.
     """
     texts = [rle["counts"] if isinstance(rle["counts"], bytes) else rle["counts"].encode() for rle in masks]
-    height = np.array([rle["size"][0] for rle in masks], np.int64)
     codes = np.frombuffer(b"".join(texts), np.uint8).astype(np.int64) - 48
     values, owner, place, _ = _run_lengths(codes, np.array([len(text) for text in texts], np.int64))
     end = _sums_within(values, owner)
     run = (place % 2 == 1) & (values > 0)
-    owner, start, last = owner[run], (end - values)[run], end[run] - 1
-    tall = height[owner]
-    column, spans = start // tall, last // tall - start // tall + 1
-    which = np.repeat(np.arange(len(column)), spans)  # a run that reaches into further columns is split
-    column = column[which] + np.arange(len(which)) - (np.cumsum(spans) - spans)[which]
-    top = np.maximum(start[which] - column * tall[which], 0)
-    bottom = np.minimum(last[which] + 1 - column * tall[which], tall[which])
-    return ColumnRuns(owner[which], column, top, bottom)
+    owner, lengths, end = owner[run], values[run], end[run]
+    areas = np.bincount(owner, lengths, len(masks)).astype(np.int64)
+    return MaskRuns(owner, np.stack([end - lengths, end], axis=-1), areas)
 
 
 def mask_areas(masks: Sequence[Mapping[str, Any]]) -> list[int]:
     """Return the number of pixels of each mask; the masks are as for ``foreground_runs``."""
     areas = []
     for first in range(0, len(masks), _MASKS_AT_ONCE):
-        some = masks[first : first + _MASKS_AT_ONCE]
-        runs = foreground_runs(some)
-        areas += np.bincount(runs.mask, runs.bottom - runs.top, len(some)).astype(np.int64).tolist()
+        areas += foreground_runs(masks[first : first + _MASKS_AT_ONCE]).areas.tolist()
     return areas
 
 
