@@ -59,19 +59,20 @@ void cover(const Patch& p, const Triangle& t) {
   const Doubles zero = all(0);  // added, it turns -0 into 0: then the sign bit tells negative numbers
   for (int64_t start = t.left; start <= t.right; start += kLanes) {
     const Doubles x = lanes + all(static_cast<double>(start));
-    const Longs beyond = (Longs)(all(static_cast<double>(t.right) + 0.5) - x);
+    const int64_t inside = t.right - start + 1;  // lanes up to the end of the face
+    const uint64_t beyond = inside < kLanes ? kAllCovered << 8 * inside : 0;
     const Doubles dx0 = all(t.u[0]) - x, dx1 = all(t.u[1]) - x, dx2 = all(t.u[2]) - x;
     uint8_t* at = p.line(t.top) + (start - p.low);
     for (int64_t line = t.top; line <= t.bottom; ++line, at += p.stride) {
       uint64_t old;
       __builtin_memcpy(&old, at, sizeof old);
-      if (old == kAllCovered) continue;
+      if ((old | beyond) == kAllCovered) continue;
       const double y = static_cast<double>(line) + 0.5;
       const Doubles dy0 = all(t.v[0] - y), dy1 = all(t.v[1] - y), dy2 = all(t.v[2] - y);
       const Doubles e0 = dx1 * dy2 - dy1 * dx2, e1 = dx2 * dy0 - dy2 * dx0, e2 = dx0 * dy1 - dy0 * dx1;
-      const Longs outside = (Longs)(e0 + zero) | (Longs)(e1 + zero) | (Longs)(e2 + zero) | beyond;
+      const Longs outside = (Longs)(e0 + zero) | (Longs)(e1 + zero) | (Longs)(e2 + zero);
       const Bytes covered = __builtin_convertvector((UnsignedLongs)~outside >> 63, Bytes);
-      const uint64_t both = old | (uint64_t)covered;
+      const uint64_t both = old | ((uint64_t)covered & ~beyond);
       __builtin_memcpy(at, &both, sizeof both);
     }
   }

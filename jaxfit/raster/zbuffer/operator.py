@@ -137,7 +137,7 @@ def mask_overlap(
     else:
         for i, one in enumerate(vertices):
             own = mesh == i
-            box[i], area[i], shared[own] = reference.mask_overlap(one, faces, *sizes[i].tolist(), runs[own])
+            box[i], area[i], shared[own] = reference.mask_overlap(one, faces, sizes[i, 0], sizes[i, 1], runs[own])
     return MaskOverlap(box, area, shared)
 
 

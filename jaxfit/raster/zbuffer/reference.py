@@ -62,13 +62,13 @@ def mask_overlap(
     width: int,
     height: int,
     runs: Int[np.ndarray, "R 2"],
-) -> tuple[tuple[int, int, int, int], int, Int[np.ndarray, "R"]]:
-    """Return the box and area of the mask of one image, and its overlap. See `jaxfit.raster.zbuffer.mask_overlap`."""
+) -> tuple[Int[np.ndarray, "4"], int, Int[np.ndarray, "R"]]:
+    """Return box, area and overlap of the mask of one image. See `jaxfit.raster.zbuffer.mask_overlap`."""
     mask = raster(vertices, faces, width, height, 1)[0] >= 0
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     before = np.append(0, np.cumsum(mask.T))  # the number of covered pixels before each pixel
-    box = (columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1) if len(rows) else (0, 0, 0, 0)
-    return box, before[-1], before[runs[:, 1]] - before[runs[:, 0]]
+    box = [columns[0], rows[0], np.ptp(columns) + 1, np.ptp(rows) + 1] if len(rows) else [0] * 4
+    return np.array(box), before[-1], before[runs[:, 1]] - before[runs[:, 0]]
 
 
 def interpolate(
