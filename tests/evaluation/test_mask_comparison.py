@@ -69,6 +69,20 @@ def test_it_equals_the_comparison_of_whole_images(monkeypatch, seed, frames):
     assert np.isfinite(found.iou).sum() >= 4
 
 
+@pytest.mark.parametrize("shift_px", [0, 100])
+def test_pixels_of_other_birds_do_not_count(shift_px):
+    result = solution(crop=solution().crop + np.float32([shift_px, 0, 0]))  # the shifted meshes leave the image
+    masks = random_masks(7)
+    right = np.arange(WIDTH) >= WIDTH // 2  # bird 1 is near the right part of bird 0 only
+    masks |= {(1, t): encode_mask(decode_mask(masks[1, t]) & right) for t in range(T)}
+    seen, measured = dataclasses.replace(truth(), masks=masks), np.ones((N, T), bool)
+    alone = [dataclasses.replace(seen, masks={(n, t): seen.masks[n, t] for t in range(T)}) for n in range(N)]
+    found, expected = compare_masks(result, BIRD, seen, measured, AT, silent), by_whole_images(result, seen, measured)
+    without = np.stack([by_whole_images(result, alone[n], measured)[0, n] for n in range(N)])
+    np.testing.assert_allclose(found.iou, expected[0], atol=1e-4)
+    assert (found.iou > without + 1e-3).any()
+
+
 def test_photographs_and_meshes_that_reach_behind_the_camera():
     own = {(1, t): (f"{t}.png", WIDTH, HEIGHT) for t in range(T)}
     seen = dataclasses.replace(truth(), own_images=own, masks=random_masks(5))

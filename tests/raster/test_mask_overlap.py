@@ -75,6 +75,15 @@ def test_a_square_at_the_borders_of_its_image(each_isa):
     assert found.shared_px.reshape(-1, 2).tolist() == [[20, 6], [0, 0], [15, 15], [0, 0], [0, 0], [0, 0], [0, 0]]
 
 
+def test_edges_through_the_centres_of_pixels_belong_to_the_mask(each_isa):
+    moved = SQUARE + np.float32([0.5, 0.5, 0])
+    for turned in range(3):
+        faces = np.roll(HALVES, turned, axis=1)
+        for order in (faces, faces[:, ::-1]):
+            assert mask_overlap(moved[None], order, np.array([[40, 40]]), *NO_RUNS).area_px.tolist() == [21**2]
+            assert hard_mask(moved, order, 40, 40)[10:31, 10:31].sum() == 21**2
+
+
 @pytest.mark.parametrize("isa", ISAS)  # the reference would need much memory
 def test_a_square_that_is_drawn_in_parts(isa):
     side, width, height = 3000, 4000, 3500
