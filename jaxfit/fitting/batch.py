@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.diagnose import name_failures
+from jaxfit.fitting.near_frames import take_near_poses
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program
 from jaxfit.fitting.solve import Report, StageState, advance, begin, report
 from jaxfit.fitting.stages import FitModel, needs_mask, stage_hyperparameters, stage_program
@@ -118,6 +119,9 @@ def fit_batch(model: FitModel, configs: Sequence[FitConfig], batch: Batch, repor
         rows, config_of_row, targets_row = _split_rows(rows, batch, hyperparameters)
         tiles = _stage_tiles(rows, hyperparameters, config_of_row, batch.targets, targets_row, needs_mask(stage))
         rows = _run_stage(program, tiles, rows, stage, report_progress)
+        if stage.near_poses:
+            near = [take_near_poses(program, tile.problems, take_tile(rows.pose, tile.rows)) for tile in tiles]
+            rows = rows._replace(pose=join_tiles(near, len(rows.failure)))
         if i < last and not (stage.keep_best and rows.hypotheses > 1):
             continue
         reports = [report(program, tile.problems, take_tile(rows.pose, tile.rows)) for tile in tiles]

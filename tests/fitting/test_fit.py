@@ -261,15 +261,25 @@ def test_reported_progress_sums_to_the_total(observed):
     assert any(note.startswith("mask: loss ") for _, note in reports[1:])
 
 
-def fit_two_hypotheses(observed, settings, order, windows=None, agreeing=False):
-    """Fit one window from the correct initial pose and from a pose that is reversed except in the frames `agreeing`."""
-    windows, truth = windows or cut_windows(observed, settings)[:1], truths()[0]
+def reversed_except(agreeing):
+    """Return the first true pose, turned by 180° except in the frames `agreeing`."""
+    truth = truths()[0]
     reversed_R = Rotation.from_rotvec([0, 0, np.pi]) * Rotation.from_rotvec(truth.global_orient)
     orient = np.where(np.broadcast_to(agreeing, T)[:, None], truth.global_orient, reversed_R.as_rotvec())
-    flipped = dataclasses.replace(truth, global_orient=orient.astype(np.float32))
-    initial_pose = jax.tree.map(lambda *x: np.stack(x)[None], *(truth, flipped)[::order])
+    return dataclasses.replace(truth, global_orient=orient.astype(np.float32))
+
+
+def fit_from(observed, settings, hypotheses, windows=None):
+    """Fit one window from some initial poses."""
+    windows = windows or cut_windows(observed, settings)[:1]
+    initial_pose = jax.tree.map(lambda *x: np.stack(x)[None], *hypotheses)
     batch = Batch(load_targets(windows, SIZE), initial_pose, *np.zeros((3, 1), int))
     return fit_batch(fit_model(BIRD, settings), [settings], batch, lambda *_: None)
+
+
+def fit_two_hypotheses(observed, settings, order, windows=None, agreeing=False):
+    """Fit one window from the correct initial pose and from a pose that is reversed except in the frames `agreeing`."""
+    return fit_from(observed, settings, (truths()[0], reversed_except(agreeing))[::order], windows)
 
 
 def two_stages(keep_first):
@@ -289,6 +299,18 @@ def test_the_better_hypothesis_is_kept(observed, after_first):
         error_px = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of(truths()[:1]), axis=-1)
         assert error_px.mean() < 0.25
         assert not fitted.ambiguity_deg.any()  # the reversed pose is much less likely
+
+
+@pytest.mark.parametrize("near_poses", [True, False])
+def test_a_stage_ends_with_the_poses_of_near_frames(observed, near_poses):
+    """The initial pose is reversed in one frame, and the stages hardly move."""
+    settings = two_stages(True)
+    first, second = (dataclasses.replace(stage, steps=1, learning_rate=1e-6) for stage in settings.stages)
+    settings = dataclasses.replace(settings, stages=(dataclasses.replace(first, near_poses=near_poses), second))
+    fitted = fit_from(observed, settings, [reversed_except(np.arange(T) != 2)])
+    error_px = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of(truths()[:1]), axis=-1)
+    assert (error_px[0, 2].mean() < 2) == near_poses
+    assert error_px[0, np.arange(T) != 2].mean() < 0.1
 
 
 def test_poses_of_frames_without_the_bird_are_no_second_pose(observed):
