@@ -72,7 +72,8 @@ def ablate(
 
     observations, truth, folder = Path(observations), Path(truth), Path(folder)
     crossed, bird = load_grid(grid), bird or load_murre()
-    observed, true = read_coco(observations), read_truth(truth)
+    observed = read_coco(observations, untracked="photographs")  # as `jaxfit fit`
+    true = read_truth(truth, untracked="photographs" if observed.own_images else "video")
     if matching != "overlap":
         check_shared(observed, true)
     check_observations(observed, bird, observations)

@@ -89,7 +89,10 @@ def adapt_photos(options: argparse.Namespace) -> None:
         raise InputError("--fix", "all parts are fixed, so that nothing is left to fit", "fix fewer parts")
     check_writable(options.out)  # before the long work
     bird = find_bird(options.model)
-    sources = [(path.name, observations_for(path, bird.keypoint_names, options)[0]) for path in options.birds]
+    sources = [
+        (path.name, observations_for(path, bird.keypoint_names, options, untracked="photographs")[0])
+        for path in options.birds
+    ]
     photographs = read_photographs(sources, bird, terminal)
     count = len(photographs.names)
     without = int((~photographs.has_mask).sum())

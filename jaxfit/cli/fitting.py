@@ -42,7 +42,7 @@ def fit(options: argparse.Namespace) -> None:
     check_replaceable(options.out, options.overwrite, "poses.npz")  # before the long work
     config = load_config(options.config)
     bird = find_bird(options.model)
-    observations, names = observations_for(options.observations, bird.keypoint_names, options)
+    observations, names = observations_for(options.observations, bird.keypoint_names, options, untracked="photographs")
     config = _fewer_keypoints(config, names, options)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
     read = time.perf_counter()
@@ -97,7 +97,9 @@ def evaluate(options: argparse.Namespace) -> None:
         _evaluate_observations(options)
         return
     solution, bird = load_solution(options.result)
-    truth = read_truth(options.truth, options.video, image_size(options))
+    # a fit of photographs has one frame, see `fit`
+    untracked = "photographs" if len(solution.frame_index) == 1 else "video"
+    truth = read_truth(options.truth, options.video, image_size(options), untracked)
     true_names = truth.observations.keypoint_names
     if set(true_names) != set(bird.keypoint_names):
         names = keypoint_map(true_names, options.truth, bird.keypoint_names, options.names, quiet=options.json)

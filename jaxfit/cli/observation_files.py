@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from jaxfit.cli.tables import EscapedTable, show
 from jaxfit.config.yaml_values import read_yaml
+from jaxfit.data.formats.coco_exports import Untracked
 from jaxfit.data.keypoint_names import NameMap, checked_map, map_keypoints, propose_names
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
@@ -26,7 +27,11 @@ class MappedObservations(NamedTuple):
 
 
 def observations_for(
-    path: Path, model_names: Sequence[str], options: argparse.Namespace, quiet: bool = False
+    path: Path,
+    model_names: Sequence[str],
+    options: argparse.Namespace,
+    quiet: bool = False,
+    untracked: Untracked = "video",
 ) -> MappedObservations:
     """Read a file of observations and map its keypoints to those of a model, by `--names` or by a proposal.
 
@@ -35,13 +40,14 @@ def observations_for(
         model_names: names of the keypoints of the model.
         options: the options `video`, `size` and `names` of the command.
         quiet: whether to print no table.
+        untracked: how a COCO file without any track is read; see `jaxfit.data.formats.coco_exports`.
 
     Raises:
         InputError: as `read_observations`; an unusable map, or no keypoint of the model.
     """
     from jaxfit.data.formats.recognise import read_observations  # imports the video libraries
 
-    observations = read_observations(path, options.video, image_size(options))
+    observations = read_observations(path, options.video, image_size(options), untracked)
     names = keypoint_map(observations.keypoint_names, path, model_names, options.names, quiet)
     return MappedObservations(map_keypoints(observations, names, model_names), names)
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.formats.coco_exports import Untracked
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.formats.scene_folder import MARKER, TRUE_POSES, TRUTH
@@ -41,7 +42,12 @@ class Truth:
         return truth if isinstance(truth, Truth) else cls(truth)
 
 
-def read_truth(path: str | Path, video: str | Path | None = None, size_px: tuple[int, int] | None = None) -> Truth:
+def read_truth(
+    path: str | Path,
+    video: str | Path | None = None,
+    size_px: tuple[int, int] | None = None,
+    untracked: Untracked = "video",
+) -> Truth:
     """Read the truth from a file of annotations or from the folder of a simulated scene.
 
     Args:
@@ -50,6 +56,7 @@ def read_truth(path: str | Path, video: str | Path | None = None, size_px: tuple
             ``scene.json``.
         video: as for `read_observations`.
         size_px: as for `read_observations`.
+        untracked: as for `read_observations`.
 
     Returns:
         The truth; without poses, model and behaviours for a file, and without behaviours for a folder without
@@ -60,7 +67,7 @@ def read_truth(path: str | Path, video: str | Path | None = None, size_px: tuple
     """
     path = Path(path)
     if not os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises for names that are too long)
-        return Truth(read_observations(path, video, size_px), source=path)
+        return Truth(read_observations(path, video, size_px, untracked), source=path)
     if not (path / TRUTH).is_file():
         remedy = "give a COCO file of annotations, or the folder of a simulated scene"
         raise InputError(path, f"is a folder without {TRUTH}", remedy)

@@ -86,6 +86,29 @@ def test_evaluate(fitted, inputs, tmp_path, capsys):
     assert f"{T} poses of tracks or frames that the truth lacks" in capsys.readouterr().out
 
 
+def test_a_file_without_tracks_is_fitted_as_photographs(inputs, tmp_path, caplog, capsys):
+    """Every annotation becomes a bird with one pose, the command says so, and the result fits to its own file."""
+    content = json.loads((inputs / "birds.json").read_text())
+    for annotation in content["annotations"]:
+        del annotation["track_id"]
+    (tmp_path / "photographs.json").write_text(json.dumps(content))
+    assert main(arguments(inputs, tmp_path / "out", obs=str(tmp_path / "photographs.json"))) == 0
+    assert "photographs.json: no annotation has a track_id, so the file is a set of photographs" in caplog.text
+    solution, _ = load_solution(tmp_path / "out")
+    assert solution.valid.shape == (3 * T, 1)
+    assert solution.valid.sum() == 2 * T
+    capsys.readouterr()
+    command = ["evaluate", str(tmp_path / "out"), "--truth", str(tmp_path / "photographs.json"), "--json"]
+    assert main(command) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["frames"], result["missing"], result["matched_by"]) == (2 * T, T, "ids")
+    assert result["pck@0.05"] == 1
+    content["annotations"][1]["track_id"] = 4
+    (tmp_path / "some.json").write_text(json.dumps(content))
+    command = arguments(inputs, tmp_path / "some", obs=str(tmp_path / "some.json"))
+    rejected(capsys, command, "some.json: annotations[0] lacks the key track_id")
+
+
 def test_fit_starts_from_an_earlier_result(fitted, inputs, tmp_path):
     command = [*arguments(inputs, tmp_path / "out"), "--init", str(fitted / "poses.npz")]
     content = (inputs / "birds.json").read_text()

@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from support.coco_files import content as video
+from support.coco_files import saved as saved_video
 
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.recognise import read_observations
@@ -92,6 +94,53 @@ def test_a_video_file_that_lacks_a_track_is_still_an_error(tmp_path):
     content = cvat(["frame_1.png", "frame_2.png"], [(1, {"track_id": 4}), (2, {})])
     with pytest.raises(InputError, match=r"annotations\[1\] lacks the key track_id"):
         read_observations(saved(tmp_path, content))
+
+
+def untracked_video():
+    """Return a file with frame numbers, but without a track."""
+    without = video()
+    for annotation in without["annotations"]:
+        del annotation["track_id"]
+    return without
+
+
+def test_photographs_without_tracks(tmp_path, caplog):
+    """For a fit, a file without any track is a set of photographs, and a line says so."""
+    observed = read_observations(saved_video(tmp_path, untracked_video()), untracked="photographs")
+    assert observed.frame_index.tolist() == [0]
+    assert observed.present.tolist() == [[True]] * 5
+    assert [observed.image_file(n, 0) for n in range(5)] == ["b.png", "a.png", "c.png", "a.png", "b.png"]
+    assert "no annotation has a track_id" in caplog.text
+    assert "3 images" in caplog.text
+    assert "5 annotations" in caplog.text
+    one_bird = label_studio(["0a1b2c3d-img_7.png", "99990000-img_5.png"])
+    observed = read_observations(saved(tmp_path, one_bird), untracked="photographs")
+    assert observed.frame_index.tolist() == [0]
+    assert observed.track_id.tolist() == [1, 2]
+
+
+def test_tracks_of_any_kind_are_kept(tmp_path, caplog):
+    """A file with tracks is a video for a fit too, whether the tracks are keys or attributes."""
+    tracked = cvat(["frame_1.png", "frame_2.png"], [(image, {"attributes": {"track_id": 3}}) for image in (1, 2)])
+    for path in (saved(tmp_path, tracked), saved_video(tmp_path, video())):
+        for untracked in ("labels", "photographs"):
+            as_video, read = read_observations(path), read_observations(path, untracked=untracked)
+            np.testing.assert_array_equal(read.track_id, as_video.track_id)
+            np.testing.assert_array_equal(read.frame_index, as_video.frame_index)
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("untracked", ["video", "labels", "photographs"])
+def test_a_file_in_which_only_some_tracks_are_missing_is_an_error(tmp_path, untracked):
+    without = video()
+    del without["annotations"][3]["track_id"]
+    with pytest.raises(InputError, match=r"annotations\[3\] lacks the key track_id \(give every"):
+        read_observations(saved_video(tmp_path, without), untracked=untracked)
+
+
+def test_only_labels_and_fits_read_a_video_without_tracks(tmp_path):
+    with pytest.raises(InputError, match=r"annotations\[0\] lacks the key track_id"):
+        read_observations(saved_video(tmp_path, untracked_video()))
 
 
 def test_damaged_exports(tmp_path):

@@ -39,6 +39,43 @@ def test_masks_without_keypoints(tmp_path):
     assert (data.frames.pictures[0][owner > 0] == 250).mean() > 0.9
 
 
+def without(content, *keys):
+    """Return a COCO file without some keys of video: `track_id` of annotations, `frame_index` of images."""
+    for table in ("images", "annotations"):
+        content[table] = [{k: v for k, v in entry.items() if k not in keys} for entry in content[table]]
+    return content
+
+
+@pytest.mark.parametrize("keys", [("track_id",), ("track_id", "frame_index")])
+def test_every_annotation_without_a_track_is_a_bird(tmp_path, caplog, keys):
+    """Labels need no tracks; the frames keep their numbers, which the hold-out needs."""
+    frames = {t: [bird(40, 30), bird(100, 60, 40)][: 1 + (t > 0)] for t in TIMES}
+    frames[50][1] = bird(-30, 30)
+    file = write_labels(tmp_path / "labels", without(coco(frames), *keys), list(TIMES))
+    pictures = read_labels([file], [], needs_keypoints=False).pictures
+    assert [picture.frame for picture in pictures] == list(TIMES)
+    assert [len(picture.birds) for picture in pictures] == [1] + [2] * (len(TIMES) - 1)
+    data = prepare_data("segmenter", LabelFiles((file,)), 0.25, None, tmp_path / "training")
+    assert len(problems(data)) == 1
+    assert "frame_0050.png bird 2: the box reaches outside" in problems(data)[0]
+    assert not caplog.text
+
+
+def test_keypoints_without_tracks(tmp_path):
+    birds = [bird(x, 30, keypoints=[x + 5, 35, 2]) for x in (10, 60, 110)]
+    file = write_labels(tmp_path, without(coco({t: birds for t in TIMES}, ["beak"]), "track_id"), [])
+    pictures = read_labels([file], []).pictures
+    assert [[int(own.keypoints_px[0, 0]) for own in picture.birds] for picture in pictures] == [[15, 65, 115]] * 8
+
+
+def test_labels_of_which_only_some_have_a_track_are_an_error(tmp_path):
+    content = coco({t: [bird()] for t in TIMES})
+    del content["annotations"][2]["track_id"]
+    file = write_labels(tmp_path, content, [])
+    with pytest.raises(InputError, match=r"annotations\[2\] lacks the key track_id"):
+        read_labels([file], [], needs_keypoints=False)
+
+
 def test_folder_of_masks(tmp_path):
     masks, images = tmp_path / "masks", tmp_path / "images"
     write_labels(images, coco({t: [bird()] for t in TIMES}), list(TIMES))

@@ -25,7 +25,8 @@ Conventions of the reader:
 - A crowd (``iscrowd`` 1) has no mask, since its region covers several birds.
 - Several images may share a ``frame_index`` (photographs, several videos); each track keeps its own image.
 - Unknown keys are ignored.
-- Files of annotation programs lack ``frame_index`` and ``track_id``; ``coco_exports`` adds both.
+- Files of annotation programs lack ``frame_index`` and ``track_id``; ``coco_exports`` adds both. A fit reads a file
+  without any ``track_id`` as a set of photographs.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from jaxfit.data.formats.coco_exports import complete_export
+from jaxfit.data.formats.coco_exports import Untracked, complete_export
 from jaxfit.data.formats.coco_parts import read_coco_parts, write_coco_parts
 from jaxfit.data.formats.coco_records import (
     Annotation,
@@ -62,12 +63,13 @@ __all__ = ["check_keypoints", "coco_observations", "read_coco", "reorder_keypoin
 _log = logging.getLogger(__name__)
 
 
-def read_coco(path: str | Path, video: Path | None = None) -> Observations:
+def read_coco(path: str | Path, video: Path | None = None, untracked: Untracked = "video") -> Observations:
     """Read observations from a COCO json, in the format that the module describes.
 
     Args:
         path: the file.
         video: the folder of pictures of a file without frame numbers, if it is known; see ``coco_exports``.
+        untracked: how a file without any ``track_id`` is read; see ``coco_exports``.
 
     Returns:
         Observations with the tracks in the order of ``track_id`` and the frames in the order of ``frame_index``,
@@ -78,7 +80,7 @@ def read_coco(path: str | Path, video: Path | None = None) -> Observations:
     """
     path = Path(path)
     stored = read_coco_parts(path)
-    return coco_observations(complete_export(read_json(path), video)) if stored is None else stored
+    return coco_observations(complete_export(read_json(path), video, untracked)) if stored is None else stored
 
 
 def coco_observations(root: Field) -> Observations:

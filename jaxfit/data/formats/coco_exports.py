@@ -9,6 +9,9 @@ keys before the file is read:
   without a track are one track if no picture holds two of them; otherwise every one is a track of its own.
 - A bird without a box with an area has the box of its keypoints. Birds without a keypoint, which CVAT writes where a
   track is outside the picture, are removed.
+
+A file without any track, also a file with `frame_index`, can be read in two more ways (`Untracked`): for training
+labels, every annotation is a bird of its own; for a fit, every image is also a photograph of its own.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import logging
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -25,17 +28,22 @@ from jaxfit.data.boxes import box_of_keypoints
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.picture_names import frame_numbers
 
-__all__ = ["complete_export"]
+__all__ = ["Untracked", "complete_export"]
+
+Untracked = Literal["video", "labels", "photographs"]
+"""How a file without any track is read. `video`: by the rule of exports; a file with `frame_index` is not completed.
+`labels`: every annotation is a bird of its own. `photographs`: the same, and all images have `frame_index` 0."""
 
 _log = logging.getLogger(__name__)
 
 
-def complete_export(root: Field, video: Path | None = None) -> Field:
+def complete_export(root: Field, video: Path | None = None, untracked: Untracked = "video") -> Field:
     """Return the content of a COCO file with the keys of video.
 
     Args:
-        root: the content. A file with a `frame_index` in any image is returned unchanged.
+        root: the content. A file with a `frame_index` in any image is returned unchanged, except by `untracked`.
         video: the folder of pictures, if it is known.
+        untracked: how a file without any track is read.
 
     Raises:
         InputError: the folder lacks some of the pictures.
@@ -43,18 +51,54 @@ def complete_export(root: Field, video: Path | None = None) -> Field:
     if not isinstance(root.value, dict):
         return root
     images: Any = root.value.get("images")
-    annotations: Any = root.value.get("annotations")
-    if not _is_table(images) or not _is_table(annotations) or any("frame_index" in image for image in images):
+    kept: Any = root.value.get("annotations")
+    if not _is_table(images) or not _is_table(kept):
         return root
-    files = [image.get("file_name") for image in images]
-    if not all(isinstance(file, str) for file in files):
-        return root
-    numbers = frame_numbers(files, video)
-    video_images = [image | {"frame_index": 0 if numbers is None else numbers[i]} for i, image in enumerate(images)]
-    kept = [annotation for annotation in map(_with_box, annotations) if not _is_outside(annotation)]
-    if not any("track_id" in annotation for annotation in kept):
-        kept = _with_tracks(kept, numbers is None, root.source)
-    return Field(root.source, root.path, root.value | {"images": video_images, "annotations": kept})
+    is_export = not any("frame_index" in image for image in images)
+    photographs = False
+    if is_export:
+        files = [image.get("file_name") for image in images]
+        if not all(isinstance(file, str) for file in files):
+            return root
+        numbers = frame_numbers(files, video)
+        photographs = numbers is None
+        images = [image | {"frame_index": 0 if numbers is None else numbers[i]} for i, image in enumerate(images)]
+        kept = [annotation for annotation in map(_with_box, kept) if not _is_outside(annotation)]
+    if not any(annotation.get("track_id") is not None for annotation in kept):
+        has_attributes = is_export and any(_track(annotation) is not None for annotation in kept)
+        if untracked == "photographs" and kept and not has_attributes:
+            images = [image | {"frame_index": 0} for image in images]
+            _report_photographs(root, len(images), kept)
+        if untracked != "video" and not has_attributes:
+            kept = _numbered(kept, images)
+        elif is_export:
+            kept = _with_tracks(kept, photographs, root.source)
+    return Field(root.source, root.path, root.value | {"images": images, "annotations": kept})
+
+
+def _report_photographs(root: Field, images: int, annotations: list[dict[str, Any]]) -> None:
+    birds = sum(bool(annotation.get("keypoints")) for annotation in annotations)
+    text = (
+        "%s: no annotation has a track_id, so the file is a set of photographs: each of the %d images is a photograph "
+        "of its own, and each of the %d annotations is a bird of its own (for a video, give every annotation the "
+        "track_id of its bird)"
+    )
+    _log.warning(text, root.source, images, birds)
+
+
+def _numbered(annotations: list[dict[str, Any]], images: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the annotations with a `track_id` that counts the birds of a frame from 1.
+
+    Few numbers keep the tables of observations small: the tables have a row for every track.
+    """
+    frames = {repr(image.get("id")): repr(image.get("frame_index")) for image in images}
+    counts: Counter[str | None] = Counter()
+    numbered = []
+    for annotation in annotations:
+        frame = frames.get(repr(annotation.get("image_id")))
+        counts[frame] += bool(annotation.get("keypoints"))  # categories without keypoints are no birds
+        numbered.append(annotation | {"track_id": counts[frame]})
+    return numbered
 
 
 def _is_table(value: Any) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.formats.coco_exports import Untracked
 from jaxfit.data.formats.deeplabcut.csv_file import read_deeplabcut_csv
 from jaxfit.data.formats.deeplabcut.hdf5_file import find_pandas_table, read_deeplabcut_hdf5
 from jaxfit.data.formats.fields import read_json
@@ -27,7 +28,10 @@ _FORMATS = (
 
 
 def read_observations(
-    path: str | Path, video: str | Path | None = None, size_px: tuple[int, int] | None = None
+    path: str | Path,
+    video: str | Path | None = None,
+    size_px: tuple[int, int] | None = None,
+    untracked: Untracked = "video",
 ) -> Observations:
     """Read observations from COCO json, DeepLabCut, Lightning Pose or SLEAP; the content tells the format.
 
@@ -41,6 +45,7 @@ def read_observations(
             does not store the size, and the times of the frames where the file does not store times. It must fit to the
             file. None: as the file and its folder say.
         size_px: width and height of the images, in place of `video`, for a file that does not store the size.
+        untracked: how a COCO file without any track is read; see `jaxfit.data.formats.coco_exports`.
 
     Raises:
         InputError: the file cannot be read, is of no supported format, is damaged, or does not fit to the video; or
@@ -55,7 +60,7 @@ def read_observations(
     if text[:1] == b"[":
         return table_observations(read_label_studio(read_json(path)), path, video, size_px)
     if text[:1] == b"{" or path.suffix.lower() == ".json":
-        observations = read_coco(path, video)
+        observations = read_coco(path, video, untracked)
         if video is not None:
             check_video(observations, path, video)
             observations = add_times(observations, video)

@@ -113,15 +113,14 @@ def read_labels(
 def _observations(file: Path, images: Path | None, needs_keypoints: bool) -> Observations:
     if file.suffix.lower() != ".json":
         return read_observations(file, images)
-    if needs_keypoints:
+    root = read_json(file)
+    if not isinstance(root.value, dict):
         return read_observations(file)  # the pictures are compared with the labels one by one, later
-    return coco_observations(complete_export(_with_keypoints(read_json(file))))
+    return coco_observations(complete_export(root if needs_keypoints else _with_keypoints(root), untracked="labels"))
 
 
 def _with_keypoints(root: Field) -> Field:
     """Return the content of a COCO file; if no category has keypoints, every bird gets the centre of its box."""
-    if not isinstance(root.value, dict):
-        return root
     categories: Any = root.value.get("categories")
     annotations: Any = root.value.get("annotations")
     for table in (categories, annotations):
