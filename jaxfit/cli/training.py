@@ -29,8 +29,15 @@ _ROWS = {
     "ap50": "AP50",
     "pck_05": "PCK@0.05",
     "pck_10": "PCK@0.10",
-    "error": "mean error, % of the bird's length",
+    "error": "mean error, % of bird length",
+    "score": "score: mean of rows 1 and 2",
 }
+_CHOSEN = {
+    "base": "The base network",
+    "rescaled": "The base network at the new scale",
+    "trained": "The trained network",
+}
+_COLUMNS = {"base": "base network", "rescaled": "base, new scale", "trained": "trained"}
 
 
 def train(options: argparse.Namespace) -> None:
@@ -77,7 +84,10 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     _show_left_out(result.left_out)
     _show_result(result)
     minutes = (time.perf_counter() - start) / 60
-    show(f"{options.network} trained in {minutes:.1f} min, {result.best_step} steps → {options.out}")
+    if result.chosen == "trained":
+        show(f"{options.network} trained in {minutes:.1f} min, {result.best_step} steps → {options.out}")
+    else:
+        show(f"{options.network} compared in {minutes:.1f} min, without trained weights → {options.out}")
 
 
 def _show_left_out(left_out: Sequence[LeftOut]) -> None:
@@ -92,25 +102,30 @@ def _show_left_out(left_out: Sequence[LeftOut]) -> None:
 
 
 def _show_result(result: FineTuned) -> None:
-    """Print the parts of the labels, and the accuracy on the held-out part before and after the training."""
+    """Print the parts of the labels, the accuracy of all candidates on the held-out part, and which one is written."""
     parts = result.pictures
     training = counted(parts["training"], "labelled picture")
     show(f"{training} for the training, {parts['holdout']} held out, {parts['gap']} in between ({result.rule})")
     if result.new_keypoints:
         show(f"new keypoints, which the base network lacks: {', '.join(result.new_keypoints)}")
-    if not result.after:
+    if not result.accuracy:
         show("nothing is held out, so the accuracy of the network is unknown")
         return
-    table = right_aligned("on the held-out pictures", "before", "after")
+    table = right_aligned("on the held-out pictures", *(_COLUMNS[name] for name in result.accuracy))
     table.columns[0].justify = "left"
-    for key, value in result.after.items():
+    for key in result.accuracy["trained"]:
         digits = 1 if key == "error" else 3
-        table.add_row(_ROWS[key], f"{result.before[key]:.{digits}f}", f"{value:.{digits}f}")
+        table.add_row(_ROWS[key], *(f"{column[key]:.{digits}f}" for column in result.accuracy.values()))
     show(table)
-    if result.best_step:
-        show(
-            f"best after step {result.best_step} of {result.steps}; the network that is written was trained again for "
-            "as many steps, on all labelled pictures"
+    show(f"{_CHOSEN[result.chosen]} has the best score. {_written(result)}")
+
+
+def _written(result: FineTuned) -> str:
+    """Return a sentence about the network that is written."""
+    if result.chosen == "trained":
+        return (
+            f"It is from step {result.best_step} of {result.steps}; the network that is written was trained again for "
+            "as many steps, on all labelled pictures."
         )
-    else:
-        show("the training did not improve the base network, so the base network is written again")
+    scale = "its own scale" if result.chosen == "base" else "the scale of the labels"
+    return f"Its weights are written without training, with {scale}."

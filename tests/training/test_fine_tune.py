@@ -21,7 +21,8 @@ from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
 from jaxfit.perception.instances import instance_of  # noqa: E402
 from jaxfit.perception.onnx_model import OnnxModel  # noqa: E402
 from jaxfit.training import keypoints, segmenter  # noqa: E402
-from jaxfit.training.fine_tuning import early_stopping  # noqa: E402
+from jaxfit.training.fine_tuning import early_stopping, fine_tune  # noqa: E402
+from jaxfit.training.fine_tuning.checkpoint import Checkpoint  # noqa: E402
 from jaxfit.training.fine_tuning.data import LabelFiles, prepare_data  # noqa: E402
 from jaxfit.training.fine_tuning.early_stopping import continue_training  # noqa: E402
 from jaxfit.training.fine_tuning.validation import keypoint_accuracy, segmenter_accuracy  # noqa: E402
@@ -98,6 +99,98 @@ def test_best_weights_and_early_stopping(data, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         trained(tmp_path / "training" / "frames", tmp_path / "short.npz", stop_after=3)
     assert np.array_equal(best.best_weights, np.load(tmp_path / "short.npz")["weights"])
+
+
+@pytest.mark.usefixtures("same_process")
+def test_the_best_weights_are_trained_weights(data, tmp_path):
+    """A training that never reaches the score of the initial weights has a best step of its own."""
+    scores = iter([0.9, 0.1, 0.5, 0.4, 0.3])
+    best, steps = trained(tmp_path / "training" / "frames", tmp_path / "best.npz", lambda: next(scores))
+    assert steps == 4  # four measurements without a better score
+    assert best.best_step == 2
+    assert not np.array_equal(best.best_weights, early_stopping.flat_weights(tiny_network()))
+    assert not np.array_equal(best.best_weights, best.weights)
+
+
+@pytest.fixture
+def compared(tmp_path, monkeypatch):
+    """Return a function that runs a fine-tuning of networks with given scores.
+
+    It returns the result and all written files: their names, the longer side of the pictures that they expect, and
+    whether their weights are trained.
+    """
+    file = write_labels(tmp_path / "labels", coco({t: [bird()] for t in TIMES}), list(TIMES))
+    written = []
+
+    def training(model, *_others):
+        weights = early_stopping.flat_weights(model)
+        history = np.array([[0, 0.5], [5, 0.6], [10, 0.4]])
+        return Checkpoint("", 10, weights, weights, weights, weights + 1, history)
+
+    def write(model, facts, path, longer_side_px):
+        trained = early_stopping.flat_weights(model)[0] != initial[0]
+        written.append((path.name, longer_side_px, bool(trained)))
+
+    def compare(**scores):
+        def accuracy(path, pictures):
+            name = "base" if path.name != fine_tune.CHECKED else "trained" if written[-1][2] else "rescaled"
+            return {"mean_iou": scores[name] - 0.1, "ap50": scores[name] + 0.1}
+
+        monkeypatch.setattr(fine_tune, "segmenter_accuracy", accuracy)
+        settings = fine_tune.Settings(scenes=0, holdout=0.25)
+        result = fine_tune.fine_tune("segmenter", LabelFiles((file,)), tmp_path / "mine.onnx", "", settings)
+        return result, written
+
+    base = fine_tune.base_file("segmenter", "builtin")
+    initial = early_stopping.flat_weights(fine_tune.load_segmenter_base(base))
+    for name, function in (
+        ("continue_training", training),
+        ("write_segmenter", write),
+        ("load_segmenter", lambda path, kind: path),
+        ("store_training_activations", lambda *_sources, **_options: None),
+    ):
+        monkeypatch.setattr(fine_tune, name, function)
+    return compare
+
+
+@pytest.mark.parametrize(
+    ("scores", "chosen", "longer_side_px", "is_trained"),
+    [
+        ({"base": 0.736, "rescaled": 0.907, "trained": 0.8}, "rescaled", 640, False),
+        ({"base": 0.7, "rescaled": 0.2, "trained": 0.6}, "base", 864, False),
+        ({"base": 0.7, "rescaled": 0.2, "trained": 0.8}, "trained", 640, True),
+        ({"base": 0.7, "rescaled": 0.7, "trained": 0.7}, "trained", 640, True),
+    ],
+)
+def test_the_best_score_decides_what_is_written(compared, scores, chosen, longer_side_px, is_trained):
+    """The base network has one score at its own scale and another at the scale of the labels."""
+    result, written = compared(**scores)
+    assert {name: column["score"] for name, column in result.accuracy.items()} == pytest.approx(scores)
+    assert result.chosen == chosen
+    assert written[:-1] == [(fine_tune.CHECKED, 640, False), (fine_tune.CHECKED, 640, True)]
+    assert written[-1] == ("mine.onnx", longer_side_px, is_trained)
+
+
+def test_the_command_says_which_networks_it_compares(tmp_path, monkeypatch, capsys):
+    columns = {
+        name: {"mean_iou": iou, "ap50": 0.9, "score": (iou + 0.9) / 2}
+        for name, iou in (("base", 0.736), ("rescaled", 0.908), ("trained", 0.8))
+    }
+    parts = {"training": 7, "holdout": 2, "gap": 1}
+    for chosen, sentences in (
+        ("base", ("The base network has the best score", "written without training, with its own scale")),
+        ("rescaled", ("The base network at the new scale has the best", "with the scale of the labels")),
+        ("trained", ("The trained network has the best score", "from step 8 of 10", "trained again")),
+    ):
+        result = fine_tune.FineTuned(columns, chosen, [], parts, "held out by blocks of time", (), 8, 10)
+        monkeypatch.setattr(fine_tune, "fine_tune", lambda *_files, result=result, **_options: result)
+        assert main(["train", "segmenter", "--labels", "labels.json", "--out", str(tmp_path / "mine.onnx")]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        for expected in ("base network", "base, new scale", "trained", "0.736", "0.908", "0.800"):
+            assert expected in said
+        assert "score: mean of rows 1 and 2 │ 0.818 │ 0.904 │ 0.850" in said
+        for sentence in sentences:
+            assert sentence in said
 
 
 @pytest.mark.usefixtures("same_process")
@@ -207,8 +300,8 @@ def test_command_after_a_kill(tmp_path):
     whole, parts = tmp_path / "whole.onnx", tmp_path / "parts.onnx"
     done = subprocess.run([*command, "--out", str(whole)], env=environment, capture_output=True, text=True, check=True)
     assert "torchvision" not in done.stderr  # a warning of the exporter
-    assert "before" in done.stdout
-    assert "after" in done.stdout
+    assert "base network" in done.stdout
+    assert "trained" in done.stdout
     state = tmp_path / "parts.onnx.training" / "checkpoint.npz"
     process = subprocess.Popen([*command, "--out", str(parts)], env=environment, start_new_session=True)
     while not state.exists() and process.poll() is None:

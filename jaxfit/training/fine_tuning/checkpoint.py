@@ -52,14 +52,17 @@ class Checkpoint(NamedTuple):
     square: np.ndarray
     """(P,) second moments of AdamW."""
     best_weights: np.ndarray
-    """(P,) the parameters with the best score so far."""
+    """(P,) the trained parameters with the best score so far; the initial parameters before the first measurement."""
     history: np.ndarray
     """(E, 2) step and score on the held-out part, of every measurement so far."""
 
     @property
     def best_step(self) -> int:
-        """Number of steps with the best score, the last of equal scores; all steps if nothing was measured."""
-        latest_first = self.history[::-1]
+        """Number of steps of the best weights; all steps if nothing was measured.
+
+        Of equal scores, the last is the best. The score of the initial weights (step 0) does not count.
+        """
+        latest_first = self.history[self.history[:, 0] > 0][::-1]
         return int(latest_first[latest_first[:, 1].argmax(), 0]) if len(latest_first) else self.step
 
 
@@ -71,7 +74,7 @@ def state_of(
     best_weights: np.ndarray,
     history: list[tuple[int, float]],
 ) -> Checkpoint:
-    """Return the state of a training; `best_weights` are the parameters with the best score so far."""
+    """Return the state of a training; `best_weights` as in `Checkpoint`."""
     parameters = list(network.parameters())
     mean, square = (
         _flat(optimiser.state[p].get(name, torch.zeros_like(p)) for p in parameters)

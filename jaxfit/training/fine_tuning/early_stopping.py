@@ -62,7 +62,7 @@ def continue_training(
         name: name of the task, for the progress report.
 
     Returns:
-        The last state, which holds the best weights.
+        The last state, which holds the best trained weights.
 
     Raises:
         InputError: the file belongs to another training, or is damaged.
@@ -106,12 +106,15 @@ def _measured(
     step: int,
     score: Callable[[], float] | None,
 ) -> Checkpoint:
-    """Return the state after a measurement; the best weights are the last weights if nothing is measured."""
+    """Return the state after a measurement; the best weights are the last weights if nothing is measured.
+
+    The initial weights are never the best weights, so that a training that does not help has a score of its own.
+    """
     history = [(int(at), float(value)) for at, value in state.history]
     best = flat_weights(model)
     if score is not None:
         history.append((step, score()))
-        if history[-1][1] < max(value for _, value in history):
+        if history[-1][1] < max(value for at, value in history if at > 0):
             best = state.best_weights
     return state_of(model, optimiser, state.fingerprint, step, best, history)
 

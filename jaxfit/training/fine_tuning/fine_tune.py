@@ -1,9 +1,11 @@
 """Fine-tuning of a network on labelled footage, in two trainings.
 
 The first training uses a part of the labelled pictures. The score on the held-out pictures determines the number of
-steps, and the accuracy before and after. The second training uses all labelled pictures for this number of steps; its
-network is written. Every sample comes from a labelled or from a simulated frame. The state is stored at regular
-intervals, so that the same call continues an interrupted training with the same result.
+steps. Then three networks are compared on the held-out pictures: the base network as its file is, the base network at
+the scale of the labels, and the trained network. If the trained network is the best, the second training uses all
+labelled pictures for this number of steps, and its network is written. Every sample comes from a labelled or from a
+simulated frame. The state is stored at regular intervals, so that the same call continues an interrupted training with
+the same result.
 """
 
 # pyright: reportMissingImports=false
@@ -16,14 +18,18 @@ from collections.abc import Callable
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
 from jaxfit.errors import InputError
 from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX
+from jaxfit.perception.keypoints.metadata import read_metadata
+from jaxfit.perception.onnx_model import OnnxModel
 from jaxfit.perception.segmentation import load_segmenter
+from jaxfit.perception.segmentation.bottom_up import LONGER_SIDE_PX
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import check_writable
 from jaxfit.training import keypoints, segmenter
@@ -43,11 +49,12 @@ from jaxfit.training.fine_tuning.data import (
 )
 from jaxfit.training.fine_tuning.early_stopping import CHECKS, continue_training
 from jaxfit.training.fine_tuning.label_checks import LeftOut
-from jaxfit.training.fine_tuning.prepare import prepare_frames
+from jaxfit.training.fine_tuning.prepare import Scale, prepare_frames
 from jaxfit.training.fine_tuning.validation import (
     keypoint_accuracy,
     keypoint_detector,
     segmenter_accuracy,
+    single_score,
     torch_segmenter,
 )
 from jaxfit.training.labelled_frames import LabelledFrames
@@ -55,7 +62,7 @@ from jaxfit.training.loop import Schedule, Source
 from jaxfit.training.network_files import Probabilities, write_keypoints, write_segmenter
 from jaxfit.training.networks import FeaturePyramid
 
-__all__ = ["FineTuned", "Settings", "default_schedule", "fine_tune"]
+__all__ = ["Candidate", "FineTuned", "Settings", "default_schedule", "fine_tune"]
 
 LABELLED_SHARE = 0.6
 """Share of the samples from labelled frames; all others are simulated."""
@@ -68,7 +75,10 @@ CHECKED_PICTURES = 16
 CHECKPOINT, CHECKPOINT_ALL = "checkpoint.npz", "checkpoint_all.npz"
 """States of the training on a part of the labelled pictures, and of the training on all."""
 CHECKED = "checked.onnx"
-"""The network of the training on a part, which is measured and then removed."""
+"""A network that is measured and then removed."""
+
+Candidate = Literal["base", "rescaled", "trained"]
+"""A network that may be written: the base network, the base network at the scale of the labels, the trained network."""
 
 
 class Settings(NamedTuple):
@@ -88,10 +98,13 @@ class Settings(NamedTuple):
 class FineTuned(NamedTuple):
     """Result of a fine-tuning."""
 
-    before: dict[str, float]
-    """Accuracy of the base network on the held-out pictures; empty without held-out pictures."""
-    after: dict[str, float]
-    """Accuracy of the network that was trained without the held-out pictures; the written network has seen them."""
+    accuracy: dict[Candidate, dict[str, float]]
+    """Accuracy of every candidate on the held-out pictures; `score` is the figure of `single_score`.
+
+    The trained network is the network of the first training: the written network has seen the held-out pictures.
+    `rescaled` is missing if the labels need no other scale. Empty without held-out pictures."""
+    chosen: Candidate
+    """The candidate with the best score; the last of equal candidates."""
     left_out: list[LeftOut]
     """Labels that were not used."""
     pictures: dict[str, int]
@@ -101,7 +114,7 @@ class FineTuned(NamedTuple):
     new_keypoints: tuple[str, ...]
     """Keypoints that the base network lacks."""
     best_step: int
-    """Number of steps of the written network; 0 if the base network was best."""
+    """Number of steps of the trained network."""
     steps: int
     """Number of steps on a part of the labelled pictures."""
 
@@ -154,10 +167,11 @@ def fine_tune(
         if not (folder / CHECKPOINT).exists():
             _remove(folder)
         raise
+    scales: dict[Candidate, Scale] = dict.fromkeys(("base", "rescaled", "trained"), data.scale)
+    scales["base"] = _base_scale(network, base, data.scale)
     schedule = settings.schedule or default_schedule(network, len(data.frames.pictures))
     mark = fingerprint(data, simulated, base, (network, schedule, settings.seed))
     names = dict(zip(data.keypoint_names, found, strict=True))
-    before = _accuracy(network, base, data, names)
     film = None if simulated is None else Path(frames_folder)
     initial = flat_weights(model)
 
@@ -175,20 +189,28 @@ def fine_tune(
         return checkpoint
 
     checkpoint = train(FRAMES, CHECKPOINT, schedule.steps, _score(network, model, data) if data.holdout else None)
-    frames, after = data.frames, {}
+    frames, labelled = data.frames, len(data.frames.pictures)
+    accuracy: dict[Candidate, dict[str, float]] = {}
     if data.holdout:
-        _write(network, model, data, {}, folder / CHECKED)
-        after = _accuracy(network, folder / CHECKED, data, {name: name for name in data.keypoint_names})
-        if checkpoint.best_step:
-            frames = prepare_frames(folder / ALL_FRAMES, data.pictures, data.keypoint_names, data.scale, network)
-            train(ALL_FRAMES, CHECKPOINT_ALL, checkpoint.best_step, None)
-    facts = _facts(network, base, data, len(frames.pictures), simulated, schedule, checkpoint)
-    _write(network, model, data, facts, path)
+        accuracy["base"] = _accuracy(network, base, data, names)
+        if scales["rescaled"] != scales["base"]:
+            accuracy["rescaled"] = _measured(network, model, initial, data, folder / CHECKED)
+        accuracy["trained"] = _measured(network, model, checkpoint.best_weights, data, folder / CHECKED)
+    chosen = _best(accuracy)
+    if chosen != "trained":
+        labelled = 0
+        set_weights(model, initial)
+    elif data.holdout:
+        frames = prepare_frames(folder / ALL_FRAMES, data.pictures, data.keypoint_names, data.scale, network)
+        labelled = len(frames.pictures)
+        train(ALL_FRAMES, CHECKPOINT_ALL, checkpoint.best_step, None)
+    facts = _facts(network, base, data, labelled, simulated, schedule, checkpoint)
+    _write(network, model, data.keypoint_names, scales[chosen], facts, path)
     store_training_activations(network, path, [f for f in (frames, simulated) if f is not None], progress=progress)
     _remove(folder)
     return FineTuned(
-        before,
-        after,
+        accuracy,
+        chosen,
         data.left_out,
         {"training": len(data.split.training), "holdout": len(data.holdout), "gap": len(data.split.gap)},
         data.split.rule,
@@ -240,23 +262,55 @@ def _score(network: str, model: FeaturePyramid, data: FineTuningData) -> Callabl
     def score() -> float:
         model.eval()
         if network == "segmenter":
-            found = segmenter_accuracy(torch_segmenter(Probabilities(model), data.scale.longer_side_px), pictures)
-            return (found["mean_iou"] + found["ap50"]) / 2
+            own = torch_segmenter(Probabilities(model), data.scale.longer_side_px)
+            return single_score(segmenter_accuracy(own, pictures))
         maps = keypoints.KeypointMaps(model, len(names)).to(next(model.parameters()).device)
         detector = keypoint_detector(maps, data.keypoint_names, data.scale)
-        found = keypoint_accuracy(detector, pictures, names)
-        return (found["pck_05"] + found["pck_10"]) / 2
+        return single_score(keypoint_accuracy(detector, pictures, names))
 
     return score
 
 
 def _accuracy(network: str, path: Path, data: FineTuningData, names: dict[str, str]) -> dict[str, float]:
     """Measure a network file on all held-out pictures, as perception uses the file."""
-    if not data.holdout:
-        return {}
     if network == "segmenter":
-        return segmenter_accuracy(load_segmenter(path, kind="bottom_up"), data.holdout)
-    return keypoint_accuracy(load_keypoint_detector(path), data.holdout, names)
+        accuracy = segmenter_accuracy(load_segmenter(path, kind="bottom_up"), data.holdout)
+    else:
+        accuracy = keypoint_accuracy(load_keypoint_detector(path), data.holdout, names)
+    return accuracy | {"score": single_score(accuracy)}
+
+
+def _measured(
+    network: str, model: FeaturePyramid, weights: np.ndarray, data: FineTuningData, file: Path
+) -> dict[str, float]:
+    """Measure weights at the scale of the labels, on all held-out pictures, through a network file."""
+    set_weights(model, weights)
+    _write(network, model, data.keypoint_names, data.scale, {}, file)
+    return _accuracy(network, file, data, {name: name for name in data.keypoint_names})
+
+
+def _best(accuracy: dict[Candidate, dict[str, float]]) -> Candidate:
+    """Return the candidate with the best score, the last of equal candidates; the trained one without a score."""
+    best: Candidate = "trained"
+    for candidate in reversed(accuracy):
+        if accuracy[candidate]["score"] > accuracy[best]["score"]:
+            best = candidate
+    return best
+
+
+def _base_scale(network: str, base: Path, scale: Scale) -> Scale:
+    """Return the scale of the file of the base network, for the footage of `scale`.
+
+    Raises:
+        InputError: the file holds an invalid scale.
+    """
+    model = OnnxModel(base)
+    if network == "segmenter":
+        load_segmenter(base, kind="bottom_up")  # checks the scale
+        return scale._replace(longer_side_px=int(model.metadata.get("longer_side", LONGER_SIDE_PX)))
+    stored = read_metadata(model)
+    pad_px = PAD_PX if stored.pad_px is None else stored.pad_px
+    return scale._replace(pad_px=pad_px, dilate_px=DILATE_PX if stored.dilate_px is None else stored.dilate_px)
 
 
 def _facts(
@@ -269,21 +323,21 @@ def _facts(
     checkpoint: Checkpoint,
 ) -> dict[str, str]:
     frames = 0 if simulated is None else len(simulated.pictures)
-    trained_on = f"{labelled if checkpoint.best_step else 0} labelled pictures and {frames} simulated frames"
+    trained_on = f"{labelled} labelled pictures and {frames} simulated frames"
     return {
         "trained_by": f"jaxfit {metadata.version('jaxfit')} train {network}, fine-tuned from {base.name}",
         "trained_on": trained_on,
-        "schedule": json.dumps(schedule._replace(steps=checkpoint.best_step)._asdict()),
+        "schedule": json.dumps(schedule._replace(steps=checkpoint.best_step if labelled else 0)._asdict()),
         "holdout": f"{len(data.holdout)} pictures, {data.split.rule}",
         "holdout_score": json.dumps(np.round(checkpoint.history, 4).tolist()),
     }
 
 
-def _write(network: str, model: Any, data: FineTuningData, facts: dict[str, str], path: Path) -> None:
+def _write(network: str, model: Any, names: tuple[str, ...], scale: Scale, facts: dict[str, str], path: Path) -> None:
     if network == "segmenter":
-        write_segmenter(model, facts, path, data.scale.longer_side_px)
+        write_segmenter(model, facts, path, scale.longer_side_px)
     else:
-        write_keypoints(model, data.keypoint_names, facts, path, (data.scale.pad_px, data.scale.dilate_px))
+        write_keypoints(model, names, facts, path, (scale.pad_px, scale.dilate_px))
 
 
 def _remove(folder: Path) -> None:

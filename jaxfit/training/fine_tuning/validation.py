@@ -26,7 +26,7 @@ from jaxfit.training.fine_tuning.labels import LabelledPicture
 from jaxfit.training.fine_tuning.prepare import Scale, owner_of
 from jaxfit.training.keypoints import SIDE_PX, STRIDE
 
-__all__ = ["keypoint_accuracy", "keypoint_detector", "segmenter_accuracy", "torch_segmenter"]
+__all__ = ["keypoint_accuracy", "keypoint_detector", "segmenter_accuracy", "single_score", "torch_segmenter"]
 
 CROPS = 16
 """Number of crops in one run of a keypoint network."""
@@ -123,6 +123,12 @@ def keypoint_accuracy(
     known = values[np.isfinite(values)]
     error = 100 * float(known.mean()) if len(known) else float("nan")
     return {"pck_05": float((values < 0.05).mean()), "pck_10": float((values < 0.10).mean()), "error": error}
+
+
+def single_score(accuracy: Mapping[str, float]) -> float:
+    """Return the figure that compares networks: the mean of mean IoU and AP50, or of PCK@0.05 and PCK@0.10."""
+    names = ("mean_iou", "ap50") if "ap50" in accuracy else ("pck_05", "pck_10")
+    return sum(accuracy[name] for name in names) / 2
 
 
 def _true_instances(picture: LabelledPicture) -> list[Instance | None]:
