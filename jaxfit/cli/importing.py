@@ -32,4 +32,4 @@ def import_observations(options: argparse.Namespace) -> None:
     birds, frames = counted(observations.num_tracks, "bird"), counted(observations.num_frames, "frame")
     show(f"{birds}, {frames}, {mapped}, {masks} → {options.out}")
     if not observations.masks:
-        show("without masks, `jaxfit fit` skips the stages that compare masks; --masks adds masks")
+        show("without masks, `jaxfit fit` compares keypoints only; --masks adds masks")

@@ -161,12 +161,14 @@ def _final_results(
 
 
 def _without_mask_stages(configs: Sequence[FitConfig], source: object) -> list[FitConfig]:
-    """Return the configs without the stages that compare masks, and report these stages once."""
+    """Return the configs with stages that compare no masks, and report the changed stages once."""
     left = [without_mask_stages(config) for config in configs]
-    skipped = [stage.name for stage in configs[0].stages if needs_mask(stage)]
-    if skipped:
-        how = "are skipped" if len(left[0].stages) < len(configs[0].stages) else "run without their mask terms"
-        _logger.warning("%s: no masks, so the stages that compare masks %s: %s", source, how, ", ".join(skipped))
+    kept = {stage.name for stage in left[0].stages}
+    changed = [stage.name for stage in configs[0].stages if needs_mask(stage)]
+    for stages, what in ((kept.intersection(changed), "compare keypoints only"), (set(changed) - kept, "are skipped")):
+        if stages:
+            names = ", ".join(name for name in changed if name in stages)
+            _logger.warning("%s: no masks, so these stages %s: %s", source, what, names)
     return left
 
 

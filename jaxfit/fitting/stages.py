@@ -70,20 +70,41 @@ def needs_mask(stage: StageConfig) -> bool:
 
 
 def without_mask_stages(config: FitConfig) -> FitConfig:
-    """Return a config without the stages that compare masks, for observations without masks.
+    """Return a config whose stages compare no masks, for observations without masks.
 
-    A config that has no other stages keeps its stages, without the terms that compare masks. A stage after a removed
-    stage does not carry moments.
+    A stage that compares masks becomes a continuation of the stage before it: it has the terms, the keypoints, the
+    optimised parameters and the solver of that stage, but its own steps and its own `override`. Without the
+    continuation, the fit would end after a stage that another stage is meant to follow: its steps may end far from the
+    minimum, and its `override` may be for the beginning of a fit only. A stage that compares masks is left out if no
+    stage stands before it.
+
+    A config that has no other stages keeps its stages, without the terms that compare masks.
     """
+    if all(map(needs_mask, config.stages)):
+        stages = [replace(stage, terms=_terms_without_masks(stage)) for stage in config.stages]
+        return replace(config, stages=tuple(stages))
     kept: list[StageConfig] = []
-    removed = False
     for stage in config.stages:
-        if not needs_mask(stage):
-            kept.append(replace(stage, carry_moments=stage.carry_moments and not removed))
-        removed = needs_mask(stage)
-    if not kept:
-        kept = [replace(stage, terms=_terms_without_masks(stage)) for stage in config.stages]
+        if kept and needs_mask(stage):
+            kept.append(_continuation(kept[-1], stage))
+        elif not needs_mask(stage):
+            carry = stage.carry_moments and bool(kept) and kept[-1].solver == "adam"
+            kept.append(replace(stage, carry_moments=carry))
     return replace(config, stages=tuple(kept))
+
+
+def _continuation(before: StageConfig, stage: StageConfig) -> StageConfig:
+    """Return the stage that takes the place of `stage`, which compares masks, after the stage `before`."""
+    return replace(
+        before,
+        name=stage.name,
+        # a number of steps of one solver says nothing about the other solver
+        steps=stage.steps if stage.solver == before.solver else before.steps,
+        override=stage.override,
+        carry_moments=before.solver == "adam",
+        keep_best=stage.keep_best,
+        near_poses=stage.near_poses,
+    )
 
 
 def _terms_without_masks(stage: StageConfig) -> tuple[str, ...]:

@@ -70,12 +70,12 @@ def test_import_writes_a_coco_file(inputs, tmp_path, csv_file, capsys, caplog):
 
 
 def test_fit_takes_the_file_as_it_is(inputs, tmp_path, csv_file, capsys, caplog):
-    """The poses are the same as from COCO, without the mask stage; `evaluate` and `overlay` take the file too."""
+    """The poses are those from COCO with a longer stage; `evaluate` and `overlay` take the file too."""
     size = ["--size", f"{SIZE}x{SIZE}"]
     mask = "  - {name: outline, steps: 5, terms: [keypoints, mask]}\n"
     (tmp_path / "masks.yaml").write_text((inputs / "quick.yaml").read_text() + mask)
     assert main([*arguments(inputs, tmp_path / "other", obs=csv_file, config=tmp_path / "masks.yaml"), *size]) == 0
-    assert "no masks, so the stages that compare masks are skipped: outline" in caplog.text
+    assert "no masks, so these stages compare keypoints only: outline" in caplog.text
     assert main(arguments(inputs, tmp_path / "coco")) == 0
     poses, _ = load_solution(tmp_path / "other")
     same, _ = load_solution(tmp_path / "coco")
