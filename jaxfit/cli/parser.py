@@ -233,8 +233,10 @@ def _models(commands: Any) -> None:
 
 
 def _configs(commands: Any) -> None:
-    config = commands.add_parser("config", help="print the settings of configs")
+    config = commands.add_parser("config", help="list the configs and print their settings")
     actions = config.add_subparsers(required=True, metavar="ACTION")
+    text = "list the configs of fits: what each config is for, and the data on which its values were chosen"
+    add_command(actions, "list", "configs.list_configs", text)
     show = add_command(actions, "show", "configs.show_config", "print all settings of a config with their descriptions")
     show.add_argument("name", metavar="NAME", help="name of a shipped config: reconstruct, paper, ablation, …")
 

@@ -5,18 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from jaxfit import limits
 from jaxfit.config.checks import is_number, require, require_positive, require_within
 from jaxfit.config.term_checks import check_terms, require_term, term_settings
-from jaxfit.config.yaml_file import read_config, shipped_configs
+from jaxfit.config.yaml_file import read_config, shipped_comment, shipped_configs
 from jaxfit.objective.registry import find_term
 
-__all__ = ["CropConfig", "FitConfig", "InitialiseConfig", "StageConfig", "load_config", "shipped_fit_configs"]
+__all__ = [
+    "CropConfig",
+    "FitConfig",
+    "InitialiseConfig",
+    "ShippedConfig",
+    "StageConfig",
+    "describe_fit_configs",
+    "load_config",
+    "shipped_fit_configs",
+]
 
 PARAMETERS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
 """Parameters of a pose that a stage can optimise."""
+GROUPS = ("published settings to reproduce", "settings to use")
+"""Groups of shipped configs of fits."""
 
 
 @dataclass(frozen=True)
@@ -214,3 +225,24 @@ def load_config(source: str | Path) -> FitConfig:
 def shipped_fit_configs() -> list[str]:
     """Return the names of the shipped configs of fits."""
     return [name for name in shipped_configs() if name not in ("ablation", "reconstruct")]
+
+
+class ShippedConfig(NamedTuple):
+    """The purpose of a shipped config of fits. The head comment of its file is the only source of these texts."""
+
+    name: str
+    group: str
+    """One of `GROUPS`."""
+    purpose: str
+    """The data that the config is for."""
+    chosen_on: str
+    """The data on which the values of the config were chosen."""
+
+
+def describe_fit_configs() -> list[ShippedConfig]:
+    """Return the purposes of all shipped configs of fits, in the order of `GROUPS`."""
+    described = []
+    for name in shipped_fit_configs():
+        comment = shipped_comment(name)
+        described.append(ShippedConfig(name, comment["group"], comment["for"], comment["chosen on"]))
+    return sorted(described, key=lambda config: GROUPS.index(config.group))

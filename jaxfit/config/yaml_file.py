@@ -22,7 +22,7 @@ from jaxfit.errors import InputError
 from jaxfit.limits import CONFIG_BASES, CONFIG_BYTES
 from jaxfit.storage.reading import read_text
 
-__all__ = ["OWN_FILE", "config_to_yaml", "documented_yaml", "read_config", "shipped_configs"]
+__all__ = ["OWN_FILE", "config_to_yaml", "documented_yaml", "read_config", "shipped_comment", "shipped_configs"]
 
 OWN_FILE = {"own_file": True}
 """Metadata of a dataclass field that is a config with its own file: its value may be a name, or hold a `base`."""
@@ -31,6 +31,24 @@ OWN_FILE = {"own_file": True}
 def shipped_configs() -> list[str]:
     """Return the names of all configs that are part of jaxfit."""
     return sorted(file.stem for file in _shipped_folder().glob("*.yaml"))
+
+
+def shipped_comment(name: str) -> dict[str, str]:
+    """Return the keys and texts of the head comment of a shipped config: its lines `# key: text` before a bare `#`.
+
+    A line that is indented by further spaces continues the text of the line above.
+    """
+    texts: dict[str, str] = {}
+    key = ""
+    for line in read_text(_shipped_folder() / f"{name}.yaml", CONFIG_BYTES, "a YAML file").splitlines():
+        if not line.startswith("# "):
+            break
+        if line.startswith("#  ") and key:
+            texts[key] += f" {line[1:].strip()}"
+        else:
+            key, _, text = line[2:].partition(": ")
+            texts[key] = text.strip()
+    return texts
 
 
 def read_config(kind: type[Config], source: str | Path) -> Config:
