@@ -38,11 +38,18 @@ from jaxfit.view.checks import check_outputs, is_inside
 from jaxfit.view.overlay import overlay
 from jaxfit.workers.cluster import Cluster
 
-__all__ = ["OBSERVATIONS", "OVERLAY", "Reconstruction", "reconstruct"]
+__all__ = ["OBSERVATIONS", "OVERLAY", "NoTrackError", "Reconstruction", "reconstruct"]
 
 OBSERVATIONS, OVERLAY, MARKER = "observations.json", "overlay.mp4", "poses.npz"
 
 _logger = logging.getLogger(__name__)
+
+
+class NoTrackError(InputError):
+    """A video without a track that counts, so that there is nothing to fit."""
+
+    tracking: TrackingResult
+    """What tracking found: trust, and the skipped tracks."""
 
 
 class Reconstruction(NamedTuple):
@@ -94,8 +101,9 @@ def reconstruct(
 
     Raises:
         InputError: no video; an unusable network or tracker; keypoints that differ from the model's; a folder that
-            cannot be written, holds the video or holds other files; a video without birds; unfinished work of another
-            video, config, model or version; another process that works on the same result; a cluster that ends.
+            cannot be written, holds the video or holds other files; a video without birds (`NoTrackError`); unfinished
+            work of another video, config, model or version; another process that works on the same result; a cluster
+            that ends.
     """
     video, folder, clock = Path(video), Path(folder), Clock()
     replaced = {"segmenter": segmenter is not None, "keypoints": keypoints is not None}
@@ -138,7 +146,7 @@ def reconstruct(
         if tracking.failure is not None:
             if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
                 stored.keep(0)  # without a bird, only other settings of tracking help
-            raise tracking.failure
+            raise _no_track(tracking, tracking.failure)
         observations = tracking.observations
         with clock("fit"):
             more = {"stored": windows, "cluster": cluster}
@@ -154,12 +162,25 @@ def reconstruct(
     return Reconstruction(tracking, solution, summary)
 
 
+def _no_track(tracking: TrackingResult, failure: InputError) -> NoTrackError:
+    error = NoTrackError(failure.source, failure.problem, failure.remedy)
+    error.tracking = tracking
+    return error
+
+
 @contextmanager
 def _announced(folder: Path) -> Iterator[None]:
     """Log one line if the body fails and unfinished work is kept."""
     unfinished = unfinished_folder(folder)
     try:
         yield
+    except NoTrackError:
+        if unfinished.is_dir():
+            text = (
+                "%s holds the frames for a lower --min-track-score or --min-track-frames; for other networks, remove it"
+            )
+            _logger.warning(text, unfinished)
+        raise
     except BaseException as error:
         if unfinished.is_dir() and not (isinstance(error, InputError) and error.source.startswith(str(unfinished))):
             _logger.warning("%s holds the work so far; the same command continues there", unfinished)

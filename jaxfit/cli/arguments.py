@@ -43,6 +43,10 @@ TRACK_OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "--start": ("frames.start", {"metavar": "FRAME", "type": int}),
     "--stop": ("frames.stop", {"metavar": "FRAME", "type": int}),
     "--step": ("frames.step", {"metavar": "N", "type": int}),
+    "--min-score": ("segmenter.min_score", {"metavar": "SCORE", "type": float}),
+    "--tile-px": ("segmenter.tile_px", {"metavar": "PX", "type": int}),
+    "--min-track-frames": ("min_track_frames", {"metavar": "N", "type": int}),
+    "--min-track-score": ("min_track_score", {"metavar": "SCORE", "type": float}),
 }
 """Option of the commands that track → the path of its setting in `TrackConfig`, which holds its description."""
 

@@ -37,20 +37,22 @@ def track(options: argparse.Namespace) -> None:
     with open_cluster(options.workers, options.scheduler) as cluster:
         tracking = run_tracking(options.video, config, progress=terminal, cluster=cluster)
     write_coco(tracking.observations, options.out, tracking.trust.info())
-    show(tracking.trust.sentence())
     if tracking.failure:
-        _logger.warning("%s", tracking.failure)
+        _show_failure(tracking, config.min_track_frames)
     else:
+        show(tracking.trust.sentence())
         show(track_table(tracking.observations))
-    _show_skipped_tracks(tracking, config.min_track_frames)
+        _show_skipped_tracks(tracking, config.min_track_frames)
     birds, frames = tracking.observations.present.shape
     seconds = time.perf_counter() - start
     show(f"{counted(birds, 'bird')} over {counted(frames, 'frame')} in {seconds:.1f} s → {options.out}")
+    if tracking.failure:
+        _logger.warning("%s", tracking.failure)  # last, because it says what to do next
 
 
 def reconstruct(options: argparse.Namespace) -> None:
     """Track the birds of a video, fit their poses and draw them."""
-    from jaxfit.pipeline import OBSERVATIONS, OVERLAY, reconstruct
+    from jaxfit.pipeline import OBSERVATIONS, OVERLAY, NoTrackError, reconstruct
     from jaxfit.report.write import REPORT
     from jaxfit.workers.cluster import open_cluster
 
@@ -59,7 +61,11 @@ def reconstruct(options: argparse.Namespace) -> None:
     bird = find_bird(options.model)
     settings = {"overwrite": options.overwrite, "progress": terminal}
     with open_cluster(options.workers, options.scheduler) as cluster:
-        done = reconstruct(options.video, options.out, bird, config, **settings, cluster=cluster)
+        try:
+            done = reconstruct(options.video, options.out, bird, config, **settings, cluster=cluster)
+        except NoTrackError as error:
+            _show_failure(error.tracking, config.track.min_track_frames)
+            raise
     show(done.tracking.trust.sentence())
     show(track_table(done.tracking.observations, done.solution))
     _show_skipped_tracks(done.tracking, config.track.min_track_frames)
@@ -86,6 +92,12 @@ def reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
     return with_values(load_reconstruct_config(options.config), settings)
 
 
+def _show_failure(tracking: TrackingResult, min_frames: int) -> None:
+    """Print why no track counts, but not what to do: `TrackingResult.failure` says so in the last line."""
+    show(tracking.trust.judgement())
+    _show_skipped_tracks(tracking, min_frames)
+
+
 def _show_skipped_tracks(tracking: TrackingResult, min_frames: int) -> None:
     """Print which tracks were skipped, because of too few frames or of low scores."""
     short, low = tracking.short_tracks, tracking.low_score_tracks
@@ -94,7 +106,7 @@ def _show_skipped_tracks(tracking: TrackingResult, min_frames: int) -> None:
         show(f"{counted(len(short), 'track')} with fewer than {min_frames} frames skipped: {frames}")
     if low:
         scores = _some(f"{track} ({score:.2f})" for track, score in low.items())
-        show(f"{counted(len(low), 'track')} with a low mean score skipped (min_track_score): {scores}")
+        show(f"{counted(len(low), 'track')} with a low mean score skipped (--min-track-score): {scores}")
 
 
 def _some(texts: Iterable[str]) -> str:

@@ -179,10 +179,10 @@ def run_tracking(
     failure = None
     if not observations.num_tracks:
         if low_score_tracks:
-            failure = _only_low_scores(source, low_score_tracks, least)
+            failure = _only_low_scores(source, trust, low_score_tracks, least)
         elif short_tracks:
             best_score = max(float(frame.score.max(initial=0.0)) for frame in processed.frames)
-            failure = _only_short_tracks(source, config, short_tracks, best_score)
+            failure = _only_short_tracks(source, config, trust, short_tracks, best_score)
         else:
             failure = _no_bird(source, config, len(processed.frames), has_own_segmenter)
     return TrackingResult(
@@ -209,22 +209,29 @@ def _tracker_of(config: TrackConfig) -> Tracker:
     )
 
 
-def _only_low_scores(source: str | Path, low_score_tracks: dict[int, float], least: float) -> InputError:
+def _remedy(trust: Trust, setting: str) -> str:
+    """Return what to do about footage without a track; under low trust, lower limits are the last choice."""
+    networks = ["label frames (jaxfit suggest)", "use other networks (--segmenter)"]
+    first, second, last = [*networks, setting] if trust.level == "low" else [setting, *networks]
+    return f"{first}, {second}, or {last}"
+
+
+def _only_low_scores(source: str | Path, trust: Trust, low_score_tracks: dict[int, float], least: float) -> InputError:
     problem = (
         f"no tracked bird has a mean score of {least:g}: the highest of {len(low_score_tracks)} tracks is "
         f"{max(low_score_tracks.values()):.3f}"
     )
-    return InputError(source, problem, "lower min_track_score, or try another segmenter")
+    return InputError(source, problem, _remedy(trust, "lower --min-track-score"))
 
 
 def _only_short_tracks(
-    source: str | Path, config: TrackConfig, short_tracks: dict[int, int], best_score: float
+    source: str | Path, config: TrackConfig, trust: Trust, short_tracks: dict[int, int], best_score: float
 ) -> InputError:
     problem = (
         f"no bird was tracked for {config.min_track_frames} frames: there are {len(short_tracks)} shorter tracks, with "
         f"scores up to {best_score:.2f} and at most {max(short_tracks.values())} frames"
     )
-    return InputError(source, problem, "lower min_track_frames, or try another segmenter or tracker")
+    return InputError(source, problem, _remedy(trust, "lower --min-track-frames"))
 
 
 def _no_bird(source: str | Path, config: TrackConfig, frame_count: int, has_own_segmenter: bool) -> InputError:
@@ -235,7 +242,7 @@ def _no_bird(source: str | Path, config: TrackConfig, frame_count: int, has_own_
     if not has_own_segmenter:
         best = _highest_score(source, config)
         problem += f"; the highest score is {best:.2f}" if best else f"; no score reaches {RETRY_MIN_SCORE}"
-    remedy = "lower min_score, cut large frames into tiles (tile_px), or try another --segmenter or --classes"
+    remedy = "label frames (jaxfit suggest), use another --segmenter or --classes, lower --min-score, or set --tile-px"
     return InputError(source, problem, remedy)
 
 

@@ -70,13 +70,17 @@ class Trust(NamedTuple):
     """Why trust is low; empty if trust is high."""
     signals: FootageSignals
 
-    def sentence(self) -> str:
-        """Return the judgement as one sentence for the user."""
+    def judgement(self) -> str:
+        """Return the level and its reasons for the user."""
         if self.level == "high":
             if None in (self.signals.frame_distance, self.signals.bird_distance):
                 return "trust is high, but not certain: a network stores no statistics of its training"
             return "trust is high: the networks work on this footage as on simulated footage"
-        return f"trust is low: {'; '.join(self.reasons)}; {REMEDY}"
+        return f"trust is low: {'; '.join(self.reasons)}"
+
+    def sentence(self) -> str:
+        """Return the judgement for the user, and what to do if trust is low."""
+        return self.judgement() + ("" if self.level == "high" else f"; {REMEDY}")
 
     def info(self) -> dict[str, str]:
         """Return the judgement as texts, for the `info` of a COCO file."""

@@ -102,7 +102,7 @@ def next_steps(report: Report) -> list[Step]:
             f"{a} and {b} exchange their numbers from frame {middle:,} on."
         )
         steps.append(Step(text, f"jaxfit tracks {result} --swap {a},{b}@{middle} --out corrected"))
-    if report.poses:
+    if report.poses and report.trust != "low":  # poses of low trust are no data for statistics
         command = f"jaxfit export {result} --to csv --out birds.csv"
         steps.append(Step("Export positions and angles for your statistics.", command))
     return steps

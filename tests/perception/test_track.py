@@ -228,7 +228,7 @@ def test_no_bird_in_the_video(video, monkeypatch, caplog):
     monkeypatch.setattr(track, "RETRY_FRAMES", 12)
     failure = run_tracking(video, config, keypoints=TrueKeypoints(FOOTAGE)).failure
     assert "the highest score is 0.70" in str(failure)
-    assert "min_score" in failure.remedy
+    assert "--min-score" in failure.remedy
 
 
 def test_no_bird_with_a_segmenter_of_the_caller(video):
@@ -243,7 +243,7 @@ def test_only_short_tracks(video):
     assert "for 13 frames: there are 3 shorter tracks, with scores up to 0.90 and at most 12 frames" in str(
         tracking.failure
     )
-    assert "min_track_frames" in tracking.failure.remedy
+    assert "--min-track-frames" in tracking.failure.remedy
 
 
 def test_range_beyond_the_end(video):

@@ -19,7 +19,7 @@ from support.exported import TRACKS, write_result
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.solution import load_solution, save_solution
-from jaxfit.report.advice import warnings_of
+from jaxfit.report.advice import next_steps, warnings_of
 from jaxfit.report.contents import gather
 from jaxfit.report.html import element
 from jaxfit.report.pictures import spread_frames
@@ -202,6 +202,17 @@ def test_warnings_name_what_was_skipped(folder, made):
     ((title, _),) = titles(ambiguity_deg=np.full(made.valid.shape, 170.0))
     assert title == "Frames with a second pose"
     assert titles(video={"damaged": [3, 4]})[0][1] == "2 frames of the video could not be decoded: 3, 4."
+
+
+def test_poses_of_low_trust_are_not_recommended_for_statistics(folder, made):
+    def commands(trust):
+        steps = next_steps(gather(made, None, {"trust": trust}, "", folder))
+        return " ".join(step.command or "" for step in steps)
+
+    assert "jaxfit export" in commands("high")
+    assert "jaxfit suggest" not in commands("high")
+    assert "jaxfit export" not in commands("low")
+    assert "jaxfit suggest" in commands("low")
 
 
 def test_other_files_are_not_replaced_and_wrong_files_are_named(folder, drawn, tmp_path, capsys):
