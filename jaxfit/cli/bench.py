@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
-from jaxfit.cli.tables import show_facts
+from rich.table import Table
+
+from jaxfit.cli.tables import right_aligned, show
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.extras import require_extra
 from jaxfit.model.files import find_bird
@@ -12,7 +15,49 @@ from jaxfit.progress import terminal
 from jaxfit.storage.files import check_writable
 from jaxfit.storage.json_values import json_text
 
-__all__ = ["bench"]
+__all__ = ["bench", "bench_tables"]
+
+_ROWS = {
+    "adam_loss": ("final loss, adam", "1"),
+    "adam_s": ("time of the whole stage, adam", "s"),
+    "birds": ("birds", ""),
+    "compile_s": ("first fit, with compilation", "s"),
+    "crops": ("crops in a batch", ""),
+    "crops_per_s": ("crops: faces and depth", "crops/s"),
+    "faces": ("faces of the mesh", ""),
+    "frame_faces": ("faces in a full frame", ""),
+    "frames": ("frames", ""),
+    "full_frame_ms": ("full frame with all birds", "ms"),
+    "full_frames_per_s": ("full frames with all birds", "frames/s"),
+    "gradient_error": ("relative error of the gradient", "1"),
+    "interpolated_crops_per_s": ("crops: interpolated colours", "crops/s"),
+    "iou": ("IoU of the masks", "1"),
+    "isa": ("instruction set of the kernels", ""),
+    "loss_ms_per_frame": ("loss only", "ms/frame"),
+    "mask_ms": ("hard mask of a bird in a full frame", "ms"),
+    "matmul_ms": ("matrix product for comparison", "ms"),
+    "matmul_ratio": ("loss and gradient of a frame, over the matrix product", "1"),
+    "me_p": ("me_p", "1"),
+    "me_v": ("me_v", "1"),
+    "minutes": ("fit", "min"),
+    "ms_per_frame": ("loss and gradient", "ms/frame"),
+    "ms_per_frame_step": ("fit, for each bird, frame and step", "ms"),
+    "pa_mpjpe": ("PA-MPJPE", "model units"),
+    "pck@0.05": ("PCK@0.05", "1"),
+    "peak_memory_gb": ("peak memory", "GB"),
+    "size": ("side of the images", "px"),
+    "stage": ("stage", ""),
+    "steps": ("steps of the stages", ""),
+    "threads": ("CPU cores", ""),
+    "windows": ("windows", ""),
+}
+"""Key of a result → its name and unit in the table."""
+_SOLVER_ROWS = {
+    "_loss": ("final loss, {}", "1"),
+    "_ratio": ("the same, over the time of adam", "1"),
+    "_s": ("time until the final loss of adam, {}", "s"),
+}
+"""End of a key that begins with the name of a solver → name and unit."""
 
 
 def bench(options: argparse.Namespace) -> None:
@@ -43,6 +88,44 @@ def bench(options: argparse.Namespace) -> None:
         result = bench_fit(bird or find_bird("murre"), options.birds, options.frames, config, progress=terminal)
     if options.json:
         print(json_text(result))  # noqa: T201
-    else:
-        # the plot and JSON have the curves, which are dicts
-        show_facts({key: value for key, value in result.items() if not isinstance(value, dict)})
+        return
+    for table in bench_tables(result):
+        show(table)
+
+
+def bench_tables(result: dict[str, Any]) -> list[Table]:
+    """Return a table of the values of a benchmark with their units, and a table for each list of measurements.
+
+    The curves of the solvers are left out: `--plot` and `--json` hold the curves.
+    """
+    main, others = right_aligned("", "value", "unit"), []
+    main.columns[0].justify = main.columns[2].justify = "left"
+    for key, value in result.items():
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            headings = (", ".join(filter(None, _row(name))) for name in value[0])
+            others.append(right_aligned(*headings, title=key))
+            for row in value:
+                others[-1].add_row(*map(_text, row.values()))
+        elif not isinstance(value, dict):
+            name, unit = _row(key)
+            main.add_row(name, _text(value), unit)
+    return [main, *others]
+
+
+def _row(key: str) -> tuple[str, str]:
+    """Return name and unit of a value."""
+    if key in _ROWS:
+        return _ROWS[key]
+    end = next(end for end in _SOLVER_ROWS if key.endswith(end))
+    name, unit = _SOLVER_ROWS[end]
+    return name.format(key.removesuffix(end).replace("_", "-")), unit
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(map(_text, value))
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    if isinstance(value, int):
+        return f"{value:,}"
+    return "–" if value is None else str(value)
