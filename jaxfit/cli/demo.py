@@ -72,7 +72,7 @@ def run_demo(folder: Path) -> Evaluation:
     for path, text in (
         (result_folder / REPORT, "warnings, quality and pictures: open it in a browser"),
         (result_folder / OVERLAY, "the posed birds on the footage, and every bird from its side"),
-        ((result_folder / OVERLAY).with_suffix(".png"), "a contact sheet"),
+        ((result_folder / OVERLAY).with_suffix(".png"), "a contact sheet, with a legend"),
         (result_folder, "observations.json, poses.npz, summary.json"),
         (scene_folder, "footage and ground truth"),
         (folder / METRICS, "the metrics above"),

@@ -74,7 +74,7 @@ def reconstruct(options: argparse.Namespace) -> None:
     for name, text in (
         (REPORT, "warnings, quality and pictures: open it in a browser"),
         (OVERLAY, "the posed birds on the footage"),
-        (OVERLAY.replace(".mp4", ".png"), "a contact sheet"),
+        (OVERLAY.replace(".mp4", ".png"), "a contact sheet, with a legend"),
         (OBSERVATIONS, "the tracked keypoints and masks"),
         ("poses.npz", "the poses"),
         ("summary.json", "metrics, timings and versions"),

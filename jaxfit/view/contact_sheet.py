@@ -27,11 +27,14 @@ from jaxfit.view.colours import (
 )
 from jaxfit.view.detected import Detected
 from jaxfit.view.drawing import dot, line, ring, tag, text, write_png
+from jaxfit.view.legend import Symbol, symbol_strip
 
 __all__ = ["contact_sheet", "cut_tiles", "sheet_pairs"]
 
 TILE_PX = 256
-"""Colours, BGR: annotated mask, outline of the mesh, its keypoints, annotated keypoints."""
+"""Side of a tile."""
+_TEXT_PX = 18.0
+"""Height of the text of the legend."""
 PALE = (0.85, 0.9, 0.95)
 """Colour that is mixed with the colours of the model, BGR in [0, 1], since shading is invisible on dark plumage."""
 
@@ -85,7 +88,7 @@ def contact_sheet(
     Left tile: the annotated mask (grey) and keypoints (black rings), the outline of the fitted mesh (green) and the
     fitted keypoints (red), with lines to the annotated keypoints. With footage, the left tile shows the footage, the
     outline of the mesh in the colour of the track, fitted keypoints as white dots and annotated keypoints as yellow
-    rings. Right tile: the mesh as the camera sees it, lit from above.
+    rings. Right tile: the mesh as the camera sees it, lit from above. A legend above the tiles explains these symbols.
 
     Args:
         solution, bird: a result and its model.
@@ -116,7 +119,38 @@ def contact_sheet(
             ground = None if footage is None else footage.get((n, t))
             tiles.append(np.hstack([_observed_tile(posed, detected, n, t, ground), _mesh_tile(posed, n, t, colours)]))
         drawn.append(np.hstack(tiles + [blank] * (columns - len(row))))
-    write_png(path, np.vstack(drawn))
+    write_png(path, np.vstack([_legend(drawn[0].shape[1], footage is not None, observations is not None), *drawn]))
+
+
+def _legend(width: int, on_footage: bool, has_detections: bool) -> UInt8[np.ndarray, "H W 3"]:
+    """Return the meaning of the symbols in the left tiles, and of the right tiles."""
+    rim, fill = (DETECTED, FITTED) if on_footage else (ON_PAPER_DETECTED, ON_PAPER_FITTED)
+    edge = INK if on_footage else None
+
+    def outline(image, x, y, size):
+        colour = track_colour(0) if on_footage else OUTLINE
+        cv2.ellipse(
+            image, (round(x + 0.85 * size), round(y)), (round(0.8 * size), round(0.45 * size)), 0, 0, 360, colour
+        )
+
+    def fitted(image, x, y, size):
+        dot(image, (x + 0.85 * size, y), 2, fill, edge)
+
+    def detected(image, x, y, size):
+        ring(image, (x + 0.85 * size, y), 4.5 if on_footage else 3, rim, edge=edge)
+
+    def mask(image, x, y, size):
+        cv2.rectangle(
+            image, (round(x), round(y - 0.5 * size)), (round(x + 1.7 * size), round(y + 0.5 * size)), SEEN, -1
+        )
+
+    entries: list[tuple[Symbol | None, str]] = [(outline, "outline of the fitted bird"), (fitted, "fitted keypoint")]
+    if has_detections:
+        entries.append((detected, "detected keypoint, with a line to the fitted keypoint"))
+        entries += [] if on_footage else [(mask, "detected mask")]
+    return symbol_strip(
+        width, _TEXT_PX, [*entries, (None, "right of each pair: the fitted bird as the camera sees it")]
+    )
 
 
 def _window(posed: PosedBirds, n: int, t: int) -> Float[np.ndarray, "3"]:

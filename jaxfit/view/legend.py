@@ -1,8 +1,8 @@
-"""The legend below the image of an overlay: number of the frame and meaning of the symbols."""
+"""Legends: the meaning of the symbols in overlays and contact sheets; in overlays also the number of the frame."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -12,9 +12,38 @@ from jaxfit.view.birds import Style
 from jaxfit.view.colours import DETECTED, FITTED, PAPER, track_colour
 from jaxfit.view.drawing import dot, line, ring, tag, text, text_width
 
-__all__ = ["Legend"]
+__all__ = ["Legend", "Symbol", "symbol_strip"]
 
-_Symbol = Callable[[np.ndarray, float, float, float], None]
+Symbol = Callable[[np.ndarray, float, float, float], None]
+"""Draws a symbol, 1.7 times as wide as the text is high: image, left end, middle row, height of the text."""
+
+
+def symbol_strip(
+    width: int, size: float, entries: Sequence[tuple[Symbol | None, str]], first: float = 0.0
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Return symbols with their meaning, in as many lines as the width requires.
+
+    Args:
+        width: width in pixels.
+        size: height of the text in pixels.
+        entries: symbol (None: only text) and meaning.
+        first: empty space at the left of the first line, in pixels.
+    """
+    left, right, gap, line_px, row = 0.8 * size, width - 0.8 * size, 1.8 * size, 2.2 * size, 0
+    x = left + first
+    places = []
+    for symbol, words in entries:
+        wide = 2.6 * size + text_width(words, size)
+        if x + wide > right and x > left:
+            x, row = left, row + 1
+        places.append((symbol, words, x, (row + 0.5) * line_px))
+        x += wide + gap
+    strip = np.full((round((row + 1) * line_px), width, 3), PAPER, np.uint8)
+    for symbol, words, x, middle in places:
+        if symbol is not None:
+            symbol(strip, x, middle, size)
+        text(strip, words, x + (0 if symbol is None else 2.1 * size), middle, size)
+    return strip
 
 
 class Legend:
@@ -29,28 +58,15 @@ class Legend:
 
     def __init__(self, width: int, style: Style, detected: bool, side_views: bool):
         self._style, size = style, style.text_px
-        entries: list[tuple[_Symbol, str]] = [(self._number, "bird (track)"), (self._mesh, "fitted bird")]
+        entries: list[tuple[Symbol | None, str]] = [(self._number, "bird (track)"), (self._mesh, "fitted bird")]
         entries.append((self._fitted, "fitted keypoint"))
         if detected:
             entries.append((self._detected, "detected keypoint"))
         if side_views:
-            entries.append((lambda *_: None, "below: each bird from its left, upright as birds stand"))
-        gap, left, right, row = 1.2 * size, 0.8 * size, width - 0.8 * size, 0
-        x = left + text_width("frame 000000   00:00:00.00", size) + 2 * gap
-        places = []
-        for symbol, words in entries:
-            wide = 2.6 * size + text_width(words, size)
-            if x + wide > right and x > left:
-                x, row = left, row + 1
-            places.append((symbol, words, x, row))
-            x += wide + 1.5 * gap
-        self._line = 2.2 * size
-        self.height = round((row + 1) * self._line)
-        self._ground = np.full((self.height, width, 3), PAPER, np.uint8)
-        for symbol, words, x, row in places:
-            middle = (row + 0.5) * self._line
-            symbol(self._ground, x, middle, size)
-            text(self._ground, words, x + (2.1 * size if words[:5] != "below" else 0), middle, size)
+            entries.append((None, "below: each bird from its left, upright as birds stand"))
+        frame_px = text_width("frame 000000   00:00:00.00", size) + 2.4 * size
+        self._ground = symbol_strip(width, size, entries, frame_px)
+        self.height = len(self._ground)
 
     def draw(self, number: int, seconds: float) -> UInt8[np.ndarray, "H W 3"]:
         """Return the legend for the frame with this number and time since the start of the video."""
@@ -58,8 +74,8 @@ class Legend:
         minutes, rest = divmod(seconds, 60)
         hours, minutes = divmod(int(minutes), 60)
         clock = f"{hours}:{minutes:02d}:{rest:05.2f}" if hours else f"{minutes}:{rest:05.2f}"
-        text(image, f"frame {number}", 0.8 * size, 0.5 * self._line, size)
-        text(image, clock, 1.6 * size + text_width("frame 000000", size), 0.5 * self._line, size, (110, 110, 110))
+        text(image, f"frame {number}", 0.8 * size, 1.1 * size, size)
+        text(image, clock, 1.6 * size + text_width("frame 000000", size), 1.1 * size, size, (110, 110, 110))
         return image
 
     def _number(self, image, x, y, size):

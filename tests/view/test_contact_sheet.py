@@ -30,7 +30,10 @@ def test_every_pair_of_tiles_is_drawn(tmp_path):
     solution = fit(observations, BIRD, short("paper"))
     contact_sheet(solution, BIRD, observations, tmp_path / "sheet.png", columns=3, most=4)
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
+    legend, sheet = sheet[: -2 * TILE_PX], sheet[-2 * TILE_PX :]
     assert sheet.shape == (2 * TILE_PX, 3 * 2 * TILE_PX, 3)
+    for colour in (SEEN, OUTLINE, ON_PAPER_FITTED):
+        assert (np.abs(legend.astype(int) - colour).sum(-1) < 60).any()
     tiles = sheet.reshape(2, TILE_PX, 3, 2, TILE_PX, 3).transpose(0, 2, 3, 1, 4, 5).reshape(6, 2, TILE_PX, TILE_PX, 3)
     for pair in range(4):
         evidence, mesh = tiles[pair]

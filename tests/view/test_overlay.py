@@ -18,7 +18,7 @@ from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.motion import smooth_motion
 from jaxfit.video.reader import probe_video, read_frames
 from jaxfit.view.birds import DrawnBird, Style, draw_birds
-from jaxfit.view.colours import TRACK_COLOURS
+from jaxfit.view.colours import DETECTED, FITTED, TRACK_COLOURS, track_colour
 from jaxfit.view.contact_sheet import TILE_PX
 from jaxfit.view.overlay import CHUNK, overlay
 from jaxfit.view.side_views import SideViews, up_direction
@@ -136,7 +136,10 @@ def test_side_views_keep_their_places(drawn):
 
 def test_the_contact_sheet_has_a_row_a_bird(drawn):
     sheet = cv2.imread(str(drawn[0].sheet)).astype(int)
+    legend, sheet = sheet[: -N * TILE_PX], sheet[-N * TILE_PX :]
     assert sheet.shape == (N * TILE_PX, 4 * 2 * TILE_PX, 3)
+    for colour in (FITTED, DETECTED, track_colour(0)):  # dots, rings and outlines are explained
+        assert (np.abs(legend - colour).sum(-1) < 40).any()
     tiles = sheet.reshape(N, TILE_PX, 8, TILE_PX, 3).transpose(0, 2, 1, 3, 4)
     for n in range(N):
         for pair in range(4):
