@@ -51,6 +51,8 @@ def fit(options: argparse.Namespace) -> None:
         solution = fit(observations, bird, config, initial_poses, terminal, source=source, cluster=cluster)
     seconds = {"read": read - start, "fit": time.perf_counter() - read}
     summary = summarise(solution, bird, seconds)
+    if observations.photographs:
+        summary["photographs"] = observations.photographs
     save_solution(solution, bird, config_to_yaml(config), summary, options.out, options.overwrite)
     table = right_aligned("track", "frames", "objective")
     table.add_column("status")
@@ -62,7 +64,8 @@ def fit(options: argparse.Namespace) -> None:
     show(table)
     poses, birds = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird")
     counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
-    show(f"{poses} of {birds} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+    photographs = f" in {counted(observations.photographs, 'photograph')}" if observations.photographs else ""
+    show(f"{poses} of {birds}{photographs} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
 
 
 def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namespace) -> FitConfig:

@@ -30,6 +30,8 @@ def import_observations(options: argparse.Namespace) -> None:
     mapped = f"{len(names.mapped)} of {counted(bird.num_keypoints, 'keypoint')} of the model"
     masks = f"{len(observations.masks):,} of {total:,} with a mask" if observations.masks else "no masks"
     birds, frames = counted(observations.num_tracks, "bird"), counted(observations.num_frames, "frame")
+    if observations.photographs:
+        frames = counted(observations.photographs, "photograph")
     show(f"{birds}, {frames}, {mapped}, {masks} → {options.out}")
     if not observations.masks:
         show("without masks, `jaxfit fit` compares keypoints only; --masks adds masks")

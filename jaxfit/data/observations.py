@@ -140,6 +140,13 @@ class Observations:
         """K."""
         return len(self.keypoint_names)
 
+    @property
+    def photographs(self) -> int:
+        """Number of photographs; 0 for video, where all birds of a frame share an image."""
+        if not self.own_images:
+            return 0
+        return len({self.image_file(n, t) for n, t in np.argwhere(self.present).tolist()})
+
     def _position(self, n: int, t: int) -> tuple[int, int]:
         # negative positions count from the end; IndexError outside
         return range(self.num_tracks)[n], range(self.num_frames)[t]

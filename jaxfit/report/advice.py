@@ -84,6 +84,8 @@ def warnings_of(report: Report) -> list[Warned]:
 def next_steps(report: Report) -> list[Step]:
     """Return the recommended actions in their order."""
     result = shlex.quote(report.folder)
+    if report.photographs:
+        return [_draw_photographs(report.folder), *_export(report, result)]
     video = "VIDEO" if report.video is None else shlex.quote(report.video)
     draw = f"jaxfit overlay {result} --video {video} --out overlay.mp4 --side-views"
     text = (
@@ -102,10 +104,21 @@ def next_steps(report: Report) -> list[Step]:
             f"{a} and {b} exchange their numbers from frame {middle:,} on."
         )
         steps.append(Step(text, f"jaxfit tracks {result} --swap {a},{b}@{middle} --out corrected"))
-    if report.poses and report.trust != "low":  # poses of low trust are no data for statistics
-        command = f"jaxfit export {result} --to csv --out birds.csv"
-        steps.append(Step("Export positions and angles for your statistics.", command))
-    return steps
+    return [*steps, *_export(report, result)]
+
+
+def _draw_photographs(folder: str) -> Step:
+    text = "Draw the fitted birds beside the annotations, in Python, with the file that was fitted:"
+    drawn = f"*jaxfit.load_solution({folder!r}), jaxfit.read_observations('OBS.json'), 'sheet.png'"
+    return Step(text, f"import jaxfit\njaxfit.contact_sheet({drawn})")
+
+
+def _export(report: Report, result: str) -> list[Step]:
+    """Return the step of the export; poses of low trust are no data for statistics."""
+    if not report.poses or report.trust == "low":
+        return []
+    command = f"jaxfit export {result} --to csv --out birds.csv"
+    return [Step("Export positions and angles for your statistics.", command)]
 
 
 def counted(count: int, noun: str) -> str:

@@ -58,6 +58,8 @@ class Report:
     title: str
     video: str | None
     """Path of the footage; None if unknown."""
+    photographs: int
+    """Number of photographs, in which every bird has an image of its own; 0 for video."""
     frames: np.ndarray
     """(T,) numbers of the frames."""
     step: int
@@ -90,6 +92,11 @@ class Report:
     def has_detections(self) -> bool:
         """Whether the detections of the birds are known, besides their poses."""
         return any(track.quality is not None for track in self.tracks)
+
+    @property
+    def over_time(self) -> bool:
+        """Whether the result has several frames of one video, so that changes over time mean something."""
+        return not self.photographs and len(self.frames) > 1
 
     @property
     def poses(self) -> int:
@@ -136,6 +143,7 @@ def gather(
         folder=str(folder),
         title=Path(named).name or named if named else folder.name,
         video=named,
+        photographs=field["photographs"].integer() if field.has("photographs") else 0,
         frames=solution.frame_index,
         step=frame_step(solution.frame_index),
         times_s=times_s,

@@ -69,10 +69,10 @@ def page(report: Report, pictures: Sequence[Picture]) -> str:
             _answer(report, warned),
             _section("What to do next", _steps(next_steps(report))),
             _section("Warnings", _warnings(warned)),
-            _section("Pictures", _strip(report, pictures)),
-            _section("Birds over time", timeline(report) if len(report.frames) else None),
+            None if report.photographs else _section("Pictures", _strip(report, pictures)),
+            _section("Birds over time", timeline(report)) if report.over_time else None,
             _section("Quality of each bird", _table(report)),
-            _section("What the words mean", _definitions(_MEANINGS)),
+            _section("What the words mean", _definitions(_meanings(report))),
             _section("How the result was made", _details(report)),
         ),
     )
@@ -84,6 +84,8 @@ def _section(title: str, *content: Html | None) -> Html:
 
 
 def _footage(report: Report) -> Html:
+    if report.photographs:
+        return element("p", counted(report.photographs, "photograph"), class_="footage")
     parts = [counted(len(report.frames), "frame")]
     if len(report.frames):
         parts[0] += f" ({report.frames[0]:,} to {report.frames[-1]:,})"
@@ -97,8 +99,8 @@ def _footage(report: Report) -> Html:
 
 def _answer(report: Report, warned: Sequence[Warned]) -> Html:
     """Return the cards with the most important numbers."""
-    length = counted(len(report.frames), "frame")
-    if report.duration_s is not None:
+    length = counted(report.photographs, "photograph") if report.photographs else counted(len(report.frames), "frame")
+    if not report.photographs and report.duration_s is not None:
         length += f", {duration(report.duration_s)}"
     share = report.poses / max(report.detections, 1)
     what = "detections" if report.has_detections else "frames of the birds"
@@ -160,18 +162,21 @@ def _strip(report: Report, pictures: Sequence[Picture]) -> Html:
 
 
 def _table(report: Report) -> Html:
-    detected = report.has_detections
-    names = [("Bird", ""), ("Status", ""), ("Frames", "first to last"), ("Poses", "number")]
+    detected, over_time = report.has_detections, report.over_time
+    names = [("Bird", ""), ("Status", "")]
+    names += [("Frames", "first to last")] if over_time else []
+    names.append(("Poses", "number"))
     if detected:
         names += [("Detections", "number"), ("Coverage", "%"), ("Gaps", "number"), ("Confidence", "0 to 1")]
         names += [("Jitter", "% of box")]
-    names += [("Objective", "per pose"), ("Size in the image", "±30 %")]
+    names.append(("Objective", "per pose"))
+    names += [("Size in the image", "±30 %")] if over_time else []
     head = element("tr", *(element("th", name, element("small", unit)) for name, unit in names))
-    rows = [element("tr", *_cells(track, detected)) for track in report.tracks]
+    rows = [element("tr", *_cells(track, detected, over_time)) for track in report.tracks]
     return element("div", element("table", element("thead", head), element("tbody", *rows)), class_="wide")
 
 
-def _cells(track: Track, detected: bool) -> list[Html]:
+def _cells(track: Track, detected: bool, over_time: bool) -> list[Html]:
     """Return the cells of a bird."""
     quality = track.quality
     frames = "–" if track.frames is None else f"{track.frames[0]:,} to {track.frames[1]:,}"
@@ -179,7 +184,7 @@ def _cells(track: Track, detected: bool) -> list[Html]:
     cells = [
         element("th", swatch(track.position), f"{track.track_id}"),
         element("td", f"{_MARKS.get(track.status, '')} {track.status}", class_=f"status {kind}"),
-        element("td", frames),
+        element("td", frames) if over_time else Html(),
         element("td", f"{track.poses:,}"),
     ]
     if detected:
@@ -190,7 +195,12 @@ def _cells(track: Track, detected: bool) -> list[Html]:
             shown += [f"{quality.mean_confidence:.2f}", jitter]
         cells += [element("td", text) for text in shown]
     cells.append(element("td", "–" if track.objective is None else f"{track.objective:,.1f}"))
-    return [*cells, element("td", size_curve(track))]
+    return [*cells, element("td", size_curve(track))] if over_time else cells
+
+
+def _meanings(report: Report) -> list[tuple[str, str]]:
+    """Return the definitions of the words on the page."""
+    return [pair for pair in _MEANINGS if report.over_time or pair[0] != "Size in the image"]
 
 
 def _definitions(pairs: Sequence[tuple[str, str]]) -> Html:

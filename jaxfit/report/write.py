@@ -94,6 +94,8 @@ def report_of_result(
             raise InputError(folder / _OBSERVATIONS, problem, "remove it, or run the reconstruction again")
     content = {} if summary is None else dict(summary.entries())
     content = {key: each.value for key, each in content.items()}
+    if video is not None and content.get("photographs"):
+        raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
     write_report(path, solution, bird, observations, content, config, folder, _footage(content, video))
     return path
 

@@ -54,6 +54,38 @@ def test_the_output_of_fit(inputs, tmp_path, capsys):
     assert str(tmp_path / "out") in said.replace("\n", "")
 
 
+def photographs_of(inputs, tmp_path):
+    """Write the first frame of every bird as a photograph of its own."""
+    content = json.loads((inputs / "birds.json").read_text())
+    first = [row for row in content["annotations"] if row["image_id"] == content["images"][0]["id"]]
+    content["images"] = [content["images"][0] | {"id": n, "file_name": f"{n}.png"} for n in range(len(first))]
+    content["annotations"] = [row | {"image_id": n} for n, row in enumerate(first)]
+    (tmp_path / "photographs.json").write_text(json.dumps(content))
+    return tmp_path / "photographs.json"
+
+
+def test_photographs_are_no_video(inputs, tmp_path, capsys):
+    given, out = photographs_of(inputs, tmp_path), tmp_path / "out"
+    assert main(["import", str(given), "--model", str(inputs / "toy.npz"), "--out", str(tmp_path / "again.json")]) == 0
+    assert "3 birds, 3 photographs, " in capsys.readouterr().out.replace("\n", " ")
+    assert main(arguments(inputs, out, obs=str(given))) == 0
+    assert "2 poses of 3 birds in 3 photographs (2 ok, " in capsys.readouterr().out
+    assert main(["report", str(out)]) == 0
+    page = (out / "report.html").read_text()
+    assert "in 3 photographs" in page
+    assert "contact_sheet" in page
+    for absent in (
+        "1 frame",
+        "Birds over time",
+        "Size in the image",
+        "unknown frame rate",
+        "jaxfit overlay",
+        "--video",
+    ):
+        assert absent not in page
+    rejected(capsys, ["report", str(out), "--video", str(given)], "holds photographs", "remove --video")
+
+
 def test_the_stored_config_reproduces_the_result(fitted, inputs, tmp_path):
     command = arguments(inputs, tmp_path / "again")
     command[command.index("--config") + 1] = str(fitted / "config.yaml")
