@@ -20,7 +20,8 @@ def test_every_public_name_comes_from_its_module():
     assert sorted(name for name, _ in static) == jaxfit.__all__
     for name, module in static:
         assert getattr(jaxfit, name) is getattr(import_module(module), name)
-    assert set(jaxfit.__all__) <= set(dir(jaxfit))
+    assert [name for name in dir(jaxfit) if not name.startswith("__")] == jaxfit.__all__
+    assert "__version__" in dir(jaxfit)
     with pytest.raises(AttributeError, match="'jaxfit' has no attribute 'reconstrcut'"):
         jaxfit.reconstrcut  # noqa: B018
 
