@@ -20,6 +20,12 @@ from jaxfit.storage.files import write_whole
 
 __all__ = ["write_movement"]
 
+_READERS = {
+    "singular": "movement 0.17 or newer reads this file; for movement 0.16 or older, export with --dims plural",
+    "plural": "movement 0.16 or older reads this file; for movement 0.17 or newer, export without --dims plural",
+}
+"""Names of the dimensions → the versions of movement that read them."""
+
 
 def write_movement(
     exported: Exported,
@@ -27,7 +33,7 @@ def write_movement(
     progress: ProgressTask,
     space: Literal["2d", "3d"] = "2d",
     dims: Literal["singular", "plural"] = "singular",
-) -> list[Path]:
+) -> tuple[list[Path], list[str]]:
     """Write a netCDF file with `position` (time, space, keypoint, individual) and `confidence`.
 
     Frame numbers that the result lacks between its first and last frame are frames of NaN, so that the frames have
@@ -39,6 +45,9 @@ def write_movement(
         progress: shows progress.
         space: `2d` for image pixels, `3d` for the camera frame of the crop.
         dims: `singular` for the dimensions `keypoint` and `individual`, `plural` for `keypoints` and `individuals`.
+
+    Returns:
+        The file, and a note about the versions of movement that read the file.
 
     Raises:
         InputError: xarray or h5netcdf is not installed, or the frame rate is unknown.
@@ -86,7 +95,7 @@ def write_movement(
             content, engine="h5netcdf", encoding={name: compressed for name in ("position", "confidence")}
         )
         write_whole(out, content.getvalue())
-    return [out]
+    return [out], [_READERS[dims]]
 
 
 def _quality(exported: Exported, individual: str) -> dict[str, tuple]:

@@ -91,7 +91,10 @@ def test_netcdf_for_movement(folder, made, tmp_path, dims, names):
     xarray = pytest.importorskip("xarray", reason="xarray is not installed")
     pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")
     out = tmp_path / "birds.nc"
-    jaxfit.export_result(folder, "movement", out, dims=dims, space="3d")
+    done = jaxfit.export_result(folder, "movement", out, dims=dims, space="3d")
+    readers = {"singular": "movement 0.17 or newer reads this file", "plural": "movement 0.16 or older reads this file"}
+    assert [note.partition(";")[0] for note in done.notes] == [readers[dims]]
+    assert "--dims plural" in done.notes[0]
     with xarray.open_dataset(out, engine="h5netcdf") as data:
         assert data.position.dims == ("time", "space", *names)
         assert data.confidence.dims == ("time", *names)
