@@ -158,7 +158,7 @@ def reconstruct(
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
             settings = config_to_yaml(config)
             write_solution(solution, bird, settings, summary, part)
-            write_report(part / REPORT, solution, bird, observations, summary, settings, folder, video)
+            write_report(part / REPORT, solution, bird, observations, summary, settings, folder, video, force=True)
     return Reconstruction(tracking, solution, summary)
 
 
@@ -211,6 +211,7 @@ def _draw(
         side_views=config.side_views,
         max_width=config.max_width_px,
         codec=config.codec,
+        force=True,  # a folder may receive further pictures during the reconstruction
         progress=progress,
     )
 
@@ -227,8 +228,9 @@ def _summary(
     """Return the content of `summary.json`; `networks` holds the hashes of `file_hashes`."""
     summary = summarise(solution, bird, clock.seconds)
     summary["versions"] |= library_versions(TRACKING_LIBRARIES)
+    described = {"file": str(video), **info._asdict(), "damaged": tracking.damaged_frames}
     return summary | {
-        "video": {"file": str(video), **info._asdict(), "damaged": tracking.damaged_frames},
+        "video": summary.get("video", {}) | described,
         "quality": {row.track_id: row._asdict() for row in track_quality(tracking.observations)},
         "short_tracks": tracking.short_tracks,
         "low_score_tracks": tracking.low_score_tracks,

@@ -105,6 +105,11 @@ def add_cluster(command: argparse.ArgumentParser, work: str = "fit windows") -> 
     group.add_argument("--scheduler", metavar="ADDRESS", help=text)
 
 
+def add_force(command: argparse.ArgumentParser) -> None:
+    text = "draw on the video even if it is not the video of the result (image size, number of frames, first frame)"
+    command.add_argument("--force", action="store_true", help=text)
+
+
 def add_codec(command: argparse.ArgumentParser) -> None:
     text = "codec of the video (default auto: the first that is installed)"
     command.add_argument("--codec", default="auto", choices=("auto", *CODECS), help=text)

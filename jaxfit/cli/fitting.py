@@ -166,7 +166,8 @@ def overlay(options: argparse.Namespace) -> None:
     observations = None
     if options.observations:
         observations, _ = observations_for(options.observations, solution.keypoint_names, options)
-    drawn = {"observations": observations, "side_views": options.side_views, "overwrite": options.overwrite}
+    drawn = {"observations": observations, "side_views": options.side_views}
+    drawn |= {"overwrite": options.overwrite, "force": options.force}
     if options.frame is not None:
         overlay_frame(solution, bird, options.video, options.frame, options.out, **drawn)
         show(f"frame {options.frame} → {options.out}")

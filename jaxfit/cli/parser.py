@@ -19,6 +19,7 @@ from jaxfit.cli.arguments import (
     add_cluster,
     add_codec,
     add_command,
+    add_force,
     add_model,
     add_observation_options,
     add_out,
@@ -132,6 +133,7 @@ def _fitting(commands: Any) -> None:
     add_observation_options(overlay, video=False)
     overlay.add_argument("--side-views", action="store_true", help="also show every bird from its side")
     overlay.add_argument("--frame", type=int, help="draw only this frame, as a picture (.png or .jpg)")
+    add_force(overlay)
     add_codec(overlay)
 
 

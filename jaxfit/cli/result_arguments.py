@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from jaxfit.cli.arguments import add_command, add_out
+from jaxfit.cli.arguments import add_command, add_force, add_out
 from jaxfit.export.formats import FORMATS
 
 __all__ = ["add_result_commands"]
@@ -31,6 +31,7 @@ def _report(commands: Any) -> None:
     text = "file to write (default: report.html in the folder of the result, which replaces an earlier report)"
     report.add_argument("--out", type=Path, metavar="HTML", help=text)
     report.add_argument("--overwrite", action="store_true", help="replace an existing file of --out")
+    add_force(report)
 
 
 def _export(commands: Any) -> None:

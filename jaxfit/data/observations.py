@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from jaxfit.data.footage import FootageIdentity
 from jaxfit.data.lazy_masks import LazyMasks
 from jaxfit.data.masks import decode_mask
 from jaxfit.errors import InputError
@@ -83,6 +84,8 @@ class Observations:
     time is unknown. None means that no time is known."""
     fps: float | None = None
     """Mean frame rate of the whole video in frames per second, as its container states; None if unknown."""
+    footage: FootageIdentity | None = None
+    """Identity of the whole video; None if unknown."""
 
     def __post_init__(self):
         occluded = np.zeros(np.shape(self.confidence), bool) if self.occluded is None else self.occluded

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.footage import FootageIdentity, footage_of
+from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import check_times
 from jaxfit.errors import InputError
 from jaxfit.limits import IMAGE_SIDE_PX
@@ -118,6 +120,8 @@ class Solution:
     time is unknown. None means that no time is known."""
     fps: float | None = None
     """Mean frame rate of the whole video in frames per second, as its container states; None if unknown."""
+    footage: FootageIdentity | None = None
+    """Identity of the whole video; None if unknown. ``summary.json`` holds it."""
 
     ambiguity_deg: np.ndarray | None = None
     """(N, T) float32: angle between the orientation and that of another pose that explains the keypoints almost as well
@@ -271,7 +275,8 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
             raise ValueError("loss_terms must be different names")
         fps = validate_arrays({"fps": arrays.pop("fps", np.nan)}, {"fps": _TIMES["fps"]})["fps"].item()
         losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
-        solution = Solution(**arrays, loss=losses, fps=None if math.isnan(fps) else fps)
+        fps = None if math.isnan(fps) else fps
+        solution = Solution(**arrays, loss=losses, fps=fps, footage=_footage(folder / _SUMMARY))
     except ValueError as error:
         raise InputError(path, str(error), "run the fit again") from error
     bird = load_bird(folder / _MODEL)
@@ -281,3 +286,11 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         problem = f"has {bird.num_shapes} shape coefficients, but {_POSES} has {solution.betas.shape[2]}"
         raise InputError(folder / _MODEL, problem, "run the fit again")
     return solution, bird
+
+
+def _footage(summary: Path) -> FootageIdentity | None:
+    """Return the identity of the video from `summary.json`; None if the file is absent or names no video."""
+    content = read_json(summary) if summary.is_file() else None
+    if content is None or not content.has("video"):
+        return None
+    return footage_of(content["video"])

@@ -137,6 +137,7 @@ def collect_windows(
         failures=failures,
         timestamp_s=observations.timestamp_s,
         fps=observations.fps,
+        footage=observations.footage,
     )
     for track, texts in ambiguous_frames(solution).items():
         for text in texts:

@@ -18,14 +18,16 @@ __all__ = ["summarise"]
 
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
-    """Return the content of `summary.json`: counts; status, failures, second poses and loss of every track; timings.
+    """Return the content of `summary.json`: counts; status, failures, second poses and loss of every track; timings;
+    the identity of the video, where it is known.
 
     Args:
         solution: the result.
         bird: the model of the fit.
         seconds: duration of each part of the command.
     """
-    return {
+    summary = {} if solution.footage is None else {"video": solution.footage.entries()}
+    return summary | {
         "tracks": len(solution.track_id),
         "frames": len(solution.frame_index),
         "fps": solution.fps,

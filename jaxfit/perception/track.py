@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from jaxfit.clock import Clock
 from jaxfit.config.perception import TrackConfig
+from jaxfit.data.footage import read_footage
 from jaxfit.data.observations import Observations
 from jaxfit.errors import InputError
 from jaxfit.model.anatomy import mirror_pairs, skeleton_pairs
@@ -127,7 +128,8 @@ def run_tracking(
     reader, given_tracker = read_frames(source, frames.start, frames.stop, frames.step), tracker
     keypoints = keypoints or open_keypoint_detector(config)
     segmenter = segmenter or open_segmenter(config)
-    recorder = TrackRecorder(keypoints.keypoint_names, skeleton_pairs(keypoints.keypoint_names), reader.info.fps)
+    footage, names = read_footage(source, reader.info.frames), keypoints.keypoint_names
+    recorder = TrackRecorder(names, skeleton_pairs(names), reader.info.fps, footage)
     clock = Clock()
     total = expected_frames(reader, frames)
     end = None if total is None else frames.start + total * frames.step

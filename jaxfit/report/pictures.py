@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -31,15 +31,16 @@ class Picture(NamedTuple):
 
 
 def report_pictures(
-    solution: Solution, bird: Bird, video: Path, observations: Observations | None = None
+    solution: Solution, bird: Bird, video: Path, observations: Observations | None = None, force: bool = False
 ) -> list[Picture]:
-    """Draw some frames of a result.
+    """Draw some frames of a result; with `force`, also on a video that is not the video of the result.
 
     Raises:
         InputError: as `jaxfit.view.overlay.overlay_frame`.
     """
     frames = solution.frame_index[spread_frames(solution.valid)].tolist()
-    drawn = overlay_pictures(solution, bird, video, frames, observations=observations, max_width=_WIDTH_PX)
+    more: dict[str, Any] = {"observations": observations, "max_width": _WIDTH_PX, "force": force}
+    drawn = overlay_pictures(solution, bird, video, frames, **more)
     pictures = []
     for frame, image in drawn:
         birds = int(solution.valid[:, int(np.searchsorted(solution.frame_index, frame))].sum())

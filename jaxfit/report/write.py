@@ -40,6 +40,7 @@ def write_report(
     config: str,
     folder: Path,
     video: Path | None,
+    force: bool = False,
 ) -> None:
     """Write the report of a result as one HTML page without links to other files.
 
@@ -51,6 +52,7 @@ def write_report(
         config: the config as YAML.
         folder: the folder that holds the result, for commands in the report.
         video: the footage; None writes a report without pictures.
+        force: draw also on footage that is not the footage of the result.
 
     Raises:
         InputError: the footage does not belong to the result, or the file cannot be written.
@@ -58,12 +60,16 @@ def write_report(
     report = gather(solution, observations, json_values(summary), config, folder)
     pictures = []
     if video is not None and solution.valid.any():
-        pictures = report_pictures(solution, bird, video, observations)
+        pictures = report_pictures(solution, bird, video, observations, force)
     write_whole(path, page(report, pictures).encode())
 
 
 def report_of_result(
-    folder: str | Path, video: str | Path | None = None, out: str | Path | None = None, overwrite: bool = False
+    folder: str | Path,
+    video: str | Path | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    force: bool = False,
 ) -> Path:
     """Write the report of a result folder.
 
@@ -72,6 +78,7 @@ def report_of_result(
         video: the footage; None takes the footage that the result names, if the footage is still there.
         out: file to write; None takes `report.html` in the folder of the result.
         overwrite: replace an existing file. Without `out`, an earlier report of the result is always replaced.
+        force: draw also on footage that is not the footage of the result.
 
     Returns:
         The written file.
@@ -96,7 +103,7 @@ def report_of_result(
     content = {key: each.value for key, each in content.items()}
     if video is not None and content.get("photographs"):
         raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
-    write_report(path, solution, bird, observations, content, config, folder, _footage(content, video))
+    write_report(path, solution, bird, observations, content, config, folder, _footage(content, video), force)
     return path
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxfit.data.footage import read_footage
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.scene_folder import DETECTIONS, FOOTAGE, MARKER, TRUE_POSES, TRUTH
 from jaxfit.data.masks import box_of_mask, encode_mask
@@ -162,10 +164,11 @@ def simulate(
             for t in range(frames):
                 video.write(footage.frame(t))
                 report_progress(1, "")
-        write_coco(scene.truth, part / TRUTH)
-        write_coco(scene.detections, part / DETECTIONS)
+        identity = read_footage(part / FOOTAGE, frames)
+        write_coco(replace(scene.truth, footage=identity), part / TRUTH)
+        write_coco(replace(scene.detections, footage=identity), part / DETECTIONS)
         origin = "simulated: these poses are the truth, not a fit"
-        facts = {"origin": origin, "jaxfit": VERSION, "model": model_hash(bird)}
+        facts = {"origin": origin, "jaxfit": VERSION, "model": model_hash(bird), "video": identity.entries()}
         save_solution(scene.poses, bird, f"# {origin}\n", facts, part / TRUE_POSES)
         write_whole(part / MARKER, json.dumps(_description(scene, birds, frames, size, fps, seed), indent=2).encode())
     return scene

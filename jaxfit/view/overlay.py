@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -64,6 +64,7 @@ def overlay(
     max_width: int | None = 1920,
     codec: str = "auto",
     overwrite: bool = False,
+    force: bool = False,
     progress: ProgressTask = silent,
 ) -> Overlay:
     """Draw the birds of a result over its video, and write a contact sheet beside the video.
@@ -84,6 +85,7 @@ def overlay(
         max_width: greatest width in pixels; a wider video is scaled down. None keeps the size.
         codec: codec of `VideoWriter`.
         overwrite: replace existing output files, but never the footage.
+        force: draw also on a video that is not the video of the result; frames that the video lacks are missing then.
         progress: shows the progress over frames.
 
     Returns:
@@ -91,17 +93,18 @@ def overlay(
 
     Raises:
         ValueError: `max_width` below 16.
-        InputError: the video does not exist; the video lacks frames of the result or has another image size; the
-            observations have another image size or share no bird with the result; the result has no valid pose; an
-            output file exists without `overwrite`, or is the footage; `out` cannot hold the codec; or the system
-            rejects the write. Nothing is written then.
+        InputError: the video does not exist; without `force`, the video has another image size, number of frames or
+            first frame than the video of the result, or the observations have another image size; the video has no
+            frame of the result; the observations share no bird with the result; the result has no valid pose; an output
+            file exists without `overwrite`, or is the footage; `out` cannot hold the codec; or the system rejects the
+            write. Nothing is written then.
     """
     video, out = Path(video), Path(out)
     if max_width is not None and max_width < 16:
         raise ValueError(f"max_width must be 16 or more, or None, not {max_width}")
     info = probe_video(video)
     check_outputs([out, out.with_suffix(".png")], video, overwrite)
-    check_belongs(solution, observations, video, info)
+    check_belongs(solution, observations, video, info, force)
     drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
     numbers = solution.frame_index
     step = frame_step(numbers)
@@ -121,8 +124,8 @@ def overlay(
             seconds = number / (fps * step) if time_s is None else time_s
             writer.write(drawing.frame(picture, number, here, seconds))
             report_progress(1, f"frame {number}")
-        if info.frames is None and number != last:
-            raise too_short(video, solution, 0 if number is None else number + 1)
+        if number is None or (info.frames is None and number != last and not force):
+            raise too_short(video, solution, (info.frames or 0) if number is None else number + 1)
     contact_sheet(solution, bird, observations, out.with_suffix(".png"), footage=tiles)
     return Overlay(
         out,
@@ -146,25 +149,27 @@ def overlay_frame(
     side_views: bool = False,
     max_width: int | None = 1920,
     overwrite: bool = False,
+    force: bool = False,
 ) -> None:
     """Draw one frame as `overlay` does, and write the image.
 
     Args:
         frame_index: number of the frame in the video.
         out: the ``.png`` or ``.jpg`` to write.
-        solution, bird, video, observations, side_views, max_width, overwrite: as for `overlay`.
+        solution, bird, video, observations, side_views, max_width, overwrite, force: as for `overlay`.
 
     Raises:
         InputError: as for `overlay`; or the result lacks the frame, or `out` has another suffix.
     """
     video, out = Path(video), Path(out)
-    probe_video(video)  # reports a missing video
+    info = probe_video(video)  # reports a missing video
     check_outputs([out], video, overwrite)
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(out, f"an image cannot end in {out.suffix!r}", "give a name that ends in .png or .jpg")
-    drawn = overlay_pictures(
-        solution, bird, video, [frame_index], observations=observations, side_views=side_views, max_width=max_width
-    )
+    more: dict[str, Any] = {"side_views": side_views, "max_width": max_width, "force": force}
+    drawn = [*overlay_pictures(solution, bird, video, [frame_index], observations=observations, **more)]
+    if not drawn:
+        raise too_short(video, solution, info.frames or 0)
     for _, image in drawn:
         _, encoded = cv2.imencode(out.suffix, image)
         write_whole(out, encoded.tobytes())
@@ -179,19 +184,20 @@ def overlay_pictures(
     observations: Observations | None = None,
     side_views: bool = False,
     max_width: int | None = 1920,
+    force: bool = False,
 ) -> Iterator[tuple[int, UInt8[np.ndarray, "H W 3"]]]:
     """Draw some frames as `overlay` does, and yield the number and the image (blue, green, red) of each frame.
 
     Args:
         frames: numbers of frames in the video, in increasing order.
-        solution, bird, video, observations, side_views, max_width: as for `overlay`.
+        solution, bird, video, observations, side_views, max_width, force: as for `overlay`.
 
     Raises:
         InputError: as for `overlay`; or the result or the video lacks a frame.
     """
     video = Path(video)
     info = probe_video(video)
-    check_belongs(solution, observations, video, info)
+    check_belongs(solution, observations, video, info, force)
     for frame in frames:
         if frame not in solution.frame_index:
             problem = f"has no frame {frame}: its frames are {solution.frame_index[0]} to {solution.frame_index[-1]}"
@@ -199,6 +205,8 @@ def overlay_pictures(
     drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
     for frame in frames:
         found = next(iter(read_frames(video, frame, frame + 1)), None)
+        if found is None and force:
+            continue
         if found is None:
             raise too_short(video, solution, 0)
         number, picture, time_s = found

@@ -13,6 +13,7 @@ from support.toy_footage import BIRD, BIRDS, FRAMES, QUICK, SIDE, Footage, TrueK
 from jaxfit import load_reconstruct_config, load_solution, pipeline, read_coco
 from jaxfit.cli import perception
 from jaxfit.cli.main import main
+from jaxfit.data.footage import read_footage
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.model.files import save_bird
 from jaxfit.perception import track
@@ -108,7 +109,11 @@ def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
     said = capsys.readouterr().out
     assert "0 birds over 12 frames" in said.replace("\n", "")
     assert "trust is low: no bird was tracked" in said
-    assert content["info"] == {"trust": "low", "trust_reasons": "no bird was tracked"}
+    assert {**content["info"], "footage": None} == {
+        "trust": "low",
+        "trust_reasons": "no bird was tracked",
+        "footage": None,
+    }
     words = "no bird was detected in 12 frames", "--min-score"
     rejected(capsys, command(inputs, "reconstruct", tmp_path / "result"), *words, alone=False)
     assert not (tmp_path / "result").exists()
@@ -172,6 +177,7 @@ def test_a_reconstruction(inputs, tmp_path, networks, capsys):
     assert set(summary["seconds"]) == {"load", "track", "fit", "overlay"}
     assert summary["quality"][str(found.track_id[0])]["coverage"] == 1
     assert summary["video"]["frames"] == FRAMES
+    assert solution.footage == found.footage == read_footage(inputs / "frames", FRAMES)
     assert "onnxruntime" in summary["versions"]
     said = capsys.readouterr().out
     assert "1 track with fewer than 3 frames skipped" in said

@@ -9,7 +9,7 @@ def assert_same(a: Observations, b: Observations):
     for name in vars(a):
         if isinstance(getattr(a, name), np.ndarray):
             np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
-    assert (a.keypoint_names, a.skeleton, a.fps) == (b.keypoint_names, b.skeleton, b.fps)
+    assert (a.keypoint_names, a.skeleton, a.fps, a.footage) == (b.keypoint_names, b.skeleton, b.fps, b.footage)
     assert a.own_images == b.own_images
     assert a.masks.keys() == b.masks.keys()
     assert a.amodal_masks.keys() == b.amodal_masks.keys()

@@ -2,7 +2,8 @@
 
 The file is an object with
 
-- ``info``, optional: ``fps``, the mean frame rate of the video in frames per second;
+- ``info``, optional: ``fps``, the mean frame rate of the video in frames per second; ``footage``, the identity of the
+  video (``jaxfit.data.footage.FootageIdentity.entries``);
 - ``images``: ``id``, ``width``, ``height``, ``file_name``, ``frame_index`` (0 for photographs), optionally
   ``timestamp_s`` (presentation time of the frame in seconds);
 - ``categories``: ``id``, ``keypoints`` (names), optionally ``skeleton`` (pairs counted from 1, as COCO does;
@@ -50,6 +51,7 @@ from jaxfit.data.formats.coco_records import (
     read_categories,
     read_fps,
     read_images,
+    read_info_footage,
 )
 from jaxfit.data.formats.fields import Field, read_json
 from jaxfit.data.formats.rle import mask_areas
@@ -104,12 +106,10 @@ def coco_observations(root: Field) -> Observations:
         if not annotations:
             problem = f"hold no bird ({skipped} of other categories)"
             root["annotations"].fail(problem, "run detection on footage with a bird in it, or choose another file")
-    return _assemble(root, list(images.values()), categories, annotations, read_fps(root))
+    return _assemble(root, list(images.values()), categories, annotations)
 
 
-def _assemble(
-    root: Field, images: list[Image], categories: Categories, found: list[Annotation], fps: float | None
-) -> Observations:
+def _assemble(root: Field, images: list[Image], categories: Categories, found: list[Annotation]) -> Observations:
     first_image: dict[int, Image] = {}
     for image in images:
         first_image.setdefault(image.frame_index, image)
@@ -158,7 +158,8 @@ def _assemble(
         occluded=keypoints[..., 3] > 0,
         score=score,
         timestamp_s=np.array([first_image[f].timestamp_s for f in frames]),
-        fps=fps,
+        fps=read_fps(root),
+        footage=read_info_footage(root),
         own_images={
             cell: (a.image.file_name, a.image.width, a.image.height)
             for cell, a in holder.items()
@@ -177,7 +178,7 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
     Args:
         observations: the observations.
         path: the file; an existing file is replaced.
-        info: COCO's ``info`` about the file: ``description``, ``license``, …; ``fps`` is added.
+        info: COCO's ``info`` about the file: ``description``, ``license``, …; ``fps`` and ``footage`` are added.
 
     Raises:
         InputError: the file cannot be written.
@@ -239,7 +240,8 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         "annotations": annotations,
         "tracks": tracks,
     }
-    about = dict(info or {}) | ({} if observations.fps is None else {"fps": observations.fps})
+    about: dict[str, Any] = dict(info or {}) | ({} if observations.fps is None else {"fps": observations.fps})
+    about |= {} if observations.footage is None else {"footage": observations.footage.entries()}
     if about:
         content = {"info": about, **content}
     encoded = json.dumps(content, allow_nan=False).encode()

@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from jaxfit.data.footage import FootageIdentity, footage_of
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.rle import read_segmentation, valid_texts
 from jaxfit.data.lazy_masks import LazyMasks
@@ -31,7 +32,8 @@ PARTS_FROM = 10_000
 """Least number of detections of a file with a copy. Shorter files open in about two seconds without a copy."""
 _FRAMES = 500
 """Frames of a part."""
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2
+"""A copy of another version is not read. Version 1 lacks the identity of the footage."""
 _LOADED = 4
 """Number of parts whose masks stay in memory."""
 
@@ -51,6 +53,7 @@ _LAYOUT = (
     | {f"{name}_length": "D" for name in _MASKS}  # bytes of the text of each mask; 0 without a mask
 )
 _HEAD = {"track_id": "N", "keypoint_names": "K", "skeleton": "pairs 2", "fps": "", "parts": ""}
+_HEAD |= {"footage_frames": "", "footage_first_frame": "P"}  # −1 and empty where unknown
 """Arrays of the first part only."""
 
 
@@ -80,13 +83,15 @@ def write_coco_parts(
         return
     order = np.argsort(observations.track_id)
     rows = order[observations.present[order].any(1)]
-    starts = range(0, observations.num_frames, _FRAMES)
+    starts, footage = range(0, observations.num_frames, _FRAMES), observations.footage or FootageIdentity()
     head = {
         "track_id": observations.track_id[rows],
         "keypoint_names": np.array(observations.keypoint_names),
         "skeleton": np.array(observations.skeleton, np.int64).reshape(-1, 2),
         "fps": np.array(np.nan if observations.fps is None else observations.fps),
         "parts": np.array(len(starts)),
+        "footage_frames": np.array(-1 if footage.frames is None else footage.frames),
+        "footage_first_frame": np.frombuffer(footage.first_frame or b"", np.uint8),
     }
     with new_folder(folder) as part_folder:
         parts = Parts(part_folder, _record(hashlib.sha256(content).hexdigest()))
@@ -185,6 +190,7 @@ def _observations(parts: Parts, folder: Path) -> Observations:
             keypoint_names=tuple(head["keypoint_names"].tolist()),
             skeleton=tuple((a, b) for a, b in head["skeleton"].tolist()),
             fps=None if np.isnan(head["fps"]) else float(head["fps"]),
+            footage=_footage(head, folder),
             masks=lazy("masks"),
             amodal_masks=lazy("amodal_masks"),
             **values,
@@ -192,6 +198,12 @@ def _observations(parts: Parts, folder: Path) -> Observations:
         )
     except ValueError as error:
         raise InputError(folder, str(error)) from error
+
+
+def _footage(head: Mapping[str, np.ndarray], folder: Path) -> FootageIdentity | None:
+    frames, first_frame = int(head["footage_frames"]), head["footage_first_frame"].astype(np.uint8).tobytes()
+    footage = FootageIdentity(None if frames < 0 else frames, first_frame or None)
+    return None if footage == FootageIdentity() else footage_of(Field(folder, "footage", footage.entries()))
 
 
 def _arrays(

@@ -9,11 +9,21 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.footage import FootageIdentity, footage_of
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.rle import read_segmentation
 from jaxfit.limits import FRAMES_PER_S, IMAGE_SIDE_PX, KEYPOINTS, SECONDS_PER_FRAME, TIMESTAMP_S
 
-__all__ = ["Annotation", "Categories", "Image", "read_annotation", "read_categories", "read_fps", "read_images"]
+__all__ = [
+    "Annotation",
+    "Categories",
+    "Image",
+    "read_annotation",
+    "read_categories",
+    "read_fps",
+    "read_images",
+    "read_info_footage",
+]
 
 _TRACK_REMEDY = "give every annotation the track_id of its bird; for photographs, a unique number"
 _FRAME_REMEDY = "give every image the number of its frame in the video; for photographs, 0"
@@ -93,6 +103,17 @@ def read_fps(root: Field) -> float | None:
     if not isinstance(root.value.get("info"), dict) or not root["info"].has("fps"):
         return None
     return root["info"]["fps"].number(1 / SECONDS_PER_FRAME, FRAMES_PER_S, "give frames per second, or remove fps")
+
+
+def read_info_footage(root: Field) -> FootageIdentity | None:
+    """Return ``info.footage``, the identity of the video; None if the file lacks it.
+
+    Raises:
+        InputError: the object has other values than jaxfit writes.
+    """
+    if not isinstance(root.value.get("info"), dict) or not root["info"].has("footage"):
+        return None
+    return footage_of(root["info"]["footage"])
 
 
 @dataclass(frozen=True)

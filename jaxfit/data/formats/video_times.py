@@ -1,4 +1,4 @@
-"""Time stamps and frame rate of observations from their video."""
+"""Time stamps, frame rate and footage of observations from their video."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 
+from jaxfit.data.footage import read_footage
 from jaxfit.data.observations import Observations
 from jaxfit.video.packets import frame_times
 from jaxfit.video.reader import probe_video
@@ -16,10 +17,10 @@ __all__ = ["add_times"]
 
 
 def add_times(observations: Observations, video: Path | None) -> Observations:
-    """Return observations with the time stamps and the frame rate of their video, if the observations have none.
+    """Return observations with the time stamps, the frame rate and the identity of their video, if they have no times.
 
-    The packets of the video are read up to the last frame, and no picture is decoded. A folder of pictures has no
-    times.
+    The packets of the video are read up to the last frame, and only the first picture is decoded. A folder of pictures
+    has no times.
 
     Args:
         observations: the observations, with frame numbers of the video.
@@ -36,4 +37,6 @@ def add_times(observations: Observations, video: Path | None) -> Observations:
     inside = numbers < len(times)
     timestamp_s = np.full(len(numbers), np.nan)
     timestamp_s[inside] = times[numbers[inside]]
-    return replace(observations, timestamp_s=timestamp_s, fps=probe_video(video).fps)
+    info = probe_video(video)
+    footage = read_footage(video, info.frames)
+    return replace(observations, timestamp_s=timestamp_s, fps=info.fps, footage=footage)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxfit.data.footage import FootageIdentity
 from jaxfit.data.observations import Observations
 from jaxfit.perception.instances import Instance
 
@@ -41,15 +42,20 @@ class TrackRecorder:
         keypoint_names: K names in the order of the detector's output.
         skeleton: pairs of keypoint indices that a drawing connects.
         fps: mean frame rate of the video in frames per second; None if unknown.
+        footage: identity of the video; None if unknown.
     """
 
     frames: list[RecordedFrame]
     """The frames so far."""
 
     def __init__(
-        self, keypoint_names: Sequence[str], skeleton: Sequence[tuple[int, int]] = (), fps: float | None = None
+        self,
+        keypoint_names: Sequence[str],
+        skeleton: Sequence[tuple[int, int]] = (),
+        fps: float | None = None,
+        footage: FootageIdentity | None = None,
     ):
-        self._names, self._skeleton, self._fps = tuple(keypoint_names), tuple(skeleton), fps
+        self._names, self._skeleton, self._fps, self._footage = tuple(keypoint_names), tuple(skeleton), fps, footage
         self.frames = []
 
     @property
@@ -144,4 +150,5 @@ class TrackRecorder:
             score=score,
             timestamp_s=np.array([frame.time_s for frame in frames], float),
             fps=self._fps,
+            footage=self._footage,
         )
