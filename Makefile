@@ -29,6 +29,7 @@ $(VENV)/installed: pyproject.toml $(wildcard kernels/*)
 	    echo "or name it: make CXX=/path/to/compiler. Without a compiler jaxfit runs hundreds of times slower."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
+	@$(BIN)/python -m pip uninstall -qq --yes jaxfit # the earlier name of this package, or other software
 	$(BIN)/python -m pip install --editable ".[$(EXTRAS)]"
 	@touch $@
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from jaxfit.extras import own_version
 
 if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.ablation.ablate import ablate
@@ -38,7 +40,7 @@ if TYPE_CHECKING:  # for type checkers and editors
     from jaxfit.view.overlay import overlay, overlay_frame
     from jaxfit.workers.cluster import open_cluster
 
-__version__ = metadata.version("jaxfit")
+__version__ = own_version()
 
 __all__ = [
     "Bird",

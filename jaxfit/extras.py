@@ -1,25 +1,36 @@
-"""Installed packages: check of optional packages, which extras add, and versions of packages that results depend on."""
+"""Installed packages: jaxfit itself, optional packages, which extras add, and packages that results depend on."""
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Sequence
 from importlib import metadata
 from importlib.util import find_spec
+from pathlib import Path
 from typing import NamedTuple
 
 from jaxfit.errors import InputError
 
 __all__ = [
+    "DISTRIBUTION",
     "LIBRARIES",
     "OPTIONAL_PACKAGES",
     "TRACKING_LIBRARIES",
     "OptionalPackage",
+    "install_command",
     "library_versions",
+    "other_jaxfit",
+    "own_version",
     "package_problem",
     "require_extra",
     "require_package",
 ]
+
+DISTRIBUTION = "jaxfit-birds"
+"""Name of the distribution, as in pyproject.toml. The package and the command are named `jaxfit`, but the package index
+has other software of that name."""
+_COMMAND = "jaxfit.cli.main:run"
 
 LIBRARIES = ("jaxfit", "jax", "jaxlib", "equinox", "optimistix", "optax", "numpy")
 """Packages that a fit depends on."""
@@ -58,11 +69,38 @@ OPTIONAL_PACKAGES = {
 """Name in the package index → package."""
 
 
+def own_version() -> str:
+    """Return the version of jaxfit: of the installed distribution, or of the checkout; `unknown` without both."""
+    try:
+        return metadata.version(DISTRIBUTION)
+    except metadata.PackageNotFoundError:
+        pass
+    path = Path(__file__).resolve().parents[1] / "pyproject.toml"
+    project = tomllib.loads(path.read_text(encoding="utf-8")).get("project", {}) if path.is_file() else {}
+    return str(project["version"]) if project.get("name") == DISTRIBUTION else "unknown"
+
+
+def other_jaxfit() -> str | None:
+    """Return the version of the other software that the package index names `jaxfit`; None if it is not installed."""
+    try:
+        found = metadata.distribution("jaxfit")
+    except metadata.PackageNotFoundError:
+        return None
+    # earlier versions of this package were distributions of that name too
+    is_own = any(point.value == _COMMAND for point in found.entry_points)
+    return None if is_own else found.version
+
+
+def install_command(extra: str, upgrade: bool = False) -> str:
+    """Return the text that says how to install an extra. The package index does not have this package."""
+    return f'pip install {"--upgrade " * upgrade}".[{extra}]" in the checkout of jaxfit'
+
+
 def require_extra(extra: str, source: str, *names: str) -> None:
     """Raise InputError if a package of an extra is missing. All versions of the packages are accepted.
 
     Args:
-        extra: name of the extra in `pip install "jaxfit[extra]"`.
+        extra: name of the extra in `pip install ".[extra]"`.
         source: the command or function that needs the extra, for the message.
         names: names of `OPTIONAL_PACKAGES` that are needed. Without names, all packages of the extra are needed.
     """
@@ -70,7 +108,7 @@ def require_extra(extra: str, source: str, *names: str) -> None:
     missing = [name for name in names if find_spec(OPTIONAL_PACKAGES[name].module) is None]
     if missing:
         problem = f"needs {' and '.join(missing)}, which this installation lacks"
-        raise InputError(source, problem, f'run pip install "jaxfit[{extra}]"')
+        raise InputError(source, problem, f"run {install_command(extra)}")
 
 
 def require_package(name: str, source: str) -> None:
@@ -83,7 +121,7 @@ def require_package(name: str, source: str) -> None:
     problem = package_problem(name)
     if problem:
         extra = OPTIONAL_PACKAGES[name].extra
-        raise InputError(source, f"needs {problem}", f'run pip install --upgrade "jaxfit[{extra}]"')
+        raise InputError(source, f"needs {problem}", f"run {install_command(extra, upgrade=True)}")
 
 
 def package_problem(name: str) -> str:
@@ -107,5 +145,5 @@ def _numbers(version: str) -> tuple[int, ...]:
 
 
 def library_versions(names: Sequence[str]) -> dict[str, str]:
-    """Return the versions of some installed packages."""
-    return {name: metadata.version(name) for name in names}
+    """Return the versions of some installed packages, and of `jaxfit`."""
+    return {name: own_version() if name == "jaxfit" else metadata.version(name) for name in names}

@@ -62,4 +62,4 @@ def test_a_missing_extra_is_named():
     code = "import sys; sys.modules['matplotlib'] = None\nimport jaxfit\n"
     code += "try: jaxfit.ablate('a.json', 'b.json', 'out')\nexcept jaxfit.InputError as error: print(error)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert 'pip install "jaxfit[report]"' in done.stdout, done.stderr
+    assert 'pip install ".[report]" in the checkout' in done.stdout, done.stderr

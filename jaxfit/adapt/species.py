@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from importlib import metadata
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfit.extras import own_version
 from jaxfit.limits import NPZ_TEXT_CHARACTERS
 from jaxfit.model.bird import Bird
 from jaxfit.model.describe import model_hash
@@ -97,7 +97,7 @@ def provenance_notes(base: Bird, facts: Mapping[str, Any]) -> dict[str, Any]:
         base: the model that was adapted.
         facts: what was free, from how many images, the settings.
     """
-    lines = {"base": base.name, "base_hash": model_hash(base), "jaxfit": metadata.version("jaxfit"), **facts}
+    lines = {"base": base.name, "base_hash": model_hash(base), "jaxfit": own_version(), **facts}
     return {"provenance": np.array([f"{key}: {value}"[:NPZ_TEXT_CHARACTERS] for key, value in lines.items()])}
 
 

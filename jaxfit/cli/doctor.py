@@ -10,10 +10,16 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxfit import __version__
 from jaxfit.cli.tables import EscapedTable, counted, show
 from jaxfit.errors import InputError
-from jaxfit.extras import OPTIONAL_PACKAGES, package_problem
+from jaxfit.extras import (
+    DISTRIBUTION,
+    OPTIONAL_PACKAGES,
+    install_command,
+    other_jaxfit,
+    own_version,
+    package_problem,
+)
 
 __all__ = ["Finding", "doctor"]
 
@@ -53,7 +59,16 @@ def _checked(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
 
 
 def _versions() -> Iterator[Finding]:
-    yield Finding("jaxfit", f"{__version__}, Python {platform.python_version()}, JAX {metadata.version('jax')}")
+    yield Finding("jaxfit", f"{own_version()}, Python {platform.python_version()}, JAX {metadata.version('jax')}")
+
+
+def _other_software() -> Iterator[Finding]:
+    version = other_jaxfit()
+    if version is not None:
+        state = f"version {version} of the package index is installed: other software, which replaces files of jaxfit"
+        remedy = "run pip uninstall jaxfit, then pip install --force-reinstall --no-deps . in the checkout of jaxfit, "
+        remedy += f"which is named {DISTRIBUTION} in pip"
+        yield Finding("another jaxfit", state, remedy)
 
 
 def _processor() -> Iterator[Finding]:
@@ -130,7 +145,7 @@ def _optional_packages() -> Iterator[Finding]:
         problem = package_problem(name)
         if problem:
             state = "missing" if "lacks" in problem else f"too old: version {metadata.version(name)}"
-            remedy = f'for {package.use}: pip install --upgrade "jaxfit[{package.extra}]"'
+            remedy = f"for {package.use}: {install_command(package.extra, upgrade=True)}"
             yield Finding(name, state, remedy)
         else:
             yield Finding(name, f"{metadata.version(name)}, for {package.use}")
@@ -153,4 +168,4 @@ def _cache() -> Iterator[Finding]:
     yield Finding("cache", f"{folder}: {counted(len(files), 'compiled program')}, {size:.0f} MB; may be deleted")
 
 
-_CHECKS = (_versions, _processor, _kernels, _ffmpeg, _networks, _optional_packages, _cache)
+_CHECKS = (_versions, _other_software, _processor, _kernels, _ffmpeg, _networks, _optional_packages, _cache)

@@ -10,7 +10,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from jaxfit import __version__
 from jaxfit.cli.adapt_arguments import add_adapt_commands, add_model_commands
 from jaxfit.cli.arguments import (
     MODEL,
@@ -27,6 +26,7 @@ from jaxfit.cli.arguments import (
     add_truth,
 )
 from jaxfit.cli.result_arguments import add_result_commands
+from jaxfit.extras import own_version
 
 __all__ = ["build_parser"]
 
@@ -34,7 +34,7 @@ __all__ = ["build_parser"]
 def build_parser() -> argparse.ArgumentParser:
     """Return the parser of the whole command line."""
     parser = Parser(prog="jaxfit", description="3D pose and shape of birds from video, on a CPU.")
-    parser.add_argument("--version", action="version", version=f"jaxfit {__version__}")
+    parser.add_argument("--version", action="version", version=f"jaxfit {own_version()}")
     parser.add_argument("-v", "--verbose", action="store_true", help="print more messages, also of libraries")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for add_commands in (

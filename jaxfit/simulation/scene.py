@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +16,7 @@ from jaxfit.data.masks import box_of_mask, encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution, save_solution
 from jaxfit.errors import InputError
+from jaxfit.extras import own_version
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera
@@ -34,7 +34,7 @@ from jaxfit.video.writer import VideoWriter
 
 __all__ = ["Scene", "simulate", "stage_scene"]
 
-VERSION = metadata.version("jaxfit")
+VERSION = own_version()
 LEDGE_DEPTH = 62.0
 """Distance from the edge of the ledge to the wall, model units (1.24 m)."""
 LARGEST_SIDE, SMALLEST_SIDE = 8192, 160

@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import json
-from importlib import metadata
 from pathlib import Path
 
 import torch
 
 from jaxfit.errors import InputError
+from jaxfit.extras import own_version
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.progress import ProgressTask, silent
@@ -89,7 +89,7 @@ def train_network(
     losses = train(network, module.draw_sample, module.loss, folder, schedule, seed, progress, f"Training {which}")
     photographs = ", but the encoder was trained on photographs before" if which == "segmenter" else ""
     facts = {
-        "trained_by": f"jaxfit {metadata.version('jaxfit')} train {which}",
+        "trained_by": f"jaxfit {own_version()} train {which}",
         "trained_on": f"{len(frames.pictures)} simulated frames of {scenes} scenes; no real footage{photographs}",
         "schedule": json.dumps(schedule._asdict()),
         "loss": json.dumps({name: round(value, 5) for name, value in losses.items()}),

@@ -20,7 +20,7 @@ def test_missing_parts_have_a_remedy(monkeypatch):
     monkeypatch.setattr("jaxfit.extras.find_spec", lambda name: None)
     packages = lines_of(doctor._checked(doctor._optional_packages))
     assert packages["pynwb"].state == "missing"
-    assert 'pip install --upgrade "jaxfit[formats]"' in packages["pynwb"].remedy
+    assert 'pip install --upgrade ".[formats]" in the checkout' in packages["pynwb"].remedy
     monkeypatch.setenv("JAXFIT_KERNEL_ISA", "none")
     assert "unset JAXFIT_KERNEL_ISA" in doctor._checked(doctor._kernels)[0].remedy
     monkeypatch.setattr(doctor, "_has_codec", lambda name, mode: name != "libx264")

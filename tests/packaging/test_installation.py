@@ -88,7 +88,7 @@ def wheel(build_python, tmp_path_factory):
     folder = tmp_path_factory.mktemp("wheel")
     code = f"import os; os.chdir({str(ROOT)!r}); from scikit_build_core.build import build_sdist"
     run(build_python, "-c", f"{code}; build_sdist({str(folder)!r})")
-    (archive,) = folder.glob("jaxfit-*.tar.gz")
+    (archive,) = folder.glob("jaxfit_birds-*.tar.gz")
     with tarfile.open(archive) as file:
         file.extractall(folder, filter="data")
     return build_wheel(build_python, archive.with_name(archive.name.removesuffix(".tar.gz")))[0]

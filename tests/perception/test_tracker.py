@@ -158,7 +158,7 @@ def test_adapter_assigns_identities_to_instances(fake_package, name):
 
 def test_missing_package_is_reported_with_the_command_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "trackers", None)
-    with pytest.raises(InputError, match=r'tracker ocsort: needs the package \w+.*pip install "jaxfit\[trackers\]"'):
+    with pytest.raises(InputError, match=r'tracker ocsort: needs the package \w+.*pip install "\.\[trackers\]" in'):
         load_tracker("ocsort")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jaxfit.errors import InputError
+from jaxfit.extras import install_command
 from jaxfit.perception.instances import Instance
 
 __all__ = ["EXTERNAL_TRACKERS", "ExternalTracker"]
@@ -40,7 +41,7 @@ class ExternalTracker:
             import trackers  # pyright: ignore[reportMissingImports]
         except ImportError as error:
             problem = f"needs the package {error.name}, which is not installed"
-            raise InputError(f"tracker {name}", problem, 'pip install "jaxfit[trackers]"') from error
+            raise InputError(f"tracker {name}", problem, f"run {install_command('trackers')}") from error
         self._detections, self._step, self._memory = supervision.Detections, step, memory
         settings: dict[str, Any] = {
             # the package scales its buffer to 30 frames/s; at a frame rate of 30 the buffer is a number of frames

@@ -16,7 +16,6 @@ import json
 import shutil
 from collections.abc import Callable
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -24,6 +23,7 @@ import numpy as np
 import torch
 
 from jaxfit.errors import InputError
+from jaxfit.extras import own_version
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.keypoints.crops import DILATE_PX, PAD_PX
 from jaxfit.perception.keypoints.metadata import read_metadata
@@ -325,7 +325,7 @@ def _facts(
     frames = 0 if simulated is None else len(simulated.pictures)
     trained_on = f"{labelled} labelled pictures and {frames} simulated frames"
     return {
-        "trained_by": f"jaxfit {metadata.version('jaxfit')} train {network}, fine-tuned from {base.name}",
+        "trained_by": f"jaxfit {own_version()} train {network}, fine-tuned from {base.name}",
         "trained_on": trained_on,
         "schedule": json.dumps(schedule._replace(steps=checkpoint.best_step if labelled else 0)._asdict()),
         "holdout": f"{len(data.holdout)} pictures, {data.split.rule}",
