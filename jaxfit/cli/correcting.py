@@ -53,8 +53,8 @@ def join(options: argparse.Namespace) -> None:
         )
     shown.title = "confidence: that the track continues a track of an earlier range"
     show(shown)
-    birds, frames = counted(len(solution.track_id), "bird"), counted(len(solution.frame_index), "frame")
-    show(f"{birds} over {frames} → {options.out}")
+    tracks, frames = counted(len(solution.track_id), "track"), counted(len(solution.frame_index), "frame")
+    show(f"{tracks} over {frames} → {options.out}")
 
 
 def _list(options: argparse.Namespace) -> None:

@@ -30,5 +30,5 @@ def murre(options: argparse.Namespace) -> None:
     write_coco(observations, options.out, info)
     show("The layout of this data set is inferred, not published:")
     show_facts(readings)
-    birds, frames = counted(observations.num_tracks, "bird"), counted(len(observations.frame_index), "frame")
-    show(f"{birds}, {frames} → {options.out} (licence {LICENSE}: no commercial use; the video itself is not read)")
+    tracks, frames = counted(observations.num_tracks, "track"), counted(len(observations.frame_index), "frame")
+    show(f"{tracks}, {frames} → {options.out} (licence {LICENSE}: no commercial use; the video itself is not read)")

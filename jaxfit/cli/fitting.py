@@ -62,10 +62,11 @@ def fit(options: argparse.Namespace) -> None:
         table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", str(solution.status[n]))
     table.title = "objective: final value per frame"
     show(table)
-    poses, birds = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird")
-    counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
+    # every bird has a photograph of its own
     photographs = f" in {counted(observations.photographs, 'photograph')}" if observations.photographs else ""
-    show(f"{poses} of {birds}{photographs} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+    poses, tracks = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird" if photographs else "track")
+    counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
+    show(f"{poses} of {tracks}{photographs} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
 
 
 def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namespace) -> FitConfig:

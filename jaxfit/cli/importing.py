@@ -29,9 +29,10 @@ def import_observations(options: argparse.Namespace) -> None:
     total = int(observations.present.sum())
     mapped = f"{len(names.mapped)} of {counted(bird.num_keypoints, 'keypoint')} of the model"
     masks = f"{len(observations.masks):,} of {total:,} with a mask" if observations.masks else "no masks"
-    birds, frames = counted(observations.num_tracks, "bird"), counted(observations.num_frames, "frame")
-    if observations.photographs:
+    tracks, frames = counted(observations.num_tracks, "track"), counted(observations.num_frames, "frame")
+    if observations.photographs:  # every bird has a photograph of its own
+        tracks = counted(observations.num_tracks, "bird")
         frames = counted(observations.photographs, "photograph")
-    show(f"{birds}, {frames}, {mapped}, {masks} → {options.out}")
+    show(f"{tracks}, {frames}, {mapped}, {masks} → {options.out}")
     if not observations.masks:
         show("without masks, `jaxfit fit` compares keypoints only; --masks adds masks")

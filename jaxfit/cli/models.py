@@ -75,9 +75,9 @@ def prior_learn(options: argparse.Namespace) -> None:
         degrees = np.rad2deg([learnt.mean_change_rad[joint], deviation_rad[joint]])
         table.add_row(*(f"{value:.1f}" for value in degrees), learnt.bird.joint_names[joint + 1])
     show(table)
-    skipped = f" ({counted(learnt.diverged, 'diverged bird')} skipped)" if learnt.diverged else ""
-    poses, birds = counted(learnt.poses, "pose"), counted(learnt.birds, "bird")
-    show(f"{poses} of {birds}{skipped}, equivalent to {learnt.effective_poses:.0f} independent poses")
+    skipped = f" ({counted(learnt.diverged, 'diverged track')} skipped)" if learnt.diverged else ""
+    poses, tracks = counted(learnt.poses, "pose"), counted(learnt.birds, "track")
+    show(f"{poses} of {tracks}{skipped}, equivalent to {learnt.effective_poses:.0f} independent poses")
     bones = "learnt" if learnt.bones_learnt else "from the model, because the results have equal bone lengths"
     show(f"correlations shrunk by {100 * learnt.shrinkage:.0f} % (100 %: no correlations); bone lengths: {bones}")
     weight = f"weight of `pose_prior` in `map` for this width: {learnt.pose_prior_weight:.2g}"
@@ -113,11 +113,10 @@ def _motion_learn(options: argparse.Namespace) -> None:
     if learnt.unknown_rates:
         results = counted(learnt.unknown_rates, "result")
         show(f"the frame rate of {results} is not known and is taken as {UNKNOWN_FPS:g} frames/s")
-    skipped = f" ({counted(learnt.diverged, 'diverged bird')} skipped)" if learnt.diverged else ""
-    birds, runs = counted(learnt.birds, "bird"), counted(learnt.frames, "run")
-    show(
-        f"{runs} of three frames of {birds}{skipped}, equivalent to {learnt.effective_birds:.1f} birds of equal length"
-    )
+    skipped = f" ({counted(learnt.diverged, 'diverged track')} skipped)" if learnt.diverged else ""
+    tracks, runs = counted(learnt.birds, "track"), counted(learnt.frames, "run")
+    equivalent = f"{learnt.effective_birds:.1f} tracks of equal length"
+    show(f"{runs} of three frames of {tracks}{skipped}, equivalent to {equivalent}")
     maximum = ", ".join(f"{name} {value:.3g}" for name, value in learnt.unshrunk._asdict().items())
     show(f"maximum of likelihood: {maximum}; share of the shipped settings {100 * learnt.shrinkage:.0f} %")
     show(f"config → {options.out}; use the config with `--config {options.out}`")

@@ -43,9 +43,9 @@ def track(options: argparse.Namespace) -> None:
         show(tracking.trust.sentence())
         show(track_table(tracking.observations))
         _show_skipped_tracks(tracking, config.min_track_frames)
-    birds, frames = tracking.observations.present.shape
+    tracks, frames = tracking.observations.present.shape
     seconds = time.perf_counter() - start
-    show(f"{counted(birds, 'bird')} over {counted(frames, 'frame')} in {seconds:.1f} s → {options.out}")
+    show(f"{counted(tracks, 'track')} over {counted(frames, 'frame')} in {seconds:.1f} s → {options.out}")
     if tracking.failure:
         _logger.warning("%s", tracking.failure)  # last, because it says what to do next
 
@@ -69,8 +69,8 @@ def reconstruct(options: argparse.Namespace) -> None:
     show(done.tracking.trust.sentence())
     show(track_table(done.tracking.observations, done.solution))
     _show_skipped_tracks(done.tracking, config.track.min_track_frames)
-    birds = counted(done.summary["tracks"], "bird")
-    show(f"{counted(done.summary['poses'], 'pose')} of {birds} in {time.perf_counter() - start:.0f} s. Files:")
+    tracks = counted(done.summary["tracks"], "track")
+    show(f"{counted(done.summary['poses'], 'pose')} of {tracks} in {time.perf_counter() - start:.0f} s. Files:")
     for name, text in (
         (REPORT, "warnings, quality and pictures: open it in a browser"),
         (OVERLAY, "the posed birds on the footage"),

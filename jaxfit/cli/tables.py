@@ -132,9 +132,9 @@ def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -
 
 def track_table(observations: Observations, solution: Solution | None = None) -> Table:
     """Return a table with the quality of every track, and with the status of its fit if there is a solution."""
-    table = right_aligned("bird", "frames", "coverage", "confidence", "jitter")
+    table = right_aligned("track", "frames", "coverage", "confidence", "jitter")
     table.caption = (
-        "coverage: fraction of the frames between a bird's first and last detection that have a detection; confidence: "
+        "coverage: fraction of the frames between the first and the last detection that have a detection; confidence: "
         "mean over all keypoints; jitter: median second difference of keypoints divided by the longer side of the box"
     )
     status = None

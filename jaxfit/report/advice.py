@@ -39,20 +39,20 @@ def warnings_of(report: Report) -> list[Warned]:
     warned = []
     if report.tracks and not report.poses:
         warned.append(
-            Warned("No bird has a pose", "Every fit failed. The table of birds shows the status of each fit.")
+            Warned("No track has a pose", "Every fit failed. The table of tracks shows the status of each fit.")
         )
     if report.trust == "low":
         text = "The networks do not work on this footage as on simulated footage. Tracks and poses may be wrong."
         warned.append(Warned("Trust in the tracking is low", text, report.trust_reasons))
     failed = [track for track in report.tracks if track.status != "ok"]
     if failed:
-        text = f"{_birds([track.track_id for track in failed])}: some or all frames have no pose."
-        warned.append(Warned(f"{counted(len(failed), 'bird')} with a fit that failed", text))
-    problems = tuple(f"bird {track.track_id}: {text}" for track in report.tracks for text in track.problems)
+        text = f"{_named([track.track_id for track in failed])}: some or all frames have no pose."
+        warned.append(Warned(f"{counted(len(failed), 'track')} with a fit that failed", text))
+    problems = tuple(f"track {track.track_id}: {text}" for track in report.tracks for text in track.problems)
     if problems:
         text = "Windows of frames whose fit diverged, and frames that were skipped, have no pose."
         warned.append(Warned(counted(len(problems), "problem") + " of the fit", text, problems))
-    ambiguous = tuple(f"bird {track.track_id}: {text}" for track in report.tracks for text in track.ambiguous)
+    ambiguous = tuple(f"track {track.track_id}: {text}" for track in report.tracks for text in track.ambiguous)
     if ambiguous:
         text = (
             "Two different poses explain the keypoints of these frames almost as well. The result holds the better one."
@@ -70,12 +70,12 @@ def warnings_of(report: Report) -> list[Warned]:
     rated = [(track, track.quality) for track in report.tracks if track.quality is not None]
     unsure = [track.track_id for track, quality in rated if quality.mean_confidence < LEAST_CONFIDENCE]
     if unsure:
-        text = f"{_birds(unsure)}: the mean confidence of the keypoints is below {LEAST_CONFIDENCE:g}."
-        warned.append(Warned(f"{counted(len(unsure), 'bird')} with uncertain keypoints", text))
+        text = f"{_named(unsure)}: the mean confidence of the keypoints is below {LEAST_CONFIDENCE:g}."
+        warned.append(Warned(f"{counted(len(unsure), 'track')} with uncertain keypoints", text))
     sparse = [track.track_id for track, quality in rated if quality.coverage < LEAST_COVERAGE]
     if sparse:
-        text = f"{_birds(sparse)}: detected in less than {100 * LEAST_COVERAGE:g} % of the frames of the track."
-        warned.append(Warned(f"{counted(len(sparse), 'bird')} with gaps", text))
+        text = f"{_named(sparse)}: detected in less than {100 * LEAST_COVERAGE:g} % of the frames of the track."
+        warned.append(Warned(f"{counted(len(sparse), 'track')} with gaps", text))
     if report.corrections:
         warned.append(Warned("Corrected tracks", f"Corrections: {'; '.join(report.corrections)}."))
     return warned
@@ -90,7 +90,7 @@ def next_steps(report: Report) -> list[Step]:
     draw = f"jaxfit overlay {result} --video {video} --out overlay.mp4 --side-views"
     text = (
         "Look at the overlay video: overlay.mp4 in the folder of a reconstruction. The meshes must follow the birds, "
-        "and each bird must keep its number. This command draws the video again:"
+        "and each bird must keep its track number. This command draws the video again:"
     )
     steps = [Step(text, draw)]
     if report.trust == "low":
@@ -100,7 +100,7 @@ def next_steps(report: Report) -> list[Step]:
         a, b = (track.track_id for track in report.tracks[:2])
         middle = report.frames[len(report.frames) // 2]
         text = (
-            "Correct exchanged or broken tracks. Only the windows that change are fitted again. Example: birds "
+            "Correct exchanged or broken tracks. Only the windows that change are fitted again. Example: tracks "
             f"{a} and {b} exchange their numbers from frame {middle:,} on."
         )
         steps.append(Step(text, f"jaxfit tracks {result} --swap {a},{b}@{middle} --out corrected"))
@@ -132,8 +132,8 @@ def numbers(values: Sequence[int | str]) -> str:
     return ", ".join(shown) + (f" and {len(values) - _NAMED:,} more" if len(values) > _NAMED else "")
 
 
-def _birds(ids: Sequence[int]) -> str:
-    return f"{'Bird' if len(ids) == 1 else 'Birds'} {numbers(ids)}"
+def _named(ids: Sequence[int]) -> str:
+    return f"{'Track' if len(ids) == 1 else 'Tracks'} {numbers(ids)}"
 
 
 def _pairs(skipped: Mapping[str, str]) -> str:

@@ -19,6 +19,7 @@ _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """The browser loads nothing from elsewhere and runs no script."""
 _MARKS = {"ok": "✓", "partly diverged": "▲", "diverged": "✕", "no usable frame": "–"}
 _MEANINGS = (
+    ("Track", "The path of one bird through the frames. A bird that was lost and detected again has two tracks."),
     ("Pose", "Position, orientation, joint angles and size of a bird in one frame."),
     ("Status", "Whether the fit of every window of frames succeeded (ok), of some windows, or of no window."),
     ("Coverage", "Share of the frames between the first and the last detection of a bird that have a detection."),
@@ -70,8 +71,8 @@ def page(report: Report, pictures: Sequence[Picture]) -> str:
             _section("What to do next", _steps(next_steps(report))),
             _section("Warnings", _warnings(warned)),
             None if report.photographs else _section("Pictures", _strip(report, pictures)),
-            _section("Birds over time", timeline(report)) if report.over_time else None,
-            _section("Quality of each bird", _table(report)),
+            _section("Tracks over time", timeline(report)) if report.over_time else None,
+            _section("Quality of each track", _table(report)),
             _section("What the words mean", _definitions(_meanings(report))),
             _section("How the result was made", _details(report)),
         ),
@@ -103,9 +104,10 @@ def _answer(report: Report, warned: Sequence[Warned]) -> Html:
     if not report.photographs and report.duration_s is not None:
         length += f", {duration(report.duration_s)}"
     share = report.poses / max(report.detections, 1)
-    what = "detections" if report.has_detections else "frames of the birds"
+    what = "detections" if report.has_detections else "frames of the tracks"
+    noun = "bird" if report.photographs else "track"
     cards = [
-        _card(f"{len(report.tracks):,}", "bird" if len(report.tracks) == 1 else "birds", f"in {length}"),
+        _card(f"{len(report.tracks):,}", noun if len(report.tracks) == 1 else f"{noun}s", f"in {length}"),
         _card(f"{report.poses:,}", "poses", f"{100 * share:.1f} % of the {what}"),
         _trust(report),
         _card(f"{len(warned)}", "warning" if len(warned) == 1 else "warnings", "see below" if warned else "none"),
@@ -145,7 +147,7 @@ def _warnings(warned: Sequence[Warned]) -> Html:
 
 def _strip(report: Report, pictures: Sequence[Picture]) -> Html:
     if not report.poses:
-        return element("p", "No bird has a pose, so there are no pictures.")
+        return element("p", "No track has a pose, so there are no pictures.")
     if not pictures:
         command = f"jaxfit report {shlex.quote(report.folder)} --video VIDEO"
         text = "The footage was not there. This command writes a report with pictures:"
@@ -163,7 +165,7 @@ def _strip(report: Report, pictures: Sequence[Picture]) -> Html:
 
 def _table(report: Report) -> Html:
     detected, over_time = report.has_detections, report.over_time
-    names = [("Bird", ""), ("Status", "")]
+    names = [("Track", ""), ("Status", "")]
     names += [("Frames", "first to last")] if over_time else []
     names.append(("Poses", "number"))
     if detected:

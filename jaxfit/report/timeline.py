@@ -110,7 +110,7 @@ def _band(track: Track, states: Int[np.ndarray, "C"]) -> Html:
     """Return the row of a bird."""
     parts = [_bars(states, _NO_POSE, 0.3, 0.4)]
     parts += [_bars(states, _POSE + level, 0, 1) for level in range(len(LEVELS) + 1)]
-    return element("svg", element("title", f"bird {track.track_id}"), *parts, class_="band", **_stretched(len(states)))
+    return element("svg", element("title", f"track {track.track_id}"), *parts, class_="band", **_stretched(len(states)))
 
 
 def _bars(states: Int[np.ndarray, "C"], state: int, top: float, height: float) -> Html | None:

@@ -192,7 +192,7 @@ def _observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footag
             ring(tile, near[k], 4.5, rim)
     for k in range(len(fitted)) if footage is not None else np.flatnonzero(confidence > 0):
         dot(tile, fitted[k], 2, fill, None if footage is None else INK)
-    name, frame = f"bird {solution.track_id[n]}", f"frame {solution.frame_index[t]}"
+    name, frame = f"track {solution.track_id[n]}", f"frame {solution.frame_index[t]}"
     if footage is None:
         text(tile, f"{name}  {frame}", 6, 11, 11, ON_PAPER_DETECTED)
     else:

@@ -58,7 +58,7 @@ class Legend:
 
     def __init__(self, width: int, style: Style, detected: bool, side_views: bool):
         self._style, size = style, style.text_px
-        entries: list[tuple[Symbol | None, str]] = [(self._number, "bird (track)"), (self._mesh, "fitted bird")]
+        entries: list[tuple[Symbol | None, str]] = [(self._number, "track"), (self._mesh, "fitted bird")]
         entries.append((self._fitted, "fitted keypoint"))
         if detected:
             entries.append((self._detected, "detected keypoint"))

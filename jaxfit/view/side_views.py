@@ -96,7 +96,7 @@ class SideViews:
                 text(tile, "not here", 0.6 * self.text_px, 3 * self.text_px, self.text_px, (170, 170, 170))
             tile[:, -1:] = (222, 222, 222)
             tile[:1] = tile[-1:] = (222, 222, 222)
-            tag(tile, f"bird {track}", 0.5 * self.text_px, 1.3 * self.text_px, self.text_px, track_colour(n))
+            tag(tile, f"track {track}", 0.5 * self.text_px, 1.3 * self.text_px, self.text_px, track_colour(n))
         return strip
 
     def _bird(self, n: int, t: int, vertices_cam: Float[np.ndarray, "V 3"]) -> UInt8[np.ndarray, "S S 3"]:

@@ -59,7 +59,7 @@ def test_import_writes_a_coco_file(inputs, tmp_path, csv_file, capsys, caplog):
     printed = capsys.readouterr().out
     assert "bird4 = 1, bird7 = 2, bird9 = 3" in caplog.text
     assert "beakTip" in printed
-    assert "3 birds, 6 frames" in printed
+    assert "3 tracks, 6 frames" in printed
     imported, original = read_coco(out), read_coco(inputs / "birds.json")
     assert imported.keypoint_names == BIRD.keypoint_names
     assert len(imported.masks) == 3  # one mask in each of three frames

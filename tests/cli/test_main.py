@@ -50,7 +50,7 @@ def test_the_output_of_fit(inputs, tmp_path, capsys):
     assert main(arguments(inputs, tmp_path / "out")) == 0
     said = capsys.readouterr().out
     assert "no usable frame" in said
-    assert "12 poses of 3 birds (2 ok, 1 no usable frame)" in said
+    assert "12 poses of 3 tracks (2 ok, 1 no usable frame)" in said
     assert str(tmp_path / "out") in said.replace("\n", "")
 
 
@@ -76,7 +76,7 @@ def test_photographs_are_no_video(inputs, tmp_path, capsys):
     assert "contact_sheet" in page
     for absent in (
         "1 frame",
-        "Birds over time",
+        "Tracks over time",
         "Size in the image",
         "unknown frame rate",
         "jaxfit overlay",

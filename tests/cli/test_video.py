@@ -62,10 +62,11 @@ def test_track_writes_the_truth(inputs, tmp_path, capsys):
     truth = np.moveaxis(FOOTAGE.keypoints_px, 1, 0)[columns][:, 2:11:2]
     np.testing.assert_array_equal(found.keypoints_px, truth.astype(np.float32))
     said = capsys.readouterr().out
-    assert "3 birds over 5 frames" in said.replace("\n", "")
+    assert "3 tracks over 5 frames" in said.replace("\n", "")
     assert said.index("trust is high") < said.index("coverage")
     assert json.loads(out.read_text())["info"]["trust"] == "high"
-    for heading in ("coverage", "confidence", "jitter"):
+    assert "bird" not in said
+    for heading in ("track", "coverage", "confidence", "jitter"):
         assert heading in said
 
 
@@ -107,7 +108,7 @@ def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
     content = json.loads(out.read_text())
     assert (len(content["images"]), content["annotations"]) == (FRAMES, [])
     said = capsys.readouterr().out
-    assert "0 birds over 12 frames" in said.replace("\n", "")
+    assert "0 tracks over 12 frames" in said.replace("\n", "")
     assert "trust is low: no bird was tracked" in said
     assert {**content["info"], "footage": None} == {
         "trust": "low",

@@ -115,7 +115,7 @@ def test_tracks_continue_and_everything_is_copied(parts, capsys):
     """The order of the folders does not matter."""
     assert main(["join", str(parts / "b"), str(parts / "a"), "--out", str(parts / "out")]) == 0
     printed = capsys.readouterr().out
-    assert "3 birds over 60 frames" in printed
+    assert "3 tracks over 60 frames" in printed
     solution, _ = jaxfit.load_solution(parts / "out")
     observed = jaxfit.read_coco(parts / "out" / "observations.json")
     assert solution.track_id.tolist() == observed.track_id.tolist() == [3, 5, 6]  # A, B and C

@@ -233,7 +233,7 @@ def test_the_command(data_set, tmp_path, capsys):
     command = ["dataset", "murre", str(folder), "--out", str(out)]
     assert main(command) == 0
     said = capsys.readouterr().out
-    for words in ("inferred, not published", "frames, birds", "a flag", "3 birds, 12 frames", "CC-BY-NC-4.0"):
+    for words in ("inferred, not published", "frames, birds", "a flag", "3 tracks, 12 frames", "CC-BY-NC-4.0"):
         assert words in said
     back = read_coco(out)
     np.testing.assert_array_equal(back.keypoints_px, read_common_murre(folder).observations.keypoints_px)

@@ -145,7 +145,7 @@ def test_the_command(tmp_path, capsys):
     out = tmp_path / "learnt.npz"
     assert main(["prior", "learn", str(tmp_path / "one"), str(tmp_path / "two"), "--out", str(out)]) == 0
     output = capsys.readouterr().out
-    for words in ("36 poses of 3 birds", "left_wing", "independent", f"--model {out}"):
+    for words in ("36 poses of 3 tracks", "left_wing", "independent", f"--model {out}"):
         assert words in output.replace("\n", "") or words in output
     learnt = load_bird(out)
     assert not np.allclose(learnt.pose_mean, BIRD.pose_mean)

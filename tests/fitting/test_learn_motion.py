@@ -173,7 +173,7 @@ def test_the_command(tmp_path, capsys):
     command = ["prior", "learn", "--motion", str(tmp_path / "one"), str(tmp_path / "two"), "--out"]
     assert main([*command, str(out)]) == 0
     output = capsys.readouterr().out
-    for words in ("wings", "legs", "root", "shipped", "84 runs of three frames of 3 birds", "share of the shipped"):
+    for words in ("wings", "legs", "root", "shipped", "84 runs of three frames of 3 tracks", "share of the shipped"):
         assert words in output
     config, text = load_config(out), out.read_text()
     for words in ("birds: 3", "runs of three frames: 84", "frames per second: 25, 50", "Fits are smoothed"):

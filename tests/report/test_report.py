@@ -104,7 +104,7 @@ def test_the_table_holds_the_numbers_of_the_result(folder, made, caplog):
     assert rows["8"][:3] == ["✕ diverged", "10 to 20", "0"]
     assert [rows[track][-2] for track in "378"] == ["2.1", "1.3", "–"]
     assert "8 poses53.3 % of the detections" in page.text
-    assert "Birds 7, 8: some or all frames have no pose" in page.text
+    assert "Tracks 7, 8: some or all frames have no pose" in page.text
 
 
 def test_the_page_stands_alone_and_shows_names_as_text(folder):
@@ -159,7 +159,7 @@ def states(svg, columns):
 
 
 def bands(text):
-    return {int(track): svg for track, svg in re.findall(r"<title>bird (\d+)</title>(.*?)</svg>", text)}
+    return {int(track): svg for track, svg in re.findall(r"<title>track (\d+)</title>(.*?)</svg>", text)}
 
 
 def test_the_timeline_shows_poses_detections_and_confidences(folder, made):
