@@ -59,13 +59,7 @@ def evaluate(
     source, seen = truth.source, check_keypoints(truth.observations, bird.keypoint_names, truth.source)
     n_truth, t_truth, shared = match(solution, seen.track_id, seen.frame_index)
     measured = shared & seen.present[n_truth, t_truth] & solution.valid
-    if not measured.any():
-        raise InputError(
-            source,
-            f"shares no bird with the result: tracks {_some(seen.track_id)}, frames {_some(seen.frame_index)} "
-            f"against {_some(solution.track_id)}, {_some(solution.frame_index)}",
-            _REMEDY,
-        )
+    _check_birds(solution, seen, measured, source)
     _check_sizes(solution, seen, measured, (n_truth, t_truth), source)
     spatial = None
     if truth.solution is not None:
@@ -75,13 +69,7 @@ def evaluate(
     if truth.behaviours is not None:
         behaviour = _behaviour_of_frames(truth.behaviours, solution, either, source)
     masks = compare_masks(solution, bird, seen, measured, (n_truth, t_truth), progress)
-    overlaps = masks.iou[np.isfinite(masks.iou)]
-    if overlaps.size and np.median(overlaps) < _LEAST_MEDIAN_IOU:
-        _logger.warning(
-            "the birds of the result hardly overlap the birds of %s (median IoU %.2f); check the video of the truth",
-            source,
-            np.median(overlaps),
-        )
+    _warn_of_small_overlap(masks.iou, source)
     unmatched = solution.valid & ~shared
     if spatial is not None:
         unmatched &= ~spatial.measured
@@ -96,22 +84,13 @@ def evaluate(
         "me_v": squared_velocity_errors(*keypoints, masks.predicted_side_px, solution.frame_index),
         **(spatial.errors() if spatial else {}),
     }
-    # the PCK of an image with a single keypoint is 1 or 0: whether this keypoint is correct
-    errors_of_keypoints = errors | {
-        "pck@0.05": correct_keypoints(*keypoints, masks.true_side_px, 0.05),
-        "pck@0.10": correct_keypoints(*keypoints, masks.true_side_px, 0.10),
-    }
     rows = np.flatnonzero(either.any(1)).tolist()
     sums = BirdSums.of(solution.track_id[rows].tolist(), {name: values[rows] for name, values in errors.items()})
-
-    def count(counted: np.ndarray) -> float:
-        return float(counted.sum())
-
     return Evaluation(
         overall=metrics_of(errors),
         tracks={
             int(solution.track_id[n]): {
-                "frames": count(measured[n]),
+                "frames": float(measured[n].sum()),
                 **metrics_of({name: values[n : n + 1] for name, values in errors.items()}),
             }
             for n in rows
@@ -122,23 +101,46 @@ def evaluate(
         frames_3d=int(spatial.measured.sum()) if spatial else 0,
         points_3d=spatial.points if spatial else "",
         intervals=sums.intervals(),
-        behaviours={
-            str(name): {
-                "birds": count((either & (behaviour == name)).any(1)),
-                "frames": count(measured & (behaviour == name)),
-                **metrics_of(errors, behaviour == name),
-            }
-            for name in np.unique(behaviour[behaviour != ""])
-        },
-        keypoints={
-            name: {
-                "count": count(annotated[..., k]),
-                **metrics_of({column: errors_of_keypoints[column][..., k : k + 1] for column in COLUMNS_KEYPOINT}),
-            }
-            for k, name in enumerate(bird.keypoint_names)
-        },
+        behaviours=_metrics_of_behaviours(behaviour, errors, measured, either),
+        keypoints=_metrics_of_keypoints(bird.keypoint_names, errors, keypoints, masks.true_side_px),
         sums=sums,
     )
+
+
+def _metrics_of_behaviours(
+    behaviour: np.ndarray, errors: Mapping[str, np.ndarray], measured: np.ndarray, either: np.ndarray
+) -> dict[str, dict[str, float]]:
+    """Return the metrics of each behaviour; `either` also has the birds and frames with 3D errors only."""
+    return {
+        str(name): {
+            "birds": float((either & (behaviour == name)).any(1).sum()),
+            "frames": float((measured & (behaviour == name)).sum()),
+            **metrics_of(errors, behaviour == name),
+        }
+        for name in np.unique(behaviour[behaviour != ""])
+    }
+
+
+def _metrics_of_keypoints(
+    names: Sequence[str],
+    errors: Mapping[str, np.ndarray],
+    keypoints: tuple[np.ndarray, np.ndarray, np.ndarray],
+    true_side_px: np.ndarray,
+) -> dict[str, dict[str, float]]:
+    """Return the metrics of each keypoint from the errors and from the arguments of `correct_keypoints`."""
+    # the PCK of an image with a single keypoint is 1 or 0: whether this keypoint is correct
+    errors = {
+        **errors,
+        "pck@0.05": correct_keypoints(*keypoints, true_side_px, 0.05),
+        "pck@0.10": correct_keypoints(*keypoints, true_side_px, 0.10),
+    }
+    return {
+        name: {
+            "count": float(keypoints[2][..., k].sum()),
+            **metrics_of({column: errors[column][..., k : k + 1] for column in COLUMNS_KEYPOINT}),
+        }
+        for k, name in enumerate(names)
+    }
 
 
 def _behaviour_of_frames(
@@ -160,6 +162,17 @@ def _behaviour_of_frames(
     return behaviour
 
 
+def _check_birds(solution: Solution, seen: Observations, measured: np.ndarray, source: object) -> None:
+    """Raise InputError if no bird is measured in any frame."""
+    if not measured.any():
+        raise InputError(
+            source,
+            f"shares no bird with the result: tracks {_some(seen.track_id)}, frames {_some(seen.frame_index)} "
+            f"against {_some(solution.track_id)}, {_some(solution.frame_index)}",
+            _REMEDY,
+        )
+
+
 def _check_sizes(
     solution: Solution, seen: Observations, measured: np.ndarray, at: tuple[np.ndarray, np.ndarray], source: object
 ) -> None:
@@ -172,6 +185,16 @@ def _check_sizes(
                 f"{true[0]}×{true[1]} pixels, but the result was fitted to an image of {own[0]}×{own[1]}"
             )
             raise InputError(source, problem, _REMEDY)
+
+
+def _warn_of_small_overlap(iou: np.ndarray, source: object) -> None:
+    overlaps = iou[np.isfinite(iou)]
+    if overlaps.size and np.median(overlaps) < _LEAST_MEDIAN_IOU:
+        _logger.warning(
+            "the birds of the result hardly overlap the birds of %s (median IoU %.2f); check the video of the truth",
+            source,
+            np.median(overlaps),
+        )
 
 
 def _some(numbers: np.ndarray) -> str:
