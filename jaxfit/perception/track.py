@@ -26,6 +26,7 @@ from jaxfit.perception.tracking import (
     mean_scores,
     repair_left_right_flips,
 )
+from jaxfit.perception.tracking.recorder import RecordedFrame
 from jaxfit.perception.trust import Trust, footage_signals, judge
 from jaxfit.perception.worker_detections import WorkerDetections
 from jaxfit.progress import ProgressTask, silent
@@ -149,18 +150,9 @@ def run_tracking(
 
     least = getattr(segmenter, "min_track_score", 0.0) if config.min_track_score is None else config.min_track_score
 
-    def cleaned(long_tracks: Observations) -> Observations:
-        observations = drop_low_scores(long_tracks, least)
-        if config.repair_left_right_flips:
-            observations, _ = repair_left_right_flips(observations, mirror_pairs(observations.keypoint_names))
-        return observations
-
-    def observations_from(first: int) -> Observations:
-        return cleaned(drop_short_tracks(recorder.observations(first), config.min_track_frames))
-
     def frame_added() -> None:
         if on_frame is not None:
-            on_frame(observations_from)
+            on_frame(lambda first: _clean(recorder.observations(first), config, least)[1])
 
     processed = process_frames(
         detections_from, reader.path.name, total, frames, new_tracker, recorder, clock, progress, parts, frame_added
@@ -169,8 +161,7 @@ def run_tracking(
         raise InputError(source, f"has no frame from {frames.start} on", "begin with an earlier frame")
     with clock("clean up"):
         all_tracks = recorder.observations()
-        long_tracks = drop_short_tracks(all_tracks, config.min_track_frames)
-        observations = cleaned(long_tracks)
+        long_tracks, observations = _clean(all_tracks, config, least)
     lengths = dict(zip(all_tracks.track_id.tolist(), all_tracks.present.sum(1).tolist(), strict=True))
     short_tracks = {track: length for track, length in lengths.items() if track not in long_tracks.track_id}
     scores = dict(zip(long_tracks.track_id.tolist(), mean_scores(long_tracks).tolist(), strict=True))
@@ -178,18 +169,19 @@ def run_tracking(
     is_calibrated = getattr(keypoints, "curve", None) is not None
     distances = [each.tolist() for each in processed.distances]
     trust = judge(footage_signals(all_tracks, short_tracks, distances, is_calibrated))
-    failure = None
-    if not observations.num_tracks:
-        if low_score_tracks:
-            failure = _only_low_scores(source, trust, low_score_tracks, least)
-        elif short_tracks:
-            best_score = max(float(frame.score.max(initial=0.0)) for frame in processed.frames)
-            failure = _only_short_tracks(source, config, trust, short_tracks, best_score)
-        else:
-            failure = _no_bird(source, config, len(processed.frames), has_own_segmenter)
-    return TrackingResult(
-        observations, short_tracks, low_score_tracks, processed.damaged, failure, trust, clock.seconds
-    )
+    result = TrackingResult(observations, short_tracks, low_score_tracks, processed.damaged, None, trust, clock.seconds)
+    if observations.num_tracks:
+        return result
+    return result._replace(failure=_failure(source, config, result, processed.frames, least, has_own_segmenter))
+
+
+def _clean(tracks: Observations, config: TrackConfig, least: float) -> tuple[Observations, Observations]:
+    """Return the long tracks, and the repaired long tracks with a mean score of at least `least`."""
+    long_tracks = drop_short_tracks(tracks, config.min_track_frames)
+    observations = drop_low_scores(long_tracks, least)
+    if config.repair_left_right_flips:
+        observations, _ = repair_left_right_flips(observations, mirror_pairs(observations.keypoint_names))
+    return long_tracks, observations
 
 
 def _no_workers(tracker: Tracker, end: int | None) -> str | None:
@@ -216,6 +208,23 @@ def _remedy(trust: Trust, setting: str) -> str:
     networks = ["label frames (jaxfit suggest)", "use other networks (--segmenter)"]
     first, second, last = [*networks, setting] if trust.level == "low" else [setting, *networks]
     return f"{first}, {second}, or {last}"
+
+
+def _failure(
+    source: str | Path,
+    config: TrackConfig,
+    result: TrackingResult,
+    frames: list[RecordedFrame],
+    least: float,
+    has_own_segmenter: bool,
+) -> InputError:
+    """Return why a result has no track."""
+    if result.low_score_tracks:
+        return _only_low_scores(source, result.trust, result.low_score_tracks, least)
+    if result.short_tracks:
+        best_score = max(float(frame.score.max(initial=0.0)) for frame in frames)
+        return _only_short_tracks(source, config, result.trust, result.short_tracks, best_score)
+    return _no_bird(source, config, len(frames), has_own_segmenter)
 
 
 def _only_low_scores(source: str | Path, trust: Trust, low_score_tracks: dict[int, float], least: float) -> InputError:
