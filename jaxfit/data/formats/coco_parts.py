@@ -153,6 +153,28 @@ def _observations(parts: Parts, folder: Path) -> Observations:
             cells[name].append(np.stack(at, -1)[has])
             sizes = arrays["image_size_px"][frame[has]]
             texts[name].append(np.column_stack([np.full(has.sum(), number), (ends - length)[has], ends[has], sizes]))
+    for array in (present, *values.values(), *frames.values()):
+        array.flags.writeable = False  # so that `Observations` needs no copy
+    try:
+        return Observations(
+            track_id=head["track_id"],
+            present=present,
+            keypoint_names=tuple(head["keypoint_names"].tolist()),
+            skeleton=tuple((a, b) for a, b in head["skeleton"].tolist()),
+            fps=None if np.isnan(head["fps"]) else float(head["fps"]),
+            footage=_footage(head, folder),
+            **_lazy_masks(parts, folder, cells, texts),
+            **values,
+            **frames,
+        )
+    except ValueError as error:
+        raise InputError(folder, str(error)) from error
+
+
+def _lazy_masks(
+    parts: Parts, folder: Path, cells: Mapping[str, list[np.ndarray]], texts: Mapping[str, list[np.ndarray]]
+) -> dict[str, Any]:
+    """Return the masks of a copy from their cells, and from part, start, end, width and height of their texts."""
     firsts = {name: np.cumsum([0, *map(len, texts[name])]) for name in _MASKS}
 
     @lru_cache(_LOADED)
@@ -181,23 +203,7 @@ def _observations(parts: Parts, folder: Path) -> Observations:
 
         return LazyMasks(np.concatenate(cells[name]), read) if len(places) else {}
 
-    for array in (present, *values.values(), *frames.values()):
-        array.flags.writeable = False  # so that `Observations` needs no copy
-    try:
-        return Observations(
-            track_id=head["track_id"],
-            present=present,
-            keypoint_names=tuple(head["keypoint_names"].tolist()),
-            skeleton=tuple((a, b) for a, b in head["skeleton"].tolist()),
-            fps=None if np.isnan(head["fps"]) else float(head["fps"]),
-            footage=_footage(head, folder),
-            masks=lazy("masks"),
-            amodal_masks=lazy("amodal_masks"),
-            **values,
-            **frames,
-        )
-    except ValueError as error:
-        raise InputError(folder, str(error)) from error
+    return {name: lazy(name) for name in _MASKS}
 
 
 def _footage(head: Mapping[str, np.ndarray], folder: Path) -> FootageIdentity | None:
