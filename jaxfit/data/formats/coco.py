@@ -221,24 +221,17 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
             annotation["score"] = float(_shortest(scores[n, t]))
         for key, masks in (("segmentation", read["masks"]), ("amodal_segmentation", read["amodal_masks"])):
             if (n, t) in masks:
-                size, counts = masks[n, t]["size"], masks[n, t]["counts"]
-                counts = counts.decode("ascii") if isinstance(counts, bytes) else counts
-                annotation[key] = {"size": [int(side) for side in size], "counts": counts}
+                annotation[key] = _json_rle(masks[n, t])
         if (n, t) in areas:
             annotation["area"] = areas[n, t]
         annotations.append(annotation)
     skeleton = [[a + 1, b + 1] for a, b in observations.skeleton]
     category = {"id": 1, "name": "bird", "keypoints": list(observations.keypoint_names), "skeleton": skeleton}
-    tracks = []
-    for quality in track_quality(observations):
-        values = quality._asdict()
-        track = {"id": values.pop("track_id"), "category_id": 1}
-        tracks.append(track | {key: round(v, 6) if isinstance(v, float) else v for key, v in values.items()})
     content: dict[str, Any] = {
         "images": list(images.values()),
         "categories": [category],
         "annotations": annotations,
-        "tracks": tracks,
+        "tracks": _tracks(observations),
     }
     about: dict[str, Any] = dict(info or {}) | ({} if observations.fps is None else {"fps": observations.fps})
     about |= {} if observations.footage is None else {"footage": observations.footage.entries()}
@@ -247,6 +240,22 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
     encoded = json.dumps(content, allow_nan=False).encode()
     write_whole(path, encoded)
     write_coco_parts(observations, read, Path(path), encoded)
+
+
+def _json_rle(rle: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the compressed run lengths of a mask as JSON values."""
+    counts = rle["counts"].decode("ascii") if isinstance(rle["counts"], bytes) else rle["counts"]
+    return {"size": [int(side) for side in rle["size"]], "counts": counts}
+
+
+def _tracks(observations: Observations) -> list[dict[str, Any]]:
+    """Return the entries of ``tracks``."""
+    tracks = []
+    for quality in track_quality(observations):
+        values = quality._asdict()
+        track = {"id": values.pop("track_id"), "category_id": 1}
+        tracks.append(track | {key: round(v, 6) if isinstance(v, float) else v for key, v in values.items()})
+    return tracks
 
 
 def _shortest(values: np.ndarray) -> np.ndarray:
