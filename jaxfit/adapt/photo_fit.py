@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxfit.adapt.bone_widths import BoneWidths, bone_widths
 from jaxfit.adapt.hierarchy import PLACE_UNITS, Data, Hierarchy, Parameters, Weights, initial_state, run_steps
 from jaxfit.adapt.offsets import with_offsets
 from jaxfit.adapt.photographs import Photographs
@@ -57,6 +58,8 @@ class PhotoFit:
     """Final weight of each image, from 0 to 1."""
     individuals: int
     settings: PhotoSettings
+    widths: BoneWidths | None
+    """Widths of the mean bone lengths; None for fixed bone lengths."""
 
     @property
     def disagreeing(self) -> list[int]:
@@ -114,13 +117,19 @@ def fit_photographs(
                 own_bones = _shrunk(first_bones, deviations[0].T @ deviations[0], individuals, settings)
                 own_shape = _shrunk(first_shape, (deviations[1] ** 2).sum(0), individuals, settings)
             weight = _image_weights(photographs, *(np.asarray(loss) for loss in losses))
+    weights = weights._replace(
+        image=jnp.asarray(weight, jnp.float32),
+        own_bones=jnp.asarray(np.linalg.inv(own_bones), jnp.float32),
+        own_shape=jnp.asarray(1 / own_shape, jnp.float32),
+    )
+    widths = None if "bones" in fixed else bone_widths(model, priors_of(extended), data, weights, p)
     symmetric = symmetric_bones(bird)
     covariance = symmetric @ own_bones @ symmetric.T + 1e-4 * np.eye(len(symmetric))
     shift = np.tensordot(np.asarray(p.shape), np.asarray(extended.shape_basis), axes=1)
     bones = np.asarray(bird.bone_mean) + symmetric @ np.asarray(p.bones)
     adapted = species_bird(bird, name, bones, shift, covariance)
     adapted = replace(adapted, shape_variance=jnp.asarray(own_shape, jnp.float32))
-    return PhotoFit(adapted, weight, individuals, settings)
+    return PhotoFit(adapted, weight, individuals, settings, widths)
 
 
 def _shrunk(first, scatter, individuals: int, settings: PhotoSettings):

@@ -26,8 +26,8 @@ __all__ = ["MASK_PX", "Photographs", "read_photographs"]
 
 MASK_PX = 128
 """Side of the masks and silhouettes that are compared, in pixels."""
-MOST_FRAMES = 10
-"""Most images of one individual: the frames of a track show one bird again and again."""
+FRAMES_PER_TRACK = 10
+"""Most images of one track, if nothing else is given: the frames of a track show one individual again and again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,28 +46,41 @@ class Photographs:
     has_mask: Bool[np.ndarray, "N"]
     pose: Pose
     """Initial poses with a leading axis N, from a fit of each image to its keypoints."""
+    remarks: tuple[str, ...] = ()
+    """How many images of the files are not used, and why."""
 
 
 def read_photographs(
-    sources: Sequence[tuple[object, Observations]], bird: Bird, progress: ProgressTask = silent
+    sources: Sequence[tuple[object, Observations]],
+    bird: Bird,
+    progress: ProgressTask = silent,
+    frames_per_track: int = FRAMES_PER_TRACK,
 ) -> Photographs:
     """Fit the keypoints of every image by itself, and return the images with these poses.
 
     Args:
-        sources: for each file its name in messages, and its observations. Every track is one individual. At most
-            `MOST_FRAMES` frames of a track are used: frames at equal distances.
+        sources: for each file its name in messages, and its observations. Every track is one individual.
         bird: the model to start from.
         progress: shows progress.
+        frames_per_track: largest number of frames of a track that are used: frames at equal distances.
 
     Raises:
         InputError: no usable image, or other keypoints than the model's.
+        ValueError: `frames_per_track` is below 1.
     """
+    if frames_per_track < 1:
+        raise ValueError(f"frames_per_track: expected 1 or more, not {frames_per_track}")
     config = _keypoint_config()
     parts: list[dict[str, Any]] = []
+    remarks: list[str] = []
     for source, given in sources:
-        observations = _few_frames(check_keypoints(given, bird.keypoint_names, source), config.min_keypoints)
+        checked = check_keypoints(given, bird.keypoint_names, source)
+        observations = _few_frames(checked, config.min_keypoints, frames_per_track)
         solution = fit(observations, bird, config, progress=progress, source=source)
         parts += _images(observations, solution, source)
+        images, fitted = int(checked.present.sum()), int(solution.valid.sum())
+        usable, chosen = (int(each.usable(config.min_keypoints).sum()) for each in (checked, observations))
+        remarks += _remarks(source, images, usable, chosen, fitted, frames_per_track)
     if not parts:
         raise InputError(sources[0][0], "has no usable image", "annotate at least four keypoints per bird")
     own = {key: number for number, key in enumerate(dict.fromkeys(part["individual"] for part in parts))}
@@ -83,7 +96,23 @@ def read_photographs(
         mask=stacked("mask"),
         has_mask=stacked("has_mask"),
         pose=jax.tree.map(lambda *x: np.stack(x), *(part["pose"] for part in parts)),
+        remarks=tuple(remarks),
     )
+
+
+def _remarks(source: object, images: int, usable: int, chosen: int, fitted: int, frames_per_track: int) -> list[str]:
+    """Return a sentence for each reason why images of a file are not used."""
+    remarks = []
+    if usable < images:
+        remarks.append(f"{source}: {images - usable} of {images} images are not used: too few keypoints")
+    if chosen < usable:
+        why = f"at most {frames_per_track} of each track, at equal distances, because a track shows one individual"
+        remarks.append(f"{source}: {chosen} of {usable} images are used: {why} (--frames-per-track)")
+    if fitted < chosen:
+        remarks.append(
+            f"{source}: {chosen - fitted} of {chosen} images are not used: the fit of their keypoints failed"
+        )
+    return remarks
 
 
 def _keypoint_config() -> FitConfig:
@@ -93,14 +122,12 @@ def _keypoint_config() -> FitConfig:
     return replace(config, stages=stages, crop=replace(config.crop, mode="box"))
 
 
-def _few_frames(observations: Observations, min_keypoints: int) -> Observations:
-    """Return the observations with at most `MOST_FRAMES` usable frames of each track."""
+def _few_frames(observations: Observations, min_keypoints: int, most: int) -> Observations:
+    """Return the observations with at most `most` usable frames of each track."""
     confidence = np.array(observations.confidence)
     for n, usable in enumerate(observations.usable(min_keypoints)):
         frames = np.flatnonzero(usable)
-        kept = (
-            frames[np.unique(np.linspace(0, len(frames) - 1, MOST_FRAMES).round().astype(int))] if len(frames) else []
-        )
+        kept = frames[np.unique(np.linspace(0, len(frames) - 1, most).round().astype(int))] if len(frames) else []
         confidence[n, np.setdiff1d(np.arange(confidence.shape[1]), kept)] = 0
     return observations.with_keypoints(observations.keypoints_px, confidence)
 

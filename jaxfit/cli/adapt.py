@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,9 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.files import find_bird, save_bird
 from jaxfit.progress import terminal
 from jaxfit.storage.files import check_writable
+
+if TYPE_CHECKING:
+    from jaxfit.adapt.bone_widths import BoneWidths
 
 __all__ = ["adapt_photos", "adapt_scan"]
 
@@ -87,13 +91,17 @@ def adapt_photos(options: argparse.Namespace) -> None:
         raise InputError("--fix", f"{unknown[0]!r} is not a part of a species", f"known: {', '.join(FREE)}")
     if set(fixed) == set(FREE):
         raise InputError("--fix", "all parts are fixed, so that nothing is left to fit", "fix fewer parts")
+    if options.frames_per_track < 1:
+        raise InputError("--frames-per-track", f"is {options.frames_per_track}", "give a number from 1")
     check_writable(options.out)  # before the long work
     bird = find_bird(options.model)
     sources = [
         (path.name, observations_for(path, bird.keypoint_names, options, untracked="photographs")[0])
         for path in options.birds
     ]
-    photographs = read_photographs(sources, bird, terminal)
+    photographs = read_photographs(sources, bird, terminal, options.frames_per_track)
+    for remark in photographs.remarks:
+        show(remark)
     count = len(photographs.names)
     without = int((~photographs.has_mask).sum())
     if without:
@@ -108,9 +116,15 @@ def adapt_photos(options: argparse.Namespace) -> None:
     }
     facts |= {"free": ", ".join(part for part in FREE if part not in fixed)}
     facts |= {f"setting_{key}": value for key, value in fit.settings._asdict().items()}
-    facts |= {"images_that_disagree": len(fit.disagreeing)}
+    facts |= {"images_that_disagree": len(fit.disagreeing), "frames_per_track": options.frames_per_track}
+    undetermined = _undetermined_bones(bird, fit.widths)
+    if fit.widths is not None:
+        facts |= {"bones_not_determined": ", ".join(undetermined) or "none"}
     save_bird(fit.bird, options.out, provenance_notes(bird, facts))
-    _show_bones(bird, fit.bird)
+    _show_bones(bird, fit.bird, fit.widths)
+    if undetermined:
+        text = f"warning: the images do not determine the length of {', '.join(undetermined)}: they say less than the "
+        show(text + "prior of the model; add images with masks and from other sides, or use --fix bones")
     for i in fit.disagreeing:
         show(f"disagrees with the other images, weight {fit.weight[i]:.2f}: {photographs.names[i]}")
     if fit.individuals < FEW_INDIVIDUALS:
@@ -118,16 +132,30 @@ def adapt_photos(options: argparse.Namespace) -> None:
     show(f"{counted(count, 'image')} of {counted(fit.individuals, 'individual')} → {options.out}")
 
 
-def _show_bones(base: Bird, adapted: Bird) -> None:
-    """Print the change of the mean bone lengths, in per cent of the bones of the base."""
+def _undetermined_bones(bird: Bird, widths: BoneWidths | None) -> list[str]:
+    """Return the bones about which the photographs say less than the prior; a left and a right bone have one name."""
+    bones = [] if widths is None else widths.undetermined
+    names = (bird.joint_names[bone + 1] for bone in bones)
+    return list(dict.fromkeys(name.removeprefix("left_").removeprefix("right_") for name in names))
+
+
+def _show_bones(base: Bird, adapted: Bird, widths: BoneWidths | None = None) -> None:
+    """Print the change of the mean bone lengths, in per cent of the bones of the base, and the widths if known."""
     from jaxfit.adapt.species import absolute_bones
 
     before, after = absolute_bones(base), absolute_bones(adapted)
-    table = right_aligned("base", "adapted", "change %", title="mean bone lengths, model units")
+    columns = ("± %", "prior ± %") if widths is not None else ()
+    table = right_aligned("base", "adapted", "change %", *columns, title="mean bone lengths, model units")
     table.add_column("bone")
+    if widths is not None:
+        table.caption = "±: standard deviation of the mean length with the images, and in the prior of the model"
+    mean = np.maximum(np.asarray(base.bone_mean), 1e-9)
     for bone in np.argsort(-np.abs(after / np.maximum(before, 1e-9) - 1)):
         change = 100 * (after[bone] / max(before[bone], 1e-9) - 1)
-        table.add_row(f"{before[bone]:.2f}", f"{after[bone]:.2f}", f"{change:+.1f}", base.joint_names[bone + 1])
+        both = () if widths is None else (widths.posterior, widths.prior)
+        cells = (f"{100 * each[bone] / mean[bone]:.1f}" for each in both)
+        row = f"{before[bone]:.2f}", f"{after[bone]:.2f}", f"{change:+.1f}"
+        table.add_row(*row, *cells, base.joint_names[bone + 1])
     show(table)
 
 

@@ -40,6 +40,9 @@ def _photos(actions: Any) -> None:
     add_out(photos, "N.npz", "model file to write")
     text = "parts that stay as in the model: bones, shape, offset, or several with commas"
     photos.add_argument("--fix", default="", metavar="PARTS", help=text)
+    text = "largest number of images of a track, which shows one individual: images at equal distances (default "
+    text += "%(default)s)"
+    photos.add_argument("--frames-per-track", type=int, default=10, metavar="N", help=text)
     add_observation_options(photos)
 
 

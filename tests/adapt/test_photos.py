@@ -7,7 +7,7 @@ import pytest
 
 from jaxfit.adapt.compare import compare_birds
 from jaxfit.adapt.photo_fit import PhotoSettings, fit_photographs
-from jaxfit.adapt.photographs import MOST_FRAMES, _few_frames, read_photographs
+from jaxfit.adapt.photographs import FRAMES_PER_TRACK, _few_frames, _remarks, read_photographs
 from jaxfit.adapt.species import absolute_bones, symmetric_bones
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import write_coco
@@ -93,10 +93,10 @@ def test_wrong_parts_are_one_line_errors(tmp_path, capsys, fixed, says):
     assert says in capsys.readouterr().err
 
 
-def test_a_track_gives_few_frames(photographs):
-    observations = photographs[2].select(tracks=np.array([1]))
-    frames = 25
-    long = replace(
+def as_one_track(observations, frames):
+    """Return observations of a track whose frames all show the second photograph, without its mask."""
+    observations = observations.select(tracks=np.array([1]))
+    return replace(
         observations,
         frame_index=np.arange(frames),
         present=np.ones((1, frames), bool),
@@ -111,9 +111,47 @@ def test_a_track_gives_few_frames(photographs):
         own_images={},
         masks={},
     )
-    used = np.flatnonzero(_few_frames(long, 4).usable(4)[0])
-    assert len(used) == MOST_FRAMES
-    assert used[[0, -1]].tolist() == [0, frames - 1]
+
+
+@pytest.mark.parametrize(("most", "used"), [(FRAMES_PER_TRACK, 10), (2, 2), (25, 25), (104, 25)])
+def test_a_track_gives_few_frames(photographs, most, used):
+    long = as_one_track(photographs[2], 25)
+    chosen = np.flatnonzero(_few_frames(long, 4, most).usable(4)[0])
+    assert len(chosen) == used
+    assert chosen[[0, -1]].tolist() == [0, 24]
+
+
+def test_remarks_say_how_many_images_are_used_and_why():
+    assert _remarks("a.json", 30, 30, 30, 30, 10) == []
+    few, track, failed = _remarks("a.json", 110, 104, 10, 8, 10)
+    assert few == "a.json: 6 of 110 images are not used: too few keypoints"
+    assert track.startswith("a.json: 10 of 104 images are used: at most 10 of each track, at equal distances")
+    assert "--frames-per-track" in track
+    assert failed == "a.json: 2 of 10 images are not used: the fit of their keypoints failed"
+
+
+@pytest.mark.extended
+def test_the_command_says_how_many_frames_of_a_track_it_uses_and_which_bones_they_do_not_determine(
+    photographs, tmp_path, capsys
+):
+    write_coco(as_one_track(photographs[2], 25), tmp_path / "birds.json")
+    arguments = ["adapt", "photos", str(tmp_path / "birds.json"), "--out", str(tmp_path / "m.npz")]
+    assert main([*arguments, "--frames-per-track", "3", "--fix", "shape,offset"]) == 0
+    printed = capsys.readouterr().out
+    assert "birds.json: 3 of 25 images are used: at most 3 of each track" in printed
+    assert "3 images of 1 individual" in printed
+    assert "prior ± %" in printed
+    warning = next(line for line in printed.splitlines() if "do not determine the length of" in line)
+    assert "neck" in warning
+    lines = list(load_npz(tmp_path / "m.npz", {"provenance": "lines"})["provenance"])
+    assert {"images: 3", "frames_per_track: 3"} <= set(lines)
+    assert any(line.startswith("bones_not_determined: ") and "neck" in line for line in lines)
+
+
+def test_a_number_of_frames_below_1_is_an_error(tmp_path, capsys):
+    arguments = ["adapt", "photos", "absent.json", "--out", str(tmp_path / "m.npz"), "--frames-per-track", "0"]
+    assert main(arguments) == 2
+    assert "--frames-per-track: is 0" in capsys.readouterr().err
 
 
 def test_left_and_right_bones_share_one_length():
