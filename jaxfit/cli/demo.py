@@ -5,20 +5,25 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from rich.table import Table
+
 from jaxfit.cli.observation_tables import matching_line, observation_tables
-from jaxfit.cli.tables import evaluation_tables, show, track_table
+from jaxfit.cli.tables import counted, evaluation_tables, show, track_table
 from jaxfit.config.reconstruct import load_reconstruct_config
+from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.scene_folder import FOOTAGE, MARKER
 from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
-from jaxfit.evaluation.matching import match_tracks
-from jaxfit.evaluation.observed import evaluate_observations
+from jaxfit.evaluation.matching import Matching, match_tracks
+from jaxfit.evaluation.observed import ObservationsEvaluation, evaluate_observations
 from jaxfit.evaluation.truth import Truth
 from jaxfit.export.export import export_result
 from jaxfit.model.files import load_murre
+from jaxfit.perception.trust import Trust
 from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.progress import terminal
-from jaxfit.report.write import REPORT
+from jaxfit.report.page import Measured
+from jaxfit.report.write import REPORT, write_report
 from jaxfit.simulation.scene import simulate
 from jaxfit.storage.files import check_replaceable, check_writable, write_whole
 from jaxfit.storage.json_values import json_text
@@ -30,12 +35,15 @@ BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 1003
 METRICS, ANIMATION = "evaluation.json", "birds.glb"
 
 
-def run_demo(folder: Path) -> Evaluation:
+def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     """Write a simulated scene and its reconstruction to a folder, and print how well the two agree.
+
+    The command prints ten lines. The report of the result holds all tables.
 
     Args:
         folder: receives `scene/`, `result/`, `evaluation.json` and `birds.glb`; an earlier demo in the folder is
             replaced.
+        verbose: print all tables too.
 
     Returns:
         The metrics of the reconstruction.
@@ -60,26 +68,55 @@ def run_demo(folder: Path) -> Evaluation:
     export_result(result_folder, "glb", folder / ANIMATION, one_file=True, overwrite=True, progress=terminal)
     metrics = {"detection": observed.detection, "tracking": observed.tracking, **result.overall}
     write_whole(folder / METRICS, json_text(metrics).encode())
-    show(track_table(observations, done.solution))
-    for table in observation_tables(observed):
-        show(table)
-    show(matching_line(matching))
-    for table in evaluation_tables(result):
-        show(table)
+    compared, numbers = [*observation_tables(observed), *evaluation_tables(result)], matching_line(matching)
+    report = done.solution, bird, observations, done.summary, config_to_yaml(config), result_folder
+    measured = [_measured(table) for table in compared]
+    measured[-1] = measured[-1]._replace(note=f"{measured[-1].note}; {numbers}")
+    write_report(result_folder / REPORT, *report, scene_folder / FOOTAGE, measured=measured)
+    if verbose:
+        for output in (track_table(observations, done.solution), *compared, numbers):
+            show(output)
+    for line in _answer(done.tracking.trust, observed, result, matching):
+        show(line)
     seconds = done.summary["seconds"]
     parts = ", ".join(f"{name} {seconds[name]:.0f}" for name in ("track", "fit", "overlay"))
-    show(f"done in {time.perf_counter() - start:.0f} s ({parts}). Files:")
+    show(f"done in {time.perf_counter() - start:.0f} s ({parts}). Open next:")
     for path, text in (
-        (result_folder / REPORT, "warnings, quality and pictures: open it in a browser"),
+        (result_folder / REPORT, "pictures, warnings and tables of all metrics, in a browser"),
         (result_folder / OVERLAY, "the posed birds on the footage, and every bird from its side"),
-        ((result_folder / OVERLAY).with_suffix(".png"), "a contact sheet, with a legend"),
-        (result_folder, "observations.json, poses.npz, summary.json"),
-        (scene_folder, "footage and ground truth"),
-        (folder / METRICS, "the metrics above"),
         (folder / ANIMATION, "the animated birds, for Blender (File > Import > glTF 2.0)"),
     ):
         show(f"  {path}: {text}")
+    show("for your own film: jaxfit reconstruct VIDEO --out result")
     return result
+
+
+def _answer(trust: Trust, observed: ObservationsEvaluation, result: Evaluation, matching: Matching) -> list[str]:
+    """Return the lines that say what was found, and how good the result is."""
+    birds = counted(len(matching.follows) + len(matching.missed), "bird")
+    found = len(matching.follows) + len(matching.unmatched)
+    wrong = f"; {counted(len(matching.unmatched), 'track')} too wrong to measure" if matching.unmatched else ""
+    detection, keypoints = observed.detection, observed.keypoints["all"]
+    tracks = {bird: track for track, bird in matching.follows.items()}
+    errors = {tracks[bird]: row["mpjpe/length"] for bird, row in result.tracks.items()}
+    worst = max(errors, key=lambda track: errors[track])
+    return [
+        f"tracks: {found} for {birds} over {counted(observed.counts['frames'], 'frame')}, "
+        f"identities exchanged {observed.tracking['switches']} times, trust is {trust.level}",
+        f"detections: {100 * detection['recall']:.0f} % of the birds in all frames, "
+        f"{100 * detection['precision']:.0f} % are right, "
+        f"mean IoU of the masks {detection['mean_iou']:.2f} (1 is perfect)",
+        f"keypoints: {100 * keypoints.annotated_pck_05:.0f} % within 5 % of the bird's size, hidden keypoints included",
+        f"poses: joints {100 * result.overall['mpjpe/length']:.1f} % of the body length from the truth, "
+        f"worst in track {worst} ({100 * errors[worst]:.1f} %){wrong}",
+    ]
+
+
+def _measured(table: Table) -> Measured:
+    """Return a table of the terminal for the report."""
+    headings = [str(column.header) for column in table.columns]
+    rows = zip(*(map(str, column.cells) for column in table.columns), strict=True)
+    return Measured(headings, list(rows), str(table.caption or ""))
 
 
 def _check_folder(folder: Path) -> None:

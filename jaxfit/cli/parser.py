@@ -153,6 +153,9 @@ def _simulation(commands: Any) -> None:
     demo = add_command(commands, "demo", "simulation.demo", text)
     text = "folder for all files (default %(default)s)"
     demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help=text)
+    text = "also print all tables, which are in the report too, and messages of libraries"
+    # without a default, so that `jaxfit --verbose demo` stays verbose
+    demo.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS, help=text)
 
 
 def _training(commands: Any) -> None:

@@ -41,7 +41,7 @@ def demo(options: argparse.Namespace) -> None:
     """Run the demo."""
     from jaxfit.cli.demo import run_demo
 
-    run_demo(options.out)
+    run_demo(options.out, options.verbose)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -6,6 +6,7 @@ import base64
 import shlex
 from collections.abc import Sequence
 from importlib import resources
+from typing import NamedTuple
 
 from jaxfit.report.advice import Step, Warned, counted, next_steps, warnings_of
 from jaxfit.report.contents import Report, Track
@@ -13,7 +14,7 @@ from jaxfit.report.html import Html, element, joined
 from jaxfit.report.pictures import Picture
 from jaxfit.report.timeline import duration, size_curve, swatch, timeline
 
-__all__ = ["page"]
+__all__ = ["Measured", "page"]
 
 _POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """The browser loads nothing from elsewhere and runs no script."""
@@ -44,12 +45,22 @@ _MEANINGS = (
 )
 
 
-def page(report: Report, pictures: Sequence[Picture]) -> str:
+class Measured(NamedTuple):
+    """A table of metrics of a result against a known truth."""
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str
+    """What the columns mean."""
+
+
+def page(report: Report, pictures: Sequence[Picture], measured: Sequence[Measured] = ()) -> str:
     """Return the page.
 
     Args:
         report: the content.
         pictures: frames with drawn birds; may be empty.
+        measured: metrics against a known truth; may be empty.
     """
     warned = warnings_of(report)
     title = f"Birds in {report.title}"
@@ -73,6 +84,7 @@ def page(report: Report, pictures: Sequence[Picture]) -> str:
             None if report.photographs else _section("Pictures", _strip(report, pictures)),
             _section("Tracks over time", timeline(report)) if report.over_time else None,
             _section("Quality of each track", _table(report)),
+            _section("Comparison with the truth", *map(_measured, measured)) if measured else None,
             _section("What the words mean", _definitions(_meanings(report))),
             _section("How the result was made", _details(report)),
         ),
@@ -198,6 +210,13 @@ def _cells(track: Track, detected: bool, over_time: bool) -> list[Html]:
         cells += [element("td", text) for text in shown]
     cells.append(element("td", "–" if track.objective is None else f"{track.objective:,.1f}"))
     return [*cells, element("td", size_curve(track))] if over_time else cells
+
+
+def _measured(table: Measured) -> Html:
+    head = element("tr", *(element("th", name) for name in table.headings))
+    rows = [element("tr", element("th", row[0]), *(element("td", cell) for cell in row[1:])) for row in table.rows]
+    content = element("table", element("thead", head), element("tbody", *rows))
+    return joined(element("div", content, class_="wide"), element("p", table.note, class_="note"))
 
 
 def _meanings(report: Report) -> list[tuple[str, str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from jaxfit.errors import InputError
 from jaxfit.limits import CONFIG_BYTES
 from jaxfit.model.bird import Bird
 from jaxfit.report.contents import gather
-from jaxfit.report.page import page
+from jaxfit.report.page import Measured, page
 from jaxfit.report.pictures import report_pictures
 from jaxfit.storage.files import check_new_file, write_whole
 from jaxfit.storage.json_values import json_values
@@ -41,6 +41,7 @@ def write_report(
     folder: Path,
     video: Path | None,
     force: bool = False,
+    measured: Sequence[Measured] = (),
 ) -> None:
     """Write the report of a result as one HTML page without links to other files.
 
@@ -53,6 +54,7 @@ def write_report(
         folder: the folder that holds the result, for commands in the report.
         video: the footage; None writes a report without pictures.
         force: draw also on footage that is not the footage of the result.
+        measured: metrics against a known truth.
 
     Raises:
         InputError: the footage does not belong to the result, or the file cannot be written.
@@ -61,7 +63,7 @@ def write_report(
     pictures = []
     if video is not None and solution.valid.any():
         pictures = report_pictures(solution, bird, video, observations, force)
-    write_whole(path, page(report, pictures).encode())
+    write_whole(path, page(report, pictures, measured).encode())
 
 
 def report_of_result(

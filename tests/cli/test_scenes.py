@@ -1,6 +1,7 @@
 """The commands for simulated scenes from end to end."""
 
 import json
+import re
 from pathlib import Path
 
 import cv2
@@ -169,13 +170,27 @@ def test_the_demo_writes_the_files_that_it_names(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "BIRDS", 2)
     monkeypatch.setattr(demo, "FRAMES", 5)
     monkeypatch.setattr(demo, "SIZE", (480, 280))
-    for _ in range(2):  # a second demo replaces the first
-        assert main(["demo", "--out", str(tmp_path / "demo")]) == 0
-    said = capsys.readouterr().out.replace("\n", "")
+    said = []
+    for options in ([], ["--verbose"]):  # a second demo replaces the first
+        assert main(["demo", "--out", str(tmp_path / "demo"), *options]) == 0
+        said.append(capsys.readouterr().out)
     for name in ("result/overlay.mp4", "result/overlay.png", "result", "scene", "evaluation.json", "birds.glb"):
         assert (tmp_path / "demo" / name).exists()
-        assert str(tmp_path / "demo" / name) in said
-    assert "PA-MPJPE" in said
+    lines = said[0].splitlines()
+    assert len(lines) == 10
+    assert max(map(len, lines[:5])) <= 110
+    assert lines[1] == "tracks: 2 for 2 birds over 5 frames, identities exchanged 0 times, trust is high"
+    assert lines[2].startswith(
+        "detections: 100 % of the birds in all frames, 100 % are right, mean IoU of the masks 1.00"
+    )
+    assert re.match(r"poses: joints \d+\.\d % of the body length from the truth, worst in track \d ", lines[4])
+    for name, line in zip(("result/report.html", "result/overlay.mp4", "birds.glb"), lines[6:9], strict=True):
+        assert line.startswith(f"  {tmp_path / 'demo' / name}: ")
+    page = (tmp_path / "demo" / "result" / "report.html").read_text()
+    for metric in ("PA-MPJPE", "HOTA", "AP50-95", "bill_tip", "me_v", "renamed to the ids of the truth"):
+        assert metric in page
+        assert metric in said[1]
+        assert metric not in said[0]
     metrics = json.loads((tmp_path / "demo" / "evaluation.json").read_text())
     assert metrics["mpjpe"] > 0
     assert metrics["detection"]["mean_iou"] == 1

@@ -22,6 +22,7 @@ from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.report.advice import next_steps, warnings_of
 from jaxfit.report.contents import gather
 from jaxfit.report.html import element
+from jaxfit.report.page import Measured, page
 from jaxfit.report.pictures import spread_frames
 from jaxfit.report.timeline import timeline
 
@@ -213,6 +214,19 @@ def test_poses_of_low_trust_are_not_recommended_for_statistics(folder, made):
     assert "jaxfit suggest" not in commands("high")
     assert "jaxfit export" not in commands("low")
     assert "jaxfit suggest" in commands("low")
+
+
+def test_metrics_against_a_known_truth_are_tables(folder, made):
+    report = gather(made, None, {}, "", folder)
+    shown = Page(page(report, [], [Measured(["track", "IoU <"], [("3", "0.9"), ("7", "0.8")], "IoU: overlap")]))
+    assert [row for row in shown.rows if row[:1] in (["track"], ["3"], ["7"])][-3:] == [
+        ["track", "IoU <"],
+        ["3", "0.9"],
+        ["7", "0.8"],
+    ]
+    assert "Comparison with the truth" in shown.text
+    assert "IoU: overlap" in shown.text
+    assert "Comparison with the truth" not in page(report, [])
 
 
 def test_other_files_are_not_replaced_and_wrong_files_are_named(folder, drawn, tmp_path, capsys):
