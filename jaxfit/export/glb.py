@@ -19,7 +19,7 @@ from jaxfit.export.folder import describe_tracks, export_folder
 from jaxfit.export.gltf_bird import add_bird, weight_error
 from jaxfit.export.gltf_file import GltfBuilder
 from jaxfit.export.gltf_ground import Ground, add_ground, level_ground
-from jaxfit.export.gltf_motion import Motion, bird_motion, image_focal_px
+from jaxfit.export.gltf_motion import Motion, bird_motion
 from jaxfit.export.result import Exported
 from jaxfit.progress import ProgressTask
 from jaxfit.storage.files import write_whole
@@ -56,12 +56,12 @@ def write_glb(
     """
     exported.require_poses()
     exported.require_fps()
-    focal_px = image_focal_px(exported.solution)
+    focal_px = exported.focal_px
     fitted = np.flatnonzero(exported.solution.valid.any(axis=1)).tolist()
     with progress("Writing glTF", len(fitted)) as report_progress:
         motions: dict[int, Motion] = {}
         for n in fitted:
-            motions[n] = bird_motion(exported, n, focal_px)
+            motions[n] = bird_motion(exported, n)
             report_progress(0.5, f"track {exported.solution.track_id[n]}")
         level = level_ground(exported, motions) if ground else None
         error = weight_error(exported)

@@ -43,7 +43,7 @@ def write_movement(
         exported: the result.
         out: the file to write.
         progress: shows progress.
-        space: `2d` for image pixels, `3d` for the camera frame of the crop.
+        space: `2d` for image pixels, `3d` for the camera frame of the image.
         dims: `singular` for the dimensions `keypoint` and `individual`, `plural` for `keypoints` and `individuals`.
 
     Returns:
@@ -86,7 +86,8 @@ def write_movement(
                 "fps": fps,
                 "time_unit": "seconds",
                 "source_file": str(exported.source),
-                "position_frame": "image, x right, y down" if space == "2d" else "camera frame of the crop, z forward",
+                "position_frame": "image, x right, y down" if space == "2d" else "camera frame of the image, z forward",
+                **({} if space == "2d" else {"focal_length_px": exported.focal_px}),
             },
         )
         content = io.BytesIO()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from jaxtyping import Float
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.frame_numbers import frame_step
+from jaxfit.data.image_camera import InImage, image_focal_px, in_image
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.selection import frame_positions, select_solution, track_positions
 from jaxfit.data.solution import Solution, load_solution
@@ -45,6 +47,8 @@ class Exported:
     """Track → quality of its detections over the whole result. Empty without detections."""
     metres_per_unit: float | None
     """Length of a model unit; None if unknown."""
+    focal_px: float
+    """Focal length of the image: that of the whole result, so that all exports of a result have one scene."""
     fps: float | None
     """Frames per second of the footage; None if unknown."""
     times_s: Float[np.ndarray, "T"]
@@ -77,18 +81,14 @@ class Exported:
 
     @property
     def keypoints_3d(self) -> Float[np.ndarray, "N T K 3"]:
-        """Keypoints in the camera frame of the crop at the size of the model, in `unit`; NaN without a pose.
+        """Keypoints in the camera frame of the image (`in_image`), in `unit`; NaN without a pose."""
+        points = self.in_image.points(self.solution.keypoints_cam, self.solution.scale)
+        return (points * self.length).astype(np.float32)
 
-        One camera does not measure size: a bird that is larger and farther away gives the same picture. The result
-        holds the keypoints at `Solution.scale` times the size of the model; here they are divided by the scale.
-        """
-        return self.at_model_size(self.solution.keypoints_cam)
-
-    def at_model_size(self, points: Float[np.ndarray, "N T K 3"]) -> Float[np.ndarray, "N T K 3"]:
-        """Return points of the camera frame (model units) for a bird of the model's size, in `unit`."""
-        valid = self.solution.valid[..., None, None]
-        scale = np.where(valid, self.solution.scale[..., None, None], np.float32(np.nan))
-        return points / scale * np.float32(self.length)
+    @cached_property
+    def in_image(self) -> InImage:
+        """The birds in the camera frame of the image, model units."""
+        return in_image(self.solution, self.bird, self.focal_px)
 
     @property
     def sampling_fps(self) -> float:
@@ -168,6 +168,7 @@ def open_result(
         observations=None if observations is None else observations.select(rows, columns),
         quality={track: quality[track] for track in chosen.track_id.tolist() if track in quality},
         metres_per_unit=metres_per_unit or bird.metres_per_unit,
+        focal_px=image_focal_px(solution),
         fps=rate,
         times_s=_times(chosen, fps, rate),
         video=video,

@@ -1,9 +1,8 @@
 """Tables for R, pandas and spreadsheets, as CSV or Parquet: poses and keypoints, and joint angles.
 
 Both tables have a row for every track and frame. A row without a pose has `fitted` = false and empty values. The last
-part of the name of a column is its unit: `s`, `px` (image pixels), `m` or `unit` (model units), `rad`. Positions are in
-the camera frame of the crop: x right, y down, z forward. Positions in space are those of a bird of the model's size:
-times `size`, they are those of the result.
+part of the name of a column is its unit: `s`, `px` (image pixels), `m` or `unit` (model units), `rad`. Positions in
+space are those of a bird of the model's size in the camera frame of the image (`jaxfit.data.image_camera`).
 """
 
 from __future__ import annotations
@@ -82,9 +81,8 @@ def _pose_columns(exported: Exported) -> Columns:
         rows = [exported.quality.get(track) for track in s.track_id.tolist()]
         values = [np.nan if row is None or getattr(row, name) is None else getattr(row, name) for row in rows]
         columns[f"track_{name}"] = np.repeat(np.array(values, np.float64), T)
-    root = s.transl + s.scale[..., None] * np.asarray(exported.bird.joints[0])
-    columns |= _vectors(exported, {"root": exported.at_model_size(root[:, :, None])[:, :, 0]}, unit)
-    columns |= _vectors(exported, {"orientation": s.global_orient}, "rad")
+    columns |= _vectors(exported, {"root": exported.in_image.root * exported.length}, unit)
+    columns |= _vectors(exported, {"orientation": exported.in_image.orientation}, "rad")
     columns["size"] = _known(exported, s.scale)
     confidence = exported.confidence
     for k, name in enumerate(s.keypoint_names):
@@ -119,14 +117,15 @@ def _facts(exported: Exported) -> dict[str, str]:
     """Return facts about the whole table, for its metadata."""
     units = {"s": "seconds", "px": "image pixels, origin at the upper left corner of the image", "rad": "radians"}
     units |= {"m": "metres"} if exported.unit == "m" else {"unit": "model units, whose length in metres is unknown"}
-    frames = "positions: camera frame of the crop, x right, y down, z forward; orientation: axis-angle, model to "
+    frames = "positions: camera frame of the image, x right, y down, z forward; orientation: axis-angle, model to "
     frames += "camera; joint angles: axis-angle relative to the parent joint"
     return {
         "source_software": "jaxfit",
         "units": json_text(units),
         "frames": frames,
         "confidence": CONFIDENCE,
-        "size": "size of the bird relative to the model in the result; positions in m or unit are divided by the size",
+        "size": "size of the bird relative to the model in the result; positions are those at the size of the model",
+        "focal_length_px": f"{exported.focal_px:.6g}, assumed; depths are proportional to it",
         "model": exported.bird.name,
         "fps": str(exported.fps or "unknown"),
     }
