@@ -81,20 +81,7 @@ def collect_windows(
         skipped: track → text about its skipped frames, for `Solution.failures`.
     """
     birds, frames = observations.num_tracks, observations.num_frames
-    bones, keypoints = bird.num_joints - 1, bird.num_keypoints
-    shapes = {
-        "global_orient": (3,),
-        "body_pose": (bones, 3),
-        "transl": (3,),
-        "scale": (),
-        "bone_length": (bones,),
-        "betas": (bird.num_shapes,),
-        "keypoints_cam": (keypoints, 3),
-        "keypoints_px": (keypoints, 2),
-        "crop": (3,),
-        "ambiguity_deg": (),
-    }
-    arrays = {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
+    arrays = _empty_frame_values(birds, frames, bird)
     valid = np.zeros((birds, frames), bool)
     image_size_px = np.zeros((birds, frames, 2), np.int64)
     fitted, diverged = np.zeros(birds, int), np.zeros(birds, int)
@@ -143,6 +130,24 @@ def collect_windows(
         for text in texts:
             _logger.warning("track %d, %s", track, text)
     return solution
+
+
+def _empty_frame_values(birds: int, frames: int, bird: Bird) -> dict[str, Any]:
+    """Return the arrays that `_frame_values` fills, for all birds and frames; NaN."""
+    bones, keypoints = bird.num_joints - 1, bird.num_keypoints
+    shapes = {
+        "global_orient": (3,),
+        "body_pose": (bones, 3),
+        "transl": (3,),
+        "scale": (),
+        "bone_length": (bones,),
+        "betas": (bird.num_shapes,),
+        "keypoints_cam": (keypoints, 3),
+        "keypoints_px": (keypoints, 2),
+        "crop": (3,),
+        "ambiguity_deg": (),
+    }
+    return {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
 
 
 def _frame_values(
