@@ -110,10 +110,7 @@ def reconstruct(
     with clock("load"):
         config = config or load_reconstruct_config()
         info = probe_video(video)
-        check_outputs([folder / OVERLAY], video, overwrite=True)  # before the long work
-        if is_inside(video, folder):
-            raise InputError(folder, "holds the video, which the result would replace", "choose another --out")
-        check_replaceable(folder, overwrite, MARKER)
+        _check_folder(folder, video, overwrite)  # before the long work
         bird = bird or load_murre()
         keypoints = keypoints or open_keypoint_detector(config.track)
         if not replaced["segmenter"]:
@@ -143,10 +140,7 @@ def reconstruct(
 
                 more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
                 tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
-        if tracking.failure is not None:
-            if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
-                stored.keep(0)  # without a bird, only other settings of tracking help
-            raise _no_track(tracking, tracking.failure)
+        _check_tracking(tracking, stored)
         observations = tracking.observations
         with clock("fit"):
             more = {"stored": windows, "cluster": cluster}
@@ -162,10 +156,22 @@ def reconstruct(
     return Reconstruction(tracking, solution, summary)
 
 
-def _no_track(tracking: TrackingResult, failure: InputError) -> NoTrackError:
-    error = NoTrackError(failure.source, failure.problem, failure.remedy)
-    error.tracking = tracking
-    return error
+def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
+    """Raise InputError if the result cannot be written to the folder."""
+    check_outputs([folder / OVERLAY], video, overwrite=True)
+    if is_inside(video, folder):
+        raise InputError(folder, "holds the video, which the result would replace", "choose another --out")
+    check_replaceable(folder, overwrite, MARKER)
+
+
+def _check_tracking(tracking: TrackingResult, stored: Parts | None) -> None:
+    """Raise the failure of tracking, and discard stored frames that cannot help another call."""
+    if tracking.failure is not None:
+        if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
+            stored.keep(0)  # without a bird, only other settings of tracking help
+        failure = NoTrackError(tracking.failure.source, tracking.failure.problem, tracking.failure.remedy)
+        failure.tracking = tracking
+        raise failure
 
 
 @contextmanager
