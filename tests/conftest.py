@@ -1,14 +1,26 @@
-"""Shared fixtures (reference data, a private cache, input files of the command line), and the rule about skips."""
+"""Shared fixtures (reference data, compiled programs, input files of the command line), and the rule about skips."""
 
 import os
 import re
+import tempfile
 from pathlib import Path
 
-import jax
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # the first process of a run; its workers and commands inherit these
+    _cache = tempfile.TemporaryDirectory(prefix="jaxfit-tests-")
+    os.environ |= {
+        "XDG_CACHE_HOME": _cache.name,  # never the user's cache
+        "JAX_COMPILATION_CACHE_DIR": f"{_cache.name}/jaxfit",
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+
+import jax  # JAX reads these variables when it is imported
 import pytest
 from support.cli_files import write_inputs
 
 DEFAULT_REFERENCE = Path(__file__).resolve().parents[1] / ".." / "shared"
+
+MOST_MAPS = 8000
+"""Linux allows 65530 memory maps per process by default. With 20,000 maps, a process of the tests takes 4 GB."""
 
 ACCEPTED_SKIPS = (
     r"no \w+ kernels here",  # the processor lacks this instruction set
@@ -46,20 +58,20 @@ def reference_dir() -> Path:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _programs_of_one_module():
-    """Free the compiled programs after each module, because the number of memory maps of a process is limited."""
+def _few_memory_maps():
+    """Free the compiled programs after a module if the process has many memory maps, whose number is limited."""
     yield
-    jax.clear_caches()
+    maps = Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") > MOST_MAPS:
+        jax.clear_caches()
 
 
-@pytest.fixture
-def own_cache(tmp_path, monkeypatch):
-    """Give the test a private cache of compiled programs instead of the user's cache."""
-    before = jax.config.jax_compilation_cache_dir, jax.config.jax_persistent_cache_min_compile_time_secs
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+@pytest.fixture(autouse=True)
+def _settings_of_the_cache():
+    """Undo what a command changes: all tests of a run share one cache, which also stores small programs."""
     yield
-    jax.config.update("jax_compilation_cache_dir", before[0])
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", before[1])
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 
 @pytest.fixture

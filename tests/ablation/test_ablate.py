@@ -18,8 +18,6 @@ from support.cli_files import rejected
 from jaxfit.cli.main import main
 from jaxfit.errors import InputError
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 GRID = """
 config: {folder}/quick.yaml
 crosses:

@@ -8,7 +8,7 @@ def lines_of(findings):
     return {finding.part: finding for finding in findings}
 
 
-def test_every_part_stands_on_the_page(capsys, own_cache):
+def test_every_part_stands_on_the_page(capsys):
     assert main(["doctor"]) == 0
     said = capsys.readouterr().out
     for part in ("processor", "kernels", "FFmpeg", "codecs that are written", "built-in segmenter", "h5py", "cache"):

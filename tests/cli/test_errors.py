@@ -12,8 +12,6 @@ from jaxfit.cli.main import main
 from jaxfit.config.fit import shipped_fit_configs
 from jaxfit.config.reconstruct import load_reconstruct_config
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 def first_annotation(**changes):
     def change(content):

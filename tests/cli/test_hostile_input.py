@@ -11,8 +11,6 @@ from support.hostile import Isolated
 from jaxfit.config.fit import load_config
 from jaxfit.config.yaml_file import config_to_yaml
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 QUICK = "base: paper\nwindow: 6\nterms: {keypoints: 1}\nstages: [{name: only, steps: 1, terms: [keypoints]}]\n"
 
 

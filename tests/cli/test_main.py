@@ -21,8 +21,6 @@ from jaxfit.cli.main import main
 from jaxfit.data.solution import load_solution
 from jaxfit.model.files import load_bird
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 
 @pytest.fixture(scope="module")
 def fitted(inputs, tmp_path_factory):
@@ -310,7 +308,8 @@ def test_unusable_results_of_evaluate(fitted, inputs, tmp_path, capsys):
     assert "4 → 104" in capsys.readouterr().out
 
 
-def test_compiled_programs_are_stored_for_later_runs(tmp_path):
+def test_compiled_programs_are_stored_for_later_runs(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     cli.use_cache()
     assert jax.config.jax_compilation_cache_dir == str(tmp_path / "cache" / "jaxfit")
 

@@ -14,7 +14,6 @@ from jaxfit.cli.main import OneLine, main
 from jaxfit.cli.tables import right_aligned, show, show_facts
 from jaxfit.limits import MESSAGE_CHARACTERS
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 NASTY = "[bold]x[/]\x1b[31m\n\udcc5:bird:"
 
 

@@ -21,7 +21,6 @@ from jaxfit.fitting.windows import window_hash
 from jaxfit.model.files import save_bird
 from jaxfit.storage import files
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 FRAME_NUMBERS = list(range(FRAMES))
 
 

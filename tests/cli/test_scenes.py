@@ -16,7 +16,6 @@ from jaxfit.perception import track
 from jaxfit.perception.instances import instance_of
 from jaxfit.video.reader import probe_video
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 SMALL = ["--birds", "2", "--frames", "5", "--size", "480x280"]
 
 

@@ -19,7 +19,6 @@ from jaxfit.model.files import save_bird
 from jaxfit.perception import track
 from jaxfit.video.reader import probe_video
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 FOOTAGE = Footage()
 EVERYONE = [(t, n) for t in range(FRAMES) for n in range(BIRDS)]
 

@@ -227,7 +227,6 @@ def test_files_that_are_missing_or_broken(data_set, tmp_path):
         read_common_murre(folder)
 
 
-@pytest.mark.usefixtures("own_cache")
 def test_the_command(data_set, tmp_path, capsys):
     folder, out = data_set(array()), tmp_path / "murres.json"
     command = ["dataset", "murre", str(folder), "--out", str(out)]

@@ -17,8 +17,6 @@ from jaxfit.fitting.diagnose import name_failures
 from jaxfit.model.camera import CROP_PX
 from jaxfit.objective import registry
 
-pytestmark = pytest.mark.usefixtures("own_cache")
-
 MODULE = """
 import jax
 import jax.numpy as jnp

@@ -15,7 +15,6 @@ from jaxfit.fitting.learn import LEAST_SD_RAD, LEAST_WIDTH, effective_count, lea
 from jaxfit.model.checks import check_bird
 from jaxfit.model.files import load_bird
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 BIRD, T = toy_bird(), 12
 
 

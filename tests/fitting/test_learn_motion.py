@@ -28,7 +28,6 @@ from jaxfit.fitting.learn_motion import (
 from jaxfit.model.anatomy import JOINT_NAMES, joint_group
 from jaxfit.objective.likelihood import motion_likelihood
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 BIRD = toy_bird()
 J = len(BIRD.joint_names)
 

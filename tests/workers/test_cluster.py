@@ -184,7 +184,6 @@ def test_no_scheduler_answers(monkeypatch, tmp_path):
     refused(tmp_path / "list.json", "list.json: is not a scheduler")
 
 
-@pytest.mark.usefixtures("own_cache")
 def test_the_command(inputs, scheduler, tmp_path, monkeypatch, capsys):
     """A scheduler that is not there is refused, and the files of a result on workers are those of one process."""
     monkeypatch.setattr("jaxfit.fitting.scheduling.fit_task", quick_fit)

@@ -146,7 +146,6 @@ def test_networks_that_run_in_this_process(video, workers, monkeypatch, caplog, 
     assert reason in caplog.text
 
 
-@pytest.mark.usefixtures("own_cache")
 def test_the_commands(video, scheduler, tmp_path, monkeypatch):
     """The files of tracking and of a reconstruction on workers are those of one process."""
     FOOTAGE.write(tmp_path / "frames")
