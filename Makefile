@@ -4,6 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+# `make test` compiles thousands of small programs, which takes longer than running them. `make extended` and the last
+# step of .ci/run compile as for users.
+QUICK_COMPILATION := --xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false
 export JAXFIT_REFERENCE
 
 .PHONY: install test extended lint bench demo notebooks clean
@@ -34,7 +37,7 @@ $(VENV)/installed: pyproject.toml $(wildcard kernels/*)
 	@touch $@
 
 test: install
-	$(PYTEST)
+	XLA_FLAGS="$$XLA_FLAGS $(QUICK_COMPILATION)" $(PYTEST)
 
 extended: install
 	$(PYTEST) -m extended
