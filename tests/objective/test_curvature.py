@@ -82,39 +82,46 @@ DIRECTIONS = 6
 @jax.jit
 def squares_by_autodiff(x, pose, targets):
     """For each term: Σ 2λwρ′·(J·x)² for changes x (DIRECTIONS, n) over `basis`; J·x from forward differentiation."""
-    results, zero = {}, jnp.zeros((T, D))
-    for name in RESIDUALS:
 
-        def residuals(rows, name=name):
-            return as_list(find_term(name).function(window_of(moved(pose, rows), targets), **find_term(name).settings))
+    def residuals(rows):
+        window = window_of(moved(pose, rows), targets)
+        return {name: as_list(find_term(name).function(window, **find_term(name).settings)) for name in RESIDUALS}
 
-        weights = []
-        for each in residuals(zero):
-            weight = 6.0 * each.weight * each.kernel.slope(jnp.sum(each.values**2, axis=-1))
-            weights.append(jnp.asarray(weight)[..., None])
+    def values(rows):
+        return {name: [each.values for each in own] for name, own in residuals(rows).items()}
 
-        def square(x, residuals=residuals, weights=weights):
-            rows = jnp.einsum("i,itd->td", x, basis())
-            changes = jax.jvp(lambda rows: [each.values for each in residuals(rows)], (zero,), (rows,))[1]
-            return sum(jnp.sum(w * change**2) for w, change in zip(weights, changes, strict=True))
+    def weight(each):
+        return jnp.asarray(6.0 * each.weight * each.kernel.slope(jnp.sum(each.values**2, axis=-1)))[..., None]
 
-        results[name] = jax.lax.map(square, x)
-    return results
+    zero = jnp.zeros((T, D))
+    weights = {name: [weight(each) for each in own] for name, own in residuals(zero).items()}
+
+    def squares(x):
+        rows = jnp.einsum("i,itd->td", x, basis())
+        changes = jax.jvp(values, (zero,), (rows,))[1]
+        return {
+            name: sum(jnp.sum(w * change**2) for w, change in zip(weights[name], changes[name], strict=True))
+            for name in RESIDUALS
+        }
+
+    return jax.lax.map(squares, x)
 
 
 def change(seed, size):
     return jnp.asarray(size * np.random.default_rng(seed).normal(size=(T, D)), jnp.float32)
 
 
-@pytest.mark.parametrize("theta", [0.0, 1e-4, 9e-3, 1.1e-2, 1.0, 3.0])
-def test_right_jacobian(theta):
-    r = theta * np.array([0.6, -0.64, 0.48])
-    R = np.asarray(axis_angle_to_matrix(jnp.asarray(r)), np.float64)
-    dR = np.asarray(jax.jacfwd(axis_angle_to_matrix)(jnp.asarray(r)), np.float64)
-    for k in range(3):
-        spin = R.T @ dR[..., k]  # skew-symmetric
-        actual = [spin[2, 1], spin[0, 2], spin[1, 0]]
-        np.testing.assert_allclose(right_jacobian(jnp.asarray(r))[:, k], actual, atol=2e-5)
+def test_right_jacobian():
+    matrix, slope, jacobian = (
+        jax.jit(each) for each in (axis_angle_to_matrix, jax.jacfwd(axis_angle_to_matrix), right_jacobian)
+    )
+    for theta in (0.0, 1e-4, 9e-3, 1.1e-2, 1.0, 3.0):
+        r = jnp.asarray(theta * np.array([0.6, -0.64, 0.48]), jnp.float32)
+        R, dR = np.asarray(matrix(r), np.float64), np.asarray(slope(r), np.float64)
+        for k in range(3):
+            spin = R.T @ dR[..., k]  # skew-symmetric
+            expected = [spin[2, 1], spin[0, 2], spin[1, 0]]
+            np.testing.assert_allclose(np.asarray(jacobian(r))[:, k], expected, atol=2e-5, err_msg=str(theta))
 
 
 def test_keypoint_jacobian():
@@ -152,77 +159,75 @@ def test_frame_rows():
     np.testing.assert_allclose(moved(common, rows).scale, [2.5])
 
 
-@pytest.mark.parametrize("name", RESIDUALS)
-def test_curvature_is_the_weighted_square_of_the_jacobian(name):
+def test_curvature_is_the_weighted_square_of_the_jacobian():
     """x·H·x for random x; H is symmetric, so that these values determine H."""
     pose, targets = case()
-    H = np.asarray(curvatures(pose, targets)[name][0], np.float64)
-    x = np.random.default_rng(0).normal(size=(DIRECTIONS, len(H)))
-    expected = squares_by_autodiff(jnp.asarray(x, jnp.float32), pose, targets)[name]
-    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", x, H, x), expected, rtol=2e-3)
-    assert (expected > 0).all()
+    x = np.random.default_rng(0).normal(size=(DIRECTIONS, len(basis())))
+    H, expected = curvatures(pose, targets), squares_by_autodiff(jnp.asarray(x, jnp.float32), pose, targets)
+    for name in RESIDUALS:
+        actual = np.einsum("ni,ij,nj->n", x, np.asarray(H[name][0], np.float64), x)
+        np.testing.assert_allclose(actual, expected[name], rtol=2e-3, err_msg=name)
+        assert (np.asarray(expected[name]) > 0).all(), name
 
 
-@pytest.mark.parametrize("name", TERMS)
-def test_product_and_diagonal_belong_to_one_positive_semidefinite_matrix(name):
-    H, diagonal = (np.asarray(x, np.float64) for x in curvatures(*case())[name])
-    scale = np.abs(H).max()
-    np.testing.assert_allclose(H, H.T, atol=1e-5 * scale)
-    assert np.linalg.eigvalsh(H).min() > -1e-4 * scale
-    assert (diagonal[np.diagonal(H) > 1e-6 * scale] > 0).all()
-    if name in [*MASKS, *KEYPOINTS]:
-        np.testing.assert_allclose(diagonal, np.diagonal(H), atol=1e-5 * scale)
-    else:  # an estimate from random signs, with a relative standard deviation of at most √(2/16)
+def test_product_and_diagonal_belong_to_one_positive_semidefinite_matrix():
+    for name, each in curvatures(*case()).items():
+        H, diagonal = (np.asarray(x, np.float64) for x in each)
+        scale = np.abs(H).max()
+        np.testing.assert_allclose(H, H.T, atol=1e-5 * scale, err_msg=name)
+        assert np.linalg.eigvalsh(H).min() > -1e-4 * scale, name
         used = np.diagonal(H) > 1e-6 * scale
-        ratio = diagonal[used] / np.diagonal(H)[used]
-        assert 0.7 < ratio.mean() < 1.3
-        assert ratio.max() < 4
+        assert (diagonal[used] > 0).all(), name
+        if name in [*MASKS, *KEYPOINTS]:
+            np.testing.assert_allclose(diagonal, np.diagonal(H), atol=1e-5 * scale, err_msg=name)
+        else:  # an estimate from random signs, with a relative standard deviation of at most √(2/16)
+            ratio = diagonal[used] / np.diagonal(H)[used]
+            assert 0.7 < ratio.mean() < 1.3, name
+            assert ratio.max() < 4, name
 
 
 def case():
     return terms_by_hand.window_pose(), terms_by_hand.random_targets()
 
 
-@pytest.mark.parametrize("name", LINEAR)
-def test_the_quadratic_is_above_the_term(name):
+def test_the_quadratic_is_above_the_term():
     pose, targets = case()
-    still = jnp.zeros((T, D))
-    value = along(still, pose, targets)[name]
-    gradient = jax.grad(lambda rows: along(rows, pose, targets)[name])(still)
-    H, _ = curvatures(pose, targets)[name]
+    still, H, units = jnp.zeros((T, D)), curvatures(pose, targets), np.asarray(basis())
+    values, slopes = along(still, pose, targets), jax.jit(jax.jacrev(along))(still, pose, targets)
     for seed, size in enumerate((0.01, 0.1, 0.5, 2.0)):
-        x = size * np.random.default_rng(seed).normal(size=len(H))
-        rows = jnp.einsum("i,itd->td", jnp.asarray(x, jnp.float32), basis())
-        bound = value + jnp.sum(gradient * rows) + 0.5 * x @ np.asarray(H) @ x
-        after = along(rows, pose, targets)[name]
-        assert after <= bound * (1 + 1e-5)
-        if name in ("pose_prior", "bone_prior", "shape_prior", "low_pass"):
-            assert after == pytest.approx(float(bound), rel=1e-4)
+        x = size * np.random.default_rng(seed).normal(size=len(units))
+        rows = np.einsum("i,itd->td", x, units).astype(np.float32)
+        after = along(rows, pose, targets)
+        for name in LINEAR:
+            bound = float(values[name]) + np.sum(np.asarray(slopes[name]) * rows) + 0.5 * x @ np.asarray(H[name][0]) @ x
+            assert float(after[name]) <= bound * (1 + 1e-5), name
+            if name in ("pose_prior", "bone_prior", "shape_prior", "low_pass"):
+                assert float(after[name]) == pytest.approx(bound, rel=1e-4), name
 
 
 @pytest.mark.parametrize("kernel", [geman_mcclure(2.0), huber(0.7), NORM, student_t(3.0, 2)])
 def test_a_kernel_lies_below_its_tangent(kernel):
     """So the weighted squares are an upper bound. At 0, the slope of the norm is replaced by a finite number."""
-    s = jnp.asarray([0.01, 0.3, 1.0, 9.0])
-    slope = jax.vmap(jax.grad(kernel.value))(s)
-    np.testing.assert_allclose(kernel.slope(s), slope, rtol=1e-5)
-    for other in (0.0, 0.1, 2.0, 100.0):
-        assert (kernel.value(jnp.asarray(other)) <= kernel.value(s) + slope * (other - s) + 1e-6).all()
-    zero = jnp.zeros(())
-    assert kernel.value(zero) == 0
-    assert np.isfinite(jax.grad(kernel.value)(zero))
-    assert 0 < kernel.slope(zero) < 1e3
+    at = jnp.asarray([0.01, 0.3, 1.0, 9.0, 0.0, 0.1, 2.0, 100.0])
+    evaluated = jax.jit(lambda s: (kernel.value(s), jax.vmap(jax.grad(kernel.value))(s), kernel.slope(s)))(at)
+    s, value, slope, own_slope = map(np.asarray, (at, *evaluated))
+    np.testing.assert_allclose(own_slope[:4], slope[:4], rtol=1e-5)
+    for i in range(4, 8):
+        assert (value[i] <= value[:4] + slope[:4] * (s[i] - s[:4]) + 1e-6).all()
+    assert value[4] == 0
+    assert np.isfinite(slope[4])
+    assert 0 < own_slope[4] < 1e3
 
 
-@pytest.mark.parametrize("name", KEYPOINTS)
-def test_keypoint_terms_do_not_couple_frames(name):
-    H = np.array(curvatures(*case())[name][0])
+def test_keypoint_terms_do_not_couple_frames():
     framewise = int((~IS_SHARED).sum())
-    H = H[: T * framewise, : T * framewise].reshape(T, framewise, T, framewise)
-    for t in range(T):
-        assert np.any(H[t, :, t])
-        H[t, :, t] = 0
-    assert not np.any(H)
+    for name in KEYPOINTS:
+        H = np.array(curvatures(*case())[name][0])
+        H = H[: T * framewise, : T * framewise].reshape(T, framewise, T, framewise)
+        for t in range(T):
+            assert np.any(H[t, :, t])
+            H[t, :, t] = 0
+        assert not np.any(H), name
 
 
 def test_a_term_that_returns_a_number_has_no_curvature():
@@ -239,16 +244,18 @@ def test_several_residuals_add_up():
     assert residual_sum(parts) == pytest.approx(5 + 1 + 50)
 
 
-@pytest.mark.parametrize("name", [name for name in TERMS if name != "low_pass"])  # low_pass fills missing frames
-@pytest.mark.parametrize("missing", range(T))
-def test_missing_frames_have_no_curvature(name, missing):
-    targets = terms_by_hand.without_frame(terms_by_hand.random_targets(), missing)
-    H, diagonal = curvatures(terms_by_hand.window_pose(), targets)[name]
+def test_missing_frames_have_no_curvature():
     framewise = int((~IS_SHARED).sum())
-    own = slice(missing * framewise, (missing + 1) * framewise)
-    assert not np.any(H[own])
-    assert not np.any(H[:, own])
-    assert not np.any(diagonal[own])
+    for missing in range(T):
+        targets = terms_by_hand.without_frame(terms_by_hand.random_targets(), missing)
+        own = slice(missing * framewise, (missing + 1) * framewise)
+        for name, each in curvatures(terms_by_hand.window_pose(), targets).items():
+            if name == "low_pass":  # the term fills missing frames
+                continue
+            H, diagonal = map(np.asarray, each)
+            assert not np.any(H[own]), (name, missing)
+            assert not np.any(H[:, own]), (name, missing)
+            assert not np.any(diagonal[own]), (name, missing)
 
 
 def test_equal_frames_have_finite_curvature():

@@ -28,15 +28,15 @@ TERMS = [pytest.param(velocity, 1, id="velocity"), pytest.param(acceleration, 2,
 
 
 @pytest.mark.parametrize(("term", "order"), TERMS)
-@pytest.mark.parametrize("missing", [(), (0,), (3,), (2, 3), (1, 4, 6), range(7), (0, 2, 4, 6)])
-def test_by_hand(term, order, missing):
-    case = random_motion(7, missing=missing)
-    assert float(term_value(term, *case)) == pytest.approx(by_hand(order, *case), rel=1e-5, abs=1e-6)
+def test_by_hand(term, order):
+    for missing in [(), (0,), (3,), (2, 3), (1, 4, 6), range(7), (0, 2, 4, 6)]:
+        case = random_motion(7, missing=missing)
+        assert float(term_value(term, *case)) == pytest.approx(by_hand(order, *case), rel=1e-5, abs=1e-6), missing
 
 
 @pytest.mark.parametrize(("term", "order"), TERMS)
 def test_betas_weight_orientation_and_body(term, order):
-    case = random_motion(5)
+    case = random_motion(7)
     for betas in ({"beta_global": 0.0}, {"beta_pose": 0.0}, {"beta_global": 3.0, "beta_pose": 7.0}):
         assert float(term_value(term, *case, **betas)) == pytest.approx(by_hand(order, *case, **betas), rel=1e-5)
     assert float(term_value(term, *case, beta_global=0.0, beta_pose=0.0)) == 0
@@ -50,10 +50,10 @@ def test_short_windows_have_no_velocity_or_acceleration():
 
 
 def test_steady_motion_has_no_acceleration():
-    steady = np.arange(6.0)[:, None] * [0.25, -0.5, 0.125]
-    body = np.broadcast_to(steady[:, None], (6, 4, 3))
-    assert float(term_value(acceleration, steady, body, np.ones(6, bool))) == 0
-    assert float(term_value(velocity, steady, body, np.ones(6, bool))) > 1
+    steady = np.arange(7.0)[:, None] * [0.25, -0.5, 0.125]
+    body = np.broadcast_to(steady[:, None], (7, 4, 3))
+    assert float(term_value(acceleration, steady, body, np.ones(7, bool))) == 0
+    assert float(term_value(velocity, steady, body, np.ones(7, bool))) > 1
 
 
 @pytest.mark.parametrize(("term", "order"), TERMS)
@@ -64,7 +64,7 @@ def test_gradients_at_equal_and_missing_frames(term, order):
     def total(orient, body):
         return term_value(term, orient, body, present)
 
-    for gradient in jax.grad(total, (0, 1))(jnp.asarray(orient), jnp.asarray(body)):
+    for gradient in map(np.asarray, jax.jit(jax.grad(total, (0, 1)))(jnp.asarray(orient), jnp.asarray(body))):
         assert np.isfinite(gradient).all()
         np.testing.assert_array_equal(gradient[3], 0)  # the missing frame
         np.testing.assert_array_equal(gradient[5], 0)  # equal to both neighbours

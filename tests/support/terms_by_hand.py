@@ -95,17 +95,22 @@ def random_motion(frames, seed=0, missing=(), spread=1.0, bones=4):
     return spread * rng.normal(size=(frames, 3)), spread * rng.normal(size=(frames, bones, 3)), present
 
 
-def term_value(term, orient, body, present, frame_s=FRAME_S, **settings):
-    """A temporal term of a motion, in a window that has only rotations."""
-    orient, body = jnp.asarray(orient, jnp.float32), jnp.asarray(body, jnp.float32)
+@functools.partial(jax.jit, static_argnums=0)
+def _term_value(term, orient, body, present, frame_s, settings):
     window = SimpleNamespace(
         pose=SimpleNamespace(global_orient=orient, body_pose=body),
         R_camera_root=axis_angle_to_matrix(orient),
         R_parent_child=axis_angle_to_matrix(body),
-        present=jnp.asarray(present),
-        frame_s=jnp.float32(frame_s),
+        present=present,
+        frame_s=frame_s,
     )
     return residual_sum(term(window, **settings))
+
+
+def term_value(term, orient, body, present, frame_s=FRAME_S, **settings):
+    """A temporal term of a motion, in a window that has only rotations."""
+    orient, body = jnp.asarray(orient, jnp.float32), jnp.asarray(body, jnp.float32)
+    return _term_value(term, orient, body, jnp.asarray(present), jnp.float32(frame_s), settings)
 
 
 def all_settings():
