@@ -1,6 +1,7 @@
 """Boxes and keypoints far outside the image: bounded crops, and frames that are skipped and reported."""
 
 import dataclasses
+import itertools
 import logging
 
 import cv2
@@ -110,27 +111,25 @@ def test_missing_keypoints_and_own_images_are_no_distant_birds():
     assert without_distant_birds(plain) is plain
 
 
-@pytest.mark.parametrize("filter_window", [1, 3])
-@pytest.mark.parametrize("mode", ["box", "image"])
-@pytest.mark.parametrize("boxes", [True, False])
-@pytest.mark.parametrize("wrong", ["keypoint", "box"])
-def test_one_distant_frame_is_skipped(wrong, boxes, mode, filter_window):
+def test_one_distant_frame_is_skipped():
     """The windows equal those of observations that lack the bird in this frame."""
-    plain = observed(boxes=boxes)
-    if mode == "image":
-        plain = dataclasses.replace(plain, image_size_px=np.full((T, 2), WIDTH), masks={})
-    far = damaged(plain, (0, 1), **{wrong: FAR if wrong == "keypoint" else [3, 4, FAR, 5]})
-    present, confidence = plain.present.copy(), plain.confidence.copy()
-    present[0, 1], confidence[0, 1] = False, 0
-    lacking = dataclasses.replace(plain, present=present, confidence=confidence)
-    settings = config(T, mode=mode, min_keypoints=3)
-    settings = dataclasses.replace(settings, filter_window=filter_window)
-    windows, expected = cut_windows(far, settings), cut_windows(lacking, settings)
-    assert windows.present.sum() == 2 * T - 1
-    for name in vars(windows):
-        if name != "masks":
-            np.testing.assert_array_equal(getattr(windows, name), getattr(expected, name), err_msg=name)
-    np.testing.assert_array_equal(load_targets(windows, 16).mask, load_targets(expected, 16).mask)
+    cases = itertools.product(("keypoint", "box"), (True, False), ("box", "image"), (1, 3))
+    for wrong, boxes, mode, filter_window in cases:
+        plain = observed(boxes=boxes)
+        if mode == "image":
+            plain = dataclasses.replace(plain, image_size_px=np.full((T, 2), WIDTH), masks={})
+        far = damaged(plain, (0, 1), **{wrong: FAR if wrong == "keypoint" else [3, 4, FAR, 5]})
+        present, confidence = plain.present.copy(), plain.confidence.copy()
+        present[0, 1], confidence[0, 1] = False, 0
+        lacking = dataclasses.replace(plain, present=present, confidence=confidence)
+        settings = config(T, mode=mode, min_keypoints=3)
+        settings = dataclasses.replace(settings, filter_window=filter_window)
+        windows, expected = cut_windows(far, settings), cut_windows(lacking, settings)
+        assert windows.present.sum() == 2 * T - 1
+        for name in vars(windows):
+            if name != "masks":
+                np.testing.assert_array_equal(getattr(windows, name), getattr(expected, name), err_msg=name)
+        np.testing.assert_array_equal(load_targets(windows, 16).mask, load_targets(expected, 16).mask)
 
 
 def test_crops_are_not_larger_than_the_image_with_a_margin():

@@ -120,28 +120,26 @@ def test_a_frame_without_a_mask_keeps_its_keypoints():
     assert targets.confidence[0, 1].all()
 
 
-@pytest.mark.parametrize(
-    "crop", [(10, 20, 96), (-13, 5, 64), (350, 250, 100), (0, 0, 32), (37, 41, 75), (500, 400, 80)]
-)
-def test_masks_shrink_by_area(crop):
+def test_masks_shrink_by_area():
     """A pixel of the crop is 1 if the mask covers at least half of the pixel: compared with exact covered areas."""
-    rng = np.random.default_rng(0)
-    mask = np.kron(rng.random((30, 40)) < 0.5, np.ones((10, 10))).astype(bool)  # 300 × 400, blocks of ten
-    x0, y0, size = crop
-    full = np.zeros((size, size))
-    for i in range(size):
-        for j in range(size):
-            y, x = y0 + i, x0 + j
-            full[i, j] = 0 <= y < HEIGHT and 0 <= x < WIDTH and mask[y, x]
-    edges = np.linspace(0, size, 33)
-    pixel = np.arange(size)
-    share = np.clip(np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel), 0, None)
-    covered = share @ full @ share.T / (size / 32) ** 2
-    clear = np.abs(covered - 0.5) > 0.01
-    assert clear.mean() > 0.7
-    cut = cut_mask(mask, np.array(crop, float), 32)
-    assert set(np.unique(cut)) <= {0, 1}
-    np.testing.assert_array_equal(cut[clear], covered[clear] > 0.5)
+    for crop in [(10, 20, 96), (-13, 5, 64), (350, 250, 100), (0, 0, 32), (37, 41, 75), (500, 400, 80)]:
+        rng = np.random.default_rng(0)
+        mask = np.kron(rng.random((30, 40)) < 0.5, np.ones((10, 10))).astype(bool)  # 300 × 400, blocks of ten
+        x0, y0, size = crop
+        full = np.zeros((size, size))
+        for i in range(size):
+            for j in range(size):
+                y, x = y0 + i, x0 + j
+                full[i, j] = 0 <= y < HEIGHT and 0 <= x < WIDTH and mask[y, x]
+        edges = np.linspace(0, size, 33)
+        pixel = np.arange(size)
+        share = np.clip(np.minimum(edges[1:, None], pixel + 1) - np.maximum(edges[:-1, None], pixel), 0, None)
+        covered = share @ full @ share.T / (size / 32) ** 2
+        clear = np.abs(covered - 0.5) > 0.01
+        assert clear.mean() > 0.7
+        cut = cut_mask(mask, np.array(crop, float), 32)
+        assert set(np.unique(cut)) <= {0, 1}
+        np.testing.assert_array_equal(cut[clear], covered[clear] > 0.5)
 
 
 @pytest.mark.parametrize("size", [40, 64, 100])
@@ -185,20 +183,19 @@ def test_the_filter_runs_over_frame_numbers(numbers):
     assert filter_observations(observations, 1) is observations
 
 
-@pytest.mark.parametrize(
-    ("numbers", "times", "frame_s"),
-    [
+def test_windows_hold_the_time_between_frames():
+    for numbers, times, frame_s in [
         (range(6), {"fps": 50.0}, 0.02),
         (range(0, 12, 2), {"fps": 50.0}, 0.04),
         (range(6), {"timestamp_s": np.arange(6) / 10}, 0.1),
         (range(6), {}, 0.04),
         (range(0, 18, 3), {}, 0.12),  # an unknown rate counts as 25 frames/s, of which the file has every third
-    ],
-)
-def test_windows_hold_the_time_between_frames(numbers, times, frame_s):
-    windows = cut_windows(dataclasses.replace(walk(numbers), **times), config(window=4))
-    assert len(windows) == 4
-    targets = load_targets(windows, 0)
-    assert targets.frame_s.dtype == np.float32
-    np.testing.assert_allclose(targets.frame_s, [frame_s] * 4, rtol=1e-6)
-    assert window_content(windows, 0) != window_content(dataclasses.replace(windows, frame_s=2 * windows.frame_s), 0)
+    ]:
+        windows = cut_windows(dataclasses.replace(walk(numbers), **times), config(window=4))
+        assert len(windows) == 4
+        targets = load_targets(windows, 0)
+        assert targets.frame_s.dtype == np.float32
+        np.testing.assert_allclose(targets.frame_s, [frame_s] * 4, rtol=1e-6)
+        assert window_content(windows, 0) != window_content(
+            dataclasses.replace(windows, frame_s=2 * windows.frame_s), 0
+        )

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -28,14 +27,14 @@ def test_projection_by_hand():
     np.testing.assert_array_equal(screen[:, 2], points[:, 2])
 
 
-@pytest.mark.parametrize("depth", [0.0, -0.0, 1e-12, -1e-3, -5.0, -1e6])
-def test_projection_at_and_behind_the_camera_is_finite(depth):
-    point = jnp.array([0.5, -2.0, depth])
-    value, pullback = jax.vjp(lambda p: project(p, Camera()), point)
-    assert np.isfinite(value).all()
-    assert np.isfinite(pullback(jnp.ones(2))[0]).all()
-    # a point on the right stays on the right: the projection does not mirror points behind the camera
-    assert value[0] > 128 > value[1]
+def test_projection_at_and_behind_the_camera_is_finite():
+    for depth in [0.0, -0.0, 1e-12, -1e-3, -5.0, -1e6]:
+        point = jnp.array([0.5, -2.0, depth])
+        value, pullback = jax.vjp(lambda p: project(p, Camera()), point)
+        assert np.isfinite(value).all()
+        assert np.isfinite(pullback(jnp.ones(2))[0]).all()
+        # a point on the right stays on the right: the projection does not mirror points behind the camera
+        assert value[0] > 128 > value[1]
 
 
 number = st.floats(-2000, 2000, width=32)

@@ -209,9 +209,9 @@ def test_objects_are_never_loaded(tmp_path):
 REQUIRED = [field for field in ARRAY_FIELDS if field not in OPTIONAL_FIELDS]
 
 
-@pytest.mark.parametrize("field", ["format_version", *REQUIRED, *STATIC])
-def test_every_field_must_be_there(tmp_path, field):
-    assert field in load_error(saved(tmp_path, **{field: None}))
+def test_every_field_must_be_there(tmp_path):
+    for field in ["format_version", *REQUIRED, *STATIC]:
+        assert field in load_error(saved(tmp_path, **{field: None}))
 
 
 def test_colours_and_limits_may_be_missing(tmp_path):
@@ -220,10 +220,10 @@ def test_colours_and_limits_may_be_missing(tmp_path):
     np.testing.assert_allclose(bird.joint_limits, np.broadcast_to([-np.pi, np.pi], (3, 3, 2)))
 
 
-@pytest.mark.parametrize("field", ["format_version", *ARRAY_FIELDS, *STATIC])
-def test_every_field_must_have_its_dimensions_and_type(tmp_path, field):
-    assert field in load_error(saved(tmp_path, **{field: np.zeros((1, 2, 3, 4))}))
-    assert field in load_error(saved(tmp_path, **{field: np.array([b"abc"])}))
+def test_every_field_must_have_its_dimensions_and_type(tmp_path):
+    for field in ["format_version", *ARRAY_FIELDS, *STATIC]:
+        assert field in load_error(saved(tmp_path, **{field: np.zeros((1, 2, 3, 4))}))
+        assert field in load_error(saved(tmp_path, **{field: np.array([b"abc"])}))
 
 
 def test_a_bird_loads_by_name_or_by_path(tmp_path):

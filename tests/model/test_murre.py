@@ -165,46 +165,46 @@ def test_keypoints_lie_at_their_places():
     assert skeleton_pairs(["crown", "left_eye", "beak", "nape", "back"]) == ((0, 3), (3, 4), (1, 0))
 
 
-@pytest.mark.parametrize("name", POSTURES)
-def test_postures_lie_within_the_limits_and_near_the_prior(name):
-    body_pose = POSTURES[name].body_pose
-    low, high = np.moveaxis(np.asarray(BIRD.joint_limits), -1, 0)
-    assert np.all((low + 0.2 < body_pose) & (body_pose < high - 0.2))
-    offset = body_pose.ravel() - np.asarray(BIRD.pose_mean, np.float64)
-    mahalanobis = np.sqrt(offset @ np.linalg.solve(np.asarray(BIRD.pose_covariance, np.float64), offset))
-    assert mahalanobis < 7.5  # a pose drawn from the prior lies near √72 = 8.5
+def test_postures_lie_within_the_limits_and_near_the_prior():
+    for name in POSTURES:
+        body_pose = POSTURES[name].body_pose
+        low, high = np.moveaxis(np.asarray(BIRD.joint_limits), -1, 0)
+        assert np.all((low + 0.2 < body_pose) & (body_pose < high - 0.2))
+        offset = body_pose.ravel() - np.asarray(BIRD.pose_mean, np.float64)
+        mahalanobis = np.sqrt(offset @ np.linalg.solve(np.asarray(BIRD.pose_covariance, np.float64), offset))
+        assert mahalanobis < 7.5  # a pose drawn from the prior lies near √72 = 8.5
 
 
-@pytest.mark.parametrize("name", [n for n in POSTURES if not n.startswith("wings_") or n == "wings_half"])
-def test_on_the_ground_the_feet_lie_flat_and_are_the_lowest_part(name):
-    vertices, _ = posed_cm(*POSTURES[name])
-    ground = vertices[:, 2].min()
-    for side in ("left", "right"):
-        soles = vertices[vertices_of(f"{side}_foot"), 2]
-        assert soles.min() - ground < 0.12
-        assert np.ptp(soles) < 0.7  # thickness of the toes
-        assert vertices[vertices_of(f"{side}_ankle"), 2].min() - ground < 0.15  # murres rest on their tarsi
-    assert (
-        vertices[~vertices_of("left_foot", "right_foot", "left_ankle", "right_ankle", least=0.4), 2].min()
-        > ground + 0.05
-    )
+def test_on_the_ground_the_feet_lie_flat_and_are_the_lowest_part():
+    for name in [n for n in POSTURES if not n.startswith("wings_") or n == "wings_half"]:
+        vertices, _ = posed_cm(*POSTURES[name])
+        ground = vertices[:, 2].min()
+        for side in ("left", "right"):
+            soles = vertices[vertices_of(f"{side}_foot"), 2]
+            assert soles.min() - ground < 0.12
+            assert np.ptp(soles) < 0.7  # thickness of the toes
+            assert vertices[vertices_of(f"{side}_ankle"), 2].min() - ground < 0.15  # murres rest on their tarsi
+        assert (
+            vertices[~vertices_of("left_foot", "right_foot", "left_ankle", "right_ankle", least=0.4), 2].min()
+            > ground + 0.05
+        )
 
 
-@pytest.mark.parametrize("name", POSTURES)
-def test_no_posture_overstretches_the_mesh(name):
-    vertices, _ = posed_cm(*POSTURES[name])
-    length = np.linalg.norm(vertices[EDGES[:, 0]] - vertices[EDGES[:, 1]], axis=1)
-    rest = np.linalg.norm(VERTICES[EDGES[:, 0]] - VERTICES[EDGES[:, 1]], axis=1) * CM_PER_UNIT
-    assert length.max() < 6.5  # the longest edge at rest is about 4 cm
-    # The folded wing is a narrow fan, so its innermost edges lengthen many times; other edges stretch as skin does.
-    body = ~vertices_of("left_shoulder", "left_elbow", "left_wrist", least=0.01)
-    body &= ~vertices_of("right_shoulder", "right_elbow", "right_wrist", least=0.01)
-    assert (length / rest)[body[EDGES].all(axis=1)].max() < 3.5
-    volume = trimesh.Trimesh(vertices, FACES, process=False).volume
-    assert 1400 < volume < 2000
-    if name.startswith("wings_"):
-        # no wing is turned inside out: nearly the whole upper side points up in the frame of the wing
-        assert inverted_share(vertices) < 0.02
+def test_no_posture_overstretches_the_mesh():
+    for name in POSTURES:
+        vertices, _ = posed_cm(*POSTURES[name])
+        length = np.linalg.norm(vertices[EDGES[:, 0]] - vertices[EDGES[:, 1]], axis=1)
+        rest = np.linalg.norm(VERTICES[EDGES[:, 0]] - VERTICES[EDGES[:, 1]], axis=1) * CM_PER_UNIT
+        assert length.max() < 6.5  # the longest edge at rest is about 4 cm
+        # The folded wing is a narrow fan, so its innermost edges lengthen many times; other edges stretch as skin does.
+        body = ~vertices_of("left_shoulder", "left_elbow", "left_wrist", least=0.01)
+        body &= ~vertices_of("right_shoulder", "right_elbow", "right_wrist", least=0.01)
+        assert (length / rest)[body[EDGES].all(axis=1)].max() < 3.5
+        volume = trimesh.Trimesh(vertices, FACES, process=False).volume
+        assert 1400 < volume < 2000
+        if name.startswith("wings_"):
+            # no wing is turned inside out: nearly the whole upper side points up in the frame of the wing
+            assert inverted_share(vertices) < 0.02
 
 
 def inverted_share(vertices) -> float:

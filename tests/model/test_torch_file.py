@@ -134,15 +134,14 @@ HOSTILE_BODIES = {
 }
 
 
-@pytest.mark.parametrize("name", HOSTILE_BODIES)
-def test_hostile_opcodes_are_rejected(tmp_path, name):
-    body, expected = HOSTILE_BODIES[name]
-    assert expected in read_error(tmp_path, legacy(body, FLOATS))
+def test_hostile_opcodes_are_rejected(tmp_path):
+    for name in HOSTILE_BODIES:
+        body, expected = HOSTILE_BODIES[name]
+        assert expected in read_error(tmp_path, legacy(body, FLOATS))
 
 
-@pytest.mark.parametrize(
-    ("shape", "strides", "offset"),
-    [
+def test_a_tensor_stays_inside_its_storage(tmp_path):
+    for shape, strides, offset in [
         ((13,), (1,), 0),
         ((12,), (1,), 1),
         ((3, 4), (5, 1), 0),
@@ -155,11 +154,9 @@ def test_hostile_opcodes_are_rejected(tmp_path, name):
         ((2**62, 4), (0, 0), 0),
         ((3,), (1, 1), 0),
         ((1,) * 9, (1,) * 9, 0),
-    ],
-)
-def test_a_tensor_stays_inside_its_storage(tmp_path, shape, strides, offset):
-    body = mapping({"V": tensor(STORED, shape, strides, offset)})
-    assert "checkpoint" in read_error(tmp_path, legacy(body, FLOATS))
+    ]:
+        body = mapping({"V": tensor(STORED, shape, strides, offset)})
+        assert "checkpoint" in read_error(tmp_path, legacy(body, FLOATS))
 
 
 def test_the_last_element_may_be_used(tmp_path):

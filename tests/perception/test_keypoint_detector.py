@@ -114,22 +114,22 @@ def test_simcc(tmp_path):
     np.testing.assert_array_equal(_detect(unnamed, kind="simcc")[0], points)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("layout", ["heatmaps", "locref", "simcc"])
-def test_values_that_are_not_finite_get_no_confidence(tmp_path, value, layout):
-    outputs = {
-        "heatmaps": {"heatmaps": _spots(CELLS)},
-        "locref": _located(),
-        "simcc": {"simcc_x": np.ones((3, 64)), "simcc_y": np.ones((3, 128))},
-    }[layout]
-    for output in outputs.values():
-        output[1].flat[-1] = value
-    if layout == "locref":
-        outputs["locref"][2, 7, 3] = value  # the offset of the second keypoint
-    points, confidence = _detect(write_constant(tmp_path / "k.onnx", (1, 3, 64, 32), outputs, PLAIN))
-    assert np.isfinite(points).all()
-    assert confidence[0, 1] == 0
-    assert (confidence[0, [0, 2]] > 0.2).all()
+def test_values_that_are_not_finite_get_no_confidence(tmp_path):
+    for layout in ["heatmaps", "locref", "simcc"]:
+        for value in [np.nan, np.inf, -np.inf]:
+            outputs = {
+                "heatmaps": {"heatmaps": _spots(CELLS)},
+                "locref": _located(),
+                "simcc": {"simcc_x": np.ones((3, 64)), "simcc_y": np.ones((3, 128))},
+            }[layout]
+            for output in outputs.values():
+                output[1].flat[-1] = value
+            if layout == "locref":
+                outputs["locref"][2, 7, 3] = value  # the offset of the second keypoint
+            points, confidence = _detect(write_constant(tmp_path / "k.onnx", (1, 3, 64, 32), outputs, PLAIN))
+            assert np.isfinite(points).all()
+            assert confidence[0, 1] == 0
+            assert (confidence[0, [0, 2]] > 0.2).all()
 
 
 def _write_pooling(path, batch, metadata, size=(192, 144), channels_last=False, kind=TensorProto.FLOAT):
@@ -166,15 +166,15 @@ def _scene():
     return np.round(frame).astype(np.uint8), birds, points
 
 
-@pytest.mark.parametrize("batch", ["n", 1, 2])
-@pytest.mark.parametrize("colour", ["rgb", "bgr"])
-def test_points_are_in_image_pixels(tmp_path, batch, colour):
-    frame, birds, points = _scene()
-    path = _write_pooling(tmp_path / "k.onnx", batch, PLAIN | {"colour": colour})
-    found, confidence = load_keypoint_detector(path, batch=2)(frame, birds)
-    expected = points if colour == "rgb" else points[:, ::-1]
-    np.testing.assert_allclose(found, expected, atol=0.15)
-    assert ((confidence > 0.65) & (confidence < 0.87)).all()
+def test_points_are_in_image_pixels(tmp_path):
+    for colour in ["rgb", "bgr"]:
+        for batch in ["n", 1, 2]:
+            frame, birds, points = _scene()
+            path = _write_pooling(tmp_path / "k.onnx", batch, PLAIN | {"colour": colour})
+            found, confidence = load_keypoint_detector(path, batch=2)(frame, birds)
+            expected = points if colour == "rgb" else points[:, ::-1]
+            np.testing.assert_allclose(found, expected, atol=0.15)
+            assert ((confidence > 0.65) & (confidence < 0.87)).all()
 
 
 def test_other_kinds_of_input(tmp_path):

@@ -37,9 +37,8 @@ def assert_same(found: list[Instance], expected: list[Instance]):
         np.testing.assert_array_equal(one.mask, other.mask)
 
 
-@pytest.mark.parametrize(
-    "boxes",
-    [
+def test_tiles_give_the_instances_of_the_whole_frame():
+    for boxes in [
         [],
         [(10, 10, 30, 40)],
         [(60, 20, 75, 40)],  # within the intersection of two tiles
@@ -48,11 +47,9 @@ def assert_same(found: list[Instance], expected: list[Instance]):
         [(5, 5, 290, 195)],  # through all tiles
         [(50, 20, 84, 40), (84, 20, 110, 40), (50, 40, 110, 60)],  # touching each other, over the same edges
         [(78, 20, 82, 40), (150, 150, 151, 151)],
-    ],
-)
-def test_tiles_give_the_instances_of_the_whole_frame(boxes):
-    frame = frame_with(*boxes)
-    assert_same(Tiled(Perfect(), 80, 0.25)(frame), Perfect()(frame))
+    ]:
+        frame = frame_with(*boxes)
+        assert_same(Tiled(Perfect(), 80, 0.25)(frame), Perfect()(frame))
 
 
 def test_positions_of_tiles():
