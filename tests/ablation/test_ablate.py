@@ -169,7 +169,9 @@ def test_a_missing_extra_is_one_input_error(inputs, monkeypatch, tmp_path):
     for module in ("ablate", "report", "plot", "table"):
         monkeypatch.delitem(sys.modules, f"jaxfit.ablation.{module}", raising=False)
     ablate = import_module("jaxfit.ablation.ablate").ablate
-    with pytest.raises(InputError, match=r"^ablate: needs matplotlib and tabulate, which.*jaxfit\[report\]"):
+    with pytest.raises(
+        InputError, match=r"^ablate: needs matplotlib and tabulate.*pip install \"\.\[report\]\""
+    ):
         ablate(inputs / "birds.json", inputs / "birds.json", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -230,5 +230,5 @@ def test_labels_without_birds(tmp_path):
 
 def test_the_extra_is_needed(tmp_path, monkeypatch):
     monkeypatch.setattr("jaxfit.extras.find_spec", lambda _name: None)
-    with pytest.raises(InputError, match=r"needs h5py.*jaxfit\[formats\]"):
+    with pytest.raises(InputError, match=r"needs h5py.*pip install \"\.\[formats\]\""):
         write_deeplabcut_labels(labelled_birds(), [""] * 4, tmp_path)

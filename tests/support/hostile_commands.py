@@ -12,10 +12,15 @@ from jaxfit.errors import InputError
 
 # The server imports these modules once, so that its children need neither the time nor the memory.
 for _name in (
-    *("ablation.ablate", "data.formats.coco", "evaluation.detection_noise", "evaluation.evaluate", "fitting.fit"),
-    *("pipeline", "view.overlay"),
+    "jaxfit.ablation.ablate",
+    "jaxfit.data.formats.coco",
+    "jaxfit.evaluation.detection_noise",
+    "jaxfit.evaluation.evaluate",
+    "jaxfit.fitting.fit",
+    "jaxfit.pipeline",
+    "jaxfit.view.overlay",
 ):
-    importlib.import_module(f"jaxfit.{_name}")
+    importlib.import_module(_name)
 
 
 class WrongEndingError(Exception):

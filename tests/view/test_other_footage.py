@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import av
 import cv2
@@ -66,7 +67,9 @@ def pictures(video, folder, suffix):
     return folder
 
 
-def test_another_recording_is_refused_in_one_line(tmp_path, capsys):
+def test_another_recording_is_refused_in_one_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # a long path shortens the message
+    tmp_path = Path()
     own = film(tmp_path / "own.mp4")
     folder = result(tmp_path / "result", own)
 
@@ -148,7 +151,9 @@ def test_unknown_numbers_of_frames_are_not_compared(tmp_path):
 
 
 @pytest.mark.parametrize("value", [7, "text", "AAAA", "ä", [1]])
-def test_a_damaged_identity_is_one_error(tmp_path, capsys, value):
+def test_a_damaged_identity_is_one_error(tmp_path, capsys, monkeypatch, value):
+    monkeypatch.chdir(tmp_path)  # a long path shortens the message
+    tmp_path = Path()
     own = film(tmp_path / "own.mp4")
     folder = result(tmp_path / "result", own)
     path = folder / "summary.json"
