@@ -173,8 +173,8 @@ def _training(commands: Any) -> None:
     train.add_argument("--base", default="builtin", metavar="N.onnx", help=text)
     text = "share of the labelled frames for the check of the result; 0 trains without a check (default %(default)s)"
     train.add_argument("--holdout", type=float, default=0.2, metavar="SHARE", help=text)
-    text = "folder of simulated frames; absent frames are simulated first (default: simulated_frames with labels, else "
-    text += "training_frames, 5 GB)"
+    text = "folder of simulated scenes; absent scenes are filmed: with labels while the network trains, else before it "
+    text += "(default: simulated_frames with labels, else training_frames, 5 GB)"
     train.add_argument("--frames", type=Path, metavar="DIR", help=text)
     train.add_argument(
         "--scenes", type=int, help="simulated scenes, of 10 frames each (default: 20 with labels, else 160)"

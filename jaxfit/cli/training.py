@@ -71,7 +71,8 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
 
 def _train_on_labels(options: argparse.Namespace) -> None:
     from jaxfit.training.fine_tuning.data import LabelFiles
-    from jaxfit.training.fine_tuning.fine_tune import Settings, default_schedule, fine_tune
+    from jaxfit.training.fine_tuning.filming import missing_scenes
+    from jaxfit.training.fine_tuning.fine_tune import LABELLED_SHARE, Settings, default_schedule, fine_tune
 
     start = time.perf_counter()
     files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)
@@ -80,6 +81,14 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     scenes = LABEL_SCENES if options.scenes is None else options.scenes
     settings = Settings(options.base, options.holdout, scenes, schedule, options.seed)
     frames = options.frames or Path("simulated_frames")
+    missing = missing_scenes(frames, scenes) if scenes > 0 else 0
+    if missing:
+        simulated = f"{100 * (1 - LABELLED_SHARE):.0f} %"
+        show(
+            f"{counted(missing, 'simulated scene')} will be filmed into {frames} while the network trains. "
+            f"{simulated} of the samples are simulated birds, so that the network does not forget birds that the "
+            "labels lack. Later trainings use the scenes again."
+        )
     result = fine_tune(options.network, files, options.out, frames, settings, progress=terminal)
     _show_left_out(result.left_out)
     _show_result(result)

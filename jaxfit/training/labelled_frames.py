@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -17,7 +17,16 @@ from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.storage.npy import load_npy
 from jaxfit.storage.npz import load_npz
 
-__all__ = ["MARKER", "MOST_BIRDS", "UNKNOWN", "LabelledFrames", "create_pictures", "load_frames", "save_labels"]
+__all__ = [
+    "MARKER",
+    "MOST_BIRDS",
+    "UNKNOWN",
+    "LabelledFrames",
+    "create_pictures",
+    "join_frames",
+    "load_frames",
+    "save_labels",
+]
 
 MARKER = "frames.npz"
 """The file of the labels; every folder of labelled frames contains this file."""
@@ -115,6 +124,44 @@ def load_frames(folder: str | Path) -> LabelledFrames:
     frames = LabelledFrames(pictures, owner, points, visibility, scale, names)
     _check_labels(frames, folder)
     return frames
+
+
+def join_frames(parts: Sequence[LabelledFrames]) -> LabelledFrames:
+    """Return the frames of several folders as one; the pictures stay memory-mapped, and index one frame at a time.
+
+    Args:
+        parts: frames of the same size with the same keypoints.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    birds = max(part.visibility.shape[1] for part in parts)
+    pictures, owner = (cast(Any, _Joined([getattr(part, name) for part in parts])) for name in ("pictures", "owner"))
+    points, visibility = (
+        np.concatenate([_with_birds(getattr(part, name), birds) for part in parts])
+        for name in ("keypoints_px", "visibility")
+    )
+    scale = np.concatenate([part.pixels_per_unit for part in parts])
+    return LabelledFrames(pictures, owner, points, visibility, scale, parts[0].keypoint_names)
+
+
+def _with_birds(array: np.ndarray, birds: int) -> np.ndarray:
+    """Return an array (S, N, …) with zeros for further birds."""
+    return np.concatenate([array, np.zeros((len(array), birds - array.shape[1], *array.shape[2:]), array.dtype)], 1)
+
+
+class _Joined(Sequence[np.ndarray]):
+    """Frames of several arrays in their order, which are not copied."""
+
+    def __init__(self, arrays: Sequence[np.ndarray]):
+        self._frames = [(array, s) for array in arrays for s in range(len(array))]
+        self.shape = (len(self._frames), *arrays[0].shape[1:])
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, s: Any) -> Any:
+        array, place = self._frames[s]
+        return array[place]
 
 
 def _check_labels(frames: LabelledFrames, folder: Path) -> None:

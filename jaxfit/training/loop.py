@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from jaxfit.progress import ProgressTask, silent
-from jaxfit.training.labelled_frames import LabelledFrames, load_frames
+from jaxfit.training.labelled_frames import LabelledFrames, join_frames, load_frames
 from jaxfit.training.networks import FeaturePyramid
 
 __all__ = ["Loss", "Schedule", "Source", "batches", "has_fast_bfloat16", "train", "train_step"]
@@ -61,26 +61,64 @@ class Source(NamedTuple):
     """Share of the samples; the shares of all sources sum to 1."""
     keypoint_names: tuple[str, ...] | None = None
     """Names of the keypoints of the samples; None keeps the names of the frames."""
+    more: tuple[Path, ...] = ()
+    """Further folders, which may be written while the training runs."""
+    samples_per_folder: int = 1
+    """Number of samples of the training for each further folder: sample i uses 1 + i // `samples_per_folder` folders
+    at most. So a sample does not depend on the time at which a folder is complete."""
+    wait: Callable[[int], object] | None = None
+    """Returns when this number of folders is complete."""
+
+    def num_folders(self, sample: int) -> int:
+        """Return the number of folders that sample number `sample` of the training is drawn from."""
+        return min(1 + sample // self.samples_per_folder, 1 + len(self.more))
 
 
 class _Samples(Dataset):
     """A dataset whose sample i depends only on the seed and i, not on the number of workers."""
 
     def __init__(self, sources: Sequence[Source], seed: int, first: int, count: int):
-        self._sources, self._seed, self._first, self._count = tuple(sources), seed, first, count
-        self._frames: list[LabelledFrames] = []
+        # a worker cannot wait: the main process waits before it sends the number of a sample
+        self._sources = tuple(source._replace(wait=None) for source in sources)
+        self._seed, self._first, self._count = seed, first, count
+        self._parts: dict[Path, LabelledFrames] = {}
+        self._joined: dict[int, tuple[int, LabelledFrames]] = {}
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, i: int) -> Any:
-        if not self._frames:  # each worker opens the frames itself
-            frames = [load_frames(source.folder) for source in self._sources]
-            pairs = zip(frames, self._sources, strict=True)
-            self._frames = [own.with_keypoints(source.keypoint_names or own.keypoint_names) for own, source in pairs]
         rng = np.random.default_rng((self._seed, self._first + i))
         k = 0 if len(self._sources) == 1 else int(rng.choice(len(self._sources), p=[s.share for s in self._sources]))
-        return self._sources[k].draw(rng, self._frames[k])
+        source = self._sources[k]
+        count = source.num_folders(self._first + i)
+        if self._joined.get(k, (0,))[0] != count:
+            self._joined[k] = count, join_frames([self._load(f, source) for f in (source.folder, *source.more)[:count]])
+        return source.draw(rng, self._joined[k][1])
+
+    def _load(self, folder: Path, source: Source) -> LabelledFrames:
+        """Return the frames of a folder; each worker opens the files itself."""
+        if folder not in self._parts:
+            frames = load_frames(folder)
+            self._parts[folder] = frames.with_keypoints(source.keypoint_names or frames.keypoint_names)
+        return self._parts[folder]
+
+
+class _Order:
+    """The numbers of the samples in their order; a number comes when all folders that the sample needs are complete."""
+
+    def __init__(self, sources: Sequence[Source], first: int, count: int):
+        self._sources, self._first, self._count = sources, first, count
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[int]:
+        for i in range(self._count):
+            for source in self._sources:
+                if source.wait is not None:
+                    source.wait(source.num_folders(self._first + i))
+            yield i
 
 
 def batches(sources: Sequence[Source], batch: int, seed: int, first_step: int, last_step: int) -> Iterator[Any]:
@@ -92,10 +130,11 @@ def batches(sources: Sequence[Source], batch: int, seed: int, first_step: int, l
         seed: seed of the samples.
         first_step, last_step: range of the steps, counted from 0; the last step is not included.
     """
-    samples = _Samples(sources, seed, first_step * batch, (last_step - first_step) * batch)
+    first, count = first_step * batch, (last_step - first_step) * batch
     yield from DataLoader(
-        samples,
+        _Samples(sources, seed, first, count),
         batch,
+        sampler=_Order(sources, first, count),
         num_workers=1,
         prefetch_factor=4,
         worker_init_fn=_use_one_thread,

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
+from jaxfit.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.progress import ProgressTask, silent
@@ -24,7 +26,7 @@ from jaxfit.storage.files import new_folder
 from jaxfit.training.labelled_frames import MARKER, LabelledFrames, create_pictures, load_frames, save_labels
 from jaxfit.training.varied import frames as varied_frames
 
-__all__ = ["FRAMES_PER_SCENE", "film_scenes"]
+__all__ = ["FRAMES_PER_SCENE", "Ledge", "film_scene", "film_scenes", "simulate_ledge"]
 
 WIDTH, HEIGHT = 960, 640
 MAX_BIRDS = 14
@@ -54,24 +56,47 @@ def film_scenes(
     Raises:
         InputError: the folder contains other files, or cannot be written.
     """
-    bird = load_murre()
-    S, K = len(seeds) * FRAMES_PER_SCENE, bird.num_keypoints
+    most = varied_frames.MAX_BIRDS if varied else MAX_BIRDS
     with new_folder(folder, overwrite, marker=MARKER) as part:
-        pictures, owner = create_pictures(part, S, HEIGHT, WIDTH)
-        most = varied_frames.MAX_BIRDS if varied else MAX_BIRDS
-        points, visibility = np.zeros((S, most, K, 2), np.float32), np.zeros((S, most, K), np.uint8)
-        scale = np.zeros(S, np.float32)
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))  # a fork breaks compiled code
-        with progress("Filming scenes", len(seeds)) as report_progress, pool:
-            for i, frames in enumerate(pool.map(partial(_film_scene, varied=varied), seeds)):
-                at = slice(i * FRAMES_PER_SCENE, (i + 1) * FRAMES_PER_SCENE)
-                N = frames.visibility.shape[1]
-                pictures[at], owner[at], scale[at] = frames.pictures, frames.owner, frames.pixels_per_unit
-                points[at, :N], visibility[at, :N] = frames.keypoints_px, frames.visibility
-                report_progress(1, "")
-        del pictures, owner  # writes the memory-mapped files
-        save_labels(part, points, visibility, scale)
+        with progress("Filming simulated scenes for the training", len(seeds)) as report_progress, pool:
+            scenes = pool.map(partial(_film_scene, varied=varied), seeds)
+            _write_scenes(part, scenes, len(seeds), most, lambda: report_progress(1, ""))
     return load_frames(folder)
+
+
+def film_scene(folder: Path, seed: int) -> None:
+    """Simulate one scene and write its frames to a folder; a folder that exists is not changed.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    if (folder / MARKER).exists():
+        return
+    try:
+        with new_folder(folder, marker=MARKER) as part:
+            _write_scenes(part, [_film_scene(seed)], 1, MAX_BIRDS)
+    except InputError:
+        if not (folder / MARKER).exists():  # another command has filmed the same scene in the meantime
+            raise
+
+
+def _write_scenes(
+    part: Path, scenes: Iterable[LabelledFrames], count: int, most: int, written: Callable[[], None] = lambda: None
+) -> None:
+    """Write the frames of `count` scenes with at most `most` birds to a folder, one scene after the other."""
+    S, K = count * FRAMES_PER_SCENE, load_murre().num_keypoints
+    pictures, owner = create_pictures(part, S, HEIGHT, WIDTH)
+    points, visibility = np.zeros((S, most, K, 2), np.float32), np.zeros((S, most, K), np.uint8)
+    scale = np.zeros(S, np.float32)
+    for i, frames in enumerate(scenes):
+        at = slice(i * FRAMES_PER_SCENE, (i + 1) * FRAMES_PER_SCENE)
+        N = frames.visibility.shape[1]
+        pictures[at], owner[at], scale[at] = frames.pictures, frames.owner, frames.pixels_per_unit
+        points[at, :N], visibility[at, :N] = frames.keypoints_px, frames.visibility
+        written()
+    del pictures, owner  # writes the memory-mapped files
+    save_labels(part, points, visibility, scale)
 
 
 def _film_scene(seed: int, varied: float = 0.0) -> LabelledFrames:
@@ -85,6 +110,28 @@ def _film_scene(seed: int, varied: float = 0.0) -> LabelledFrames:
 
 def _film_ledge(seed: int, bird: Bird) -> LabelledFrames:
     """Simulate murres on a ledge with a random camera, light and number of birds."""
+    scene = simulate_ledge(seed, bird)
+    frames = list(_render_frames(scene, np.asarray(bird.faces)))
+    pictures, owner, points, visibility = (np.stack(values) for values in zip(*frames, strict=True))
+    scale = np.full(len(scene.kept), scene.pixels_per_unit, np.float32)
+    return LabelledFrames(pictures, owner, points, visibility, scale)
+
+
+class Ledge(NamedTuple):
+    """Murres on a ledge, before the pictures are rendered."""
+
+    footage: Footage
+    kept: range
+    """The frames of the training."""
+    vertices: Float[np.ndarray, "T N V 3"]
+    """Vertices of the birds, world frame."""
+    keypoints: Float[np.ndarray, "T N K 3"]
+    """Keypoints of the birds, world frame."""
+    pixels_per_unit: float
+
+
+def simulate_ledge(seed: int, bird: Bird) -> Ledge:
+    """Simulate the birds of a scene without rendering the pictures."""
     rng = np.random.default_rng((seed, 10))
     view, pixels_per_unit = _random_view(rng)
     # the expected number of birds grows with the visible area
@@ -95,23 +142,18 @@ def _film_ledge(seed: int, bird: Bird) -> LabelledFrames:
     footage = Footage(bird, birds, view, LEDGE_DEPTH, random_light(rng), seed)
     kept = range(int(rng.integers(EVERY)), T, EVERY)
     vertices = np.stack([simulated.vertices_world for simulated in birds], axis=1)
-    keypoints = mesh_keypoints(bird, vertices)
-    faces = np.asarray(bird.faces)
-    frames = list(_render_frames(footage, kept, vertices, keypoints, faces, view))
-    pictures, owner, points, visibility = (np.stack(values) for values in zip(*frames, strict=True))
-    return LabelledFrames(pictures, owner, points, visibility, np.full(len(kept), pixels_per_unit, np.float32))
+    return Ledge(footage, kept, vertices, mesh_keypoints(bird, vertices), pixels_per_unit)
 
 
-def _render_frames(
-    footage: Footage, kept: range, vertices, keypoints, faces, view: Viewpoint
-) -> Iterator[tuple[Any, ...]]:
-    for t in kept:
-        visible = render_visibility(vertices[t], keypoints[t], faces, view)
+def _render_frames(scene: Ledge, faces: np.ndarray) -> Iterator[tuple[Any, ...]]:
+    view = scene.footage.view
+    for t in scene.kept:
+        visible = render_visibility(scene.vertices[t], scene.keypoints[t], faces, view)
         owner = np.zeros((view.height, view.width), np.uint8)
         for n, mask in enumerate(visible.visible_masks, start=1):
             owner[mask] = n
         visibility = visible.inside.astype(np.uint8) + visible.keypoint_visible
-        yield footage.frame(t), owner, visible.keypoints_px.astype(np.float32), visibility
+        yield scene.footage.frame(t), owner, visible.keypoints_px.astype(np.float32), visibility
 
 
 def _random_view(rng: np.random.Generator) -> tuple[Viewpoint, float]:

@@ -27,7 +27,7 @@ from jaxfit.training.fine_tuning.data import LabelFiles, prepare_data  # noqa: E
 from jaxfit.training.fine_tuning.early_stopping import continue_training  # noqa: E402
 from jaxfit.training.fine_tuning.validation import keypoint_accuracy, segmenter_accuracy  # noqa: E402
 from jaxfit.training.labelled_frames import UNKNOWN, load_frames  # noqa: E402
-from jaxfit.training.loop import Schedule, Source, _Samples  # noqa: E402
+from jaxfit.training.loop import Schedule, Source, _Order, _Samples  # noqa: E402
 from jaxfit.training.networks import FeaturePyramid, residual_stages  # noqa: E402
 
 TIMES = range(0, 400, 50)
@@ -46,8 +46,9 @@ def same_process(monkeypatch):
 
     def batches(sources, batch, seed, first, last):
         samples = _Samples(sources, seed, first * batch, (last - first) * batch)
-        for step in range(last - first):
-            yield default_collate([samples[step * batch + i] for i in range(batch)])
+        order = iter(_Order(sources, first * batch, (last - first) * batch))
+        for _ in range(last - first):
+            yield default_collate([samples[next(order)] for _ in range(batch)])
 
     monkeypatch.setattr(early_stopping, "batches", batches)
 
@@ -184,8 +185,11 @@ def test_the_command_says_which_networks_it_compares(tmp_path, monkeypatch, caps
     ):
         result = fine_tune.FineTuned(columns, chosen, [], parts, "held out by blocks of time", (), 8, 10)
         monkeypatch.setattr(fine_tune, "fine_tune", lambda *_files, result=result, **_options: result)
-        assert main(["train", "segmenter", "--labels", "labels.json", "--out", str(tmp_path / "mine.onnx")]) == 0
+        command = ["train", "segmenter", "--labels", "labels.json", "--out", str(tmp_path / "mine.onnx")]
+        assert main([*command, "--frames", str(tmp_path / "simulated")]) == 0
         said = " ".join(capsys.readouterr().out.split())
+        assert "20 simulated scenes will be filmed into" in said
+        assert "so that the network does not forget birds that the labels lack" in said
         for expected in ("base network", "base, new scale", "trained", "0.736", "0.908", "0.800"):
             assert expected in said
         assert "score: mean of rows 1 and 2 │ 0.818 │ 0.904 │ 0.850" in said

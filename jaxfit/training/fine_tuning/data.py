@@ -13,13 +13,13 @@ import numpy as np
 from jaxfit.errors import InputError
 from jaxfit.progress import ProgressTask, silent
 from jaxfit.storage.files import new_folder
+from jaxfit.training.fine_tuning.filming import Filming
 from jaxfit.training.fine_tuning.holdout import Split, split_pictures
 from jaxfit.training.fine_tuning.label_checks import LeftOut, check_picture, check_sides
 from jaxfit.training.fine_tuning.label_pictures import StoredPicture, images_of, read_pictures
 from jaxfit.training.fine_tuning.labels import LabelSet, read_labels
 from jaxfit.training.fine_tuning.prepare import Scale, choose_scale, prepare_frames
-from jaxfit.training.labelled_frames import LabelledFrames, load_frames
-from jaxfit.training.scenes import film_scenes
+from jaxfit.training.labelled_frames import LabelledFrames
 
 __all__ = [
     "ALL_FRAMES",
@@ -28,7 +28,6 @@ __all__ = [
     "FineTuningData",
     "LabelFiles",
     "fingerprint",
-    "load_or_film",
     "prepare_data",
 ]
 
@@ -67,7 +66,7 @@ def prepare_data(
     network: str,
     files: LabelFiles,
     share: float,
-    simulated: LabelledFrames | None,
+    references: LabelledFrames | None,
     folder: Path,
     labels: LabelSet | None = None,
     progress: ProgressTask = silent,
@@ -78,7 +77,7 @@ def prepare_data(
         network: `segmenter` or `keypoints`.
         files: files of the labels.
         share: share of the pictures to hold out; 0 holds out nothing.
-        simulated: simulated frames, for the check of left and right.
+        references: simulated birds for the check of left and right, if any.
         folder: folder of the training.
         labels: the labels, if they are read already.
         progress: reports progress.
@@ -101,7 +100,7 @@ def prepare_data(
                     np.save(part / name, pixels)
                     stored.append(StoredPicture(usable, folder / PICTURES / name))
     if network == "keypoints":
-        checked, mixed_up = check_sides([picture.labels for picture in stored], labels.keypoint_names, simulated)
+        checked, mixed_up = check_sides([picture.labels for picture in stored], labels.keypoint_names, references)
         left_out += mixed_up
         pairs = zip(stored, checked, strict=True)
         stored = [StoredPicture(own, picture.file) for picture, own in pairs if own.birds]
@@ -131,22 +130,14 @@ def _check_count(stored: list[StoredPicture], left_out: list[LeftOut], files: La
     raise InputError(files.labels[0], problem, remedy)
 
 
-def load_or_film(folder: Path, scenes: int, progress: ProgressTask = silent) -> LabelledFrames | None:
-    """Return simulated frames of a folder, simulate them if the folder does not exist, or None for 0 scenes."""
-    if scenes == 0:
-        return None
-    return load_frames(folder) if folder.exists() else film_scenes(folder, range(scenes), progress=progress)
-
-
-def fingerprint(data: FineTuningData, simulated: LabelledFrames | None, base: Path, settings: Sequence[object]) -> str:
+def fingerprint(data: FineTuningData, simulated: Filming | None, base: Path, settings: Sequence[object]) -> str:
     """Return a hash of everything that determines a training, so that only the same training is resumed."""
     content = hashlib.blake2b(digest_size=16)
     content.update(repr((tuple(settings), data.keypoint_names, data.scale, data.split)).encode())
     content.update(base.read_bytes())
-    for frames in (data.frames, simulated):
-        if frames is not None:
-            for array in (frames.keypoints_px, frames.visibility, frames.pixels_per_unit):
-                content.update(np.ascontiguousarray(array).tobytes())
+    content.update(b"" if simulated is None else simulated.identity)
+    for array in (data.frames.keypoints_px, data.frames.visibility, data.frames.pixels_per_unit):
+        content.update(np.ascontiguousarray(array).tobytes())
     for pictures, owner in zip(data.frames.pictures, data.frames.owner, strict=True):
         content.update(np.ascontiguousarray(pictures).tobytes())
         content.update(np.ascontiguousarray(owner).tobytes())

@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -43,13 +44,14 @@ from jaxfit.training.fine_tuning.data import (
     FineTuningData,
     LabelFiles,
     fingerprint,
-    load_or_film,
     prepare_data,
     read_label_files,
 )
 from jaxfit.training.fine_tuning.early_stopping import CHECKS, continue_training
+from jaxfit.training.fine_tuning.filming import Filming
 from jaxfit.training.fine_tuning.label_checks import LeftOut
 from jaxfit.training.fine_tuning.prepare import Scale, prepare_frames
+from jaxfit.training.fine_tuning.reference_birds import load_reference_birds
 from jaxfit.training.fine_tuning.validation import (
     keypoint_accuracy,
     keypoint_detector,
@@ -57,7 +59,6 @@ from jaxfit.training.fine_tuning.validation import (
     single_score,
     torch_segmenter,
 )
-from jaxfit.training.labelled_frames import LabelledFrames
 from jaxfit.training.loop import Schedule, Source
 from jaxfit.training.network_files import Probabilities, write_keypoints, write_segmenter
 from jaxfit.training.networks import FeaturePyramid
@@ -70,6 +71,9 @@ LABELLED_SCENE_SHARE = 0.3
 """Share of the labelled samples with a random scene; most samples keep the scene of the footage."""
 LEAST_COMMON_KEYPOINTS = 4
 """With fewer keypoints in common, the keypoint network sees no simulated frames."""
+STEPS_PER_SCENE = 8
+"""Number of steps after which the samples come from one more simulated scene, so that the training can begin when the
+first scene is filmed. The default number of 20 scenes is in use after 152 steps; the shortest training has 240."""
 CHECKED_PICTURES = 16
 """Largest number of held-out pictures of a measurement during the training; the last measurement uses all."""
 CHECKPOINT, CHECKPOINT_ALL = "checkpoint.npz", "checkpoint_all.npz"
@@ -88,7 +92,8 @@ class Settings(NamedTuple):
     holdout: float = 0.2
     """Share of the labelled pictures that are held out; 0 trains without a check and without early stopping."""
     scenes: int = 20
-    """Number of simulated scenes, if the folder of simulated frames does not exist; 0 trains on labels only."""
+    """Number of simulated scenes, unless the folder holds the frames of all scenes in one file; 0 trains on labels
+    only."""
     schedule: Schedule | None = None
     """None chooses a schedule by the number of labelled pictures."""
     seed: int = 0
@@ -142,7 +147,8 @@ def fine_tune(
         network: `segmenter` or `keypoints`.
         files: files of the labels, pictures and masks.
         path: the `.onnx` file to write; an existing file is replaced.
-        frames_folder: folder of simulated frames, created if it does not exist; about 32 MB per scene.
+        frames_folder: folder of simulated scenes, about 32 MB per scene; absent scenes are filmed while the network
+            trains.
         settings: base network, hold-out, schedule, seed.
         progress: reports every part of the work.
 
@@ -154,32 +160,50 @@ def fine_tune(
     _check(network, path, settings)
     base = base_file(network, settings.base)
     labels = read_label_files(network, files, progress)
+    simulated = Filming(Path(frames_folder), settings.scenes, progress) if settings.scenes else None
     torch.manual_seed(settings.seed)
     found: tuple[str, ...] = labels.keypoint_names
     if network == "segmenter":
         model = load_segmenter_base(base)
     else:
         model, found = load_keypoint_base(base, labels.keypoint_names)
-    simulated = load_or_film(Path(frames_folder), settings.scenes, progress)
-    try:
-        data = prepare_data(network, files, settings.holdout, simulated, folder, labels, progress)
-    except BaseException:
-        if not (folder / CHECKPOINT).exists():
-            _remove(folder)
-        raise
-    scales: dict[Candidate, Scale] = dict.fromkeys(("base", "rescaled", "trained"), data.scale)
-    scales["base"] = _base_scale(network, base, data.scale)
+    with nullcontext() if simulated is None else simulated:
+        try:
+            references = None if simulated is None else load_reference_birds()
+            data = prepare_data(network, files, settings.holdout, references, folder, labels, progress)
+            base_scale = _base_scale(network, base, data.scale)
+        except BaseException:
+            if not (folder / CHECKPOINT).exists():
+                _remove(folder)
+            raise
+        named = dict(zip(data.keypoint_names, found, strict=True))
+        return _fine_tune(network, model, base, base_scale, named, data, simulated, folder, path, settings, progress)
+
+
+def _fine_tune(
+    network: str,
+    model: FeaturePyramid,
+    base: Path,
+    base_scale: Scale,
+    names: dict[str, str],
+    data: FineTuningData,
+    simulated: Filming | None,
+    folder: Path,
+    path: Path,
+    settings: Settings,
+    progress: ProgressTask,
+) -> FineTuned:
+    """Train the base network on prepared data, and write the best network; `names` as in `keypoint_accuracy`."""
+    scales: dict[Candidate, Scale] = {"base": base_scale, "rescaled": data.scale, "trained": data.scale}
     schedule = settings.schedule or default_schedule(network, len(data.frames.pictures))
     mark = fingerprint(data, simulated, base, (network, schedule, settings.seed))
-    names = dict(zip(data.keypoint_names, found, strict=True))
-    film = None if simulated is None else Path(frames_folder)
     initial = flat_weights(model)
 
     def train(frames: str, state: str, steps: int, score: Callable[[], float] | None) -> Checkpoint:
         """Train from the initial weights on one folder of labelled frames."""
         set_weights(model, initial)
         loss = segmenter.loss if network == "segmenter" else keypoints.loss
-        sources = _sources(network, folder / frames, data, film, simulated)
+        sources = _sources(network, folder / frames, data, simulated, schedule)
         what = f"Training {network}" if frames == FRAMES else f"Training {network} on all labels"
         own = schedule._replace(steps=steps)
         checkpoint = continue_training(
@@ -204,9 +228,13 @@ def fine_tune(
         frames = prepare_frames(folder / ALL_FRAMES, data.pictures, data.keypoint_names, data.scale, network)
         labelled = len(frames.pictures)
         train(ALL_FRAMES, CHECKPOINT_ALL, checkpoint.best_step, None)
-    facts = _facts(network, base, data, labelled, simulated, schedule, checkpoint)
+    used = [frames]
+    if simulated is not None:
+        used.append(simulated.frames(_scenes_in_use(simulated, checkpoint.step)))
+    filmed = sum(len(own.pictures) for own in used[1:])
+    facts = _facts(network, base, data, labelled, filmed, schedule, checkpoint)
     _write(network, model, data.keypoint_names, scales[chosen], facts, path)
-    store_training_activations(network, path, [f for f in (frames, simulated) if f is not None], progress=progress)
+    store_training_activations(network, path, used, progress=progress)
     _remove(folder)
     return FineTuned(
         accuracy,
@@ -235,22 +263,28 @@ def _check(network: str, path: Path, settings: Settings) -> None:
 
 
 def _sources(
-    network: str, frames: Path, data: FineTuningData, simulated_folder: Path | None, simulated: LabelledFrames | None
+    network: str, frames: Path, data: FineTuningData, simulated: Filming | None, schedule: Schedule
 ) -> list[Source]:
     """Return the labelled and the simulated frames with their shares."""
     # the new segmenter sees the footage at one scale, so it needs no wide range of scales
     draw = partial(segmenter.draw_sample, wide_share=0.0) if network == "segmenter" else keypoints.draw_sample
     labelled = Source(frames, partial(draw, scene_share=LABELLED_SCENE_SHARE))
-    if simulated is None or simulated_folder is None:
+    if simulated is None:
         return [labelled]
     if network == "keypoints":
-        mapped = simulated.with_keypoints(data.keypoint_names)
+        mapped = simulated.frames(1).with_keypoints(data.keypoint_names)
         least = min(LEAST_COMMON_KEYPOINTS, len(data.keypoint_names))
         if not ((mapped.visibility == 2).sum(-1) >= least).any():
             return [labelled]
     names = data.keypoint_names if network == "keypoints" else None
-    others = Source(simulated_folder, draw, 1 - LABELLED_SHARE, names)
-    return [labelled._replace(share=LABELLED_SHARE), others]
+    first, *more = simulated.folders
+    growth = tuple(more), STEPS_PER_SCENE * schedule.batch, simulated.wait
+    return [labelled._replace(share=LABELLED_SHARE), Source(first, draw, 1 - LABELLED_SHARE, names, *growth)]
+
+
+def _scenes_in_use(simulated: Filming, steps: int) -> int:
+    """Return the number of scenes that the samples of the last of some steps come from, as `_sources` says."""
+    return min(1 + max(steps - 1, 0) // STEPS_PER_SCENE, len(simulated.folders))
 
 
 def _score(network: str, model: FeaturePyramid, data: FineTuningData) -> Callable[[], float]:
@@ -318,12 +352,11 @@ def _facts(
     base: Path,
     data: FineTuningData,
     labelled: int,
-    simulated: LabelledFrames | None,
+    simulated: int,
     schedule: Schedule,
     checkpoint: Checkpoint,
 ) -> dict[str, str]:
-    frames = 0 if simulated is None else len(simulated.pictures)
-    trained_on = f"{labelled} labelled pictures and {frames} simulated frames"
+    trained_on = f"{labelled} labelled pictures and {simulated} simulated frames"
     return {
         "trained_by": f"jaxfit {own_version()} train {network}, fine-tuned from {base.name}",
         "trained_on": trained_on,
