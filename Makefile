@@ -24,7 +24,7 @@ help:
 
 install: $(VENV)/installed
 
-$(VENV)/installed: pyproject.toml $(wildcard kernels/*)
+$(VENV)/installed: pyproject.toml $(wildcard jaxfit/raster/cpp/*)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "jaxfit needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)"; exit 1; }
 	@command -v $${CXX:-c++} >/dev/null || \

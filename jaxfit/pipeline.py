@@ -1,44 +1,104 @@
-"""The whole reconstruction: from a video to poses and an overlay, as `jaxfit reconstruct` does."""
+"""`reconstruct`: from a video to poses and an overlay; what unfinished work depends on."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxfit.clock import Clock
+from jaxfit.config.build import plain_config
+from jaxfit.config.fit import FitConfig
+from jaxfit.config.perception import TrackConfig
 from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, write_solution
-from jaxfit.data.track_quality import track_quality
-from jaxfit.errors import InputError
-from jaxfit.extras import TRACKING_LIBRARIES, library_versions
+from jaxfit.data.tracks import track_quality
+from jaxfit.fitting.collect import summarise
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.provisional import ProvisionalFit
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.fitting.summary import summarise
-from jaxfit.model.bird import Bird
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.extras import LIBRARIES, TRACKING_LIBRARIES, library_versions
+from jaxfit.foundation.files import check_replaceable, new_folder
+from jaxfit.foundation.progress import Clock, ProgressTask, annotated, silent
+from jaxfit.foundation.unfinished import Parts, unfinished_folder, unfinished_work
+from jaxfit.foundation.workers import Cluster
+from jaxfit.model.bird import Bird, model_hash
 from jaxfit.model.files import load_murre
-from jaxfit.perception.instances import KeypointDetector, Segmenter
-from jaxfit.perception.opening import check_segmenter, network_files, open_keypoint_detector
+from jaxfit.perception.detections import check_segmenter, network_files, open_keypoint_detector
+from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.track import ObservationsFrom, TrackingResult, run_tracking
 from jaxfit.perception.tracking import TrackRecorder
-from jaxfit.pipeline_record import file_hashes, fit_record, tracking_record
-from jaxfit.progress import ProgressTask, annotated, silent
-from jaxfit.report.write import REPORT, write_report
-from jaxfit.storage.files import check_replaceable, new_folder
-from jaxfit.storage.parts import Parts
-from jaxfit.storage.unfinished import unfinished_folder, unfinished_work
+from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import VideoInfo, probe_video
-from jaxfit.view.checks import check_outputs, is_inside
-from jaxfit.view.overlay import overlay
-from jaxfit.workers.cluster import Cluster
+from jaxfit.view.overlay import check_outputs, is_inside, overlay
+from jaxfit.view.report.write import REPORT, write_report
 
-__all__ = ["OBSERVATIONS", "OVERLAY", "NoTrackError", "Reconstruction", "reconstruct"]
+_AFTER_TRACKING = ("min_track_frames", "min_track_score", "repair_left_right_flips")
+"""Settings of tracking that are applied to the stored frames."""
+_FORMAT_VERSION = 1
+"""Version of the stored frames and windows."""
+_BLOCK_BYTES = 1 << 22
+
+
+def tracking_record(
+    config: TrackConfig, video: Path, networks: dict[str, dict[str, str]], progress: ProgressTask = silent
+) -> dict[str, Any]:
+    """Return what the stored frames of a video depend on.
+
+    Args:
+        config: the settings of tracking.
+        video: a video, or a folder of frames; its content counts, not its folder.
+        networks: the hashes of the networks (`file_hashes`).
+        progress: reports the bytes of the video that were read.
+    """
+    settings = {key: value for key, value in plain_config(config).items() if key not in _AFTER_TRACKING}
+    files = image_files(video) if video.is_dir() else [video]
+    with progress("Checking the video", sum(file.stat().st_size for file in files)) as report_progress:
+        content = _content_hash(files, lambda size: report_progress(size, ""))
+    return {
+        "track": settings,
+        "video": {"name": video.name, "content": content},
+        "networks": networks,
+        "versions": library_versions(("jaxfit", "numpy", *TRACKING_LIBRARIES)),
+        "format_version": _FORMAT_VERSION,
+    }
+
+
+def fit_record(config: FitConfig, bird: Bird) -> dict[str, Any]:
+    """Return what the stored windows depend on, beside the content of each window."""
+    return {
+        "fit": {key: value for key, value in plain_config(config).items() if key != "memory_gb"},
+        "model": model_hash(bird),
+        "versions": library_versions(LIBRARIES),
+        "format_version": _FORMAT_VERSION,
+    }
+
+
+def file_hashes(networks: dict[str, list[Path]]) -> dict[str, dict[str, str]]:
+    """Return kind → name → SHA-256 hash of the files of networks."""
+    return {kind: {file.name: _content_hash([file]) for file in files} for kind, files in networks.items()}
+
+
+def _content_hash(files: Sequence[Path], report_bytes: Callable[[int], object] = lambda _: None) -> str:
+    """Return the SHA-256 hash of a file, or of the names and contents of several files."""
+    digest = hashlib.sha256()
+    for file in files:
+        one = hashlib.sha256()
+        with file.open("rb") as opened:
+            while block := opened.read(_BLOCK_BYTES):
+                one.update(block)
+                report_bytes(len(block))
+        if len(files) == 1:
+            return one.hexdigest()
+        digest.update(f"{file.name!a} ".encode() + one.digest())
+    return digest.hexdigest()
+
 
 OBSERVATIONS, OVERLAY, MARKER = "observations.json", "overlay.mp4", "poses.npz"
 

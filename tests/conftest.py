@@ -77,7 +77,7 @@ def _settings_of_the_cache():
 @pytest.fixture
 def distant_birds(monkeypatch):
     """Let a fit accept birds at any distance, whose objective overflows."""
-    monkeypatch.setattr("jaxfit.fitting.distant.DISTANCE_IMAGE_SIDES", 1e35)
+    monkeypatch.setattr("jaxfit.fitting.windows.DISTANCE_IMAGE_SIDES", 1e35)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCUMENT = ROOT / "docs" / "architecture.md"
 PACKAGE = ROOT / "jaxfit"
 MODULES = sorted(PACKAGE.rglob("*.py"))
-MOST_LINES, MOST_ROOT_MODULES, MOST_FLOORS = 300, 8, 100
+MOST_LINES, MOST_FUNCTION_LINES, MOST_ROOT_MODULES, MOST_FLOORS = 500, 60, 2, 100
 TREE = re.compile(r"(?<=```\n)jaxfit/\n.*?(?=```)", re.DOTALL)
 
 
@@ -29,10 +29,10 @@ class Entry(NamedTuple):
 def paths_on_disk():
     """Return the folders (with a `/` at the end) and files of the package, in the order of the document's tree.
 
-    Compiled files are omitted, and so is the `__init__.py` of every package but the root: the line of the folder
-    describes the package.
+    Compiled files, the sources of the kernels and the `__init__.py` of every package but the root are omitted: the
+    line of the folder describes the package.
     """
-    omitted = re.compile(r"(^|/)(__pycache__|\.|_kernels\.)|.+/__init__\.py$")
+    omitted = re.compile(r"(^|/)(__pycache__|\.|_kernels\.)|.+/__init__\.py$|^raster/cpp/.+")
     paths = {path.relative_to(PACKAGE).as_posix() + "/" * path.is_dir() for path in PACKAGE.rglob("*")}
     floor = floors()
 
@@ -123,7 +123,7 @@ def test_paths_in_the_text_of_the_document_exist():
 
 
 def test_the_document_names_the_floor_of_every_package():
-    present = {path.split("/")[0].removesuffix(".py") for path in paths_on_disk()} - {"__init__"}
+    present = {path.split("/")[0].removesuffix(".py") for path in paths_on_disk()} - {"__init__", "__init__.pyi"}
     lacking, removed = present - floors().keys(), floors().keys() - present
     assert not lacking | removed, f'docs/architecture.md, "Floors": add {lacking or "none"}, remove {removed or "none"}'
 
@@ -147,6 +147,19 @@ def test_no_modules_import_each_other():
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         raise AssertionError("a circle of imports: " + " → ".join(reversed(error.args[1]))) from None
+
+
+def test_functions_are_short():
+    """The lines of a function do not count its docstring."""
+    long = []
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                first = node.body[1] if ast.get_docstring(node) and len(node.body) > 1 else node.body[0]
+                lines = node.end_lineno - first.lineno + 1 + node.body[0].lineno - node.lineno
+                if lines > MOST_FUNCTION_LINES:
+                    long.append(f"{path.relative_to(ROOT)}:{node.lineno}: {node.name} has {lines} lines")
+    assert not long, "\n".join(long)
 
 
 def test_modules_are_short_and_few_at_the_root():

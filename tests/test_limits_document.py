@@ -1,4 +1,4 @@
-"""docs/limits.md lists every limit of jaxfit/limits.py; `python tests/test_limits_document.py` rewrites its tables."""
+"""docs/limits.md lists all limits of `jaxfit.foundation.limits`; `python tests/test_limits_document.py` rewrites it."""
 
 import ast
 import re
@@ -6,12 +6,12 @@ from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCE, DOCUMENT = ROOT / "jaxfit" / "limits.py", ROOT / "docs" / "limits.md"
-START = "<!-- the tables below are written from jaxfit/limits.py -->\n"
+SOURCE, DOCUMENT = ROOT / "jaxfit" / "foundation" / "limits.py", ROOT / "docs" / "limits.md"
+START = "<!-- the tables below are written from jaxfit/foundation/limits.py -->\n"
 
 
 def tables():
-    """Return a table for every part of jaxfit/limits.py: name, value and description of each limit."""
+    """Return a table for every part of jaxfit/foundation/limits.py: name, value and description of each limit."""
     text = SOURCE.read_text(encoding="utf-8")
     headings = {text[: match.start()].count("\n"): match[1] for match in re.finditer(r"# --- (.*)", text)}
     body = ast.parse(text).body

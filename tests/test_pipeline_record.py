@@ -6,9 +6,9 @@ from contextlib import contextmanager
 import cv2
 import numpy as np
 
-from jaxfit import pipeline_record
+from jaxfit import pipeline
 from jaxfit.config.perception import TrackConfig
-from jaxfit.pipeline_record import tracking_record
+from jaxfit.pipeline import tracking_record
 
 
 def record(video, seen=None):
@@ -22,7 +22,7 @@ def record(video, seen=None):
 
 
 def test_the_content_of_a_file_counts_and_its_bytes_are_progress(tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline_record, "_BLOCK_BYTES", 400)
+    monkeypatch.setattr(pipeline, "_BLOCK_BYTES", 400)
     content = np.random.default_rng(0).bytes(1000)
     (tmp_path / "a.mp4").write_bytes(content)
     seen = []

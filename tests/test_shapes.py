@@ -25,7 +25,7 @@ import numpy as np
 from support.birds import random_pose, toy_bird
 from jaxfit.fitting import filtering
 from jaxfit.model import camera, kinematics, rotation
-from jaxfit.model.pose import rest_pose
+from jaxfit.model.kinematics import rest_pose
 
 bird = toy_bird()
 rig, one = kinematics.fold_bird(bird), random_pose(bird, 0)

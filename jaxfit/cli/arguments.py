@@ -1,4 +1,4 @@
-"""Arguments that several commands share."""
+"""Arguments that several commands share, and those of results and species."""
 
 from __future__ import annotations
 
@@ -6,24 +6,11 @@ import argparse
 from pathlib import Path
 from typing import Any, NoReturn
 
-from jaxfit.config.help import option_help
+from jaxfit.config.build import option_help
 from jaxfit.config.perception import TrackConfig
-from jaxfit.errors import InputError
-from jaxfit.video.codecs import CODECS
-
-__all__ = [
-    "MODEL",
-    "OBSERVATIONS",
-    "Parser",
-    "add_cluster",
-    "add_codec",
-    "add_command",
-    "add_model",
-    "add_observation_options",
-    "add_out",
-    "add_tracking_options",
-    "add_truth",
-]
+from jaxfit.export import FORMATS
+from jaxfit.foundation.errors import InputError
+from jaxfit.video import CODECS
 
 MODEL = "`murre`, or a model file (.npz) that `jaxfit model import` writes"
 OBSERVATIONS = (
@@ -123,3 +110,146 @@ def add_tracking_options(command: argparse.ArgumentParser) -> None:
     for option, (path, details) in TRACK_OPTIONS.items():
         text = option_help(TrackConfig, path)
         command.add_argument(option, dest=f"track.{path}", help=text[0].lower() + text[1:], **details)
+
+
+def add_result_commands(commands: Any) -> None:
+    """Add the commands."""
+    _report(commands)
+    _export(commands)
+    _tracks(commands)
+    _join(commands)
+    text = "check the installation: kernels, FFmpeg, codecs, networks, optional packages, cache"
+    add_command(commands, "doctor", "doctor.doctor", text)
+
+
+def _report(commands: Any) -> None:
+    text = "write a report of a result as one HTML page: quality, warnings, pictures, timeline"
+    report = add_command(commands, "report", "results.report", text)
+    report.add_argument("result", type=Path, metavar="RESULT", help="folder of a result")
+    text = "the footage, if the result does not name the footage, or the footage was moved"
+    report.add_argument("--video", type=Path, help=text)
+    text = "file to write (default: report.html in the folder of the result, which replaces an earlier report)"
+    report.add_argument("--out", type=Path, metavar="HTML", help=text)
+    report.add_argument("--overwrite", action="store_true", help="replace an existing file of --out")
+    add_force(report)
+
+
+def _export(commands: Any) -> None:
+    text = "write a result in a format that other tools open"
+    export = add_command(commands, "export", "results.export", text)
+    export.add_argument("result", type=Path, metavar="RESULT", help="folder of a result")
+    tools = "; ".join(f"{name} ({form.tools})" for name, form in FORMATS.items())
+    export.add_argument("--to", required=True, choices=tuple(FORMATS), metavar="FORMAT", help=f"format: {tools}")
+    text = "file to write; a folder for nwb, and for glb without --one-file"
+    add_out(export, "PATH", text, overwrite="existing files, or an earlier export in the folder")
+    export.add_argument("--tracks", metavar="ID,ID", help="only these tracks")
+    text = "only the frames from number A to number B − 1; A or B may be left out"
+    export.add_argument("--frames", metavar="A:B", help=text)
+    text = "frame rate of the footage, if the result does not hold the rate, or holds a wrong rate"
+    export.add_argument("--fps", type=float, help=text)
+    text = "length of a model unit in metres, for models that do not state the length"
+    export.add_argument("--metres-per-unit", type=float, metavar="M", help=text)
+    text = "the footage, if the result does not name the footage, or the footage was moved"
+    export.add_argument("--video", type=Path, help=text)
+    text = "movement: keypoints in image pixels (2d, the default) or in the camera frame (3d)"
+    export.add_argument("--space", choices=("2d", "3d"), help=text)
+    text = "movement: names of the dimensions; plural for movement before 0.17 (default singular)"
+    export.add_argument("--dims", choices=("singular", "plural"), help=text)
+    text = "nwb: time of frame 0 of the footage, such as 2024-06-01T12:00:00+02:00"
+    export.add_argument("--start", metavar="TIME", help=text)
+    export.add_argument("--one-file", action="store_true", help="glb: all birds in one file")
+    export.add_argument("--ground", action="store_true", help="glb: add a level ground below the feet of the birds")
+
+
+class _AddEdit(argparse.Action):
+    """Collects the corrections in the order of the command line."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        edits = [*(namespace.edits or []), ((option_string or "").lstrip("-"), values)]
+        namespace.edits = edits
+
+
+def _tracks(commands: Any) -> None:
+    text = "list the tracks of a result, or correct the tracks and fit only the windows that change"
+    tracks = add_command(commands, "tracks", "results.tracks", text)
+    tracks.add_argument("result", type=Path, metavar="RESULT", help="folder of a result")
+    for option, metavar, what in (
+        ("--swap", "ID,ID@A:B", "exchange two tracks, from frame A to frame B − 1 (or to the end, or everywhere)"),
+        ("--cut", "ID@A", "the frames from A on become a new track"),
+        ("--join", "ID,ID", "the second track becomes a part of the first track"),
+        ("--delete", "ID,ID", "delete tracks"),
+    ):
+        text = f"{what}; may be repeated, corrections happen in their order"
+        tracks.add_argument(option, dest="edits", action=_AddEdit, metavar=metavar, help=text)
+    text = "the file that was fitted, for a result of `jaxfit fit`"
+    tracks.add_argument("--observations", type=Path, metavar="OBS.json", help=text)
+    tracks.add_argument("--out", type=Path, metavar="DIR", help="folder for the corrected result")
+    text = "replace an earlier result in the folder of --out"
+    tracks.add_argument("--overwrite", action="store_true", help=text)
+
+
+def _join(commands: Any) -> None:
+    text = "join the results of ranges of one video, and continue tracks across the cuts by place and size"
+    join = add_command(commands, "join", "results.join", text)
+    text = "folders of `jaxfit reconstruct --start A --stop B`, in any order"
+    join.add_argument("results", type=Path, nargs="+", metavar="RESULT", help=text)
+    text = "a track may continue after so many frames without the bird (default: the memory of the tracker)"
+    join.add_argument("--bridge", type=int, metavar="FRAMES", help=text)
+    add_out(join, "DIR", "folder for the joined result", overwrite="an earlier result in the folder")
+
+
+def add_adapt_commands(commands: Any) -> None:
+    """Add `jaxfit adapt scan` and `jaxfit adapt photos`."""
+    adapt = commands.add_parser("adapt", help="adapt a bird model to a species")
+    actions = adapt.add_subparsers(required=True, metavar="ACTION")
+    scan = add_command(actions, "scan", "species.adapt_scan", "fit bone lengths and shape of a model to a 3D scan")
+    scan.add_argument("scan", type=Path, metavar="SCAN", help="scan as a triangle mesh (.ply, .obj, .stl, .glb)")
+    text = "annotated keypoints: JSON of names with vertex numbers or points, or picked points of MeshLab (.pp)"
+    scan.add_argument("--keypoints", type=Path, required=True, metavar="K.json", help=text)
+    scan.add_argument("--model", default="murre", metavar="BASE", help=f"model to start from: {MODEL} (default murre)")
+    add_out(scan, "M.npz", "model file to write, and its picture")
+    text = "also move the vertices by a smooth, left-right symmetric offset: for shapes outside the model's shape space"
+    scan.add_argument("--offset", action="store_true", help=text)
+    text = "axis of the scan that points up (X, Y, Z, -X, …): helps the start, and is checked"
+    scan.add_argument(
+        "--up", type=str.upper, choices=[s + a for s in ("", "-") for a in "XYZ"], metavar="AXIS", help=text
+    )
+    text = "unit of the scan, for errors in mm; the size of the model is free (default %(default)s)"
+    scan.add_argument("--unit", choices=("mm", "cm", "m"), default="cm", help=text)
+    _photos(actions)
+
+
+def _photos(actions: Any) -> None:
+    text = "fit the mean bone lengths and the mean shape of a species to photographs"
+    photos = add_command(actions, "photos", "species.adapt_photos", text)
+    text = "keypoints and masks of photographs or tracks (COCO, or files of other programs)"
+    photos.add_argument("birds", type=Path, nargs="+", metavar="BIRDS.json", help=text)
+    photos.add_argument("--model", default="murre", metavar="M", help=f"model to start from: {MODEL} (default murre)")
+    add_out(photos, "N.npz", "model file to write")
+    text = "parts that stay as in the model: bones, shape, offset, or several with commas"
+    photos.add_argument("--fix", default="", metavar="PARTS", help=text)
+    text = "largest number of images of a track, which shows one individual: images at equal distances (default "
+    text += "%(default)s)"
+    photos.add_argument("--frames-per-track", type=int, default=10, metavar="N", help=text)
+    add_observation_options(photos)
+
+
+def add_model_commands(actions: Any) -> None:
+    """Add `jaxfit model compare`, `rig` and `keypoints`."""
+    compare = add_command(actions, "compare", "species.model_compare", "compare bones and surfaces of two models")
+    for name in ("first", "second"):
+        compare.add_argument(name, metavar=name[0].upper() + name[1:], help=MODEL)
+    text = "picture of both models from six sides, coloured by their distance"
+    compare.add_argument("--out", type=Path, metavar="PNG", help=text)
+    compare.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    text = "transfer joints, skin weights and keypoints of a model to a mesh, so that the mesh can be posed"
+    rig = add_command(actions, "rig", "species.model_rig", text)
+    rig.add_argument("mesh", type=Path, metavar="MESH", help="triangle mesh (.ply, .obj, .stl, .glb), such as a scan")
+    text = "model that lies on the mesh: a model that `jaxfit adapt scan` wrote for this scan, or a model "
+    text += "in whose rest pose the mesh is"
+    rig.add_argument("--like", type=Path, required=True, metavar="MODEL", help=text)
+    add_out(rig, "M.npz", "model file to write")
+    text = "write a page (.html) that shows annotators where each keypoint sits"
+    keypoints = add_command(actions, "keypoints", "species.model_keypoints", text)
+    keypoints.add_argument("file", metavar="MODEL", help=MODEL)
+    add_out(keypoints, "PAGE.html", "page to write")

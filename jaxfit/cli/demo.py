@@ -1,35 +1,32 @@
-"""The demo: simulate a short scene, reconstruct the scene from its footage, measure and export the result."""
+"""`simulate`, `demo`."""
 
 from __future__ import annotations
 
+import argparse
 import time
 from pathlib import Path
 
 from rich.table import Table
 
-from jaxfit.cli.observation_tables import matching_line, observation_tables
+from jaxfit.cli.observations import matching_line, observation_tables
 from jaxfit.cli.tables import counted, evaluation_tables, show, track_table
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
-from jaxfit.data.formats.scene_folder import FOOTAGE, MARKER
-from jaxfit.errors import InputError
+from jaxfit.data.formats import FOOTAGE, MARKER
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
-from jaxfit.evaluation.matching import Matching, match_tracks
-from jaxfit.evaluation.observed import ObservationsEvaluation, evaluate_observations
-from jaxfit.evaluation.truth import Truth
+from jaxfit.evaluation.tracking import ObservationsEvaluation, evaluate_observations
+from jaxfit.evaluation.truth import Matching, Truth, match_tracks
 from jaxfit.export.export import export_result
-from jaxfit.model.files import load_murre
-from jaxfit.perception.trust import Trust
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import check_replaceable, check_writable, remove_leftovers, write_whole
+from jaxfit.foundation.progress import terminal
+from jaxfit.foundation.reading import json_text
+from jaxfit.model.files import find_bird, load_murre
+from jaxfit.perception.track import Trust
 from jaxfit.pipeline import OVERLAY, reconstruct
-from jaxfit.progress import terminal
-from jaxfit.report.page import Measured
-from jaxfit.report.write import REPORT, write_report
 from jaxfit.simulation.scene import simulate
-from jaxfit.storage.files import check_replaceable, check_writable, write_whole
-from jaxfit.storage.json_values import json_text
-from jaxfit.storage.temporary import remove_leftovers
-
-__all__ = ["run_demo"]
+from jaxfit.view.report.page import Measured
+from jaxfit.view.report.write import REPORT, write_report
 
 BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 1003
 METRICS, ANIMATION = "evaluation.json", "birds.glb"
@@ -130,3 +127,41 @@ def _check_folder(folder: Path) -> None:
     if any(folder.iterdir()) and not (folder / "scene" / MARKER).is_file():
         problem = "holds files that are not an earlier demo"
         raise InputError(folder, problem, "choose another --out, new or empty")
+
+
+def simulate_scene(options: argparse.Namespace) -> None:
+    """Simulate a scene and write its footage and ground truth."""
+    from jaxfit.simulation.scene import simulate
+
+    start = time.perf_counter()
+    scene = simulate(
+        find_bird("murre"),
+        options.out,
+        birds=options.birds,
+        frames=options.frames,
+        size=_size(options.size),
+        fps=options.fps,
+        seed=options.seed,
+        codec=options.codec,
+        overwrite=options.overwrite,
+        progress=terminal,
+    )
+    poses, detections = int(scene.truth.present.sum()), int(scene.detections.present.sum())
+    show(
+        f"{counted(options.birds, 'bird')} over {counted(options.frames, 'frame')}: {counted(poses, 'true pose')}, "
+        f"{counted(detections, 'detection')}, in {time.perf_counter() - start:.0f} s → {options.out}"
+    )
+
+
+def demo(options: argparse.Namespace) -> None:
+    """Run the demo."""
+
+    run_demo(options.out, options.verbose)
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Return width and height in pixels from a text such as `2592x1520`."""
+    sides = text.lower().replace("×", "x").split("x")
+    if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
+        raise InputError("--size", f"{text!r} is not a picture size", "give width and height as in 2592x1520")
+    return int(sides[0]), int(sides[1])

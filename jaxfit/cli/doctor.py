@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxfit.cli.tables import EscapedTable, counted, show
-from jaxfit.errors import InputError
-from jaxfit.extras import (
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.extras import (
     DISTRIBUTION,
     OPTIONAL_PACKAGES,
     install_command,
@@ -20,8 +20,6 @@ from jaxfit.extras import (
     own_version,
     package_problem,
 )
-
-__all__ = ["Finding", "doctor"]
 
 _DECODERS = ("h264", "hevc", "vp9", "av1", "mpeg4", "mjpeg", "prores")
 """Codecs of cameras and of video archives."""
@@ -96,7 +94,7 @@ def _kernels() -> Iterator[Finding]:
 def _ffmpeg() -> Iterator[Finding]:
     import av
 
-    from jaxfit.video.codecs import CODECS
+    from jaxfit.video import CODECS
 
     codecs = ".".join(map(str, av.library_versions["libavcodec"]))
     yield Finding("FFmpeg", f"PyAV {av.__version__} with libavcodec {codecs}")
@@ -125,7 +123,7 @@ def _networks() -> Iterator[Finding]:
     import onnxruntime
 
     from jaxfit.config.perception import TrackConfig
-    from jaxfit.perception.opening import open_keypoint_detector
+    from jaxfit.perception.detections import open_keypoint_detector
     from jaxfit.perception.segmentation import load_segmenter
 
     yield Finding("ONNX Runtime", f"{onnxruntime.__version__}: {', '.join(onnxruntime.get_available_providers())}")
@@ -153,7 +151,7 @@ def _optional_packages() -> Iterator[Finding]:
 
 def _cache() -> Iterator[Finding]:
     from jaxfit.cli.main import cache_folder
-    from jaxfit.storage.files import check_writable
+    from jaxfit.foundation.files import check_writable
 
     folder = cache_folder()
     files = [path for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []

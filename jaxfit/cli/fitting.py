@@ -10,18 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxfit.cli.observation_files import image_size, keypoint_map, observations_for
+from jaxfit.cli.observations import image_size, keypoint_map, observations_for
 from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, right_aligned, show
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.progress import terminal
+from jaxfit.foundation.reading import json_text
 from jaxfit.model.files import find_bird
-from jaxfit.progress import terminal
-from jaxfit.storage.json_values import json_text
 
 if TYPE_CHECKING:
     from jaxfit.config.fit import FitConfig
     from jaxfit.data.keypoint_names import NameMap
-
-__all__ = ["evaluate", "fit", "overlay"]
 
 LEAST_KEYPOINTS = 3
 """Fewer keypoints do not determine the orientation of a bird."""
@@ -32,11 +30,11 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.config.fit import load_config
     from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import save_solution
+    from jaxfit.fitting.collect import summarise
     from jaxfit.fitting.fit import fit
-    from jaxfit.fitting.initial_pose_file import load_initial_poses
-    from jaxfit.fitting.summary import summarise
-    from jaxfit.storage.files import check_replaceable
-    from jaxfit.workers.cluster import open_cluster
+    from jaxfit.fitting.initial_poses import load_initial_poses
+    from jaxfit.foundation.files import check_replaceable
+    from jaxfit.foundation.workers import open_cluster
 
     start = time.perf_counter()
     check_replaceable(options.out, options.overwrite, "poses.npz")  # before the long work
@@ -87,12 +85,11 @@ def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namesp
 
 def evaluate(options: argparse.Namespace) -> None:
     """Compare a result or observations with the truth and print metrics."""
-    from jaxfit.cli.observation_tables import matching_line
+    from jaxfit.cli.observations import matching_line
     from jaxfit.data.keypoint_names import map_keypoints
     from jaxfit.data.solution import load_solution
     from jaxfit.evaluation.evaluate import evaluate
-    from jaxfit.evaluation.matching import match_tracks
-    from jaxfit.evaluation.truth import read_truth
+    from jaxfit.evaluation.truth import match_tracks, read_truth
 
     if os.path.isfile(options.result):  # noqa: PTH113 - False for paths that cannot exist
         if options.by:
@@ -133,10 +130,10 @@ def _evaluate_observations(options: argparse.Namespace) -> None:
     """Compare observations with the truth and print detection, keypoint and tracking metrics."""
     from dataclasses import asdict
 
-    from jaxfit.cli.observation_tables import observation_tables, uncounted_lines
+    from jaxfit.cli.observations import observation_tables, uncounted_lines
     from jaxfit.data.formats.recognise import read_observations
     from jaxfit.data.keypoint_names import map_keypoints, propose_names
-    from jaxfit.evaluation.observed import evaluate_observations
+    from jaxfit.evaluation.tracking import evaluate_observations
     from jaxfit.evaluation.truth import read_truth
 
     truth = read_truth(options.truth, options.video, image_size(options))

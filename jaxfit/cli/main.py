@@ -14,10 +14,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from jaxfit.cli.parser import build_parser
-from jaxfit.errors import InputError, one_line, shortened
-from jaxfit.limits import MESSAGE_CHARACTERS
-
-__all__ = ["cache_folder", "main", "run", "use_cache"]
+from jaxfit.foundation.errors import InputError, one_line, shortened
+from jaxfit.foundation.limits import MESSAGE_CHARACTERS
 
 STOPPED = 130
 """Exit code of an interrupted command."""

@@ -1,20 +1,18 @@
-"""Commands that import, describe and draw bird models, and learn priors of poses and of motion."""
+"""`model`, `prior`, `config`."""
 
 from __future__ import annotations
 
 import argparse
 
 from jaxfit.cli.tables import counted, right_aligned, show, show_facts
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.reading import json_text
 from jaxfit.model.files import find_bird, read_provenance, save_bird
-from jaxfit.storage.json_values import json_text
-
-__all__ = ["model_import", "model_info", "model_view", "prior_learn"]
 
 
 def model_import(options: argparse.Namespace) -> None:
     """Import a published model and write a model file."""
-    from jaxfit.model.importers.import_model import import_model
+    from jaxfit.model.published import import_model
 
     bird = import_model(options.kind, options.sources)
     save_bird(bird, options.out)
@@ -23,7 +21,7 @@ def model_import(options: argparse.Namespace) -> None:
 
 def model_info(options: argparse.Namespace) -> None:
     """Print a description of a model."""
-    from jaxfit.model.describe import describe_bird
+    from jaxfit.model.bird import describe_bird
 
     facts, provenance = describe_bird(find_bird(options.file)), read_provenance(options.file)
     if options.json:
@@ -37,9 +35,9 @@ def model_info(options: argparse.Namespace) -> None:
 
 def model_view(options: argparse.Namespace) -> None:
     """Draw a model from six sides."""
-    from jaxfit.model.murre import POSTURES
-    from jaxfit.storage.files import check_writable
-    from jaxfit.view.six_views import six_views
+    from jaxfit.foundation.files import check_writable
+    from jaxfit.model.murre.postures import POSTURES
+    from jaxfit.view.mesh_views import six_views
 
     if options.posture and options.posture not in POSTURES:
         raise InputError("--posture", f"{options.posture!r} is not a known posture", f"known: {', '.join(POSTURES)}")
@@ -56,8 +54,8 @@ def prior_learn(options: argparse.Namespace) -> None:
     import numpy as np
 
     from jaxfit.data.solution import load_solution
-    from jaxfit.fitting.learn import learn_prior
-    from jaxfit.storage.files import check_writable
+    from jaxfit.foundation.files import check_writable
+    from jaxfit.learning.priors import learn_prior
 
     check_writable(options.out)  # before the long work
     if options.motion:
@@ -89,10 +87,10 @@ def _motion_learn(options: argparse.Namespace) -> None:
     """Learn the settings of `motion_likelihood` from results, and write a config with these settings."""
     import numpy as np
 
-    from jaxfit.data.frame_numbers import UNKNOWN_FPS
     from jaxfit.data.solution import load_solution
-    from jaxfit.fitting.learn_motion import learn_motion, motion_config
-    from jaxfit.storage.files import write_whole
+    from jaxfit.data.tracks import UNKNOWN_FPS
+    from jaxfit.foundation.files import write_whole
+    from jaxfit.learning.priors import learn_motion, motion_config
 
     if options.out.suffix not in (".yaml", ".yml"):
         raise InputError(options.out, "is not the name of a config", "choose a name that ends in .yaml")
@@ -120,3 +118,31 @@ def _motion_learn(options: argparse.Namespace) -> None:
     maximum = ", ".join(f"{name} {value:.3g}" for name, value in learnt.unshrunk._asdict().items())
     show(f"maximum of likelihood: {maximum}; share of the shipped settings {100 * learnt.shrinkage:.0f} %")
     show(f"config → {options.out}; use the config with `--config {options.out}`")
+
+
+def list_configs(options: argparse.Namespace) -> None:
+    """Print the purpose of every shipped config of fits, and the data on which its values were chosen."""
+    from itertools import groupby
+
+    from jaxfit.cli.tables import EscapedTable, show
+    from jaxfit.config.fit import describe_fit_configs
+
+    for group, configs in groupby(describe_fit_configs(), lambda config: config.group):
+        table = EscapedTable("config", "for", "chosen on", title=group, show_lines=True)
+        for config in configs:
+            table.add_row(config.name, config.purpose, config.chosen_on)
+        show(table)
+    show("`jaxfit fit --config NAME` uses a config, and `jaxfit config show NAME` prints its settings")
+
+
+def show_config(options: argparse.Namespace) -> None:
+    """Print a shipped config with all values, and with their descriptions as comments."""
+    from jaxfit.config.fit import FitConfig
+    from jaxfit.config.reconstruct import ReconstructConfig
+    from jaxfit.config.yaml_file import documented_yaml, read_config, shipped_configs
+    from jaxfit.evaluation.ablation.grid import GridConfig
+
+    if options.name not in shipped_configs():
+        raise InputError(options.name, "is not a shipped config", f"give one of {', '.join(shipped_configs())}")
+    kind = {"reconstruct": ReconstructConfig, "ablation": GridConfig}.get(options.name, FitConfig)
+    print(documented_yaml(read_config(kind, options.name)), end="")  # noqa: T201

@@ -10,25 +10,24 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from jaxfit.cli.adapt_arguments import add_adapt_commands, add_model_commands
 from jaxfit.cli.arguments import (
     MODEL,
     OBSERVATIONS,
     Parser,
+    add_adapt_commands,
     add_cluster,
     add_codec,
     add_command,
     add_force,
     add_model,
+    add_model_commands,
     add_observation_options,
     add_out,
+    add_result_commands,
     add_tracking_options,
     add_truth,
 )
-from jaxfit.cli.result_arguments import add_result_commands
-from jaxfit.extras import own_version
-
-__all__ = ["build_parser"]
+from jaxfit.foundation.extras import own_version
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -57,7 +56,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _labelling(commands: Any) -> None:
     text = "choose frames that a person should label, and write their pictures and pre-filled labels (extra `formats`)"
-    suggest = add_command(commands, "suggest", "labelling.suggest_frames", text)
+    suggest = add_command(commands, "suggest", "perception.suggest_frames", text)
     add_tracking_options(suggest)
     text = "result of this video, instead of tracking: a folder of reconstruct or fit, or a file of keypoints (as OBS)"
     suggest.add_argument("--result", type=Path, metavar="DIR|OBS", help=text)
@@ -103,7 +102,7 @@ def _fitting(commands: Any) -> None:
     evaluate.add_argument("--json", action="store_true", help=text)
 
     text = "estimate the errors of detections from labelled frames, and write a config of a fit that holds them"
-    calibrate = add_command(commands, "calibrate", "calibrating.calibrate", text)
+    calibrate = add_command(commands, "calibrate", "training.calibrate", text)
     calibrate.add_argument("detections", type=Path, metavar="OBS", help=OBSERVATIONS)
     text = "labels of some frames of the same video (formats as of OBS), or a scene"
     calibrate.add_argument("--truth", type=Path, required=True, metavar="LABELS", help=text)
@@ -111,7 +110,7 @@ def _fitting(commands: Any) -> None:
     add_out(calibrate, "NOISE.yaml", "config to write, for `jaxfit fit --config`", overwrite="an existing file")
 
     text = "fit the same birds with a grid of configs and compare the results (needs the extra `report`)"
-    ablate = add_command(commands, "ablate", "ablation.ablate", text)
+    ablate = add_command(commands, "ablate", "experiments.ablate", text)
     text = "COCO file with the keypoint names of the model; `jaxfit import` writes it from other files"
     ablate.add_argument("observations", type=Path, metavar="OBS.json", help=text)
     add_truth(ablate)
@@ -139,7 +138,7 @@ def _fitting(commands: Any) -> None:
 
 def _simulation(commands: Any) -> None:
     text = "film simulated murres on a ledge and store the ground truth"
-    simulate = add_command(commands, "simulate", "simulation.simulate", text)
+    simulate = add_command(commands, "simulate", "demo.simulate_scene", text)
     add_out(simulate, "SCENE", "folder for the scene", overwrite="an earlier scene in the folder")
     simulate.add_argument("--birds", type=int, default=7, help="number of birds (default %(default)s)")
     simulate.add_argument("--frames", type=int, default=100, help="number of frames (default %(default)s)")
@@ -150,7 +149,7 @@ def _simulation(commands: Any) -> None:
     add_codec(simulate)
 
     text = "simulate a short scene, reconstruct the scene from its footage, and measure the result"
-    demo = add_command(commands, "demo", "simulation.demo", text)
+    demo = add_command(commands, "demo", "demo.demo", text)
     text = "folder for all files (default %(default)s)"
     demo.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help=text)
     text = "also print all tables, which are in the report too, and messages of libraries"
@@ -191,7 +190,7 @@ def _datasets(commands: Any) -> None:
     dataset = commands.add_parser("dataset", help="convert published data sets")
     actions = dataset.add_subparsers(required=True, metavar="NAME")
     text = "convert common_murre_temporal, with an inferred layout, to a COCO file"
-    murre = add_command(actions, "murre", "datasets.murre", text)
+    murre = add_command(actions, "murre", "observations.murre", text)
     murre.add_argument("folder", type=Path, metavar="DIR", help="folder with annotations.npy and images/")
     text = "names of the 20 keypoints in order, with commas; `murre` for the names of the murre model; or `none` for "
     text += "numbers as names (default %(default)s)"
@@ -201,7 +200,7 @@ def _datasets(commands: Any) -> None:
 
 def _import(commands: Any) -> None:
     text = "convert keypoints of DeepLabCut, SLEAP, Lightning Pose, CVAT or Label Studio to a COCO file"
-    importer = add_command(commands, "import", "importing.import_observations", text)
+    importer = add_command(commands, "import", "observations.import_observations", text)
     importer.add_argument("file", type=Path, metavar="FILE", help=OBSERVATIONS)
     add_out(importer, "OBS.json", "COCO file to write", overwrite="an existing file")
     add_observation_options(importer)
@@ -241,13 +240,13 @@ def _configs(commands: Any) -> None:
     config = commands.add_parser("config", help="list the configs and print their settings")
     actions = config.add_subparsers(required=True, metavar="ACTION")
     text = "list the configs of fits: what each config is for, and the data on which its values were chosen"
-    add_command(actions, "list", "configs.list_configs", text)
-    show = add_command(actions, "show", "configs.show_config", "print all settings of a config with their descriptions")
+    add_command(actions, "list", "models.list_configs", text)
+    show = add_command(actions, "show", "models.show_config", "print all settings of a config with their descriptions")
     show.add_argument("name", metavar="NAME", help="name of a shipped config: reconstruct, paper, ablation, …")
 
 
 def _bench(commands: Any) -> None:
-    bench = add_command(commands, "bench", "bench.bench", "measure speed on this machine")
+    bench = add_command(commands, "bench", "experiments.bench", "measure speed on this machine")
     bench.add_argument("what", choices=("silhouette", "render", "fit", "solvers"), help="part to measure")
     bench.add_argument("--model", help=f"model to measure with, instead of the default: {MODEL}")
     bench.add_argument("--birds", type=int, default=9, help="fit, solvers: number of birds (default %(default)s)")

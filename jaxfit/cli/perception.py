@@ -1,16 +1,17 @@
-"""Commands that read video: track birds, and reconstruct birds."""
+"""`track`, `reconstruct`, `suggest`."""
 
 from __future__ import annotations
 
 import argparse
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from jaxfit.cli.tables import counted, show, track_table
+from jaxfit.cli.tables import counted, right_aligned, show, track_table
+from jaxfit.foundation.progress import terminal
 from jaxfit.model.files import find_bird
-from jaxfit.progress import terminal
 
 if TYPE_CHECKING:
     from jaxfit.config.reconstruct import ReconstructConfig
@@ -18,16 +19,14 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 
-__all__ = ["reconstruct", "reconstruct_config", "track"]
-
 
 def track(options: argparse.Namespace) -> None:
     """Track the birds of a video and write a COCO file."""
     from jaxfit.data.formats.coco import write_coco
+    from jaxfit.foundation.files import check_writable
+    from jaxfit.foundation.workers import open_cluster
     from jaxfit.perception.track import run_tracking
-    from jaxfit.storage.files import check_writable
-    from jaxfit.view.checks import check_outputs
-    from jaxfit.workers.cluster import open_cluster
+    from jaxfit.view.overlay import check_outputs
 
     start = time.perf_counter()
     if options.video.exists():  # tracking reports a missing video
@@ -52,9 +51,9 @@ def track(options: argparse.Namespace) -> None:
 
 def reconstruct(options: argparse.Namespace) -> None:
     """Track the birds of a video, fit their poses and draw them."""
+    from jaxfit.foundation.workers import open_cluster
     from jaxfit.pipeline import OBSERVATIONS, OVERLAY, NoTrackError, reconstruct
-    from jaxfit.report.write import REPORT
-    from jaxfit.workers.cluster import open_cluster
+    from jaxfit.view.report.write import REPORT
 
     start = time.perf_counter()
     config = reconstruct_config(options)
@@ -85,7 +84,7 @@ def reconstruct(options: argparse.Namespace) -> None:
 
 def reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
     """Return the config of `--config`, with the values of the options for single settings."""
-    from jaxfit.config.paths import with_values
+    from jaxfit.config.build import with_values
     from jaxfit.config.reconstruct import load_reconstruct_config
 
     settings = {path: value for path, value in vars(options).items() if path.startswith("track.") and value is not None}
@@ -113,3 +112,34 @@ def _some(texts: Iterable[str]) -> str:
     """Return the first ten texts as one text."""
     shown = list(texts)
     return ", ".join([*shown[:10], *(["…"] if len(shown) > 10 else [])])
+
+
+def suggest_frames(options: argparse.Namespace) -> None:
+    """Choose frames for labelling, and write their pictures and pre-filled labels."""
+    from jaxfit.review.suggest import suggest
+
+    config = reconstruct_config(options).track
+    done = suggest(
+        options.video,
+        options.out,
+        options.count,
+        options.result,
+        config,
+        overwrite=options.overwrite,
+        empty=options.empty,
+        progress=terminal,
+    )
+    table = right_aligned("frame", "time", "birds", "reason", "score")
+    table.columns[3].justify = "left"
+    for frame in done.frames:
+        time = "–" if frame.time_s is None else f"{frame.time_s:.2f} s"
+        table.add_row(str(frame.frame_index), time, str(frame.birds), frame.reason, f"{frame.score:.2f}")
+    table.caption = (
+        "reason: the strongest signal of uncertainty, or variety for a frame that mainly differs from the others; "
+        "score: mean rank of all signals among the examined frames, from 0 to 1"
+    )
+    show(table)
+    reasons = ", ".join(f"{reason} {number}" for reason, number in Counter(f.reason for f in done.frames).most_common())
+    birds = counted(int(done.observations.present.sum()), "bird")
+    show(f"{counted(len(done.frames), 'frame')} with {birds} ({reasons}) → {options.out}")
+    show(f"{options.out / 'README.txt'} says how to correct the labels and how to read them again")

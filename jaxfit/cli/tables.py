@@ -9,24 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich.console import Console
 from rich.table import Table
 
-from jaxfit.data.track_quality import track_quality
-from jaxfit.errors import one_line
+from jaxfit.data.tracks import track_quality
+from jaxfit.foundation.errors import one_line
 
 if TYPE_CHECKING:
     from jaxfit.data.observations import Observations
     from jaxfit.data.solution import Solution
-    from jaxfit.evaluation.aggregation import Evaluation
-
-__all__ = [
-    "EscapedTable",
-    "breakdown_tables",
-    "counted",
-    "evaluation_tables",
-    "right_aligned",
-    "show",
-    "show_facts",
-    "track_table",
-]
+    from jaxfit.evaluation.evaluate import Evaluation
 
 _COLUMNS_3D = {
     "mpjpe": "MPJPE",
@@ -73,7 +62,7 @@ def right_aligned(*columns: str, **options: Any) -> Table:
 
 def evaluation_tables(result: Evaluation) -> list[Table]:
     """Return the table of metrics in 2D, and the table of metrics in 3D if there are any; one row per track."""
-    from jaxfit.evaluation.aggregation import COLUMNS
+    from jaxfit.evaluation.evaluate import COLUMNS
 
     def frames(row: dict[str, float]) -> str:
         return f"{row['frames']:.0f}"
@@ -109,7 +98,7 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
 
 def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -> list[Table]:
     """Return tables of metrics with one row per behaviour or per keypoint."""
-    from jaxfit.evaluation.aggregation import COLUMNS, COLUMNS_KEYPOINT
+    from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_KEYPOINT
 
     if by == "keypoint":
         table = right_aligned("keypoint", "frames", *COLUMNS_KEYPOINT)

@@ -1,24 +1,26 @@
-"""Command that trains networks: the built-in networks again, or networks for the labels of a user."""
+"""`train`, `calibrate`."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxfit.cli.tables import counted, right_aligned, show
-from jaxfit.errors import InputError
-from jaxfit.extras import require_extra
-from jaxfit.progress import terminal
-from jaxfit.storage.files import check_new_file
+from jaxfit.cli.observations import image_size, keypoint_map
+from jaxfit.cli.tables import EscapedTable, counted, right_aligned, show, show_facts
+from jaxfit.config.yaml_file import rounded
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.extras import require_extra
+from jaxfit.foundation.files import check_new_file
+from jaxfit.foundation.progress import terminal
 
 if TYPE_CHECKING:
-    from jaxfit.training.fine_tuning.fine_tune import FineTuned
-    from jaxfit.training.fine_tuning.label_checks import LeftOut
-
-__all__ = ["train"]
+    from jaxfit.learning.networks.fine_tune import FineTuned
+    from jaxfit.learning.networks.label_checks import LeftOut
 
 BUILTIN_SCENES, LABEL_SCENES = 160, 20
 """Default number of simulated scenes of a training from the beginning, and of a training on labels."""
@@ -56,7 +58,7 @@ def train(options: argparse.Namespace) -> None:
 
 
 def _train_on_simulation(options: argparse.Namespace) -> None:
-    from jaxfit.training.train import SCHEDULES, train_network
+    from jaxfit.learning.networks.train import SCHEDULES, train_network
 
     start = time.perf_counter()
     steps = SCHEDULES[options.network].steps if options.steps is None else options.steps
@@ -70,9 +72,9 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
 
 
 def _train_on_labels(options: argparse.Namespace) -> None:
-    from jaxfit.training.fine_tuning.data import LabelFiles
-    from jaxfit.training.fine_tuning.filming import missing_scenes
-    from jaxfit.training.fine_tuning.fine_tune import LABELLED_SHARE, Settings, default_schedule, fine_tune
+    from jaxfit.learning.networks.filming import missing_scenes
+    from jaxfit.learning.networks.fine_tune import LABELLED_SHARE, Settings, default_schedule, fine_tune
+    from jaxfit.learning.networks.label_data import LabelFiles
 
     start = time.perf_counter()
     files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)
@@ -138,3 +140,46 @@ def _written(result: FineTuned) -> str:
         )
     scale = "its own scale" if result.chosen == "base" else "the scale of the labels"
     return f"Its weights are written without training, with {scale}."
+
+
+def calibrate(options: argparse.Namespace) -> None:
+    """Estimate the errors of detections from labelled frames, and write a config that holds them."""
+    from jaxfit.data.formats.recognise import read_observations
+    from jaxfit.data.keypoint_names import map_keypoints
+    from jaxfit.evaluation.detection_noise import estimate_noise, facts, noise_yaml
+    from jaxfit.evaluation.truth import read_truth
+    from jaxfit.foundation.files import check_new_file, check_writable, write_whole
+
+    check_new_file(options.out, options.overwrite)
+    check_writable(options.out)
+    truth = read_truth(options.truth, options.video, image_size(options))
+    detected = read_observations(options.detections, options.video, image_size(options))
+    true_names, names = truth.observations.keypoint_names, detected.keypoint_names
+    if true_names != names:
+        mapped = keypoint_map(true_names, options.truth, names, options.names)
+        truth = replace(truth, observations=map_keypoints(truth.observations, mapped, names))
+    noise = estimate_noise(detected, truth, options.detections, terminal)
+    check_new_file(options.out, options.overwrite)  # again, because the estimate may have taken minutes
+    write_whole(options.out, noise_yaml(noise, options.detections, options.truth).encode())
+    table = right_aligned("setting", "value", "from", "to")
+    table.columns[0].justify = "left"
+    for path, value in noise.settings.items():
+        ends = ("–" if math.isnan(end) else rounded(end) for end in noise.intervals[path])
+        table.add_row(path, rounded(value), *ends)
+    table.caption = (
+        "in pixels of a 256-pixel crop; from, to: 95 % bootstrap interval over birds (none for a single bird)"
+    )
+    show(table)
+    show_facts(facts(noise))
+    scales = EscapedTable()
+    scales.add_column("keypoint")
+    scales.add_column("scale", justify="right")
+    for name, factor in noise.factors.items():
+        scales.add_row(name, f"{factor:.2f}")
+    scales.caption = "scale: relative to the scale of all keypoints"
+    show(scales)
+    if noise.outline is None:
+        show("the labels hold no masks of the matched birds: the config leaves out mask and grow_masks_px")
+    counts = (counted(noise.frames, "frame"), counted(noise.birds, "bird"), counted(noise.keypoints, "keypoint"))
+    show(f"{', '.join(counts)}, {counted(noise.masks, 'mask')} → {options.out}")
+    show(f"next: jaxfit fit {options.detections} --config {options.out} --out result")

@@ -1,4 +1,4 @@
-"""Settings of a fit: crops, initial poses, stages, terms and batches."""
+"""Keys of a fit: crops, initial poses, stages, terms, batches."""
 
 from __future__ import annotations
 
@@ -7,22 +7,67 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
-from jaxfit import limits
-from jaxfit.config.checks import is_number, require, require_positive, require_within
-from jaxfit.config.term_checks import check_terms, require_term, term_settings
+from jaxfit.config.checks import (
+    ConfigKeyError,
+    is_number,
+    known_names,
+    require,
+    require_positive,
+    require_within,
+    shown,
+)
 from jaxfit.config.yaml_file import read_config, shipped_comment, shipped_configs
-from jaxfit.objective.registry import find_term
+from jaxfit.foundation import limits
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import CONFIG_NUMBER
+from jaxfit.objective.registry import Term, find_term, known_terms
 
-__all__ = [
-    "CropConfig",
-    "FitConfig",
-    "InitialiseConfig",
-    "ShippedConfig",
-    "StageConfig",
-    "describe_fit_configs",
-    "load_config",
-    "shipped_fit_configs",
-]
+
+def check_terms(key: str, terms: Mapping[str, Any]) -> None:
+    """Check a mapping of term names to weights, or to weights and settings.
+
+    Args:
+        key: the config key of the mapping, for messages.
+        terms: term name → weight, or → `{weight: …, setting: …}`.
+
+    Raises:
+        ConfigKeyError: an unknown term or setting, or a value that is not a number in the allowed range.
+    """
+    for name, value in terms.items():
+        term = require_term(f"{key}.{name}", name)
+        known = ("weight", *term.settings)
+        for setting, number in (value if isinstance(value, dict) else {"weight": value}).items():
+            path = f"{key}.{name}.{setting}"
+            if setting not in known:
+                raise ConfigKeyError(path, "is not a setting of this term", known_names(setting, known))
+            expected = f"expected a number from 0 to {CONFIG_NUMBER:g}"
+            require(is_number(number), path, f"is {shown(number)}", expected)
+            require(setting not in term.positive or number > 0, path, f"is {number!r}", "expected a number above 0")
+
+
+def require_term(key: str, name: str) -> Term:
+    """Return the term of a name.
+
+    Args:
+        key: the config key that holds the name, for messages.
+        name: a registered term, or `package.module:function`.
+
+    Raises:
+        ConfigKeyError: there is no such term, or the term cannot be imported.
+    """
+    try:
+        return find_term(name)
+    except KeyError:
+        remedy = f"{known_names(name, known_terms())}; or package.module:function"
+        raise ConfigKeyError(key, f"names an unknown term {name!r}", remedy) from None
+    except InputError as error:
+        raise ConfigKeyError(key, f"names a {error.source}, which {error.problem}", error.remedy) from error
+
+
+def term_settings(value: Any) -> dict[str, float]:
+    """Return the settings that a config gives for a term; a plain number is the term's weight."""
+    return {key: float(number) for key, number in (value if isinstance(value, dict) else {"weight": value}).items()}
+
 
 PARAMETERS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
 """Parameters of a pose that a stage can optimise."""

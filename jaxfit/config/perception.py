@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from jaxfit import limits
 from jaxfit.config.checks import require, require_fraction, require_within
-
-__all__ = ["FramesConfig", "KeypointsConfig", "SegmenterConfig", "TrackConfig", "TrackerConfig"]
+from jaxfit.foundation import limits
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,8 @@ from jaxfit.config.checks import require_within
 from jaxfit.config.fit import FitConfig, shipped_fit_configs
 from jaxfit.config.perception import TrackConfig
 from jaxfit.config.yaml_file import OWN_FILE, read_config
-from jaxfit.errors import InputError
-from jaxfit.limits import IMAGE_SIDE_PX
-
-__all__ = ["OverlayConfig", "ReconstructConfig", "load_reconstruct_config"]
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import IMAGE_SIDE_PX
 
 
 @dataclass(frozen=True)

@@ -1,28 +1,278 @@
-"""Configs as YAML files: a file holds only the values that differ from its base."""
+"""Config files and command-line values as YAML, with bases and one-line errors.
+
+The text is read event by event. Aliases and merges are counted with all values that they stand for before any copy is
+made, so that a short text cannot demand much memory or time.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import textwrap
 import typing
+import unicodedata
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn, TypeAlias
 
+import numpy as np
 import yaml
 
-from jaxfit.config.build import Config, build_config, plain_config
-from jaxfit.config.checks import ConfigKeyError, first_key
-from jaxfit.config.help import field_help
-from jaxfit.config.messages import shown
-from jaxfit.config.yaml_values import Lines, YamlMapping, line_of, read_yaml
-from jaxfit.errors import InputError
-from jaxfit.limits import CONFIG_BASES, CONFIG_BYTES
-from jaxfit.storage.reading import read_text
+from jaxfit.config.build import Config, build_config, field_help, plain_config
+from jaxfit.config.checks import ConfigKeyError, first_key, shown
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import (
+    CONFIG_BASES,
+    CONFIG_BYTES,
+    CONFIG_DIGITS,
+    CONFIG_KEY_CHARACTERS,
+    CONFIG_LEVELS,
+    CONFIG_VALUES,
+)
+from jaxfit.foundation.reading import read_text
 
-__all__ = ["OWN_FILE", "config_to_yaml", "documented_yaml", "read_config", "shipped_comment", "shipped_configs"]
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_TAG = "tag:yaml.org,2002:"
+_RESOLVER, _CONSTRUCTOR = yaml.resolver.Resolver(), yaml.constructor.SafeConstructor()
+_CONSTRUCTED = {
+    f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
+    f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
+    f"{_TAG}int": _CONSTRUCTOR.construct_yaml_int,
+    f"{_TAG}float": _CONSTRUCTOR.construct_yaml_float,
+}
+"""Tag of a plain value → the function that constructs the value; all other values are text, dates too."""
+_WORDS = {dict: "a mapping", list: "a list", bool: "true or false", type(None): "null"}
+_NOT_TEXT = re.compile("[^\t\n\r\x20-\x7e\x85\xa0-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+Lines: TypeAlias = "dict[str, tuple[int, Lines]]"
+"""Key, or the number of a list item as text → its line, counted from 1, and the lines inside its value."""
+
+
+class YamlMapping(NamedTuple):
+    """The content of a YAML text."""
+
+    values: dict[str, Any]
+    """Dicts with text as keys, lists, text, numbers, true, false and None; no two of them share a dict or list."""
+    lines: Lines
+
+
+class _Merge(str):
+    """The key `<<`, which stands for the keys of another mapping."""
+
+
+@dataclass
+class _Part:
+    """A list or a mapping that is being read."""
+
+    value: Any
+    line: int
+    anchor: str | None
+    size: int = 1
+    """Number of values, those of aliases included."""
+    height: int = 1
+    """Number of levels."""
+    key: str | None = None
+    """The key whose value comes next."""
+    lines: Lines = dataclasses.field(default_factory=dict)
+    merged: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    """Mappings of the key `<<`."""
+
+
+def read_yaml(text: str, source: object) -> YamlMapping:
+    """Return the mapping that a YAML text holds.
+
+    Args:
+        text: one YAML document without tags.
+        source: the file, for messages.
+
+    Raises:
+        InputError: the text is not valid YAML or not a mapping, holds a tag, a key that is not text or that stands
+            twice, a control character, or exceeds a limit of `jaxfit.foundation.limits`; the message names the line.
+    """
+    if found := _NOT_TEXT.search(text):
+        line, name = text.count("\n", 0, found.start()) + 1, _character_name(found[0])
+        raise InputError(source, f"line {line} holds {name}", "remove it, or write the file again")
+    return _Reader(source).read(text)
+
+
+class _Reader:
+    def __init__(self, source: object):
+        self._source = source
+        self._open: list[_Part] = []
+        self._anchors: dict[str, tuple[Any, int, int]] = {}  # anchor → value, size, height
+        self._size = 0
+        self._content, self._lines = None, {}
+
+    def read(self, text: str) -> YamlMapping:
+        documents = 0
+        for event in self._events(text):
+            line = event.start_mark.line + 1
+            if isinstance(event, yaml.DocumentStartEvent):
+                documents += 1
+                if documents > 1:
+                    self._fail(line, "begins a second document", "keep one document per file")
+            elif isinstance(event, yaml.AliasEvent):
+                self._alias(event.anchor, line)
+            elif isinstance(event, yaml.NodeEvent):
+                self._node(event, line)
+            elif isinstance(event, yaml.CollectionEndEvent):
+                part = self._open.pop()
+                self._complete(self._finished(part), part.size, part.height, part.anchor, part.line, part.lines)
+        if not isinstance(self._content, dict):
+            raise InputError(self._source, "holds no mapping of keys to values", "write `key: value` lines")
+        return YamlMapping(self._content, self._lines)
+
+    def _events(self, text: str) -> Iterator[Any]:
+        try:
+            yield from yaml.parse(text, Loader=_LOADER)
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+            where = f"line {mark.line + 1} " if mark else ""
+            problem = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
+            raise InputError(self._source, f"{where}is not valid YAML: {problem}") from None
+        except (ValueError, OverflowError):  # of PyYAML without its compiled part
+            raise InputError(self._source, "is not valid YAML: an escape names no character") from None
+
+    def _node(self, event: Any, line: int) -> None:
+        if event.tag is not None:
+            tag = event.tag.replace(_TAG, "!!")
+            self._fail(line, f"holds the tag `{tag}`", "remove the tag; quotes make a value text")
+        if not isinstance(event, yaml.ScalarEvent):
+            part = _Part({} if isinstance(event, yaml.MappingStartEvent) else [], line, event.anchor)
+            if len(self._open) >= CONFIG_LEVELS:
+                self._fail(line, f"is nested more than {CONFIG_LEVELS} levels deep", "use fewer levels")
+            if self._open and self._is_key():
+                self._fail_key(line, part.value)
+            self._count(1, line)
+            self._open.append(part)
+            return
+        self._count(1, line)
+        value = self._scalar(event.value, event.implicit[0], line)
+        self._complete(value, 1, 0, event.anchor, line)
+
+    def _alias(self, anchor: str, line: int) -> None:
+        if anchor not in self._anchors:
+            self._fail(line, f"uses `*{anchor}`, which no earlier value defines", f"write `&{anchor}` before a value")
+        value, size, height = self._anchors[anchor]
+        if len(self._open) + height > CONFIG_LEVELS:
+            self._fail(line, f"is nested more than {CONFIG_LEVELS} levels deep", "use fewer levels")
+        self._count(size, line)
+        self._complete(_copied(value), size, height, None, line)
+
+    def _complete(
+        self, value: Any, size: int, height: int, anchor: str | None, line: int, lines: Lines | None = None
+    ) -> None:
+        """Put a value that is read to its end into the list or mapping that holds it."""
+        if anchor is not None:
+            self._anchors[anchor] = value, size, height
+        if not self._open:
+            self._content, self._lines = value, lines or {}
+            return
+        part = self._open[-1]
+        part.size, part.height = part.size + size, max(part.height, height + 1)
+        if isinstance(part.value, list):
+            part.lines[str(len(part.value))] = line, lines or {}
+            part.value.append(value)
+        elif part.key is None:
+            self._check_key(value, line)
+            part.key, part.lines[value] = value, (line, {})
+        else:
+            part.lines[part.key] = part.lines[part.key][0], lines or {}
+            if isinstance(part.key, _Merge):
+                part.merged = self._merged(value, line)
+            else:
+                part.value[part.key] = value
+            part.key = None
+
+    def _check_key(self, key: Any, line: int) -> None:
+        if not isinstance(key, str):
+            self._fail_key(line, key)
+        if len(key) > CONFIG_KEY_CHARACTERS:
+            self._fail(line, f"holds a key of {len(key)} characters", f"use at most {CONFIG_KEY_CHARACTERS}")
+        if key in self._open[-1].lines:
+            first = self._open[-1].lines[key][0]
+            self._fail(line, f"holds the key `{key}`, which line {first} holds too", "remove one of the two")
+
+    def _finished(self, part: _Part) -> Any:
+        """Return the value of a list or mapping; a key of the mapping itself replaces a key of `<<`."""
+        if not part.merged:
+            return part.value
+        values: dict[str, Any] = {}
+        for below in reversed(part.merged):
+            values |= below
+        return values | part.value
+
+    def _merged(self, value: Any, line: int) -> list[dict[str, Any]]:
+        mappings = value if isinstance(value, list) else [value]
+        if not all(isinstance(each, dict) for each in mappings):
+            self._fail(line, "gives `<<` a value that is not a mapping", "write `<<: *anchor` of a mapping")
+        return mappings
+
+    def _scalar(self, text: str, implicit: bool, line: int) -> Any:
+        if found := _NOT_TEXT.search(text):  # an escape in double quotes
+            self._fail(line, f"holds {_character_name(found[0])}", "remove it")
+        tag = _RESOLVER.resolve(yaml.ScalarNode, text, (True, False)) if implicit else None
+        if tag == f"{_TAG}merge":
+            return _Merge(text) if self._open and self._is_key() else text
+        if tag not in _CONSTRUCTED:
+            return text
+        if len(text) > CONFIG_DIGITS:
+            self._fail(line, f"holds a number of {len(text)} digits", f"write at most {CONFIG_DIGITS} digits")
+        try:
+            value = _CONSTRUCTED[tag](yaml.ScalarNode(tag, text))
+        except ValueError:  # such as `0x_`
+            self._fail(line, f"holds {text!r}, which is no number", "write a number, or quotes around a text")
+        if isinstance(value, int) and abs(value) >= 2**63:
+            self._fail(line, f"holds {text!r}, which exceeds 64 bits", "write a smaller number")
+        return value
+
+    def _is_key(self) -> bool:
+        part = self._open[-1]
+        return isinstance(part.value, dict) and part.key is None
+
+    def _count(self, size: int, line: int) -> None:
+        self._size += size
+        if self._size > CONFIG_VALUES:
+            problem = f"is value number {CONFIG_VALUES + 1:,}, values of aliases included"
+            self._fail(line, problem, f"write at most {CONFIG_VALUES:,} values")
+
+    def _fail_key(self, line: int, value: Any) -> NoReturn:
+        kind = _WORDS.get(type(value), "a number")
+        self._fail(line, f"holds a key that is {kind}, not text", "write the key in quotes")
+
+    def _fail(self, line: int, problem: str, remedy: str) -> NoReturn:
+        raise InputError(self._source, f"line {line} {problem}", remedy)
+
+
+def line_of(lines: Lines, path: str) -> int | None:
+    """Return the line of the value at a path, or of the nearest enclosing value; None where the text has neither."""
+    line, rest = None, re.sub(r"\[(\d+)\]", r".\1", path)
+    while rest:
+        key, rest = first_key(lines, rest)
+        if key not in lines:
+            break
+        line, lines = lines[key]
+    return line
+
+
+def rounded(value: float, digits: int = 3) -> str:
+    """Return a number with some significant digits and without an exponent, because YAML reads 1e-05 as text."""
+    return np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _copied(item) for key, item in value.items()}
+    return [_copied(item) for item in value] if isinstance(value, list) else value
+
+
+def _character_name(character: str) -> str:
+    return f"the character U+{ord(character):04X} ({unicodedata.name(character, 'a control character')})"
+
 
 OWN_FILE = {"own_file": True}
 """Metadata of a dataclass field that is a config with its own file: its value may be a name, or hold a `base`."""

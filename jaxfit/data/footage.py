@@ -15,9 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfit.data.formats.fields import Field
-from jaxfit.errors import InputError
-
-__all__ = ["FootageIdentity", "footage_of", "read_footage"]
+from jaxfit.foundation.errors import InputError
 
 SIDE = 32
 """Width and height of the small picture of the first frame."""

@@ -14,9 +14,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-
-__all__ = ["NameMap", "checked_map", "map_keypoints", "opposite_keypoints", "propose_names"]
+from jaxfit.foundation.errors import InputError
 
 _SYNONYMS = {
     "beak": "bill",

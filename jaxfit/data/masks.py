@@ -1,13 +1,16 @@
-"""Masks as run lengths, the format of pycocotools and of COCO files."""
+"""Masks as run lengths that are read when they are needed; boxes.
+
+Boxes in an image: tight boxes of keypoints, and intersection over union. A box is x and y of the upper left corner,
+width and height, in image pixels.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, cast
 
 import numpy as np
-
-__all__ = ["box_of_mask", "decode_mask", "encode_mask", "encode_patch"]
+from jaxtyping import Bool, Float, Int
 
 
 def box_of_mask(mask: np.ndarray) -> tuple[int, int, int, int] | None:
@@ -79,3 +82,101 @@ def encode_patch(mask: Any, x0: int, y0: int, width: int, height: int) -> dict[s
         runs = runs[:-1]
     counts = {"size": [height, width], "counts": runs.tolist()}
     return cast(Any, coco_mask.frPyObjects(cast(Any, counts), height, width))
+
+
+class LazyMasks(Mapping[tuple[int, int], Mapping[str, Any]]):
+    """A mapping as `Observations.masks`, whose values are read at every access.
+
+    Args:
+        cells: positions (n, t) of the masks, each once.
+        read: returns the run lengths of a mask from its number in `cells`. Masks with near numbers are read together
+            at the lowest cost, so iteration follows the numbers.
+        numbers: numbers that `read` receives; None counts from 0.
+    """
+
+    def __init__(
+        self,
+        cells: Int[np.ndarray, "M 2"],
+        read: Callable[[int], Mapping[str, Any]],
+        numbers: Int[np.ndarray, "M"] | None = None,
+    ):
+        self._cells, self._read = cells.astype(np.int64).reshape(-1, 2), read
+        self._numbers = np.arange(len(cells)) if numbers is None else numbers
+        self._columns = int(self._cells[:, 1].max(initial=0)) + 1
+        keys = self._keys(self._cells)
+        self._order = np.argsort(keys)
+        self._sorted = keys[self._order]
+
+    def select(self, rows: Mapping[int, int], columns: Mapping[int, int]) -> LazyMasks:
+        """Return the masks of some tracks and frames, which are not read.
+
+        Args:
+            rows, columns: old position → new position of the tracks and frames that remain.
+        """
+        kept = [i for i, (n, t) in enumerate(self._cells.tolist()) if n in rows and t in columns]
+        cells = np.array([(rows[n], columns[t]) for n, t in self._cells[kept].tolist()], np.int64)
+        return LazyMasks(cells, self._read, self._numbers[kept])
+
+    def __getitem__(self, cell: tuple[int, int]) -> Mapping[str, Any]:
+        return self._read(int(self._numbers[self._find(cell)]))
+
+    def __contains__(self, cell: object) -> bool:
+        try:
+            self._find(cell)
+        except KeyError:
+            return False
+        return True
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        return ((n, t) for n, t in self._cells.tolist())
+
+    def __len__(self) -> int:
+        return len(self._cells)
+
+    def _find(self, cell: Any) -> int:
+        n, t = cell
+        if not 0 <= t < self._columns:
+            raise KeyError(cell)
+        key = n * self._columns + t
+        i = int(np.searchsorted(self._sorted, key))
+        if i == len(self._sorted) or self._sorted[i] != key:
+            raise KeyError(cell)
+        return int(self._order[i])
+
+    def _keys(self, cells: Int[np.ndarray, "M 2"]) -> Int[np.ndarray, "M"]:
+        return cells[:, 0] * self._columns + cells[:, 1]
+
+
+def box_iou(boxes_a_px: Float[np.ndarray, "*#B 4"], boxes_b_px: Float[np.ndarray, "*#B 4"]) -> Float[np.ndarray, "*B"]:
+    """Intersection over union |A ∩ B| / |A ∪ B| of boxes; NaN where a box is NaN or both boxes have no area.
+
+    The leading axes are broadcast: `box_iou(a[:, None], b[None])` compares every box of `a` with every box of `b`.
+
+    Args:
+        boxes_a_px: x, y, width, height; image pixels.
+        boxes_b_px: x, y, width, height; image pixels.
+    """
+    low = np.maximum(boxes_a_px[..., :2], boxes_b_px[..., :2])
+    high = np.minimum(
+        boxes_a_px[..., :2] + boxes_a_px[..., 2:],
+        boxes_b_px[..., :2] + boxes_b_px[..., 2:],
+    )
+    intersection = np.maximum(high - low, 0).prod(-1)
+    union = boxes_a_px[..., 2:].prod(-1) + boxes_b_px[..., 2:].prod(-1) - intersection
+    with np.errstate(invalid="ignore"):
+        return intersection / union
+
+
+def box_of_keypoints(
+    keypoints_px: Float[np.ndarray, "*B K 2"], known: Bool[np.ndarray, "*B K"]
+) -> Float[np.ndarray, "*B 4"]:
+    """The tight boxes of the known keypoints: x, y, width, height; NaN where no keypoint is known.
+
+    Args:
+        keypoints_px: positions (x, y), image pixels.
+        known: whether a keypoint counts.
+    """
+    low = np.where(known[..., None], keypoints_px, np.inf).min(-2)
+    high = np.where(known[..., None], keypoints_px, -np.inf).max(-2)
+    boxes = np.concatenate([low, high - low], axis=-1)
+    return np.where(known.any(-1, keepdims=True), boxes, np.nan)

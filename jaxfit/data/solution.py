@@ -1,4 +1,4 @@
-"""The result of a fit, and the result folder that stores it."""
+"""`Solution`: fitted poses, frames with a second pose, and the result folder."""
 
 from __future__ import annotations
 
@@ -13,18 +13,14 @@ import numpy as np
 from jaxfit.data.footage import FootageIdentity, footage_of
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import check_times
-from jaxfit.errors import InputError
-from jaxfit.limits import IMAGE_SIDE_PX
+from jaxfit.foundation.array_files import load_npz, validate_arrays
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import new_folder, write_whole
+from jaxfit.foundation.limits import IMAGE_SIDE_PX
+from jaxfit.foundation.reading import check_folder, json_text
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
-from jaxfit.model.pose import Pose
-from jaxfit.storage.arrays import validate_arrays
-from jaxfit.storage.files import new_folder, write_whole
-from jaxfit.storage.json_values import json_text
-from jaxfit.storage.npz import load_npz
-from jaxfit.storage.reading import check_folder
-
-__all__ = ["FORMAT_VERSION", "LAYOUT", "Solution", "check_poses", "load_solution", "save_solution", "write_solution"]
+from jaxfit.model.kinematics import Pose
 
 FORMAT_VERSION = 4
 """Version of ``poses.npz``; increased when its arrays change. Version 3 lacks `ambiguity_deg`, version 2 also lacks
@@ -221,7 +217,7 @@ def save_solution(
         solution: the result.
         bird: the model of the fit, stored with the result, since poses have no meaning without their model.
         config_yaml: the config of the fit.
-        summary: metrics, timings, versions; see `jaxfit.storage.json_values.json_values`.
+        summary: metrics, timings, versions; see `jaxfit.foundation.reading.json_values`.
         folder: the folder to write.
         overwrite: replace an older result folder, as soon as the new folder is complete.
 
@@ -294,3 +290,21 @@ def _footage(summary: Path) -> FootageIdentity | None:
     if content is None or not content.has("video"):
         return None
     return footage_of(content["video"])
+
+
+def ambiguous_frames(solution: Solution) -> dict[int, tuple[str, ...]]:
+    """Return track → a text for each range of frames with a second pose (`Solution.ambiguity_deg`)."""
+    assert solution.ambiguity_deg is not None  # `Solution` replaces None
+    texts = {}
+    for n, track in enumerate(solution.track_id.tolist()):
+        angle_deg = np.where(solution.valid[n], solution.ambiguity_deg[n], 0)
+        inside = np.concatenate([[0], angle_deg > 0, [0]])
+        first, after = (np.flatnonzero(np.diff(inside) == sign) for sign in (1, -1))
+        ranges = [
+            f"frames {solution.frame_index[a]} to {solution.frame_index[b - 1]}: a pose that is turned by "
+            f"{np.median(angle_deg[a:b]):.0f}° explains the keypoints almost as well"
+            for a, b in zip(first.tolist(), after.tolist(), strict=True)
+        ]
+        if ranges:
+            texts[track] = tuple(ranges)
+    return texts

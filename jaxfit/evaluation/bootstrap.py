@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.stats import bootstrap
 
-__all__ = ["BirdSums", "Interval", "Ratio", "paired_ratio"]
-
 LEVEL = 0.95
 """Fraction of the resampled values inside an interval."""
 RESAMPLES = 2000

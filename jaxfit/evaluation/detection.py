@@ -1,22 +1,148 @@
-"""Detection metrics that ignore identities: average precision, and the accuracy of keypoints."""
+"""Overlap of detected and true birds, and detection metrics that ignore identities."""
 
 from __future__ import annotations
 
 import contextlib
 import io
-from typing import Any, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
+from scipy.optimize import linear_sum_assignment
 
 from jaxfit.data.observations import Observations
 from jaxfit.evaluation import metrics
-from jaxfit.evaluation.overlap import Overlap, assign, ignored_region, region
+from jaxfit.evaluation.truth import Truth
+from jaxfit.foundation.errors import InputError
 
-__all__ = ["KeypointRow", "average_precision", "keypoint_accuracy", "matches"]
+MATCH_IOU = 0.5
+"""Least IoU at which a detected bird matches a true bird."""
+LEAST_VISIBLE = 0.05
+"""Ground-truth birds with a smaller visible fraction of the usual area of their track are ignored."""
+_REMEDY = "give the annotations of the same video"
+
+
+class Overlap(NamedTuple):
+    """M true and N detected birds in the L frames that the truth and the observations share."""
+
+    true_frame: Int[np.ndarray, "L"]
+    """Positions of the shared frames in the truth."""
+    detected_frame: Int[np.ndarray, "L"]
+    """Positions of the shared frames in the observations."""
+    true: Bool[np.ndarray, "L M"]
+    """True birds that count."""
+    ignored: Bool[np.ndarray, "L M"]
+    """True birds that are present but hardly visible: neither a detection nor a miss of them counts."""
+    detected: Bool[np.ndarray, "L N"]
+    """Detected birds that count."""
+    excused: Bool[np.ndarray, "L N"]
+    """Detected birds that match no true bird but lie on an ignored bird: they are no false alarms and do not count."""
+    iou: Float[np.ndarray, "L M N"]
+    """Intersection over union of the birds that count; 0 elsewhere."""
+    kind: Literal["masks", "boxes"]
+    """The regions of the IoU."""
+
+
+def overlap(detected: Observations, truth: Truth | Observations) -> Overlap:
+    """Compare the detected birds of a video with the true birds.
+
+    The regions are visible masks where both files have masks, else boxes. In a truth with masks, a bird is ignored
+    where its visible mask is smaller than ``LEAST_VISIBLE`` times the median area of the whole masks of its track (of
+    the visible masks where no whole masks are known), or where the mask is missing: hidden birds, slivers at the edge
+    of the image, crowds. A detected bird that matches no counted bird is excused where at least ``MATCH_IOU`` of its
+    area lies on an ignored bird. The region of an ignored bird is its visible mask, or its box where there is no mask
+    and the bird is not known to be hidden.
+
+    Args:
+        detected: observations of N tracks.
+        truth: annotations of M tracks.
+
+    Raises:
+        InputError: no common frame, frames of different sizes, or photographs instead of video.
+
+    Source: ignored birds correspond to the crowds of COCO (Lin et al. 2014, *Microsoft COCO*), which are matched by
+    the intersection over the area of the detection, after all counted birds; and to the distractors of MOT16 (Milan
+    et al. 2016).
+    """
+    truth = Truth.of(truth)
+    seen, source = truth.observations, truth.source
+    for observations, name in ((seen, source), (detected, "the observations")):
+        if observations.own_images:
+            raise InputError(name, "hold several images of one frame: photographs", "give annotations of one video")
+    _, at_truth, at_detected = np.intersect1d(seen.frame_index, detected.frame_index, return_indices=True)
+    if not len(at_truth):
+        raise InputError(source, "shares no frame with the observations", _REMEDY)
+    sizes = seen.image_size_px[at_truth], detected.image_size_px[at_detected]
+    if (sizes[0] != sizes[1]).any():
+        t = int(np.flatnonzero((sizes[0] != sizes[1]).any(1))[0])
+        (w, h), (own_w, own_h) = sizes[0][t], sizes[1][t]
+        problem = f"has frame {seen.frame_index[at_truth[t]]} of {w}×{h} pixels, the observations of {own_w}×{own_h}"
+        raise InputError(source, problem, _REMEDY)
+    masks = bool(seen.masks) and (bool(detected.masks) or not detected.present.any())
+    present, hidden = seen.present[:, at_truth].T, _hidden(seen)[:, at_truth].T
+    true, counted = present & ~hidden, detected.present[:, at_detected].T.copy()
+    excused = np.zeros(counted.shape, bool)
+    iou = np.zeros((len(at_truth), seen.num_tracks, detected.num_tracks))
+    for i, (t, s) in enumerate(zip(at_truth.tolist(), at_detected.tolist(), strict=True)):
+        rows, columns = np.flatnonzero(true[i]).tolist(), np.flatnonzero(counted[i]).tolist()
+        own = [region(detected, n, s, masks) for n in columns]
+        iou[i][np.ix_(rows, columns)] = _iou(own, [region(seen, m, t, masks) for m in rows]).T
+        ignored = [ignored_region(seen, m, t, masks) for m in np.flatnonzero(present[i] & hidden[i]).tolist()]
+        covered = (_iou(own, [rle for rle in ignored if rle is not None], of_own=True) >= MATCH_IOU).any(1)
+        covered = covered & ~np.isin(columns, assign(iou[i])[1])
+        excused[i, np.array(columns, int)[covered]] = True
+    iou = np.where(excused[:, None], 0.0, iou)
+    kind = "masks" if masks else "boxes"
+    return Overlap(at_truth, at_detected, true, present & hidden, counted & ~excused, excused, iou, kind)
+
+
+def assign(
+    similarity: Float[np.ndarray, "M N"], at_least: float = MATCH_IOU
+) -> tuple[Int[np.ndarray, "P"], Int[np.ndarray, "P"]]:
+    """Return one-to-one pairs with the greatest sum of similarities, each at least ``at_least`` (which is above 0)."""
+    close = np.where(similarity >= at_least, similarity, 0.0)
+    rows, columns = linear_sum_assignment(close, maximize=True)
+    matched = close[rows, columns] > 0
+    return rows[matched], columns[matched]
+
+
+def region(observations: Observations, n: int, t: int, masks: bool = True) -> dict[str, Any]:
+    """Return the run lengths of a bird's mask; of its box where there is no mask, or ``masks`` is False."""
+    rle = observations.masks.get((n, t)) if masks else None
+    if rle is None:
+        width, height = observations.image_size(n, t)
+        box = observations.box_px[n, t].astype(np.float64)[None]
+        return cast(Any, coco_mask.frPyObjects(cast(Any, box), height, width))[0]
+    return cast(Any, rle)
+
+
+def ignored_region(truth: Observations, m: int, t: int, masks: bool) -> dict[str, Any] | None:
+    """Return the region in which an ignored bird excuses detections; None where the bird is wholly hidden."""
+    known_hidden = (m, t) not in truth.masks and (m, t) in truth.amodal_masks
+    return None if known_hidden else region(truth, m, t, masks)
+
+
+def _hidden(truth: Observations) -> Bool[np.ndarray, "M T"]:
+    """Return where the visible fraction of a bird is below ``LEAST_VISIBLE``, also where the bird is not annotated."""
+    if not truth.masks:
+        return np.zeros(truth.present.shape, bool)
+    visible, whole = np.zeros(truth.present.shape), np.zeros(truth.present.shape)
+    for at, rle in truth.masks.items():
+        visible[at] = whole[at] = coco_mask.area(cast(Any, rle))
+    for at, rle in truth.amodal_masks.items():
+        whole[at] = coco_mask.area(cast(Any, rle))
+    usual = [np.median(areas[areas > 0]) if areas.any() else np.inf for areas in whole]
+    return visible < LEAST_VISIBLE * np.array(usual)[:, None]
+
+
+def _iou(own: list, others: list, of_own: bool = False) -> Float[np.ndarray, "D G"]:
+    """Return the intersection over the union of regions, or over the area of ``own``."""
+    if not own or not others:
+        return np.zeros((len(own), len(others)))
+    return np.asarray(coco_mask.iou(own, others, [int(of_own)] * len(others)), np.float64)
 
 
 def matches(overlap: Overlap) -> Int[np.ndarray, "P 3"]:

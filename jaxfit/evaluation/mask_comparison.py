@@ -10,15 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxfit.data.formats.rle import foreground_runs
-from jaxfit.data.neighbours import FrameMasks
-from jaxfit.data.observations import Observations
-from jaxfit.data.posed_meshes import PosedBirds
+from jaxfit.data.observations import FrameMasks, Observations
+from jaxfit.data.projection import PosedBirds
 from jaxfit.data.solution import Solution
+from jaxfit.foundation.progress import ProgressTask
 from jaxfit.model.bird import Bird
-from jaxfit.progress import ProgressTask
 from jaxfit.raster.zbuffer import mask_overlap
-
-__all__ = ["MaskComparison", "compare_masks"]
 
 _FRAMES = 64
 """Frames that are posed at once."""

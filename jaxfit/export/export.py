@@ -7,15 +7,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxfit.errors import InputError
-from jaxfit.export.folder import MARKER
-from jaxfit.export.formats import FORMATS, Format
-from jaxfit.export.result import open_result
+from jaxfit.export import FORMATS, Format
+from jaxfit.export.result import MARKER, open_result
 from jaxfit.export.tables import angles_path
-from jaxfit.progress import ProgressTask, silent
-from jaxfit.storage.files import check_new_file, check_replaceable, check_writable
-
-__all__ = ["Export", "export_result"]
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import check_new_file, check_replaceable, check_writable
+from jaxfit.foundation.progress import ProgressTask, silent
 
 
 class Export(NamedTuple):
@@ -46,7 +43,7 @@ def export_result(
 
     Args:
         result: folder of `jaxfit fit` or `jaxfit reconstruct`.
-        to: a name of `jaxfit.export.formats.FORMATS`: `csv`, `parquet`, `movement`, `coco`, `slp`, `dlc`, `glb`, `nwb`.
+        to: a name of `jaxfit.export.FORMATS`: `csv`, `parquet`, `movement`, `coco`, `slp`, `dlc`, `glb`, `nwb`.
         out: the file to write; a folder for `nwb`, and for `glb` without `one_file`.
         tracks: ids of the tracks; None exports all tracks.
         frames: number of the first frame, and number after the last frame; None is an end of the result.

@@ -1,28 +1,98 @@
-"""The result that is exported: chosen tracks and frames, times, units, confidences and quality."""
+"""What every format exports: some tracks and frames of a result, and its folder."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.fields import read_json
-from jaxfit.data.frame_numbers import frame_step
-from jaxfit.data.image_camera import InImage, image_focal_px, in_image
 from jaxfit.data.observations import Observations, check_keypoints
-from jaxfit.data.selection import frame_positions, select_solution, track_positions
-from jaxfit.data.solution import Solution, load_solution
-from jaxfit.data.track_quality import TrackQuality, track_quality
-from jaxfit.errors import InputError
+from jaxfit.data.projection import InImage, image_focal_px, in_image
+from jaxfit.data.solution import LAYOUT, Solution, load_solution
+from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import new_folder, write_whole
+from jaxfit.foundation.reading import json_text
 from jaxfit.model.bird import Bird
 from jaxfit.video.reader import probe_video
 
-__all__ = ["CONFIDENCE", "Exported", "open_result"]
+
+def select_solution(solution: Solution, rows: Int[np.ndarray, "M"], columns: Int[np.ndarray, "L"]) -> Solution:
+    """Return M tracks and L frames of a solution, chosen by their positions.
+
+    The loss of a track stays the loss over all its frames.
+    """
+    arrays = {}
+    for name, (shape, _) in LAYOUT.items():
+        if shape.split()[0] not in ("N", "T"):
+            continue
+        array = getattr(solution, name)
+        if shape.startswith("N"):
+            array = array[rows]
+        if "T" in shape.split():
+            array = array.take(columns, axis=shape.split().index("T"))
+        arrays[name] = array
+    kept = set(arrays["track_id"].tolist())
+    return replace(
+        solution,
+        **arrays,
+        loss={term: values[rows] for term, values in solution.loss.items()},
+        failures={track: texts for track, texts in solution.failures.items() if track in kept},
+        timestamp_s=None if solution.timestamp_s is None else solution.timestamp_s[columns],
+    )
+
+
+def track_positions(solution: Solution, tracks: Sequence[int] | None, source: object) -> Int[np.ndarray, "M"]:
+    """Return the positions of some tracks, in the order of the solution; None means all tracks.
+
+    Raises:
+        InputError: the solution lacks a track, or no track is named.
+    """
+    known = solution.track_id.tolist()
+    if tracks is None:
+        return np.arange(len(known))
+    missing = [track for track in tracks if track not in known]
+    if missing or not tracks:
+        problem = f"has no track {missing[0]}" if missing else "needs at least one track"
+        raise InputError(source, problem, f"its tracks are {_listed(known)}")
+    return np.flatnonzero(np.isin(solution.track_id, list(tracks)))
+
+
+def frame_positions(solution: Solution, frames: tuple[int | None, int | None], source: object) -> Int[np.ndarray, "L"]:
+    """Return the positions of the frames from a first frame to a last frame, which is left out, as in Python.
+
+    Args:
+        solution: the solution.
+        frames: number of the first frame and number after the last frame; None is the first or the last frame of the
+            solution.
+        source: the result, for messages.
+
+    Raises:
+        InputError: the solution has no frames, or lacks a frame at one end of the range.
+    """
+    numbers = solution.frame_index
+    if not len(numbers):
+        raise InputError(source, "has no frames", "give another result")
+    first, last = int(numbers[0]), int(numbers[-1])
+    start, stop = (first if frames[0] is None else frames[0]), (last + 1 if frames[1] is None else frames[1])
+    chosen = np.flatnonzero((numbers >= start) & (numbers < stop))
+    if start < first or stop > last + 1 or not len(chosen):
+        raise InputError(source, f"lacks the frames {start}:{stop}", f"its frames are {first}:{last + 1}")
+    return chosen
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    shown = ", ".join(map(str, numbers[:20]))
+    return f"{shown}, …" if len(numbers) > 20 else shown or "none"
+
 
 CONFIDENCE = (
     "confidence of the detected keypoint that the pose was fitted to, in [0, 1], as the keypoint network gives it; 0 "
@@ -221,3 +291,44 @@ def _rate_of(video: Path, solution: Solution) -> float | None:
         problem = f"is {info.size_px[0]}×{info.size_px[1]}, but the result has images of {sizes[0, 0]}×{sizes[0, 1]}"
         raise InputError(video, problem, "give the video that the result was fitted to")
     return info.fps
+
+
+MARKER = "export.json"
+"""Name of the file that every folder of an export contains."""
+
+
+@contextmanager
+def export_folder(
+    exported: Exported, out: Path, overwrite: bool, names: dict[int, str], further: dict[str, Any]
+) -> Iterator[Path]:
+    """Write the folder of an export, completely or not at all, as a context manager; yields a temporary folder.
+
+    Args:
+        exported: the result.
+        out: the folder.
+        overwrite: replace an earlier export in the folder.
+        names: track → name of its file; a track without a pose has no file.
+        further: further entries of `export.json`; the body may add entries.
+
+    Raises:
+        InputError: the folder holds other files, or cannot be written.
+    """
+    with new_folder(out, overwrite, MARKER) as part:
+        yield part
+        facts = {"source_software": "jaxfit", "unit_of_lengths": exported.unit, "fps": exported.fps}
+        tracks = describe_tracks(exported)
+        for track, name in names.items():
+            tracks[str(track)]["file"] = name
+        write_whole(part / MARKER, json_text(facts | further | {"tracks": tracks}).encode())
+
+
+def describe_tracks(exported: Exported) -> dict[str, dict[str, Any]]:
+    """Return the status, the number of poses, the failures and the quality of every track, for JSON."""
+    s = exported.solution
+    tracks = {}
+    for n, track in enumerate(s.track_id.tolist()):
+        facts: dict[str, Any] = {"status": str(s.status[n]), "poses": int(s.valid[n].sum())}
+        if track in exported.quality:
+            facts["quality"] = exported.quality[track]._asdict()
+        tracks[str(track)] = facts
+    return tracks

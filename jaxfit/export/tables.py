@@ -2,7 +2,7 @@
 
 Both tables have a row for every track and frame. A row without a pose has `fitted` = false and empty values. The last
 part of the name of a column is its unit: `s`, `px` (image pixels), `m` or `unit` (model units), `rad`. Positions in
-space are those of a bird of the model's size in the camera frame of the image (`jaxfit.data.image_camera`).
+space are those of a bird of the model's size in the camera frame of the image (`jaxfit.data.projection`).
 """
 
 from __future__ import annotations
@@ -16,12 +16,10 @@ from typing import Any
 import numpy as np
 
 from jaxfit.export.result import CONFIDENCE, Exported
-from jaxfit.extras import require_package
-from jaxfit.progress import ProgressTask
-from jaxfit.storage.files import write_whole
-from jaxfit.storage.json_values import json_text
-
-__all__ = ["angles_path", "write_csv", "write_parquet"]
+from jaxfit.foundation.extras import require_package
+from jaxfit.foundation.files import write_whole
+from jaxfit.foundation.progress import ProgressTask
+from jaxfit.foundation.reading import json_text
 
 Columns = dict[str, np.ndarray]
 """Name → values of all rows; NaN and None are empty cells."""

@@ -1,4 +1,15 @@
-"""Run all stages of a fit on a batch of problems."""
+"""All stages of a batch of problems, in tiles of a fixed shape; hypotheses and failures.
+
+Tiles: a batch is computed in parts of a fixed shape, so that the result of a problem does not depend on the batch. The
+compiler fuses and orders the operations of a program by the shapes of its arrays. Programs for different numbers of
+problems therefore round differently. The steps of Adam do not become smaller, so a difference of one rounding grows to
+tenths of a pixel within some hundred steps. The shape of a tile depends only on the length of the windows, so all
+problems run through one compiled program.
+
+Frames that a stage leaves far from their keypoints take the pose of a near frame. Where the motion terms have heavy
+tails, a pose that jumps away for a few frames and returns costs little. Such frames may stay in a wrong local minimum.
+The next stage continues from the poses of this module.
+"""
 
 from __future__ import annotations
 
@@ -15,17 +26,103 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.diagnose import name_failures
-from jaxfit.fitting.near_frames import take_near_poses
-from jaxfit.fitting.problem import Hyperparameters, Problem, Program
-from jaxfit.fitting.solve import Report, StageState, advance, begin, report
-from jaxfit.fitting.stages import FitModel, needs_mask, stage_hyperparameters, stage_program
-from jaxfit.fitting.tiles import join_tiles, take_tile, tile_rows, tile_size
+from jaxfit.fitting.solve import (
+    FitModel,
+    Hyperparameters,
+    Problem,
+    Program,
+    Report,
+    StageState,
+    advance,
+    begin,
+    needs_mask,
+    report,
+    stage_hyperparameters,
+    stage_program,
+)
+from jaxfit.foundation.progress import ReportProgress
 from jaxfit.model.bird import Bird
-from jaxfit.model.pose import Pose
+from jaxfit.model.kinematics import Pose
 from jaxfit.objective.posed_window import Targets
-from jaxfit.progress import ReportProgress
 
-__all__ = ["Batch", "Fitted", "bytes_per_frame", "fit_batch", "frames_per_batch"]
+FRAMES_PER_TILE = 16
+"""Frames in a tile of short windows. Larger tiles are not faster, and a single short window fills its tile up."""
+LEAST_PROBLEMS_PER_TILE = 2
+"""A tile of a single long window is slow: the compiler then computes the joint transforms several times."""
+
+
+def tile_size(frames: int) -> int:
+    """Return the number of problems in a tile, for windows of `frames` frames."""
+    return max(FRAMES_PER_TILE // frames, LEAST_PROBLEMS_PER_TILE)
+
+
+def tile_rows(count: int, size: int) -> list[Int[np.ndarray, "G"]]:
+    """Return the rows of each tile of `size` of `count` rows.
+
+    Rows that the last tile lacks are −1: the tile is filled with problems whose results are discarded.
+    """
+    rows = np.full(-(-count // size) * size, -1)
+    rows[:count] = np.arange(count)
+    return list(rows.reshape(-1, size))
+
+
+def join_tiles(tiles: Sequence[Any], count: int) -> Any:
+    """Return the first `count` rows of some tiles (pytrees of arrays with a leading axis) as NumPy arrays."""
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(each) for each in x])[:count], *tiles)
+
+
+def take_tile(tree: Any, rows: Int[np.ndarray, "G"]) -> Any:
+    """Return some rows of a pytree of arrays as JAX arrays; −1 is the last row."""
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), tree)
+
+
+OFFSETS = (-1, 1, -2, 2, -4, 4, -8, 8)
+"""Distances of the near frames, in frames."""
+FAR_PX = 6.0
+"""Frames with a smaller keypoint error keep their pose, in pixels of a 256-pixel crop."""
+OUTLIER_PX = 32.0
+"""A keypoint has at most this error, so that a few outliers do not decide."""
+RATIO = 0.7
+"""The keypoint error must fall below this multiple of the error before."""
+
+
+def take_near_poses(program: Program, problems: Problem, pose: Pose) -> Pose:
+    """Return the poses after a stage, with the poses of near frames where the keypoints are much closer to them.
+
+    The keypoint error of a frame is the mean distance of the detected keypoints, weighted by their confidence. Only
+    frames with the bird give and take poses. The constants were chosen on simulated scenes (docs/configs.md).
+
+    Args:
+        program: the program of the stage.
+        problems: B problems of the stage, with windows of T frames.
+        pose: their poses after the stage.
+    """
+    present = np.asarray(problems.targets.present)
+    frames = np.broadcast_to(np.arange(present.shape[1]), present.shape)
+    source, before = frames, _keypoint_error(program, problems, pose)
+    limit = np.where(before > FAR_PX, RATIO * before, 0.0)
+    for offset in OFFSETS:
+        near = np.clip(frames + offset, 0, frames.shape[1] - 1)
+        error = _keypoint_error(program, problems, _poses_at(pose, near))
+        better = present & np.take_along_axis(present, near, axis=1) & (error < limit)
+        source, limit = np.where(better, near, source), np.where(better, error, limit)
+    return _poses_at(pose, source) if (source != frames).any() else pose
+
+
+def _poses_at(pose: Pose, source: Int[np.ndarray, "B T"]) -> Pose:
+    """Return poses whose frame t has the pose of frame `source[..., t]`; sizes and shapes do not change."""
+    rows = np.arange(len(source))[:, None]
+    changed = {name: getattr(pose, name)[rows, source] for name in ("global_orient", "body_pose", "transl")}
+    return replace(pose, **changed)
+
+
+def _keypoint_error(program: Program, problems: Problem, pose: Pose) -> Float[np.ndarray, "B T"]:
+    """Return the mean distance of the detected keypoints in crop pixels; NaN without a keypoint."""
+    weight = problems.targets.confidence * problems.hyperparameters.keypoints_on[:, None]
+    shift_px = report(program, problems, pose).keypoints_px - problems.targets.keypoints_px
+    distance_px = jnp.minimum(jnp.linalg.norm(shift_px, axis=-1), OUTLIER_PX)
+    return np.asarray((weight * distance_px).sum(-1) / weight.sum(-1))
+
 
 LIKELIHOOD_RATIO = 20.0
 """A hypothesis is reported if the best hypothesis is less than this many times as likely."""

@@ -8,12 +8,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-from jaxfit.limits import CROP_IMAGE_SIDES, IMAGE_SIDE_PX
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import CROP_IMAGE_SIDES, IMAGE_SIDE_PX
 from jaxfit.model.camera import CROP_PX
-from jaxfit.raster.silhouette import UNKNOWN
-
-__all__ = ["crop_squares", "cut_mask", "grow_mask", "mark_unknown"]
+from jaxfit.raster.silhouette_reference import UNKNOWN
 
 LEAST_SIZE_PX = 16.0
 """Smallest side of a crop, in image pixels."""

@@ -12,15 +12,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from jaxfit.config.fit import FitConfig
-from jaxfit.errors import InputError
-from jaxfit.fitting.problem import Problem, Program, problem_window
-from jaxfit.fitting.stages import FitModel, needs_mask, stage_hyperparameters, stage_program
-from jaxfit.model.pose import Pose, rest_pose
+from jaxfit.fitting.solve import (
+    FitModel,
+    Problem,
+    Program,
+    needs_mask,
+    problem_window,
+    stage_hyperparameters,
+    stage_program,
+)
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.kinematics import Pose, rest_pose
 from jaxfit.objective.objective import evaluate_curvature, weighted_sum
 from jaxfit.objective.posed_window import Targets
 from jaxfit.objective.registry import Term
-
-__all__ = ["check_terms", "name_failures"]
 
 
 def check_terms(config: FitConfig, model: FitModel) -> None:

@@ -1,4 +1,4 @@
-"""The whole fit, from observations and a bird model to poses.
+"""`fit`: from observations to a solution.
 
 The data passes each step once: observations → windows → targets and initial poses → stages → solution.
 """
@@ -15,23 +15,56 @@ from jaxtyping import Int
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
-from jaxfit.errors import InputError
-from jaxfit.fitting.collect import FittedWindow, collect_windows
+from jaxfit.fitting.batch import bytes_per_frame
+from jaxfit.fitting.collect import FittedWindow, blend_seams, collect_windows
 from jaxfit.fitting.diagnose import check_terms
-from jaxfit.fitting.distant import distant_birds, report_distant_birds
-from jaxfit.fitting.initial_pose_file import InitialPoses
-from jaxfit.fitting.memory import check_fit_memory
-from jaxfit.fitting.scheduling import fit_batches, in_batches, steps_per_batch
-from jaxfit.fitting.seams import blend_seams
-from jaxfit.fitting.stages import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
+from jaxfit.fitting.initial_poses import InitialPoses
+from jaxfit.fitting.solve import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.fitting.tasks import FitShared, Run
-from jaxfit.fitting.windows import Windows, cut_windows, windows_key
+from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
+from jaxfit.fitting.windows import Windows, cut_windows, distant_birds, report_distant_birds, windows_key
+from jaxfit.foundation.array_files import check_memory, observations_bytes
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import TABLE_GB, WINDOW_GB
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.foundation.workers import Cluster
 from jaxfit.model.bird import Bird
-from jaxfit.progress import ProgressTask, silent
-from jaxfit.workers.cluster import Cluster
 
-__all__ = ["check_observations", "checked_model", "fit", "fit_runs", "windows_of"]
+
+def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[FitConfig], source: object) -> None:
+    """Check that the tables of a fit, and one window, fit into memory.
+
+    Args:
+        observations: N tracks over T frames.
+        bird: the model.
+        configs: configs that share one compiled program.
+        source: name of the observations in messages.
+
+    Raises:
+        InputError: the tables of poses, or one window, need more memory than `limits.TABLE_GB` or `limits.WINDOW_GB`,
+            and more than `memory_gb`.
+    """
+    config, N, T = configs[0], observations.num_tracks, observations.num_frames
+    bones, K = bird.num_joints - 1, bird.num_keypoints
+    # numbers of a pose, of its keypoints and of its crop; the validation of a solution copies them
+    pose_bytes = 2 * 4 * (4 * bones + 5 * K + bird.num_shapes + 16)
+    held = 2 * N * T * (26 + 13 * K)  # the observations as read, and with the keypoints in the order of the model
+    needed = observations_bytes(N, T, K) + held + N * T * len(configs) * pose_bytes
+    runs = f" in {len(configs)} runs" if len(configs) > 1 else ""
+    remedy = "split the file into parts with fewer frames or tracks, or raise `memory_gb` in the config"
+    tables = f"the poses of {N:,} tracks over {T:,} frames{runs}"
+    check_memory(source, tables, needed, remedy, max(TABLE_GB, config.memory_gb))
+
+    search = config.initialise
+    orientations = search.turns * search.directions if search.method == "so3" else search.turns
+    candidates = min(search.candidates, orientations)
+    # the search compares every orientation with the keypoints, and every candidate with those of the next frame
+    search_bytes = 450 * orientations + 12 * candidates**2
+    needed = config.window * (search.hypotheses * bytes_per_frame(bird, config) + search_bytes)
+    window = f"the arrays of a window of {config.window:,} frames"
+    remedy = "lower `window`, `crop.size_px` or the numbers of `initialise`, or raise `memory_gb`"
+    check_memory("config", window, needed, remedy, max(WINDOW_GB, config.memory_gb))
+
 
 _logger = logging.getLogger(__name__)
 

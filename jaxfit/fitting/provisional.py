@@ -10,20 +10,17 @@ from typing import Any
 import numpy as np
 
 from jaxfit.config.fit import FitConfig
-from jaxfit.data.frame_numbers import frame_step
 from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.tracks import frame_step
+from jaxfit.fitting.batch import tile_size
 from jaxfit.fitting.fit import checked_model
-from jaxfit.fitting.scheduling import fit_batches, in_batches
-from jaxfit.fitting.stages import FitModel
+from jaxfit.fitting.solve import FitModel
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.fitting.tasks import FitShared, Run
-from jaxfit.fitting.tiles import tile_size
+from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches
 from jaxfit.fitting.windows import Windows, first_frames, prepare_observations, window_starts, windows_at
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.foundation.workers import Cluster
 from jaxfit.model.bird import Bird
-from jaxfit.progress import ProgressTask, silent
-from jaxfit.workers.cluster import Cluster
-
-__all__ = ["ProvisionalFit"]
 
 STEP_FRAMES = 25
 """Number of frames after which complete windows are searched and fitted."""

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from jaxfit.fitting.batch import tile_size
 from jaxfit.fitting.collect import FittedWindow
-from jaxfit.fitting.tiles import tile_size
 from jaxfit.fitting.windows import Windows, window_hash
-from jaxfit.model.pose import Pose
-from jaxfit.storage.parts import Parts
-
-__all__ = ["StoredWindows", "windows_per_part"]
+from jaxfit.foundation.unfinished import Parts
+from jaxfit.model.kinematics import Pose
 
 LEAST_FRAMES = 100
 """Frames of every bird between two writes, for windows of fewer frames."""

@@ -1,11 +1,11 @@
-"""Tasks of a fit: some windows under some configs, which any process can fit in any order.
+"""Tasks of a fit: some windows under some configs, and their distribution over processes.
 
 The result of a window does not depend on the other windows of its task, so tasks of any size give the same result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -15,17 +15,16 @@ import numpy as np
 from jaxtyping import Int
 
 from jaxfit.config.fit import FitConfig
-from jaxfit.fitting.batch import Batch, fit_batch
+from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch, tile_size
 from jaxfit.fitting.collect import FittedWindow, window_of_batch
-from jaxfit.fitting.initial_pose_file import InitialPoses
-from jaxfit.fitting.initial_pose_search import search_initial_poses
-from jaxfit.fitting.stages import FitModel, needs_mask
+from jaxfit.fitting.initial_poses import InitialPoses, search_initial_poses
+from jaxfit.fitting.solve import FitModel, needs_mask
+from jaxfit.fitting.stored_windows import StoredWindows, windows_per_part
 from jaxfit.fitting.windows import Windows, load_targets, windows_key
-from jaxfit.model.pose import Pose, rest_pose
+from jaxfit.foundation.progress import ReportProgress
+from jaxfit.foundation.workers import Cluster, FailedTask
+from jaxfit.model.kinematics import Pose, rest_pose
 from jaxfit.objective.posed_window import Targets
-from jaxfit.progress import ReportProgress
-
-__all__ = ["FitShared", "FitTask", "Run", "cut_task", "failed_windows", "fit_task", "initial_poses_of"]
 
 
 class Run(NamedTuple):
@@ -164,3 +163,86 @@ def _prepare_rows(
         row |= {(key, w): len(row) + i for i, w in enumerate(windows)}
         prepared.append(prepare(run, run.windows[np.array(windows)]))
     return prepared, np.array([row[pair] for pair in pairs])
+
+
+def in_batches(
+    problems: Sequence[tuple[int, int]],
+    runs: Sequence[Run],
+    shared: FitShared,
+    birds: int,
+    stored: StoredWindows | None,
+    cluster: Cluster | None,
+) -> list[list[tuple[int, int]]]:
+    """Divide the problems (run, window) of a fit into batches.
+
+    Args:
+        problems: the problems.
+        runs: the windows of every config.
+        shared: the model of the fit.
+        birds: number of tracks.
+        stored: the store of fitted windows, or None.
+        cluster: the workers, or None.
+    """
+    config = runs[0].config
+    size = max(min(frames_per_batch(shared.model.bird, config) // config.window, len(problems)), 1)
+    # by time, because masks of a frame lie together in files; problems of one window share their initial poses
+    ordered = sorted(
+        problems, key=lambda problem: (int(runs[problem[0]].windows.frame[problem[1]].max()), problem[::-1])
+    )
+    if cluster is not None:
+        # a small task costs little if its worker ends
+        size = min(size, tile_size(config.window) * len(runs))
+    if stored is not None:
+        # an interruption costs one batch
+        size = min(size, windows_per_part(birds, config.window))
+    return [ordered[first : first + size] for first in range(0, len(ordered), size)]
+
+
+def steps_per_batch(config: FitConfig) -> int:
+    """Return the number of steps that a fit reports for every batch."""
+    return sum(stage.steps for stage in config.stages)
+
+
+def fit_batches(
+    batches: Sequence[list[tuple[int, int]]],
+    runs: Sequence[Run],
+    shared: FitShared,
+    stored: StoredWindows | None,
+    cluster: Cluster | None,
+    report_progress: ReportProgress,
+) -> dict[tuple[int, int], FittedWindow]:
+    """Fit batches of problems, and store the windows of every batch when they are fitted.
+
+    Args:
+        batches: the result of `in_batches`.
+        runs, shared, stored, cluster: as for `in_batches`.
+        report_progress: called with the number of new steps, `steps_per_batch` for every batch.
+
+    Returns:
+        The result of every problem. A window whose task failed on the workers is not stored.
+    """
+    config, results = runs[0].config, {}
+    tasks = (cut_task(runs, batch) for batch in batches)
+    for i, windows in _fit_tasks(cluster, shared, tasks, steps_per_batch(config), report_progress):
+        if isinstance(windows, FailedTask):
+            windows = failed_windows(shared.model, config, len(batches[i]), f"not computed: {windows.reason}")
+        elif stored is not None:
+            stored.add(runs[0].windows, {w: window for (_, w), window in zip(batches[i], windows, strict=True)})
+            report_progress(0, "")
+        results |= dict(zip(batches[i], windows, strict=True))
+    return results
+
+
+def _fit_tasks(
+    cluster: Cluster | None, shared: FitShared, tasks: Iterable[FitTask], steps: int, report_progress: ReportProgress
+) -> Iterator[tuple[int, list[FittedWindow] | FailedTask]]:
+    """Fit tasks in this process or on workers. Yield number and results of every task, in the order of arrival."""
+    if cluster is None:
+        for i, task in enumerate(tasks):
+            report_progress(0, "initial poses")
+            yield i, fit_task(shared, task, report_progress)
+        return
+    report_progress(0, "starting workers")
+    for i, windows in cluster.run(fit_task, shared, tasks):
+        report_progress(steps, "on workers")
+        yield i, windows

@@ -1,44 +1,200 @@
-"""Windows: the frames of one bird that are fitted together, with their keypoints and masks in crop pixels."""
+"""Filters keypoints, cuts tracks into windows, reads the targets of windows.
+
+The masks of a window, which are read when the window is fitted. The masks of a long video never lie in memory together.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, cast
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfit.config.fit import FitConfig
-from jaxfit.data.frame_numbers import assumed_interval_s, frame_interval_s, frame_step
 from jaxfit.data.masks import decode_mask
-from jaxfit.data.neighbours import FrameMasks
-from jaxfit.data.observations import Observations
-from jaxfit.data.tables import check_memory
-from jaxfit.errors import InputError
+from jaxfit.data.observations import FrameMasks, Observations
+from jaxfit.data.tracks import assumed_interval_s, frame_interval_s, frame_step
 from jaxfit.fitting.crops import crop_squares, cut_mask, grow_mask, mark_unknown
-from jaxfit.fitting.distant import without_distant_birds
-from jaxfit.fitting.filtering import weighted_median_filter
-from jaxfit.fitting.window_masks import LoadedMasks, WindowMasks
-from jaxfit.limits import TABLE_GB
+from jaxfit.foundation.array_files import check_memory
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import DISTANCE_IMAGE_SIDES, TABLE_GB
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets
 
-__all__ = [
-    "Windows",
-    "cut_windows",
-    "filter_observations",
-    "first_frames",
-    "load_targets",
-    "prepare_observations",
-    "window_content",
-    "window_hash",
-    "window_starts",
-    "windows_at",
-    "windows_key",
-]
+
+def weighted_median_filter(
+    keypoints_px: Float[Array | np.ndarray, "T K 2"],
+    confidence: Float[Array | np.ndarray, "T K"],
+    window: int = 5,
+) -> Float[Array, "T K 2"]:
+    """Return the weighted median of each keypoint over a window of frames, separately for x and y.
+
+    Let x_1 ≤ x_2 ≤ … be the sorted values of the window, and c_1, c_2, … their confidences. The filtered value is x_k
+    with the smallest k for which c_1 + … + c_k ≥ ½ Σ c.
+
+    The window is centred on the frame and is shorter at both ends of the array. A missing keypoint has confidence 0
+    and does not contribute. Its filtered value is the median of its neighbours, but the caller keeps its confidence
+    of 0, so the keypoint does not become a detection. If a keypoint is missing in all frames of the window, its input
+    is returned.
+
+    Args:
+        keypoints_px: x, y in image pixels; any value where the confidence is 0.
+        confidence: weight of each keypoint, 0 or more.
+        window: number of consecutive frames, odd.
+
+    Returns:
+        Filtered x, y in image pixels.
+
+    Raises:
+        ValueError: `window` is not odd and positive.
+
+    Source: Hägerlind et al. 2024, the filter over detected keypoints.
+    """
+    if window < 1 or window % 2 == 0:
+        raise ValueError(f"window must be odd and positive, not {window}")
+    keypoints_px, confidence = jnp.asarray(keypoints_px), jnp.asarray(confidence)
+    T = keypoints_px.shape[0]
+    neighbours = jnp.arange(T)[:, None] + jnp.arange(window) - window // 2
+    inside = (neighbours >= 0) & (neighbours < T)
+    neighbours = jnp.clip(neighbours, 0, T - 1)
+    values = keypoints_px[neighbours]  # (T, window, K, 2)
+    weights = jnp.where(inside[:, :, None], confidence[neighbours], 0)[..., None]
+
+    order = jnp.argsort(values, axis=1)
+    values = jnp.take_along_axis(values, order, axis=1)
+    weights = jnp.take_along_axis(jnp.broadcast_to(weights, values.shape), order, axis=1)
+    cumulative = jnp.cumsum(weights, axis=1)
+    total = cumulative[:, -1:]
+    # a sum of exactly half must pass in spite of rounding errors
+    half = total * (0.5 - 4 * jnp.finfo(total.dtype).eps)
+    first = jnp.argmax(cumulative >= half, axis=1, keepdims=True)
+    median = jnp.take_along_axis(values, first, axis=1)[:, 0]
+    return jnp.where(total[:, 0] > 0, median, keypoints_px)
+
+
+_logger = logging.getLogger(__name__)
+
+_LISTED_FRAMES = 10
+_PROBLEM = f"a box or a keypoint lies more than {DISTANCE_IMAGE_SIDES:g} × the image's longer side outside the image"
+
+
+def distant_birds(observations: Observations) -> Bool[np.ndarray, "N T"]:
+    """Return where the box or a keypoint of a bird is far outside its image.
+
+    The distance is measured in x and in y, from the nearest edge of the image. It is far if it exceeds
+    `limits.DISTANCE_IMAGE_SIDES` times the longer side of the image. Missing keypoints do not count.
+    """
+    size_px = observations.image_size_px
+    if observations.own_images:
+        size_px = np.broadcast_to(size_px, (*observations.present.shape, 2)).copy()
+        for at, (_, width, height) in observations.own_images.items():
+            size_px[at] = width, height
+    allowed_px = DISTANCE_IMAGE_SIDES * size_px.max(-1, keepdims=True)
+    corner_px, extent_px = (observations.box_px[..., axes].astype(np.float64) for axes in (slice(2), slice(2, 4)))
+    keypoints = (observations.keypoints_px[:, :, k] for k in range(observations.num_keypoints))  # (0, 0) if missing
+    distant = np.zeros(observations.present.shape, bool)
+    for points_px in (corner_px, corner_px + extent_px, *keypoints):
+        distant |= ((points_px < -allowed_px) | (points_px > size_px + allowed_px)).any(-1)
+    return distant & observations.present
+
+
+def without_distant_birds(observations: Observations) -> Observations:
+    """Return the observations without the birds of `distant_birds`, each in the frames in which it is distant."""
+    distant = distant_birds(observations)
+    if not distant.any():
+        return observations
+    confidence = np.where(distant[..., None], np.float32(0), observations.confidence)
+    return replace(observations, present=observations.present & ~distant, confidence=confidence)
+
+
+def report_distant_birds(observations: Observations, source: object) -> dict[int, tuple[str, ...]]:
+    """Return track → text about its frames with a distant bird, as `Solution.failures`, and log one warning.
+
+    Args:
+        observations: the observations.
+        source: name of the observations in the warning.
+    """
+    distant = distant_birds(observations)
+    reports = {}
+    for n in np.flatnonzero(distant.any(1)).tolist():
+        frames = observations.frame_index[distant[n]].tolist()
+        listed = ", ".join(map(str, frames[:_LISTED_FRAMES]))
+        more = f" and {len(frames) - _LISTED_FRAMES} more" if len(frames) > _LISTED_FRAMES else ""
+        text = f"{'frame' if len(frames) == 1 else 'frames'} {listed}{more} skipped: {_PROBLEM}"
+        reports[int(observations.track_id[n])] = (text,)
+    if reports:
+        track, (text,) = next(iter(reports.items()))
+        others = len(reports) - 1
+        more = f" (and {others} more {'track' if others == 1 else 'tracks'})" if others else ""
+        _logger.warning("%s: track %d, %s%s", source, track, text, more)
+    return reports
+
+
+class LoadedMasks(NamedTuple):
+    """The masks of a window of T frames, as run lengths."""
+
+    own: tuple[Mapping[str, Any] | None, ...]
+    """The bird's mask in each image; None without a mask."""
+    others: tuple[Mapping[str, Any] | Literal[False] | None, ...]
+    """The masks of all other birds that reach into the crop; None without them. False where the pixels outside the
+    bird's mask are background."""
+
+
+class WindowMasks:
+    """A reference to the masks of a window. A pickle holds the masks themselves, for workers.
+
+    Args:
+        load: returns the masks.
+    """
+
+    def __init__(self, load: Callable[[], LoadedMasks]):
+        self.load = load
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _loaded, (self.load(),)
+
+    @classmethod
+    def of(
+        cls,
+        frames: FrameMasks,
+        n: int,
+        frame: Int[np.ndarray, "T"],
+        present: Bool[np.ndarray, "T"],
+        crop: Float[np.ndarray, "T 3"],
+        unknown_pixels: bool,
+    ) -> WindowMasks:
+        """Return the reference of one window.
+
+        Args:
+            frames: the masks of the video.
+            n: position of the track.
+            frame: positions of the frames.
+            present: the frames that are fitted; other frames have no masks.
+            crop: x0, y0, size in image pixels.
+            unknown_pixels: whether the masks of other birds are needed.
+        """
+
+        def load() -> LoadedMasks:
+            at = [t if there else -1 for t, there in zip(frame.tolist(), present.tolist(), strict=True)]
+            own = tuple(None if t < 0 else frames.mask(n, t) for t in at)
+            if not unknown_pixels:
+                return LoadedMasks(own, (False,) * len(at))
+            boxes = crop[:, [0, 1, 2, 2]]
+            others = (None if t < 0 else frames.union_of_others(n, t, boxes[i]) for i, t in enumerate(at))
+            return LoadedMasks(own, tuple(others))
+
+        return cls(load)
+
+
+def _loaded(masks: LoadedMasks) -> WindowMasks:
+    return WindowMasks(lambda: masks)
+
 
 FILTER_BYTES = 50_000_000
 """Memory for the birds that are filtered at once."""

@@ -15,18 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = [
-    "AVES_KEYPOINTS",
-    "AVIAN_MESH_KEYPOINTS",
-    "JOINT_NAMES",
-    "MURRE_KEYPOINTS",
-    "MURRE_SKELETON",
-    "joint_group",
-    "mirror_pairs",
-    "other_side",
-    "skeleton_pairs",
-]
-
 JOINT_NAMES = (
     "root",
     "lower_body",

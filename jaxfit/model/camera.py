@@ -8,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = ["CROP_PX", "Camera", "crop_to_image", "image_to_crop", "project", "to_screen"]
-
 CROP_PX = 256
 """Side of every crop in crop pixels. All pixel quantities of a fit are in this unit, whatever the silhouette's size."""
 

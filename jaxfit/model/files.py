@@ -15,14 +15,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxfit.errors import InputError
-from jaxfit.limits import MODEL_BYTES
-from jaxfit.model.bird import Bird, neutral_colours, unlimited_joints
-from jaxfit.model.checks import ARRAY_FIELDS, check_bird
-from jaxfit.storage.files import write_whole
-from jaxfit.storage.npz import load_npz
-
-__all__ = ["FORMAT_VERSION", "MURRE_PATH", "find_bird", "load_bird", "load_murre", "read_provenance", "save_bird"]
+from jaxfit.foundation.array_files import load_npz
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import write_whole
+from jaxfit.foundation.limits import MODEL_BYTES
+from jaxfit.model.bird import ARRAY_FIELDS, Bird, check_bird, neutral_colours, unlimited_joints
 
 FORMAT_VERSION = 1
 MURRE_PATH = Path(__file__).with_name("murre.npz")

@@ -7,19 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = [
-    "axis_angle_to_matrix",
-    "geodesic_distance",
-    "matrix_to_axis_angle",
-    "right_jacobian",
-    "rotation_between",
-    "rotation_change",
-    "safe_norm",
-    "unwrap_axis_angle",
-    "view_grid",
-    "viewing_axis_rotations",
-]
-
 
 def axis_angle_to_matrix(axis_angle: Float[Array, "*B 3"]) -> Float[Array, "*B 3 3"]:
     """Return the rotation matrices of axis-angles in radians (Rodrigues), differentiable at zero rotation.

@@ -15,17 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxfit.model.pose import Pose
-
-__all__ = [
-    "SHARED_PARAMETERS",
-    "Curvature",
-    "Rows",
-    "add_rows",
-    "frame_rows",
-    "shared_columns",
-    "weighted_curvature",
-]
+from jaxfit.model.kinematics import Pose
 
 SHARED_PARAMETERS = ("bone_length", "betas")
 """The parameters that all frames of a window share, beside a common scale."""

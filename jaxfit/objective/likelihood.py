@@ -17,8 +17,6 @@ from jaxfit.objective.registry import term
 from jaxfit.objective.residuals import Residuals, Scalar, student_t
 from jaxfit.objective.temporal import complete_runs
 
-__all__ = ["keypoint_likelihood", "keypoint_sd_px", "motion_likelihood", "place_likelihood"]
-
 
 @term(positive=["sd_sure_px", "sd_unsure_px", "dof"])
 def keypoint_likelihood(

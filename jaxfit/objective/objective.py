@@ -9,13 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.objective.curvature import Curvature, weighted_curvature
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import Term
 from jaxfit.objective.residuals import Residuals, as_list, residual_curvature, residual_sum
-
-__all__ = ["evaluate_curvature", "evaluate_terms", "weighted_sum"]
 
 Settings = Mapping[str, Mapping[str, Float[Array | np.ndarray, ""] | float]]
 """The `weight` and the other settings of each active term; all values may be traced."""

@@ -11,29 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird, unlimited_joints
 from jaxfit.model.camera import Camera, project, to_screen
-from jaxfit.model.jacobian import (
-    window_keypoint_derivatives,
-    window_keypoint_rows,
-    window_shape_derivatives,
-    window_transform_derivatives,
-)
 from jaxfit.model.kinematics import (
+    Pose,
     Rig,
     shaped_vertices,
     window_joints,
+    window_keypoint_derivatives,
+    window_keypoint_rows,
     window_keypoints,
+    window_shape_derivatives,
+    window_transform_derivatives,
     window_transforms,
     window_vertices,
 )
-from jaxfit.model.pose import Pose
 from jaxfit.model.rotation import axis_angle_to_matrix
 from jaxfit.objective.curvature import Rows, add_rows
-from jaxfit.raster.silhouette import Blur, Skin
-
-__all__ = ["PosedWindow", "Priors", "Raster", "Targets", "priors_of"]
+from jaxfit.raster.silhouette_reference import Blur, Skin
 
 
 class Targets(eqx.Module):

@@ -10,10 +10,8 @@ from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import Any, TypeVar, overload
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.objective.curvature import Curvature
-
-__all__ = ["ENTRY_POINTS", "Term", "find_term", "find_terms", "known_terms", "term"]
 
 ENTRY_POINTS = "jaxfit.terms"
 """The entry-point group with which an installed package provides terms."""

@@ -17,20 +17,6 @@ from jaxtyping import Array, Float
 from jaxfit.objective.curvature import Curvature, Rows, frame_rows, shared_columns, weighted_curvature
 from jaxfit.objective.posed_window import PosedWindow
 
-__all__ = [
-    "NORM",
-    "SQUARE",
-    "Residuals",
-    "RobustKernel",
-    "Scalar",
-    "as_list",
-    "geman_mcclure",
-    "huber",
-    "residual_curvature",
-    "residual_sum",
-    "student_t",
-]
-
 Scalar = Float[Array, ""]
 
 SHORTEST, AT_REST = 1e-4, 0.05

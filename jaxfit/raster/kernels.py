@@ -1,9 +1,10 @@
-"""Load the compiled kernels and register them with XLA; no other module does this.
+"""Loads the compiled kernels, registers them with XLA, and calls those of the silhouette.
 
-An installation without a C++ compiler has no kernels. A warning says so once, and the reference implementations run in
-place of the kernels. Kernels that exist but do not load are an error. The environment variable `JAXFIT_KERNEL_ISA`
-chooses the instruction set of the process: avx512, avx2 or baseline. The default is the best instruction set of the
-processor. The value none switches the kernels off.
+Load the compiled kernels and register them with XLA; no other module does this. An installation without a C++ compiler
+has no kernels. A warning says so once, and the reference implementations run in place of the kernels. Kernels that
+exist but do not load are an error. The environment variable `JAXFIT_KERNEL_ISA` chooses the instruction set of the
+process: avx512, avx2 or baseline. The default is the best instruction set of the processor. The value none switches the
+kernels off.
 """
 
 import functools
@@ -14,8 +15,11 @@ import os
 from types import ModuleType
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
-__all__ = ["ISA_VARIABLE", "available_isas", "choose_isa", "current_isa", "kernels_available", "require_kernels"]
+from jaxfit.raster.silhouette_reference import KINDS, Blur, Skin
 
 ISA_VARIABLE = "JAXFIT_KERNEL_ISA"
 _MODULE = "jaxfit.raster._kernels"
@@ -82,3 +86,85 @@ def choose_isa(name: str) -> None:
         RuntimeError: the kernels are not built or are switched off.
     """
     require_kernels().choose_isa(name)
+
+
+PARAMETER_MULTIPLE = 16
+"""The kernels need a number of parameters that is a multiple of this."""
+
+
+def _call(name: str, results, *operands, blur: Blur, **attributes):
+    require_kernels()
+    call = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")
+    return call(*operands, sigma=np.float32(blur.sigma), radius=np.float32(blur.radius), **attributes)
+
+
+def _shape_like(vertices) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(vertices.shape, jnp.float32)
+
+
+def silhouette(vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], size: int, blur: Blur):
+    """Return the soft silhouette, an image of shape (size, size)."""
+    image = jax.ShapeDtypeStruct((size, size), jnp.float32)
+    return _call("jaxfit_silhouette", image, vertices, faces, blur=blur)
+
+
+def silhouette_gradient(
+    vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], cotangent: Float[Array, "size size"], blur: Blur
+) -> Float[Array, "V 3"]:
+    """Return the gradient of Σ cotangent · silhouette with respect to the vertices."""
+    return _call("jaxfit_silhouette_gradient", _shape_like(vertices), vertices, faces, cotangent, blur=blur)
+
+
+def mask_loss(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    target: Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"],
+    weight: Float[Array, ""],
+    kind: str,
+    blur: Blur,
+) -> Float[Array, ""]:
+    """Return the unweighted loss. A weight of 0 gives a loss of 0 and skips the rendering."""
+    loss = jax.ShapeDtypeStruct((), jnp.float32)
+    operands = (vertices, faces, target, weight)
+    return _call("jaxfit_mask_loss", loss, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))
+
+
+def mask_loss_and_gradient(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    target: Bool[Array, "size size"] | UInt8[Array, "size size"] | Float[Array, "size size"],
+    weight: Float[Array, ""],
+    kind: str,
+    blur: Blur,
+) -> tuple[Float[Array, ""], Float[Array, "V 3"]]:
+    """Return `mask_loss` and its gradient with respect to the vertices. One pass computes both."""
+    results = (jax.ShapeDtypeStruct((), jnp.float32), _shape_like(vertices))
+    operands = (vertices, faces, target, weight)
+    return _call("jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))
+
+
+def silhouette_gauss_newton(
+    vertices: Float[Array, "V 3"],
+    faces: Int[Array, "F 3"],
+    target: UInt8[Array, "size size"],
+    weight: Float[Array, ""],
+    skin: Skin,
+    camera_px: tuple[float, float],
+    blur: Blur,
+) -> Float[Array, "D D"]:
+    """Return the unweighted Gauss-Newton block. A weight of 0 gives a block of 0 and skips the rendering."""
+    slope, shape_slope = _padded(skin.slope), _padded(skin.shape_slope)
+    size_of_block = slope.shape[-1] + shape_slope.shape[-1]
+    block = jax.ShapeDtypeStruct((size_of_block, size_of_block), jnp.float32)
+    operands = (vertices, faces, target, weight, skin.rest, skin.joint, skin.weight, slope, shape_slope)
+    focal, centre = (np.float32(x) for x in camera_px)
+    result = _call("jaxfit_silhouette_gauss_newton", block, *operands, blur=blur, focal=focal, centre=centre)
+    parameters, shapes = skin.slope.shape[-1], skin.shape_slope.shape[-1]
+    kept = np.r_[:parameters, slope.shape[-1] : slope.shape[-1] + shapes]
+    return result[kept][:, kept] if shapes else result[:parameters, :parameters]
+
+
+def _padded(derivatives: Float[Array, "... P"]) -> Float[Array, "... M"]:
+    """Return derivatives with columns of zeros up to a multiple of `PARAMETER_MULTIPLE`."""
+    padding = -derivatives.shape[-1] % PARAMETER_MULTIPLE
+    return jnp.pad(derivatives, ((0, 0),) * (derivatives.ndim - 1) + ((0, padding),))

@@ -14,12 +14,9 @@ from jaxfit.data.masks import box_of_mask, encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera, project, to_screen
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_vertices
-from jaxfit.model.pose import Pose
+from jaxfit.model.kinematics import Pose, fold_bird, joint_transforms, posed_vertices
 from jaxfit.model.rotation import view_grid
 from jaxfit.raster.zbuffer import hard_mask, zbuffer
-
-__all__ = ["SimulatedScan", "random_pose", "random_species", "simulate_photographs", "simulate_scan"]
 
 
 def random_species(bird: Bird, seed: int, bone_sd: float = 0.05) -> Bird:

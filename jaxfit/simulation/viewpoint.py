@@ -10,8 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["PICTURE_WIDTH_UNITS", "Viewpoint", "camera_axes", "random_viewpoint"]
-
 PICTURE_WIDTH_UNITS = 125.0
 """Width of the picture at the ledge, model units. A bird is 21 units long."""
 

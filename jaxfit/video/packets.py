@@ -1,30 +1,280 @@
-"""Packets of a video: numbers and times of frames without decoding, and seeking."""
+"""Opening of video files, and their packets: numbers and times of frames, seeking."""
 
 from __future__ import annotations
 
+import heapq
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import av
 import av.error
 import numpy as np
+from av.stream import Disposition
 from jaxtyping import Float
 
-from jaxfit.video.numbering import Packet, Place, Timeline
-from jaxfit.video.opening import MP4, frame_rate, opened
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import FRAMES_PER_S, IMAGE_PIXELS, IMAGE_SIDE_PX, SECONDS_PER_FRAME, VIDEO_GAP_FRAMES
+from jaxfit.foundation.reading import open_file
+from jaxfit.video.pictures import is_too_large
 
-__all__ = [
-    "add_packet",
-    "begin",
-    "checked_by_index",
-    "demuxed",
-    "first_picture",
-    "frame_times",
-    "packet_timeline",
-    "time_of",
-]
+MP4 = "mov,mp4,m4a,3gp,3g2,mj2"
+"""Name of the format of MP4 and QuickTime files in FFmpeg."""
+
+_OPTIONS = {
+    "protocol_whitelist": "none",  # a playlist may name other files and network addresses
+    "max_pixels": str(IMAGE_PIXELS),  # decoders reject larger pictures before they take memory
+}
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Open a file. Gives its container and its first video stream.
+
+    Raises:
+        InputError: the file is not a readable video, or its pictures are too large.
+    """
+    with open_file(path, "a video") as file:
+        try:
+            container = av.open(file, options=_OPTIONS, metadata_errors="replace")
+        except av.error.FFmpegError as error:
+            problem = f"is not a readable video: {error.strerror}"
+            raise InputError(path, problem, "the file may be incomplete or of another type") from error
+        with container:
+            stream = _video_stream(path, container)
+            stream.codec_context.options = {"max_pixels": _OPTIONS["max_pixels"]}
+            stream.thread_type = "SLICE"  # with threads for frames, the detected damage would vary from run to run
+            yield container, stream
+
+
+def _video_stream(path: Path, container: Any) -> Any:
+    # the cover picture of a music file is also a video stream
+    streams = [one for one in container.streams.video if not one.disposition & Disposition.attached_pic]
+    if not streams:
+        raise InputError(path, "has no video stream", "give a video or a folder of images")
+    stream: Any = streams[0]
+    if stream.codec_context is None:
+        raise InputError(path, "has a codec that this PyAV cannot decode", "convert the video to H.264")
+    if is_too_large(stream.width, stream.height):
+        problem = f"has pictures of {stream.width}×{stream.height}"
+        raise InputError(path, problem, f"the limits are {IMAGE_SIDE_PX} pixels a side and {IMAGE_PIXELS:,} pixels")
+    return stream
+
+
+def frame_count(stream: Any) -> int | None:
+    """Return the number of frames that players show; None if the container does not store a number.
+
+    An edit list of an MP4 file hides frames. FFmpeg marks these frames in its index, or leaves the frames out.
+    """
+    if not stream.frames or stream.container.format.name != MP4:
+        return stream.frames or None
+    return sum(not entry.is_discard for entry in stream.index_entries) or stream.frames
+
+
+def frame_rate(stream: Any) -> float | None:
+    """Return the mean frame rate in frames per second; None if it is unknown, or absurd because of damage."""
+    rate = stream.average_rate or stream.guessed_rate
+    return float(rate) if rate and 1 / SECONDS_PER_FRAME <= rate <= FRAMES_PER_S else None
+
+
+_REORDER = 16  # the most pictures that a codec delays to change their order
+_MOST_DELAYED = 128  # a picture that is shown after so many later packets has a damaged time stamp
+
+
+class Packet(NamedTuple):
+    """The properties of a packet that numbering needs. Packets sort by time."""
+
+    stamp: int
+    """Presentation time stamp, or `order` if the time stamps are unusable."""
+    order: int
+    """Position of the packet in decoding order."""
+    groups: tuple[int, ...]
+    """Numbers of the keyframes that its picture depends on: its own keyframe and, for a leading picture, the previous
+    keyframe."""
+    starts: bool
+    """Whether the packet is a keyframe."""
+    lost: bool
+    """Whether damage hides the packet, so that only the index of the file lists the packet."""
+
+
+class Place(NamedTuple):
+    """A keyframe where decoding can start, and the state of the numbering there."""
+
+    number: int
+    stamp: int
+    steady: bool
+    skipped: int
+
+
+class Timeline:
+    """Number packets in the order of their time stamps, and give every decoded picture the number of its packet.
+
+    A number is a rank: the number of packets in the file that are shown earlier. It needs no frame rate, it is correct
+    for a variable frame rate, and it does not change if a picture cannot be decoded. There are two exceptions. First,
+    damage may hide packets in a container without a list of packets. If the steps between frames were even before the
+    gap, the frame rate gives the number of frames in the gap. If the steps were uneven, the number is unknown, and
+    counting continues without a gap. Second, time stamps may be missing or contradict each other. Then pictures are
+    counted in decoding order.
+
+    A damaged or missing picture spoils all pictures that are decoded after it, up to the next keyframe, because
+    decoders do not report which of these pictures repeat the damage.
+
+    Args:
+        interval: ticks of the time base between frames, to count the frames of gaps. None if unknown.
+        stamped: False if the time stamps are known to be guesses.
+        place: the keyframe of the first packet. None for the start of the file.
+    """
+
+    def __init__(self, interval: float | None, stamped: bool = True, place: Place | None = None):
+        self.number = 0 if place is None else place.number
+        """Number of the next frame, which is the count of numbered frames."""
+        self.stamped = stamped
+        self.skipped = 0 if place is None else place.skipped
+        """Count of packets that are never shown and have no number."""
+        self.troubled = False
+        """Whether the decoder rejected a packet or reported a corrupt picture."""
+        self.last: int | None = None
+        """Time stamp of the last numbered packet."""
+        self._floor = -math.inf if place is None else place.stamp
+        self._interval = interval
+        self._steady = place is None or place.steady
+        self._order = self._group = 0
+        self._torn = -math.inf
+        self._key_stamp = -math.inf
+        self._pending: list[Packet] = []
+        self._held: deque[tuple[int, Packet, Any]] = deque()
+        self._spoilt: dict[int, int] = {}
+        self._lost = False
+        """Whether the last packet was lost, and all pending packets are spoilt."""
+
+    def add(
+        self, stamp: int | None, starts: bool, *, lost: bool = False, corrupt: bool = False, torn: bool = False
+    ) -> Packet | None:
+        """Add the next packet of the file. Returns None if its frame is shown before the starting place.
+
+        Args:
+            stamp, starts, lost: as in `Packet`.
+            corrupt: whether the container marks the packet as damaged.
+            torn: whether the container skipped bytes, and perhaps packets, before this packet.
+        """
+        if self.stamped and (stamp is None or (self.last is not None and stamp <= self.last)):
+            self._count()
+        if self.stamped and stamp is not None and stamp < self._floor:
+            return None
+        if starts:
+            self._group += 1
+            self._key_stamp = stamp if self.stamped and stamp is not None else -math.inf
+        stamp = self._order if stamp is None or not self.stamped else stamp
+        groups = (self._group - 1, self._group) if stamp < self._key_stamp else (self._group,)
+        packet = Packet(stamp, self._order, groups, starts, lost)
+        self._order += 1
+        heapq.heappush(self._pending, packet)
+        if torn:
+            self._torn = packet.order
+        if lost:  # the decoder returns its pending pictures out of order, or not at all
+            for one in [packet] if self._lost else self._pending:
+                self._spoil(one)
+        elif corrupt or (torn and not starts):
+            self._spoil(packet)
+        self._lost = lost
+        return packet
+
+    def settle(self, before: float) -> Iterator[tuple[int, Packet, bool]]:
+        """Number the frames that are shown before a time stamp.
+
+        Yields the number, a packet, and True if the packet is that of the frame. A frame in a gap has no packet: then
+        the packet after the gap and False are given.
+        """
+        while self._pending and self._pending[0].stamp < before:
+            yield from self._next()
+
+    def place(self, number: int, packet: Packet) -> Place:
+        """Return the place of a keyframe that `settle` has just yielded."""
+        return Place(number, packet.stamp, self._steady, self.skipped)
+
+    def show(self, picture: Any) -> None:
+        """Add the next picture of the decoder."""
+        stamp = picture.pts
+        if self.stamped:
+            if stamp is not None and stamp < self._floor:
+                return
+            if all(packet.stamp != stamp for packet in self._pending):
+                if self.troubled and stamp is not None:
+                    return  # damage also changes the order: the number of this picture is already counted as missed
+                self._count()
+        if not self.stamped:
+            present = [packet for packet in self._pending if not packet.lost]
+            # a keyframe can be recognised: all frames that are shown before this keyframe are missing
+            keys = [packet for packet in present if packet.starts] if picture.key_frame else []
+            stamp = min(keys or present).stamp if present else self._order
+            if not present:
+                self.add(None, picture.key_frame)
+        self._miss(math.inf if stamp is None else stamp)
+        *gap, (number, packet, _) = self._next()
+        for missing, _, _ in gap:
+            self._held.append((missing, packet, None))
+        if picture.is_corrupt:
+            self.troubled = True
+            self._spoil(packet)
+        self._held.append((number, packet, picture))
+        if self.stamped and any(packet.order - one.order > _MOST_DELAYED for one in self._pending):
+            self._count()  # otherwise all later pictures would wait in memory
+
+    def finish(self) -> None:
+        """End the pictures. Packets that still wait for a picture are missed."""
+        self._miss(math.inf)
+
+    def ready(self) -> Iterator[tuple[int, Packet, Any]]:
+        """Yield number, packet and picture (None if damaged) of the frames that no later packet can change."""
+        oldest = min((packet.order for packet in self._pending), default=math.inf)
+        while self._held and self._held[0][1].order < oldest:
+            number, packet, picture = self._held.popleft()
+            spoilt = any(packet.order >= self._spoilt.get(group, math.inf) for group in packet.groups)
+            yield number, packet, None if spoilt else picture
+
+    def _next(self) -> list[tuple[int, Packet, bool]]:
+        packet = heapq.heappop(self._pending)
+        numbered = []
+        if self.stamped:
+            for _ in range(self._gap(packet)):
+                numbered.append((self.number, packet, False))
+                self.number += 1
+            self.last = packet.stamp
+        numbered.append((self.number, packet, True))
+        self.number += 1
+        return numbered
+
+    def _gap(self, packet: Packet) -> int:
+        """Return the number of frames that are lost directly before a packet."""
+        if self._interval is None or not self._steady or self.last is None:
+            return 0
+        steps = (packet.stamp - self.last) / self._interval
+        # time stamps are rounded to whole ticks, and an interval may have only a few ticks
+        even = abs(steps - round(steps)) * self._interval <= 1 + 0.02 * self._interval
+        follows = round(steps) == 1 or (packet.order <= self._torn + _REORDER and steps <= VIDEO_GAP_FRAMES)
+        self._steady = even and follows
+        return max(0, round(steps) - 1) if self._steady else 0
+
+    def _miss(self, before: float) -> None:
+        for number, packet, there in self.settle(before):
+            self._held.append((number, packet, None))
+            if there:
+                self._spoil(packet)
+
+    def _spoil(self, packet: Packet) -> None:
+        group = packet.groups[-1]
+        self._spoilt[group] = min(packet.order, self._spoilt.get(group, packet.order))
+
+    def _count(self) -> None:
+        self.stamped = False
+        self._floor = -math.inf
+        self._pending = [packet._replace(stamp=packet.order) for packet in self._pending]
+        heapq.heapify(self._pending)
+
 
 _MATROSKA = "matroska,webm"
 _STAMPED = (MP4, _MATROSKA)  # every packet has a time stamp, so seeks are exact

@@ -10,11 +10,9 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxfit.errors import InputError
-from jaxfit.limits import IMAGE_PIXELS, IMAGE_SIDE_PX, PICTURE_BYTES, PICTURE_SCANS
-from jaxfit.storage.reading import check_folder, read_file
-
-__all__ = ["IMAGE_SUFFIXES", "image_files", "is_too_large", "picture_size", "read_picture"]
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import IMAGE_PIXELS, IMAGE_SIDE_PX, PICTURE_BYTES, PICTURE_SCANS
+from jaxfit.foundation.reading import check_folder, read_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 

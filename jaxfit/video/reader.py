@@ -12,15 +12,11 @@ from queue import SimpleQueue
 from threading import Event, Semaphore, Thread, current_thread
 from typing import NamedTuple
 
-from jaxfit.errors import InputError
-from jaxfit.storage.reading import check_readable
-from jaxfit.video.decoding import Frame, decode
-from jaxfit.video.display import displayed_size
-from jaxfit.video.opening import frame_count, frame_rate, opened
-from jaxfit.video.packets import first_picture
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.reading import check_readable
+from jaxfit.video.decoding import Frame, decode, displayed_size
+from jaxfit.video.packets import first_picture, frame_count, frame_rate, opened
 from jaxfit.video.pictures import image_files, read_picture
-
-__all__ = ["Frame", "FrameReader", "VideoInfo", "probe_video", "read_frames", "warn_of_damage"]
 
 _logger = logging.getLogger(__name__)
 

@@ -15,12 +15,10 @@ import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
-from jaxfit.errors import InputError
-from jaxfit.storage.files import new_file
-from jaxfit.video.codecs import CODECS, CONTAINERS
-from jaxfit.video.display import EXACT
-
-__all__ = ["SLOWEST_FPS", "VideoWriter"]
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import new_file
+from jaxfit.video import CODECS, CONTAINERS
+from jaxfit.video.decoding import EXACT
 
 _logger = logging.getLogger(__name__)
 

@@ -5,24 +5,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-__all__ = [
-    "DARK",
-    "DETECTED",
-    "FITTED",
-    "GREY",
-    "INK",
-    "ON_PAPER_DETECTED",
-    "ON_PAPER_FITTED",
-    "OUTLINE",
-    "PAPER",
-    "PLUMAGE_SHARE",
-    "SEEN",
-    "TRACK_COLOURS",
-    "Colour",
-    "tinted",
-    "track_colour",
-]
-
 Colour = tuple[int, int, int]
 
 """Blue, green, red."""

@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfit.data.observations import Observations
-from jaxfit.data.posed_meshes import PosedBirds
+from jaxfit.data.projection import PosedBirds
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.raster.zbuffer import draw, hard_mask, shade
+from jaxfit.view.birds import Detected
 from jaxfit.view.colours import (
     DETECTED,
     FITTED,
@@ -25,11 +26,8 @@ from jaxfit.view.colours import (
     SEEN,
     track_colour,
 )
-from jaxfit.view.detected import Detected
 from jaxfit.view.drawing import dot, line, ring, tag, text, write_png
 from jaxfit.view.legend import Symbol, symbol_strip
-
-__all__ = ["contact_sheet", "cut_tiles", "sheet_pairs"]
 
 TILE_PX = 256
 """Side of a tile."""

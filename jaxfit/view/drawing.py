@@ -8,18 +8,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jaxfit.storage.files import write_whole
+from jaxfit.foundation.files import write_whole
 from jaxfit.view.colours import INK, Colour
-
-__all__ = [
-    "dot",
-    "line",
-    "ring",
-    "tag",
-    "text",
-    "text_width",
-    "write_png",
-]
 
 SHIFT = 4  # OpenCV draws in units of 1/16 pixel; pixel centres are whole numbers in OpenCV, halves in jaxfit
 

@@ -12,8 +12,6 @@ from jaxfit.view.birds import Style
 from jaxfit.view.colours import DETECTED, FITTED, PAPER, track_colour
 from jaxfit.view.drawing import dot, line, ring, tag, text, text_width
 
-__all__ = ["Legend", "Symbol", "symbol_strip"]
-
 Symbol = Callable[[np.ndarray, float, float, float], None]
 """Draws a symbol, 1.7 times as wide as the text is high: image, left end, middle row, height of the text."""
 

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from jaxfit.model.bird import Bird
-from jaxfit.model.importers.import_model import import_model
+from jaxfit.model.published import import_model
 
 __all__ = ["reference_bird", "reference_folder"]
 

@@ -21,17 +21,16 @@ from reference_data import reference_bird, reference_folder
 from rich.console import Console
 from rich.table import Table
 
-from jaxfit.benchmarks.fit import bench_fit
-from jaxfit.benchmarks.render import bench_render
-from jaxfit.benchmarks.silhouette import bench_silhouette
 from jaxfit.cli.main import use_cache
 from jaxfit.config.fit import load_config
 from jaxfit.data.formats.coco import read_coco
+from jaxfit.evaluation.benchmarks.fit import bench_fit
+from jaxfit.evaluation.benchmarks.raster import bench_render, bench_silhouette
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.initial_pose_file import load_initial_poses
+from jaxfit.fitting.initial_poses import load_initial_poses
+from jaxfit.foundation.progress import terminal
 from jaxfit.model.bird import Bird
-from jaxfit.progress import terminal
 
 BASELINE = Path(__file__).with_name("baseline.json")
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxfit.benchmarks import render as benchmark
+from jaxfit.evaluation.benchmarks import raster as benchmark
 from jaxfit.raster import kernels as native
 
 

@@ -5,8 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxfit.benchmarks import silhouette as benchmark
-from jaxfit.benchmarks.silhouette import bench_silhouette, bird_like_mesh, fitted_to_image
+from jaxfit.evaluation.benchmarks import raster as benchmark
+from jaxfit.evaluation.benchmarks.raster import bench_silhouette, bird_like_mesh, fitted_to_image
+from jaxfit.raster import kernels
 from jaxfit.raster import silhouette as raster
 
 
@@ -48,7 +49,7 @@ def test_report(monkeypatch):
     vertices, faces = bird_like_mesh()
     result = bench_silhouette(frames=4, repeats=1, size=64, vertices=vertices, faces=faces[::50])
     assert (result["frames"], result["faces"], result["size"]) == (4, len(faces[::50]), 64)
-    assert result["isa"] == raster.current_isa()
+    assert result["isa"] == kernels.current_isa()
     assert result["threads"] >= 1
     assert 0 <= result["gradient_error"] < 1e-3
     assert (result["ms_per_frame"], result["matmul_ms"], result["loss_ms_per_frame"]) == (1e3 / 4, 2e3, 7e3 / 4)

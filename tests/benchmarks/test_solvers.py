@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from support.birds import toy_bird
 
-from jaxfit.benchmarks.fit import noisy_scene
-from jaxfit.benchmarks.solvers import SCHEDULES, bench_solvers, plot_solvers
+from jaxfit.evaluation.benchmarks.fit import SCHEDULES, bench_solvers, noisy_scene, plot_solvers
 
 pytestmark = pytest.mark.extended
 

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from jaxfit.benchmarks import fit, silhouette, solvers
 from jaxfit.cli.main import main
+from jaxfit.evaluation.benchmarks import fit, raster
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 SILHOUETTE = {
@@ -36,7 +36,7 @@ def rows(text):
 
 
 def test_values_and_lists_of_measurements_have_units(monkeypatch, capsys):
-    monkeypatch.setattr(silhouette, "bench_silhouette", lambda **_: SILHOUETTE)
+    monkeypatch.setattr(raster, "bench_silhouette", lambda **_: SILHOUETTE)
     assert main(["bench", "silhouette"]) == 0
     said = capsys.readouterr().out
     assert "{" not in said
@@ -51,7 +51,7 @@ def test_values_and_lists_of_measurements_have_units(monkeypatch, capsys):
 
 
 def test_solvers_have_names_and_no_curves(monkeypatch, capsys):
-    monkeypatch.setattr(solvers, "bench_solvers", lambda *_, **__: SOLVERS)
+    monkeypatch.setattr(fit, "bench_solvers", lambda *_, **__: SOLVERS)
     monkeypatch.setattr(fit, "noisy_scene", lambda *_: (None, None))
     assert main(["bench", "solvers"]) == 0
     said = capsys.readouterr().out

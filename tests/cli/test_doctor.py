@@ -17,7 +17,7 @@ def test_every_part_stands_on_the_page(capsys):
 
 
 def test_missing_parts_have_a_remedy(monkeypatch):
-    monkeypatch.setattr("jaxfit.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("jaxfit.foundation.extras.find_spec", lambda name: None)
     packages = lines_of(doctor._checked(doctor._optional_packages))
     assert packages["pynwb"].state == "missing"
     assert 'pip install --upgrade ".[formats]" in the checkout' in packages["pynwb"].remedy

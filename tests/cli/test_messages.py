@@ -12,7 +12,7 @@ from rich.table import Table
 from jaxfit.cli import main as cli
 from jaxfit.cli.main import OneLine, main
 from jaxfit.cli.tables import right_aligned, show, show_facts
-from jaxfit.limits import MESSAGE_CHARACTERS
+from jaxfit.foundation.limits import MESSAGE_CHARACTERS
 
 NASTY = "[bold]x[/]\x1b[31m\n\udcc5:bird:"
 

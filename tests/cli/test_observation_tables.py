@@ -5,9 +5,9 @@ import json
 from support.rectangles import birds, steady
 
 from jaxfit.cli import main as cli
-from jaxfit.cli.observation_tables import matching_line
+from jaxfit.cli.observations import matching_line
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.evaluation.matching import Matching
+from jaxfit.evaluation.truth import Matching
 
 LEFT, RIGHT = (0, 0, 30, 20), (60, 0, 30, 20)
 

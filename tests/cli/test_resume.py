@@ -15,11 +15,11 @@ from support.toy_footage import BIRD, FRAMES, TrueSegmenter
 
 from jaxfit import pipeline
 from jaxfit.cli.main import main
-from jaxfit.errors import InputError
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.windows import window_hash
+from jaxfit.foundation import files
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import save_bird
-from jaxfit.storage import files
 
 FRAME_NUMBERS = list(range(FRAMES))
 

@@ -13,7 +13,7 @@ from jaxfit.cli import demo
 from jaxfit.cli.main import main
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception import track
-from jaxfit.perception.instances import instance_of
+from jaxfit.perception.network import instance_of
 from jaxfit.video.reader import probe_video
 
 SMALL = ["--birds", "2", "--frames", "5", "--size", "480x280"]

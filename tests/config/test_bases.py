@@ -6,8 +6,8 @@ import pytest
 
 from jaxfit.config.fit import load_config
 from jaxfit.config.reconstruct import load_reconstruct_config
-from jaxfit.errors import InputError
-from jaxfit.limits import CONFIG_BASES, CONFIG_BYTES
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import CONFIG_BASES, CONFIG_BYTES
 
 
 def written(folder, text, name="mine.yaml"):

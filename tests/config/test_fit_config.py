@@ -7,7 +7,7 @@ import yaml
 
 from jaxfit.config.fit import FitConfig, StageConfig, load_config, shipped_fit_configs
 from jaxfit.config.yaml_file import _parse, config_to_yaml
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.objective.registry import find_term, known_terms
 
 

@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
+from jaxfit.config.build import get_value, with_values
 from jaxfit.config.checks import ConfigKeyError
 from jaxfit.config.fit import load_config
-from jaxfit.config.paths import get_value, with_values
 
 PAPER = load_config("paper")
 

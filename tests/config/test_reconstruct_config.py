@@ -5,13 +5,13 @@ import typing
 
 import pytest
 
+from jaxfit.config.build import field_help
 from jaxfit.config.fit import load_config
-from jaxfit.config.grid import GridConfig
-from jaxfit.config.help import field_help
 from jaxfit.config.perception import TrackConfig
 from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
 from jaxfit.config.yaml_file import _parse, config_to_yaml, documented_yaml
-from jaxfit.errors import InputError
+from jaxfit.evaluation.ablation.grid import GridConfig
+from jaxfit.foundation.errors import InputError
 
 
 def written(tmp_path, text, name="mine.yaml"):

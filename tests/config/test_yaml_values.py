@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from support.hostile import Isolated, many_examples
 from support.mutations import damaged_bytes, damaged_tree
 
-from jaxfit.config.yaml_file import _shipped_folder, shipped_configs
-from jaxfit.config.yaml_values import line_of, read_yaml, rounded
-from jaxfit.errors import InputError
-from jaxfit.limits import CONFIG_LEVELS
+from jaxfit.config.yaml_file import _shipped_folder, line_of, read_yaml, rounded, shipped_configs
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import CONFIG_LEVELS
 
 NINE = ", ".join(f"k{i}: 1" for i in range(9))
 ANCHORS = f"a0: &a0 {{{NINE}}}\n" + "".join(

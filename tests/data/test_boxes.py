@@ -1,6 +1,6 @@
 import numpy as np
 
-from jaxfit.data.boxes import box_iou, box_of_keypoints
+from jaxfit.data.masks import box_iou, box_of_keypoints
 
 
 def test_box_iou_by_hand():

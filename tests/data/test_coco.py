@@ -16,7 +16,7 @@ from jaxfit.data.formats.coco import read_coco, write_coco
 from jaxfit.data.formats.rle import run_lengths
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 
 def test_reads_tracks_and_frames_in_order(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from support.coco_files import MASK, content, saved
 
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 # each: where in the content, the new value (or a function of the old), and what the message says
 REMOVED = object()

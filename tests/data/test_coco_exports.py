@@ -9,7 +9,7 @@ from support.coco_files import saved as saved_video
 
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.recognise import read_observations
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 KEYPOINTS = [10, 5, 2, 20.5, 6.25, 1, 0, 0, 0]
 

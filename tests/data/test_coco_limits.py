@@ -11,8 +11,8 @@ from support.hostile import Isolated, many_examples
 from support.mutations import damaged_bytes, damaged_tree
 
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.errors import InputError
-from jaxfit.limits import IMAGE_SIDE_PX, KEYPOINTS, POLYGON_LENGTH_PX, POLYGONS
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import IMAGE_SIDE_PX, KEYPOINTS, POLYGON_LENGTH_PX, POLYGONS
 
 
 def rejected(tmp_path, data, message):

@@ -9,11 +9,10 @@ from support.observations import assert_same
 from jaxfit.data.formats import coco_parts
 from jaxfit.data.formats.coco import read_coco, write_coco
 from jaxfit.data.formats.coco_parts import parts_folder
-from jaxfit.data.lazy_masks import LazyMasks
-from jaxfit.data.masks import encode_mask
+from jaxfit.data.masks import LazyMasks, encode_mask
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-from jaxfit.storage.parts import Parts
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.unfinished import Parts
 
 N, T, K = 3, 8, 4
 SIZE = (30, 20)

@@ -14,7 +14,7 @@ from support.cli_files import rejected
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.common_murre import read_common_murre
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 
 N, T, K, WIDTH, HEIGHT = 3, 12, 20, 64, 40

@@ -11,7 +11,7 @@ from support.hostile import Isolated, many_examples
 from support.mutations import damaged_arrays, damaged_bytes
 
 from jaxfit.data.formats.common_murre import read_common_murre
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 T, N, WIDTH, HEIGHT = 3, 2, 32, 24
 

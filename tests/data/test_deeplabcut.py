@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support.tracking_files import LIKELIHOOD, NAMES, XY, T, write_csv, write_fixed, write_table
 
-from jaxfit.data.formats.deeplabcut.pickled_literals import NotLiteralError, read_literal
+from jaxfit.data.formats.deeplabcut import NotLiteralError, read_literal
 from jaxfit.data.formats.recognise import read_observations
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 SIZE = (120, 100)
 PICTURES = [f"labeled-data/clip/img{i:03d}.png" for i in (30, 7, 8, 11)]

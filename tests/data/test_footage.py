@@ -14,11 +14,11 @@ from jaxfit.data.formats import coco_parts
 from jaxfit.data.formats.coco import read_coco, write_coco
 from jaxfit.data.formats.coco_parts import parts_folder
 from jaxfit.data.formats.fields import Field
-from jaxfit.data.formats.video_times import add_times
-from jaxfit.data.projected import projected_observations
+from jaxfit.data.formats.image_sizes import add_times
+from jaxfit.data.projection import projected_observations
 from jaxfit.data.solution import load_solution, save_solution
-from jaxfit.errors import InputError
-from jaxfit.fitting.summary import summarise
+from jaxfit.fitting.collect import summarise
+from jaxfit.foundation.errors import InputError
 from jaxfit.perception.track import track_video
 
 KNOWN = FootageIdentity(40, bytes(range(256)) * 4)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxfit.data.frame_numbers import consecutive, frame_interval_s, frame_step
+from jaxfit.data.tracks import consecutive, frame_interval_s, frame_step
 
 
 def test_step_is_the_greatest_that_divides_all_differences():

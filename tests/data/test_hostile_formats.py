@@ -13,7 +13,7 @@ from support.label_files import labelled_birds, write_label_file
 from support.mutations import HOSTILE_VALUES, damaged_arrays, damaged_bytes, damaged_tree
 from support.tracking_files import columns, project, write_analysis, write_csv, write_fixed, write_project, write_table
 
-from jaxfit.data.formats.deeplabcut.pickled_literals import NotLiteralError, read_literal
+from jaxfit.data.formats.deeplabcut import NotLiteralError, read_literal
 
 READER = "support.format_calls:read_sized"
 PICTURES = [f"labeled-data/clip/img{i}.png" for i in range(4)]

@@ -8,9 +8,8 @@ from support.birds import solution_of, toy_bird
 from support.exported import BIRD
 
 import jaxfit
-from jaxfit.data.image_camera import in_image
-from jaxfit.data.posed_meshes import PosedBirds
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.data.projection import PosedBirds, in_image
+from jaxfit.simulation.flock import smooth_motion
 
 FRAMES, FOCAL_PX = 12, 5000.0
 SIZE_PX = np.array([1600, 900])

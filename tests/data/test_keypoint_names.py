@@ -6,7 +6,7 @@ from support.coco_files import content, saved
 
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.keypoint_names import checked_map, map_keypoints, opposite_keypoints, propose_names
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import AVIAN_MESH_KEYPOINTS, MURRE_KEYPOINTS
 
 SPELLINGS = {

@@ -11,9 +11,9 @@ import pytest
 from support.label_files import FRAMES, KINDS, NAMES, SIZE, labelled_birds, write_label_file
 
 from jaxfit.data.formats.cvat import write_cvat_label
-from jaxfit.data.formats.deeplabcut.labels import write_deeplabcut_labels
 from jaxfit.data.formats.recognise import read_observations
-from jaxfit.errors import InputError
+from jaxfit.data.formats.write_deeplabcut import write_deeplabcut_labels
+from jaxfit.foundation.errors import InputError
 
 WITH_SCORES = ("coco", "label studio", "sleap")
 
@@ -229,6 +229,6 @@ def test_labels_without_birds(tmp_path):
 
 
 def test_the_extra_is_needed(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxfit.extras.find_spec", lambda _name: None)
+    monkeypatch.setattr("jaxfit.foundation.extras.find_spec", lambda _name: None)
     with pytest.raises(InputError, match=r"needs h5py.*pip install \"\.\[formats\]\""):
         write_deeplabcut_labels(labelled_birds(), [""] * 4, tmp_path)

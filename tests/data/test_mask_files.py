@@ -10,7 +10,7 @@ from support.tracking_files import T, write_csv
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.mask_files import add_masks
 from jaxfit.data.formats.recognise import read_observations
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 SIZE = (120, 100)
 

@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from jaxfit.data.lazy_masks import LazyMasks
-from jaxfit.data.masks import decode_mask, encode_mask
-from jaxfit.data.neighbours import FrameMasks
-from jaxfit.data.observations import Observations
+from jaxfit.data.masks import LazyMasks, decode_mask, encode_mask
+from jaxfit.data.observations import FrameMasks, Observations
 
 SIZE = WIDTH, HEIGHT = 40, 30
 FRAMES = 5

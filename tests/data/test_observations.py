@@ -7,7 +7,7 @@ import pytest
 
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations, check_keypoints, reorder_keypoints
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 MASK = np.zeros((6, 8), bool)
 MASK[1:4, 2:7] = True

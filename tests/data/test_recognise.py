@@ -13,7 +13,7 @@ from support.tracking_files import T, write_analysis, write_csv, write_project, 
 from jaxfit.data.formats import recognise
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.recognise import read_observations
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.video.reader import probe_video
 from jaxfit.video.writer import VideoWriter
 
@@ -122,7 +122,7 @@ def test_paths_that_are_no_files(tmp_path):
 
 
 def test_without_the_extra(tmp_path, monkeypatch):
-    from jaxfit import extras
+    from jaxfit.foundation import extras
 
     monkeypatch.setattr(extras, "find_spec", lambda package: None)
     with pytest.raises(InputError, match=r"needs h5py, which this installation lacks \(run pip install .*formats"):

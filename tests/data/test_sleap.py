@@ -8,7 +8,7 @@ import pytest
 from support.tracking_files import LIKELIHOOD, NAMES, XY, T, project, write_analysis, write_project, write_table
 
 from jaxfit.data.formats.recognise import read_observations
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 SIZE = (120, 100)
 

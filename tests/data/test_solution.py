@@ -12,9 +12,8 @@ from support.birds import toy_bird
 from support.hostile import Isolated, fewer_examples
 from support.mutations import damaged_npz
 
-from jaxfit.data.ambiguity import ambiguous_frames
-from jaxfit.data.solution import FORMAT_VERSION, Solution, load_solution, save_solution
-from jaxfit.errors import InputError
+from jaxfit.data.solution import FORMAT_VERSION, Solution, ambiguous_frames, load_solution, save_solution
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import save_bird
 
 BIRD = replace(toy_bird(), joint_names=("körper", *toy_bird().joint_names[1:]))

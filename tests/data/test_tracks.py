@@ -10,11 +10,11 @@ from support.observations import assert_same
 from jaxfit.data.formats.coco import read_coco, write_coco
 from jaxfit.data.masks import encode_mask, encode_patch
 from jaxfit.data.observations import Observations
-from jaxfit.data.track_quality import track_quality
-from jaxfit.errors import InputError
+from jaxfit.data.tracks import track_quality
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.windows import filter_observations
-from jaxfit.perception.instances import instance_of
+from jaxfit.foundation.errors import InputError
+from jaxfit.perception.network import instance_of
 from jaxfit.perception.tracking import TrackRecorder, drop_low_scores, drop_short_tracks
 
 NAMES, SIZE = ("bill", "left_eye", "right_eye"), (60, 40)

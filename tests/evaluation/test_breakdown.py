@@ -9,12 +9,11 @@ import pytest
 from support.evaluated import BIRD, N, T, sides, solution, truth
 
 from jaxfit.cli.tables import breakdown_tables
-from jaxfit.errors import InputError
-from jaxfit.evaluation.aggregation import COLUMNS_KEYPOINT
 from jaxfit.evaluation.bootstrap import paired_ratio
-from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, Evaluation, evaluate
+from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, COLUMNS_KEYPOINT, Evaluation, evaluate
 from jaxfit.evaluation.truth import Truth, read_behaviours
-from jaxfit.storage.json_values import json_text
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.reading import json_text
 
 K = BIRD.num_keypoints
 ACTS = {5: [(0, "stand"), (12, "preen")], 3: [(0, "walk"), (11, "stand")]}

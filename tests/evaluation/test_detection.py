@@ -8,9 +8,9 @@ import pytest
 from support.rectangles import HEIGHT, WIDTH, birds, steady
 
 from jaxfit.data.masks import encode_mask
-from jaxfit.errors import InputError
-from jaxfit.evaluation.observed import evaluate_observations
+from jaxfit.evaluation.tracking import evaluate_observations
 from jaxfit.evaluation.truth import Truth
+from jaxfit.foundation.errors import InputError
 
 HERE, THERE, AWAY = (10, 10, 20, 10), (60, 10, 20, 10), (10, 60, 20, 10)
 PERFECT = pytest.approx({"ap50": 1, "ap50-95": 1, "precision": 1, "recall": 1, "mean_iou": 1})

@@ -8,13 +8,12 @@ import yaml
 from support.noisy_discs import BIRDS, RADIUS, SIDES, UNIT, K, detected, labelled, student_t
 
 from jaxfit.config.fit import load_config
-from jaxfit.config.yaml_values import rounded
+from jaxfit.config.yaml_file import rounded
 from jaxfit.data.masks import encode_mask
-from jaxfit.errors import InputError
 from jaxfit.evaluation import detection_noise
-from jaxfit.evaluation.detection_noise import SHIPPED_OFFSET_PX, estimate_noise
-from jaxfit.evaluation.noise_config import noise_yaml
+from jaxfit.evaluation.detection_noise import SHIPPED_OFFSET_PX, estimate_noise, noise_yaml
 from jaxfit.evaluation.truth import Truth
+from jaxfit.foundation.errors import InputError
 
 SURE, UNSURE, DOF = 1.5, 8.0, 5.0
 

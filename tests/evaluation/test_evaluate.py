@@ -8,11 +8,10 @@ import pytest
 from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, sides, solution, truth
 
 from jaxfit.data.masks import encode_mask
-from jaxfit.data.posed_meshes import PosedBirds
-from jaxfit.errors import InputError
+from jaxfit.data.projection import PosedBirds
 from jaxfit.evaluation.evaluate import COLUMNS, evaluate
-from jaxfit.evaluation.matching import match_tracks
-from jaxfit.evaluation.truth import Truth
+from jaxfit.evaluation.truth import Truth, match_tracks
+from jaxfit.foundation.errors import InputError
 
 
 def test_the_truth_is_perfect():

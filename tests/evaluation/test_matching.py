@@ -7,9 +7,8 @@ import pytest
 from support.rectangles import HEIGHT, WIDTH, birds, steady
 
 from jaxfit.data.solution import Solution
-from jaxfit.errors import InputError
-from jaxfit.evaluation.matching import match_by_overlap, match_tracks
-from jaxfit.evaluation.truth import Truth
+from jaxfit.evaluation.truth import Truth, match_by_overlap, match_tracks
+from jaxfit.foundation.errors import InputError
 
 NAMES = ("bill", "back", "wing", "tail")
 LEFT, RIGHT, BELOW = (0, 0, 30, 20), (60, 0, 30, 20), (0, 60, 30, 20)

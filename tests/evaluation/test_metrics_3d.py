@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxfit.evaluation.metrics_3d import acceleration_errors, best_scale, crop_rotation
+from jaxfit.evaluation.spatial import acceleration_errors, best_scale, crop_rotation
 
 
 def test_crop_rotation_by_hand():

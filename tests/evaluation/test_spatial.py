@@ -10,10 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.birds import pose_window, skin_by_hand, solution_of, toy_bird
 
-from jaxfit.errors import InputError
-from jaxfit.evaluation.aggregation import metrics_of
+from jaxfit.evaluation.evaluate import metrics_of
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
-from jaxfit.model.pose import Pose
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.kinematics import Pose
 
 OFFSET = np.float32([1, -2, 3])  # the root does not lie in the model's origin
 TOY = toy_bird()

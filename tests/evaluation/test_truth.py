@@ -9,9 +9,9 @@ from support.evaluated import BIRD, solution, truth
 
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.solution import save_solution
-from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, evaluate
 from jaxfit.evaluation.truth import Truth, read_truth
+from jaxfit.foundation.errors import InputError
 
 
 @pytest.fixture

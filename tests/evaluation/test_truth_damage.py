@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from support.hostile import Isolated, many_examples
 from support.mutations import damaged_bytes, damaged_tree
 
-from jaxfit.errors import InputError
 from jaxfit.evaluation.truth import read_behaviours, read_truth
+from jaxfit.foundation.errors import InputError
 
 SCENE = {
     "birds": 2,

@@ -12,8 +12,8 @@ from support.exported import BIRD, FPS, FRAMES, TRACKS, write_result
 
 import jaxfit
 from jaxfit.cli.main import main
-from jaxfit.errors import InputError
-from jaxfit.extras import OPTIONAL_PACKAGES
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.extras import OPTIONAL_PACKAGES
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -177,11 +177,11 @@ def test_unknown_footage_and_frame_rate_are_required(tmp_path):
     ("to", "package", "out"), [("parquet", "pyarrow", "a.parquet"), ("movement", "xarray", "a.nc")]
 )
 def test_missing_and_old_packages_are_named(folder, tmp_path, monkeypatch, to, package, out):
-    monkeypatch.setattr("jaxfit.extras.find_spec", lambda name: None)
+    monkeypatch.setattr("jaxfit.foundation.extras.find_spec", lambda name: None)
     with pytest.raises(InputError, match=f"needs {package}, which this installation lacks .*formats"):
         jaxfit.export_result(folder, to, tmp_path / out)
-    monkeypatch.setattr("jaxfit.extras.find_spec", lambda name: name)
-    monkeypatch.setattr("jaxfit.extras.metadata.version", lambda name: "0.3.1+cpu")
+    monkeypatch.setattr("jaxfit.foundation.extras.find_spec", lambda name: name)
+    monkeypatch.setattr("jaxfit.foundation.extras.metadata.version", lambda name: "0.3.1+cpu")
     with pytest.raises(InputError, match=f"needs {package} .* or newer, but version 0.3.1.cpu is installed"):
         jaxfit.export_result(folder, to, tmp_path / out)
 

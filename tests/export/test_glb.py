@@ -9,8 +9,8 @@ from support.exported import BIRD, FPS, FRAMES, TRACKS, solution, write_result
 from support.gltf_reader import Glb
 
 import jaxfit
-from jaxfit.data.posed_meshes import PosedBirds
-from jaxfit.errors import InputError
+from jaxfit.data.projection import PosedBirds
+from jaxfit.foundation.errors import InputError
 
 LENGTH = float(np.ptp(np.asarray(BIRD.vertices), axis=0).max()) * 0.02
 """Body length in metres."""

@@ -6,7 +6,7 @@ from support.exported import FPS, FRAMES, write_result
 
 import jaxfit
 from jaxfit.cli.main import main
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 pynwb = pytest.importorskip("pynwb", reason="pynwb is not installed")
 pytest.importorskip("ndx_pose", reason="ndx-pose is not installed")
@@ -35,7 +35,7 @@ def test_a_file_holds_one_bird_and_its_keypoints(tmp_path):
 
 
 def test_names_with_slashes():
-    from jaxfit.export.nwb import _series_names
+    from jaxfit.export.pose_files import _series_names
 
     assert _series_names(("a/b", "a:b", "a_b", "c")) == ["a_b", "a_b_", "a_b__", "c"]
 

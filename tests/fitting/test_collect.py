@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from support.corrected import BIRD, CONFIG, observations
 
-from jaxfit.fitting.collect import FittedWindow, collect_windows
-from jaxfit.fitting.seams import _keypoints
-from jaxfit.fitting.stages import fit_model
+from jaxfit.fitting.collect import FittedWindow, _keypoints, collect_windows
+from jaxfit.fitting.solve import fit_model
 from jaxfit.fitting.windows import cut_windows
 from jaxfit.model.camera import crop_to_image
-from jaxfit.model.pose import Pose
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.model.kinematics import Pose
+from jaxfit.simulation.flock import smooth_motion
 
 MODEL = fit_model(BIRD, CONFIG)
 SIZES = np.float32([0.6, 1.7])

@@ -8,8 +8,8 @@ from jaxfit.config.fit import load_config
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.initial_pose_file import load_initial_poses
-from jaxfit.model.importers.import_model import import_model
+from jaxfit.fitting.initial_poses import load_initial_poses
+from jaxfit.model.published import import_model
 
 pytestmark = pytest.mark.extended
 

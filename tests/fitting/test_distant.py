@@ -12,12 +12,11 @@ from support.fits import BIRD, config, keypoints_of, truths
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
 from jaxfit.fitting.crops import cut_mask
-from jaxfit.fitting.distant import distant_birds, report_distant_birds, without_distant_birds
 from jaxfit.fitting.fit import fit, windows_of
-from jaxfit.fitting.windows import cut_windows, load_targets
-from jaxfit.limits import CROP_IMAGE_SIDES, DISTANCE_IMAGE_SIDES
+from jaxfit.fitting.windows import cut_windows, distant_birds, load_targets, report_distant_birds, without_distant_birds
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import CROP_IMAGE_SIDES, DISTANCE_IMAGE_SIDES
 
 T, WIDTH, HEIGHT = 4, 40, 30
 FAR = 300_000.0

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfit.fitting.filtering import weighted_median_filter
+from jaxfit.fitting.windows import weighted_median_filter
 
 
 def slow_filter(keypoints, confidence, window):

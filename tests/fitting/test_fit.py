@@ -14,19 +14,17 @@ from support.fits import BIRD, CAMERA, ONE_WINDOW_GB, SIZE, T, config, keypoints
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.solution import save_solution
-from jaxfit.errors import InputError
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.initial_pose_file import load_initial_poses
-from jaxfit.fitting.learn import learn_prior
-from jaxfit.fitting.problem import Problem
-from jaxfit.fitting.solve import report
-from jaxfit.fitting.stages import fit_model, stage_hyperparameters, stage_program
+from jaxfit.fitting.initial_poses import load_initial_poses
+from jaxfit.fitting.solve import Problem, fit_model, report, stage_hyperparameters, stage_program
 from jaxfit.fitting.windows import cut_windows, load_targets
+from jaxfit.foundation.errors import InputError
+from jaxfit.learning.priors import learn_prior
 from jaxfit.model.camera import CROP_PX, project
-from jaxfit.model.pose import Pose
-from jaxfit.simulation.detections import detect
+from jaxfit.model.kinematics import Pose
+from jaxfit.simulation.noise import detect
 
 
 @pytest.fixture(scope="module")

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from support.birds import toy_bird
 
+from jaxfit.config.build import with_values
 from jaxfit.config.fit import load_config
-from jaxfit.config.paths import with_values
 from jaxfit.fitting import batch, tasks
 from jaxfit.fitting import fit as fit_module
 from jaxfit.fitting.fit import fit, fit_runs
 from jaxfit.model.camera import Camera
-from jaxfit.simulation.detections import detect
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
 
 BIRD, T, SIZE, BIRDS = toy_bird(shapes=0), 6, 64, 2
 CAMERA = Camera(2167.0 * SIZE / 256, SIZE / 2, SIZE)

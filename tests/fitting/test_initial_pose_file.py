@@ -12,9 +12,9 @@ from support.mutations import damaged_npz
 
 from jaxfit.config.fit import load_config
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-from jaxfit.fitting.initial_pose_file import load_initial_poses
+from jaxfit.fitting.initial_poses import load_initial_poses
 from jaxfit.fitting.windows import cut_windows
+from jaxfit.foundation.errors import InputError
 
 BIRD = toy_bird()
 N, T, J = 2, 5, BIRD.num_joints

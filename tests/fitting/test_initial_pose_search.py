@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.birds import exp_map, toy_bird
 
 from jaxfit.config.fit import InitialiseConfig
-from jaxfit.fitting.initial_pose_search import (
+from jaxfit.fitting.initial_poses import (
     LEAST_SEPARATION_RAD,
     LEAST_SPAN,
     candidate_orientations,

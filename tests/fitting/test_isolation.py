@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support.fits import BIRD, CAMERA, T, config, replaced, truths
 
+from jaxfit.fitting.batch import FRAMES_PER_TILE, join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.tiles import FRAMES_PER_TILE, join_tiles, take_tile, tile_rows, tile_size
-from jaxfit.model.pose import Pose
-from jaxfit.simulation.detections import detect
+from jaxfit.model.kinematics import Pose
+from jaxfit.simulation.noise import detect
 
 pytestmark = pytest.mark.usefixtures("distant_birds")
 ARRAYS = [*Pose.__dataclass_fields__, "keypoints_cam", "keypoints_px", "valid"]

@@ -10,9 +10,9 @@ from support.birds import random_pose, solution_of, toy_bird
 
 from jaxfit.cli.main import main
 from jaxfit.data.solution import save_solution
-from jaxfit.errors import InputError
-from jaxfit.fitting.learn import LEAST_SD_RAD, LEAST_WIDTH, effective_count, learn_prior, oas_shrinkage
-from jaxfit.model.checks import check_bird
+from jaxfit.foundation.errors import InputError
+from jaxfit.learning.priors import LEAST_SD_RAD, LEAST_WIDTH, effective_count, learn_prior, oas_shrinkage
+from jaxfit.model.bird import check_bird
 from jaxfit.model.files import load_bird
 
 BIRD, T = toy_bird(), 12

@@ -13,8 +13,8 @@ from support.terms_by_hand import accelerations, term_value
 from jaxfit.cli.main import main
 from jaxfit.config.fit import load_config
 from jaxfit.data.solution import save_solution
-from jaxfit.errors import InputError
-from jaxfit.fitting.learn_motion import (
+from jaxfit.foundation.errors import InputError
+from jaxfit.learning.priors import (
     MotionPrior,
     accelerations_rad_s2,
     effective_birds,

@@ -9,24 +9,23 @@ import pytest
 from support.stages import BIRD, CONFIG, FIRST, MODEL, B, T, case, problems, program, solve, total
 
 from jaxfit.config.fit import load_config
-from jaxfit.errors import InputError
-from jaxfit.fitting import levenberg_marquardt
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.levenberg_marquardt import (
+from jaxfit.fitting.solve import (
     DAMPING_DECREASE,
     DAMPING_INCREASE,
     FIRST_DAMPING,
     LEVENBERG_MARQUARDT,
     MOMENTUM,
     MOST_RELAXATION,
+    problem_window,
 )
-from jaxfit.fitting.problem import problem_window
+from jaxfit.foundation.errors import InputError
 from jaxfit.objective import registry
 from jaxfit.objective.curvature import add_rows, frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature
-from jaxfit.simulation.detections import detect
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
 
 NEWTON = dataclasses.replace(
     FIRST, solver="levenberg_marquardt", terms=("keypoints", "pose_prior", "velocity", "acceleration")
@@ -73,7 +72,7 @@ def take_steps(stage, problem, count=1, **changes):
     first = init(batch)._replace(**{name: value[None] for name, value in changes.items()})
     states = [(batch.anchor, first)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(levenberg_marquardt, "CG_TOLERANCE", 1e-6)
+        patch.setattr("jaxfit.fitting.solve.CG_TOLERANCE", 1e-6)
         for _ in range(count):
             states.append(step(batch, *states[-1]))
     (_, before), *after = jax.tree.map(lambda x: x[0], states)

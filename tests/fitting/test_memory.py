@@ -10,10 +10,10 @@ from support.fits import config
 
 from jaxfit.config.fit import load_config
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
 from jaxfit.fitting import windows
-from jaxfit.fitting.memory import check_fit_memory
+from jaxfit.fitting.fit import check_fit_memory
 from jaxfit.fitting.windows import cut_windows, filter_observations
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import load_murre
 
 PAPER = load_config("paper")

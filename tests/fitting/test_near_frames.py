@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.stages import BIRD, CAMERA, MODEL, B, T, case, problems, program, stacked
 
-from jaxfit.fitting.near_frames import take_near_poses
+from jaxfit.fitting.batch import take_near_poses
 from jaxfit.model.camera import project
 from jaxfit.model.kinematics import window_keypoints, window_transforms
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
 
 FIELDS = "global_orient", "body_pose", "transl"
 

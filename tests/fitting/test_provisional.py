@@ -7,14 +7,14 @@ import pytest
 from support.fits import BIRD, CAMERA, T, config, truths
 from support.worker_tasks import quick_fit
 
-from jaxfit.errors import InputError
-from jaxfit.fitting import provisional, scheduling
+from jaxfit.fitting import provisional, tasks
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.provisional import ProvisionalFit
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.simulation.detections import detect
-from jaxfit.storage.parts import Parts
-from jaxfit.workers.cluster import Cluster, FailedTask
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.unfinished import Parts
+from jaxfit.foundation.workers import Cluster, FailedTask
+from jaxfit.simulation.noise import detect
 
 FRAMES, BIRDS = 40, 3
 STEP, LATER = 5, 2
@@ -30,7 +30,7 @@ def fitted(monkeypatch):
         done.extend((int(windows.track_id[w]), int(windows.frame[w].max(initial=-1))) for _, w in task.problems)
         return quick_fit(shared, task)
 
-    monkeypatch.setattr(scheduling, "fit_task", recorded)
+    monkeypatch.setattr(tasks, "fit_task", recorded)
     monkeypatch.setattr(provisional, "STEP_FRAMES", STEP)
     monkeypatch.setattr(provisional, "LATER_FRAMES", LATER)
     return done

@@ -10,9 +10,9 @@ from jaxfit.config.fit import load_config
 from jaxfit.evaluation.metrics import me_p, me_v, mpjpe, pa_mpjpe
 from jaxfit.fitting.fit import fit
 from jaxfit.model.camera import Camera, project
-from jaxfit.model.importers.import_model import import_model
-from jaxfit.simulation.detections import detect
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.model.published import import_model
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
 
 pytestmark = pytest.mark.extended
 

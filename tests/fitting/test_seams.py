@@ -9,19 +9,18 @@ from support.corrected import BIRD, CONFIG, observations
 from support.fits import config
 
 from jaxfit.config.checks import ConfigKeyError
-from jaxfit.corrections.edits import Edit, apply_edits
-from jaxfit.corrections.refit import refit
 from jaxfit.data.solution import LAYOUT, save_solution
-from jaxfit.errors import InputError
-from jaxfit.fitting.collect import FittedWindow, collect_windows
+from jaxfit.fitting.collect import FittedWindow, _keypoints, blend_seams, collect_windows, shared_frames
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.initial_pose_file import load_initial_poses
-from jaxfit.fitting.seams import _keypoints, blend_seams, shared_frames
-from jaxfit.fitting.stages import fit_model
+from jaxfit.fitting.initial_poses import load_initial_poses
+from jaxfit.fitting.solve import fit_model
 from jaxfit.fitting.windows import cut_windows
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.camera import crop_to_image
-from jaxfit.model.pose import Pose
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.model.kinematics import Pose
+from jaxfit.review.correct import refit
+from jaxfit.review.edits import Edit, apply_edits
+from jaxfit.simulation.flock import smooth_motion
 
 SHARED = dataclasses.replace(CONFIG, overlap=2)
 MODEL = fit_model(BIRD, CONFIG)

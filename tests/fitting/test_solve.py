@@ -26,8 +26,7 @@ from support.stages import (
 
 from jaxfit.fitting.solve import advance, begin, report
 from jaxfit.model.camera import project
-from jaxfit.model.kinematics import window_keypoints, window_transforms
-from jaxfit.model.pose import Pose
+from jaxfit.model.kinematics import Pose, window_keypoints, window_transforms
 
 STEP = {"global_orient": 0.02, "body_pose": 0.02, "transl": np.array([0.02, 0.01, 0]), "scale": 0.005}
 """Step size of each optimised parameter in the stage `FIRST`."""

@@ -9,14 +9,14 @@ from support.birds import toy_bird
 from jaxfit.config.fit import CropConfig, load_config
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
-from jaxfit.data.posed_meshes import PosedBirds
+from jaxfit.data.projection import PosedBirds
 from jaxfit.evaluation.metrics import iou
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.windows import cut_windows, load_targets, window_content
-from jaxfit.raster.silhouette import UNKNOWN
+from jaxfit.raster.silhouette_reference import UNKNOWN
 from jaxfit.raster.zbuffer import hard_mask
-from jaxfit.simulation.detections import detect
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
 
 WIDTH, HEIGHT = 400, 300
 BACKGROUND, BIRD = 0, 1

@@ -7,10 +7,15 @@ import pytest
 from support.walking import HEIGHT, WIDTH, K, walk
 
 from jaxfit.config.fit import CropConfig, load_config
-from jaxfit.errors import InputError
 from jaxfit.fitting.crops import cut_mask
-from jaxfit.fitting.filtering import weighted_median_filter
-from jaxfit.fitting.windows import cut_windows, filter_observations, load_targets, window_content
+from jaxfit.fitting.windows import (
+    cut_windows,
+    filter_observations,
+    load_targets,
+    weighted_median_filter,
+    window_content,
+)
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.camera import CROP_PX, crop_to_image
 
 

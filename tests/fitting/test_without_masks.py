@@ -10,9 +10,9 @@ from support.fits import BIRD, CAMERA, config, truths
 from jaxfit.config.fit import StageConfig, load_config, shipped_fit_configs
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.fitting.fit import _without_mask_stages, fit
-from jaxfit.fitting.stages import needs_mask, without_mask_stages
-from jaxfit.model.importers.import_model import import_model
-from jaxfit.simulation.detections import detect
+from jaxfit.fitting.solve import needs_mask, without_mask_stages
+from jaxfit.model.published import import_model
+from jaxfit.simulation.noise import detect
 
 
 @pytest.mark.parametrize("name", shipped_fit_configs())

@@ -9,11 +9,9 @@ from support.checkpoints import write_legacy, write_zip
 from support.hostile import Isolated, fewer_examples
 from support.mutations import damaged_arrays, damaged_bytes, damaged_tree
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, mirror_pairs
-from jaxfit.model.importers.aves import import_aves
-from jaxfit.model.importers.avian_mesh import import_avian_mesh
-from jaxfit.model.importers.import_model import import_model
+from jaxfit.model.published import import_aves, import_avian_mesh, import_model
 
 PARENTS = [-1, 0, 1, 0, 3, 3, 5, 6, 7, 3, 9, 10, 11, 3, 13, 14, 15, 3, 17, 18, 19, 3, 21, 22, 23]
 
@@ -206,7 +204,7 @@ def test_mirror_pairs():
 def test_any_damage_of_the_json_is_one_error(tmp_path, avian_mesh_files):
     path, prior_path = avian_mesh_files
     whole, tree = path.read_bytes(), json.loads(path.read_text())
-    with Isolated("jaxfit.model.importers.avian_mesh:import_avian_mesh", memory_mb=150) as reader:
+    with Isolated("jaxfit.model.published:import_avian_mesh", memory_mb=150) as reader:
 
         @fewer_examples
         @given(damaged_bytes(whole) | damaged_tree(tree).map(lambda value: json.dumps(value).encode()))
@@ -221,7 +219,7 @@ def test_any_damage_of_the_json_is_one_error(tmp_path, avian_mesh_files):
 def test_any_damage_of_the_tensors_is_one_error(tmp_path):
     path, arrays = tmp_path / "aves.pt", {}
     write_aves(path, lambda _, content: arrays.update(content))
-    with Isolated("jaxfit.model.importers.aves:import_aves", memory_mb=150) as reader:
+    with Isolated("jaxfit.model.published:import_aves", memory_mb=150) as reader:
 
         @fewer_examples
         @given(damaged_arrays(arrays))

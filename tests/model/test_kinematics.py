@@ -11,9 +11,15 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 from support.birds import PUBLISHED_CASES, exp_map, published_poses, random_pose, skin_by_hand, toy_bird
 
-from jaxfit.model.importers.import_model import import_model
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_joints, posed_keypoints, posed_vertices
-from jaxfit.model.pose import rest_pose
+from jaxfit.model.kinematics import (
+    fold_bird,
+    joint_transforms,
+    posed_joints,
+    posed_keypoints,
+    posed_vertices,
+    rest_pose,
+)
+from jaxfit.model.published import import_model
 
 # the root is not at the origin, so that rotations about the root and about the origin differ
 ROOT = np.float32([0.5, -1.0, 2.0])

@@ -12,10 +12,8 @@ from hypothesis import given
 from support.hostile import Isolated, fewer_examples
 from support.mutations import damaged_npz
 
-from jaxfit.errors import InputError
-from jaxfit.model.bird import Bird
-from jaxfit.model.checks import ARRAY_FIELDS, check_bird
-from jaxfit.model.describe import describe_bird, model_hash
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.bird import ARRAY_FIELDS, Bird, check_bird, describe_bird, model_hash
 from jaxfit.model.files import OPTIONAL_FIELDS, find_bird, load_bird, save_bird
 
 STATIC = ("parents", "joint_names", "keypoint_names", "joint_pairs", "keypoint_pairs", "name")

@@ -9,14 +9,13 @@ import trimesh
 from support.birds import exp_map
 
 from jaxfit.model.anatomy import JOINT_NAMES, MURRE_KEYPOINTS, MURRE_SKELETON, other_side, skeleton_pairs
-from jaxfit.model.checks import ARRAY_FIELDS
+from jaxfit.model.bird import ARRAY_FIELDS
 from jaxfit.model.files import MURRE_PATH, load_murre
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints, posed_vertices
+from jaxfit.model.kinematics import Pose, fold_bird, joint_transforms, posed_keypoints, posed_vertices
 from jaxfit.model.murre.build import build_murre
-from jaxfit.model.murre.measurements import MEASUREMENTS
 from jaxfit.model.murre.postures import POSTURES, mirrored_pose
 from jaxfit.model.murre.skeleton import CM_PER_UNIT, spread_rotations
-from jaxfit.model.pose import Pose
+from jaxfit.model.murre.skinning import MEASUREMENTS
 
 BIRD = load_murre()
 RIG = fold_bird(BIRD)

@@ -7,7 +7,7 @@ import pytest
 from support.birds import PUBLISHED_CASES, published_poses, skin_by_hand
 
 from jaxfit.model.anatomy import AVES_KEYPOINTS, JOINT_NAMES
-from jaxfit.model.importers.import_model import import_model
+from jaxfit.model.published import import_model
 
 
 @pytest.fixture(scope="module")

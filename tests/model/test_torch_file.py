@@ -22,8 +22,8 @@ from support.checkpoints import (
 from support.hostile import Isolated, many_examples
 from support.mutations import damaged_bytes
 
-from jaxfit.errors import InputError
-from jaxfit.model.importers.torch_file import read_tensors
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.torch_file import read_tensors
 
 RAW = np.arange(12, dtype="<f4").tobytes()
 FLOATS = {"0": RAW}
@@ -227,7 +227,7 @@ def test_any_damage_is_one_error(tmp_path, write):
     """For any damage, the reader returns arrays or raises InputError, within a bound on memory."""
     path = tmp_path / "a.pt"
     whole = write(path, {"V": np.ones((4, 3), "<f4"), "F": np.array([[0, 1, 2]])}).read_bytes()
-    with Isolated("jaxfit.model.importers.torch_file:read_tensors", memory_mb=30) as reader:
+    with Isolated("jaxfit.model.torch_file:read_tensors", memory_mb=30) as reader:
 
         @many_examples
         @given(damaged_bytes(whole))

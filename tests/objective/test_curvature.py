@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import terms_by_hand
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.rotation import axis_angle_to_matrix, right_jacobian
 from jaxfit.objective.curvature import SHARED_PARAMETERS, add_rows, frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature, residual_sum

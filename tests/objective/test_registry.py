@@ -11,7 +11,7 @@ import pytest
 from support.terms_by_hand import posed_window, random_targets, window_pose
 
 import jaxfit
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.objective import registry, terms
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
 from jaxfit.objective.registry import find_term, find_terms, known_terms, term

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from support.birds import toy_bird
 from support.terms_by_hand import CAMERA, RASTER, motion_by_hand, random_motion, random_targets, term_value, window_pose
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.objective.likelihood import motion_likelihood
-from jaxfit.objective.plausibility import feet_on_ground, joint_limits
 from jaxfit.objective.posed_window import PosedWindow, priors_of
 from jaxfit.objective.residuals import huber, residual_sum
-from jaxfit.objective.smoothness import geodesic_velocity, huber_velocity, low_pass
+from jaxfit.objective.temporal import geodesic_velocity, huber_velocity, low_pass
+from jaxfit.objective.terms import feet_on_ground, joint_limits
 
 BONES, L = 4, 8
 

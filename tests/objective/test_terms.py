@@ -53,7 +53,7 @@ def test_stored_geman_mcclure_and_mahalanobis(reference_dir):
         value = geman_mcclure(50.0).value(jnp.asarray(stored["geman_mcclure/residual"]) ** 2)
         np.testing.assert_allclose(value, stored["geman_mcclure/value"], rtol=1e-6)
         poses, expected = stored["pose_prior/body_pose"], stored["pose_prior/squared_mahalanobis"]
-    from jaxfit.model.importers.import_model import import_model
+    from jaxfit.model.published import import_model
 
     priors = priors_of(import_model("avian-mesh", [reference_dir / "models" / "avian_mesh"]))
     for body_pose, distance in zip(poses, expected, strict=True):

@@ -20,7 +20,7 @@ from jaxfit.export.export import export_result
 pytestmark = pytest.mark.extended
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "configs", "jaxfit", "kernels")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "configs", "jaxfit")
 ANNOUNCEMENT = "installs WITHOUT its compiled kernels"
 TRACKER_TESTS = ("tests/perception/test_tracker.py", "tests/evaluation/test_tracking_metrics.py")
 
@@ -164,7 +164,7 @@ def test_for_another_processor_the_package_installs_without_kernels(build_python
     [("int broken(", "error: expected"), ('#include "no_such_header.h"', "no_such_header.h: No such file")],
 )
 def test_a_compile_error_fails_the_installation(build_python, source, line, message):
-    file = source / "kernels" / "instruction_set.cc"
+    file = source / "jaxfit" / "raster" / "cpp" / "instruction_set.cc"
     file.write_text(file.read_text() + f"\n{line}\n")
     _, output = build_wheel(build_python, source, fails=True)
     assert message in output

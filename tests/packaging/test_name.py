@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from jaxfit import extras
 from jaxfit.cli import doctor
-from jaxfit.extras import DISTRIBUTION, install_command, library_versions, other_jaxfit, own_version
+from jaxfit.foundation import extras
+from jaxfit.foundation.extras import DISTRIBUTION, install_command, library_versions, other_jaxfit, own_version
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -57,7 +57,7 @@ def test_the_version_is_that_of_the_distribution_or_of_the_checkout(installed, m
     assert library_versions(["jaxfit"]) == {"jaxfit": "7.1"}
     del installed[DISTRIBUTION]
     (tmp_path / "site" / "jaxfit").mkdir(parents=True)
-    monkeypatch.setattr(extras, "__file__", str(tmp_path / "site" / "jaxfit" / "extras.py"))
+    monkeypatch.setattr(extras, "__file__", str(tmp_path / "site" / "jaxfit" / "foundation/extras.py"))
     assert own_version() == "unknown"
     (tmp_path / "site" / "pyproject.toml").write_text('[project]\nname = "another"\nversion = "3"\n')
     assert own_version() == "unknown"

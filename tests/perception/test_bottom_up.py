@@ -5,10 +5,9 @@ import pytest
 from onnx import helper
 from support.onnx_graphs import write_constant, write_graph
 
-from jaxfit.errors import InputError
-from jaxfit.perception.onnx_model import OnnxModel
-from jaxfit.perception.segmentation import load_segmenter
-from jaxfit.perception.segmentation.bottom_up import BottomUp
+from jaxfit.foundation.errors import InputError
+from jaxfit.perception.network import OnnxModel
+from jaxfit.perception.segmentation import BottomUp, load_segmenter
 
 CELLS_HIGH, CELLS_WIDE, CELL_PX = 48, 64, 2  # an input of 128 x 96
 

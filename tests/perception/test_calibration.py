@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 from support.onnx_graphs import write_constant
 
-from jaxfit.errors import InputError
-from jaxfit.perception.calibration import CONFIDENCE_KEY, Curve, read_curve
-from jaxfit.perception.instances import instance_of
+from jaxfit.foundation.errors import InputError
 from jaxfit.perception.keypoints import load_keypoint_detector
-from jaxfit.perception.onnx_model import OnnxModel
+from jaxfit.perception.network import CONFIDENCE_KEY, Curve, OnnxModel, instance_of, read_curve
 
 FRAME = np.zeros((64, 64, 3), np.uint8)
 BIRD = instance_of(np.ones((20, 20), bool), 1.0, "bird", 10, 10)

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import binary_dilation
 from support.instances import rectangle_instance
 
-from jaxfit.perception.instances import instance_of
 from jaxfit.perception.keypoints import crop_bird
+from jaxfit.perception.network import instance_of
 
 
 def test_box_is_padded_then_enlarged_about_its_centre():

@@ -8,9 +8,9 @@ import pytest
 from onnx import helper
 from support.onnx_graphs import write_graph, write_reading
 
-from jaxfit.perception.onnx_model import OnnxModel
+from jaxfit.perception.network import OnnxModel
 from jaxfit.perception.segmentation import load_segmenter
-from jaxfit.perception.segmentation.yolox import Yolox
+from jaxfit.perception.segmentation_layouts import Yolox
 
 load = partial(load_segmenter, threads=1)  # one thread is faster on a busy machine
 FIRST_OF_STRIDE_16, FIRST_OF_STRIDE_32 = 52 * 52, 52 * 52 + 26 * 26

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxfit.perception.keypoints.heatmaps import apply_activation, heatmap_peaks, simcc_peaks, subcell_offsets
+from jaxfit.perception.keypoint_layouts import apply_activation, heatmap_peaks, simcc_peaks, subcell_offsets
 
 
 def _gaussian(x0, y0, covariance, size=(12, 9), height=0.8):

@@ -13,10 +13,10 @@ from onnx import TensorProto, helper, numpy_helper
 from support.hostile import Isolated, many_examples
 from support.mutations import damaged_bytes
 
-from jaxfit.errors import InputError
-from jaxfit.limits import CLASSES, INSTANCES
-from jaxfit.perception.instances import collect_instances, instance_of
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import CLASSES, INSTANCES
 from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.perception.network import collect_instances, instance_of
 from jaxfit.perception.segmentation import load_segmenter
 
 FRAME = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)

@@ -6,7 +6,7 @@ from onnx import TensorProto, helper
 from support.instances import rectangle_instance
 from support.onnx_graphs import write_constant, write_graph
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception.keypoints import load_keypoint_detector
 

@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 
 from jaxfit.config.perception import TrackConfig
-from jaxfit.data.formats.scene_folder import FOOTAGE
-from jaxfit.evaluation.observed import evaluate_observations
+from jaxfit.data.formats import FOOTAGE
+from jaxfit.evaluation.tracking import evaluate_observations
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.model.files import load_murre
-from jaxfit.perception.keypoints import load_keypoint_detector
-from jaxfit.perception.keypoints.detector import BUILTIN_PATH
-from jaxfit.perception.onnx_model import OnnxModel
-from jaxfit.perception.segmentation.load import BUILTIN, load_segmenter
-from jaxfit.perception.track import run_tracking
-from jaxfit.perception.trust import MAX_FRAME_DISTANCE
+from jaxfit.perception.keypoints import BUILTIN_PATH, load_keypoint_detector
+from jaxfit.perception.network import OnnxModel
+from jaxfit.perception.segmentation import BUILTIN, load_segmenter
+from jaxfit.perception.track import MAX_FRAME_DISTANCE, run_tracking
 from jaxfit.simulation.scene import simulate
 
 FILES = BUILTIN, BUILTIN_PATH

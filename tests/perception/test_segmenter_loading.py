@@ -8,9 +8,9 @@ import pytest
 from onnx import TensorProto
 from support.onnx_graphs import write_constant, write_reading
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.perception.segmentation import KINDS, load_segmenter
-from jaxfit.perception.segmentation.placement import Placement, non_maximum_suppression
+from jaxfit.perception.segmentation_inputs import Placement, non_maximum_suppression
 
 load = partial(load_segmenter, threads=1)  # one thread is faster on a busy machine
 HEAD, PROTOS = np.zeros((1, 116, 84)), np.zeros((1, 32, 16, 16))

@@ -8,9 +8,9 @@ import pytest
 from onnx import TensorProto, helper
 from support.onnx_graphs import write_graph, write_reading
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.perception.segmentation import load_segmenter
-from jaxfit.perception.segmentation.classes import COCO, coco_by_category
+from jaxfit.perception.segmentation_inputs import COCO, coco_by_category
 
 load = partial(load_segmenter, threads=1)  # one thread is faster on a busy machine
 BIRD, CAT = 14, 15

@@ -5,12 +5,12 @@ import pytest
 from support.toy_footage import FRAMES, MISSED, Footage, MonitoredSegmenter, TrueKeypoints, assert_same_tracking
 
 from jaxfit.config.perception import FramesConfig, TrackConfig, TrackerConfig
-from jaxfit.errors import InputError
-from jaxfit.perception import frame_loop, track
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.unfinished import Parts
+from jaxfit.perception import detections, track
+from jaxfit.perception.detections import load_frames
 from jaxfit.perception.track import run_tracking
-from jaxfit.perception.tracking.stored_frames import load_frames
-from jaxfit.perception.tracking.tracker import load_tracker
-from jaxfit.storage.parts import Parts
+from jaxfit.perception.tracking import load_tracker
 
 FOOTAGE = Footage()
 
@@ -24,7 +24,7 @@ def video(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch):
-    monkeypatch.setattr(frame_loop, "FRAMES_PER_PART", 4)
+    monkeypatch.setattr(detections, "FRAMES_PER_PART", 4)
 
 
 class StoppedError(Exception):

@@ -8,7 +8,7 @@ import pytest
 from support.toy_footage import BIRD, BIRDS, FRAMES, SIDE, Footage, TrueKeypoints, TrueSegmenter
 
 from jaxfit.config.perception import FramesConfig, SegmenterConfig, TrackConfig, TrackerConfig
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.perception import track
 from jaxfit.perception.track import open_segmenter, run_tracking, track_video
 from jaxfit.video.writer import VideoWriter

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from support.instances import rectangle_instance
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
+from jaxfit.perception.external_trackers import EXTERNAL_TRACKERS
 from jaxfit.perception.tracking import TRACKERS, load_tracker
-from jaxfit.perception.tracking.external_trackers import EXTERNAL_TRACKERS
 
 
 def bird(x, y=0, width=20, height=10, score=0.9):

@@ -9,17 +9,23 @@ import pytest
 from support.birds import toy_bird
 
 from jaxfit.model.camera import Camera, to_screen
-from jaxfit.model.jacobian import shape_derivatives, transform_derivatives
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_vertices, shaped_vertices
-from jaxfit.model.pose import Pose
+from jaxfit.model.kinematics import (
+    Pose,
+    fold_bird,
+    joint_transforms,
+    posed_vertices,
+    shape_derivatives,
+    shaped_vertices,
+    transform_derivatives,
+)
+from jaxfit.raster import kernels, silhouette_reference
 from jaxfit.raster import silhouette as raster
-from jaxfit.raster.silhouette import reference
 
-ISAS = raster.available_isas()
+ISAS = kernels.available_isas()
 BIRD = toy_bird()
 RIG = fold_bird(BIRD)
 SIZE = 40
-BLUR = raster.Blur(sigma=1.0, radius=3.0)
+BLUR = silhouette_reference.Blur(sigma=1.0, radius=3.0)
 """So sharp that all pixels of the band fit into the rows of the kernels."""
 PLACED = 3 * 8 + 4
 """Columns before the lengths of the bones: 8 joints, translation, scale."""
@@ -29,9 +35,9 @@ PLACED = 3 * 8 + 4
 def native(request):
     if request.param is None:
         pytest.skip("no compiled kernels here")
-    raster.choose_isa(request.param)
+    kernels.choose_isa(request.param)
     yield "native"
-    raster.choose_isa("auto")
+    kernels.choose_isa("auto")
 
 
 @pytest.fixture(params=["reference", *ISAS])
@@ -40,9 +46,9 @@ def backend(request):
     if request.param == "reference":
         yield request.param
     else:
-        raster.choose_isa(request.param)
+        kernels.choose_isa(request.param)
         yield "native"
-        raster.choose_isa("auto")
+        kernels.choose_isa("auto")
 
 
 def pose_of(row) -> Pose:
@@ -70,7 +76,8 @@ def skin_of(row):
     pose = pose_of(row)
     A, rest = joint_transforms(RIG, pose), shaped_vertices(RIG, pose).T
     slope = transform_derivatives(RIG, A, pose, with_bones=True)
-    return raster.Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope, shape_derivatives(RIG, A, pose))
+    shapes = shape_derivatives(RIG, A, pose)
+    return silhouette_reference.Skin(rest, RIG.vertex_joints, RIG.vertex_weights, slope, shapes)
 
 
 def block(row, backend, weight=1.0, vertices=None, faces=RIG.faces, blur=BLUR, size=SIZE, target=None):
@@ -91,7 +98,7 @@ def by_autodiff(row, known):
     """JᵀJ over the known pixels of the band, and their number."""
 
     def image(row):
-        return reference.silhouette(on_screen(row), RIG.faces, SIZE, BLUR)
+        return silhouette_reference.silhouette(on_screen(row), RIG.faces, SIZE, BLUR)
 
     value, J = image(row), jax.jacfwd(image)(row)
     band = (value > 0.01) & (value < 0.99) & known
@@ -117,7 +124,7 @@ PLACES = {"inside": (0.3, -0.2, 180.0), "at the border": (9.0, 4.0, 180.0), "par
 @functools.cache
 def expected_block(place, masked=False):
     """JᵀJ and the number of pixels of its band, by automatic differentiation."""
-    known = random_target(SIZE) != raster.UNKNOWN if masked else jnp.ones((SIZE, SIZE), bool)
+    known = random_target(SIZE) != silhouette_reference.UNKNOWN if masked else jnp.ones((SIZE, SIZE), bool)
     return by_autodiff(row_of(PLACES[place]), known)
 
 
@@ -130,7 +137,8 @@ def test_it_is_the_square_of_the_jacobian(backend, place):
 
 def random_target(size):
     """A mask of background, bird and unknown pixels, and one other byte, which is bird."""
-    return jnp.asarray(np.random.default_rng(3).choice([0, 1, raster.UNKNOWN, 255], (size, size)), jnp.uint8)
+    values = [0, 1, silhouette_reference.UNKNOWN, 255]
+    return jnp.asarray(np.random.default_rng(3).choice(values, (size, size)), jnp.uint8)
 
 
 def test_unknown_pixels_have_no_curvature(backend):
@@ -139,7 +147,7 @@ def test_unknown_pixels_have_no_curvature(backend):
     assert 10 < band < 0.9 * expected_block("inside")[1]
     found = block(row, backend, target=target)
     np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
-    assert not np.any(block(row, backend, target=jnp.full_like(target, raster.UNKNOWN)))
+    assert not np.any(block(row, backend, target=jnp.full_like(target, silhouette_reference.UNKNOWN)))
     np.testing.assert_array_equal(block(row, backend, target=target == 1), block(row, backend))
 
 
@@ -164,7 +172,7 @@ def test_weights(backend):
 
 def test_many_pixels_are_sampled_evenly(native):
     """With a wide band, the kernels sum over a part of the pixels, and scale the sum."""
-    row, blur = row_of(), raster.Blur(sigma=12.0, radius=12.0)
+    row, blur = row_of(), silhouette_reference.Blur(sigma=12.0, radius=12.0)
     image = raster.silhouette(on_screen(row, 64), RIG.faces, 64, blur=blur)
     assert ((image > 0.01) & (image < 0.99)).sum() > 2 * 256
     exact, sampled = (

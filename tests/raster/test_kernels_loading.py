@@ -10,7 +10,7 @@ import pytest
 from jaxfit.raster import kernels as native
 from jaxfit.raster import silhouette as raster
 
-ISAS = raster.available_isas()
+ISAS = native.available_isas()
 needs_kernels = pytest.mark.skipif(not ISAS, reason="built without the kernels")
 VERTICES = jnp.asarray([[2.0, 2, 1], [12, 3, 1], [6, 13, 1]])
 FACES = jnp.asarray([[0, 1, 2]])
@@ -19,12 +19,12 @@ FACES = jnp.asarray([[0, 1, 2]])
 @needs_kernels
 def test_choosing_an_instruction_set_that_is_not_there():
     with pytest.raises(ValueError, match=r"'sse9' is not available here: choose one of auto.*baseline"):
-        raster.choose_isa("sse9")
+        native.choose_isa("sse9")
     for isa in ISAS:
-        raster.choose_isa(isa)
-        assert raster.current_isa() == isa
-    raster.choose_isa("auto")
-    assert raster.current_isa() == ISAS[0]
+        native.choose_isa(isa)
+        assert native.current_isa() == isa
+    native.choose_isa("auto")
+    assert native.current_isa() == ISAS[0]
     assert ISAS[-1] == "baseline"
 
 
@@ -41,15 +41,15 @@ class TestWithoutKernels:
             images = [raster.silhouette(VERTICES, FACES, 16) for _ in range(2)]
         np.testing.assert_array_equal(images[0], raster.silhouette(VERTICES, FACES, 16, backend="reference"))
         assert [r.message.count("without its compiled kernels") for r in caplog.records] == [1]
-        assert raster.available_isas() == ()
-        assert raster.current_isa() is None
-        assert not raster.kernels_available()
+        assert native.available_isas() == ()
+        assert native.current_isa() is None
+        assert not native.kernels_available()
 
     def test_insisting_on_them_is_an_error(self):
         with pytest.raises(RuntimeError, match="without its compiled kernels"):
             raster.silhouette(VERTICES, FACES, 16, backend="native")
         with pytest.raises(RuntimeError, match="without its compiled kernels"):
-            raster.choose_isa("auto")
+            native.choose_isa("auto")
 
 
 def test_broken_kernels_fail_loudly(tmp_path, monkeypatch):
@@ -68,16 +68,16 @@ def test_broken_kernels_fail_loudly(tmp_path, monkeypatch):
 def test_the_environment_chooses_the_instruction_set(monkeypatch):
     native._kernels.cache_clear()
     monkeypatch.setenv(native.ISA_VARIABLE, "baseline")
-    assert raster.current_isa() == "baseline"
+    assert native.current_isa() == "baseline"
     native._kernels.cache_clear()
     monkeypatch.setenv(native.ISA_VARIABLE, "abacus")
     with pytest.raises(ValueError, match="'abacus' is not available"):
-        raster.current_isa()
+        native.current_isa()
     monkeypatch.delenv(native.ISA_VARIABLE)
     native._kernels.cache_clear()
-    assert raster.current_isa() == ISAS[0]
+    assert native.current_isa() == ISAS[0]
 
 
 @pytest.mark.skipif(not os.environ.get("JAXFIT_REQUIRE_KERNELS"), reason="JAXFIT_REQUIRE_KERNELS is not set")
 def test_the_kernels_were_built():
-    assert raster.kernels_available()
+    assert native.kernels_available()

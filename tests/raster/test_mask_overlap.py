@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from support.meshes import random_mesh
 
 from jaxfit.raster import kernels as native
-from jaxfit.raster.zbuffer import hard_mask, mask_overlap, reference
+from jaxfit.raster import zbuffer_reference
+from jaxfit.raster.zbuffer import hard_mask, mask_overlap
 
 ISAS = native.available_isas()
 SQUARE = np.array([[10.0, 10, 2], [30, 10, 2], [30, 30, 2], [10, 30, 2]], np.float32)
@@ -27,7 +28,7 @@ def random_runs(rng, sizes_px, count=200):
 def agree(vertices, faces, sizes_px, mesh, runs):
     found = mask_overlap(vertices, faces, sizes_px, mesh, runs)
     for i, (width, height) in enumerate(sizes_px):
-        mask = reference.raster(vertices[i], faces, width, height, 1)[0] >= 0
+        mask = zbuffer_reference.raster(vertices[i], faces, width, height, 1)[0] >= 0
         y, x = np.nonzero(mask)
         box = [x.min(), y.min(), np.ptp(x) + 1, np.ptp(y) + 1] if len(x) else [0, 0, 0, 0]
         assert found.box_px[i].tolist() == box

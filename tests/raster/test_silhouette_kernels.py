@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxfit.raster import kernels, silhouette_reference
 from jaxfit.raster import silhouette as raster
+from jaxfit.raster.silhouette_reference import Blur
 
-ISAS = raster.available_isas()
+ISAS = kernels.available_isas()
 needs_kernels = pytest.mark.skipif(not ISAS, reason="built without the kernels")
 
 
@@ -21,9 +23,9 @@ def each_isa(request):
     """Runs the test once an instruction set."""
     if request.param not in ISAS:
         pytest.skip(f"no {request.param} kernels here: {ISAS}")
-    raster.choose_isa(request.param)
+    kernels.choose_isa(request.param)
     yield request.param
-    raster.choose_isa("auto")
+    kernels.choose_isa("auto")
 
 
 def random_mesh(seed, faces=24, size=64, spread=1.2):
@@ -45,7 +47,7 @@ def random_target(seed, size, dtype):
     rng = np.random.default_rng(seed)
     if dtype == np.float32:
         return jnp.asarray(rng.random((size, size), np.float32))
-    values = [False, True] if dtype is bool else [0, 1, raster.UNKNOWN, 255]
+    values = [False, True] if dtype is bool else [0, 1, silhouette_reference.UNKNOWN, 255]
     return jnp.asarray(rng.choice(values, (size, size)), dtype)
 
 
@@ -108,15 +110,15 @@ def test_random_meshes(each_isa, seed, size, kind, dtype):
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(st.integers(0, 2**31), st.sampled_from(ISAS or ("none",)))
 def test_any_mesh(seed, isa):
-    raster.choose_isa(isa)
+    kernels.choose_isa(isa)
     try:
         vertices, faces = random_mesh(seed, size=40)
         agree(vertices, faces, random_target(seed, 40, np.uint8))
     finally:
-        raster.choose_isa("auto")
+        kernels.choose_isa("auto")
 
 
-@pytest.mark.parametrize("blur", [raster.Blur(0.05, 0.7), raster.Blur(30.0, 15.0), raster.Blur(1.0, 60.0)])
+@pytest.mark.parametrize("blur", [Blur(0.05, 0.7), Blur(30.0, 15.0), Blur(1.0, 60.0)])
 def test_other_blurs(each_isa, blur):
     vertices, faces = random_mesh(5)
     agree(vertices, faces, random_target(5, 64, np.uint8), blur=blur)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxfit.raster import kernels, silhouette_reference
 from jaxfit.raster import silhouette as raster
 
 SIZE = 32
-BACKENDS = ["reference"] + (["native"] if raster.kernels_available() else [])
+BACKENDS = ["reference"] + (["native"] if kernels.kernels_available() else [])
 FACES = jnp.asarray([[0, 1, 2], [2, 1, 3], [0, 3, 4]], jnp.int32)
 
 
@@ -27,7 +28,7 @@ def mask(seed=0):
 def test_silhouette_by_hand(backend):
     # One face whose edge runs along x = 8: the pixel at 8 + n/2 lies n/2 from it, on the outside.
     vertices = jnp.asarray([[8.0, -40, 1], [8.0, 60, 1], [-60.0, 10, 1]])
-    blur = raster.Blur(sigma=2.0, radius=2.0)
+    blur = silhouette_reference.Blur(sigma=2.0, radius=2.0)
     image = raster.silhouette(vertices, jnp.asarray([[0, 1, 2]]), 20, blur=blur, backend=backend)
     d = np.array([-2.25, -0.25, 0.25, 2.25])  # squared distances of the pixels 6 to 9, signed
     np.testing.assert_allclose(image[10, 6:10], 1 / (1 + np.exp(d / 2.0)), rtol=1e-4)
@@ -48,7 +49,7 @@ def test_loss_by_hand(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_gradients_by_finite_differences(backend):
     # Smooth: a wide blur whose radius is beyond every pixel, and a target that no pixel crosses.
-    blur = raster.Blur(sigma=25.0, radius=100.0)
+    blur = silhouette_reference.Blur(sigma=25.0, radius=100.0)
     middle = jnp.asarray([[12.0, 13, 1], [20, 12.5, 1], [15, 21, 1]])
 
     weights = jnp.linspace(0, 1, SIZE)[:, None] * jnp.linspace(1, 0.3, SIZE)
@@ -163,11 +164,11 @@ def test_unknown_pixels_cost_nothing(backend, kind):
         e = jnp.abs(raster.silhouette(vertices, FACES, SIZE, backend="reference") - target)[known]
         return jnp.sum(e if kind == "l1" else 0.5 * e**2)
 
-    value, gradient = both(quad(), jnp.where(known, target, raster.UNKNOWN))
+    value, gradient = both(quad(), jnp.where(known, target, silhouette_reference.UNKNOWN))
     expected = jax.jit(jax.value_and_grad(by_hand))(quad())
     assert value == pytest.approx(float(expected[0]), rel=1e-4)
     np.testing.assert_allclose(gradient, expected[1], rtol=1e-3, atol=1e-3 * np.abs(expected[1]).max())
-    nothing = both(quad(), jnp.full_like(target, raster.UNKNOWN))
+    nothing = both(quad(), jnp.full_like(target, silhouette_reference.UNKNOWN))
     assert nothing[0] == 0
     assert not np.any(nothing[1])
 
@@ -217,4 +218,4 @@ def test_wrong_sizes_and_blurs_are_named():
             raster.silhouette(quad(), FACES, size)
     for sigma, radius, name in ((0, 1, "sigma"), (-1, 1, "sigma"), (np.nan, 1, "sigma"), (1, -1, "radius")):
         with pytest.raises(ValueError, match=name):
-            raster.Blur(sigma, radius)
+            silhouette_reference.Blur(sigma, radius)

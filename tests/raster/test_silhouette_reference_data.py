@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfit.raster import kernels, silhouette_reference
 from jaxfit.raster import silhouette as raster
 
 CASES = ("triangle", "triangle_edge_of_frame", "icosphere", "aves_template_a", "aves_template_b", "avian_mesh_a")
@@ -18,11 +19,11 @@ CENTRE = 128
 @pytest.fixture(params=["avx512", "avx2", "baseline"])
 def each_isa(request):
     """Runs the test once for each instruction set."""
-    if request.param not in raster.available_isas():
-        pytest.skip(f"no {request.param} kernels here: {raster.available_isas()}")
-    raster.choose_isa(request.param)
+    if request.param not in kernels.available_isas():
+        pytest.skip(f"no {request.param} kernels here: {kernels.available_isas()}")
+    kernels.choose_isa(request.param)
     yield request.param
-    raster.choose_isa("auto")
+    kernels.choose_isa("auto")
 
 
 @pytest.fixture(scope="module")
@@ -83,6 +84,6 @@ def test_reference_agrees_with_pytorch3d(data, case):
 
 
 def test_default_blur_is_that_of_the_data(data):
-    blur = raster.Blur.for_size(256)
+    blur = silhouette_reference.Blur.for_size(256)
     assert blur.sigma == pytest.approx(float(data["sigma"]) * 128**2)
     assert blur.radius == pytest.approx(128 * float(data["blur_radius"]) ** 0.5)

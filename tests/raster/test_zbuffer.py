@@ -14,7 +14,7 @@ from support.meshes import random_mesh
 
 from jaxfit.raster import kernels as native
 from jaxfit.raster import zbuffer as render
-from jaxfit.raster.zbuffer import reference
+from jaxfit.raster import zbuffer_reference
 
 ISAS = native.available_isas()
 needs_kernels = pytest.mark.skipif(not ISAS, reason="built without the kernels")
@@ -27,20 +27,20 @@ def agree(vertices, faces, width, height, samples=2):
     rng = np.random.default_rng(0)
     found, expected = (
         render.zbuffer(vertices, faces, width, height),
-        reference.fragments(vertices, faces, width, height),
+        zbuffer_reference.fragments(vertices, faces, width, height),
     )
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(render.hard_mask(vertices, faces, width, height), expected[0] >= 0)
     attributes = rng.normal(size=(len(vertices), 5)).astype(np.float32)
     found = render.interpolate(vertices, faces, attributes, width, height, samples)
-    expected = reference.interpolate(vertices, faces, attributes, width, height, samples)
+    expected = zbuffer_reference.interpolate(vertices, faces, attributes, width, height, samples)
     np.testing.assert_allclose(found[0], expected[0], atol=1e-5)
     np.testing.assert_array_equal(found[1], expected[1].astype(np.float32))
     np.testing.assert_array_equal(found[2], expected[2])
     image = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
     drawn, colours = image.copy(), rng.uniform(-0.2, 1.2, (len(vertices), 3)).astype(np.float32)
-    reference.draw(drawn, vertices, faces, colours, samples)
+    zbuffer_reference.draw(drawn, vertices, faces, colours, samples)
     np.testing.assert_array_equal(render.draw(image, vertices, faces, colours, samples), drawn)
 
 
@@ -251,7 +251,8 @@ def test_without_kernels_a_process_of_its_own_renders_and_says_so():
     found = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, cwd=Path.cwd()
     )
-    expected = reference.raster(np.float32([[2, 2, 1], [12, 3, 1], [6, 13, 1]]), np.array([[0, 1, 2]]), 16, 16, 1)
+    corners = np.float32([[2, 2, 1], [12, 3, 1], [6, 13, 1]])
+    expected = zbuffer_reference.raster(corners, np.array([[0, 1, 2]]), 16, 16, 1)
     assert int(found.stdout) == (expected[0] >= 0).sum()
     assert found.stderr.count("renderings in NumPy") == 1
 

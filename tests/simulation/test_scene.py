@@ -10,15 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit import load_murre
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.data.posed_meshes import PosedBirds
-from jaxfit.errors import InputError
+from jaxfit.data.projection import PosedBirds
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.truth import Truth, read_truth
+from jaxfit.foundation.errors import InputError
 from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.behaviour import BEHAVIOURS
 from jaxfit.simulation.flock import simulate_flock
-from jaxfit.simulation.footage import Footage
-from jaxfit.simulation.ledge import random_light
+from jaxfit.simulation.footage import Footage, random_light
 from jaxfit.simulation.scene import LEDGE_DEPTH, simulate, stage_scene
 from jaxfit.simulation.viewpoint import random_viewpoint
 from jaxfit.video.reader import read_frames

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird, neutral_colours, unlimited_joints
 from jaxfit.model.camera import Camera, crop_to_image, project
-from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms, window_vertices
-from jaxfit.model.pose import Pose
+from jaxfit.model.kinematics import Pose, fold_bird, window_keypoints, window_transforms, window_vertices
 
 PARTS = {  # joint: parent, position, centre and half-axes of its ellipsoid (x side, y to the bill, z up)
     "root": (None, (0, 0, 0), (0, 0, 0), (2.0, 4.0, 1.8)),

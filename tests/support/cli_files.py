@@ -8,8 +8,8 @@ from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.model.camera import Camera
 from jaxfit.model.files import save_bird
-from jaxfit.simulation.detections import detect
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
 from support.birds import toy_bird
 
 BIRD, T, SIZE = toy_bird(shapes=0), 6, 64

@@ -6,9 +6,9 @@ import numpy as np
 
 import jaxfit
 from jaxfit.config.yaml_file import config_to_yaml
-from jaxfit.data.boxes import box_of_keypoints
+from jaxfit.data.masks import box_of_keypoints
 from jaxfit.data.observations import Observations
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
 from support.fits import BIRD, config, keypoints_of
 
 WINDOW, FRAMES, TRACKS = 6, 17, (2, 4, 5)

@@ -9,7 +9,7 @@ from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.evaluation.metrics import longest_side_of_mask
 from jaxfit.model.camera import Camera, project
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
 from support.birds import filled_mask, pose_window, solution_of, toy_bird
 
 BIRD, CAMERA, N, T = toy_bird(), Camera(), 2, 4

@@ -6,9 +6,9 @@ import json
 import numpy as np
 
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.data.projected import projected_observations
+from jaxfit.data.projection import projected_observations
 from jaxfit.data.solution import Solution, save_solution
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
 from support.birds import solution_of, toy_bird
 
 BIRD = dataclasses.replace(toy_bird(), metres_per_unit=0.02)

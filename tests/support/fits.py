@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxfit.config.fit import load_config
 from jaxfit.model.camera import Camera, project
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
 from support.birds import pose_window, toy_bird
 
 BIRD = toy_bird(shapes=0)

@@ -3,7 +3,7 @@
 A server process imports the reader once and forks one child per file, so that a crash, a hang or gigabytes of memory
 end one child and not the tests. The server does not start JAX's threads, so forks are safe.
 
-    with Isolated("jaxfit.storage.npz:load_npz") as reader:
+    with Isolated("jaxfit.foundation.array_files:load_npz") as reader:
         outcome = reader(path, {})
         assert outcome.acceptable
 """

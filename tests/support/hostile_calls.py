@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from jaxfit.fitting.initial_pose_file import load_initial_poses
+from jaxfit.fitting.initial_poses import load_initial_poses
 
 
 def read_initial_poses(path: str) -> None:

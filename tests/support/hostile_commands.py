@@ -8,11 +8,11 @@ import io
 import sys
 
 from jaxfit.cli.main import main
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 
 # The server imports these modules once, so that its children need neither the time nor the memory.
 for _name in (
-    "jaxfit.ablation.ablate",
+    "jaxfit.evaluation.ablation.ablate",
     "jaxfit.data.formats.coco",
     "jaxfit.evaluation.detection_noise",
     "jaxfit.evaluation.evaluate",

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jaxfit.ablation import record
-from jaxfit.ablation.claims import judge
-from jaxfit.ablation.grid import load_grid
-from jaxfit.ablation.measure import Result, read_metrics
-from jaxfit.ablation.plot import swept
-from jaxfit.ablation.table import claims_table, results_csv, results_table
 from jaxfit.config.fit import load_config
 from jaxfit.config.reconstruct import load_reconstruct_config
+from jaxfit.evaluation.ablation import ablate
+from jaxfit.evaluation.ablation.grid import load_grid
+from jaxfit.evaluation.ablation.measure import Result, judge, read_metrics
+from jaxfit.evaluation.ablation.report import swept
+from jaxfit.evaluation.ablation.table import claims_table, results_csv, results_table
 
-record.model_hash = lambda _: "a hash"  # a model would start JAX's threads before the fork, or take seconds after it
+ablate.model_hash = lambda _: "a hash"  # a model would start JAX's threads before the fork, or take seconds after it
 
 
 def call(reader: str, path: str) -> None:
@@ -29,7 +28,7 @@ def call(reader: str, path: str) -> None:
 
 def _record(path: str) -> None:
     folder = Path(path).parent  # it also holds the grid
-    record.claim_folder(folder, load_grid(folder / "grid.yaml").runs, {"truth": folder / "grid.yaml"}, None)
+    ablate.claim_folder(folder, load_grid(folder / "grid.yaml").runs, {"truth": folder / "grid.yaml"}, None)
 
 
 def _metrics(path: str) -> None:

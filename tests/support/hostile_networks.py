@@ -3,8 +3,8 @@
 import numpy as np
 import onnxruntime  # noqa: F401 - imported once in the server, not in every child
 
-from jaxfit.perception.instances import instance_of
 from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.perception.network import instance_of
 from jaxfit.perception.segmentation import load_segmenter
 
 FRAME = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)

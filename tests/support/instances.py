@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxfit.perception.instances import Instance
+from jaxfit.perception.network import Instance
 
 
 def rectangle_instance(x0, y0, width, height, score=1.0, label="bird"):

@@ -17,8 +17,8 @@ from jaxfit import pipeline
 from jaxfit.cli.main import main
 from jaxfit.fitting import provisional, stored_windows
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.perception import frame_loop, track
-from jaxfit.storage.parts import Parts
+from jaxfit.foundation.unfinished import Parts
+from jaxfit.perception import detections, track
 from support.toy_footage import QUICK, Footage, TrueKeypoints, TrueSegmenter
 
 FOOTAGE = Footage()
@@ -36,7 +36,7 @@ def toy_networks(segmenter):
         mock.patch.object(pipeline, "check_segmenter"),
         mock.patch.object(pipeline, "open_keypoint_detector", return_value=TrueKeypoints(FOOTAGE)),
         mock.patch.object(pipeline, "network_files", return_value={}),
-        mock.patch.object(frame_loop, "FRAMES_PER_PART", FRAMES_PER_PART),
+        mock.patch.object(detections, "FRAMES_PER_PART", FRAMES_PER_PART),
         mock.patch.object(stored_windows, "LEAST_FRAMES", 1),
         mock.patch.object(provisional, "STEP_FRAMES", FRAMES_PER_PART),
         mock.patch.object(provisional, "LATER_FRAMES", 2),

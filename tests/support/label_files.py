@@ -2,13 +2,12 @@
 
 import numpy as np
 
-from jaxfit.data.boxes import box_of_keypoints
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.cvat import write_cvat
-from jaxfit.data.formats.deeplabcut.labels import write_deeplabcut_labels
 from jaxfit.data.formats.label_studio import write_label_studio
-from jaxfit.data.formats.sleap.write_project import write_sleap_project
-from jaxfit.data.masks import encode_mask
+from jaxfit.data.formats.write_deeplabcut import write_deeplabcut_labels
+from jaxfit.data.formats.write_sleap import write_sleap_project
+from jaxfit.data.masks import box_of_keypoints, encode_mask
 from jaxfit.data.observations import Observations
 
 NAMES = ("bill_tip", "left_wingtip", "right_wingtip")

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxfit.data.solution import Solution
 from jaxfit.model.camera import Camera
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
 from jaxfit.video.writer import VideoWriter
 from support.birds import solution_of, toy_bird
 

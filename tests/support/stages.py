@@ -7,14 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfit.config.fit import FitConfig, StageConfig
-from jaxfit.fitting.problem import Problem
-from jaxfit.fitting.solve import advance, begin
-from jaxfit.fitting.stages import FitModel, stage_hyperparameters, stage_program
+from jaxfit.fitting.solve import FitModel, Problem, advance, begin, stage_hyperparameters, stage_program
 from jaxfit.model.camera import Camera, project
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.objective.objective import weighted_sum
 from jaxfit.objective.posed_window import PosedWindow, Targets, priors_of
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
 from support.birds import toy_bird
 
 B, T, STEPS = 2, 4, 25

@@ -19,7 +19,7 @@ from jaxfit.objective.objective import evaluate_terms
 from jaxfit.objective.posed_window import PosedWindow, Raster, Targets, priors_of
 from jaxfit.objective.registry import find_term, find_terms, known_terms
 from jaxfit.objective.residuals import residual_sum
-from jaxfit.raster.silhouette import Blur
+from jaxfit.raster.silhouette_reference import Blur
 from support.birds import random_pose, skin_by_hand, toy_bird
 
 T, SIZE = 3, 32

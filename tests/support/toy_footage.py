@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 
 from jaxfit.model.camera import Camera
-from jaxfit.perception.instances import instance_of
-from jaxfit.simulation.detections import detect
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.perception.network import instance_of
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
 from support.birds import toy_bird
 
 BIRD, FRAMES, SIDE = toy_bird(shapes=0), 12, 64

@@ -8,10 +8,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxfit.errors import InputError
 from jaxfit.fitting.collect import FittedWindow
 from jaxfit.fitting.tasks import failed_windows
 from jaxfit.fitting.windows import window_content
+from jaxfit.foundation.errors import InputError
 
 attempts = []
 """Tasks that `failing` received in this process."""

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.films import encode, number_in, numbered, overwrite, packets, solid, trim
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.video.packets import frame_times
 from jaxfit.video.reader import probe_video, read_frames
 

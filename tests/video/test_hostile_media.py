@@ -16,9 +16,9 @@ from support.films import encode, frames
 from support.hostile import Isolated, many_examples
 from support.mutations import damaged_bytes
 
-from jaxfit.errors import InputError
-from jaxfit.limits import PICTURE_SCANS, VIDEO_GAP_FRAMES
-from jaxfit.video.numbering import Timeline
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import PICTURE_SCANS, VIDEO_GAP_FRAMES
+from jaxfit.video.packets import Timeline
 from jaxfit.video.pictures import picture_size, read_picture
 from jaxfit.video.reader import probe_video, read_frames
 

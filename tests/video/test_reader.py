@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.films import COUNT, SIZE, encode, frames, number_in, numbered, overwrite, packets, reader_threads, write
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.video import packets as packet_reading
 from jaxfit.video.reader import Frame, VideoInfo, probe_video, read_frames
 

@@ -8,7 +8,7 @@ import threading
 import pytest
 from support.films import encode, reader_threads
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.video.reader import _AHEAD, _ahead, read_frames
 
 

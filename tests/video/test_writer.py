@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.films import COUNT, FPS, SIZE, frames, write
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.video import writer as writer_module
 from jaxfit.video.reader import VideoInfo, probe_video, read_frames
 from jaxfit.video.writer import VideoWriter

@@ -8,10 +8,10 @@ import pytest
 from support.birds import toy_bird
 
 from jaxfit import load_config
-from jaxfit.benchmarks.fit import bench_fit
+from jaxfit.evaluation.benchmarks.fit import bench_fit
 from jaxfit.fitting.fit import fit
-from jaxfit.simulation.detections import detect
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
 from jaxfit.view.colours import ON_PAPER_FITTED, OUTLINE, SEEN
 from jaxfit.view.contact_sheet import TILE_PX, contact_sheet
 

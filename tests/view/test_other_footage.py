@@ -15,7 +15,7 @@ from jaxfit import overlay
 from jaxfit.cli.main import main
 from jaxfit.data.footage import FootageIdentity, read_footage
 from jaxfit.data.solution import save_solution
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.video.reader import probe_video, read_frames
 from jaxfit.video.writer import VideoWriter
 from jaxfit.view.overlay import overlay_frame

@@ -11,17 +11,17 @@ from support.birds import filled_mask, pose_window
 from support.overlays import BIRD, CAMERA, CROPS, FIRST, FPS, GREY, HEIGHT, WIDTH, N, T, film, solution
 
 from jaxfit.data.observations import Observations
-from jaxfit.data.posed_meshes import PosedBirds
-from jaxfit.errors import InputError
+from jaxfit.data.projection import PosedBirds
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.camera import project
 from jaxfit.raster.zbuffer import hard_mask
-from jaxfit.simulation.motion import smooth_motion
+from jaxfit.simulation.flock import smooth_motion
 from jaxfit.video.reader import probe_video, read_frames
 from jaxfit.view.birds import DrawnBird, Style, draw_birds
 from jaxfit.view.colours import DETECTED, FITTED, TRACK_COLOURS, track_colour
 from jaxfit.view.contact_sheet import TILE_PX
+from jaxfit.view.mesh_views import SideViews, up_direction
 from jaxfit.view.overlay import CHUNK, overlay
-from jaxfit.view.side_views import SideViews, up_direction
 
 
 def detections(size=(WIDTH, HEIGHT)) -> Observations:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from support.overlays import BIRD, FIRST, HEIGHT, WIDTH, T, film, solution
 
-from jaxfit.errors import InputError
+from jaxfit.foundation.errors import InputError
 from jaxfit.video.reader import probe_video
 from jaxfit.view.overlay import overlay, overlay_frame
 

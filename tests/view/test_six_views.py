@@ -6,7 +6,7 @@ import pytest
 from support.birds import toy_bird
 
 from jaxfit.model.files import load_murre
-from jaxfit.view.six_views import FOOT_PX, PAPER, TILE_PX, TITLE_PX, six_views
+from jaxfit.view.mesh_views import FOOT_PX, PAPER, TILE_PX, TITLE_PX, six_views
 
 
 def tiles(path):

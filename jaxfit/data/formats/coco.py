@@ -13,7 +13,7 @@ The file is an object with
   ``keypoint_scores`` (K numbers in [0, 1]), ``score`` (of the bird as a whole, in [0, 1]), ``iscrowd``, ``id``.
 
 A written file also has ``tracks``, for people who open the file: ``id``, ``category_id`` and the fields of
-``jaxfit.data.track_quality.TrackQuality``. The reader ignores ``tracks``, which follow from the annotations.
+``jaxfit.data.tracks.TrackQuality``. The reader ignores ``tracks``, which follow from the annotations.
 
 Conventions of the reader:
 
@@ -41,12 +41,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from jaxfit.data.formats.coco_exports import Untracked, complete_export
 from jaxfit.data.formats.coco_parts import read_coco_parts, write_coco_parts
 from jaxfit.data.formats.coco_records import (
     Annotation,
     Categories,
     Image,
+    Untracked,
+    complete_export,
     read_annotation,
     read_categories,
     read_fps,
@@ -55,12 +56,10 @@ from jaxfit.data.formats.coco_records import (
 )
 from jaxfit.data.formats.fields import Field, read_json
 from jaxfit.data.formats.rle import mask_areas
-from jaxfit.data.observations import Observations, check_keypoints, reorder_keypoints
-from jaxfit.data.tables import check_memory, observations_bytes
-from jaxfit.data.track_quality import track_quality
-from jaxfit.storage.files import write_whole
-
-__all__ = ["check_keypoints", "coco_observations", "read_coco", "reorder_keypoints", "write_coco"]
+from jaxfit.data.observations import Observations
+from jaxfit.data.tracks import track_quality
+from jaxfit.foundation.array_files import check_memory, observations_bytes
+from jaxfit.foundation.files import write_whole
 
 _log = logging.getLogger(__name__)
 

@@ -19,14 +19,12 @@ import numpy as np
 from jaxfit.data.footage import FootageIdentity, footage_of
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.rle import read_segmentation, valid_texts
-from jaxfit.data.lazy_masks import LazyMasks
+from jaxfit.data.masks import LazyMasks
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-from jaxfit.storage.files import new_folder
-from jaxfit.storage.parts import RECORD, Parts, read_record
-from jaxfit.storage.reading import open_file
-
-__all__ = ["PARTS_FROM", "parts_folder", "read_coco_parts", "write_coco_parts"]
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import new_folder
+from jaxfit.foundation.reading import open_file
+from jaxfit.foundation.unfinished import RECORD, Parts, read_record
 
 PARTS_FROM = 10_000
 """Least number of detections of a file with a copy. Shorter files open in about two seconds without a copy."""

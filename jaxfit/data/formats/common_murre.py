@@ -15,19 +15,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit.data.boxes import box_of_keypoints
 from jaxfit.data.formats.fields import LARGEST_POSITION_PX
+from jaxfit.data.masks import box_of_keypoints
 from jaxfit.data.observations import Observations
-from jaxfit.data.tables import check_memory
-from jaxfit.errors import InputError
-from jaxfit.limits import MURRE_BYTES
+from jaxfit.foundation.array_files import check_memory, load_npy
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import MURRE_BYTES
+from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.anatomy import skeleton_pairs
-from jaxfit.progress import ProgressTask, silent
-from jaxfit.storage.npy import load_npy
 from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import read_frames
-
-__all__ = ["ANNOTATIONS", "IMAGES", "LICENSE", "NUM_KEYPOINTS", "CommonMurre", "generic_names", "read_common_murre"]
 
 ANNOTATIONS, IMAGES = "annotations.npy", "images"
 LICENSE = "CC-BY-NC-4.0"

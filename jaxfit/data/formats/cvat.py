@@ -18,9 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxfit.data.observations import Observations
-from jaxfit.storage.files import write_whole
-
-__all__ = ["write_cvat", "write_cvat_label"]
+from jaxfit.foundation.files import write_whole
 
 _BIRD, _TRACK = "bird", "bird"
 """Names of the label and of its attribute."""

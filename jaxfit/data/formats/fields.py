@@ -10,11 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from jaxfit.errors import InputError
-from jaxfit.limits import OBSERVATIONS_BYTES, TEXT_CHARACTERS
-from jaxfit.storage.json_file import read_json_file
-
-__all__ = ["Field", "read_json"]
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import OBSERVATIONS_BYTES, TEXT_CHARACTERS
+from jaxfit.foundation.reading import read_json_file
 
 _SURROGATE = re.compile("[\ud800-\udfff]")  # half of a character, which UTF-8 cannot represent
 LARGEST_POSITION_PX = 1e6

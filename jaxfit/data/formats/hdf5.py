@@ -1,11 +1,18 @@
-"""Safe reading of HDF5 files: types, sizes and links are checked before anything is read.
+"""Safe reading of HDF5 files.
 
 Only datasets inside the file itself are read: links to other files, external storage and virtual datasets are rejected.
 Attributes are read as bytes or text and never unpickled.
+
+Check of the heaps of an HDF5 file, which hold texts of variable length. The HDF5 library (2.0) never returns if an
+object of a damaged heap has no size. So every heap is checked before the library reads a text.
+
+Source: HDF5 file format specification, section III.E, global heap.
 """
 
 from __future__ import annotations
 
+import mmap
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,16 +20,13 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from jaxfit.data.formats.hdf5_heaps import check_heaps
-from jaxfit.errors import InputError
-from jaxfit.extras import require_extra
-from jaxfit.limits import HDF5_BYTES, HDF5_ENTRIES, HDF5_TEXT_BYTES, HDF5_TEXTS
-from jaxfit.storage.reading import check_readable
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.extras import require_extra
+from jaxfit.foundation.limits import HDF5_BYTES, HDF5_ENTRIES, HDF5_TEXT_BYTES, HDF5_TEXTS
+from jaxfit.foundation.reading import check_readable
 
 if TYPE_CHECKING:
     import h5py
-
-__all__ = ["HDF5_SIGNATURE", "Hdf5Group", "open_hdf5"]
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file."""
@@ -239,3 +243,38 @@ def _errors(source: Path, label: str) -> Iterator[None]:
     except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, SystemError) as error:
         reason = str(error.args[0]) if error.args else type(error).__name__
         raise InputError(source, f"{label} cannot be read: {reason}", _REMEDY) from error
+
+
+_SIGNATURE = b"GCOL\x01\x00\x00\x00"
+_OBJECT = struct.Struct("<HHIQ")  # index, references, reserved, size
+
+
+def check_heaps(path: Path) -> None:
+    """Raise InputError if a heap of an HDF5 file is damaged.
+
+    Args:
+        path: a file that is not empty.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        at = content.find(_SIGNATURE)
+        while at >= 0:
+            if not _is_valid(content, at):
+                remedy = "copy or write the file again"
+                raise InputError(path, f"is damaged: its heap of texts at byte {at:,} is not valid", remedy)
+            at = content.find(_SIGNATURE, at + 1)
+
+
+def _is_valid(content: mmap.mmap, at: int) -> bool:
+    header = content[at + 8 : at + 16]
+    size = int.from_bytes(header, "little")
+    if len(header) < 8 or size < 16 or at + size > len(content):
+        return False
+    place = 16
+    while place + _OBJECT.size <= size:
+        index, _, _, length = _OBJECT.unpack_from(content, at + place)
+        # index 0 is the free space, whose size includes its header
+        needed = length if index == 0 else _OBJECT.size + (length + 7) // 8 * 8
+        if needed < _OBJECT.size or place + needed > size:
+            return False
+        place += needed
+    return True

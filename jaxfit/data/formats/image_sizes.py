@@ -1,21 +1,22 @@
-"""Size of the images of a file of keypoints: from a video, from the file, or from its pictures."""
+"""What the video or the pictures of a file say: sizes of images, times, frame rate."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
+from jaxfit.data.footage import read_footage
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-from jaxfit.limits import IMAGE_SIDE_PX
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import IMAGE_SIDE_PX
+from jaxfit.video.packets import frame_times
 from jaxfit.video.pictures import read_picture
 from jaxfit.video.reader import probe_video
-
-__all__ = ["ImageSizes", "check_video", "image_sizes"]
 
 _VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".wmv")
 
@@ -156,3 +157,29 @@ def _video_of_size(size_px: tuple[int, int], source: Path, stored: str | None) -
 
 def _is_file(path: Path) -> bool:
     return os.path.isfile(path)  # noqa: PTH113  (False for names that no file can have, where Path.is_file fails)
+
+
+def add_times(observations: Observations, video: Path | None) -> Observations:
+    """Return observations with the time stamps, the frame rate and the identity of their video, if they have no times.
+
+    The packets of the video are read up to the last frame, and only the first picture is decoded. A folder of pictures
+    has no times.
+
+    Args:
+        observations: the observations, with frame numbers of the video.
+        video: the video. None or a folder of pictures returns the observations unchanged.
+
+    Raises:
+        InputError: the file is not a readable video.
+    """
+    known = observations.fps is not None or np.isfinite(cast(np.ndarray, observations.timestamp_s)).any()
+    if known or observations.own_images or not observations.num_frames or video is None or video.is_dir():
+        return observations
+    numbers = observations.frame_index
+    times = frame_times(video, int(numbers[-1]) + 1)
+    inside = numbers < len(times)
+    timestamp_s = np.full(len(numbers), np.nan)
+    timestamp_s[inside] = times[numbers[inside]]
+    info = probe_video(video)
+    footage = read_footage(video, info.frames)
+    return replace(observations, timestamp_s=timestamp_s, fps=info.fps, footage=footage)

@@ -8,16 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfit.data.boxes import box_of_keypoints
 from jaxfit.data.formats.fields import LARGEST_POSITION_PX
-from jaxfit.data.formats.image_sizes import image_sizes
-from jaxfit.data.formats.picture_names import frame_numbers
-from jaxfit.data.formats.video_times import add_times
+from jaxfit.data.formats.image_sizes import add_times, image_sizes
+from jaxfit.data.masks import box_of_keypoints
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError, one_line, shortened
-from jaxfit.limits import CONFIDENCE, NAME_CHARACTERS, TABLE_BIRDS, TABLE_PICTURES, TABLE_VALUES
-
-__all__ = ["KeypointTable", "check_table_size", "table_observations"]
+from jaxfit.data.tracks import frame_numbers
+from jaxfit.foundation.errors import InputError, one_line, shortened
+from jaxfit.foundation.limits import CONFIDENCE, NAME_CHARACTERS, TABLE_BIRDS, TABLE_PICTURES, TABLE_VALUES
 
 _log = logging.getLogger(__name__)
 

@@ -25,11 +25,9 @@ import numpy as np
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.keypoint_table import KeypointTable, check_table_size
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-from jaxfit.limits import IMAGE_SIDE_PX
-from jaxfit.storage.files import write_whole
-
-__all__ = ["read_label_studio", "write_label_studio"]
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import write_whole
+from jaxfit.foundation.limits import IMAGE_SIDE_PX
 
 _log = logging.getLogger(__name__)
 

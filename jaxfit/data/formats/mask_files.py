@@ -17,18 +17,15 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxfit.data.formats.coco_exports import complete_export
-from jaxfit.data.formats.coco_records import read_images
+from jaxfit.data.formats.coco_records import complete_export, read_images
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.rle import read_segmentation
 from jaxfit.data.masks import decode_mask, encode_mask
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-from jaxfit.limits import FRAME_DIGITS, MASKS_PER_PICTURE
-from jaxfit.progress import ProgressTask, silent
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import FRAME_DIGITS, MASKS_PER_PICTURE
+from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.video.pictures import image_files, read_picture
-
-__all__ = ["add_masks", "masks_of_picture"]
 
 _COVERED = 0.3
 """Least fraction of a bird's keypoints that its mask covers, weighted by confidence; another bird may hide the rest."""

@@ -5,22 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.data.formats.coco_exports import Untracked
-from jaxfit.data.formats.deeplabcut.csv_file import read_deeplabcut_csv
-from jaxfit.data.formats.deeplabcut.hdf5_file import find_pandas_table, read_deeplabcut_hdf5
+from jaxfit.data.formats.coco_records import Untracked
+from jaxfit.data.formats.deeplabcut import find_pandas_table, read_deeplabcut_csv, read_deeplabcut_hdf5
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.hdf5 import HDF5_SIGNATURE, open_hdf5
-from jaxfit.data.formats.image_sizes import check_video
+from jaxfit.data.formats.image_sizes import add_times, check_video
 from jaxfit.data.formats.keypoint_table import KeypointTable, table_observations
 from jaxfit.data.formats.label_studio import read_label_studio
-from jaxfit.data.formats.sleap.analysis import read_sleap_analysis
-from jaxfit.data.formats.sleap.project import read_sleap_project
-from jaxfit.data.formats.video_times import add_times
+from jaxfit.data.formats.sleap import read_sleap_analysis, read_sleap_project
 from jaxfit.data.observations import Observations
-from jaxfit.errors import InputError
-from jaxfit.storage.reading import open_file
-
-__all__ = ["read_observations"]
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.reading import open_file
 
 _FORMATS = (
     "give COCO or Label Studio json, DeepLabCut or Lightning Pose .csv, DeepLabCut .h5, SLEAP .slp or .analysis.h5"
@@ -45,7 +40,7 @@ def read_observations(
             does not store the size, and the times of the frames where the file does not store times. It must fit to the
             file. None: as the file and its folder say.
         size_px: width and height of the images, in place of `video`, for a file that does not store the size.
-        untracked: how a COCO file without any track is read; see `jaxfit.data.formats.coco_exports`.
+        untracked: how a COCO file without any track is read; see `jaxfit.data.formats.coco_records`.
 
     Raises:
         InputError: the file cannot be read, is of no supported format, is damaged, or does not fit to the video; or

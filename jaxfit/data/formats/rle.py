@@ -14,9 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from jaxfit.data.formats.fields import Field
-from jaxfit.limits import POLYGON_LENGTH_PX, POLYGONS
-
-__all__ = ["MaskRuns", "foreground_runs", "mask_areas", "read_segmentation", "run_lengths", "valid_texts"]
+from jaxfit.foundation.limits import POLYGON_LENGTH_PX, POLYGONS
 
 _MASKS_AT_ONCE = 500
 """Masks that are checked at once, which bounds the memory."""

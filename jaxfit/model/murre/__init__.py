@@ -1,9 +1,9 @@
 """The bird that comes with jaxfit: a common guillemot (common murre), *Uria aalge*, in breeding plumage.
 
-This package designs the model from measurements: `measurements` (sizes of the species), `skeleton` (joints, and the
-unfolding of the wing), `surface`, `wing` and `leg` (the mesh), `skinning`, `plumage` (colours and keypoints),
-`variation` (shape and bone lengths), `postures`, `prior`. `build` combines these parts and writes `murre.npz`, the
-file that `load_murre` reads.
+This package designs the model from measurements: `skeleton` (joints, and the
+unfolding of the wing), `surface` (the mesh of body, wing and leg), `skinning` (with the variation of shape and bone
+lengths), `postures` (with the prior). `build` combines these parts and writes `murre.npz`, the file that `load_murre`
+reads.
 """
 
 from jaxfit.model.files import load_murre

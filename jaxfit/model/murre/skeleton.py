@@ -15,8 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.model.anatomy import JOINT_NAMES
 
-__all__ = ["CM_PER_UNIT", "PARENTS", "WING_BONES", "Frame", "joint_positions", "spread_rotations", "spread_transforms"]
-
 CM_PER_UNIT = 2.0
 """Length of one model unit. The murre is then about 20 units long, as the published birds are, so learning rates,
 priors and weights that were tuned on the published birds remain valid."""

@@ -1,23 +1,68 @@
-"""Skinning weights of the murre.
+"""Skin weights, shape directions, bone lengths and the measurements behind them.
+
+Measurements of the common guillemot from which the model is built, in centimetres, with their sources. `low` and `high`
+are the range of adults of the species (all subspecies and both sexes, which differ little); `used` is the value of this
+model. The ranges of total length and wingspan are published ranges. The values of wing, bill, tarsus and tail are the
+usual values of the named handbooks. We rounded these ranges outwards and did not copy them from the tables of the
+handbooks: they are accurate enough to build a model, but must not be cited. Values marked APPROXIMATE come from no
+table. We estimated them from photographs and from the proportions of auk skeletons; their error is 10 to 20 % of the
+value.
+
+Sources:
+    BWP: Cramp, S. (ed.) 1985, *The Birds of the Western Palearctic*, vol. IV, Uria aalge.
+    HBW: del Hoyo, J., Elliott, A. & Sargatal, J. (eds.) 1996, *Handbook of the Birds of the World*, vol. 3, Alcidae.
+    Pyle: Pyle, P. 2008, *Identification Guide to North American Birds*, part II.
+    G&J: Gaston, A. J. & Jones, I. L. 1998, *The Auks*.
+    Collins: Mullarney, K. et al. 1999, *Collins Bird Guide*.
 
 The weights of body and leg are smooth steps from joint to joint. The weights of the wing solve a least-squares problem:
 linear blend skinning shall transform the folded wing into the spread wing (`wing`). The tip of a feather then follows
 a mean of hand, forearm and upper arm, as the feathers of a fan do, instead of one bone.
+
+Variation between murres: shape directions and the prior of bone lengths. The directions are designed from the ranges in
+`measurements`, not learnt. One unit of a shape coefficient is one standard deviation, which is a quarter of the range
+from the lowest to the highest measurement.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import nnls
 
-from jaxfit.model.anatomy import JOINT_NAMES, other_side
-from jaxfit.model.murre.leg import LEG_PARTS
-from jaxfit.model.murre.skeleton import spread_transforms
-from jaxfit.model.murre.surface import ANGLES, RINGS, Half, Mesh
-from jaxfit.model.murre.wing import SPAN, spread_sheet
+from jaxfit.model.anatomy import JOINT_NAMES, mirror_pairs, other_side
+from jaxfit.model.murre.skeleton import MIDDLE_AND_LEFT, WING_TIP, spread_transforms
+from jaxfit.model.murre.surface import ANGLES, LEG_PARTS, RINGS, SPAN, Half, Mesh, sections_at, spread_sheet
 
-__all__ = ["body_weights", "half_weights", "mirrored_weights", "smooth_step"]
+
+class Measurement(NamedTuple):
+    """Range, model value and source of one length, in centimetres."""
+
+    low: float
+    high: float
+    used: float
+    source: str
+
+
+MEASUREMENTS = {
+    "total_length": Measurement(38.0, 46.0, 42.5, "Collins 38–46; HBW 38–43; bill tip to tail tip, neck straight"),
+    "wingspan": Measurement(61.0, 73.0, 67.3, "Collins 61–73; BWP 64–70"),
+    "wing": Measurement(19.0, 21.6, 19.9, "BWP, Pyle: folded wing, wrist to the tip of the longest primary"),
+    "bill": Measurement(4.2, 5.1, 4.7, "BWP, Pyle: culmen, from the feathers to the tip"),
+    "tarsus": Measurement(3.5, 4.1, 3.8, "BWP, Pyle"),
+    "tail": Measurement(4.0, 5.3, 4.8, "BWP, Pyle"),
+    "middle_toe": Measurement(4.4, 5.6, 5.0, "BWP: middle toe with claw; APPROXIMATE"),
+    "humerus": Measurement(7.4, 9.4, 7.5, "proportions of auk skeletons; APPROXIMATE; shorter when feathered"),
+    "forearm": Measurement(5.8, 7.4, 6.7, "proportions of auk skeletons; APPROXIMATE"),
+    "body_width": Measurement(
+        10.0, 12.5, 11.4, "photographs, and 0.95–1.05 kg at the density of a plumed bird; APPROXIMATE"
+    ),
+    "body_depth": Measurement(9.0, 11.5, 9.9, "as body_width; APPROXIMATE"),
+    "neck_width": Measurement(4.0, 5.8, 5.2, "photographs; APPROXIMATE"),
+}
+
 
 SPINE = (
     ("tail", "lower_body", 2.6, 4.2),
@@ -148,3 +193,55 @@ def smooth_step(x, start: float, end: float):
     """Return 0 below `start`, 1 above `end`, and the cubic 3t² − 2t³ between them."""
     t = np.clip((x - start) / (end - start), 0.0, 1.0)
     return t * t * (3 - 2 * t)
+
+
+SHAPES = ("girth", "neck thickness", "bill length", "wing length", "tail length")
+PIVOT = (0.0, 0.0, 2.8)
+"""Centre from which the girth direction expands the trunk, centimetres."""
+BONE_DEVIATION, SIDE_CORRELATION = 0.05, 0.9
+"""Standard deviation of relative bone lengths, and correlation between the two sides of a bird."""
+
+
+def relative_deviation(name: str) -> float:
+    """Return the standard deviation of a measurement, relative to the value of the model."""
+    low, high, used, _ = MEASUREMENTS[name]
+    return (high - low) / 4 / used
+
+
+def half_shapes(half: Half, weights: Float[np.ndarray, "H J"]) -> Float[np.ndarray, "S H 3"]:
+    """Return the vertex displacements of the left half for one unit of each shape direction, in centimetres."""
+    v, basis = half.vertices, np.zeros((len(SHAPES), *half.vertices.shape))
+    trunk = smooth_step(v[:, 1], -13.0, -5.0) * (1 - smooth_step(v[:, 1], 7.0, 11.0)) * (half.part < 2)
+    basis[0] = relative_deviation("body_width") * trunk[:, None] * (v - PIVOT) * [1, 0, 1]
+
+    body = half.part == 0
+    row = RINGS[half.place[body, 0]]
+    centre = np.zeros((body.sum(), 3))
+    centre[:, 1:] = sections_at(row)[:, :2]
+    neck = smooth_step(row, 8.5, 10.5) * (1 - smooth_step(row, 12.5, 14.5))
+    basis[1, body] = relative_deviation("neck_width") * neck[:, None] * (v[body] - centre)
+
+    base, tip = (sections_at(np.array(r))[:2] for r in (17.0, 20.0))
+    along = np.array([0.0, *(tip - base)]) / np.linalg.norm(tip - base)
+    beyond = np.clip((v[body] - [0.0, *base]) @ along, 0, None) * (row >= 17)
+    basis[2, body] = relative_deviation("bill") * beyond[:, None] * along
+
+    wrist = np.asarray(MIDDLE_AND_LEFT["left_wrist"])
+    hand = np.asarray(WING_TIP) - wrist
+    hand /= np.linalg.norm(hand)
+    reach = np.clip((v - wrist) @ hand, 0, None) * weights[:, JOINT_NAMES.index("left_wrist")]
+    basis[3] = relative_deviation("wing") * reach[:, None] * hand * (half.part == 1)[:, None]
+
+    behind = np.clip(MIDDLE_AND_LEFT["tail"][1] - v[:, 1], 0, None) * body
+    basis[4] = relative_deviation("tail") * behind[:, None] * [0.0, -1.0, 0.0]
+    basis[:, v[:, 0] == 0, 0] = 0
+    return basis
+
+
+def bone_prior() -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B B"]]:
+    """Return mean (1) and covariance of the relative bone lengths; the two sides of a bird are strongly correlated."""
+    bones = len(JOINT_NAMES) - 1
+    correlation = np.eye(bones)
+    for left, right in mirror_pairs(JOINT_NAMES):
+        correlation[left - 1, right - 1] = correlation[right - 1, left - 1] = SIDE_CORRELATION
+    return np.ones(bones), BONE_DEVIATION**2 * correlation

@@ -1,1 +1,0 @@
-"""Adaptation of a bird model to a species: from scans and from photographs; comparison and rigging of models"""

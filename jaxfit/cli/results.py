@@ -1,0 +1,150 @@
+"""`report`, `export`, `tracks`, `join`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+
+import numpy as np
+
+from jaxfit.cli.tables import counted, right_aligned, show, track_table
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.progress import terminal
+from jaxfit.review.edits import Edit
+
+_TRACKS = {"swap": 2, "cut": 1, "join": 2, "delete": None}
+"""Kind of an edit → number of its tracks; None is any number."""
+
+
+def tracks(options: argparse.Namespace) -> None:
+    """List the tracks of a result, or correct the tracks and fit what changes."""
+    if not options.edits:
+        if options.out is not None:
+            raise InputError("tracks", "has --out, but no correction", "give --swap, --cut, --join or --delete")
+        _list(options)
+        return
+    if options.out is None:
+        raise InputError("tracks", "has corrections, but no folder for the new result", "give --out")
+    from jaxfit.review.correct import correct_tracks
+
+    edits = [_edit(kind, text) for kind, text in options.edits]
+    done = correct_tracks(
+        options.result, options.out, edits, options.observations, options.overwrite, progress=terminal
+    )
+    for track, first, last in done.fitted:
+        show(f"fitted again: track {track}, frames {first} to {last}")
+    show(f"{len(done.fitted)} of {counted(done.windows, 'window')} fitted again → {options.out}")
+    show(f"jaxfit overlay {options.out} --video VIDEO --out overlay.mp4 draws the new result")
+
+
+def join(options: argparse.Namespace) -> None:
+    """Join the results of ranges of one video."""
+    from jaxfit.review.join import join_results
+
+    solution, table = join_results(options.results, options.out, options.bridge, options.overwrite)
+    shown = right_aligned("track", "first frame", "last frame", "becomes", "frames missing", "confidence")
+    shown.add_column("of", overflow="fold")
+    for row in table:
+        continued = ("–", "–") if row.confidence is None else (str(row.missing), f"{row.confidence:.3f}")
+        shown.add_row(
+            str(row.track), str(row.first_frame), str(row.last_frame), str(row.joined), *continued, row.folder
+        )
+    shown.title = "confidence: that the track continues a track of an earlier range"
+    show(shown)
+    tracks, frames = counted(len(solution.track_id), "track"), counted(len(solution.frame_index), "frame")
+    show(f"{tracks} over {frames} → {options.out}")
+
+
+def _list(options: argparse.Namespace) -> None:
+    from jaxfit.data.formats.coco import read_coco
+    from jaxfit.data.solution import load_solution
+
+    solution, _ = load_solution(options.result)
+    table = right_aligned("track", "poses", "first frame", "last frame", "gaps")
+    table.add_column("status")
+    for n, track in enumerate(solution.track_id.tolist()):
+        at = np.flatnonzero(solution.valid[n])
+        gaps = int((np.diff(at) > 1).sum())
+        ends = [str(solution.frame_index[at[i]]) if len(at) else "–" for i in (0, -1)]
+        table.add_row(str(track), str(len(at)), *ends, str(gaps), str(solution.status[n]))
+    show(table)
+    path = options.result / "observations.json" if options.observations is None else options.observations
+    if path.is_file():
+        show(track_table(read_coco(path)))
+
+
+def _edit(kind: str, text: str) -> Edit:
+    """Return the edit of an option such as `--swap 3,5@120:140`."""
+    match = re.fullmatch(r"(\d{1,9}(?:,\d{1,9})*)(?:@(\d{1,9})(?::(\d{1,9}))?)?", text)
+    named, *ends = match.groups() if match else ("", None, None)
+    numbers = tuple(int(part) for part in named.split(",") if part)
+    start, stop = (None if end is None else int(end) for end in ends)
+    wrong = not numbers or (_TRACKS[kind] or len(numbers)) != len(numbers)
+    wrong |= kind == "cut" and (start is None or stop is not None)
+    wrong |= kind in ("join", "delete") and start is not None
+    if wrong:
+        examples = {"swap": "3,5@120", "cut": "4@80", "join": "2,7", "delete": "6"}
+        raise InputError(f"--{kind}", f"cannot be '{text}'", f"write for example --{kind} {examples[kind]}")
+    return Edit(kind, numbers, start, stop)
+
+
+def export(options: argparse.Namespace) -> None:
+    """Write a result in a format of another tool."""
+    from jaxfit.export.export import export_result
+
+    done = export_result(
+        options.result,
+        options.to,
+        options.out,
+        tracks=None if options.tracks is None else track_ids(options.tracks),
+        frames=frame_range(options.frames),
+        fps=options.fps,
+        metres_per_unit=options.metres_per_unit,
+        video=options.video,
+        overwrite=options.overwrite,
+        progress=terminal,
+        space=options.space,
+        dims=options.dims,
+        one_file=options.one_file,
+        ground=options.ground,
+        start=options.start,
+    )
+    for note in done.notes:
+        show(note)
+    for path in done.files:
+        show(f"{path} ({path.stat().st_size / 1e6:.2f} MB)")
+    if done.unit == "unit" and options.to not in ("coco", "slp", "dlc"):
+        show("lengths are in model units: the model does not state the length of its unit (--metres-per-unit)")
+    show(f"{counted(len(done.files), 'file')} for {options.to}")
+
+
+def track_ids(text: str) -> list[int]:
+    """Return the ids of `--tracks 1,4`.
+
+    Raises:
+        InputError: the text is not a list of numbers.
+    """
+    if not re.fullmatch(r"\d{1,18}(,\d{1,18})*", text):
+        raise InputError("--tracks", f"is '{text}', not a list of track ids", "write for example --tracks 1,4")
+    return [int(part) for part in text.split(",")]
+
+
+def frame_range(text: str | None) -> tuple[int | None, int | None]:
+    """Return the two ends of `--frames A:B`; an end that is left out is None.
+
+    Raises:
+        InputError: the text is not a range of frames.
+    """
+    match = re.fullmatch(r"(\d{1,9})?:(\d{1,9})?", text or ":")
+    if match is None:
+        raise InputError("--frames", f"is '{text}', not a range of frames", "write for example --frames 100:200")
+    first, stop = (None if part is None else int(part) for part in match.groups())
+    return first, stop
+
+
+def report(options: argparse.Namespace) -> None:
+    """Write the report of a result."""
+    from jaxfit.view.report.write import report_of_result
+
+    path = report_of_result(options.result, options.video, options.out, options.overwrite, options.force)
+    show(f"{path} ({path.stat().st_size / 1e6:.2f} MB): open it in a browser")

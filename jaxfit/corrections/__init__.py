@@ -1,1 +1,0 @@
-"""Corrections of tracks by hand: swap, cut, join and delete tracks, and fit the touched windows again."""

@@ -1,0 +1,200 @@
+"""Metrics of the runs, and verdicts on claims."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import load_solution
+from jaxfit.evaluation.ablation.grid import ClaimConfig, Run, hashable
+from jaxfit.evaluation.ablation.runs import run_folder
+from jaxfit.evaluation.bootstrap import Ratio, paired_ratio
+from jaxfit.evaluation.evaluate import Evaluation, evaluate
+from jaxfit.evaluation.truth import Truth, match_tracks
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import write_whole
+from jaxfit.foundation.limits import ABLATION_BYTES
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.foundation.reading import json_text, read_json_file
+
+CLAIMED = ("me_p", "me_v")
+"""The metrics of claims and plots; lower is better."""
+_EVALUATION = "evaluation.json"
+
+
+@dataclass(frozen=True)
+class Result:
+    """The metrics of a run."""
+
+    run: Run
+    evaluation: Evaluation
+    seconds: float
+    """Time of the fit of the batch, divided by the number of runs in the batch."""
+    runs_at_once: int
+    """Number of runs in the batch."""
+
+
+def check_shared(observations: Observations, truth: Truth) -> None:
+    """Check before the fit that the truth has tracks and frames of the observations.
+
+    Raises:
+        InputError: no common track or no common frame.
+    """
+    for name, own, true in (
+        ("track", observations.track_id, truth.observations.track_id),
+        ("frame", observations.frame_index, truth.observations.frame_index),
+    ):
+        if not set(own.tolist()) & set(true.tolist()):
+            ids = [", ".join(map(str, each[:10])) + (", …" if len(each) > 10 else "") for each in (true, own)]
+            problem = f"shares no {name} with the observations: it has {name}s {ids[0]}, they have {ids[1]}"
+            remedy = "give the annotations of the same video"
+            if name == "track":
+                remedy += ", or pass --match overlap where a tracker named the birds"
+            raise InputError(truth.source, problem, remedy)
+
+
+def measure_grid(
+    runs: Sequence[Run],
+    folder: Path,
+    truth: Truth,
+    matching: Literal["auto", "ids", "overlap"] = "auto",
+    progress: ProgressTask = silent,
+) -> list[Result]:
+    """Return the metrics of every run, and compute and store metrics that the folder lacks.
+
+    Args:
+        runs: the grid; the folder holds all runs.
+        folder: the folder of the ablation.
+        truth: the annotations, optionally with poses and behaviours.
+        matching: how tracks and birds are matched, see `match_tracks`.
+        progress: shows the progress over runs.
+
+    Raises:
+        InputError: the result or the metrics of a run cannot be read.
+    """
+    results = []
+    with progress("Measuring", len(runs)) as report_progress:
+        for run in runs:
+            own = run_folder(folder, run)
+            path = own / _EVALUATION
+            if not path.is_file():
+                solution, bird = load_solution(own)
+                solution, _ = match_tracks(solution, truth, matching)
+                write_whole(path, json_text(evaluate(solution, bird, truth).to_dict(), indent=1).encode())
+            results.append(Result(run, *read_metrics(own)))
+            report_progress(1, run.name)
+    return results
+
+
+def read_metrics(folder: Path) -> tuple[Evaluation, float, int]:
+    """Return the stored metrics of a run, the seconds of its fit, and the number of runs in its batch.
+
+    Raises:
+        InputError: a file cannot be read, or does not hold metrics.
+    """
+    path, remedy = folder / _EVALUATION, "remove this folder; then the same command fits the run again"
+    content = read_json_file(path, ABLATION_BYTES)
+    summary = read_json_file(folder / "summary.json", ABLATION_BYTES)
+    try:
+        evaluation = Evaluation.from_dict(content)
+        seconds, runs_at_once = summary["seconds"]["fit"], summary["runs_at_once"]
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InputError(folder, f"holds damaged metrics: {type(error).__name__}: {error}", remedy) from None
+    if not (_is_consistent(evaluation) and _are_numbers([seconds]) and _are_counts([runs_at_once])):
+        raise InputError(path, "does not hold metrics of a run", remedy)
+    return evaluation, seconds, runs_at_once
+
+
+def _is_consistent(evaluation: Evaluation) -> bool:
+    """Return whether all metrics are numbers, and whether the sums have a number for each bird."""
+    rows = [evaluation.overall, *(evaluation.intervals[name]._asdict() for name in evaluation.intervals)]
+    for table in (evaluation.tracks, evaluation.behaviours, evaluation.keypoints):
+        rows += table.values()
+    # NaN marks a metric without a measurement
+    values = [value for row in rows for value in row.values() if value == value]
+    birds, numerators, counts = evaluation.sums.birds, evaluation.sums.numerators, evaluation.sums.counts
+    lengths = {len(each) for each in (birds, *numerators.values(), *counts.values())}
+    return (
+        _are_numbers(values)
+        and all(each.keys() >= set(CLAIMED) for each in (evaluation.overall, evaluation.intervals, counts))
+        and numerators.keys() == counts.keys()
+        and len(lengths) == 1
+        and all(isinstance(bird, str) for bird in birds)
+        and len(set(birds)) == len(birds)
+        and all(map(_are_numbers, numerators.values()))
+        and all(map(_are_counts, counts.values()))
+        and _are_counts([evaluation.frames, evaluation.missing, evaluation.unmatched, evaluation.frames_3d])
+        and evaluation.points_3d in ("", "joints", "keypoints")
+    )
+
+
+def _are_numbers(values: Iterable[Any]) -> bool:
+    return all(type(value) in (int, float) and abs(value) < 1e300 for value in values)
+
+
+def _are_counts(values: Iterable[Any]) -> bool:
+    return all(type(value) is int and 0 <= value < 2**53 for value in values)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict on one claim in one metric."""
+
+    claim: ClaimConfig
+    metric: str
+    pairs: int
+    """Number of pairs of runs that differ only in the keys of the claim."""
+    agree: int
+    """Number of pairs in which the better run of the claim has the lower error."""
+    ratio: Ratio
+    """Error of the better over the worse run, as the geometric mean over pairs; below 1 where the claim is right."""
+
+    @property
+    def holds(self) -> str:
+        """The verdict: `holds`, `does not hold`, or `not decided` where the interval over birds contains 1.
+
+        A claim of harmlessness holds unless the interval lies above 1.
+        """
+        if self.ratio.high < 1:
+            return "holds"
+        if self.ratio.low > 1:
+            return "does not hold"
+        if self.claim.harmless and self.ratio.low <= 1 <= self.ratio.high:
+            return "holds: no harm shown"
+        return "not decided"
+
+
+def judge(claims: Sequence[ClaimConfig], results: Sequence[Result]) -> list[Verdict]:
+    """Return the verdict on each claim in each metric; claims without a pair of runs are skipped."""
+    verdicts = []
+    sums = {result.run.name: result.evaluation.sums for result in results}
+    runs = [result.run for result in results]
+    for claim in claims:
+        pairs = [(sums[better.name], sums[worse.name]) for better, worse in pairs_of(claim, runs)]
+        for metric in CLAIMED if pairs else ():
+            agree = sum(better.value(metric) < worse.value(metric) for better, worse in pairs)
+            verdicts.append(Verdict(claim, metric, len(pairs), agree, paired_ratio(pairs, metric)))
+    return verdicts
+
+
+def pairs_of(claim: ClaimConfig, runs: Sequence[Run]) -> list[tuple[Run, Run]]:
+    """Return the pairs (better, worse) of a claim: runs with equal values of all keys that the claim does not name."""
+    named = {*claim.better, *claim.worse}
+    worse_runs: dict[Hashable, list[Run]] = {}
+
+    def rest(run: Run) -> Hashable:
+        return hashable({path: level for path, level in run.levels.items() if path not in named})
+
+    for run in runs:
+        if _has(run, claim.worse):
+            worse_runs.setdefault(rest(run), []).append(run)
+    return [
+        (better, worse) for better in runs if _has(better, claim.better) for worse in worse_runs.get(rest(better), ())
+    ]
+
+
+def _has(run: Run, levels: Mapping[str, Any]) -> bool:
+    return all(run.levels[path] == level for path, level in levels.items())

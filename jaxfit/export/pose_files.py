@@ -1,0 +1,335 @@
+"""Files of other programs: movement, NWB, SLEAP, DeepLabCut, COCO.
+
+2D keypoints for correction by hand, as COCO, SLEAP and DeepLabCut; `jaxfit import` reads the corrected files. The
+keypoints are the projected keypoints of the poses, each with confidence 1, because a person corrects all of them. A
+frame without a pose has no bird.
+
+netCDF files for the package movement (`ds_type` = poses). Source: the layout is that of the poses of movement 0.17,
+whose dimensions have names in the singular. Versions up to 0.16 have the dimensions `keypoints` and `individuals`.
+
+Positions are in image pixels. A frame without a pose is NaN. The file has a skeleton, a series of positions and
+confidences for every keypoint, and a link to the footage.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import io
+import os
+import uuid
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.formats.write_deeplabcut import write_deeplabcut_predictions
+from jaxfit.data.formats.write_sleap import write_sleap_project
+from jaxfit.data.observations import Observations
+from jaxfit.data.projection import projected_observations
+from jaxfit.data.tracks import frame_step
+from jaxfit.export.result import CONFIDENCE, Exported, describe_tracks, export_folder
+from jaxfit.foundation.errors import InputError, one_line
+from jaxfit.foundation.extras import __version__, require_package
+from jaxfit.foundation.files import write_whole
+from jaxfit.foundation.progress import ProgressTask
+from jaxfit.foundation.reading import json_text
+from jaxfit.model.anatomy import skeleton_pairs
+
+
+def write_coco_keypoints(exported: Exported, out: Path, progress: ProgressTask) -> list[Path]:
+    """Write COCO, with the masks of the detections; `info` holds the status and the quality of the tracks."""
+    exported.require_poses()
+    s = exported.solution
+    keypoints = _keypoints(exported)
+    if exported.observations is not None:
+        masks = {(n, t): rle for (n, t), rle in exported.observations.masks.items() if s.valid[n, t]}
+        keypoints = replace(keypoints, file_name=exported.observations.file_name, masks=masks)
+    status = {str(track): str(status) for track, status in zip(s.track_id.tolist(), s.status, strict=True)}
+    quality = {str(track): row._asdict() for track, row in exported.quality.items()}
+    info = {"description": f"projected keypoints of {one_line(exported.source.name)}, by jaxfit"}
+    info |= {"track_status": json_text(status), "track_quality": json_text(quality)}
+    with progress("Writing COCO", None):
+        write_coco(keypoints, out, info)
+    return [out]
+
+
+def write_slp_keypoints(exported: Exported, out: Path, progress: ProgressTask) -> list[Path]:
+    """Write a SLEAP project with predictions on the footage.
+
+    Raises:
+        InputError: h5py is not installed, the footage is unknown, or no pose is chosen.
+    """
+    require_package("h5py", "--to slp")
+    exported.require_poses()
+    with progress("Writing SLEAP", None):
+        write_sleap_project(_keypoints(exported), str(exported.require_video()), out)
+    return [out]
+
+
+def write_dlc_keypoints(exported: Exported, out: Path, progress: ProgressTask) -> list[Path]:
+    """Write predictions of DeepLabCut for several animals, as `.h5` or `.csv`.
+
+    Raises:
+        InputError: h5py is not installed, the name has another suffix, or no pose is chosen.
+    """
+    if out.suffix not in (".h5", ".csv"):
+        raise InputError(out, "must end with .h5 or .csv for DeepLabCut", "choose another --out")
+    if out.suffix == ".h5":
+        require_package("h5py", "--to dlc")
+    exported.require_poses()
+    with progress("Writing DeepLabCut", None):
+        write_deeplabcut_predictions(_keypoints(exported), out)
+    return [out]
+
+
+def _keypoints(exported: Exported) -> Observations:
+    observations = projected_observations(exported.solution)
+    times = exported.times_s if np.isfinite(exported.times_s).all() else None
+    return replace(observations, timestamp_s=times, fps=exported.fps)
+
+
+_READERS = {
+    "singular": "movement 0.17 or newer reads this file; for movement 0.16 or older, export with --dims plural",
+    "plural": "movement 0.16 or older reads this file; for movement 0.17 or newer, export without --dims plural",
+}
+"""Names of the dimensions → the versions of movement that read them."""
+
+
+def write_movement(
+    exported: Exported,
+    out: Path,
+    progress: ProgressTask,
+    space: Literal["2d", "3d"] = "2d",
+    dims: Literal["singular", "plural"] = "singular",
+) -> tuple[list[Path], list[str]]:
+    """Write a netCDF file with `position` (time, space, keypoint, individual) and `confidence`.
+
+    Frame numbers that the result lacks between its first and last frame are frames of NaN, so that the frames have
+    equal distances in time. The individual of track 3 has the name `bird_3`.
+
+    Args:
+        exported: the result.
+        out: the file to write.
+        progress: shows progress.
+        space: `2d` for image pixels, `3d` for the camera frame of the image.
+        dims: `singular` for the dimensions `keypoint` and `individual`, `plural` for `keypoints` and `individuals`.
+
+    Returns:
+        The file, and a note about the versions of movement that read the file.
+
+    Raises:
+        InputError: xarray or h5netcdf is not installed, or the frame rate is unknown.
+    """
+    for package in ("xarray", "h5netcdf"):
+        require_package(package, "--to movement")
+    import xarray
+
+    s, fps = exported.solution, exported.sampling_fps
+    numbers = np.arange(s.frame_index[0], s.frame_index[-1] + 1, frame_step(s.frame_index))
+    column = np.searchsorted(numbers, s.frame_index)
+    points = exported.keypoints_px if space == "2d" else exported.keypoints_3d
+    position = np.full((len(numbers), points.shape[3], points.shape[2], points.shape[0]), np.nan, np.float32)
+    position[column] = points.transpose(1, 3, 2, 0)
+    confidence = np.full((len(numbers), *position.shape[2:]), np.nan, np.float32)
+    confidence[column] = exported.confidence.transpose(1, 2, 0)
+    keypoint, individual = ("keypoint", "individual") if dims == "singular" else ("keypoints", "individuals")
+    with progress("Writing netCDF", None):
+        dataset = xarray.Dataset(
+            {
+                "position": (("time", "space", keypoint, individual), position, {"units": _unit(exported, space)}),
+                "confidence": (("time", keypoint, individual), confidence, {"description": CONFIDENCE}),
+                "status": ((individual,), s.status.astype(str), {"description": "how the fit of the track ended"}),
+                **_quality(exported, individual),
+            },
+            coords={
+                "time": np.interp(numbers, s.frame_index, exported.times_s),
+                "space": list("xyz"[: position.shape[1]]),
+                keypoint: list(s.keypoint_names),
+                individual: [f"bird_{track}" for track in s.track_id.tolist()],
+                "frame": ("time", numbers),
+            },
+            attrs={
+                "source_software": "jaxfit",
+                "ds_type": "poses",
+                "fps": fps,
+                "time_unit": "seconds",
+                "source_file": str(exported.source),
+                "position_frame": "image, x right, y down" if space == "2d" else "camera frame of the image, z forward",
+                **({} if space == "2d" else {"focal_length_px": exported.focal_px}),
+            },
+        )
+        content = io.BytesIO()
+        compressed = {"zlib": True, "complevel": 4}
+        dataset.to_netcdf(
+            content, engine="h5netcdf", encoding={name: compressed for name in ("position", "confidence")}
+        )
+        write_whole(out, content.getvalue())
+    return [out], [_READERS[dims]]
+
+
+def _quality(exported: Exported, individual: str) -> dict[str, tuple]:
+    """Return the quality of the tracks, if the result has detections."""
+    if not exported.quality:
+        return {}
+    rows = [exported.quality.get(track) for track in exported.solution.track_id.tolist()]
+    names = ("coverage", "mean_confidence")
+    values = {name: np.array([np.nan if row is None else getattr(row, name) for row in rows]) for name in names}
+    return {f"track_{name}": ((individual,), column) for name, column in values.items()}
+
+
+def _unit(exported: Exported, space: str) -> str:
+    return "pixels" if space == "2d" else {"m": "metres", "unit": "model units"}[exported.unit]
+
+
+_ORIGIN = "(0, 0) is the upper left corner of the image, x right, y down, pixels"
+_SPECIES = {"murre": "Uria aalge"}
+
+
+def write_nwb(
+    exported: Exported, out: Path, progress: ProgressTask, start: str | None = None, overwrite: bool = False
+) -> tuple[list[Path], list[str]]:
+    """Write one NWB file for every bird with a pose, into a folder.
+
+    Args:
+        exported: the result.
+        out: the folder.
+        progress: shows progress.
+        start: time of the first frame of the footage (ISO 8601); None stores 1970-01-01, which the note says.
+        overwrite: replace an earlier export in the folder.
+
+    Raises:
+        InputError: pynwb or ndx-pose is missing or too old, the frame rate or the footage is unknown, no pose is
+            chosen, or the start is no time.
+    """
+    for package in ("pynwb", "ndx-pose"):
+        require_package(package, "--to nwb")
+    exported.require_poses()
+    exported.require_fps()
+    exported.require_video()
+    began = _start(start)
+    tracks = exported.solution.track_id.tolist()
+    fitted = np.flatnonzero(exported.solution.valid.any(axis=1)).tolist()
+    names = {tracks[n]: f"bird_{tracks[n]}.nwb" for n in fitted}
+    with (
+        export_folder(exported, out, overwrite, names, {"confidence": CONFIDENCE}) as folder,
+        progress("Writing NWB", len(fitted)) as report_progress,
+    ):
+        for n in fitted:
+            _write_bird(exported, n, began, _link(exported.require_video(), out), folder / names[tracks[n]])
+            report_progress(1, names[tracks[n]])
+    notes = []
+    if start is None:
+        notes.append("the start of the recording is unknown and stored as 1970-01-01: give --start to store the time")
+    return [out / name for name in names.values()], notes
+
+
+def _start(text: str | None) -> datetime.datetime:
+    try:
+        time = datetime.datetime.fromisoformat(text or "1970-01-01T00:00:00+00:00")
+    except ValueError:
+        problem = f"is '{text}', not a time"
+        raise InputError("--start", problem, "write for example 2024-06-01T12:00:00+02:00") from None
+    return time if time.tzinfo else time.replace(tzinfo=datetime.UTC)
+
+
+def _link(video: Path, folder: Path) -> str:
+    """Return the path of the footage from the folder of the NWB files; the stored path if the footage was moved."""
+    return os.path.relpath(video.resolve(), folder.resolve()) if video.exists() else str(video)
+
+
+def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str, path: Path) -> None:
+    pynwb, ndx_pose = _library("pynwb"), _library("ndx_pose")
+    s, track = exported.solution, int(exported.solution.track_id[n])
+    facts = describe_tracks(exported)[str(track)]
+    # the same export has the same identifier
+    digest = hashlib.sha256(f"{video} {track}".encode() + s.keypoints_px[n].tobytes() + s.valid[n].tobytes()).digest()
+    file = pynwb.NWBFile(
+        session_description=f"3D pose of bird {track}, fitted by jaxfit to {one_line(exported.require_video().name)}",
+        identifier=str(uuid.UUID(bytes=digest[:16])),
+        session_start_time=began,
+        notes=json_text(facts),
+    )
+    species = _SPECIES.get(exported.bird.name)
+    about: dict[str, Any] = {"species": species} if species else {}
+    subject = pynwb.file.Subject(
+        subject_id=f"bird_{track}", sex="U", age="P0D/", description="track of a video", **about
+    )
+    file.subject = subject
+    footage = pynwb.image.ImageSeries(
+        name="footage",
+        description="the video that the poses were fitted to",
+        external_file=[video],
+        format="external",
+        starting_frame=[0],
+        rate=exported.require_fps(),
+        starting_time=0.0,
+        num_samples=int(s.frame_index[-1]) + 1,
+        unit="n.a.",
+        dimension=s.image_size_px[s.valid].max(0).tolist(),
+    )
+    file.add_acquisition(footage)
+    edges = np.array(skeleton_pairs(s.keypoint_names), np.uint8).reshape(-1, 2)
+    skeleton = ndx_pose.Skeleton(name="bird", nodes=list(s.keypoint_names), edges=edges, subject=subject)
+    pose = ndx_pose.PoseEstimation(
+        name="PoseEstimation",
+        pose_estimation_series=_series(exported, n),
+        description=f"projected keypoints of the fitted mesh; the fit ended with the status: {facts['status']}",
+        original_videos=[video],
+        scorer="jaxfit",
+        source_software="jaxfit",
+        source_software_version=__version__,
+        skeleton=skeleton,
+        source_video=footage,
+    )
+    behaviour = file.create_processing_module("behavior", "poses of the bird")
+    behaviour.add(ndx_pose.Skeletons(skeletons=[skeleton]))
+    behaviour.add(pose)
+    with pynwb.NWBHDF5IO(path, "w") as io:
+        io.write(file)
+
+
+def _series(exported: Exported, n: int) -> list[Any]:
+    """Return one series for every keypoint. The series share their times."""
+    ndx_pose = _library("ndx_pose")
+    points, confidence = exported.keypoints_px[n], exported.confidence[n]
+    times = exported.times_s
+    steps = np.diff(times)
+    timing: dict[str, Any] = {"timestamps": times}
+    if len(steps) and np.abs(steps - steps[0]).max() < 1e-6:
+        timing = {"starting_time": float(times[0]), "rate": float(1 / steps.mean())}
+    series: list[Any] = []
+    for k, name in enumerate(_series_names(exported.solution.keypoint_names)):
+        one = ndx_pose.PoseEstimationSeries(
+            name=name,
+            description=f"keypoint {one_line(exported.solution.keypoint_names[k])}",
+            data=points[:, k],
+            unit="pixels",
+            reference_frame=_ORIGIN,
+            **timing,
+            confidence=confidence[:, k],
+            confidence_definition=CONFIDENCE,
+        )
+        if "timestamps" in timing and not series:
+            timing = {"timestamps": one}  # a link to the times of the first series
+        series.append(one)
+    return series
+
+
+def _series_names(names: tuple[str, ...]) -> list[str]:
+    """Return names without the characters / and :, which NWB does not accept, each name once."""
+    changed: list[str] = []
+    for name in names:
+        plain = name.replace("/", "_").replace(":", "_")
+        while plain in changed:
+            plain += "_"
+        changed.append(plain)
+    return changed
+
+
+def _library(name: str) -> Any:
+    """Return a library that makes its classes when it is imported, so that type checkers do not know them."""
+    return import_module(name)

@@ -1,0 +1,1 @@
+"""What every package uses: errors, limits, progress, safe files, worker processes."""

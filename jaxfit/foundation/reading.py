@@ -1,0 +1,229 @@
+"""Opening of files for reading with one-line errors, and JSON text."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import stat
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import JSON_LEVELS, JSON_VALUES
+
+# Errors of the operating system for a read: the problem, and the action that the user can take.
+_PROBLEMS = {
+    errno.ENOENT: ("does not exist", "check the path"),
+    errno.ENOTDIR: ("does not exist: a part of its path is a file", "check the path"),
+    errno.ELOOP: ("is a symbolic link that leads back to itself", "check the links of its path"),
+    errno.ENAMETOOLONG: ("has a name that is too long for this system", "check the path"),
+    errno.EACCES: ("cannot be read: permission denied", "change its permissions"),
+    errno.EPERM: ("cannot be read: permission denied", "change its permissions"),
+}
+
+
+def check_readable(path: str | Path, kind: str = "a file") -> Path:
+    """Check that a path is a regular file that can be read; call this function before a library opens the path.
+
+    Args:
+        path: the file.
+        kind: the expected kind of file with its article, such as ``an .npz file``, for the message.
+
+    Returns:
+        The path.
+
+    Raises:
+        InputError: the path does not exist, is not a regular file (a folder, a device, a pipe), is a cyclic symbolic
+            link, has a name that is too long or that no file can have, or cannot be read.
+    """
+    with open_file(path, kind):
+        return Path(path)
+
+
+def check_folder(path: str | Path, kind: str = "a folder") -> Path:
+    """Check that a path is a folder; arguments, result and errors as `check_readable`."""
+    path = Path(path)
+    with _read_errors(path):
+        if not stat.S_ISDIR(path.stat().st_mode):
+            raise InputError(path, f"is a file, not {kind}", "check the path")
+    return path
+
+
+@contextmanager
+def open_file(path: str | Path, kind: str = "a file") -> Iterator[BinaryIO]:
+    """Open a regular file for reading bytes, as a context manager; arguments and errors as `check_readable`.
+
+    An error of the operating system in the body, such as a damaged disk, is an InputError too.
+    """
+    path = Path(path)
+    with _read_errors(path):
+        _require_file(path, path.stat().st_mode, kind)  # before the open, because devices may react to it
+        # without O_NONBLOCK, opening a pipe that replaces the file now would wait for a writer
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        with os.fdopen(descriptor, "rb") as file:
+            _require_file(path, os.fstat(descriptor).st_mode, kind)
+            yield file
+
+
+def read_file(path: str | Path, most_bytes: int, kind: str = "a file") -> bytes:
+    """Return the bytes of a regular file of at most `most_bytes`.
+
+    Raises:
+        InputError: as `check_readable`; or the file is larger.
+    """
+    with open_file(path, kind) as file:
+        # the size of a file may change, and is 0 for files of the operating system
+        size = os.fstat(file.fileno()).st_size
+        content = bytearray()
+        # in parts, because read() reserves memory for the size that it is given
+        while size <= most_bytes and len(content) <= most_bytes and (part := file.read(2**18)):
+            content += part
+    if max(size, len(content)) > most_bytes:
+        problem = f"has {max(size, len(content)):,} bytes, more than {most_bytes:,}"
+        raise InputError(path, problem, f"give {kind} of at most this size")
+    return bytes(content)
+
+
+def read_text(path: str | Path, most_bytes: int, kind: str) -> str:
+    """Return the text of a UTF-8 file of at most `most_bytes`, without a byte order mark.
+
+    Raises:
+        InputError: as `read_file`; or the content is not UTF-8.
+    """
+    content = read_file(path, most_bytes, kind)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        problem = f"line {line} is not UTF-8 text (byte {error.start})"
+        raise InputError(path, problem, f"give {kind}, saved as UTF-8") from None
+
+
+def _require_file(path: Path, mode: int, kind: str) -> None:
+    if stat.S_ISDIR(mode):
+        raise InputError(path, f"is a folder, not {kind}", "check the path")
+    if not stat.S_ISREG(mode):
+        raise InputError(path, f"is a device or a pipe, not {kind}", "check the path")
+
+
+@contextmanager
+def _read_errors(path: Path) -> Iterator[None]:
+    """Convert errors of the operating system in the body to an InputError that names `path`."""
+    try:
+        valid = b"\0" not in os.fsencode(path)
+    except UnicodeEncodeError:
+        valid = False
+    if not valid:
+        raise InputError(path, "contains a character that no file name has", "check the path")
+    try:
+        yield
+    except OSError as error:
+        unknown = f"cannot be read: {error.strerror or error}", "check the disk or the path"
+        problem, remedy = _PROBLEMS.get(error.errno or 0, unknown)
+        raise InputError(path, problem, remedy) from error
+
+
+def read_json_file(path: str | Path, most_bytes: int) -> Any:
+    """Return the content of a JSON file as dicts, lists and plain values.
+
+    Args:
+        path: the file.
+        most_bytes: size of the largest file that is accepted.
+
+    Raises:
+        InputError: as `read_text` and `parse_json`.
+    """
+    return parse_json(read_text(path, most_bytes, "a JSON file"), path)
+
+
+def parse_json(text: str, source: object) -> Any:
+    """Return the content of a JSON text as dicts, lists and plain values.
+
+    The numbers NaN, Infinity and -Infinity are accepted, although JSON does not define them.
+
+    Args:
+        text: the JSON text.
+        source: the file, for messages.
+
+    Raises:
+        InputError: the text is empty, is not JSON (the message names line and column), has more than `JSON_LEVELS`
+            levels or `JSON_VALUES` values, holds a whole number that Python refuses to read (more than 4,300 digits),
+            or an object that holds a key twice.
+    """
+    if not text.strip():
+        raise InputError(source, "is empty", "write it again")
+    # every value but the first follows one of these characters
+    values = sum(map(text.count, ",[{"))
+    if values > JSON_VALUES:
+        raise InputError(source, f"holds about {values:,} values, more than {JSON_VALUES:,}", "split the file")
+    try:
+        content = json.loads(text, object_pairs_hook=partial(_object, source))
+    except json.JSONDecodeError as error:
+        # a truncated file has its error at its end, or at the string or list that is not closed
+        cut = text.lstrip().startswith(("{", "[")) and not text.rstrip().endswith(("}", "]"))
+        remedy = "the file ends midway: copy or write it again" if cut else "correct the file or write it again"
+        problem = f"is not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
+        raise InputError(source, problem, remedy) from None
+    except RecursionError:
+        raise _too_deep(source) from None
+    except InputError:
+        raise
+    except ValueError:
+        raise InputError(source, "holds a number of too many digits", "write it again") from None
+    level = [content] if isinstance(content, dict | list) else []
+    for _ in range(JSON_LEVELS):
+        values = (each.values() if isinstance(each, dict) else each for each in level)
+        level = [value for part in values for value in part if type(value) in (dict, list)]
+        if not level:
+            return content
+    raise _too_deep(source)
+
+
+def _object(source: object, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+        raise InputError(source, f'holds the key "{twice}" twice in one object', "remove one of the two")
+    return content
+
+
+def _too_deep(source: object) -> InputError:
+    return InputError(source, f"is nested more than {JSON_LEVELS} levels deep", "write it again")
+
+
+def json_text(content: Any, indent: int | None = 2) -> str:
+    """Return the JSON text of `json_values` of the content.
+
+    Args:
+        content: mappings, sequences, arrays and scalars.
+        indent: spaces of each level; None writes one line.
+
+    Raises:
+        TypeError: the content holds a value that JSON cannot represent.
+    """
+    return json.dumps(json_values(content), indent=indent, allow_nan=False)
+
+
+def json_values(content: Any) -> Any:
+    """Return the content in the types of JSON.
+
+    Arrays and tuples become lists, NumPy scalars become Python scalars, keys become text, and NaN and infinite
+    numbers become None, since JSON has no such numbers.
+    """
+    if isinstance(content, np.ndarray | np.generic) or hasattr(content, "__array__"):
+        content = np.asarray(content).tolist()
+    if isinstance(content, Mapping):
+        return {str(key): json_values(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [json_values(value) for value in content]
+    if isinstance(content, float) and not math.isfinite(content):
+        return None
+    return content

@@ -1,1 +1,0 @@
-"""Choice of the frames of a video that a person should label."""

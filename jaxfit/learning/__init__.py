@@ -1,0 +1,1 @@
+"""What is learnt from data: priors, species, networks (extra `train`)."""

@@ -1,0 +1,149 @@
+"""Curves of confidences, fitted on known birds and stored in the ONNX file.
+
+The module needs the package `onnx`, but not PyTorch. `jaxfit.perception.network` describes the curves and reads
+them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import onnx
+from jaxtyping import Bool, Float
+from scipy.optimize import isotonic_regression
+
+from jaxfit.data.masks import box_of_mask
+from jaxfit.evaluation.detection import assign
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import write_whole
+from jaxfit.learning.networks.labelled_frames import LabelledFrames
+from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.perception.network import CONFIDENCE_KEY, Curve, Instance, KeypointDetector, Segmenter
+
+# pyright: reportMissingImports=false
+
+
+def set_metadata(path: str | Path, entries: Mapping[str, str]) -> None:
+    """Set entries of the metadata of an ONNX file; other entries and the network do not change."""
+    model = onnx.load(str(path))
+    kept = {entry.key: entry.value for entry in model.metadata_props}
+    onnx.helper.set_model_props(model, kept | dict(entries))
+    write_whole(path, model.SerializeToString())
+
+
+RIGHT = 0.05
+"""Largest error of a keypoint that is right, as a share of the longer side of the bird's box."""
+RANGES = 20
+"""Number of equal ranges of values, each of which gives at most one point of a curve."""
+MIN_IN_RANGE = 50
+"""A range with fewer detections is merged with the next range."""
+MIN_OUTCOMES = 200
+"""Least number of detections for a curve."""
+
+
+class Outcomes(NamedTuple):
+    """M detections: what the network said, and whether the detection is right."""
+
+    values: Float[np.ndarray, "M"]
+    """Raw values of the network."""
+    right: Bool[np.ndarray, "M"]
+
+
+def calibrate_keypoints(path: str | Path, frames: LabelledFrames, segmenter: Segmenter) -> Curve:
+    """Fit the curve of a keypoint network on known birds, and store the curve in the file.
+
+    Args:
+        path: the ONNX file; it is replaced. A curve that the file holds is replaced too.
+        frames: frames that neither network was trained on.
+        segmenter: detects the birds.
+
+    Raises:
+        InputError: the file is no keypoint network, or fewer than 200 keypoints are detected.
+    """
+    detector = load_keypoint_detector(path)
+    detector.curve = None
+    curve = fit_curve(keypoint_outcomes(frames, segmenter, detector), path)
+    set_metadata(path, {CONFIDENCE_KEY: curve.text()})
+    return curve
+
+
+def keypoint_outcomes(frames: LabelledFrames, segmenter: Segmenter, keypoints: KeypointDetector) -> Outcomes:
+    """Detect the keypoints of known birds, and compare them with the known positions.
+
+    The birds are those of the segmenter, as in tracking. A bird is compared with the known bird whose mask it shares
+    with an IoU of at least 0.5. Every keypoint with a known position counts, also if it is hidden. A keypoint is right
+    if its error is at most 5 % of the longer side of the bird's box: the box around the mask and the known keypoints.
+
+    Args:
+        frames: frames that neither network was trained on, with the keypoints in the order of the detector.
+        segmenter: detects the birds.
+        keypoints: the detector, without a curve.
+    """
+    values, right = [np.zeros(0)], [np.zeros(0, bool)]
+    for picture, owner, true_px, known in zip(
+        frames.pictures, frames.owner, frames.keypoints_px, frames.known, strict=True
+    ):
+        birds = segmenter(picture)
+        masks = [owner == n for n in range(1, len(known) + 1)]
+        detected, true = assign(_ious(birds, masks))
+        if not len(detected):
+            continue
+        points_px, confidence = keypoints(picture, [birds[i] for i in detected])
+        for m, n in enumerate(true):
+            side = _longer_side(masks[n], true_px[n, known[n]])
+            error = np.linalg.norm(points_px[m] - true_px[n], axis=-1)
+            values.append(confidence[m, known[n]])
+            right.append(error[known[n]] <= RIGHT * side)
+    return Outcomes(np.concatenate(values), np.concatenate(right))
+
+
+def fit_curve(outcomes: Outcomes, source: object = "outcomes") -> Curve:
+    """Fit a monotone curve from raw values to the share of right detections.
+
+    An isotonic regression gives the shares. The values are cut into 20 equal ranges; a range with fewer than 50
+    detections is merged with the next range. The mean value and the mean share of a range are a point of the curve,
+    and (0, 0) is its first point.
+
+    Args:
+        outcomes: detections and whether they are right.
+        source: the network, for messages.
+
+    Raises:
+        InputError: fewer than 200 detections, or detections with equal values.
+    """
+    detected = outcomes.values > 0
+    values, right = outcomes.values[detected].astype(np.float64), outcomes.right[detected]
+    order = np.argsort(values, kind="stable")
+    if len(values) < MIN_OUTCOMES or values.min() == values.max():
+        problem = f"has {len(values)} detections of known birds, or equal confidences"
+        raise InputError(source, problem, f"calibrate on pictures with at least {MIN_OUTCOMES} detected keypoints")
+    shares = isotonic_regression(right[order].astype(float)).x
+    edges = np.searchsorted(values[order], np.linspace(values.min(), values.max(), RANGES + 1)[1:-1])
+    points, start = [(0.0, 0.0)], 0
+    for stop in [*edges.tolist(), len(order)]:
+        is_last = stop == len(order)
+        if stop - start >= MIN_IN_RANGE and (is_last or len(order) - stop >= MIN_IN_RANGE):
+            points.append((values[order][start:stop].mean(), shares[start:stop].mean()))
+            start = stop
+    return Curve(*np.array(points).T)
+
+
+def _ious(birds: Sequence[Instance], masks: Sequence[Bool[np.ndarray, "H W"]]) -> Float[np.ndarray, "M N"]:
+    """Return the IoU of every detected bird with every known bird."""
+    iou = np.zeros((len(birds), len(masks)))
+    for i, bird in enumerate(birds):
+        height, width = bird.mask.shape
+        for n, mask in enumerate(masks):
+            shared = np.count_nonzero(bird.mask & mask[bird.y0 : bird.y0 + height, bird.x0 : bird.x0 + width])
+            iou[i, n] = shared / (np.count_nonzero(bird.mask) + np.count_nonzero(mask) - shared)
+    return iou
+
+
+def _longer_side(mask: Bool[np.ndarray, "H W"], points_px: Float[np.ndarray, "M 2"]) -> float:
+    """Return the longer side of the box around a mask and points, pixels."""
+    x0, y0, width, height = box_of_mask(mask) or (0, 0, 0, 0)
+    corners = np.concatenate([[[x0, y0], [x0 + width, y0 + height]], points_px])
+    return float(np.ptp(corners, axis=0).max())

@@ -1,0 +1,174 @@
+"""Labelled frames for training: pictures, the bird of every pixel, keypoints and scale, as files of one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy.lib.format import open_memmap
+
+from jaxfit.data.formats.fields import LARGEST_POSITION_PX
+from jaxfit.data.keypoint_names import propose_names
+from jaxfit.foundation.array_files import load_npy, load_npz
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
+
+MARKER = "frames.npz"
+"""The file of the labels; every folder of labelled frames contains this file."""
+MOST_BIRDS = 255
+"""Largest number of birds in a frame."""
+UNKNOWN = 3
+"""Visibility of a keypoint without a label: the keypoint does not count in the training."""
+_LABELS = {"keypoints_px": "S N K 2", "visibility": "S N K", "pixels_per_unit": "S"}
+"""The arrays of the labels, and their shapes."""
+
+
+class LabelledFrames(NamedTuple):
+    """S frames; the large arrays are memory-mapped files."""
+
+    pictures: UInt8[np.ndarray, "S H W 3"]
+    """Blue, green, red."""
+    owner: UInt8[np.ndarray, "S H W"]
+    """Number of the bird of each pixel, from 1; 0 for no bird."""
+    keypoints_px: Float[np.ndarray, "S N K 2"]
+    """x, y of every keypoint, also if it is occluded or outside the picture."""
+    visibility: UInt8[np.ndarray, "S N K"]
+    """2 if the keypoint is visible, 1 if it is occluded, 0 if it is outside the picture or the bird does not exist;
+    `UNKNOWN` if the keypoint has no label."""
+    pixels_per_unit: Float[np.ndarray, "S"]
+    """Scale of the picture: pixels per model unit (2 cm). For labelled footage, the scale that the networks assume."""
+    keypoint_names: tuple[str, ...] = MURRE_KEYPOINTS
+    """K names."""
+
+    @property
+    def known(self) -> Bool[np.ndarray, "S N K"]:
+        """Whether a keypoint has a label and lies in the picture, also if it is occluded."""
+        return (self.visibility == 1) | (self.visibility == 2)
+
+    def with_keypoints(self, names: Sequence[str]) -> LabelledFrames:
+        """Return the frames with other keypoints: keypoints of the same name are kept, all others are `UNKNOWN`."""
+        if tuple(names) == self.keypoint_names:
+            return self
+        S, N, _ = self.visibility.shape
+        points = np.zeros((S, N, len(names), 2), np.float32)
+        visibility = np.where((self.visibility > 0).any(-1, keepdims=True), UNKNOWN, 0)
+        visibility = np.repeat(visibility, len(names), axis=-1).astype(np.uint8)
+        for own, old in propose_names(names, self.keypoint_names).mapped.items():
+            new, k = list(names).index(own), self.keypoint_names.index(old)
+            points[:, :, new], visibility[:, :, new] = self.keypoints_px[:, :, k], self.visibility[:, :, k]
+        return self._replace(keypoints_px=points, visibility=visibility, keypoint_names=tuple(names))
+
+
+def create_pictures(folder: Path, count: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Create the memory-mapped files of `count` pictures and of the bird of each pixel, both 0; the caller fills them.
+
+    Args:
+        folder: an existing folder.
+        count, height, width: number and size of the pictures.
+    """
+    pictures = open_memmap(folder / "pictures.npy", "w+", np.uint8, (count, height, width, 3))
+    owner = open_memmap(folder / "owner.npy", "w+", np.uint8, (count, height, width))
+    return pictures, owner
+
+
+def save_labels(
+    folder: Path,
+    keypoints_px: Float[np.ndarray, "S N K 2"],
+    visibility: UInt8[np.ndarray, "S N K"],
+    pixels_per_unit: Float[np.ndarray, "S"],
+    keypoint_names: Sequence[str] = MURRE_KEYPOINTS,
+) -> None:
+    """Write the labels, the last file of a folder of labelled frames; arguments as in `LabelledFrames`.
+
+    A bird that flies past the camera has keypoints very far outside the picture: their positions are clipped to the
+    range that `load_frames` accepts.
+    """
+    clipped_px = np.clip(keypoints_px, -LARGEST_POSITION_PX, LARGEST_POSITION_PX)
+    keypoints_px = np.where(visibility[..., None] == 0, clipped_px, keypoints_px).astype(np.float32)
+    np.savez(
+        folder / MARKER,
+        keypoints_px=keypoints_px,
+        visibility=visibility,
+        pixels_per_unit=pixels_per_unit,
+        keypoint_names=np.array(keypoint_names, str),
+    )
+
+
+def load_frames(folder: str | Path) -> LabelledFrames:
+    """Load the frames that `film_scenes` or `prepare_frames` wrote.
+
+    Raises:
+        InputError: the frames cannot be read, an earlier version wrote them, or the labels hold impossible values.
+    """
+    folder = Path(folder)
+    labels = load_npz(folder / MARKER, _LABELS, optional={"keypoint_names": "K"})
+    points, visibility, scale = (labels[name] for name in _LABELS)
+    pictures = load_npy(folder / "pictures.npy", f"{len(scale)} H W 3", mapped=True)
+    owner = load_npy(folder / "owner.npy", " ".join(map(str, pictures.shape[:3])), mapped=True)
+    names = tuple(str(name) for name in labels.get("keypoint_names", MURRE_KEYPOINTS))
+    frames = LabelledFrames(pictures, owner, points, visibility, scale, names)
+    _check_labels(frames, folder)
+    return frames
+
+
+def join_frames(parts: Sequence[LabelledFrames]) -> LabelledFrames:
+    """Return the frames of several folders as one; the pictures stay memory-mapped, and index one frame at a time.
+
+    Args:
+        parts: frames of the same size with the same keypoints.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    birds = max(part.visibility.shape[1] for part in parts)
+    pictures, owner = (cast(Any, _Joined([getattr(part, name) for part in parts])) for name in ("pictures", "owner"))
+    points, visibility = (
+        np.concatenate([_with_birds(getattr(part, name), birds) for part in parts])
+        for name in ("keypoints_px", "visibility")
+    )
+    scale = np.concatenate([part.pixels_per_unit for part in parts])
+    return LabelledFrames(pictures, owner, points, visibility, scale, parts[0].keypoint_names)
+
+
+def _with_birds(array: np.ndarray, birds: int) -> np.ndarray:
+    """Return an array (S, N, …) with zeros for further birds."""
+    return np.concatenate([array, np.zeros((len(array), birds - array.shape[1], *array.shape[2:]), array.dtype)], 1)
+
+
+class _Joined(Sequence[np.ndarray]):
+    """Frames of several arrays in their order, which are not copied."""
+
+    def __init__(self, arrays: Sequence[np.ndarray]):
+        self._frames = [(array, s) for array in arrays for s in range(len(array))]
+        self.shape = (len(self._frames), *arrays[0].shape[1:])
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, s: Any) -> Any:
+        array, place = self._frames[s]
+        return array[place]
+
+
+def _check_labels(frames: LabelledFrames, folder: Path) -> None:
+    integers = all(array.dtype == np.uint8 for array in (frames.pictures, frames.owner, frames.visibility))
+    numbers = all(array.dtype == np.float32 for array in (frames.keypoints_px, frames.pixels_per_unit))
+    if not (integers and numbers):  # the checks below need numbers
+        raise _wrong(folder, "type of numbers")
+    valid = {
+        "number of keypoints": frames.visibility.shape[2] == len(frames.keypoint_names),
+        "number of birds": frames.visibility.shape[1] <= MOST_BIRDS,
+        "number of frames": len(frames.pictures) > 0,
+        "position of a keypoint": bool((np.abs(frames.keypoints_px.astype(np.float64)) <= LARGEST_POSITION_PX).all()),
+        "visibility": bool((frames.visibility <= UNKNOWN).all()),
+        "scale": bool(((frames.pixels_per_unit > 0.01) & (frames.pixels_per_unit < 1e4)).all()),
+    }
+    for name, holds in valid.items():
+        if not holds:
+            raise _wrong(folder, name)
+
+
+def _wrong(folder: Path, name: str) -> InputError:
+    return InputError(folder, f"holds frames with a wrong {name}", "remove the folder, to make the frames again")

@@ -1,0 +1,380 @@
+"""Simulated frames with labels: murres on ledges, and many kinds of birds in many landscapes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import new_folder
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.learning.networks.labelled_frames import MARKER, LabelledFrames, create_pictures, load_frames, save_labels
+from jaxfit.learning.networks.varied import Landscape, Species, draw_landscape, draw_species
+from jaxfit.model.bird import Bird
+from jaxfit.model.files import load_murre
+from jaxfit.raster.zbuffer import hard_mask, interpolate, vertex_normals, zbuffer
+from jaxfit.simulation.flock import simulate_flock
+from jaxfit.simulation.footage import GAMMA, Footage, Light, Noise, lit_plumage, random_light
+from jaxfit.simulation.scene import LEDGE_DEPTH, SURFACE_TOLERANCE, mesh_keypoints, render_visibility
+from jaxfit.simulation.viewpoint import Viewpoint, camera_axes
+
+MAX_VARIED_BIRDS = 40
+LENGTH_UNITS = 20.0
+"""Length of the murre in model units; the sizes of birds refer to this length."""
+LENGTH_SHARE = 0.03, 0.44
+"""Range of the length of birds, as a share of the width of the picture."""
+DEPTH_STEP = 1000.0
+"""Depth between birds in model units: a nearer bird hides a farther bird completely."""
+
+
+class _Placed(NamedTuple):
+    """One bird in the picture."""
+
+    vertices_world: Float[np.ndarray, "V 3"]
+    vertices_screen: Float[np.ndarray, "V 3"]
+    keypoints_screen: Float[np.ndarray, "K 3"]
+    species: Species
+    waterline: float | None
+    """Height below which water hides the bird, model units; None on the ground and in the air."""
+    flies: bool
+
+
+def draw_frames(rng: np.random.Generator, bird: Bird, count: int, width: int, height: int) -> LabelledFrames:
+    """Draw a scene, which is one or two species, one landscape, one light and one camera, and some of its frames.
+
+    Birds have other places and postures in every frame.
+
+    Args:
+        rng: source of randomness.
+        bird: the murre.
+        count: number of frames.
+        width, height: size of the frames, pixels.
+    """
+    pitch = float(rng.uniform(0, 90))
+    R_cam_world = camera_axes(pitch, 0, rng.uniform(-8, 8))
+    species = [draw_species(rng, bird) for _ in range(int(rng.integers(1, 3)))]
+    scale = float(np.exp(rng.uniform(*np.log(LENGTH_SHARE)))) * width / LENGTH_UNITS
+    landscape, light = draw_landscape(rng, width, height, pitch), random_light(rng)
+    expected = min(rng.uniform(0.05, 0.6) * width * height / (LENGTH_UNITS * scale) ** 2, MAX_VARIED_BIRDS)
+    feathers = Noise(rng, octaves=5, coarsest=16)
+    K = bird.num_keypoints
+    points = np.zeros((count, MAX_VARIED_BIRDS, K, 2), np.float32)
+    visibility = np.zeros((count, MAX_VARIED_BIRDS, K), np.uint8)
+    pictures, owner = np.zeros((count, height, width, 3), np.uint8), np.zeros((count, height, width), np.uint8)
+    for s in range(count):
+        N = int(np.clip(rng.poisson(expected), 1, MAX_VARIED_BIRDS))
+        birds = _place(rng, species, N, scale, R_cam_world, landscape, (width, height))
+        pictures[s], owner[s], points[s, :N], visibility[s, :N] = _render(rng, birds, landscape, light, feathers)
+    return LabelledFrames(pictures, owner, points, visibility, np.full(count, scale, np.float32))
+
+
+def _place(
+    rng: np.random.Generator,
+    species: list[Species],
+    N: int,
+    scale: float,
+    R_cam_world: np.ndarray,
+    landscape: Landscape,
+    size_px: tuple[int, int],
+) -> list[_Placed]:
+    """Place birds at random points of the picture; birds that stand lower in the picture are nearer."""
+    flies = rng.random() < 0.15
+    centres = rng.uniform([0, 0], size_px, (N, 2))
+    for n in range(1, N):  # some birds stand close to another bird
+        if rng.random() < 0.35:
+            centres[n] = centres[rng.integers(n)] + rng.normal(0, 0.6 * LENGTH_UNITS * scale, 2)
+    centres = np.clip(centres, 0, size_px)[np.argsort(centres[:, 1])]
+    kinds = rng.integers(len(species), size=N)
+    swims = np.zeros(N, bool) if flies else centres[:, 1] >= landscape.water_from
+    # most birds on water swim, the others stand on something that the picture does not show
+    swims &= rng.random(N) < 0.95
+    manners = ("fly",) if flies else ("stand", "swim")
+    posed = {manner: [one.pose(rng, N, manner) for one in species] for manner in manners}
+    placed = []
+    for n, (centre, kind) in enumerate(zip(centres, kinds, strict=True)):
+        own = scale * float(np.exp(rng.normal(0, 0.12)))
+        birds = posed["fly" if flies else "swim" if swims[n] else "stand"][kind]
+        vertices, keypoints = birds.vertices_world[n], birds.keypoints_world[n]
+        screen, points = (_on_screen(world, R_cam_world, own, centre, N - n + 1) for world in (vertices, keypoints))
+        low, high = vertices[:, 2].min(), vertices[:, 2].max()
+        waterline = low + rng.uniform(0.25, 0.5) * (high - low) if swims[n] else None
+        placed.append(_Placed(vertices, screen, points, species[kind], waterline, flies))
+    return placed
+
+
+def _on_screen(
+    points_world: Float[np.ndarray, "P 3"], R_cam_world: np.ndarray, scale: float, centre_px: np.ndarray, rank: int
+) -> Float[np.ndarray, "P 3"]:
+    """Project points in parallel to x, y in pixels and depth in model units; birds of a higher rank are farther."""
+    cam = points_world @ R_cam_world.T
+    return np.column_stack([centre_px + scale * cam[:, :2], DEPTH_STEP * rank + cam[:, 2]])
+
+
+def _render(
+    rng: np.random.Generator, birds: list[_Placed], landscape: Landscape, light: Light, feathers: Noise
+) -> tuple[Any, ...]:
+    picture = landscape.picture * light.tint.astype(np.float32)
+    height, width = picture.shape[:2]
+    owner = np.zeros((height, width), np.uint8)
+    depths = np.full((height, width), np.inf, np.float32)
+    faces = np.asarray(birds[0].species.body.faces)
+    strength = rng.uniform(0, 0.6)
+    for bird in birds:
+        if not bird.flies and bird.waterline is None:
+            picture = _add_shadow(picture, bird, faces, light, strength)
+    reflection = rng.uniform(0, 0.5)
+    for n, bird in enumerate(birds, start=1):
+        _draw(picture, owner, depths, n, bird, faces, light, feathers, reflection)
+    if rng.random() < 0.2:
+        _add_foreground(rng, picture, owner)
+    exposed = np.clip(picture * rng.uniform(0.9, 1.6), 0, 1) ** (1 / GAMMA)
+    points = np.stack([bird.keypoints_screen for bird in birds])
+    return (
+        np.clip(255 * exposed + 0.5, 0, 255).astype(np.uint8),
+        owner,
+        points[..., :2].astype(np.float32),
+        _visibility(points, owner, depths),
+    )
+
+
+def _box(points: np.ndarray, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    low = np.clip(np.floor(points[:, :2].min(0)).astype(int) - 1, 0, [width, height])
+    return low, np.clip(np.ceil(points[:, :2].max(0)).astype(int) + 1, 0, [width, height])
+
+
+def _draw(
+    picture: np.ndarray,
+    owner: np.ndarray,
+    depths: np.ndarray,
+    n: int,
+    bird: _Placed,
+    faces: np.ndarray,
+    light: Light,
+    feathers: Noise,
+    reflection: float,
+) -> None:
+    """Draw one bird, and its reflection if the bird swims."""
+    height, width = owner.shape
+    low, high = _box(bird.vertices_screen, width, height)
+    columns, rows = (high - low).tolist()
+    if columns <= 0 or rows <= 0:
+        return
+    screen = (bird.vertices_screen - [*low, 0]).astype(np.float32)
+    normals = vertex_normals(bird.vertices_world, faces)
+    up = bird.vertices_world[:, 2:] - bird.vertices_world[:, 2].min()
+    rest = np.asarray(bird.species.body.vertices)
+    attributes = np.concatenate([bird.species.colours, normals, rest, up, bird.vertices_world[:, 2:]], axis=1)
+    values, coverage, _ = interpolate(screen, faces, attributes.astype(np.float32), columns, rows)
+    inside = coverage > 0
+    mean = values[inside] / coverage[inside][:, None]
+    colours = np.zeros((rows, columns, 3))
+    colours[inside] = lit_plumage(mean[:, :10], light, feathers)
+    alpha = coverage.copy()
+    if bird.waterline is not None:
+        alpha[inside] *= mean[:, 10] > bird.waterline
+    box = (slice(low[1], high[1]), slice(low[0], high[0]))
+    if bird.waterline is not None and alpha.any():
+        _reflect(picture, colours, alpha, low, reflection)
+    picture[box] = picture[box] * (1 - alpha[..., None]) + colours * alpha[..., None]
+    shown = alpha > 0.5
+    owner[box][shown] = n
+    depths[box][shown] = zbuffer(screen, faces, columns, rows).depth[shown]
+
+
+def _reflect(picture: np.ndarray, colours: np.ndarray, alpha: np.ndarray, low: np.ndarray, strength: float) -> None:
+    """Draw the mirror image of a swimming bird below the lowest row of the bird."""
+    bottom = int(np.flatnonzero(alpha.any(1))[-1]) + 1
+    top = low[1] + bottom
+    rows = min(bottom, picture.shape[0] - top)
+    if rows <= 0:
+        return
+    share = cv2.GaussianBlur(alpha[bottom - rows : bottom][::-1], (0, 0), 2.0)[..., None] * strength
+    box = (slice(top, top + rows), slice(low[0], low[0] + alpha.shape[1]))
+    picture[box] = picture[box] * (1 - share) + 0.7 * colours[bottom - rows : bottom][::-1] * share
+
+
+def _add_shadow(picture: np.ndarray, bird: _Placed, faces: np.ndarray, light: Light, strength: float) -> np.ndarray:
+    """Darken the ground where the body hides sun and sky."""
+    height, width = picture.shape[:2]
+    world, screen = bird.vertices_world, bird.vertices_screen
+    # the affine map from the world to the screen, from the vertices themselves
+    system = np.column_stack([world, np.ones(len(world))])
+    to_screen, *_ = np.linalg.lstsq(system, screen, rcond=None)
+    above = world[:, 2:] - world[:, 2].min()
+    fallen = world - above * (light.to_sun_world / light.to_sun_world[2])
+    shadow = np.column_stack([fallen, np.ones(len(world))]) @ to_screen
+    mask = hard_mask((shadow / [4, 4, 1]).astype(np.float32), faces, width // 4, height // 4).astype(np.float32)
+    soft = cv2.resize(cv2.GaussianBlur(mask, (0, 0), 1.5), (width, height), interpolation=cv2.INTER_LINEAR)
+    return picture * (1 - strength * soft[..., None])
+
+
+def _add_foreground(rng: np.random.Generator, picture: np.ndarray, owner: np.ndarray) -> None:
+    """Draw blades of grass or twigs in front of the birds."""
+    height, width = owner.shape
+    drawn = np.zeros((height, width), np.float32)
+    around = rng.uniform(0, width)
+    for _ in range(int(rng.integers(5, 60))):
+        root = np.array([around + rng.normal(0, 0.15 * width), height * rng.uniform(0.4, 1.1)])
+        tip = root + np.array([rng.normal(0, 30), -rng.uniform(40, 260)])
+        thickness = int(rng.integers(1, 4))
+        cv2.line(drawn, root.astype(int).tolist(), tip.astype(int).tolist(), 1.0, thickness, cv2.LINE_AA)
+    colour = np.array([0.05, 0.2, 0.1]) * rng.uniform(0.3, 2.5) * rng.uniform(0.7, 1.3, 3)
+    picture[:] = picture * (1 - drawn[..., None]) + colour * drawn[..., None]
+    owner[drawn > 0.5] = 0
+
+
+def _visibility(points: Float[np.ndarray, "N K 3"], owner: np.ndarray, depths: np.ndarray) -> Float[np.ndarray, "N K"]:
+    """Return 2 for visible keypoints, 1 for hidden keypoints and 0 for keypoints outside the picture."""
+    height, width = owner.shape
+    inside: Bool[np.ndarray, "N K"] = np.all((points[..., :2] >= 0) & (points[..., :2] < [width, height]), axis=-1)
+    column, row = (np.clip(points[..., i].astype(int), 0, side - 1) for i, side in enumerate((width, height)))
+    own = owner[row, column] == np.arange(1, len(points) + 1)[:, None]
+    visible = inside & own & (points[..., 2] <= depths[row, column] + SURFACE_TOLERANCE)
+    return inside.astype(np.uint8) + visible
+
+
+WIDTH, HEIGHT = 960, 640
+MAX_BIRDS = 14
+FRAMES_PER_SCENE = 10
+FPS, EVERY = 12.0, 4
+"""Every fourth frame at 12 frames/s: the frames of a scene are 1/3 s apart, so that postures differ."""
+
+
+def film_scenes(
+    folder: str | Path,
+    seeds: range,
+    workers: int = 2,
+    overwrite: bool = False,
+    progress: ProgressTask = silent,
+    varied: float = 0.0,
+) -> LabelledFrames:
+    """Simulate scenes and write their frames to a folder; the same seeds give the same frames.
+
+    Args:
+        folder: folder to create, with about 32 MB per scene.
+        seeds: one seed per scene.
+        workers: number of parallel processes.
+        overwrite: replace the frames of an earlier run.
+        progress: reports every scene.
+        varied: share of the scenes with other birds in other landscapes (`jaxfit.learning.networks`).
+
+    Raises:
+        InputError: the folder contains other files, or cannot be written.
+    """
+    most = MAX_VARIED_BIRDS if varied else MAX_BIRDS
+    with new_folder(folder, overwrite, marker=MARKER) as part:
+        pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))  # a fork breaks compiled code
+        with progress("Filming simulated scenes for the training", len(seeds)) as report_progress, pool:
+            scenes = pool.map(partial(_film_scene, varied=varied), seeds)
+            _write_scenes(part, scenes, len(seeds), most, lambda: report_progress(1, ""))
+    return load_frames(folder)
+
+
+def film_scene(folder: Path, seed: int) -> None:
+    """Simulate one scene and write its frames to a folder; a folder that exists is not changed.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    if (folder / MARKER).exists():
+        return
+    try:
+        with new_folder(folder, marker=MARKER) as part:
+            _write_scenes(part, [_film_scene(seed)], 1, MAX_BIRDS)
+    except InputError:
+        if not (folder / MARKER).exists():  # another command has filmed the same scene in the meantime
+            raise
+
+
+def _write_scenes(
+    part: Path, scenes: Iterable[LabelledFrames], count: int, most: int, written: Callable[[], None] = lambda: None
+) -> None:
+    """Write the frames of `count` scenes with at most `most` birds to a folder, one scene after the other."""
+    S, K = count * FRAMES_PER_SCENE, load_murre().num_keypoints
+    pictures, owner = create_pictures(part, S, HEIGHT, WIDTH)
+    points, visibility = np.zeros((S, most, K, 2), np.float32), np.zeros((S, most, K), np.uint8)
+    scale = np.zeros(S, np.float32)
+    for i, frames in enumerate(scenes):
+        at = slice(i * FRAMES_PER_SCENE, (i + 1) * FRAMES_PER_SCENE)
+        N = frames.visibility.shape[1]
+        pictures[at], owner[at], scale[at] = frames.pictures, frames.owner, frames.pixels_per_unit
+        points[at, :N], visibility[at, :N] = frames.keypoints_px, frames.visibility
+        written()
+    del pictures, owner  # writes the memory-mapped files
+    save_labels(part, points, visibility, scale)
+
+
+def _film_scene(seed: int, varied: float = 0.0) -> LabelledFrames:
+    """Simulate the frames of one scene: with probability `varied`, other birds in another landscape."""
+    bird = load_murre()
+    if np.random.default_rng((seed, 11)).random() < varied:
+        rng = np.random.default_rng((seed, 12))
+        return draw_frames(rng, bird, FRAMES_PER_SCENE, WIDTH, HEIGHT)
+    return _film_ledge(seed, bird)
+
+
+def _film_ledge(seed: int, bird: Bird) -> LabelledFrames:
+    """Simulate murres on a ledge with a random camera, light and number of birds."""
+    scene = simulate_ledge(seed, bird)
+    frames = list(_render_frames(scene, np.asarray(bird.faces)))
+    pictures, owner, points, visibility = (np.stack(values) for values in zip(*frames, strict=True))
+    scale = np.full(len(scene.kept), scene.pixels_per_unit, np.float32)
+    return LabelledFrames(pictures, owner, points, visibility, scale)
+
+
+class Ledge(NamedTuple):
+    """Murres on a ledge, before the pictures are rendered."""
+
+    footage: Footage
+    kept: range
+    """The frames of the training."""
+    vertices: Float[np.ndarray, "T N V 3"]
+    """Vertices of the birds, world frame."""
+    keypoints: Float[np.ndarray, "T N K 3"]
+    """Keypoints of the birds, world frame."""
+    pixels_per_unit: float
+
+
+def simulate_ledge(seed: int, bird: Bird) -> Ledge:
+    """Simulate the birds of a scene without rendering the pictures."""
+    rng = np.random.default_rng((seed, 10))
+    view, pixels_per_unit = _random_view(rng)
+    # the expected number of birds grows with the visible area
+    expected_birds = (view.width / pixels_per_unit) * (view.height / pixels_per_unit) / 170
+    N = int(np.clip(rng.poisson(min(expected_birds, 9)) + 1, 1, MAX_BIRDS))
+    T = FRAMES_PER_SCENE * EVERY
+    birds = simulate_flock(bird, N, T, FPS, LEDGE_DEPTH, view, seed)
+    footage = Footage(bird, birds, view, LEDGE_DEPTH, random_light(rng), seed)
+    kept = range(int(rng.integers(EVERY)), T, EVERY)
+    vertices = np.stack([simulated.vertices_world for simulated in birds], axis=1)
+    return Ledge(footage, kept, vertices, mesh_keypoints(bird, vertices), pixels_per_unit)
+
+
+def _render_frames(scene: Ledge, faces: np.ndarray) -> Iterator[tuple[Any, ...]]:
+    view = scene.footage.view
+    for t in scene.kept:
+        visible = render_visibility(scene.vertices[t], scene.keypoints[t], faces, view)
+        owner = np.zeros((view.height, view.width), np.uint8)
+        for n, mask in enumerate(visible.visible_masks, start=1):
+            owner[mask] = n
+        visibility = visible.inside.astype(np.uint8) + visible.keypoint_visible
+        yield scene.footage.frame(t), owner, visible.keypoints_px.astype(np.float32), visibility
+
+
+def _random_view(rng: np.random.Generator) -> tuple[Viewpoint, float]:
+    """Draw a camera with random direction (steeply above to obliquely in front), distance and zoom."""
+    R_cam_world = camera_axes(rng.uniform(42, 82), rng.uniform(-25, 25), rng.uniform(-6, 6))
+    distance = rng.uniform(130, 400)
+    width_units = float(np.exp(rng.uniform(np.log(48), np.log(130))))
+    aim = np.array([rng.uniform(-6, 6), rng.uniform(0.35, 0.55) * LEDGE_DEPTH, 6])
+    focal_px = WIDTH * distance / width_units
+    view = Viewpoint(R_cam_world, aim - distance * R_cam_world[2], focal_px, WIDTH, HEIGHT)
+    return view, WIDTH / width_units

@@ -1,1 +1,0 @@
-"""Importers of published bird models: they read the files that the authors released, without PyTorch."""

@@ -1,0 +1,297 @@
+"""Import of published models: avian-mesh (Badger et al. 2020) and AVES (Wang et al. 2021).
+
+Build a `Bird` from the arrays of a published model: the part that avian-mesh and AVES share. Both models are posed as
+in `jaxfit.model.kinematics`: joint offsets times bone length, then linear blend skinning. Units and axes are the
+authors': a bird is about 20 units long, looks along +y, and has +z up, so left = −x.
+
+Source: Badger et al. 2020 (github.com/marcbadger/avian-mesh); Wang et al. 2021 (github.com/yufu-wang/aves).
+
+Import avian-mesh, the cowbird model of Badger et al. 2020. Source: Badger et al. 2020, *3D Bird Reconstruction*
+(github.com/marcbadger/avian-mesh).
+
+Import AVES, the multi-species model of Wang et al. 2021. Source: Wang et al. 2021, *Birds of a Feather*
+(github.com/yufu-wang/aves).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import MODEL_JSON_BYTES
+from jaxfit.foundation.reading import check_readable, read_json_file
+from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, JOINT_NAMES, mirror_pairs
+from jaxfit.model.bird import Bird, check_bird, neutral_colours, unlimited_joints
+from jaxfit.model.torch_file import read_tensors
+
+PRIOR_FIELDS = ("pose_mean", "pose_covariance", "bone_mean", "bone_covariance")
+MESH_KEYS = {"V": "f", "F": "i", "J": "f", "kintree_table": "i", "weights": "f", "vert2kpt": "f"}
+"""Arrays of a published mesh, and whether each array holds real numbers ("f") or integers ("i")."""
+
+
+def read_numbers(content: dict[str, Any], key: str, kind: str, source: object) -> np.ndarray:
+    """Return one array of a model file as float64 (`kind` "f") or int64 (`kind` "i").
+
+    Raises:
+        InputError: the array is missing, or holds other values than such numbers.
+    """
+    if key not in content:
+        known = ", ".join(sorted(map(str, content))[:20]) or "nothing"
+        raise InputError(source, f"{key}: missing", f"the file contains {known}")
+    try:
+        array = np.asarray(content[key])
+        if array.dtype.kind not in ("iuf" if kind == "f" else "iu"):
+            raise ValueError(f"{array.dtype}, expected {'numbers' if kind == 'f' else 'integers'}")
+        return array.astype(np.float64 if kind == "f" else np.int64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError(source, f"{key}: not an array of numbers: {error}", "use the published file") from error
+
+
+def read_prior(content: dict[str, Any], keys: tuple[str, ...], source: object) -> dict[str, np.ndarray]:
+    """Return the Gaussian priors under their names in `Bird`.
+
+    Args:
+        content: arrays of the file by name.
+        keys: their names in the file, in the order of `PRIOR_FIELDS`.
+        source: the file that an error names.
+
+    Raises:
+        InputError: an array is missing or has a wrong shape.
+    """
+    bones = len(JOINT_NAMES) - 1
+    shapes = ((3 * bones,), (3 * bones, 3 * bones), (bones,), (bones, bones))
+    prior = {}
+    for field, key, shape in zip(PRIOR_FIELDS, keys, shapes, strict=True):
+        prior[field] = array = read_numbers(content, key, "f", source)
+        if array.shape != shape:
+            problem = f"{key}: shape {array.shape}, expected {shape}"
+            raise InputError(source, problem, "use the published prior")
+    return prior
+
+
+def build_bird(
+    name: str,
+    mesh: dict[str, Any],
+    prior: dict[str, np.ndarray],
+    keypoint_names: tuple[str, ...],
+    source: object,
+    shape: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Bird:
+    """Build and check a bird.
+
+    Args:
+        name: name of the model.
+        mesh: arrays of the model file, among them those of `MESH_KEYS`.
+        prior: the priors from `read_prior`.
+        keypoint_names: names of the K keypoints, in the order of `vert2kpt`.
+        source: the file that an error names.
+        shape: shape basis (S, V, 3) and variance (S,) of a model that has shape directions.
+
+    Raises:
+        InputError: an array is missing, or has a wrong shape or wrong numbers.
+    """
+    parts = {key: read_numbers(mesh, key, kind, source) for key, kind in MESH_KEYS.items()}
+    joints = len(JOINT_NAMES)
+    for key, expected in (
+        ("kintree_table", (2, joints)),
+        ("J", (joints, 3)),
+        ("V", (None, 3)),
+        ("F", (None, 3)),
+        ("weights", (len(parts["V"]), joints)),
+        ("vert2kpt", (len(keypoint_names), len(parts["V"]))),
+    ):
+        actual = parts[key].shape
+        if len(actual) != len(expected) or any(e not in (None, a) for e, a in zip(expected, actual, strict=True)):
+            shown = str(expected).replace("None", "any")
+            raise InputError(source, f"{key}: shape {actual}, expected {shown}", f"is this the {name} model?")
+    parents, numbers = parts["kintree_table"]
+    if not np.array_equal(numbers, np.arange(joints)):
+        raise InputError(source, "kintree_table: its second row must be 0, 1, 2, …", "use the published file")
+    basis, variance = shape if shape is not None else (np.zeros((0, len(parts["V"]), 3)), np.zeros(0))
+
+    def float32(array: np.ndarray) -> Any:
+        # a number too large for float32 becomes infinite, and check_bird reports its field
+        with np.errstate(over="ignore"):
+            return jnp.asarray(array.astype(np.float32))
+
+    # without this, an index beyond int32 would wrap round to an index that may be valid
+    faces = np.where(np.abs(parts["F"]) < 2**31, parts["F"], -1)
+    bird = Bird(
+        vertices=float32(parts["V"]),
+        faces=jnp.asarray(faces.astype(np.int32)),
+        joints=float32(parts["J"]),
+        skin_weights=float32(parts["weights"]),
+        keypoint_weights=float32(parts["vert2kpt"]),
+        shape_basis=float32(basis),
+        shape_variance=float32(variance),
+        **{field: float32(array) for field, array in prior.items()},
+        vertex_colours=jnp.asarray(neutral_colours(len(parts["V"]))),
+        joint_limits=jnp.asarray(unlimited_joints(joints - 1)),
+        parents=tuple(int(parent) for parent in parents),
+        joint_names=JOINT_NAMES,
+        keypoint_names=keypoint_names,
+        joint_pairs=mirror_pairs(JOINT_NAMES),
+        keypoint_pairs=mirror_pairs(keypoint_names),
+        name=name,
+    )
+    return check_bird(bird, source)
+
+
+PRIOR_KEYS = ("p_m", "p_cov", "b_m", "b_cov")
+"""Tensors of `pose_bone_prior.pth`: mean and covariance of the pose, then of the bone lengths."""
+
+
+def import_avian_mesh(json_path: Path | str, prior_path: Path | str | None = None) -> Bird:
+    """Import the cowbird model: 3932 vertices, 25 joints, 12 keypoints, no shape directions.
+
+    Args:
+        json_path: `bird_eccv.json`, the mesh, in model units.
+        prior_path: `pose_bone_prior.pth`, the Gaussian priors of pose (radians) and bone length. This file is
+            required, because a fit without a pose prior gives poor results.
+
+    Raises:
+        InputError: a file is missing or damaged, a field is missing, or a field has a wrong shape or wrong numbers.
+    """
+    if prior_path is None:
+        remedy = "give pose_bone_prior.pth too; it is published beside bird_eccv.json"
+        raise InputError(json_path, "the prior of pose and bone lengths is missing", remedy)
+    mesh = read_model_json(json_path)
+    prior = read_prior(read_tensors(prior_path), PRIOR_KEYS, prior_path)
+    return build_bird("avian-mesh", mesh, prior, AVIAN_MESH_KEYPOINTS, json_path)
+
+
+def read_model_json(path: Path | str) -> dict[str, Any]:
+    """Return the top-level object of a model's JSON file, with its values as parsed.
+
+    Raises:
+        InputError: the file is missing, too large, not JSON (the message names line and column), or does not
+            contain an object.
+    """
+    path = Path(path)
+    content = read_json_file(path, MODEL_JSON_BYTES)
+    if not isinstance(content, dict):
+        raise InputError(path, "not a JSON object", "expected bird_eccv.json")
+    return content
+
+
+OWN_PRIOR_KEYS = ("pose_mean", "pose_cov", "bone_mean", "bone_cov")
+"""The same four tensors as `PRIOR_KEYS`, by their names in `aves.pt`."""
+
+
+def import_aves(pt_path: Path | str, prior_path: Path | str | None = None) -> Bird:
+    """Import the multi-species model: 3932 vertices, 25 joints, 18 keypoints, 15 shape directions.
+
+    `V` is the mean shape. `Beta` holds unit vectors over all vertices, and the code of AVES multiplies them by
+    `Beta_sigma`. `shape_basis` is this product, so `betas` have the same meaning here as in AVES.
+
+    The code of AVES treats σ (`Beta_sigma`) as standard deviations, but the values are the variances along each
+    vector. If σ were standard deviations, one unit of the first coefficient would lengthen a bird of 23 units by 18,
+    and the cowbird of Badger et al. (`beta_original`) would lie implausibly close to the mean: χ² = 0.9 for 15
+    coefficients instead of 10.8. Hence `shape_variance` = σ/σ² = 1/σ. The fit of AVES itself uses no variance, but
+    the penalty 150·‖betas‖₂. A fit needs neither `beta_original` nor `vert2kpt_cub` (the 15 parts of CUB), so the
+    importer skips both.
+
+    Args:
+        pt_path: `aves.pt`, in model units; the file contains the same priors as avian-mesh.
+        prior_path: a `pose_bone_prior.pth` that replaces the priors of `aves.pt`.
+
+    Raises:
+        InputError: a file is missing or damaged, a field is missing, or a field has a wrong shape or wrong numbers.
+    """
+    tensors = read_tensors(pt_path)
+    if prior_path is None:
+        prior = read_prior(tensors, OWN_PRIOR_KEYS, pt_path)
+    else:
+        prior = read_prior(read_tensors(prior_path), PRIOR_KEYS, prior_path)
+    directions = read_numbers(tensors, "Beta", "f", pt_path)
+    sigma = read_numbers(tensors, "Beta_sigma", "f", pt_path)
+    if directions.ndim != 3 or sigma.shape != directions.shape[:1]:
+        problem = f"shapes {directions.shape} and {sigma.shape}, expected (S, V, 3) and (S,)"
+        raise InputError(pt_path, f"Beta, Beta_sigma: {problem}", "use aves.pt as published")
+    if not np.all(sigma > 0):
+        raise InputError(pt_path, "Beta_sigma: must be positive", "use aves.pt as published")
+    shape = (directions * sigma[:, None, None], 1.0 / sigma)
+    return build_bird("aves", tensors, prior, AVES_KEYPOINTS, pt_path, shape)
+
+
+MODEL_KINDS = ("avian-mesh", "aves")
+"""Published models that jaxfit imports."""
+SUFFIXES = (".json", ".pt", ".pth")
+FILE_NAMES = {"mesh": "bird_eccv.json", "aves": "aves.pt", "prior": "pose_bone_prior.pth"}
+"""Published name of the file for each role."""
+
+
+def import_model(kind: str, sources: Sequence[Path | str]) -> Bird:
+    """Import a published model from its files, in any order, or from the folder that contains them.
+
+    Args:
+        kind: "avian-mesh" (`bird_eccv.json` and `pose_bone_prior.pth`) or "aves" (`aves.pt`; a prior is
+            optional and replaces the prior of `aves.pt`).
+        sources: files or folders. In a folder, files that the model does not need are ignored. A file that is
+            named explicitly must belong to the model.
+
+    Raises:
+        ValueError: an unknown kind.
+        InputError: a file is missing, is given twice, or does not belong to the model.
+    """
+    if kind not in MODEL_KINDS:
+        raise ValueError(f"kind must be one of {', '.join(MODEL_KINDS)}, not {kind!r}")
+    main = "mesh" if kind == "avian-mesh" else "aves"
+    needed = {FILE_NAMES[main]} | ({FILE_NAMES["prior"]} if kind == "avian-mesh" else set())
+    chosen: dict[str, Path] = {}
+    for path, explicit in _list_files(sources):
+        # a damaged file with the expected name is an error, even where the user named only its folder
+        role = _role(path, strict=explicit or path.name in needed)
+        if role not in (main, "prior"):
+            if explicit:
+                remedy = f"{kind} needs {FILE_NAMES[main]} and {FILE_NAMES['prior']}"
+                raise InputError(path, f"not a file of the {kind} model", remedy)
+            continue
+        # aves.pt contains a prior already: only an explicit file replaces that prior
+        if role == "prior" and kind == "aves" and not explicit:
+            continue
+        if role in chosen and chosen[role].resolve() != path.resolve():
+            problem = f"a second {FILE_NAMES[role]} beside {chosen[role]}"
+            raise InputError(path, problem, "give one of the two, by its file name")
+        chosen[role] = path
+    shown = ", ".join(map(str, sources)) or "nothing"
+    if main not in chosen:
+        raise InputError(shown, f"holds no {FILE_NAMES[main]}", f"give the {kind} model's {FILE_NAMES[main]}")
+    if kind == "aves":
+        return import_aves(chosen["aves"], chosen.get("prior"))
+    return import_avian_mesh(chosen["mesh"], chosen.get("prior"))
+
+
+def _list_files(sources: Sequence[Path | str]) -> list[tuple[Path, bool]]:
+    """Return (file, whether the user named this file explicitly) for all sources."""
+    files: list[tuple[Path, bool]] = []
+    for source in map(Path, sources):
+        if os.path.isdir(source):  # noqa: PTH112 - False for paths that cannot exist
+            try:
+                inside = [path for path in sorted(source.iterdir()) if path.is_file()]
+            except OSError as error:
+                raise InputError(source, f"cannot be read: {error.strerror}", "check the permissions") from error
+            files += [(path, False) for path in inside if path.suffix.lower() in SUFFIXES]
+        else:
+            files.append((check_readable(source, "a file of a bird model"), True))
+    return files
+
+
+def _role(path: Path, strict: bool) -> str:
+    """Return "mesh", "aves", "prior" or "other", from the content; with `strict`, a damaged file is an error."""
+    try:
+        if path.suffix.lower() == ".json":
+            keys = read_model_json(path).keys()
+            return "mesh" if {"V", "J"} & keys else "other"
+        keys = read_tensors(path).keys()
+        return "aves" if "V" in keys else "prior" if {"p_m", "b_m"} & keys else "other"
+    except InputError:
+        if strict:
+            raise
+        return "other"

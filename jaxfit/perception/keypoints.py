@@ -1,0 +1,234 @@
+"""A keypoint network applied to crops of the birds of a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Num, UInt8
+
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, MURRE_KEYPOINTS
+from jaxfit.perception.keypoint_layouts import (
+    HeatmapLayout,
+    KeypointInput,
+    SimccLayout,
+    detect_layout,
+    read_input,
+    read_metadata,
+)
+from jaxfit.perception.network import CONFIDENCE_KEY, OUTPUT, Instance, OnnxModel, activation_monitor, read_curve
+
+PAD_PX = 40
+DILATE_PX = 70
+"""The paper's values, for footage in which birds are about 250 pixels long."""
+
+
+class Crop(NamedTuple):
+    """A box of the frame and the size of the resampled picture; pixel centres at i + 0.5 in both."""
+
+    x0: int
+    """Left border, image pixels; negative if the box extends beyond the frame."""
+    y0: int
+    """Upper border, image pixels."""
+    width: int
+    """Width of the box, image pixels."""
+    height: int
+    """Height of the box, image pixels."""
+    size_px: tuple[int, int]
+    """Width and height of the resampled picture, crop pixels."""
+
+    @property
+    def scale(self) -> Float[np.ndarray, "2"]:
+        """Image pixels per crop pixel, along x and y. The two differ because the box is rounded to whole pixels."""
+        return np.array([self.width, self.height]) / np.array(self.size_px)
+
+    def to_image(self, points_px: Float[np.ndarray, "*B 2"]) -> Float[np.ndarray, "*B 2"]:
+        """Convert points from crop pixels to image pixels."""
+        return points_px * self.scale + (self.x0, self.y0)
+
+    def to_crop(self, points_px: Float[np.ndarray, "*B 2"]) -> Float[np.ndarray, "*B 2"]:
+        """Convert points from image pixels to crop pixels; the inverse of `to_image`."""
+        return (points_px - (self.x0, self.y0)) / self.scale
+
+
+def crop_bird(
+    frame: UInt8[np.ndarray, "H W 3"],
+    instance: Instance,
+    size_px: tuple[int, int],
+    pad_px: int = PAD_PX,
+    dilate_px: int = DILATE_PX,
+) -> tuple[UInt8[np.ndarray, "h w 3"], Crop]:
+    """Crop one bird and set every pixel outside its dilated mask to black, including other birds.
+
+    The tight box of the mask is padded, then enlarged about its centre (to half a pixel) to the aspect ratio of the
+    picture. Reduction averages over areas, which avoids aliasing.
+
+    Args:
+        frame: any colour order; only pixels within the box are read.
+        instance: its mask lies within the frame.
+        size_px: width and height of the picture.
+        pad_px: margin on every side of the box, image pixels; 0 or more.
+        dilate_px: side of the square that dilates the mask, image pixels; 0 does not dilate.
+
+    Returns:
+        The picture, black where the box extends beyond the frame, and the crop that converts to image pixels.
+
+    Source: Hägerlind et al. 2024, the crops of its keypoint network (40 and 70 pixels).
+    """
+    crop = _padded_box(instance, size_px, pad_px)
+    mask = np.zeros((crop.height, crop.width), np.uint8)
+    h, w = instance.mask.shape
+    left, top = instance.x0 - crop.x0, instance.y0 - crop.y0
+    mask[top : top + h, left : left + w] = instance.mask
+    if dilate_px > 1:
+        mask = cv2.dilate(mask, np.ones((dilate_px, dilate_px), np.uint8))
+    rows = slice(max(crop.y0, 0), min(crop.y0 + crop.height, frame.shape[0]))
+    columns = slice(max(crop.x0, 0), min(crop.x0 + crop.width, frame.shape[1]))
+    inside = slice(rows.start - crop.y0, rows.stop - crop.y0), slice(columns.start - crop.x0, columns.stop - crop.x0)
+    part = frame[rows, columns]
+    picture = np.zeros((crop.height, crop.width, 3), np.uint8)
+    picture[inside] = cv2.bitwise_and(part, part, mask=mask[inside])
+    is_reduction = crop.width >= size_px[0] and crop.height >= size_px[1]
+    # when it enlarges, OpenCV's area mode shifts the pixel centres
+    return cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA if is_reduction else cv2.INTER_LINEAR), crop
+
+
+def _padded_box(instance: Instance, size_px: tuple[int, int], pad_px: int) -> Crop:
+    h, w = instance.mask.shape
+    padded_w, padded_h = w + 2 * pad_px, h + 2 * pad_px
+    width = max(padded_w, round(padded_h * size_px[0] / size_px[1]))
+    height = max(padded_h, round(padded_w * size_px[1] / size_px[0]))
+    x0 = instance.x0 - pad_px - (width - padded_w) // 2
+    y0 = instance.y0 - pad_px - (height - padded_h) // 2
+    return Crop(x0, y0, width, height, size_px)
+
+
+BUILTIN_PATH = Path(__file__).parent / "networks" / "keypoints.onnx"
+NAME_SETS = {"murre": MURRE_KEYPOINTS, "aves": AVES_KEYPOINTS, "avian-mesh": AVIAN_MESH_KEYPOINTS}
+
+
+class OnnxKeypoints:
+    """A `KeypointDetector`: crops the birds, runs the network on batches of crops, and converts to image pixels."""
+
+    keypoint_names: tuple[str, ...]
+
+    def __init__(
+        self,
+        model: OnnxModel,
+        network_input: KeypointInput,
+        layout: HeatmapLayout | SimccLayout,
+        keypoint_names: Sequence[str],
+        pad_px: int,
+        dilate_px: int,
+        batch: int,
+        shapes: Mapping[str, tuple[int, ...]],
+    ):
+        self.keypoint_names = tuple(keypoint_names)
+        self._model, self._input, self._layout = model, network_input, layout
+        self._pad_px, self._dilate_px = pad_px, dilate_px
+        self._batch = network_input.batch or batch
+        self._shapes = shapes
+        self.activations = activation_monitor(model)
+        self.curve = read_curve(model, CONFIDENCE_KEY)
+
+    def __call__(
+        self, frame: UInt8[np.ndarray, "H W 3"], instances: Sequence[Instance]
+    ) -> tuple[Float[np.ndarray, "M K 2"], Float[np.ndarray, "M K"]]:
+        """Detect keypoints, as `KeypointDetector` describes."""
+        K = len(self.keypoint_names)
+        points_px, confidence = np.zeros((len(instances), K, 2), np.float32), np.zeros((len(instances), K), np.float32)
+        for start in range(0, len(instances), self._batch):
+            array, crops = self.network_input(frame, instances[start : start + self._batch])
+            outputs = self._model(array)
+            self._model.check_outputs(outputs, {name: (len(array), *shape) for name, shape in self._shapes.items()})
+            if self.activations is not None:
+                self.activations.add(outputs, len(crops))
+            crop_points_px, crop_confidence = self._layout(outputs)
+            if self.curve is not None:
+                crop_confidence = self.curve(crop_confidence)
+            for i, crop in enumerate(crops):
+                points_px[start + i] = crop.to_image(crop_points_px[i])
+                confidence[start + i] = crop_confidence[i]
+        return points_px, confidence
+
+    def network_input(
+        self, frame: UInt8[np.ndarray, "H W 3"], birds: Sequence[Instance]
+    ) -> tuple[Num[np.ndarray, "N _ _ _"], list[Crop]]:
+        """Return the input of the network for the birds of a frame, and their crops; a fixed batch is filled with 0."""
+        width, height = self._input.size_px
+        batch = np.zeros((self._input.batch or len(birds), height, width, 3), np.uint8)
+        crops = []
+        for i, bird in enumerate(birds):
+            batch[i], crop = crop_bird(frame, bird, (width, height), self._pad_px, self._dilate_px)
+            crops.append(crop)
+        return self._input.array(batch), crops
+
+
+def load_keypoint_detector(
+    spec: str | Path = "builtin",
+    *,
+    kind: str = "auto",
+    names: Sequence[str] | str | None = None,
+    pad_px: int | None = None,
+    dilate_px: int | None = None,
+    batch: int = 16,
+    threads: int | None = None,
+) -> OnnxKeypoints:
+    """Load a keypoint network; its inputs and outputs determine its layout.
+
+    Args:
+        spec: `builtin`, or an ONNX file; `jaxfit.perception.keypoint_layouts` describes its optional metadata.
+        kind: one of `KINDS`; `auto` uses the layout that fits.
+        names: names of the keypoints in the order of the output, or a key of `NAME_SETS`; None or empty uses the
+            names in the file.
+        pad_px, dilate_px: parameters of the crops (`crop_bird`), image pixels; None uses the values in the file, or
+            the paper's 40 and 70.
+        batch: number of crops in one run, if the network does not fix it.
+        threads: number of cores for one run; None uses all cores.
+
+    Raises:
+        InputError: the file does not exist, is not a keypoint network, has an unknown layout or not three channels,
+            or the names are missing or of the wrong number.
+    """
+    model = OnnxModel(BUILTIN_PATH if spec == "builtin" else spec, threads)
+    metadata = read_metadata(model)
+    network_input = read_input(model, metadata)
+    width, height = network_input.size_px
+    outputs = model(network_input.array(np.zeros((network_input.batch or 1, height, width, 3), np.uint8)))
+    outputs = {
+        name: value for name, value in outputs.items() if name != OUTPUT and np.asarray(value).dtype.kind in "fiub"
+    }
+    layout, count = detect_layout(model, outputs, kind, network_input, metadata)
+    return OnnxKeypoints(
+        model,
+        network_input,
+        layout,
+        _choose_names(model, count, names or metadata.keypoint_names),
+        _first_given(pad_px, metadata.pad_px, PAD_PX),
+        _first_given(dilate_px, metadata.dilate_px, DILATE_PX),
+        batch,
+        {name: outputs[name].shape[1:] for name in layout.outputs},
+    )
+
+
+def _choose_names(model: OnnxModel, count: int, given: Sequence[str] | str | None) -> Sequence[str]:
+    sets = ", ".join(f"`{name}` ({len(keypoints)})" for name, keypoints in NAME_SETS.items())
+    if not given:
+        remedy = f"give the names in the order of the output, or one of {sets}"
+        raise InputError(model.path, f"does not name its {count} keypoints", remedy)
+    if isinstance(given, str) and given not in NAME_SETS:
+        raise InputError(given, "is not a set of keypoint names", f"supported are {sets}; or give the {count} names")
+    names = NAME_SETS[given] if isinstance(given, str) else given
+    if len(names) != count:
+        problem = f"has {count} keypoints, but {len(names)} names are given"
+        remedy = f"give one name for each keypoint in the order of the output: {model.describe()}"
+        raise InputError(model.path, problem, remedy)
+    return names
+
+
+def _first_given(*values: int | None) -> int:
+    return next(value for value in values if value is not None)

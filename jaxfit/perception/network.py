@@ -1,0 +1,412 @@
+"""Detected birds, the protocols of networks, and ONNX networks with jaxfit's metadata.
+
+Distance of a network's activations from the activations of its training. A network that `jaxfit train` wrote has an
+output `activations`: its last feature map, averaged over the cells. Its metadata hold the mean μ of the activations of
+its training inputs and a matrix W (`jaxfit.learning.networks.familiarity`). The distance of an input with activations a
+is ‖W (a − μ)‖. W whitens the activations of the training, and its scale is such that 99 % of the training inputs have a
+distance below 1.
+
+Calibration of confidences: from a network's raw value to the probability that the detection is right. A network that
+`jaxfit train` wrote holds a curve in its metadata (`jaxfit.learning.networks.calibration` fits the curve): points
+`value:probability`, separated by commas, with linear interpolation between the points. The values increase and the
+probabilities do not decrease. Without a curve, the confidence is the network's own value.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from jaxfit.data.masks import box_of_mask, encode_patch
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import (
+    ACTIVATION_CHANNELS,
+    CURVE_POINTS,
+    IMAGE_SIDE_PX,
+    INSTANCES,
+    MASK_AREA,
+    NETWORK_BYTES,
+    NETWORK_INPUT_VALUES,
+)
+from jaxfit.foundation.reading import open_file
+
+
+class Instance(NamedTuple):
+    """One bird in one frame. The mask covers the bird's box, not the whole frame."""
+
+    mask: Bool[np.ndarray, "h w"]
+    """The visible part of the bird, cropped to its tight box: every border row and column contains a True."""
+    x0: int
+    """Column of the frame at which the mask begins."""
+    y0: int
+    """Row of the frame at which the mask begins."""
+    score: float
+    """Confidence of the instance, within [0, 1]."""
+    label: str
+    """Name of the class."""
+
+    @property
+    def box_px(self) -> Float[np.ndarray, "4"]:
+        """The tight box of the mask: x, y of the upper left corner, width, height; image pixels."""
+        height, width = self.mask.shape
+        return np.array([self.x0, self.y0, width, height], np.float32)
+
+    def encode(self, width: int, height: int) -> dict[str, Any]:
+        """Encode the mask as run lengths over a frame of the given size, as in `Observations.masks`."""
+        return encode_patch(self.mask, self.x0, self.y0, width, height)
+
+
+def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int = 0, y0: int = 0) -> Instance | None:
+    """Create an instance from a mask that may have empty borders; return None for an empty mask.
+
+    Args:
+        mask: mask of the whole frame or of a part of the frame.
+        score, label: as in `Instance`; the score is clipped to [0, 1].
+        x0, y0: position of this part in the frame, pixels; 0 or more.
+    """
+    box = box_of_mask(mask)
+    if box is None:
+        return None
+    left, top, width, height = box
+    return Instance(
+        mask[top : top + height, left : left + width], x0 + left, y0 + top, min(max(float(score), 0.0), 1.0), label
+    )
+
+
+def collect_instances(
+    source: object, instances: Iterable[Instance | None], frame_px: tuple[int, int]
+) -> list[Instance]:
+    """Return the instances of a frame without None.
+
+    Args:
+        source: the network, for messages.
+        instances: instances, or None for an empty mask.
+        frame_px: width and height of the frame.
+
+    Raises:
+        InputError: the number of instances or the area of their masks shows that the network does not detect birds.
+    """
+    collected, area = [], 0
+    for instance in instances:
+        if instance is None:
+            continue
+        collected.append(instance)
+        area += instance.mask.size
+        if len(collected) > INSTANCES or area > MASK_AREA * frame_px[0] * frame_px[1]:
+            problem = f"detects more than {INSTANCES} instances in one frame, or boxes of {MASK_AREA} times its area"
+            raise InputError(source, problem, "raise min_score, or give another network")
+    return collected
+
+
+class Segmenter(Protocol):
+    """Detects the instances of a frame."""
+
+    class_names: tuple[str, ...]
+    """The classes that the segmenter reports."""
+
+    def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
+        """Return the instances of a blue-green-red frame, by falling score; masks lie within the frame."""
+        ...
+
+
+class KeypointDetector(Protocol):
+    """Detects the keypoints of instances."""
+
+    keypoint_names: tuple[str, ...]
+    """K names in the order of the output."""
+
+    def __call__(
+        self, frame: UInt8[np.ndarray, "H W 3"], instances: Sequence[Instance]
+    ) -> tuple[Float[np.ndarray, "M K 2"], Float[np.ndarray, "M K"]]:
+        """Return positions (x, y in image pixels, pixel centres at i + 0.5) and confidences within [0, 1], float32."""
+        ...
+
+
+class Port(NamedTuple):
+    """An input or output, as the file declares it."""
+
+    name: str
+    shape: tuple[int | None, ...]
+    """Length of each axis; None for an axis of variable length."""
+    kind: str
+    """ONNX Runtime's name of the element type, such as `tensor(float)`."""
+
+    def __str__(self) -> str:
+        return f"{self.name} ({', '.join('?' if side is None else str(side) for side in self.shape)})"
+
+
+class OnnxModel:
+    """A network in an ONNX file.
+
+    Args:
+        path: the `.onnx` file.
+        threads: number of cores for one run; None uses all cores.
+
+    Raises:
+        InputError: the file does not exist, is not ONNX, lacks its external data, contains an unknown operator or text
+            that is not UTF-8, or declares an input without values or with too many values.
+    """
+
+    path: Path
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+    metadata: Mapping[str, str]
+    """The exporter's metadata, such as `names` (Ultralytics)."""
+
+    def __init__(self, path: str | Path, threads: int | None = None):
+        import onnxruntime as ort
+
+        self.path = Path(path)
+        with open_file(self.path, "an ONNX file") as file:
+            size = os.fstat(file.fileno()).st_size
+        if size > NETWORK_BYTES:
+            raise InputError(path, f"has {size:,} bytes", f"the limit is {NETWORK_BYTES:,}")
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = threads or 0
+        options.log_severity_level = 4  # the error below reports the problem
+        try:
+            self._session = ort.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # the errors of ONNX Runtime have no common base class
+            raise InputError(path, f"cannot be loaded: {_shorten(error)}", _remedy(str(error))) from error
+        try:
+            self.inputs = tuple(_read_port(value) for value in self._session.get_inputs())
+            self.outputs = tuple(_read_port(value) for value in self._session.get_outputs())
+            self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+        except UnicodeDecodeError as error:
+            raise InputError(path, "has names or metadata that are not UTF-8", "export it again") from error
+        for port in self.inputs:
+            self.check_input(port.shape)
+
+    def __call__(self, *inputs: np.ndarray) -> dict[str, np.ndarray]:
+        """Run the network once.
+
+        Args:
+            inputs: one array for each input, in the order of `self.inputs`.
+
+        Returns:
+            Name → array of each output.
+
+        Raises:
+            InputError: the network fails on these inputs.
+        """
+        names = [port.name for port in self.outputs]
+        feed = {port.name: value for port, value in zip(self.inputs, inputs, strict=True)}
+        try:
+            values: Any = self._session.run(names, feed)
+        except Exception as error:
+            problem = f"cannot be run: {_shorten(error)}"
+            raise InputError(self.path, problem, "check the layout of its inputs") from error
+        return dict(zip(names, values, strict=True))
+
+    def check_input(self, shape: Sequence[int | None]) -> None:
+        """Raise InputError if an input of this shape has no values or too many values; None is a variable side."""
+        sides = [side for side in shape if side is not None]
+        if sides and (min(sides) < 1 or max(sides) > IMAGE_SIDE_PX or math.prod(sides) > NETWORK_INPUT_VALUES):
+            problem = f"has an input of {' × '.join(map(str, sides))} values"
+            remedy = f"the limits are {IMAGE_SIDE_PX} for a side and {NETWORK_INPUT_VALUES:,} values"
+            raise InputError(self.path, problem, remedy)
+
+    def check_outputs(self, outputs: Mapping[str, Any], expected: Mapping[str, Sequence[int | str | None]]) -> None:
+        """Check the outputs of a run.
+
+        Args:
+            outputs: name → value.
+            expected: name → length of each axis. A word stands for one length, which is the same in all outputs and is
+                0 only for `n`; None stands for any length.
+
+        Raises:
+            InputError: an output has another shape, or does not contain numbers.
+        """
+        lengths: dict[str, int] = {}
+        for name, sides in expected.items():
+            value = outputs[name]
+            if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
+                raise InputError(self.path, f"its output {name} does not contain numbers", "export it again")
+            fits = value.ndim == len(sides)
+            for length, side in zip(value.shape, sides, strict=False):
+                if isinstance(side, str):
+                    fits &= (length >= 1 or side == "n") and lengths.setdefault(side, length) == length
+                else:
+                    fits &= side is None or length == side
+            if not fits:
+                shape = f"({', '.join('?' if side is None else str(side) for side in sides)})"
+                problem = f"a run gives {name} {value.shape} instead of {shape}"
+                raise InputError(self.path, problem, "export it again")
+
+    def describe(self) -> str:
+        """List the inputs and outputs with their shapes, for messages."""
+        return f"{', '.join(map(str, self.inputs))} → {', '.join(map(str, self.outputs))}"
+
+
+def _read_port(value: Any) -> Port:
+    return Port(value.name, tuple(side if isinstance(side, int) else None for side in value.shape), value.type)
+
+
+def _shorten(error: Exception) -> str:
+    return " ".join(str(error).split(" : ")[-1].split())[:300]
+
+
+def _remedy(text: str) -> str:
+    lowered = text.lower()
+    if "external" in lowered or "model_path" in lowered or "file_size" in lowered:
+        return "put the file with its external data (often `….onnx.data`) into the same folder, with its original name"
+    if "protobuf" in lowered:
+        return "give a complete ONNX file"
+    return "export it again; use an older opset if an operator is unknown"
+
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+"""Red, green, blue within [0, 1]."""
+
+
+def normalise(rgb: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """Subtract ImageNet's mean from a red-green-blue picture within [0, 1], and divide by the standard deviation."""
+    return (rgb - np.array(IMAGENET_MEAN, np.float32)) / np.array(IMAGENET_STD, np.float32)
+
+
+OUTPUT = "activations"
+"""Name of the output (N, C) of a network."""
+MEAN_KEY, WHITENING_KEY = "activation_mean", "activation_whitening"
+"""Keys of the metadata: μ (C,) and W (C, C) as little-endian floats of 32 bits in base64."""
+LARGEST_DISTANCE = 1e6
+"""Distance of activations that are not finite, and largest distance that is reported."""
+
+
+class ActivationStatistics(NamedTuple):
+    """The activations of the training of a network."""
+
+    mean: Float[np.ndarray, "C"]
+    whitening: Float[np.ndarray, "C C"]
+
+    def distance(self, activations: Float[np.ndarray, "N C"]) -> Float[np.ndarray, "N"]:
+        """Compute the distance of each input; 99 % of the training inputs have a distance below 1."""
+        with np.errstate(all="ignore"):
+            distance = np.linalg.norm((activations.astype(np.float64) - self.mean) @ self.whitening.T, axis=-1)
+        return np.minimum(np.where(np.isfinite(distance), distance, LARGEST_DISTANCE), LARGEST_DISTANCE)
+
+    def metadata(self) -> dict[str, str]:
+        """Return the entries of the metadata that hold the statistics."""
+        return {MEAN_KEY: _encode(self.mean), WHITENING_KEY: _encode(self.whitening)}
+
+
+class ActivationMonitor:
+    """Collects the distances of the inputs of a network.
+
+    Args:
+        model: the network, for messages.
+        statistics: the activations of its training.
+    """
+
+    def __init__(self, model: OnnxModel, statistics: ActivationStatistics):
+        self._model, self._statistics = model, statistics
+        self._distances: list[Float[np.ndarray, "N"]] = []
+
+    def add(self, outputs: Mapping[str, np.ndarray], count: int) -> None:
+        """Add the distances of the first `count` inputs of a run.
+
+        Raises:
+            InputError: the output `activations` has another shape than the statistics.
+        """
+        self._model.check_outputs(outputs, {OUTPUT: ("inputs", len(self._statistics.mean))})
+        self._distances.append(self._statistics.distance(outputs[OUTPUT][:count]))
+
+    def take(self) -> Float[np.ndarray, "N"]:
+        """Return the distances since the last call, in the order of the inputs."""
+        taken, self._distances = self._distances, []
+        return np.concatenate([np.zeros(0), *taken])
+
+
+def activation_monitor(model: OnnxModel) -> ActivationMonitor | None:
+    """Create the monitor of a network; None for a network without statistics of its training.
+
+    Raises:
+        InputError: the statistics are incomplete, damaged or too large.
+    """
+    texts = [model.metadata.get(key) for key in (MEAN_KEY, WHITENING_KEY)]
+    if texts == [None, None]:
+        return None
+    mean, whitening = (_decode(text or "") for text in texts)
+    if mean is None or whitening is None or not 1 <= len(mean) <= ACTIVATION_CHANNELS:
+        raise _damaged_activations(model)
+    if len(whitening) != len(mean) ** 2 or OUTPUT not in {port.name for port in model.outputs}:
+        raise _damaged_activations(model)
+    return ActivationMonitor(model, ActivationStatistics(mean, whitening.reshape(len(mean), -1)))
+
+
+def _damaged_activations(model: OnnxModel) -> InputError:
+    problem = f"its metadata `{MEAN_KEY}` and `{WHITENING_KEY}` do not describe its output `{OUTPUT}`"
+    return InputError(model.path, problem, "train it again, or remove both entries of the metadata")
+
+
+def _encode(values: np.ndarray) -> str:
+    return base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
+
+
+def _decode(text: str) -> Float[np.ndarray, "n"] | None:
+    """Decode finite numbers; None for any other text."""
+    if len(text) > 8 * ACTIVATION_CHANNELS**2:
+        return None
+    try:
+        data = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError):
+        return None
+    values = np.frombuffer(data, "<f4") if len(data) % 4 == 0 else np.array([np.nan])
+    return values.astype(np.float64) if len(values) and np.isfinite(values).all() else None
+
+
+CONFIDENCE_KEY = "confidence_curve"
+"""Key of the metadata: the curve of the keypoints' confidences."""
+
+
+class Curve(NamedTuple):
+    """A monotone curve through P points, constant beyond the first and the last point."""
+
+    values: Float[np.ndarray, "P"]
+    """Raw values of the network, increasing."""
+    probabilities: Float[np.ndarray, "P"]
+    """Within [0, 1], not decreasing."""
+
+    def __call__(self, values: Float[np.ndarray, "*B"]) -> Float[np.ndarray, "*B"]:
+        """Return the probabilities of raw values; 0 stays 0, because 0 means that nothing was detected."""
+        return np.where(values > 0, np.interp(values, self.values, self.probabilities), 0)
+
+    def text(self) -> str:
+        """Return the entry of the metadata."""
+        points = zip(self.values.tolist(), self.probabilities.tolist(), strict=True)
+        return ",".join(f"{value:.6g}:{probability:.4g}" for value, probability in points)
+
+
+def read_curve(model: OnnxModel, key: str) -> Curve | None:
+    """Read a curve from the metadata of a network; None without a curve.
+
+    Raises:
+        InputError: the text is not a monotone curve of probabilities.
+    """
+    text = model.metadata.get(key)
+    if text is None:
+        return None
+    try:
+        if text.count(",") >= CURVE_POINTS:
+            raise ValueError("too many points")
+        points = np.array([[float(number) for number in point.split(":")] for point in text.split(",")])
+        values, probabilities = points.T
+    except ValueError as error:
+        raise _damaged_curve(model, key, text) from error
+    rising = (np.diff(values) > 0).all() and (np.diff(probabilities) >= 0).all()
+    if not (np.isfinite(points).all() and rising and probabilities[0] >= 0 and probabilities[-1] <= 1):
+        raise _damaged_curve(model, key, text)
+    return Curve(values, probabilities)
+
+
+def _damaged_curve(model: OnnxModel, key: str, text: str) -> InputError:
+    problem = f"its metadata `{key}` is {text[:60]!r}"
+    return InputError(model.path, problem, "expected points value:probability that rise, as in 0:0,0.5:0.4,1:0.9")

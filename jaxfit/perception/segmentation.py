@@ -1,0 +1,470 @@
+"""Segmentation networks: the built-in layout, the choice of a layout, large frames in tiles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from jaxfit.data.masks import box_of_mask
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.limits import INSTANCES
+from jaxfit.perception.network import Instance, OnnxModel, Segmenter, activation_monitor, collect_instances
+from jaxfit.perception.segmentation_inputs import Placement, SegmentationNetwork
+from jaxfit.perception.segmentation_layouts import DetectorAndSaliency, MaskRcnn, RfDetrSeg, Saliency, YoloSeg, Yolox
+
+MIN_PART_SHARE = 0.5
+"""Least share of a part that lies in the whole bird, and least share of a whole bird that hides it."""
+
+
+def length_px(bird: Instance) -> int:
+    """Return the longer side of a bird's box, in image pixels."""
+    return max(bird.mask.shape)
+
+
+def replace_parts(
+    birds: Sequence[Instance], birds_of_smaller_input: Sequence[Instance], least_length_px: float
+) -> list[Instance]:
+    """Return the birds of a frame, in which long birds of a smaller input replace their parts.
+
+    A long bird replaces all birds of which at least half lies in its mask. A bird that reaches beyond the long bird and
+    that contains at least half of it stays, and the long bird is dropped. The scores do not count: parts can have high
+    scores.
+
+    Args:
+        birds: birds of the usual input.
+        birds_of_smaller_input: birds of the same frame in a smaller input.
+        least_length_px: shorter birds of the smaller input are dropped, image pixels.
+    """
+    kept = list(birds)
+    for whole in birds_of_smaller_input:
+        if length_px(whole) < least_length_px:
+            continue
+        common = [_common_pixels(bird, whole) for bird in kept]
+        is_part = [n >= MIN_PART_SHARE * np.count_nonzero(bird.mask) for n, bird in zip(common, kept, strict=True)]
+        least = MIN_PART_SHARE * np.count_nonzero(whole.mask)
+        if any(n >= least and not part for n, part in zip(common, is_part, strict=True)):
+            continue
+        kept = [bird for bird, part in zip(kept, is_part, strict=True) if not part] + [whole]
+    return kept
+
+
+def _common_pixels(first: Instance, second: Instance) -> int:
+    """Count the pixels that belong to both birds."""
+    corners = [(i.x0, i.y0, i.x0 + i.mask.shape[1], i.y0 + i.mask.shape[0]) for i in (first, second)]
+    (x0, y0), (x1, y1) = np.max(corners, 0)[:2].tolist(), np.min(corners, 0)[2:].tolist()
+    if x0 >= x1 or y0 >= y1:
+        return 0
+    parts = [i.mask[y0 - i.y0 : y1 - i.y0, x0 - i.x0 : x1 - i.x0] for i in (first, second)]
+    return int(np.count_nonzero(parts[0] & parts[1]))
+
+
+LONGER_SIDE_PX = 864
+"""Default of the metadata `longer_side`, the longer side of the input: 6.9 pixels for 2 cm of a ledge 2.5 m wide."""
+LARGEST_SIDE_PX = 8192
+MULTIPLE = 32
+OFFSET_UNIT_PX = 32.0
+MIN_PEAK = 0.2
+"""Lower peaks of the centre map are noise."""
+PEAK_WINDOW = 7
+"""Side, in cells, of the square in which a peak must be the maximum."""
+MIN_FOREGROUND = 0.1
+"""Cells with a lower foreground belong to no bird. Masks are cut at 0.5, between cells."""
+MAX_DISTANCE_PX = 60.0
+"""Cells whose offset ends at least this far from every centre belong to no bird; pixels of the input."""
+LARGE_BIRD_PX = 200.0
+"""Birds that are longer in the input are detected in parts, so an input of half the size detects them."""
+SMALLER_INPUTS = 2
+"""Number of smaller inputs: half and a quarter of the size."""
+MOST_PEAKS = 10 * INSTANCES
+"""More peaks are the output of a network that was not trained."""
+MIN_CELLS = 12
+"""Instances with fewer cells are dropped."""
+
+
+class BottomUp(SegmentationNetwork):
+    """Instances as groups of foreground cells whose offsets point to the same centre (Cheng et al. 2020).
+
+    Outputs over cells of equal size: `foreground` (1, 1, h, w), probabilities; `centre` (1, 1, h, w), with a peak of 1
+    for each bird; `offset` (1, 2, h, w), x and y from a cell to the centre of its bird in units of 32 pixels. Input:
+    blue-green-red within 0 and 1, sides multiples of 32; the frame in the upper left corner, the rest black. The score
+    is the peak of the centre times the mean foreground.
+
+    Where the input has a variable size, birds that are long in the input are detected in smaller inputs.
+
+    Raises:
+        InputError: an unsupported input, more than one class, or an invalid `longer_side` or `min_track_score` in the
+            metadata.
+
+    Source: Cheng et al. 2020, Panoptic-DeepLab.
+    """
+
+    layout = "outputs foreground, centre, offset"
+    default_min_score = 0.4
+
+    def _set_up(self) -> None:
+        (self._label,) = self.class_names
+        text = self._model.metadata.get("longer_side", str(LONGER_SIDE_PX))
+        if not (
+            text.isdecimal() and len(text) <= 5 and 1 <= int(text) <= LARGEST_SIDE_PX and int(text) % MULTIPLE == 0
+        ):
+            remedy = f"export it with a multiple of {MULTIPLE} pixels, at most {LARGEST_SIDE_PX}"
+            raise InputError(self._model.path, f"its metadata `longer_side` is {text[:40]!r}", remedy)
+        self._longer_side_px = int(text)
+        self.min_track_score = self._min_track_score()
+        self.activations = activation_monitor(self._model)
+
+    def _min_track_score(self) -> float:
+        """Return the least mean score of a track, 0 if the file does not contain it."""
+        text = self._model.metadata.get("min_track_score", "0")
+        try:
+            score = float(text)
+        except ValueError:
+            score = float("nan")
+        if not 0 <= score <= 1:
+            problem = f"its metadata `min_track_score` is {text[:40]!r}"
+            raise InputError(self._model.path, problem, "export it with a number within 0 and 1")
+        return score
+
+    def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
+        names_by_index = super()._all_classes(names)
+        if len(names_by_index) != 1:
+            raise InputError(self._model.path, f"names {len(names_by_index)} classes", "give a network of one class")
+        return names_by_index
+
+    @staticmethod
+    def fits(model: OnnxModel) -> bool:
+        """Whether the outputs of a network have this layout."""
+        return {"foreground", "centre", "offset"} <= {port.name for port in model.outputs}
+
+    def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
+        """Segment a frame, as `Segmenter` describes."""
+        array, placement = self.network_input(frame)
+        outputs = self._model(array)
+        found = self._instances(outputs, placement)
+        if self.activations is not None:
+            self.activations.add(outputs, 1)
+        if self._input.size_px is None:
+            found = self._with_large_birds(frame, found)
+        return sorted(found, key=lambda instance: -instance.score)
+
+    def _with_large_birds(self, frame: UInt8[np.ndarray, "H W 3"], found: list[Instance]) -> list[Instance]:
+        """Replace the parts of large birds; a smaller input is used only if a detection could be half a large bird."""
+        least_px = LARGE_BIRD_PX * max(frame.shape[:2]) / self._longer_side_px
+        for n in range(1, SMALLER_INPUTS + 1):
+            if not any(2 * length_px(bird) >= least_px for bird in found):
+                break
+            array, placement = self.network_input(frame, self._longer_side_px / 2**n)
+            found = replace_parts(found, self._instances(self._model(array), placement), least_px)
+            least_px *= 2
+        return found
+
+    def _instances(self, outputs: dict[str, np.ndarray], placement: Placement) -> list[Instance]:
+        """Return the instances of the outputs of the network."""
+        shape = (1, 1, "h", "w")
+        self._model.check_outputs(outputs, {"foreground": shape, "centre": shape, "offset": (1, 2, "h", "w")})
+        foreground, centre = (outputs[name][0, 0].astype(np.float32, copy=False) for name in ("foreground", "centre"))
+        cell_px = placement.input_px[0] / foreground.shape[1]
+        peaks = _find_peaks(centre)
+        if len(peaks) > MOST_PEAKS:
+            problem = f"gives {len(peaks)} centres of birds in one frame"
+            raise InputError(self._model.path, problem, "give another network")
+        assignment = _assign_cells(foreground, outputs["offset"][0] * OFFSET_UNIT_PX, peaks, cell_px)
+        instances = (
+            self._instance(foreground, assignment == n, float(centre[row, column]), placement)
+            for n, (row, column) in enumerate(peaks)
+        )
+        return collect_instances(self._model.path, instances, placement.frame_px)
+
+    def network_input(
+        self, frame: UInt8[np.ndarray, "H W 3"], longer_side_px: float | None = None
+    ) -> tuple[Float[np.ndarray, "1 3 h w"], Placement]:
+        """Return the input of the network for a frame, and the place of the frame in the input.
+
+        Args:
+            frame: blue, green, red.
+            longer_side_px: longer side of an input of variable size; None for the size of the metadata.
+        """
+        frame_px = frame.shape[1], frame.shape[0]
+        input_px = self._input_px(frame_px, longer_side_px or self._longer_side_px)
+        placement = Placement.letterboxed(frame_px, input_px, centred=False)
+        return self._input.array(_network_picture(frame, placement)), placement
+
+    def _input_px(self, frame_px: tuple[int, int], longer_side_px: float) -> tuple[int, int]:
+        """Return width and height of the input; a variable size has the frame's proportions, in multiples of 32."""
+        if self._input.size_px is not None:
+            return self._input.size_px
+        zoom = longer_side_px / max(frame_px)
+        width, height = (MULTIPLE * max(1, int(np.ceil(round(side * zoom) / MULTIPLE))) for side in frame_px)
+        return width, height
+
+    def _instance(
+        self, foreground: Float[np.ndarray, "h w"], own: Bool[np.ndarray, "h w"], peak: float, placement: Placement
+    ) -> Instance | None:
+        """Create the instance of the cells `own`; None if it is too small or its score too low."""
+        certain = own & (foreground > 0.5)
+        if np.count_nonzero(certain) < MIN_CELLS:
+            return None
+        score = float(np.clip(peak, 0, 1) * foreground[certain].mean())
+        if score < self._min_score:
+            return None
+        x0, y0, width, height = cast(tuple[int, int, int, int], box_of_mask(own))
+        corners = np.array([x0, y0, x0 + width, y0 + height], np.float32)
+        cells = np.array(foreground.shape[::-1], np.float32)
+        corners_px = placement.to_frame(corners[None] * np.tile(placement.input_px / cells, 2))[0]
+        return placement.instance(np.where(own, foreground, 0), corners_px, 0.5, score, self._label)
+
+
+def _network_picture(frame: UInt8[np.ndarray, "H W 3"], placement: Placement) -> Float[np.ndarray, "h w 3"]:
+    """Resize the frame into the upper left corner of a black picture within 0 and 1."""
+    inner = [round(side * scale) for side, scale in zip(placement.frame_px, placement.scale, strict=True)]
+    is_reduction = inner[0] < frame.shape[1]
+    resized = cv2.resize(frame, inner, interpolation=cv2.INTER_AREA if is_reduction else cv2.INTER_LINEAR)
+    width, height = placement.input_px
+    picture = np.zeros((height, width, 3), np.float32)
+    picture[: inner[1], : inner[0]] = resized
+    return picture / 255
+
+
+def _find_peaks(centre: Float[np.ndarray, "h w"]) -> Int[np.ndarray, "M 2"]:
+    """Return rows and columns of the local maxima."""
+    maximum = cv2.dilate(centre, np.ones((PEAK_WINDOW, PEAK_WINDOW), np.uint8))
+    return np.argwhere((centre >= maximum) & (centre > MIN_PEAK))
+
+
+def _assign_cells(
+    foreground: Float[np.ndarray, "h w"],
+    offset_px: Float[np.ndarray, "2 h w"],
+    peaks: Int[np.ndarray, "M 2"],
+    cell_px: float,
+) -> Int[np.ndarray, "h w"]:
+    """Assign each cell to the peak nearest to the end of its offset; −1 for no peak."""
+    assignment = np.full(foreground.shape, -1)
+    rows, columns = np.nonzero(foreground > MIN_FOREGROUND)
+    if not len(peaks) or not len(rows):
+        return assignment
+    ends = (np.stack([columns, rows], 1) + 0.5) * cell_px + offset_px[:, rows, columns].T
+    nearest, best = np.full(len(rows), -1), np.full(len(rows), MAX_DISTANCE_PX)
+    for n, (x, y) in enumerate((peaks[:, ::-1] + 0.5) * cell_px):
+        distance = np.hypot(ends[:, 0] - x, ends[:, 1] - y)
+        is_nearer = distance < best
+        nearest[is_nearer], best[is_nearer] = n, distance[is_nearer]
+    assignment[rows, columns] = nearest
+    return assignment
+
+
+MIN_TILE_SHARE = 0.5  # of the smaller mask within the intersection of two tiles
+
+
+class _Tile(NamedTuple):
+    x0: int
+    y0: int
+    x1: int
+    y1: int
+
+    def intersection(self, other: _Tile) -> _Tile:
+        x0, y0 = max(self.x0, other.x0), max(self.y0, other.y0)
+        return _Tile(x0, y0, max(x0, min(self.x1, other.x1)), max(y0, min(self.y1, other.y1)))
+
+
+class Tiled:
+    """A segmenter that runs another segmenter on the tiles of a frame and merges the instances.
+
+    Tiles are squares with equal distances; the first and the last tile touch the border of the frame. Two instances of
+    different tiles are the same bird if their labels agree and if, within the intersection of the tiles, their masks
+    share at least half of the smaller mask. This rule merges the parts of a bird at the edge of a tile and removes
+    duplicates. Pairs with the largest share are merged first. Two instances of the same tile are never merged, because
+    the segmenter separated them. A merged bird has the union of the masks and the best score.
+
+    Args:
+        segmenter: runs on each tile.
+        tile_px: side of a tile.
+        overlap: least share of a tile that lies in the next tile.
+
+    Raises:
+        ValueError: a tile below 16 pixels, or an overlap outside [0, 1).
+    """
+
+    def __init__(self, segmenter: Segmenter, tile_px: int, overlap: float = 0.25):
+        if tile_px < 16:
+            raise ValueError(f"tile_px must be 16 or more, not {tile_px}")
+        if not 0 <= overlap < 1:
+            raise ValueError(f"overlap must be within 0 and 1, not {overlap}")
+        self._segmenter, self._tile_px, self._overlap = segmenter, tile_px, overlap
+        self.class_names = segmenter.class_names
+        self.min_track_score = getattr(segmenter, "min_track_score", 0.0)
+
+    def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
+        """Segment a frame, as `Segmenter` describes."""
+        height, width = frame.shape[:2]
+        detections: list[tuple[Instance, _Tile]] = []
+        for y0, y1 in _tile_spans(height, self._tile_px, self._overlap):
+            for x0, x1 in _tile_spans(width, self._tile_px, self._overlap):
+                instances = self._segmenter(np.ascontiguousarray(frame[y0:y1, x0:x1]))
+                tile = _Tile(x0, y0, x1, y1)
+                detections += [(bird._replace(x0=bird.x0 + x0, y0=bird.y0 + y0), tile) for bird in instances]
+        return sorted(_merge(detections), key=lambda instance: -instance.score)
+
+
+def _tile_spans(length: int, tile: int, overlap: float) -> list[tuple[int, int]]:
+    """Return starts and ends of the smallest number of tiles along one side that have the overlap."""
+    if length <= tile:
+        return [(0, length)]
+    count = 1 + int(np.ceil((length - tile) / (tile * (1 - overlap))))
+    starts = np.linspace(0, length - tile, count).round().astype(int)
+    return [(int(start), int(start) + tile) for start in starts]
+
+
+def _merge(detections: list[tuple[Instance, _Tile]]) -> list[Instance]:
+    """Merge the instances of the same bird."""
+    pairs = [
+        (share, i, j)
+        for i in range(len(detections))
+        for j in range(i + 1, len(detections))
+        if (share := _shared_part(*detections[i], *detections[j])) >= MIN_TILE_SHARE
+    ]
+    bird_of = list(range(len(detections)))
+    birds = {i: [i] for i in bird_of}
+    for _, i, j in sorted(pairs, key=lambda pair: -pair[0]):
+        first, second = birds[bird_of[i]], birds[bird_of[j]]
+        if {detections[k][1] for k in first} & {detections[k][1] for k in second}:
+            continue  # a common tile; this is also the case if both are the same bird already
+        first += birds.pop(bird_of[j])
+        for k in second:
+            bird_of[k] = bird_of[i]
+    return [_union([detections[k][0] for k in bird]) for bird in birds.values()]
+
+
+def _shared_part(first: Instance, first_tile: _Tile, second: Instance, second_tile: _Tile) -> float:
+    """Compute the intersection of two masks, as a share of the smaller mask within the intersection of the tiles."""
+    if first_tile == second_tile or first.label != second.label:
+        return 0.0
+    region = first_tile.intersection(second_tile)
+    smaller = min(np.count_nonzero(_mask_within(first, region)), np.count_nonzero(_mask_within(second, region)))
+    if not smaller:
+        return 0.0
+    both = region.intersection(_extent(first)).intersection(_extent(second))
+    return np.count_nonzero(_mask_within(first, both) & _mask_within(second, both)) / smaller
+
+
+def _extent(instance: Instance) -> _Tile:
+    """Return the box of an instance."""
+    height, width = instance.mask.shape
+    return _Tile(instance.x0, instance.y0, instance.x0 + width, instance.y0 + height)
+
+
+def _mask_within(instance: Instance, region: _Tile) -> Bool[np.ndarray, "h w"]:
+    """Return the part of an instance's mask that lies in the region."""
+    inside = region.intersection(_extent(instance))
+    x, y = instance.x0, instance.y0
+    return instance.mask[inside.y0 - y : inside.y1 - y, inside.x0 - x : inside.x1 - x]
+
+
+def _union(instances: list[Instance]) -> Instance:
+    """Combine the instances of one bird: the union of the masks, the label and score of the best instance."""
+    best = max(instances, key=lambda instance: instance.score)
+    if len(instances) == 1:
+        return best
+    corners = np.array([_extent(instance) for instance in instances])
+    (x0, y0), (x1, y1) = corners[:, :2].min(0).tolist(), corners[:, 2:].max(0).tolist()
+    mask = np.zeros((y1 - y0, x1 - x0), bool)
+    for instance in instances:
+        height, width = instance.mask.shape
+        mask[instance.y0 - y0 :, instance.x0 - x0 :][:height, :width] |= instance.mask
+    return Instance(mask, x0, y0, best.score, best.label)
+
+
+BUILTIN = Path(__file__).parent / "networks" / "segmenter.onnx"
+"""The built-in segmenter."""
+
+
+_NETWORKS = {"bottom_up": BottomUp, "rf_detr": RfDetrSeg, "mask_rcnn": MaskRcnn, "yolo": YoloSeg}
+KINDS = ("auto", *_NETWORKS, "yolox+saliency")
+"""The values that `load_segmenter` accepts as `kind`."""
+
+
+def load_segmenter(
+    spec: str | Path,
+    *,
+    kind: str = "auto",
+    classes: Sequence[str] | None = None,
+    min_score: float | None = None,
+    names: Sequence[str] | None = None,
+    tile_px: int | None = None,
+    tile_overlap: float = 0.25,
+    threads: int | None = None,
+) -> Segmenter:
+    """Load a segmenter from one or two ONNX files; the inputs and outputs determine its layout.
+
+    Args:
+        spec: `builtin`; or a file; or two files as `detector.onnx+saliency.onnx`: a YOLOX detector, and a network such
+            as U²-Net that segments the salient object in each box.
+        kind: one of `KINDS`; a name requires this layout, `auto` uses the layout that fits.
+        classes: names of the classes to keep; None keeps `bird`, or the only class.
+        min_score: least score of an instance, within [0, 1]; None uses the default of the layout.
+        names: names of all classes in their order; None uses the names in the file.
+        tile_px: side of the square tiles of a frame, pixels; None uses no tiles. Small birds in large frames need
+            tiles: a reduction from 2592 x 1520 to 640 x 640 keeps a sixteenth of the pixels.
+        tile_overlap: share of a tile that lies in the next tile, within [0, 1); best wider than a bird.
+        threads: number of cores for a network; None uses all cores.
+
+    Raises:
+        ValueError: unknown kind, or an invalid size of tiles, overlap or score.
+        InputError: a file does not exist, cannot be loaded, has an unknown layout (the message lists the outputs
+            and names the supported layouts), has not three channels, or lacks a class.
+    """
+    if kind not in KINDS:
+        raise ValueError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}")
+    if min_score is not None and not 0 <= min_score <= 1:
+        raise ValueError(f"min_score must be within 0 and 1, not {min_score}")
+    segmenter = _load(str(spec), kind, classes, min_score, names, threads)
+    return segmenter if tile_px is None else Tiled(segmenter, tile_px, tile_overlap)
+
+
+def segmenter_files(spec: str) -> list[Path]:
+    """Return the one or two files of a `spec` of `load_segmenter`."""
+    first, plus, second = spec.partition(".onnx+")
+    if plus and not Path(spec).is_file():
+        return [Path(first + ".onnx"), Path(second)]
+    return [BUILTIN if spec == "builtin" else Path(spec)]
+
+
+def _load(
+    spec: str,
+    kind: str,
+    classes: Sequence[str] | None,
+    min_score: float | None,
+    names: Sequence[str] | None,
+    threads: int | None,
+) -> Segmenter:
+    path, *second = segmenter_files(spec)
+    if second:
+        if kind not in ("auto", "yolox+saliency"):
+            raise InputError(spec, f"is two files, but kind {kind} needs one file", "give one file, or kind auto")
+        detector, saliency = OnnxModel(path, threads), OnnxModel(second[0], threads)
+        if not Yolox.fits(detector):
+            raise _unknown_layout(detector, f"YOLOX detector: {Yolox.layout}")
+        if not Saliency.fits(saliency):
+            raise _unknown_layout(saliency, "saliency: first output (1, 1, h, w)")
+        return DetectorAndSaliency(Yolox(detector, classes, min_score, names), Saliency(saliency))
+    if kind == "yolox+saliency":
+        raise InputError(spec, f"is one file, but kind {kind} needs two files", "give detector.onnx+saliency.onnx")
+    model = OnnxModel(path, threads)
+    candidates = {name: network for name, network in _NETWORKS.items() if kind in ("auto", name)}
+    for network in candidates.values():
+        if network.fits(model):
+            return network(model, classes, min_score, names)
+    if Yolox.fits(model):
+        problem = f"detects boxes, but no masks: {model.describe()}"
+        raise InputError(model.path, problem, f"add a network for the masks: {model.path.name}+u2netp.onnx")
+    if kind != "auto":
+        raise _unknown_layout(model, f"{kind}: {candidates[kind].layout}")
+    raise _unknown_layout(model, f"{', '.join(_NETWORKS)}; docs/usage.md lists their outputs")
+
+
+def _unknown_layout(model: OnnxModel, supported: str) -> InputError:
+    return InputError(model.path, f"has an unknown layout: {model.describe()}", f"supported are {supported}")

@@ -1,0 +1,1 @@
+"""What people do with results: frames to label, corrected tracks, joined results."""

@@ -1,0 +1,258 @@
+"""`correct_tracks`: a result with corrected tracks, whose changed windows are fitted again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxfit.config.fit import FitConfig, load_config
+from jaxfit.config.reconstruct import ReconstructConfig, load_reconstruct_config
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.formats.fields import read_json
+from jaxfit.data.formats.recognise import read_observations
+from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.solution import LAYOUT, Solution, load_solution, write_solution
+from jaxfit.data.tracks import track_quality
+from jaxfit.fitting.collect import summarise, track_status
+from jaxfit.fitting.fit import check_observations, fit_runs, windows_of
+from jaxfit.fitting.windows import Windows, window_hash
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import check_replaceable, new_folder
+from jaxfit.foundation.limits import CONFIG_BYTES
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.foundation.reading import read_file
+from jaxfit.model.bird import Bird
+from jaxfit.review.edits import Edit, apply_edits
+
+_CELLS = tuple(name for name, (shape, _) in LAYOUT.items() if shape.startswith("N T"))
+
+
+class Refit(NamedTuple):
+    """The result of a refit."""
+
+    solution: Solution
+    fitted: list[tuple[int, int, int]]
+    """Track, first and last frame number of every window that was fitted again."""
+    windows: int
+    """Number of all windows."""
+
+
+def refit(
+    solution: Solution,
+    before: Observations,
+    after: Observations,
+    bird: Bird,
+    config: FitConfig,
+    progress: ProgressTask = silent,
+    source: object = "observations",
+) -> Refit:
+    """Fit the corrected observations, but only windows that no window of the earlier fit equals.
+
+    Two windows are equal if they have the same frames, crops, filtered keypoints, confidences and masks. The fit of a
+    window does not depend on other windows, so the result is that of a fit of all corrected observations. The poses of
+    an equal window are copied bit by bit, also if its track has another number now. Where windows share frames
+    (`overlap`), a window is copied only if its neighbours are equal too.
+
+    Args:
+        solution: the earlier result.
+        before: the observations of the earlier result.
+        after: the same frames with corrected tracks.
+        bird: the model of the result.
+        config: the config of the result.
+        progress: shows progress.
+        source: name of the observations in messages.
+
+    Returns:
+        The new result. The loss of a track with copied and fitted windows is NaN, because the result does not hold
+        the loss of single windows.
+
+    Raises:
+        InputError: as `jaxfit.fit`.
+    """
+    before, after = (check_observations(each, bird, source) for each in (before, after))
+    old, new = windows_of(before, config, source), windows_of(after, config, source)
+    rows = {window_hash(old, w): w for w in range(len(old))}
+    source_row = np.array([rows.get(window_hash(new, w), -1) for w in range(len(new))])
+    if config.overlap_frames:
+        source_row = _with_equal_neighbours(source_row, old, new)
+    touched = np.flatnonzero(source_row < 0)
+    result = _empty(solution, after)
+    if len(touched):
+        result = fit_runs(after, bird, [config], None, progress, source, select=touched)[0]
+    arrays = {name: getattr(result, name).copy() for name in _CELLS}
+    counts = np.zeros((after.num_tracks, 2), int)  # windows with poses, windows that diverged
+    loss = {term: np.full(after.num_tracks, np.nan) for term in result.loss or solution.loss}
+    failures = {track: list(texts) for track, texts in result.failures.items()}
+    for w in range(len(new)):
+        n, at = int(new.track[w]), new.frame[w][new.present[w]]
+        if source_row[w] >= 0:
+            m = _row_of(solution, int(old.track_id[source_row[w]]))
+            for name in _CELLS:
+                arrays[name][n, at] = getattr(solution, name)[m, at]
+            if not solution.valid[m, at].any():
+                first, last = after.frame_index[at[[0, -1]]]
+                text = f"frames {first} to {last}: the window diverged in the earlier fit"
+                failures.setdefault(int(after.track_id[n]), []).append(text)
+        counts[n, 0 if arrays["valid"][n, at].any() else 1] += 1
+    for n in range(after.num_tracks):
+        own = new.track == n
+        origins = {int(old.track_id[row]) for row in source_row[own]} if (source_row[own] >= 0).all() else set()
+        if (source_row[own] < 0).all():
+            for term in loss:
+                loss[term][n] = result.loss[term][n] if term in result.loss else np.nan
+        elif len(origins) == 1:
+            track = origins.pop()
+            if own.sum() == (old.track_id == track).sum():  # all windows of one track
+                for term in loss:
+                    loss[term][n] = solution.loss[term][_row_of(solution, track)]
+    merged = replace(
+        result,
+        **arrays,
+        loss=loss,
+        status=np.array([track_status(*count) for count in counts.tolist()], "<U32"),
+        failures={track: tuple(texts) for track, texts in failures.items()},
+    )
+    fitted = [(int(new.track_id[w]), *_ends(after, new, w)) for w in touched.tolist()]
+    return Refit(merged, fitted, len(new))
+
+
+def _with_equal_neighbours(source_row: np.ndarray, old: Windows, new: Windows) -> np.ndarray:
+    """Keep the rows of windows whose neighbours in their track were their neighbours before; −1 for other windows.
+
+    Where windows share frames, the poses of a window depend on its neighbours.
+    """
+
+    def neighbour(windows: Windows, w: int, step: int) -> int:
+        inside = 0 <= w + step < len(windows)
+        return w + step if inside and windows.track[w + step] == windows.track[w] else -1
+
+    kept = source_row.copy()
+    for w in np.flatnonzero(source_row >= 0).tolist():
+        for step in (-1, 1):
+            before, now = neighbour(old, int(source_row[w]), step), neighbour(new, w, step)
+            if before != (source_row[now] if now >= 0 else -1) or (before < 0) != (now < 0):
+                kept[w] = -1
+    return kept
+
+
+def _empty(solution: Solution, observations: Observations) -> Solution:
+    """Return a result without poses for the tracks of the observations."""
+    count = observations.num_tracks
+    arrays = {}
+    for name in _CELLS:
+        values = getattr(solution, name)
+        filler = np.nan if values.dtype.kind == "f" else 0
+        arrays[name] = np.full((count, *values.shape[1:]), filler, values.dtype)
+    status = np.full(count, "no usable frame")
+    return replace(solution, **arrays, track_id=observations.track_id, status=status, loss={}, failures={})
+
+
+def _row_of(solution: Solution, track: int) -> int:
+    return int(np.flatnonzero(solution.track_id == track)[0])
+
+
+def _ends(observations: Observations, windows: Windows, w: int) -> tuple[int, int]:
+    at = windows.frame[w][windows.present[w]]
+    return int(observations.frame_index[at[0]]), int(observations.frame_index[at[-1]])
+
+
+OBSERVATIONS, CONFIG, MARKER = "observations.json", "config.yaml", "poses.npz"
+_SUMMARY = "summary.json"
+_KEPT = ("video", "trust", "trust_reasons", "networks")
+"""Entries of the summary that corrections do not change."""
+
+
+class Tracks(NamedTuple):
+    """A result with the observations that it was fitted to."""
+
+    solution: Solution
+    bird: Bird
+    observations: Observations
+
+
+def read_tracks(result: str | Path, observations: str | Path | None = None) -> Tracks:
+    """Read a result and its observations.
+
+    Args:
+        result: folder of `jaxfit reconstruct` or `jaxfit fit`.
+        observations: the file that `jaxfit fit` was given; None takes `observations.json` of the folder.
+
+    Raises:
+        InputError: the files cannot be read, or do not belong together.
+    """
+    folder = Path(result)
+    solution, bird = load_solution(folder)
+    path = folder / OBSERVATIONS if observations is None else Path(observations)
+    if observations is None and not path.is_file():
+        problem = f"holds no {OBSERVATIONS}, because `jaxfit fit` does not copy the observations"
+        raise InputError(folder, problem, "give the observations of the fit by --observations")
+    read = check_keypoints(read_observations(path), bird.keypoint_names, path)
+    same = np.array_equal(read.frame_index, solution.frame_index)
+    if not (same and np.array_equal(np.sort(read.track_id), np.sort(solution.track_id))):
+        raise InputError(path, f"has other tracks or frames than {folder}", "give the file that was fitted")
+    return Tracks(solution, bird, read)
+
+
+def correct_tracks(
+    result: str | Path,
+    out: str | Path,
+    edits: Sequence[Edit],
+    observations: str | Path | None = None,
+    overwrite: bool = False,
+    progress: ProgressTask = silent,
+) -> Refit:
+    """Correct the tracks of a result, fit the windows that change, and write the new result.
+
+    The folder holds the files of `jaxfit fit` and the corrected `observations.json`. `corrections` in `summary.json`
+    lists the edits.
+
+    Args:
+        result: folder of the earlier result, which stays as it is.
+        out: folder for the new result.
+        edits: the corrections, one after the other.
+        observations: the observations of the earlier result, see `read_tracks`.
+        overwrite: replace an earlier result in `out`.
+        progress: shows progress.
+
+    Raises:
+        InputError: as `read_tracks`, `apply_edits` and `jaxfit.fit`; or `out` is the folder of the earlier result,
+            holds other files or cannot be written.
+    """
+    folder, out, start = Path(result), Path(out), time.perf_counter()
+    if out.resolve() == folder.resolve():
+        raise InputError(out, "is the result itself, which corrections keep", "choose another --out")
+    check_replaceable(out, overwrite, MARKER)
+    tracks = read_tracks(folder, observations)
+    corrected = apply_edits(tracks.observations, edits, folder)
+    config, config_text = read_config(folder)
+    fit_config = config.fit if isinstance(config, ReconstructConfig) else config
+    done = refit(tracks.solution, tracks.observations, corrected, tracks.bird, fit_config, progress, folder)
+    summary: dict[str, Any] = summarise(done.solution, tracks.bird, {"fit": time.perf_counter() - start})
+    earlier = read_summary(folder)
+    summary |= {key: value for key, value in earlier.items() if key in _KEPT}
+    summary["quality"] = {row.track_id: row._asdict() for row in track_quality(corrected)}
+    summary["corrections"] = [*earlier.get("corrections", []), *map(str, edits)]
+    with new_folder(out, overwrite, marker=MARKER) as part:
+        write_coco(corrected, part / OBSERVATIONS)
+        write_solution(done.solution, tracks.bird, config_text, summary, part)
+    return done
+
+
+def read_config(folder: Path) -> tuple[FitConfig | ReconstructConfig, str]:
+    """Return the config of a result, of a fit or of a reconstruction, and the text of its file."""
+    path = folder / CONFIG
+    text = read_file(path, CONFIG_BYTES, "a config").decode("utf-8", "replace")
+    is_reconstruction = any(line.startswith("fit:") for line in text.splitlines())
+    return (load_reconstruct_config(path) if is_reconstruction else load_config(path)), text
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Return the content of `summary.json` of a result; empty if the file is absent."""
+    path = folder / _SUMMARY
+    value = read_json(path).value if path.is_file() else {}
+    return value if isinstance(value, dict) else {}

@@ -1,0 +1,386 @@
+"""`suggest`: from a video or a result to a folder of frames that a person should label."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import os
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import quote
+
+import numpy as np
+
+from jaxfit.config.perception import FramesConfig, TrackConfig
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.formats.cvat import write_cvat, write_cvat_label
+from jaxfit.data.formats.image_sizes import check_video
+from jaxfit.data.formats.label_studio import write_label_studio
+from jaxfit.data.formats.recognise import read_observations
+from jaxfit.data.formats.write_deeplabcut import write_deeplabcut_labels
+from jaxfit.data.formats.write_sleap import write_sleap_project
+from jaxfit.data.observations import Observations
+from jaxfit.data.projection import projected_observations
+from jaxfit.data.solution import Solution, load_solution
+from jaxfit.foundation.errors import InputError, one_line
+from jaxfit.foundation.extras import require_extra
+from jaxfit.foundation.files import check_replaceable, new_folder, write_whole
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.perception.detections import open_keypoint_detector
+from jaxfit.perception.network import KeypointDetector, Segmenter
+from jaxfit.perception.track import run_tracking
+from jaxfit.review.signals import choose, combine, frame_signals, mirror_disagreement, shortlist, thumbnail
+from jaxfit.video.reader import probe_video, read_frames
+from jaxfit.view.drawing import write_png
+from jaxfit.view.overlay import is_inside
+
+_OBSERVATIONS = "observations.json"
+
+
+class Result(NamedTuple):
+    """What is known about the birds of a video."""
+
+    observations: Observations
+    solution: Solution | None
+    """The fit of the observations, if there is a fit."""
+
+
+def read_result(path: Path, video: Path) -> Result:
+    """Read a result folder or a file of observations, and check that the result belongs to a video.
+
+    The observations of a folder without `observations.json`, which `jaxfit fit` writes, are the projected keypoints.
+
+    Args:
+        path: a folder of `jaxfit reconstruct` or `jaxfit fit`, or a file of observations in any format.
+        video: the video, or folder of pictures.
+
+    Raises:
+        InputError: the result cannot be read, has images of another size or frames that the video lacks, or consists
+            of photographs.
+    """
+    solution = None
+    if path.is_dir():
+        solution, _ = load_solution(path)
+        if (path / _OBSERVATIONS).is_file():
+            observations = read_observations(path / _OBSERVATIONS, video)
+        else:
+            observations, solution = projected_observations(solution), None
+            check_video(observations, path, video)
+    else:
+        observations = read_observations(path, video)
+    if observations.own_images:
+        raise InputError(path, "holds photographs, not frames of one video", "give the result of this video")
+    if not observations.num_frames:
+        raise InputError(path, "holds no frames", "give the result of this video")
+    return Result(observations, solution)
+
+
+IMAGES, MARKER = "images", "suggested.csv"
+_DEEPLABCUT = Path("deeplabcut") / "labeled-data"
+
+_README = """Frames of {video} to label, suggested by jaxfit.
+
+images/        the {count} pictures; the number at the end of a name is the number of the frame
+suggested.csv  why every frame was suggested
+coco.json      the labels that jaxfit detected, with masks and confidences
+
+Correct the labels in ONE of these programs. Move wrong keypoints, remove keypoints that cannot be placed,
+add missing birds, and remove detections that are no birds.
+
+CVAT
+  1. Create a task. Paste the content of cvat_labels.json into the tab "Raw" of the labels. Add images/.
+  2. Upload annotations: format "COCO Keypoints 1.0", file cvat.json.
+  3. After the correction, export in the format "COCO Keypoints 1.0" and unpack the archive.
+     The attribute "bird" is the number of the bird. Give a new bird a new number.
+  4. jaxfit import person_keypoints_default.json --masks {out}/coco.json --out corrected.json
+
+Label Studio
+  1. Start Label Studio with LABEL_STUDIO_LOCAL_FILES_SERVING_ENABLED=true and
+     LABEL_STUDIO_LOCAL_FILES_DOCUMENT_ROOT={out}
+  2. Create a project. Paste label_studio.xml into the code of the labelling interface.
+     Add a source storage of local files: {out}/images
+  3. Import label_studio.json. A new bird is a rectangle with key points inside.
+  4. After the correction, export as JSON (not as COCO, which rounds positions to whole pixels).
+  5. jaxfit import export.json --masks {out}/coco.json --out corrected.json
+
+DeepLabCut
+  1. Copy deeplabcut/labeled-data/{folder} into the folder labeled-data of a project for several animals,
+     whose scorer is "{scorer}" and whose individuals are: {birds}.
+     For another scorer, rename the files and run deeplabcut.convertcsv2h5.
+  2. Open the folder in the labelling tool, and correct and save the labels.
+  3. jaxfit import CollectedData_{scorer}.h5 --masks {out}/coco.json --out corrected.json
+
+SLEAP
+  1. Open labels.slp. A double click turns a prediction into a label that can be corrected.
+     The tab "Labeling Suggestions" lists all frames.
+  2. Save the project.
+  3. jaxfit import labels.slp --masks {out}/coco.json --out corrected.json
+     labels.slp holds the absolute paths of the pictures. SLEAP asks for a picture that was moved.
+
+The pictures of the folder deeplabcut are the files of images/ under a second name (hard links), where the disk
+allows it. coco.json can be corrected by a program of your own, too.
+"""
+
+
+def picture_name(video: Path, number: int) -> str:
+    """Return the file name of the picture of a frame, from which `picture_names.frame_numbers` reads the number."""
+    return f"{_stem(video)}_{number:06d}.png"
+
+
+def _stem(video: Path) -> str:
+    """Return the name of a video with the characters that all labelling programs accept in file names."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", one_line(video.stem))[:100].strip("_") or "video"
+
+
+def write_labels(observations: Observations, video: Path, folder: Path, final: Path, scorer: str = "jaxfit") -> None:
+    """Write the labels of all formats into a folder that holds the pictures of the frames in `images/`.
+
+    Args:
+        observations: the birds of the suggested frames.
+        video: the video, for names.
+        folder: the folder, which may have a temporary name.
+        final: the absolute path that the folder will have.
+        scorer: name of the labelling person or program in DeepLabCut.
+
+    Raises:
+        InputError: the extra `formats` is not installed, or a file cannot be written.
+    """
+    pictures = [picture_name(video, number) for number in observations.frame_index.tolist()]
+    named = replace(observations, file_name=np.array(pictures, str))
+    write_coco(named, folder / "coco.json", {"description": f"frames of {one_line(video.name)} to label"})
+    write_cvat(named, folder / "cvat.json")
+    write_cvat_label(named, folder / "cvat_labels.json")
+    urls = [f"/data/local-files/?d={quote(f'{IMAGES}/{picture}')}" for picture in pictures]
+    write_label_studio(named, urls, folder / "label_studio.json", folder / "label_studio.xml")
+    write_sleap_project(named, [str(final / IMAGES / picture) for picture in pictures], folder / "labels.slp")
+    deeplabcut = folder / _DEEPLABCUT / _stem(video)
+    deeplabcut.mkdir(parents=True)
+    for picture in pictures:
+        _link(folder / IMAGES / picture, deeplabcut / picture)
+    write_deeplabcut_labels(named, pictures, deeplabcut, scorer)
+    birds = ", ".join(f"bird{track}" for track in named.track_id[named.present.any(1)].tolist()) or "none"
+    facts = {"video": one_line(video.name), "count": len(pictures), "out": one_line(final), "birds": birds}
+    write_whole(folder / "README.txt", _README.format(**facts, folder=_stem(video), scorer=scorer).encode())
+
+
+def write_list(rows: list[tuple], path: Path) -> None:
+    """Write the table of suggested frames: frame, time in seconds, picture, birds, reason, score."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("frame", "time_s", "picture", "birds", "reason", "score"))
+    writer.writerows(rows)
+    write_whole(path, text.getvalue().encode())
+
+
+def _link(source: Path, target: Path) -> None:
+    """Give a file a second name, or copy the file where the file system has no hard links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copyfile(source, target)
+
+
+_logger = logging.getLogger(__name__)
+
+MIRROR, VARIETY = "mirror image", "variety"
+"""Reasons beside the signals of `frame_signals`: disagreement under flips; a frame unlike the others."""
+
+
+class SuggestedFrame(NamedTuple):
+    """A frame that a person should label."""
+
+    frame_index: int
+    """Number of the frame in the video."""
+    time_s: float | None
+    """Presentation time in seconds; None if the time is unknown."""
+    birds: int
+    """Number of birds with pre-filled labels."""
+    reason: str
+    """The strongest signal of uncertainty, or `variety`."""
+    score: float
+    """Mean rank of the signals among the examined frames, in [0, 1]."""
+
+
+class Suggestions(NamedTuple):
+    """The suggested frames of a video."""
+
+    frames: list[SuggestedFrame]
+    """In the order of their numbers."""
+    observations: Observations
+    """The birds of these frames: the pre-filled labels."""
+
+
+class _Examined(NamedTuple):
+    """The frames of the shortlist that could be decoded."""
+
+    positions: list[int]
+    thumbnails: np.ndarray
+    mirror: np.ndarray
+    times_s: dict[int, float | None]
+
+
+def suggest(
+    video: str | Path,
+    out: str | Path,
+    count: int = 40,
+    result: str | Path | None = None,
+    config: TrackConfig = TrackConfig(),
+    segmenter: Segmenter | None = None,
+    keypoints: KeypointDetector | None = None,
+    overwrite: bool = False,
+    empty: bool = False,
+    progress: ProgressTask = silent,
+) -> Suggestions:
+    """Choose frames of a video for labelling, and write their pictures and pre-filled labels into a folder.
+
+    A frame is uncertain if the signals of `frame_signals` are large, and if the keypoint network detects other
+    keypoints in the mirror image (`mirror_disagreement`). The mirror image is examined for a shortlist of frames.
+    `choose` takes frames that are uncertain and differ from the frames chosen before. Without any bird, the frames are
+    chosen by variety alone.
+
+    The video is read once, or twice without `result`. docs/files.md describes the folder.
+
+    Args:
+        video: a video, or a folder of frames.
+        out: folder to write, completely or not at all.
+        count: number of frames to choose.
+        result: a folder of `jaxfit reconstruct` or `jaxfit fit`, or a file of observations of this video; None tracks
+            the birds first.
+        config: frames, networks and tracker.
+        segmenter, keypoints: networks that replace the networks of `config`.
+        overwrite: replace an earlier folder of suggestions.
+        empty: write no labels, for networks that do not know the footage: wrong labels take longer than no labels.
+        progress: reports every frame.
+
+    Raises:
+        InputError: the video, the result, a network or the folder cannot be used; the result belongs to another video;
+            the video has fewer frames than `count`; or the extra `formats` is not installed.
+    """
+    video, out = Path(video), Path(out)
+    if count < 1:
+        raise InputError("--count", f"is {count}", "give 1 or more")
+    require_extra("formats", "jaxfit suggest", "h5py")
+    info = probe_video(video)
+    if is_inside(video, out) or out.absolute() == video.absolute():
+        raise InputError(out, "holds the video, which the suggestions would replace", "choose another --out")
+    if video.is_dir() and is_inside(out, video):
+        raise InputError(out, f"lies among the video's images in {video}", "choose an --out elsewhere")
+    check_replaceable(out, overwrite, MARKER)
+    if info.frames is not None:
+        _check_count(count, len(_wanted(np.arange(info.frames), config.frames)), video)
+    if result is None:
+        tracking = run_tracking(video, config, segmenter, keypoints, progress=progress)
+        found = Result(tracking.observations, None)
+        if tracking.trust.level == "low" and not empty:
+            _logger.warning(
+                "%s: the labels may be wrong; --empty writes no labels. %s", video, tracking.trust.sentence()
+            )
+    else:
+        found = read_result(Path(result), video)
+        found = found._replace(
+            observations=found.observations.select(frames=_wanted(found.observations.frame_index, config.frames))
+        )
+    observations = found.observations
+    _check_count(count, observations.num_frames, video if result is None else Path(result))
+    with new_folder(out, overwrite, marker=MARKER) as part:
+        (part / IMAGES).mkdir()
+        signals = frame_signals(observations, found.solution)
+        candidates = shortlist(combine(signals)[0], count)
+        detector = _detector(observations, config, keypoints)
+        examined = _examine(video, observations, candidates, detector, part / IMAGES, progress)
+        _check_count(count, len(examined.positions), video)
+        frames, positions = _choose(observations, signals, examined, count)
+        for t in set(examined.positions) - set(positions):
+            (part / IMAGES / picture_name(video, int(observations.frame_index[t]))).unlink()
+        chosen = observations.select(tracks=[] if empty else None, frames=positions)
+        write_labels(chosen, video, part, out.resolve())
+        rows = []
+        for number, time_s, birds, reason, score in frames:
+            time = "" if time_s is None else f"{time_s:.3f}"
+            rows.append((number, time, picture_name(video, number), birds, reason, f"{score:.3f}"))
+        write_list(rows, part / MARKER)
+    return Suggestions(frames, chosen)
+
+
+def _wanted(numbers: np.ndarray, frames: FramesConfig) -> np.ndarray:
+    """Return the positions of the frames that the config processes."""
+    last = np.inf if frames.stop is None else frames.stop
+    inside = (numbers >= frames.start) & (numbers < last) & ((numbers - frames.start) % frames.step == 0)
+    return np.flatnonzero(inside)
+
+
+def _check_count(count: int, frames: int, source: Path) -> None:
+    if count > frames:
+        problem = f"has {frames} frames to choose from, fewer than --count {count}"
+        raise InputError(source, problem, f"give --count {frames} or less" if frames else "give other frames")
+
+
+def _detector(
+    observations: Observations, config: TrackConfig, keypoints: KeypointDetector | None
+) -> KeypointDetector | None:
+    """Return the network that sees mirror images; None without birds, or if the network has other keypoints."""
+    if not observations.present.any():
+        _logger.warning("no bird is detected: the frames are chosen by variety alone, and their labels are empty")
+        return None
+    detector = keypoints or open_keypoint_detector(config)
+    if sorted(detector.keypoint_names) != sorted(observations.keypoint_names):
+        _logger.warning(
+            "%s: has other keypoints than the result, so mirror images are not compared", config.keypoints.file
+        )
+        return None
+    return detector
+
+
+def _examine(
+    video: Path,
+    observations: Observations,
+    candidates: np.ndarray,
+    detector: KeypointDetector | None,
+    folder: Path,
+    progress: ProgressTask,
+) -> _Examined:
+    """Read the frames of the shortlist, write their pictures, and compare their mirror images."""
+    numbers = observations.frame_index[candidates]
+    position = dict(zip(numbers.tolist(), candidates.tolist(), strict=True))
+    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    reader = read_frames(video, int(numbers[0]), int(numbers[-1]) + 1, step)
+    positions, thumbnails, mirror, times = [], [], [], {}
+    with progress("Examining frames", len(candidates)) as report_progress:
+        for number, picture, time_s in reader:
+            t = position.get(number)
+            if t is None:
+                continue
+            positions.append(t)
+            thumbnails.append(thumbnail(picture))
+            mirror.append(np.nan if detector is None else mirror_disagreement(picture, observations, t, detector))
+            times[t] = time_s
+            write_png(folder / picture_name(video, number), picture)
+            report_progress(1, f"frame {number}")
+    return _Examined(positions, np.array(thumbnails), np.array(mirror), times)
+
+
+def _choose(
+    observations: Observations, signals: dict[str, np.ndarray], examined: _Examined, count: int
+) -> tuple[list[SuggestedFrame], list[int]]:
+    """Return the suggested frames and their positions, in the order of their numbers."""
+    at = np.array(examined.positions)
+    score, reasons = combine({name: values[at] for name, values in signals.items()} | {MIRROR: examined.mirror})
+    if not observations.present.any():
+        score, reasons = np.full(len(at), 0.5), [""] * len(at)
+    picks = sorted(choose(score, examined.thumbnails, observations.frame_index[at], count))
+    birds = observations.present.sum(0)
+    frames = [
+        SuggestedFrame(
+            frame_index=int(observations.frame_index[at[i]]),
+            time_s=examined.times_s[int(at[i])],
+            birds=int(birds[at[i]]),
+            reason=reasons[i] if score[i] > 0.5 else VARIETY,
+            score=float(score[i]),
+        )
+        for i in picks
+    ]
+    return frames, at[picks].tolist()

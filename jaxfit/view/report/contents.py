@@ -1,0 +1,368 @@
+"""What a report shows, warns about and recommends."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxfit.data.formats.fields import Field
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution, ambiguous_frames
+from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
+
+
+@dataclass(frozen=True)
+class Track:
+    """One bird of a report; T frames of the result."""
+
+    position: int
+    """Position of the track in the result, which determines its colour in overlays."""
+    track_id: int
+    status: str
+    poses: int
+    objective: float | None
+    """Final objective of each pose; None without a pose."""
+    frames: tuple[int, int] | None
+    """Numbers of the first and the last frame with a detection; None without a detection."""
+    quality: TrackQuality | None
+    """Quality of the detections; None without observations."""
+    present: Bool[np.ndarray, "T"]
+    """Where the bird was detected; without observations, where the bird has a pose."""
+    valid: Bool[np.ndarray, "T"]
+    """Where the bird has a pose."""
+    confidence: Float[np.ndarray, "T"] | None
+    """Mean confidence of the keypoints in every frame; None without observations."""
+    size: Float[np.ndarray, "T"]
+    """Size in the image relative to the median of the track; NaN without a pose."""
+    problems: tuple[str, ...]
+    """Texts about skipped frames and diverged windows."""
+    ambiguous: tuple[str, ...]
+    """Texts about frames with a second pose (`ambiguous_frames`)."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The content of a report."""
+
+    folder: str
+    """Path of the result, for commands."""
+    title: str
+    video: str | None
+    """Path of the footage; None if unknown."""
+    photographs: int
+    """Number of photographs, in which every bird has an image of its own; 0 for video."""
+    frames: np.ndarray
+    """(T,) numbers of the frames."""
+    step: int
+    """Distance of the frame numbers."""
+    times_s: Float[np.ndarray, "T"]
+    """Time of every frame in seconds; NaN if unknown."""
+    size_px: tuple[int, int] | None
+    """Width and height of the footage."""
+    fps: float | None
+    tracks: tuple[Track, ...]
+    """In the order in which the birds appear."""
+    damaged: tuple[int, ...]
+    """Numbers of the frames that could not be decoded."""
+    short_tracks: Mapping[str, str]
+    """Skipped track → number of frames."""
+    low_score_tracks: Mapping[str, str]
+    """Skipped track → mean score."""
+    trust: str | None
+    """`high`, `low`, or None if the tracking was not judged."""
+    trust_reasons: tuple[str, ...]
+    seconds: Mapping[str, float]
+    """Part of the work → seconds."""
+    facts: Mapping[str, str]
+    """Model, networks and versions."""
+    corrections: tuple[str, ...]
+    config: str
+    """The config as YAML."""
+
+    @property
+    def has_detections(self) -> bool:
+        """Whether the detections of the birds are known, besides their poses."""
+        return any(track.quality is not None for track in self.tracks)
+
+    @property
+    def over_time(self) -> bool:
+        """Whether the result has several frames of one video, so that changes over time mean something."""
+        return not self.photographs and len(self.frames) > 1
+
+    @property
+    def poses(self) -> int:
+        """Number of poses of all birds."""
+        return sum(track.poses for track in self.tracks)
+
+    @property
+    def detections(self) -> int:
+        """Number of detections of all birds; without observations, the number of poses."""
+        return sum(int(track.present.sum()) for track in self.tracks)
+
+    @property
+    def duration_s(self) -> float | None:
+        """Time from the first to the end of the last frame; None if unknown."""
+        if self.fps is None:
+            return None
+        return float(self.frames[-1] - self.frames[0] + self.step) / self.fps if len(self.frames) else 0.0
+
+
+def gather(
+    solution: Solution, observations: Observations | None, summary: Mapping[str, Any], config: str, folder: Path
+) -> Report:
+    """Return the content of the report of a result.
+
+    Args:
+        solution: the poses.
+        observations: the detections of the same tracks and frames; None if they are unknown.
+        summary: content of `summary.json`, in the types of JSON.
+        config: the config as YAML.
+        folder: folder of the result.
+
+    Raises:
+        InputError: an entry of the summary has another type than jaxfit writes.
+    """
+    field = Field(folder / "summary.json", "", summary)
+    video = field["video"] if field.has("video") else None
+    named = video["file"].text() if video is not None and video.has("file") else None
+    sizes = solution.image_size_px[solution.valid]
+    times_s = np.full(len(solution.frame_index), np.nan) if solution.timestamp_s is None else solution.timestamp_s
+    if solution.fps and not np.isfinite(times_s).all():
+        times_s = solution.frame_index / solution.fps
+    tracks = _tracks(solution, observations, _texts_of(field, "failures"))
+    return Report(
+        folder=str(folder),
+        title=Path(named).name or named if named else folder.name,
+        video=named,
+        photographs=field["photographs"].integer() if field.has("photographs") else 0,
+        frames=solution.frame_index,
+        step=frame_step(solution.frame_index),
+        times_s=times_s,
+        size_px=(int(sizes[0, 0]), int(sizes[0, 1])) if len(sizes) else None,
+        fps=solution.fps,
+        tracks=tuple(sorted(tracks, key=lambda track: (_first(track), track.position))),
+        damaged=tuple(_integers(video, "damaged")) if video is not None else (),
+        short_tracks={track: f"{each.integer()}" for track, each in _entries(field, "short_tracks")},
+        low_score_tracks={
+            track: f"{each.number(0, 1, 'run the reconstruction again'):.2f}"
+            for track, each in _entries(field, "low_score_tracks")
+        },
+        trust=field["trust"].text() if field.has("trust") else None,
+        trust_reasons=tuple(_texts(field, "trust_reasons")),
+        seconds={
+            name: each.number(0, 1e12, "run the reconstruction again") for name, each in _entries(field, "seconds")
+        },
+        facts=_facts(field),
+        corrections=tuple(_texts(field, "corrections")),
+        config=config,
+    )
+
+
+def _first(track: Track) -> int:
+    at = np.flatnonzero(track.present)
+    return int(at[0]) if len(at) else len(track.present)
+
+
+def _tracks(
+    solution: Solution, observations: Observations | None, problems: Mapping[str, tuple[str, ...]]
+) -> list[Track]:
+    quality = {} if observations is None else {row.track_id: row for row in track_quality(observations)}
+    rows = {} if observations is None else {track: n for n, track in enumerate(observations.track_id.tolist())}
+    size = _image_size(solution)
+    total = np.sum(list(solution.loss.values()), axis=0) if solution.loss else np.full(len(solution.track_id), np.nan)
+    ambiguous = ambiguous_frames(solution)
+    tracks = []
+    for n, track_id in enumerate(solution.track_id.tolist()):
+        valid, present, confidence = solution.valid[n], solution.valid[n], None
+        if observations is not None and track_id in rows:
+            present = observations.present[rows[track_id]]
+            confidence = observations.confidence[rows[track_id]].mean(-1) if observations.num_keypoints else None
+        median = np.median(size[n, valid]) if valid.any() else 1.0
+        poses, at = int(valid.sum()), solution.frame_index[present]
+        tracks.append(
+            Track(
+                position=n,
+                track_id=track_id,
+                status=str(solution.status[n]),
+                poses=poses,
+                objective=float(total[n]) / poses if poses and np.isfinite(total[n]) else None,
+                frames=(int(at[0]), int(at[-1])) if len(at) else None,
+                quality=quality.get(track_id),
+                present=present,
+                valid=valid,
+                confidence=confidence,
+                size=np.where(valid, size[n] / median, np.nan),
+                problems=problems.get(str(track_id), ()),
+                ambiguous=ambiguous.get(track_id, ()),
+            )
+        )
+    return tracks
+
+
+def _image_size(solution: Solution) -> Float[np.ndarray, "N T"]:
+    """Return the size of every bird in the image, in image pixels per model unit; NaN without a pose."""
+    depth = np.where(solution.valid, solution.transl[..., 2], np.nan)
+    return solution.scale * (solution.focal_px / solution.crop_px) * solution.crop[..., 2] / depth
+
+
+def _facts(field: Field) -> dict[str, str]:
+    """Return the model, the networks and the versions as texts."""
+    facts = {}
+    if field.has("model"):
+        model = field["model"]
+        facts["model"] = f"{model['name'].text()} ({model['hash'].text()[:12]})"
+    for kind, files in _entries(field, "networks"):
+        facts[f"network: {kind}"] = ", ".join(f"{name} ({each.text()[:12]})" for name, each in files.entries())
+    return facts | {name: each.text() for name, each in _entries(field, "versions")}
+
+
+def _entries(field: Field, key: str) -> list[tuple[str, Field]]:
+    return list(field[key].entries()) if field.has(key) else []
+
+
+def _texts(field: Field, key: str) -> list[str]:
+    return [each.text() for each in field[key]] if field.has(key) else []
+
+
+def _integers(field: Field, key: str) -> list[int]:
+    return [each.integer() for each in field[key]] if field.has(key) else []
+
+
+def _texts_of(field: Field, key: str) -> dict[str, tuple[str, ...]]:
+    return {name: tuple(each.text() for each in texts) for name, texts in _entries(field, key)}
+
+
+LEAST_CONFIDENCE = 0.5
+"""Tracks with a lower mean confidence of the keypoints are named."""
+LEAST_COVERAGE = 0.8
+"""Tracks with detections in a smaller share of their frames are named."""
+_NAMED = 12
+"""Number of tracks or frames that a sentence names."""
+
+
+class Warned(NamedTuple):
+    """One warning."""
+
+    title: str
+    text: str
+    details: tuple[str, ...] = ()
+    """Single cases, which the reader may open."""
+
+
+class Step(NamedTuple):
+    """One recommended action."""
+
+    text: str
+    command: str | None = None
+
+
+def warnings_of(report: Report) -> list[Warned]:
+    """Return the warnings of a result, the most important first."""
+    warned = []
+    if report.tracks and not report.poses:
+        warned.append(
+            Warned("No track has a pose", "Every fit failed. The table of tracks shows the status of each fit.")
+        )
+    if report.trust == "low":
+        text = "The networks do not work on this footage as on simulated footage. Tracks and poses may be wrong."
+        warned.append(Warned("Trust in the tracking is low", text, report.trust_reasons))
+    failed = [track for track in report.tracks if track.status != "ok"]
+    if failed:
+        text = f"{_named([track.track_id for track in failed])}: some or all frames have no pose."
+        warned.append(Warned(f"{counted(len(failed), 'track')} with a fit that failed", text))
+    problems = tuple(f"track {track.track_id}: {text}" for track in report.tracks for text in track.problems)
+    if problems:
+        text = "Windows of frames whose fit diverged, and frames that were skipped, have no pose."
+        warned.append(Warned(counted(len(problems), "problem") + " of the fit", text, problems))
+    ambiguous = tuple(f"track {track.track_id}: {text}" for track in report.tracks for text in track.ambiguous)
+    if ambiguous:
+        text = (
+            "Two different poses explain the keypoints of these frames almost as well. The result holds the better one."
+        )
+        warned.append(Warned("Frames with a second pose", text, ambiguous))
+    if report.damaged:
+        text = f"{counted(len(report.damaged), 'frame')} of the video could not be decoded: {numbers(report.damaged)}."
+        warned.append(Warned("Damaged frames", text))
+    if report.short_tracks:
+        text = f"A bird was detected in too few frames. Track (frames): {_pairs(report.short_tracks)}."
+        warned.append(Warned(f"{counted(len(report.short_tracks), 'short track')} skipped", text))
+    if report.low_score_tracks:
+        text = f"The detections may be no birds. Track (mean score): {_pairs(report.low_score_tracks)}."
+        warned.append(Warned(f"{counted(len(report.low_score_tracks), 'track')} with a low score skipped", text))
+    rated = [(track, track.quality) for track in report.tracks if track.quality is not None]
+    unsure = [track.track_id for track, quality in rated if quality.mean_confidence < LEAST_CONFIDENCE]
+    if unsure:
+        text = f"{_named(unsure)}: the mean confidence of the keypoints is below {LEAST_CONFIDENCE:g}."
+        warned.append(Warned(f"{counted(len(unsure), 'track')} with uncertain keypoints", text))
+    sparse = [track.track_id for track, quality in rated if quality.coverage < LEAST_COVERAGE]
+    if sparse:
+        text = f"{_named(sparse)}: detected in less than {100 * LEAST_COVERAGE:g} % of the frames of the track."
+        warned.append(Warned(f"{counted(len(sparse), 'track')} with gaps", text))
+    if report.corrections:
+        warned.append(Warned("Corrected tracks", f"Corrections: {'; '.join(report.corrections)}."))
+    return warned
+
+
+def next_steps(report: Report) -> list[Step]:
+    """Return the recommended actions in their order."""
+    result = shlex.quote(report.folder)
+    if report.photographs:
+        return [_draw_photographs(report.folder), *_export(report, result)]
+    video = "VIDEO" if report.video is None else shlex.quote(report.video)
+    draw = f"jaxfit overlay {result} --video {video} --out overlay.mp4 --side-views"
+    text = (
+        "Look at the overlay video: overlay.mp4 in the folder of a reconstruction. The meshes must follow the birds, "
+        "and each bird must keep its track number. This command draws the video again:"
+    )
+    steps = [Step(text, draw)]
+    if report.trust == "low":
+        command = f"jaxfit suggest {video} --result {result} --count 10 --out label"
+        steps.append(Step("Label ten frames of this footage, and train the networks with them.", command))
+    if report.has_detections and len(report.tracks) > 1:
+        a, b = (track.track_id for track in report.tracks[:2])
+        middle = report.frames[len(report.frames) // 2]
+        text = (
+            "Correct exchanged or broken tracks. Only the windows that change are fitted again. Example: tracks "
+            f"{a} and {b} exchange their numbers from frame {middle:,} on."
+        )
+        steps.append(Step(text, f"jaxfit tracks {result} --swap {a},{b}@{middle} --out corrected"))
+    return [*steps, *_export(report, result)]
+
+
+def _draw_photographs(folder: str) -> Step:
+    text = "Draw the fitted birds beside the annotations, in Python, with the file that was fitted:"
+    drawn = f"*jaxfit.load_solution({folder!r}), jaxfit.read_observations('OBS.json'), 'sheet.png'"
+    return Step(text, f"import jaxfit\njaxfit.contact_sheet({drawn})")
+
+
+def _export(report: Report, result: str) -> list[Step]:
+    """Return the step of the export; poses of low trust are no data for statistics."""
+    if not report.poses or report.trust == "low":
+        return []
+    command = f"jaxfit export {result} --to csv --out birds.csv"
+    return [Step("Export positions and angles for your statistics.", command)]
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun: `1 bird`, `2,000 birds`."""
+    return f"{count:,} {noun}" + ("" if count == 1 else "s")
+
+
+def numbers(values: Sequence[int | str]) -> str:
+    """Return the first values as a list."""
+    shown = [f"{value}" for value in values[:_NAMED]]
+    return ", ".join(shown) + (f" and {len(values) - _NAMED:,} more" if len(values) > _NAMED else "")
+
+
+def _named(ids: Sequence[int]) -> str:
+    return f"{'Track' if len(ids) == 1 else 'Tracks'} {numbers(ids)}"
+
+
+def _pairs(skipped: Mapping[str, str]) -> str:
+    return numbers([f"{track} ({value})" for track, value in skipped.items()])

@@ -1,0 +1,202 @@
+"""Which bird is present when, and how certain the detection is; escaped HTML text."""
+
+from __future__ import annotations
+
+from html import escape
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxfit.foundation.errors import one_line
+from jaxfit.view.colours import track_colour
+from jaxfit.view.report.contents import Report, Track
+
+_WITHOUT_END = ("img", "meta")
+
+
+class Html(str):
+    """Text that is HTML already."""
+
+    __slots__ = ()
+
+
+def joined(*parts: object) -> Html:
+    """Return the parts as one HTML text: HTML as it is, other values as escaped text, and nothing for None."""
+    return Html("".join(part if isinstance(part, Html) else _text(part) for part in parts if part is not None))
+
+
+def element(tag: str, *content: object, **attributes: object) -> Html:
+    """Return an HTML element.
+
+    Args:
+        tag: name of the element.
+        content: the content, as for `joined`.
+        attributes: name → value; `_` becomes `-`, and a `_` at the end is dropped (`class_`). None leaves the
+            attribute out.
+    """
+    named = {key.rstrip("_").replace("_", "-"): value for key, value in attributes.items() if value is not None}
+    start = "".join(f' {key}="{_text(value)}"' for key, value in named.items())
+    return Html(f"<{tag}{start}>" if tag in _WITHOUT_END else f"<{tag}{start}>{joined(*content)}</{tag}>")
+
+
+def _text(value: object) -> str:
+    """Return a value as escaped text; control characters other than line breaks become visible escapes."""
+    return escape("\n".join(one_line(line) for line in str(value).split("\n")))
+
+
+LEVELS = (0.5, 0.75, 0.9)
+"""Mean confidences of the keypoints at which the colour changes."""
+_ABSENT, _NO_POSE, _POSE = 0, 1, 2
+"""States of a bird in a frame; poses of level i have the state `_POSE + i`."""
+_COLUMNS = 500
+"""Most columns of a row: longer results have several frames in a column."""
+_TICKS = 5
+_CURVE_PX = (90, 22)
+_CURVE_RANGE = 0.3
+"""Deviations of the size beyond this share are drawn at the edge."""
+
+
+def timeline(report: Report) -> Html:
+    """Return the rows of all birds over a common axis of frames."""
+    first, last = int(report.frames[0]), int(report.frames[-1])
+    length = (last - first) // report.step + 1
+    per_column = -(-length // _COLUMNS)
+    at = (report.frames - first) // report.step
+    rows = [_axis(report, first, length), _counts(report, at, length)]
+    for track in report.tracks:
+        states = np.zeros(length, int)
+        states[at] = _states(track)
+        label = element("span", swatch(track.position), f"{track.track_id}", class_="label")
+        rows.append(element("div", label, _band(track, _binned(states, per_column)), class_="row"))
+    if report.damaged:
+        states = np.zeros(length, int)
+        damaged = (np.array(report.damaged) - first) // report.step
+        states[damaged[(damaged >= 0) & (damaged < length)]] = 1
+        columns = np.pad(states, (0, -length % per_column)).reshape(-1, per_column).max(1)
+        band = element("svg", _bars(columns, 1, 0.2, 0.6), class_="band", **_stretched(len(columns)))
+        rows.append(element("div", element("span", "damaged", class_="label"), band, class_="row"))
+    note = None
+    if per_column > 1:
+        text = f"One column shows {per_column} frames: their most frequent state, and their mean confidence."
+        note = element("p", text, class_="note")
+    return joined(_legend(report), element("div", *rows, class_="timeline"), note)
+
+
+def swatch(position: int) -> Html:
+    """Return a mark in the colour that the bird has in overlays."""
+    blue, green, red = track_colour(position)
+    return element("i", class_="swatch", style=f"background:rgb({red},{green},{blue})")
+
+
+def size_curve(track: Track) -> Html:
+    """Return the size of a bird in the image over the frames of its track, as a small curve around its median."""
+    width, height = _CURVE_PX
+    at = np.flatnonzero(track.valid)
+    if not len(at):
+        return Html("–")
+    groups = np.array_split(at, min(len(at), width // 2))
+    x = np.array([group.mean() for group in groups])
+    x = (x - at[0]) / max(at[-1] - at[0], 1) * width
+    y = np.array([np.mean(track.size[group]) for group in groups]) - 1
+    y = height / 2 * (1 - np.clip(y / _CURVE_RANGE, -0.95, 0.95))
+    line = "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x, y, strict=True))
+    low, high = np.quantile(track.size[at], [0.05, 0.95]) - 1
+    title = element("title", f"90 % of the frames: {low:+.0%} to {high:+.0%}")
+    middle = element("path", class_="middle", d=f"M0 {height / 2}H{width}")
+    paths = title, middle, element("path", class_="curve", d=line)
+    return element("svg", *paths, class_="size", viewBox=f"0 0 {width} {height}", width=width, height=height)
+
+
+def duration(seconds: float) -> str:
+    """Return a duration as `2.4 s`, `3:05 min` or `1:02:03 h`."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d} h" if hours else f"{minutes}:{rest:02d} min"
+
+
+def _states(track: Track) -> Int[np.ndarray, "T"]:
+    """Return the state of a bird in every frame."""
+    level = np.zeros(len(track.valid), int)
+    if track.confidence is not None:
+        level = np.searchsorted(LEVELS, track.confidence, side="right")
+    else:
+        level[:] = len(LEVELS)
+    return np.where(track.valid, _POSE + level, np.where(track.present, _NO_POSE, _ABSENT))
+
+
+def _binned(states: Int[np.ndarray, "L"], per_column: int) -> Int[np.ndarray, "C"]:
+    """Return the most frequent kind of state in every column; for poses, their mean level."""
+    if per_column == 1:
+        return states
+    columns = np.pad(states, (0, -len(states) % per_column)).reshape(-1, per_column)
+    is_pose = columns >= _POSE
+    kinds = np.stack([(columns == _ABSENT).sum(1), (columns == _NO_POSE).sum(1), is_pose.sum(1)], axis=1)
+    mean = (columns * is_pose).sum(1) / np.maximum(is_pose.sum(1), 1)
+    return np.where(kinds.argmax(1) == _POSE, np.round(mean).astype(int), kinds.argmax(1))
+
+
+def _band(track: Track, states: Int[np.ndarray, "C"]) -> Html:
+    """Return the row of a bird."""
+    parts = [_bars(states, _NO_POSE, 0.3, 0.4)]
+    parts += [_bars(states, _POSE + level, 0, 1) for level in range(len(LEVELS) + 1)]
+    return element("svg", element("title", f"track {track.track_id}"), *parts, class_="band", **_stretched(len(states)))
+
+
+def _bars(states: Int[np.ndarray, "C"], state: int, top: float, height: float) -> Html | None:
+    """Return the columns of one state as one path; None without a column."""
+    edges = np.flatnonzero(np.diff(states == state, prepend=False, append=False))
+    bars = "".join(f"M{a} {top}h{b - a}v{height}h{a - b}z" for a, b in zip(edges[::2], edges[1::2], strict=True))
+    return element("path", class_=f"s{state}", d=bars) if bars else None
+
+
+def _counts(report: Report, at: np.ndarray, length: int) -> Html:
+    """Return the row with the number of birds over the frames."""
+    per_column = -(-length // _COLUMNS)
+    counts = np.zeros(length + -length % per_column)
+    for track in report.tracks:
+        counts[at] += track.present
+    counts = counts.reshape(-1, per_column).max(1)
+    most = int(counts.max(initial=1))
+    steps = "".join(f"V{1 - count / most:.3f}h1" for count in counts)
+    area = element("path", class_="count", d=f"M0 1{steps}V1z")
+    title = element("title", f"number of birds in a frame, at most {most}")
+    band = element("svg", title, area, class_="band counts", **_stretched(len(counts)))
+    return element("div", element("span", f"birds ≤ {most}", class_="label"), band, class_="row")
+
+
+def _stretched(columns: int) -> dict[str, object]:
+    return {"viewBox": f"0 0 {columns} 1", "preserveAspectRatio": "none"}
+
+
+def _axis(report: Report, first: int, length: int) -> Html:
+    """Return the row with the numbers and times of some frames."""
+    span = max(length - 1, 1) * report.step
+    raw = span / _TICKS
+    power = 10 ** np.floor(np.log10(max(raw, 1)))
+    every = max(int(next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw)), 1)
+    ticks = []
+    for number in range(-(-first // every) * every, first + span + 1, every):
+        place = (number - first) / (length * report.step)
+        if place > 0.93:  # the label would leave the page
+            continue
+        time = None if report.fps is None else element("small", duration(number / report.fps))
+        ticks.append(element("span", f"{number:,}", time, class_="tick", style=f"left:{100 * place:.2f}%"))
+    return element("div", element("span", "frame", class_="label"), element("div", *ticks, class_="axis"), class_="row")
+
+
+def _legend(report: Report) -> Html:
+    def entry(name: str, text: str) -> Html:
+        return element("span", element("i", class_=f"key {name}"), text)
+
+    if report.has_detections:
+        bounds = [f"below {LEVELS[0]:g}", *(f"{a:g} to {b:g}" for a, b in pairwise(LEVELS))]
+        words = [*bounds, f"{LEVELS[-1]:g} or more"]
+        entries = [element("b", "Pose, by confidence of the keypoints:")]
+        entries += [entry(f"s{_POSE + level}", text) for level, text in enumerate(words)]
+        entries.append(entry(f"s{_NO_POSE}", "detected, without a pose"))
+    else:
+        entries = [entry(f"s{_POSE + len(LEVELS)}", "pose")]
+    return element("p", *entries, class_="legend")

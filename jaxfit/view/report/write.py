@@ -1,0 +1,119 @@
+"""Write the report of a result."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.formats.fields import read_json
+from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.solution import Solution, load_solution
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import check_new_file, write_whole
+from jaxfit.foundation.limits import CONFIG_BYTES
+from jaxfit.foundation.reading import json_values, read_file
+from jaxfit.model.bird import Bird
+from jaxfit.view.report.contents import gather
+from jaxfit.view.report.page import Measured, page, report_pictures
+
+REPORT = "report.html"
+_OBSERVATIONS, _SUMMARY, _CONFIG = "observations.json", "summary.json", "config.yaml"
+
+_logger = logging.getLogger(__name__)
+
+
+def write_report(
+    path: Path,
+    solution: Solution,
+    bird: Bird,
+    observations: Observations | None,
+    summary: Mapping[str, Any],
+    config: str,
+    folder: Path,
+    video: Path | None,
+    force: bool = False,
+    measured: Sequence[Measured] = (),
+) -> None:
+    """Write the report of a result as one HTML page without links to other files.
+
+    Args:
+        path: file to write.
+        solution, bird: the result and its model.
+        observations: the detections of the same tracks and frames; None if they are unknown.
+        summary: content of `summary.json`.
+        config: the config as YAML.
+        folder: the folder that holds the result, for commands in the report.
+        video: the footage; None writes a report without pictures.
+        force: draw also on footage that is not the footage of the result.
+        measured: metrics against a known truth.
+
+    Raises:
+        InputError: the footage does not belong to the result, or the file cannot be written.
+    """
+    report = gather(solution, observations, json_values(summary), config, folder)
+    pictures = []
+    if video is not None and solution.valid.any():
+        pictures = report_pictures(solution, bird, video, observations, force)
+    write_whole(path, page(report, pictures, measured).encode())
+
+
+def report_of_result(
+    folder: str | Path,
+    video: str | Path | None = None,
+    out: str | Path | None = None,
+    overwrite: bool = False,
+    force: bool = False,
+) -> Path:
+    """Write the report of a result folder.
+
+    Args:
+        folder: folder of `jaxfit reconstruct` or `jaxfit fit`.
+        video: the footage; None takes the footage that the result names, if the footage is still there.
+        out: file to write; None takes `report.html` in the folder of the result.
+        overwrite: replace an existing file. Without `out`, an earlier report of the result is always replaced.
+        force: draw also on footage that is not the footage of the result.
+
+    Returns:
+        The written file.
+
+    Raises:
+        InputError: the folder holds no result, the files do not belong together, the video cannot be read, or the
+            file exists or cannot be written.
+    """
+    folder = Path(folder)
+    path = folder / REPORT if out is None else Path(out)
+    check_new_file(path, overwrite or out is None)
+    solution, bird = load_solution(folder)
+    summary = read_json(folder / _SUMMARY) if (folder / _SUMMARY).is_file() else None
+    config = read_file(folder / _CONFIG, CONFIG_BYTES, "a config").decode("utf-8", "replace")
+    observations = None
+    if (folder / _OBSERVATIONS).is_file():
+        observations = check_keypoints(read_coco(folder / _OBSERVATIONS), bird.keypoint_names, folder / _OBSERVATIONS)
+        if not np.array_equal(observations.frame_index, solution.frame_index):
+            problem = "has other frames than poses.npz, so it belongs to another result"
+            raise InputError(folder / _OBSERVATIONS, problem, "remove it, or run the reconstruction again")
+    content = {} if summary is None else dict(summary.entries())
+    content = {key: each.value for key, each in content.items()}
+    if video is not None and content.get("photographs"):
+        raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
+    write_report(path, solution, bird, observations, content, config, folder, _footage(content, video), force)
+    return path
+
+
+def _footage(summary: Mapping[str, Any], given: str | Path | None) -> Path | None:
+    """Return the footage that is given, or else the footage that the summary names and that still exists."""
+    if given is not None:
+        return Path(given)
+    video = summary.get("video")
+    named = video.get("file") if isinstance(video, dict) else None
+    if not isinstance(named, str) or "\0" in named:
+        return None
+    if Path(named).exists():
+        return Path(named)
+    _logger.warning("%s: the footage is not there, so the report has no pictures; give --video", named)
+    return None

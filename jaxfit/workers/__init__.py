@@ -1,1 +1,0 @@
-"""Worker processes: of this machine, or of a Dask cluster."""

@@ -1,0 +1,218 @@
+"""The record of an ablation and stored metrics: nothing in them is imported, and any damage is one error."""
+
+import dataclasses
+import json
+import os
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.birds import toy_bird
+from support.hostile import Isolated, many_examples
+from support.mutations import damaged_bytes, damaged_tree
+
+from jaxfit.cli.parser import build_parser
+from jaxfit.config.build import describes, plain_config
+from jaxfit.config.fit import load_config
+from jaxfit.evaluation.ablation.ablate import claim_folder
+from jaxfit.evaluation.ablation.grid import load_grid
+from jaxfit.evaluation.ablation.measure import read_metrics
+from jaxfit.evaluation.bootstrap import BirdSums, Interval
+from jaxfit.evaluation.evaluate import Evaluation
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.reading import json_text
+
+GRID = """
+crosses: [{cross: {filter_window: [5, 1], terms.velocity: [1, 100]}}]
+claims: [{claim: it helps, better: {filter_window: 5}, worse: {filter_window: 1}}]
+"""
+BIRD = toy_bird(shapes=0)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "grid.yaml").write_text(GRID)
+    return tmp_path
+
+
+def claim(folder, out, **options):
+    runs = load_grid(folder / "grid.yaml").runs
+    claim_folder(out, runs, {"truth": folder / "grid.yaml"}, BIRD, **options)
+    return out / "ablation.json"
+
+
+def changed(path, change):
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_the_record_of_the_same_ablation_is_accepted(folder):
+    path = claim(folder, folder / "out")
+    before = path.read_bytes()
+    claim(folder, folder / "out")
+    assert path.read_bytes() == before
+    (folder / "empty").mkdir()
+    claim(folder, folder / "empty")
+    # a later version has keys that this record lacks
+    changed(path, lambda content: [run.pop("memory_gb") for run in content["runs"].values()])
+    claim(folder, folder / "out")
+    (run, *_) = json.loads(path.read_text())["runs"]
+    changed(path, lambda content: content["runs"][run].pop("filter_window"))  # 5, the default, in this run only
+    claim(folder, folder / "out")
+    changed(path, lambda content: content["runs"][run].update(window=3))
+    with pytest.raises(InputError, match="another grid"):
+        claim(folder, folder / "out")
+
+
+def test_describes():
+    paper = load_config("paper")
+    plain = plain_config(paper)
+    assert describes(plain, paper)
+    assert describes(json.loads(json.dumps(plain)), paper)
+    for key, value in (("window", True), ("window", 99), ("stages", []), ("terms", []), ("crop", {}), ("more", 1)):
+        assert describes({**plain, key: value}, paper) == (key == "crop")  # all keys of `crop` have their defaults
+    assert not describes({**plain, "window": True}, dataclasses.replace(paper, window=1))
+    assert not describes([], paper)
+
+
+@pytest.mark.parametrize("place", ["terms", "stage", "override"])
+def test_a_record_imports_nothing(folder, place, monkeypatch):
+    (folder / "evil_module.py").write_text("from pathlib import Path\nPath(__file__ + '.ran').touch()\n")
+    monkeypatch.syspath_prepend(str(folder))
+    path = claim(folder, folder / "out")
+
+    def add(content):
+        for run in content["runs"].values():
+            if place == "terms":
+                run["terms"]["evil_module:f"] = 1
+            elif place == "stage":
+                run["stages"][0]["terms"].append("evil_module:f")
+            else:
+                run["stages"][1]["override"]["evil_module:f"] = {"weight": 1}
+
+    changed(path, add)
+    with pytest.raises(InputError, match=r"names the code 'evil_module:f'.*--allow-import evil_module:f"):
+        claim(folder, folder / "out")
+    with pytest.raises(InputError, match="another grid"):
+        claim(folder, folder / "out", allow_import=["evil_module:f"])
+    assert "evil_module" not in sys.modules
+    assert not (folder / "evil_module.py.ran").exists()
+
+
+def test_a_term_that_the_grid_names_may_stand_in_the_record(folder, monkeypatch):
+    (folder / "record_term.py").write_text("def f(window, *, power=2.0): return 0.0\n")
+    monkeypatch.syspath_prepend(str(folder))
+    (folder / "grid.yaml").write_text(GRID.replace("[1, 100]}", "[1, 100], 'terms.record_term:f': [1]}"))
+    claim(folder, folder / "out")
+    claim(folder, folder / "out")
+
+
+def test_the_option_may_be_given_several_times():
+    command = ["ablate", "obs.json", "--truth", "t", "--out", "o", "--allow-import", "a:b", "--allow-import", "c:d"]
+    assert build_parser().parse_args(command).allow_import == ["a:b", "c:d"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("[]", "does not describe an ablation"),
+        ("3", "does not describe an ablation"),
+        ("{}", "does not describe an ablation"),
+        ('{"runs": []}', "does not describe an ablation"),
+        ('{"runs": {}}', "another grid, format_version, model, truth"),
+        ('{"runs": {"a": 3, "b": {"terms": 3, "stages": [3, {"terms": [3]}]}}}', "another grid"),
+        ('{"runs": {"a": "terms: {evil:f: 1}"}, "format_version": 1}', "another grid, format_version"),
+        ("[" * 100_000, "levels deep"),
+        ('{"runs":' + '{"a":' * 200 + "1" + "}" * 201, "levels deep"),
+        ("1" * 5000, "too many digits"),
+        ("", "is empty"),
+        ("\xff", "another grid|not valid JSON"),
+    ],
+)
+def test_records_of_something_else(folder, content, words):
+    (folder / "out").mkdir()
+    (folder / "out" / "ablation.json").write_text(content)
+    with pytest.raises(InputError, match=words):
+        claim(folder, folder / "out")
+
+
+def test_what_is_no_folder(folder):
+    (folder / "file").touch()
+    (folder / "loop").symlink_to("loop")
+    os.mkfifo(folder / "pipe")
+    (folder / "full").mkdir()
+    (folder / "full" / "x").touch()
+    (folder / "odd" / "ablation.json").mkdir(parents=True)
+    cases = {
+        "file": "is a file",
+        "pipe": "is a file",
+        "loop": "symbolic links",
+        "full": "no ablation.json",
+        "odd": "is a folder, not a JSON file",
+        "x" * 300: "name too long",
+        "a\0b": "not a file name",
+    }
+    for name, words in cases.items():
+        with pytest.raises(InputError, match=words):
+            claim(folder, folder / name)
+
+
+def store_metrics(folder):
+    overall, interval = {"pck@0.05": 0.9, "iou": None, "me_p": 0.1, "me_v": 0.01}, Interval(0.05, 0.2)
+    sums = BirdSums(("4", "7"), {m: (0.1, 0.2) for m in ("me_p", "me_v")}, {m: (3, 4) for m in ("me_p", "me_v")})
+    row = {"me_p": 0.1, "frames": 3}
+    intervals = {"me_p": interval, "me_v": interval}
+    evaluation = Evaluation(overall, {4: row, 7: row}, 6, 0, intervals=intervals, keypoints={"bill": row}, sums=sums)
+    (folder / "evaluation.json").write_text(json_text(evaluation.to_dict()))
+    (folder / "summary.json").write_text('{"seconds": {"fit": 1.5}, "runs_at_once": 2}')
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("evaluation.json", "[]"),
+        ("evaluation.json", "3"),
+        ("evaluation.json", "{}"),
+        ("evaluation.json", "[" * 5000),
+        ("summary.json", "[]"),
+        ("summary.json", '{"seconds": 3, "runs_at_once": 2}'),
+        ("summary.json", '{"seconds": {"fit": NaN}, "runs_at_once": 2}'),
+        ("summary.json", '{"seconds": {"fit": 1}, "runs_at_once": "2"}'),
+        ("summary.json", '{"seconds": {"fit": 1}, "runs_at_once": ' + "9" * 400 + "}"),
+    ],
+)
+def test_damaged_metrics(folder, name, content):
+    store_metrics(folder)
+    assert read_metrics(folder)[1:] == (1.5, 2)
+    (folder / name).write_text(content)
+    with pytest.raises(InputError):
+        read_metrics(folder)
+
+
+@pytest.fixture(scope="module")
+def readers():
+    with Isolated("support.hostile_configs:call") as call:
+        yield call
+
+
+@pytest.mark.extended
+@pytest.mark.parametrize("reader", ["record", "metrics"])
+def test_any_damage_is_one_error(folder, readers, reader):
+    store_metrics(folder)
+    path = folder / "out" / "ablation.json" if reader == "record" else folder / "evaluation.json"
+    if reader == "record":
+        claim(folder, folder / "out")
+        (folder / "grid.yaml").rename(folder / "out" / "grid.yaml")
+    valid = path.read_bytes()
+    trees = damaged_tree(json.loads(valid)).map(lambda changed: json.dumps(changed).encode())
+
+    @many_examples
+    @given(st.one_of(damaged_bytes(valid), trees))
+    def check(content):
+        path.write_bytes(content)
+        outcome = readers(reader, path)
+        assert outcome.acceptable, outcome
+
+    check()

@@ -1,0 +1,323 @@
+"""Fine-tuning: mixed samples, early stopping, resumption, accuracy, the command."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+from support.labelled_pictures import bird, coco, write_labels
+
+torch = pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
+
+from torch.utils.data import default_collate  # noqa: E402
+
+from jaxfit.cli.main import main  # noqa: E402
+from jaxfit.foundation.errors import InputError  # noqa: E402
+from jaxfit.learning.networks import fine_tune, keypoints, loop, segmenter  # noqa: E402  # noqa: E402
+from jaxfit.learning.networks.label_data import LabelFiles, prepare_data  # noqa: E402
+from jaxfit.learning.networks.labelled_frames import UNKNOWN, load_frames  # noqa: E402
+from jaxfit.learning.networks.loop import (  # noqa: E402
+    Checkpoint,
+    Schedule,
+    Source,
+    _Order,
+    _Samples,
+    continue_training,
+)
+from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages  # noqa: E402
+from jaxfit.learning.networks.validation import keypoint_accuracy, segmenter_accuracy  # noqa: E402
+from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
+from jaxfit.perception.network import OnnxModel, instance_of  # noqa: E402
+
+TIMES = range(0, 400, 50)
+SCHEDULE = Schedule(10, 2, 1e-3)
+
+
+@pytest.fixture
+def data(tmp_path):
+    file = write_labels(tmp_path / "labels", coco({t: [bird(40 + t // 20, 30)] for t in TIMES}), list(TIMES))
+    return prepare_data("segmenter", LabelFiles((file,)), 0.25, None, tmp_path / "training")
+
+
+@pytest.fixture
+def same_process(monkeypatch):
+    """Draw the batches in this process, because a new process takes seconds."""
+
+    def batches(sources, batch, seed, first, last):
+        samples = _Samples(sources, seed, first * batch, (last - first) * batch)
+        order = iter(_Order(sources, first * batch, (last - first) * batch))
+        for _ in range(last - first):
+            yield default_collate([samples[next(order)] for _ in range(batch)])
+
+    monkeypatch.setattr(loop, "batches", batches)
+
+
+def tiny_network():
+    torch.manual_seed(0)
+    return FeaturePyramid(residual_stages((4, 4), (0, 1)), (4, 4), (4,), {"foreground": 1, "centre": 1, "offset": 2})
+
+
+def trained(folder, state, score=None, stop_after=None):
+    """Train a tiny network; `stop_after` interrupts the training in this step."""
+    network = tiny_network()
+    taken = []
+
+    def loss(maps, sample):
+        if len(taken) == stop_after:
+            raise KeyboardInterrupt
+        taken.append(1)
+        return segmenter.loss(maps, sample)
+
+    sources = [Source(folder, partial(segmenter.draw_sample, scene_share=0.5))]
+    result = continue_training(network, loss, sources, SCHEDULE, 3, state, "mark", score)
+    return result, len(taken)
+
+
+@pytest.mark.usefixtures("same_process")
+@pytest.mark.extended
+def test_interrupted_training_gives_the_same_weights(data, tmp_path):
+    folder = tmp_path / "training" / "frames"
+    whole, _ = trained(folder, tmp_path / "whole.npz")
+    with pytest.raises(KeyboardInterrupt):
+        trained(folder, tmp_path / "parts.npz", stop_after=6)
+    resumed, steps = trained(folder, tmp_path / "parts.npz")
+    assert steps == 4
+    assert resumed.step == whole.step == 10
+    assert np.array_equal(resumed.weights, whole.weights)
+    assert not np.array_equal(whole.weights, loop.flat_weights(tiny_network()))
+    finished, steps = trained(folder, tmp_path / "parts.npz")
+    assert steps == 0
+    assert np.array_equal(finished.best_weights, whole.best_weights)
+
+
+@pytest.mark.usefixtures("same_process")
+def test_best_weights_and_early_stopping(data, tmp_path):
+    scores = iter([0.1, 0.5, 0.4, 0.5, 0.3, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1])
+    best, steps = trained(tmp_path / "training" / "frames", tmp_path / "best.npz", lambda: next(scores))
+    assert steps == 7  # four measurements after the last measurement of 0.5, which follows step 3
+    assert best.history[:, 1].tolist() == [0.1, 0.5, 0.4, 0.5, 0.3, 0.2, 0.2, 0.1]
+    with pytest.raises(KeyboardInterrupt):
+        trained(tmp_path / "training" / "frames", tmp_path / "short.npz", stop_after=3)
+    assert np.array_equal(best.best_weights, np.load(tmp_path / "short.npz")["weights"])
+
+
+@pytest.mark.usefixtures("same_process")
+def test_the_best_weights_are_trained_weights(data, tmp_path):
+    """A training that never reaches the score of the initial weights has a best step of its own."""
+    scores = iter([0.9, 0.1, 0.5, 0.4, 0.3])
+    best, steps = trained(tmp_path / "training" / "frames", tmp_path / "best.npz", lambda: next(scores))
+    assert steps == 4  # four measurements without a better score
+    assert best.best_step == 2
+    assert not np.array_equal(best.best_weights, loop.flat_weights(tiny_network()))
+    assert not np.array_equal(best.best_weights, best.weights)
+
+
+@pytest.fixture
+def compared(tmp_path, monkeypatch):
+    """Return a function that runs a fine-tuning of networks with given scores.
+
+    It returns the result and all written files: their names, the longer side of the pictures that they expect, and
+    whether their weights are trained.
+    """
+    file = write_labels(tmp_path / "labels", coco({t: [bird()] for t in TIMES}), list(TIMES))
+    written = []
+
+    def training(model, *_others):
+        weights = loop.flat_weights(model)
+        history = np.array([[0, 0.5], [5, 0.6], [10, 0.4]])
+        return Checkpoint("", 10, weights, weights, weights, weights + 1, history)
+
+    def write(model, facts, path, longer_side_px):
+        trained = loop.flat_weights(model)[0] != initial[0]
+        written.append((path.name, longer_side_px, bool(trained)))
+
+    def compare(**scores):
+        def accuracy(path, pictures):
+            name = "base" if path.name != fine_tune.CHECKED else "trained" if written[-1][2] else "rescaled"
+            return {"mean_iou": scores[name] - 0.1, "ap50": scores[name] + 0.1}
+
+        monkeypatch.setattr(fine_tune, "segmenter_accuracy", accuracy)
+        settings = fine_tune.Settings(scenes=0, holdout=0.25)
+        result = fine_tune.fine_tune("segmenter", LabelFiles((file,)), tmp_path / "mine.onnx", "", settings)
+        return result, written
+
+    base = fine_tune.base_file("segmenter", "builtin")
+    initial = loop.flat_weights(fine_tune.load_segmenter_base(base))
+    for name, function in (
+        ("continue_training", training),
+        ("write_segmenter", write),
+        ("load_segmenter", lambda path, kind: path),
+        ("store_training_activations", lambda *_sources, **_options: None),
+    ):
+        monkeypatch.setattr(fine_tune, name, function)
+    return compare
+
+
+@pytest.mark.parametrize(
+    ("scores", "chosen", "longer_side_px", "is_trained"),
+    [
+        ({"base": 0.736, "rescaled": 0.907, "trained": 0.8}, "rescaled", 640, False),
+        ({"base": 0.7, "rescaled": 0.2, "trained": 0.6}, "base", 864, False),
+        ({"base": 0.7, "rescaled": 0.2, "trained": 0.8}, "trained", 640, True),
+        ({"base": 0.7, "rescaled": 0.7, "trained": 0.7}, "trained", 640, True),
+    ],
+)
+def test_the_best_score_decides_what_is_written(compared, scores, chosen, longer_side_px, is_trained):
+    """The base network has one score at its own scale and another at the scale of the labels."""
+    result, written = compared(**scores)
+    assert {name: column["score"] for name, column in result.accuracy.items()} == pytest.approx(scores)
+    assert result.chosen == chosen
+    assert written[:-1] == [(fine_tune.CHECKED, 640, False), (fine_tune.CHECKED, 640, True)]
+    assert written[-1] == ("mine.onnx", longer_side_px, is_trained)
+
+
+def test_the_command_says_which_networks_it_compares(tmp_path, monkeypatch, capsys):
+    columns = {
+        name: {"mean_iou": iou, "ap50": 0.9, "score": (iou + 0.9) / 2}
+        for name, iou in (("base", 0.736), ("rescaled", 0.908), ("trained", 0.8))
+    }
+    parts = {"training": 7, "holdout": 2, "gap": 1}
+    for chosen, sentences in (
+        ("base", ("The base network has the best score", "written without training, with its own scale")),
+        ("rescaled", ("The base network at the new scale has the best", "with the scale of the labels")),
+        ("trained", ("The trained network has the best score", "from step 8 of 10", "trained again")),
+    ):
+        result = fine_tune.FineTuned(columns, chosen, [], parts, "held out by blocks of time", (), 8, 10)
+        monkeypatch.setattr(fine_tune, "fine_tune", lambda *_files, result=result, **_options: result)
+        command = ["train", "segmenter", "--labels", "labels.json", "--out", str(tmp_path / "mine.onnx")]
+        assert main([*command, "--frames", str(tmp_path / "simulated")]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert "20 simulated scenes will be filmed into" in said
+        assert "so that the network does not forget birds that the labels lack" in said
+        for expected in ("base network", "base, new scale", "trained", "0.736", "0.908", "0.800"):
+            assert expected in said
+        assert "score: mean of rows 1 and 2 │ 0.818 │ 0.904 │ 0.850" in said
+        for sentence in sentences:
+            assert sentence in said
+
+
+@pytest.mark.usefixtures("same_process")
+def test_state_of_another_training_is_rejected(data, tmp_path):
+    trained(tmp_path / "training" / "frames", tmp_path / "state.npz")
+    state = dict(np.load(tmp_path / "state.npz"))
+    np.savez(tmp_path / "state.npz", **state | {"fingerprint": "other"})
+    with pytest.raises(InputError, match="interrupted training with other labels or options"):
+        trained(tmp_path / "training" / "frames", tmp_path / "state.npz")
+    np.savez(tmp_path / "state.npz", **state | {"weights": state["weights"] * np.nan})
+    with pytest.raises(InputError, match="is damaged"):
+        trained(tmp_path / "training" / "frames", tmp_path / "state.npz")
+
+
+def test_samples_come_from_both_sources_by_their_shares(data, tmp_path):
+    folder = tmp_path / "training" / "frames"
+    sources = [Source(folder, lambda _rng, _frames, k=k: k, share) for k, share in enumerate((0.7, 0.3))]
+    samples = _Samples(sources, seed=1, first=100, count=400)
+    drawn = [samples[i] for i in range(400)]
+    assert np.mean(drawn) == pytest.approx(0.3, abs=0.07)
+    later = _Samples(sources, seed=1, first=150, count=400)
+    assert [later[i] for i in range(50)] == drawn[50:100]  # a sample depends on its number only
+
+
+def test_simulated_keypoints_take_the_names_of_the_labels(data, tmp_path):
+    frames = load_frames(tmp_path / "training" / "frames")._replace(
+        keypoints_px=np.arange(6 * 2 * 20 * 2, dtype=np.float32).reshape(6, 2, 20, 2),
+        visibility=np.stack([np.full((6, 20), 2, np.uint8), np.zeros((6, 20), np.uint8)], 1),
+        keypoint_names=MURRE_KEYPOINTS,
+    )
+    mapped = frames.with_keypoints(["beak", "own", "eyeR"])
+    assert mapped.visibility[0].tolist() == [[2, UNKNOWN, 2], [0, 0, 0]]
+    assert np.array_equal(mapped.keypoints_px[:, :, 2], frames.keypoints_px[:, :, MURRE_KEYPOINTS.index("right_eye")])
+    sample = keypoints.draw_sample(
+        np.random.default_rng(0),
+        mapped._replace(owner=data.frames.owner)._replace(visibility=np.full((6, 2, 3), 2, np.uint8)),
+    )
+    assert sample.weight.shape == (3,)
+
+
+def test_accuracy_of_known_detections(data):
+    holdout = data.holdout
+
+    def shifted(pixels):
+        white = np.roll(pixels[..., 0] == 250, 10, axis=1)  # a third of the square
+        return [instance_of(white, 0.9, "bird")]
+
+    found = segmenter_accuracy(shifted, holdout)
+    assert found["mean_iou"] == pytest.approx(20 / 40, abs=0.03)
+    assert segmenter_accuracy(lambda pixels: [], holdout) == {"mean_iou": 0.0, "ap50": 0.0}
+    perfect = segmenter_accuracy(lambda pixels: [instance_of(pixels[..., 0] == 250, 0.9, "bird")], holdout)
+    assert perfect["mean_iou"] > 0.93
+    assert perfect["ap50"] == pytest.approx(1)
+
+    class Detector:
+        keypoint_names = ("here",)
+
+        def __call__(self, frame, instances):
+            centres = [bird.box_px[:2] + bird.box_px[2:] / 2 + (2.4, 0) for bird in instances]
+            return np.array(centres, np.float32)[:, None], np.ones((len(instances), 1), np.float32)
+
+    found = keypoint_accuracy(Detector(), holdout, {"centre": "here"})  # 8 % of the bird's length
+    assert found["pck_05"] == 0
+    assert found["pck_10"] == 1
+    assert found["error"] == pytest.approx(8, abs=0.6)
+    assert keypoint_accuracy(Detector(), holdout, {"centre": ""})["pck_10"] == 0
+
+
+def test_wrong_use_of_the_command(tmp_path, capsys):
+    out = str(tmp_path / "mine.onnx")
+    assert main(["train", "segmenter", "--images", str(tmp_path), "--out", out]) == 2
+    assert "--images: needs labels" in capsys.readouterr().err
+    labels = str(write_labels(tmp_path / "labels", coco({0: [bird()]}), [0]))
+    command = ["train", "segmenter", "--labels", labels, "--scenes", "0", "--out", out]
+    for extra, message in (
+        ([], "has no bird"),
+        (["--holdout", "0.9"], "holdout"),
+        (["--base", labels], "cannot be loaded"),
+        (["--images", labels, labels], "names 2 videos or folders for 1 files"),
+    ):
+        assert main([*command, *extra]) == 2
+        *_progress, error = capsys.readouterr().err.strip().split("\n")
+        assert error.startswith("jaxfit: ")
+        assert message in error
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["labels"]
+
+
+@pytest.mark.extended
+def test_command_after_a_kill(tmp_path):
+    """A killed training continues, and the result is that of an uninterrupted training."""
+    labels = write_labels(tmp_path / "labels", coco({t: [bird(40 + t // 20, 30)] for t in TIMES}), list(TIMES))
+    run = "from jaxfit.cli.main import run; run()"
+    command = [
+        sys.executable,
+        "-c",
+        run,
+        "train",
+        "segmenter",
+        "--labels",
+        str(labels),
+        "--scenes",
+        "0",
+        "--steps",
+        "10",
+    ]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    whole, parts = tmp_path / "whole.onnx", tmp_path / "parts.onnx"
+    done = subprocess.run([*command, "--out", str(whole)], env=environment, capture_output=True, text=True, check=True)
+    assert "torchvision" not in done.stderr  # a warning of the exporter
+    assert "base network" in done.stdout
+    assert "trained" in done.stdout
+    state = tmp_path / "parts.onnx.training" / "checkpoint.npz"
+    process = subprocess.Popen([*command, "--out", str(parts)], env=environment, start_new_session=True)
+    while not state.exists() and process.poll() is None:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not parts.exists()
+    assert np.load(state)["step"] < 10
+    subprocess.run([*command, "--out", str(parts)], env=environment, check=True)
+    assert parts.read_bytes() == whole.read_bytes()
+    assert not state.parent.exists()
+    assert OnnxModel(whole).metadata["trained_on"].startswith("8 labelled pictures")  # the held-out pictures too
