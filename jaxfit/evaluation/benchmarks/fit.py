@@ -244,14 +244,20 @@ def bench_solvers(
                 result[name] = {"steps": steps, "loss": loss}
     for name, seconds in seconds_of_runs.items():
         result[name]["seconds"] = np.median(seconds, axis=0).tolist()
-    target, adam_s = result["adam"]["loss"][-1], result["adam"]["seconds"][-1]
-    result |= {"adam_s": adam_s, "adam_loss": target}
-    for name in list(schedules)[1:]:
-        result[f"{name}_loss"] = result[name]["loss"][-1]
-        reached = [s for s, loss in zip(result[name]["seconds"], result[name]["loss"], strict=True) if loss <= target]
-        result[f"{name}_s"] = reached[0] if reached else None
-        result[f"{name}_ratio"] = reached[0] / adam_s if reached else None
-    return result
+    return result | _compared(result, list(schedules)[1:])
+
+
+def _compared(curves: dict[str, Any], others: list[str]) -> dict[str, Any]:
+    """Return the final losses, and when the other solvers reach Adam's, as `bench_solvers` names them."""
+    target, adam_s = curves["adam"]["loss"][-1], curves["adam"]["seconds"][-1]
+    compared = {"adam_s": adam_s, "adam_loss": target}
+    for name in others:
+        seconds, losses = curves[name]["seconds"], curves[name]["loss"]
+        reached = [s for s, loss in zip(seconds, losses, strict=True) if loss <= target]
+        compared[f"{name}_loss"] = losses[-1]
+        compared[f"{name}_s"] = reached[0] if reached else None
+        compared[f"{name}_ratio"] = reached[0] / adam_s if reached else None
+    return compared
 
 
 def _total_loss(final: Report) -> float:

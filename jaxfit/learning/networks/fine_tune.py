@@ -245,6 +245,16 @@ def _fine_tune(
     _write(network, model, data.keypoint_names, scales[chosen], facts, path)
     store_training_activations(network, path, used, progress=progress)
     _remove(folder)
+    return _summary(accuracy, chosen, data, names, checkpoint)
+
+
+def _summary(
+    accuracy: dict[Candidate, dict[str, float]],
+    chosen: Candidate,
+    data: FineTuningData,
+    names: dict[str, str],
+    checkpoint: Checkpoint,
+) -> FineTuned:
     return FineTuned(
         accuracy,
         chosen,
