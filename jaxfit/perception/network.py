@@ -17,7 +17,9 @@ from __future__ import annotations
 import base64
 import binascii
 import math
+import mmap
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -151,7 +153,7 @@ class OnnxModel:
         threads: number of cores for one run; None uses all cores.
 
     Raises:
-        InputError: the file does not exist, is not ONNX, lacks its external data, contains an unknown operator or text
+        InputError: the file does not exist, is not ONNX, names external data, contains an unknown operator or text
             that is not UTF-8, or declares an input without values or with too many values.
     """
 
@@ -169,6 +171,9 @@ class OnnxModel:
             size = os.fstat(file.fileno()).st_size
         if size > NETWORK_BYTES:
             raise InputError(path, f"has {size:,} bytes", f"the limit is {NETWORK_BYTES:,}")
+        if size and _has_external_data(self.path):
+            problem = "stores its weights in another file (external data), which is not read"
+            raise InputError(path, problem, "save the network as one file: onnx.save(onnx.load(path), new_path)")
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads or 0
         options.log_severity_level = 4  # the error below reports the problem
@@ -254,10 +259,15 @@ def _shorten(error: Exception) -> str:
     return " ".join(str(error).split(" : ")[-1].split())[:300]
 
 
+def _has_external_data(path: Path) -> bool:
+    """Return whether a file names external data: a tensor with an entry of the key `location` (`onnx.proto`)."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        # field 13 of a tensor: tag, length in up to five bytes, then the key; metadata of a model have another tag
+        return re.search(rb"\x6a[\x80-\xff]{0,4}[\x00-\x7f]\x0a\x08location\x12", content) is not None
+
+
 def _remedy(text: str) -> str:
     lowered = text.lower()
-    if "external" in lowered or "model_path" in lowered or "file_size" in lowered:
-        return "put the file with its external data (often `….onnx.data`) into the same folder, with its original name"
     if "protobuf" in lowered:
         return "give a complete ONNX file"
     return "export it again; use an older opset if an operator is unknown"

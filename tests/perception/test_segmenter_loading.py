@@ -9,6 +9,7 @@ from onnx import TensorProto
 from support.onnx_graphs import write_constant, write_reading
 
 from jaxfit.foundation.errors import InputError
+from jaxfit.perception.network import OnnxModel
 from jaxfit.perception.segmentation import KINDS, load_segmenter
 from jaxfit.perception.segmentation_inputs import Placement, non_maximum_suppression
 
@@ -108,12 +109,23 @@ def test_files_that_cannot_be_loaded(tmp_path, path):
     path.write_bytes(b"no network")
     with pytest.raises(InputError, match="cannot be loaded"):
         load(path)
+
+
+def test_external_data_are_refused(tmp_path, path):
+    """ONNX Runtime reads every file that a network names, also the file of the network itself."""
     whole = onnx.load(write(path, output0=HEAD, output1=PROTOS))
-    onnx.save(whole, path, save_as_external_data=True, location="net.onnx.data", size_threshold=0)
     assert load(path).class_names == ("bird",)
-    (tmp_path / "net.onnx.data").unlink()
-    with pytest.raises(InputError, match="external data"):
-        load(path)
+    for location in ("net.onnx.data", path.name):
+        for tensor in whole.graph.initializer:
+            tensor.ClearField("external_data")
+            onnx.external_data_helper.set_external_data(tensor, location, offset=0)
+        (tmp_path / "net.onnx.data").write_bytes(bytes(1 << 16))
+        path.write_bytes(whole.SerializeToString())
+        with pytest.raises(InputError, match=r"external data.*save the network as one file"):
+            load(path)
+    onnx.helper.set_model_props(whole := onnx.load(write(path, output0=HEAD, output1=PROTOS)), {"location": "ledge 3"})
+    path.write_bytes(whole.SerializeToString())
+    OnnxModel(path)
 
 
 def test_detector_needs_a_saliency_network(tmp_path, path):
