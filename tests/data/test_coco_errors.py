@@ -196,3 +196,8 @@ def test_only_other_categories_is_no_bird(tmp_path):
         entry["category_id"] = 2
     with pytest.raises(InputError, match=r"annotations hold no bird \(5 of other categories\)"):
         read_coco(saved(tmp_path, data))
+
+
+def test_an_empty_path_is_one_error():
+    with pytest.raises(InputError, match=r"\. *: is a folder"):
+        read_coco("")

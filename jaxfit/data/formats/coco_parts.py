@@ -57,7 +57,7 @@ _HEAD |= {"footage_frames": "", "footage_first_frame": "P"}  # −1 and empty wh
 
 def parts_folder(path: Path) -> Path:
     """Return the folder of the copy of a COCO file."""
-    return path.with_suffix(".parts")
+    return path.parent / f"{path.stem}.parts"
 
 
 def write_coco_parts(
