@@ -140,7 +140,7 @@ def _export(commands: Any) -> None:
     export.add_argument("result", type=Path, metavar="RESULT", help="folder of a result")
     tools = "; ".join(f"{name} ({form.tools})" for name, form in FORMATS.items())
     export.add_argument("--to", required=True, choices=tuple(FORMATS), metavar="FORMAT", help=f"format: {tools}")
-    text = "file to write; a folder for nwb, and for glb without --one-file"
+    text = "file to write; a folder for nwb, and for glb unless the name ends with .glb"
     add_out(export, "PATH", text, overwrite="existing files, or an earlier export in the folder")
     export.add_argument("--tracks", metavar="ID,ID", help="only these tracks")
     text = "only the frames from number A to number B − 1; A or B may be left out"
@@ -157,7 +157,6 @@ def _export(commands: Any) -> None:
     export.add_argument("--dims", choices=("singular", "plural"), help=text)
     text = "nwb: time of frame 0 of the footage, such as 2024-06-01T12:00:00+02:00"
     export.add_argument("--start", metavar="TIME", help=text)
-    export.add_argument("--one-file", action="store_true", help="glb: all birds in one file")
     export.add_argument("--ground", action="store_true", help="glb: add a level ground below the feet of the birds")
 
 

@@ -62,7 +62,7 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     observed = evaluate_observations(observations, truth)
     solution, matching = match_tracks(done.solution, truth, "overlap")
     result = evaluate(solution, bird, truth, terminal)
-    export_result(result_folder, "glb", folder / ANIMATION, one_file=True, overwrite=True, progress=terminal)
+    export_result(result_folder, "glb", folder / ANIMATION, overwrite=True, progress=terminal)
     metrics = {"detection": observed.detection, "tracking": observed.tracking, **result.overall}
     write_whole(folder / METRICS, json_text(metrics).encode())
     compared, numbers = [*observation_tables(observed), *evaluation_tables(result)], matching_line(matching)

@@ -105,7 +105,6 @@ def export(options: argparse.Namespace) -> None:
         progress=terminal,
         space=options.space,
         dims=options.dims,
-        one_file=options.one_file,
         ground=options.ground,
         start=options.start,
     )

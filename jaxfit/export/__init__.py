@@ -20,14 +20,14 @@ class Format(NamedTuple):
     """Accepted ends of the file name."""
     options: tuple[str, ...] = ()
     folder: bool = False
-    """Whether the output is a folder (with `one_file`, it is a file)."""
+    """Whether the output is a folder, unless its name ends with one of the suffixes."""
 
 
 FORMATS = {
     "csv": Format("tables", "write_csv", "R, spreadsheets, pandas", (".csv",)),
     "parquet": Format("tables", "write_parquet", "R, pandas, polars, DuckDB", (".parquet",)),
     "movement": Format("pose_files", "write_movement", "movement, xarray, napari", (".nc",), ("space", "dims")),
-    "glb": Format("glb", "write_glb", "Blender, three.js, viewers", (".glb",), ("one_file", "ground"), True),
+    "glb": Format("glb", "write_glb", "Blender, three.js, viewers", (".glb",), ("ground",), True),
     "nwb": Format("pose_files", "write_nwb", "pynwb, NWB Explorer, DANDI", (), ("start",), True),
     "coco": Format("pose_files", "write_coco_keypoints", "CVAT, programs that read COCO", (".json",)),
     "slp": Format("pose_files", "write_slp_keypoints", "SLEAP", (".slp",)),

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxfit.export import FORMATS, Format
+from jaxfit.export import FORMATS
 from jaxfit.export.result import MARKER, open_result
 from jaxfit.export.tables import angles_path
 from jaxfit.foundation.errors import InputError
@@ -44,7 +44,8 @@ def export_result(
     Args:
         result: folder of `jaxfit fit` or `jaxfit reconstruct`.
         to: a name of `jaxfit.export.FORMATS`: `csv`, `parquet`, `movement`, `coco`, `slp`, `dlc`, `glb`, `nwb`.
-        out: the file to write; a folder for `nwb`, and for `glb` without `one_file`.
+        out: the file to write. A folder, with a file for every bird, for `nwb`, and for `glb` unless the name ends with
+            `.glb`.
         tracks: ids of the tracks; None exports all tracks.
         frames: number of the first frame, and number after the last frame; None is an end of the result.
         fps: frame rate of the footage in frames per second; None takes the times and the rate of the result.
@@ -53,7 +54,7 @@ def export_result(
         overwrite: replace existing files, or an earlier export in the folder.
         progress: shows progress.
         **options: options of the format: `space` ("2d", "3d") and `dims` ("singular", "plural") of `movement`;
-            `one_file` and `ground` (bools) of `glb`; `start` (ISO 8601, time of frame 0) of `nwb`.
+            `ground` (bool) of `glb`; `start` (ISO 8601, time of frame 0) of `nwb`.
 
     Returns:
         The written files, the unit of lengths, and notes.
@@ -72,8 +73,8 @@ def export_result(
         option = f"--{foreign[0].replace('_', '-')}"
         problem = f"does not belong to the format {to}"
         raise InputError(option, problem, f"remove {option}, or choose another format")
-    to_folder = form.folder and not chosen.get("one_file")
-    _check_out(out, to_folder, form, overwrite)
+    to_folder = form.folder and out.suffix not in form.suffixes
+    _check_out(out, to_folder, to, overwrite)
     exported = open_result(result, tracks, frames, fps, metres_per_unit, video)
     if to_folder:
         chosen["overwrite"] = overwrite
@@ -82,9 +83,14 @@ def export_result(
     return Export(files, exported.unit, notes)
 
 
-def _check_out(out: Path, to_folder: bool, form: Format, overwrite: bool) -> None:
+def _check_out(out: Path, to_folder: bool, to: str, overwrite: bool) -> None:
     """Raise InputError if the output exists or cannot be written, before the long work."""
+    form = FORMATS[to]
     if to_folder:
+        if out.suffix in {".nwb", *(suffix for each in FORMATS.values() for suffix in each.suffixes)}:
+            end = "".join(f", or of a file that ends with {suffix}" for suffix in form.suffixes)
+            problem = f"is the name of a file, but {to} writes a folder with a file for every bird"
+            raise InputError(out, problem, f"give the name of a folder{end}")
         check_replaceable(out, overwrite, MARKER)
         return
     if out.suffix not in form.suffixes:

@@ -105,7 +105,6 @@ def write_glb(
     exported: Exported,
     out: Path,
     progress: ProgressTask,
-    one_file: bool = False,
     ground: bool = False,
     overwrite: bool = False,
 ) -> tuple[list[Path], list[str]]:
@@ -113,9 +112,8 @@ def write_glb(
 
     Args:
         exported: the result.
-        out: a folder, or the file with `one_file`.
+        out: a folder for a file of every bird, or a file for all birds whose name ends with `.glb`.
         progress: shows progress.
-        one_file: write all birds into one file.
         ground: turn the scene so that the ground is level, and add a rectangle below the feet.
         overwrite: replace an earlier export in the folder.
 
@@ -137,7 +135,7 @@ def write_glb(
         level = level_ground(exported, motions) if ground else None
         error = weight_error(exported)
         facts = {"largest_error_of_four_weights": error, "focal_length_px": focal_px}
-        if one_file:
+        if out.suffix == ".glb":
             write_whole(out, _content(exported, motions, fitted, focal_px, level, facts))
             files = [out]
         else:

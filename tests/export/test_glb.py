@@ -34,7 +34,7 @@ def betas():
 @pytest.fixture(scope="module")
 def glb(folder, tmp_path_factory):
     out = tmp_path_factory.mktemp("glb") / "birds.glb"
-    jaxfit.export_result(folder, "glb", out, one_file=True)
+    jaxfit.export_result(folder, "glb", out)
     return Glb(out)
 
 
@@ -103,7 +103,7 @@ def test_the_error_of_fewer_weights_is_reported(tmp_path):
     weights[0] = [0.3, 0.2, 0.15, 0.15, 0.1, 0.1, 0, 0]
     bird = dataclasses.replace(BIRD, skin_weights=weights)
     made = write_result(tmp_path / "result", bird=bird)
-    done = jaxfit.export_result(tmp_path / "result", "glb", tmp_path / "birds.glb", one_file=True)
+    done = jaxfit.export_result(tmp_path / "result", "glb", tmp_path / "birds.glb")
     assert "vertices move by up to" in done.notes[0]
     glb = Glb(tmp_path / "birds.glb")
     error = glb.root["asset"]["extras"]["largest_error_of_four_weights"]
@@ -128,8 +128,15 @@ def vertex_by_hand(bird, pose, row):
 
 def test_no_pose_and_no_frame_rate(folder, tmp_path):
     with pytest.raises(InputError, match="holds no pose in the chosen tracks"):
-        jaxfit.export_result(folder, "glb", tmp_path / "birds.glb", tracks=[8], one_file=True)
+        jaxfit.export_result(folder, "glb", tmp_path / "birds.glb", tracks=[8])
     write_result(tmp_path / "result", fps=None, timestamp_s=None)
     with pytest.raises(InputError, match="does not hold the frame rate"):
         jaxfit.export_result(tmp_path / "result", "glb", tmp_path / "birds", tracks=[3])
     assert not (tmp_path / "birds").exists()
+
+
+@pytest.mark.parametrize(("to", "name"), [("glb", "birds.csv"), ("nwb", "birds.nwb"), ("nwb", "birds.glb")])
+def test_the_name_of_a_file_never_becomes_a_folder(folder, tmp_path, to, name):
+    with pytest.raises(InputError, match=f"{name}: is the name of a file, but {to} writes a folder"):
+        jaxfit.export_result(folder, to, tmp_path / name)
+    assert not (tmp_path / name).exists()
