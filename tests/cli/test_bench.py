@@ -2,12 +2,9 @@
 
 import json
 
-import pytest
-
 from jaxfit.cli.main import main
 from jaxfit.evaluation.benchmarks import fit, raster
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 SILHOUETTE = {
     "frames": 100,
     "faces": 5712,
