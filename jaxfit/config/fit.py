@@ -205,6 +205,10 @@ class FitConfig:
     grow_masks_px: float = 0.0
     """Pixels of a 256-pixel crop by which masks are enlarged before they are compared with silhouettes. The 0.5 level
     of a soft silhouette lies outside the mesh (murre, blur 1: 2.3 pixels), so birds are fitted too small without it."""
+    edge: Literal["soft_rasterizer", "unbiased"] = "soft_rasterizer"
+    """Edge of the silhouette. `soft_rasterizer`: as published; the silhouette is larger than its mesh, by 1.5 pixels at
+    blur 1. `unbiased`: the covered area of the pixels, filtered like the mask; the silhouette has the area of its
+    mesh."""
     min_keypoints: int = 4
     """Number of confident keypoints that a frame needs to be fitted."""
     crop: CropConfig = CropConfig()

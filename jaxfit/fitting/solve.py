@@ -422,7 +422,7 @@ def _terms_without_masks(stage: StageConfig) -> tuple[str, ...]:
 def stage_program(config: FitConfig, stage: StageConfig, model: FitModel) -> Program:
     """Return the program of one stage. The functions of the terms are part of the program."""
     paper_blur = Blur.for_size(config.crop.size_px)
-    blur = Blur(paper_blur.sigma * stage.blur**2, paper_blur.radius * stage.blur)
+    blur = Blur(paper_blur.sigma * stage.blur**2, paper_blur.radius * stage.blur, config.edge)
     raster = Raster(blur, config.crop.size_px, config.backend)
     return Program(
         model.rig,

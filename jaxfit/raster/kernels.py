@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
-from jaxfit.raster.silhouette_reference import KINDS, Blur, Skin
+from jaxfit.raster.silhouette_reference import EDGES, KINDS, Blur, Skin
 
 ISA_VARIABLE = "JAXFIT_KERNEL_ISA"
 _MODULE = "jaxfit.raster._kernels"
@@ -95,7 +95,8 @@ PARAMETER_MULTIPLE = 16
 def _call(name: str, results, *operands, blur: Blur, **attributes):
     require_kernels()
     call = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")
-    return call(*operands, sigma=np.float32(blur.sigma), radius=np.float32(blur.radius), **attributes)
+    softness = {"sigma": np.float32(blur.sigma), "radius": np.float32(blur.radius)}
+    return call(*operands, **softness, edge=np.int32(EDGES.index(blur.edge)), **attributes)
 
 
 def _shape_like(vertices) -> jax.ShapeDtypeStruct:

@@ -1,20 +1,22 @@
-"""The soft silhouette in plain JAX: the specification that the tests compare the compiled kernels with.
+"""Silhouettes in plain JAX, of both kinds of edges: the specification that the tests compare the compiled kernels with.
 
 The reference runs on any platform and JAX derives its gradients. It is a few hundred times slower than the kernels.
 """
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 KINDS = ("l1", "smooth_l1")
+EDGES = ("soft_rasterizer", "unbiased")
 MIN_DEPTH = 1e-8  # a face with a vertex at or behind this depth is skipped
 MIN_AREA = 1e-8  # a face with at most this |2·area|, in units of half the image, is skipped
 FAR_AWAY = 2.0**20  # px; coordinates are clamped to ± this, so that their squares stay finite
+COVERED = 0.9999  # from this mean number of faces on, a pixel is covered
 BAND_EDGE = 0.01  # the Gauss-Newton block sums over the pixels whose silhouette is this far from 0 and from 1
 UNKNOWN = 2  # this value of a uint8 mask marks the pixels that may or may not show the bird
 _FACES_AT_ONCE = 16
@@ -31,9 +33,15 @@ class Blur:
     """Softness s in px²: a face covers a pixel at signed squared distance d by sigmoid(−d/s)."""
 
     radius: float
-    """px. A face does not affect the pixels outside it at this distance or farther."""
+    """px. A face does not affect the pixels outside it at this distance or farther. Only for `soft_rasterizer`."""
+
+    edge: Literal["soft_rasterizer", "unbiased"] = "soft_rasterizer"
+    """`soft_rasterizer`: every face has a soft edge, as published; the silhouette is larger than its mesh.
+    `unbiased`: the covered area of the pixels, filtered by a Gaussian with the variance 2·ln(2)·s of that edge."""
 
     def __post_init__(self):
+        if self.edge not in EDGES:
+            raise ValueError(f"edge: expected one of {EDGES}, got {self.edge!r}")
         if not (math.isfinite(self.sigma) and self.sigma > 0):
             raise ValueError(f"sigma: expected a positive number of px², got {self.sigma}")
         if not (math.isfinite(self.radius) and self.radius >= 0):
@@ -102,7 +110,21 @@ def _log_transmitted_of_mesh(vertices, faces, size, blur):
     xy = jnp.clip(vertices[:, :2], -FAR_AWAY, FAR_AWAY)
     vertices = jnp.concatenate([xy, jax.lax.stop_gradient(vertices[:, 2:])], -1)
 
-    # A few faces at a time, which the backward pass computes again: the memory is that of a few dozen images.
+    def log_transmitted(chunk):
+        indices, is_real = chunk
+        corners = vertices[indices]
+        behind_camera = corners.at[..., 2].set(-1.0)
+        corners = jnp.where(is_real[:, None, None], corners, behind_camera)
+        return _log_transmitted(corners, centres[None, :], centres[:, None], size, blur)
+
+    return _sum_over_faces(log_transmitted, jnp.zeros((size, size), vertices.dtype), faces)
+
+
+def _sum_over_faces(function, start, faces):
+    """Return start + Σ function((some faces, whether each face is real)), over all faces.
+
+    A few faces at a time, which the backward pass computes again: the memory is that of a few dozen images.
+    """
     count = faces.shape[0]
     padding = -count % _FACES_AT_ONCE
     chunks = jnp.pad(faces, ((0, padding), (0, 0))).reshape(-1, _FACES_AT_ONCE, 3)
@@ -110,22 +132,77 @@ def _log_transmitted_of_mesh(vertices, faces, size, blur):
 
     @jax.checkpoint
     def add(total, chunk):
+        return total + function(chunk), None
+
+    return jax.lax.scan(add, start, (chunks, real))[0] if count else start
+
+
+def _filtered(image: Float[Array, "size size"], blur: Blur) -> Float[Array, "size size"]:
+    """Filter an image by a Gaussian of the variance 2·ln(2)·s; pixels outside the image are 0."""
+    size, variance = image.shape[0], 2 * math.log(2) * blur.sigma
+    radius = math.ceil(3 * math.sqrt(variance))
+    taps = [math.exp(-0.5 * k * k / variance) for k in range(-radius, radius + 1)]
+    weights = jnp.asarray(taps, image.dtype) / sum(taps)
+    apart = jnp.arange(size)[:, None] - jnp.arange(size)
+    matrix = jnp.where(abs(apart) <= radius, weights[jnp.clip(apart + radius, 0, 2 * radius)], 0.0)
+    return matrix @ image @ matrix.T
+
+
+def _areas_below(start, end, column, row):
+    """Return the signed area of each pixel below the edges from `start` to `end`, (x, y) pairs, in its column.
+
+    The area is positive if the edge goes to the right. The sum over the edges of a face that turns from +x to +y is the
+    area of the pixel inside the face.
+    """
+    tiny = jnp.asarray(1e-12, start[0].dtype)
+    x, y, dx, dy = start[0], start[1], end[0] - start[0], end[1] - start[1]
+
+    def shares(low, at, change):
+        """The shares of the edge's length between which it lies between low and low + 1."""
+        inverse = 1 / jnp.where(jnp.abs(change) < tiny, tiny, change)
+        first, second = (low - at) * inverse, (low + 1 - at) * inverse
+        return jnp.minimum(first, second), jnp.maximum(first, second)
+
+    in_column = tuple(jnp.clip(t, 0, 1) for t in shares(column, x, dx))
+    in_row = shares(row, y, dy)
+    enter, leave = (jnp.clip(t, *in_column) for t in in_row)
+    # the share above the pixel is at the side of the smaller y
+    above = jnp.where(dy < 0, in_column[1] - leave, enter - in_column[0])
+    inside = (leave - enter) * (row + 1 - y - dy * (enter + leave) / 2)
+    return dx * (above + inside)
+
+
+def _coverage(vertices, faces, size):
+    """Return the covered area of each pixel: the larger mean number of faces of one of the two sides, at most 1."""
+    pixel = jnp.arange(size, dtype=vertices.dtype)
+    xy = jnp.clip(vertices[:, :2], -FAR_AWAY, FAR_AWAY)
+    vertices = jnp.concatenate([xy, jax.lax.stop_gradient(vertices[:, 2:])], -1)
+
+    def areas(chunk):
         indices, is_real = chunk
         corners = vertices[indices]
-        behind_camera = corners.at[..., 2].set(-1.0)
-        corners = jnp.where(is_real[:, None, None], corners, behind_camera)
-        return total + _log_transmitted(corners, centres[None, :], centres[:, None], size, blur), None
+        a, b, c = ((corners[:, i, 0, None, None], corners[:, i, 1, None, None]) for i in range(3))
+        turn = _side(c[0], c[1], a, b)
+        skipped = jnp.any(corners[..., 2] <= MIN_DEPTH, -1)[:, None, None] | (jnp.abs(turn) <= MIN_AREA * (size / 2) ** 2)
+        below = (_areas_below(*ends, pixel[None, :], pixel[:, None]) for ends in ((a, b), (b, c), (c, a)))
+        area = jnp.where(skipped | ~is_real[:, None, None], 0.0, sum(below) * jnp.sign(turn))
+        return jnp.stack([jnp.sum(jnp.where(side, area, 0.0), 0) for side in (turn > 0, turn < 0)])
 
-    start = jnp.zeros((size, size), vertices.dtype)
-    return jax.lax.scan(add, start, (chunks, real))[0] if count else start
+    mean = jnp.zeros((2, size, size), vertices.dtype)
+    mean = _sum_over_faces(areas, mean, faces).max(axis=0)
+    return jnp.where(mean < COVERED, mean, 1.0)
 
 
 def silhouette(
     vertices: Float[Array, "V 3"], faces: Int[Array, "F 3"], size: int, blur: Blur
 ) -> Float[Array, "size size"]:
-    """Return 1 − Π (1 − p) over all faces. See `jaxfit.raster.silhouette.silhouette`."""
+    """Return the silhouette. See `jaxfit.raster.silhouette.silhouette`."""
     finite = jnp.all(jnp.isfinite(vertices))
-    image = -jnp.expm1(_log_transmitted_of_mesh(jnp.where(finite, vertices, 0.0), faces, size, blur))
+    vertices_or_zero = jnp.where(finite, vertices, 0.0)
+    if blur.edge == "unbiased":
+        image = _filtered(_coverage(vertices_or_zero, faces, size), blur)
+    else:
+        image = -jnp.expm1(_log_transmitted_of_mesh(vertices_or_zero, faces, size, blur))
     # This term also makes the gradient NaN, with respect to every x and y.
     return image + jnp.sum(vertices[:, :2] * jnp.where(finite, 0.0, jnp.nan))
 
@@ -133,6 +210,17 @@ def silhouette(
 def _known(target):
     """Return the pixels of a mask that are not unknown; float and bool masks have no unknown pixels."""
     return target != UNKNOWN if target.dtype == jnp.uint8 else jnp.ones(target.shape, bool)
+
+
+def _error(vertices, faces, mask, known, blur):
+    """Return the difference of silhouette and mask, without the unknown pixels. A filter is applied to the whole."""
+    size = mask.shape[-1]
+    if blur.edge != "unbiased":
+        return jnp.where(known, silhouette(vertices, faces, size, blur) - mask, 0.0)
+    finite = jnp.all(jnp.isfinite(vertices))
+    coverage = _coverage(jnp.where(finite, vertices, 0.0), faces, size)
+    error = _filtered(jnp.where(known, coverage - mask, 0.0), blur)
+    return error + jnp.sum(vertices[:, :2] * jnp.where(finite, 0.0, jnp.nan))
 
 
 def mask_loss(
@@ -145,9 +233,9 @@ def mask_loss(
 ) -> Float[Array, ""]:
     """Return the unweighted loss. A weight of 0 gives a loss of 0."""
     missing = weight == 0
-    image = silhouette(jnp.where(missing, 0.0, vertices), faces, target.shape[-1], blur)
-    mask = target if jnp.issubdtype(target.dtype, jnp.floating) else (target != 0).astype(image.dtype)
-    error = jnp.where(_known(target), image - mask, 0.0)
+    vertices = jnp.where(missing, 0.0, vertices)
+    mask = target if jnp.issubdtype(target.dtype, jnp.floating) else (target != 0).astype(vertices.dtype)
+    error = _error(vertices, faces, mask, _known(target), blur)
     magnitude = jnp.abs(error)
     if kind == "smooth_l1":
         magnitude = jnp.where(magnitude < 1, 0.5 * error**2, magnitude - 0.5)
@@ -175,10 +263,11 @@ def silhouette_gauss_newton(
     tangents = jnp.concatenate([moved_px, moved_cam[..., 2:]], axis=-1)
 
     def image(v):
-        return silhouette(v, faces, target.shape[-1], blur)
+        return _error(v, faces, jnp.zeros(target.shape, v.dtype), _known(target), blur)
 
     value = image(vertices)
     rows = jax.vmap(lambda tangent: jax.jvp(image, (vertices,), (tangent,))[1])(tangents)  # (D, size, size)
-    band = (value > BAND_EDGE) & (value < 1 - BAND_EDGE) & _known(target)
-    block = jnp.einsum("dyx,eyx->de", jnp.where(band, rows, 0.0), rows)
+    if blur.edge != "unbiased":
+        rows = jnp.where((value > BAND_EDGE) & (value < 1 - BAND_EDGE), rows, 0.0)
+    block = jnp.einsum("dyx,eyx->de", rows, rows)
     return jnp.where(missing, 0.0, block)

@@ -9,11 +9,8 @@ namespace {
 
 constexpr int kBlock = 4;  // pixels along a side; a block has one pixel for each of the sixteen lanes
 constexpr float kSaturated = 1e5f;   // from this product on, the silhouette is within 1e-5 of 1
-constexpr float kFarAway = 1048576.f;  // px; coordinates are clamped to ± this, so that squares stay finite
-constexpr float kMinDepth = 1e-8f;
 constexpr float kNegligible = 6.3f;   // scaled distance from which p is below 2^-39
 constexpr float kShortest = 1e-12f;  // least length of an edge; shorter lengths are raised to this
-constexpr float kMinArea = 1e-8f;    // greatest |2·area| of a skipped face, in units of half the image
 
 // Sixteen faces. Lengths are scaled by k. The order of the vertices makes the area positive.
 struct Faces {
@@ -51,7 +48,7 @@ struct Layout {
         chunks(round_up(mesh.num_faces) / kLanes) {}
 };
 
-size_t workspace(const Mesh& mesh, int64_t size) {
+size_t workspace(const Mesh& mesh, Blur, int64_t size) {
   const Layout l(mesh, size);
   return sizeof(float) * (2 * l.vertices + l.products + l.open) + sizeof(Faces) * l.chunks;
 }

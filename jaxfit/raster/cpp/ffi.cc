@@ -22,6 +22,12 @@ Blur checked_blur(float sigma, float radius) {
   return {sigma, radius};
 }
 
+Edge checked_edge(int32_t edge) {
+  if (edge != static_cast<int32_t>(Edge::kSoftRasterizer) && edge != static_cast<int32_t>(Edge::kUnbiased))
+    throw std::invalid_argument("edge: expected 0 or 1, got " + std::to_string(edge));
+  return static_cast<Edge>(edge);
+}
+
 LossKind checked_kind(int32_t kind) {
   if (kind != static_cast<int32_t>(LossKind::kL1) && kind != static_cast<int32_t>(LossKind::kSmoothL1))
     throw std::invalid_argument("kind: expected 0 or 1, got " + std::to_string(kind));
@@ -29,35 +35,38 @@ LossKind checked_kind(int32_t kind) {
 }
 
 ffi::Error silhouette(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::Result<Floats> image, float sigma,
-                      float radius) {
+                      float radius, int32_t edge_number) {
   const int64_t size = size_of("image", image->dimensions());
   const Batch batch(image->dimensions(), 2);
   check_result("image", image->dimensions(), batch, {size, size});
   const Blur blur = checked_blur(sigma, radius);
-  const Meshes meshes(vertices, faces, batch);
-  const Kernels& kernels = current_kernels();
+  const Edge edge = checked_edge(edge_number);
+  const Meshes meshes(vertices, faces, batch, edge == Edge::kUnbiased);
+  const Kernels& kernels = current_kernels(edge);
   float* out = image->typed_data();
   for_each_task(pool, batch.count, [=, &batch, &meshes, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
-    kernels.silhouette(mesh, blur, size, scratch(kernels.workspace(mesh, size)), out + i * size * size);
+    kernels.silhouette(mesh, blur, size, scratch(kernels.workspace(mesh, blur, size)), out + i * size * size);
   });
   return ffi::Error::Success();
 }
 
 ffi::Error silhouette_gradient(ffi::ThreadPool pool, Floats vertices, Indices faces, Floats cotangent,
-                               ffi::Result<Floats> gradient, float sigma, float radius) {
+                               ffi::Result<Floats> gradient, float sigma, float radius,
+                               int32_t edge_number) {
   const Batch batch(gradient->dimensions(), 2);
   const Blur blur = checked_blur(sigma, radius);
-  const Meshes meshes(vertices, faces, batch);
+  const Edge edge = checked_edge(edge_number);
+  const Meshes meshes(vertices, faces, batch, edge == Edge::kUnbiased);
   check_result("gradient", gradient->dimensions(), batch, {meshes.num_vertices, 3});
   const int64_t size = size_of("cotangent", cotangent.dimensions());
   const Operand cotangent_at = bind("cotangent", cotangent.dimensions(), batch, {size, size});
-  const Kernels& kernels = current_kernels();
+  const Kernels& kernels = current_kernels(edge);
   const float* from = cotangent.typed_data();
   float* out = gradient->typed_data();
   for_each_task(pool, batch.count, [=, &batch, &meshes, &cotangent_at, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
-    kernels.silhouette_gradient(mesh, blur, size, scratch(kernels.workspace(mesh, size)),
+    kernels.silhouette_gradient(mesh, blur, size, scratch(kernels.workspace(mesh, blur, size)),
                                 from + cotangent_at.offset(batch, i), out + i * 3 * mesh.num_vertices);
   });
   return ffi::Error::Success();
@@ -66,11 +75,13 @@ ffi::Error silhouette_gradient(ffi::ThreadPool pool, Floats vertices, Indices fa
 // If `gradient` is null, only the loss is computed.
 ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const Indices& faces,
                          const ffi::AnyBuffer& target, const Floats& weight, ffi::Result<Floats>& loss,
-                         ffi::Result<Floats>* gradient, float sigma, float radius, int32_t kind_number) {
+                         ffi::Result<Floats>* gradient, float sigma, float radius, int32_t edge_number,
+                         int32_t kind_number) {
   const Batch batch(loss->dimensions(), 0);
   const Blur blur = checked_blur(sigma, radius);
+  const Edge edge = checked_edge(edge_number);
   const LossKind kind = checked_kind(kind_number);
-  const Meshes meshes(vertices, faces, batch);
+  const Meshes meshes(vertices, faces, batch, edge == Edge::kUnbiased);
   if (gradient) check_result("gradient", (*gradient)->dimensions(), batch, {meshes.num_vertices, 3});
   const int64_t size = size_of("target", target.dimensions());
   const Operand target_at = bind("target", target.dimensions(), batch, {size, size});
@@ -79,7 +90,7 @@ ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const In
   const bool bytes = type == ffi::U8 || type == ffi::PRED;
   if (!bytes && type != ffi::F32) throw std::invalid_argument("target: expected bool, uint8 or float32");
   const auto* pixels = static_cast<const char*>(target.untyped_data());
-  const Kernels& kernels = current_kernels();
+  const Kernels& kernels = current_kernels(edge);
   const float* weights = weight.typed_data();
   float* out = loss->typed_data();
   float* slopes = gradient ? (*gradient)->typed_data() : nullptr;
@@ -97,29 +108,31 @@ ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const In
       image.bytes = reinterpret_cast<const uint8_t*>(pixels) + at;
     else
       image.floats = reinterpret_cast<const float*>(pixels) + at;
-    kernels.mask_loss(mesh, blur, size, scratch(kernels.workspace(mesh, size)), image, kind, out + i, slope);
+    kernels.mask_loss(mesh, blur, size, scratch(kernels.workspace(mesh, blur, size)), image, kind, out + i, slope);
   });
   return ffi::Error::Success();
 }
 
 ffi::Error mask_loss(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target, Floats weight,
-                     ffi::Result<Floats> loss, float sigma, float radius, int32_t kind) {
-  return run_mask_loss(pool, vertices, faces, target, weight, loss, nullptr, sigma, radius, kind);
+                     ffi::Result<Floats> loss, float sigma, float radius, int32_t edge, int32_t kind) {
+  return run_mask_loss(pool, vertices, faces, target, weight, loss, nullptr, sigma, radius, edge, kind);
 }
 
 ffi::Error mask_loss_and_gradient(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target,
                                   Floats weight, ffi::Result<Floats> loss, ffi::Result<Floats> gradient, float sigma,
-                                  float radius, int32_t kind) {
-  return run_mask_loss(pool, vertices, faces, target, weight, loss, &gradient, sigma, radius, kind);
+                                  float radius, int32_t edge, int32_t kind) {
+  return run_mask_loss(pool, vertices, faces, target, weight, loss, &gradient, sigma, radius, edge, kind);
 }
 
 // `slope` is (J, 3, 4, P) and `shape` is (V, 3, S), with P and S multiples of 16 and D = P + S.
 ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indices faces, Bytes target, Floats weight,
                                    Floats rest, Indices joint, Floats skin_weight, Floats slope, Floats shape,
-                                   ffi::Result<Floats> block, float sigma, float radius, float focal, float centre) {
+                                   ffi::Result<Floats> block, float sigma, float radius, int32_t edge_number,
+                                   float focal, float centre) {
   const Batch batch(block->dimensions(), 2);
   const Blur blur = checked_blur(sigma, radius);
-  const Meshes meshes(vertices, faces, batch);
+  const Edge edge = checked_edge(edge_number);
+  const Meshes meshes(vertices, faces, batch, edge == Edge::kUnbiased);
   const int64_t parameters = block->dimensions()[block->dimensions().size() - 1];
   const int64_t shapes = shape.dimensions().size() ? shape.dimensions()[shape.dimensions().size() - 1] : 0;
   const int64_t transforming = parameters - shapes;
@@ -137,7 +150,7 @@ ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indice
   const Operand slope_at = bind("slope", slope.dimensions(), batch, {kAny, 3, 4, transforming});
   const Operand shape_at = bind("shape", shape.dimensions(), batch, {meshes.num_vertices, 3, shapes});
   check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, slope_at.item / (12 * transforming));
-  const Kernels& kernels = current_kernels();
+  const Kernels& kernels = current_kernels(edge);
   float* out = block->typed_data();
   for_each_task(pool, batch.count, [&](int64_t i) {
     float* own = out + i * parameters * parameters;
@@ -156,7 +169,7 @@ ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indice
                     focal,
                     centre};
     const Mesh mesh = meshes.of(batch, i);
-    void* memory = scratch(kernels.gauss_newton_workspace(mesh, skin, size));
+    void* memory = scratch(kernels.gauss_newton_workspace(mesh, skin, blur, size));
     const uint8_t* pixels = target.typed_data() + target_at.offset(batch, i);
     kernels.silhouette_gauss_newton(mesh, skin, blur, size, memory, pixels, own);
   });
@@ -171,8 +184,13 @@ auto with_mesh_and_target() { return with_mesh().Arg<ffi::AnyBuffer>().Arg<Float
 
 XLA_FFI_Error* silhouette_handler(XLA_FFI_CallFrame* frame) {
   return call_guarded(frame->api, [frame] {
-    static const auto* handler =
-        with_mesh().Ret<Floats>().Attr<float>("sigma").Attr<float>("radius").To(silhouette).release();
+    static const auto* handler = with_mesh()
+                                     .Ret<Floats>()
+                                     .Attr<float>("sigma")
+                                     .Attr<float>("radius")
+                                     .Attr<int32_t>("edge")
+                                     .To(silhouette)
+                                     .release();
     return handler->Call(frame);
   });
 }
@@ -184,6 +202,7 @@ XLA_FFI_Error* silhouette_gradient_handler(XLA_FFI_CallFrame* frame) {
                                      .Ret<Floats>()
                                      .Attr<float>("sigma")
                                      .Attr<float>("radius")
+                                     .Attr<int32_t>("edge")
                                      .To(silhouette_gradient)
                                      .release();
     return handler->Call(frame);
@@ -196,6 +215,7 @@ XLA_FFI_Error* mask_loss_handler(XLA_FFI_CallFrame* frame) {
                                      .Ret<Floats>()
                                      .Attr<float>("sigma")
                                      .Attr<float>("radius")
+                                     .Attr<int32_t>("edge")
                                      .Attr<int32_t>("kind")
                                      .To(mask_loss)
                                      .release();
@@ -210,6 +230,7 @@ XLA_FFI_Error* mask_loss_and_gradient_handler(XLA_FFI_CallFrame* frame) {
                                      .Ret<Floats>()
                                      .Attr<float>("sigma")
                                      .Attr<float>("radius")
+                                     .Attr<int32_t>("edge")
                                      .Attr<int32_t>("kind")
                                      .To(mask_loss_and_gradient)
                                      .release();
@@ -230,6 +251,7 @@ XLA_FFI_Error* silhouette_gauss_newton_handler(XLA_FFI_CallFrame* frame) {
                                      .Ret<Floats>()
                                      .Attr<float>("sigma")
                                      .Attr<float>("radius")
+                                     .Attr<int32_t>("edge")
                                      .Attr<float>("focal")
                                      .Attr<float>("centre")
                                      .To(silhouette_gauss_newton)

@@ -7,6 +7,7 @@
 #pragma once
 
 #include "products.h"
+#include "vertex_rows.h"
 
 namespace jaxfit {
 namespace {
@@ -17,28 +18,27 @@ constexpr float kBandEdge = 0.01f;  // the band holds the pixels whose silhouett
 struct Rows {
   float* values;        // (kMostRows, D)
   int32_t* of_pixel;    // for each chosen pixel of each block the index of its row
-  float* of_vertex;     // (V, 2, D): d vertex / d parameters in px, for the vertices that are ready
-  uint8_t* ready;       // (V)
+  VertexRows of_vertex;
   uint16_t* chosen;     // for each block the pixels that have a row, as bits
   int64_t count;
 };
 
-size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, int64_t size) {
+size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size) {
   const Layout l(mesh, size);
   const int64_t floats = kMostRows * skin.parameters + l.products + 2 * mesh.num_vertices * skin.parameters;
   const int64_t bytes = sizeof(float) * floats + sizeof(uint16_t) * l.blocks * l.blocks + mesh.num_vertices;
-  return workspace(mesh, size) + bytes;
+  return workspace(mesh, blur, size) + bytes;
 }
 
-INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, int64_t size, void* memory) {
+INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory) {
   const Layout l(mesh, size);
   Rows rows;
-  rows.values = reinterpret_cast<float*>(static_cast<char*>(memory) + workspace(mesh, size));
-  rows.of_vertex = rows.values + kMostRows * skin.parameters;
-  rows.of_pixel = reinterpret_cast<int32_t*>(rows.of_vertex + 2 * mesh.num_vertices * skin.parameters);
+  rows.values = reinterpret_cast<float*>(static_cast<char*>(memory) + workspace(mesh, blur, size));
+  rows.of_vertex.values = rows.values + kMostRows * skin.parameters;
+  rows.of_pixel = reinterpret_cast<int32_t*>(rows.of_vertex.values + 2 * mesh.num_vertices * skin.parameters);
   rows.chosen = reinterpret_cast<uint16_t*>(rows.of_pixel + l.products);
-  rows.ready = reinterpret_cast<uint8_t*>(rows.chosen + l.blocks * l.blocks);
-  for (int64_t i = 0; i < mesh.num_vertices; ++i) rows.ready[i] = 0;
+  rows.of_vertex.ready = reinterpret_cast<uint8_t*>(rows.chosen + l.blocks * l.blocks);
+  for (int64_t i = 0; i < mesh.num_vertices; ++i) rows.of_vertex.ready[i] = 0;
   rows.count = 0;
   return rows;
 }
@@ -86,31 +86,6 @@ void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
   });
 }
 
-// Returns d vertex / d parameters in px: D derivatives of x, then D of y.
-INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, Rows& rows) {
-  const int64_t D = skin.parameters, P = skin.transforming;
-  float* out = rows.of_vertex + 2 * v * D;
-  if (rows.ready[v]) return out;
-  rows.ready[v] = 1;
-  const float* at = mesh.vertices + 3 * v;
-  const float* rest = skin.rest + 3 * v;
-  const float zoom = skin.focal / at[2];
-  const float by_depth[2] = {(skin.centre - at[0]) / at[2], (skin.centre - at[1]) / at[2]};
-  for (int64_t d = 0; d < D; d += kLanes) {
-    Vec x[3] = {all(0.f), all(0.f), all(0.f)};  // d position / d parameters, camera frame
-    for (int64_t m = 0; d < P && m < skin.per_vertex; ++m) {
-      const float w = skin.weight[v * skin.per_vertex + m];
-      if (w == 0) continue;
-      const float* slope = skin.slope + skin.joint[v * skin.per_vertex + m] * 12 * P + d;
-      for (int i = 0; i < 3; ++i, slope += 4 * P)
-        for (int c = 0; c < 4; ++c) x[i] = fma(all(c < 3 ? w * rest[c] : w), load(slope + c * P), x[i]);
-    }
-    for (int i = 0; d >= P && i < 3; ++i) x[i] = load(skin.shape + (3 * v + i) * (D - P) + d - P);
-    for (int i = 0; i < 2; ++i) store(out + i * D + d, fma(all(zoom), x[i], all(by_depth[i]) * x[2]));
-  }
-  return out;
-}
-
 void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, Rows& rows) {
   const int64_t D = skin.parameters;
   const Vec outside = all(scale.radius * scale.radius);
@@ -142,19 +117,12 @@ void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, R
           for (; pixels; pixels &= pixels - 1) {
             const int k = __builtin_ctz(pixels);
             if (!a) {
-              a = vertex_rows(mesh, skin, f.vertex[i][lane], rows);
-              b = vertex_rows(mesh, skin, f.vertex[(i + 1) % 3][lane], rows);
+              a = vertex_rows(mesh, skin, f.vertex[i][lane], rows.of_vertex);
+              b = vertex_rows(mesh, skin, f.vertex[(i + 1) % 3][lane], rows.of_vertex);
             }
             const float to_a = 0.5f - place_along[k], to_b = 0.5f + place_along[k];
-            const Vec ax = all(to_a * pull_x[k]), ay = all(to_a * pull_y[k]);
-            const Vec bx = all(to_b * pull_x[k]), by = all(to_b * pull_y[k]);
-            float* row = rows.values + of_pixel[k] * D;
-            for (int64_t d = 0; d < D; d += kLanes) {
-              Vec sum = load(row + d);
-              sum = fma(ax, load(a + d), fma(ay, load(a + D + d), sum));
-              sum = fma(bx, load(b + d), fma(by, load(b + D + d), sum));
-              store(row + d, sum);
-            }
+            add_vertices(a, b, to_a * pull_x[k], to_a * pull_y[k], to_b * pull_x[k], to_b * pull_y[k], D,
+                         rows.values + of_pixel[k] * D);
           }
         }
       });
@@ -162,31 +130,15 @@ void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, R
   }
 }
 
-// block = rowsᵀ · rows, four lines of the block at a time.
-void multiply_rows(const Rows& rows, int64_t D, float* block) {
-  for (int64_t i = 0; i < D; i += 4)
-    for (int64_t d = i / kLanes * kLanes; d < D; d += kLanes) {
-      Vec sums[4] = {all(0.f), all(0.f), all(0.f), all(0.f)};
-      for (int64_t r = 0; r < rows.count; ++r) {
-        const float* row = rows.values + r * D;
-        const Vec right = load(row + d);
-        for (int k = 0; k < 4; ++k) sums[k] = fma(all(row[i + k]), right, sums[k]);
-      }
-      for (int k = 0; k < 4; ++k) store(block + (i + k) * D + d, sums[k]);
-    }
-  for (int64_t i = 0; i < D; ++i)
-    for (int64_t d = 0; d < i; ++d) block[i * D + d] = block[d * D + i];
-}
-
 void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory,
                              const uint8_t* target, float* block) {
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
   if (!render(mesh, size, scale, ws)) return fill(block, skin.parameters * skin.parameters, __builtin_nanf(""));
-  Rows rows = carve_rows(mesh, skin, size, memory);
+  Rows rows = carve_rows(mesh, skin, blur, size, memory);
   choose_rows(set_row_factors(target, size, scale, ws), ws, rows);
   fill_rows(mesh, skin, scale, ws, rows);
-  multiply_rows(rows, skin.parameters, block);
+  multiply_rows(rows.values, rows.values, rows.count, skin.parameters, block);
 }
 
 }  // namespace

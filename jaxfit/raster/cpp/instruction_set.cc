@@ -6,11 +6,14 @@
 namespace jaxfit {
 
 extern const Kernels kernels_baseline;
+extern const Kernels filtered_baseline;
 extern const Renderer renderer_baseline;
 #ifdef JAXFIT_X86
 extern const Kernels kernels_avx2;
+extern const Kernels filtered_avx2;
 extern const Renderer renderer_avx2;
 extern const Kernels kernels_avx512;
+extern const Kernels filtered_avx512;
 extern const Renderer renderer_avx512;
 #endif
 
@@ -18,7 +21,7 @@ namespace {
 
 struct Choice {
   const char* name;
-  const Kernels* kernels;
+  const Kernels* kernels[2];  // by Edge
   const Renderer* renderer;
 };
 
@@ -29,10 +32,10 @@ std::vector<Choice> choices() {
   const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
       __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-    available.push_back({"avx512", &kernels_avx512, &renderer_avx512});
-  if (avx2) available.push_back({"avx2", &kernels_avx2, &renderer_avx2});
+    available.push_back({"avx512", {&kernels_avx512, &filtered_avx512}, &renderer_avx512});
+  if (avx2) available.push_back({"avx2", {&kernels_avx2, &filtered_avx2}, &renderer_avx2});
 #endif
-  available.push_back({"baseline", &kernels_baseline, &renderer_baseline});
+  available.push_back({"baseline", {&kernels_baseline, &filtered_baseline}, &renderer_baseline});
   return available;
 }
 
@@ -56,7 +59,7 @@ std::vector<std::string> available_isas() {
 
 std::string current_isa() { return all_choices()[chosen()].name; }
 
-const Kernels& current_kernels() { return *all_choices()[chosen()].kernels; }
+const Kernels& current_kernels(Edge edge) { return *all_choices()[chosen()].kernels[static_cast<int32_t>(edge)]; }
 
 const Renderer& current_renderer() { return *all_choices()[chosen()].renderer; }
 

@@ -18,7 +18,7 @@ std::string current_isa();
 // Chooses the set to use; "auto" is the best set. Throws std::invalid_argument if the set is not available.
 void choose_isa(const std::string& name);
 
-const Kernels& current_kernels();
+const Kernels& current_kernels(Edge edge);
 const Renderer& current_renderer();
 
 }  // namespace jaxfit

@@ -6,6 +6,7 @@
 #include <string>
 #include <vector>
 
+#include "edges.h"
 #include "mesh.h"
 #include "shapes.h"
 #include "xla/ffi/api/ffi.h"
@@ -89,8 +90,9 @@ struct Meshes {
   const int32_t* faces;
   Operand vertices_at, faces_at;
   int64_t num_vertices = 0, num_faces = 0;
+  std::vector<EdgeTable> edges;  // of each item of `faces`, if they are needed
 
-  Meshes(const Floats& vertices, const Indices& faces, const Batch& batch)
+  Meshes(const Floats& vertices, const Indices& faces, const Batch& batch, bool with_edges)
       : vertices(vertices.typed_data()),
         faces(faces.typed_data()),
         vertices_at(bind("vertices", vertices.dimensions(), batch, {kAny, 3})),
@@ -98,11 +100,14 @@ struct Meshes {
         num_vertices(vertices_at.item / 3),
         num_faces(faces_at.item / 3) {
     check_indices("faces", this->faces, faces_at.items * faces_at.item, num_vertices);
+    for (int64_t i = 0; with_edges && i < faces_at.items; ++i)
+      edges.emplace_back(this->faces + i * faces_at.item, num_faces, num_vertices);
   }
 
   Mesh of(const Batch& batch, int64_t image) const {
-    return {vertices + vertices_at.offset(batch, image), faces + faces_at.offset(batch, image), num_vertices,
-            num_faces};
+    const int64_t at = faces_at.offset(batch, image);
+    const Edges own = edges.empty() || !num_faces ? Edges{} : edges[at / faces_at.item].view();
+    return {vertices + vertices_at.offset(batch, image), faces + at, num_vertices, num_faces, own};
   }
 };
 

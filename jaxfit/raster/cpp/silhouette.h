@@ -1,4 +1,4 @@
-// The soft silhouette of a triangle mesh, its losses against a mask and their gradients, for one image.
+// The silhouette of a triangle mesh with a soft edge, its losses against a mask and their gradients, for one image.
 #pragma once
 
 #include <cstddef>
@@ -9,9 +9,12 @@
 namespace jaxfit {
 
 struct Blur {
-  float sigma;   // softness s in px²: p = sigmoid(-d / s)
+  float sigma;   // softness s in px²: at a straight edge, the silhouette is sigmoid(-d / s), or has the same variance
   float radius;  // px; a face does not affect the pixels outside it at this distance or farther
 };
+
+// How the edge of the silhouette is drawn: silhouette.cc and filtered.cc.
+enum class Edge : int32_t { kSoftRasterizer = 0, kUnbiased = 1 };
 
 enum class LossKind : int32_t { kL1 = 0, kSmoothL1 = 1 };
 
@@ -38,17 +41,17 @@ struct Skin {
   float focal, centre;    // px of the silhouette
 };
 
-// The entry points of one instruction set. `gradient` is (V, 3) and is overwritten. Its depth column is 0.
+// The entry points of one kind of edge and one instruction set. `gradient` is (V, 3) and is overwritten. Its depth column is 0.
 struct Kernels {
   // Returns the size of `memory` in bytes for one image. `memory` is 64-byte aligned.
-  size_t (*workspace)(const Mesh&, int64_t size);
+  size_t (*workspace)(const Mesh&, Blur, int64_t size);
   void (*silhouette)(const Mesh&, Blur, int64_t size, void* memory, float* image);
   void (*silhouette_gradient)(const Mesh&, Blur, int64_t size, void* memory, const float* cotangent,
                               float* gradient);
   // If `gradient` is null, only the loss is computed.
   void (*mask_loss)(const Mesh&, Blur, int64_t size, void* memory, Target, LossKind, float* loss,
                     float* gradient);
-  size_t (*gauss_newton_workspace)(const Mesh&, const Skin&, int64_t size);
+  size_t (*gauss_newton_workspace)(const Mesh&, const Skin&, Blur, int64_t size);
   // Computes the block Jᵀ·J (D, D) with J = d silhouette / d parameters, without the unknown pixels of the mask `target`.
   // The depths of the mesh are in the camera frame.
   void (*silhouette_gauss_newton)(const Mesh&, const Skin&, Blur, int64_t size, void* memory, const uint8_t* target,

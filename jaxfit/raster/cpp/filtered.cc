@@ -1,0 +1,461 @@
+// The filtered silhouette: the area of each pixel that the mesh covers, filtered by a Gaussian. This file is compiled
+// once for each instruction set, as silhouette.cc is.
+//
+// N(x) is the number of faces that turn to one side and contain the point x. The mean of N over a pixel is exact: each
+// face adds its directed edges, edges between two such faces cancel, and only the edges that remain are walked through
+// the pixels. An edge adds the area below itself to the pixels of each column, so that sums down the columns give the
+// mean of N. The coverage of a pixel is the larger mean of the two sides, at most 1: a closed surface has equal means, a
+// sheet has one. Coverage is too large only where two outlines share a pixel.
+//
+// The error, coverage minus mask at the known pixels, is filtered as a whole, so that both have the same softness: the
+// silhouette has the area of its mesh, whatever the width of the filter and of the part.
+#include "vertex_rows.h"
+
+#if defined(JAXFIT_AVX512)
+#define KERNELS filtered_avx512
+#elif defined(JAXFIT_AVX2)
+#define KERNELS filtered_avx2
+#else
+#define KERNELS filtered_baseline
+#endif
+
+namespace jaxfit {
+namespace {
+
+constexpr float kCovered = 0.9999f;  // from this mean of N on, a pixel is covered
+constexpr int64_t kRowsPerColumn = 16;  // the Gauss-Newton block has at most this many rows per column of the image
+
+INLINE int64_t round_up(int64_t n) { return (n + kLanes - 1) / kLanes * kLanes; }
+
+// Taps of a Gaussian with the variance of the soft rasteriser's edge, whose profile is sigmoid(-x·|x| / s): 2·ln(2)·s.
+struct Filter {
+  double variance;
+  int64_t radius;  // pixels
+
+  explicit Filter(Blur blur)
+      : variance(2 * 0.69314718055994530942 * blur.sigma),
+        radius(static_cast<int64_t>(__builtin_ceil(3 * __builtin_sqrt(variance)))) {}
+
+  void fill_taps(float* taps) const {
+    double total = 0;
+    for (int64_t k = -radius; k <= radius; ++k) total += __builtin_exp(-0.5 * static_cast<double>(k * k) / variance);
+    for (int64_t k = -radius; k <= radius; ++k)
+      taps[k + radius] =
+          static_cast<float>(__builtin_exp(-0.5 * static_cast<double>(k * k) / variance) / total);
+  }
+};
+
+// Images are planes with rows of `stride` floats: a margin of `radius` zeros, the pixels, and zeros up to the end.
+struct Workspace {
+  float* taps;
+  float *front, *back;  // means of N of the two sides; later the factors of their edges in the gradient
+  float *error, *other;
+  int16_t *front_edges, *back_edges;  // for each edge how often it remains, with the sign of its direction
+  int64_t radius, stride, plane, size;
+  bool closed;  // the edges of both sides are the same, and so are the means
+};
+
+INLINE Workspace carve(const Mesh& mesh, Blur blur, int64_t size, void* memory, size_t* bytes = nullptr) {
+  const Filter filter(blur);
+  Workspace ws;
+  ws.size = size, ws.radius = filter.radius;
+  ws.stride = round_up(size) + round_up(2 * ws.radius);
+  ws.plane = ws.stride * (size + 1);
+  float* p = static_cast<float*>(memory);
+  ws.taps = p, p += round_up(2 * ws.radius + 1);
+  float** const planes[] = {&ws.front, &ws.back, &ws.error, &ws.other};
+  for (float** plane : planes) *plane = p, p += ws.plane;
+  ws.front_edges = reinterpret_cast<int16_t*>(p);
+  ws.back_edges = ws.front_edges + mesh.edges.count;
+  if (bytes) {
+    const size_t edges = round_up(mesh.edges.count) * sizeof(float);
+    *bytes = (p - static_cast<float*>(nullptr)) * sizeof(float) + edges;
+  } else {
+    filter.fill_taps(ws.taps);
+  }
+  return ws;
+}
+
+size_t workspace(const Mesh& mesh, Blur blur, int64_t size) {
+  size_t bytes;
+  carve(mesh, blur, size, nullptr, &bytes);
+  return bytes;
+}
+
+void fill(float* p, int64_t n, float value) {
+  for (int64_t i = 0; i < n; ++i) p[i] = value;
+}
+
+INLINE float clamp(float a) { return a < -kFarAway ? -kFarAway : a > kFarAway ? kFarAway : a; }
+
+// Finds the edges that remain of each side. Returns false if a coordinate is not finite.
+bool find_edges(const Mesh& mesh, Workspace& ws) {
+  float finite = 0;
+  for (int64_t i = 0; i < 3 * mesh.num_vertices; ++i) finite += 0 * mesh.vertices[i];
+  if (finite != 0) return false;
+  for (int64_t e = 0; e < 2 * mesh.edges.count; ++e) ws.front_edges[e] = 0;
+  const float half = 0.5f * static_cast<float>(ws.size), least = kMinArea * half * half;
+  for (int64_t i = 0; i < mesh.num_faces; ++i) {
+    const int32_t* corner = mesh.faces + 3 * i;
+    const float *a = mesh.vertices + 3 * corner[0], *b = mesh.vertices + 3 * corner[1],
+                *c = mesh.vertices + 3 * corner[2];
+    if (!(a[2] > kMinDepth && b[2] > kMinDepth && c[2] > kMinDepth)) continue;
+    const float ax = clamp(a[0]), ay = clamp(a[1]);
+    const float area = (clamp(b[0]) - ax) * (clamp(c[1]) - ay) - (clamp(b[1]) - ay) * (clamp(c[0]) - ax);
+    if (!(__builtin_fabsf(area) > least)) continue;
+    int16_t* edges = area > 0 ? ws.front_edges : ws.back_edges;
+    const int sign = area > 0 ? 1 : -1;
+    for (int k = 0; k < 3; ++k) {
+      const int32_t edge = mesh.edges.of_face[3 * i + k];
+      edges[edge >> 1] = static_cast<int16_t>(edges[edge >> 1] + (edge & 1 ? -sign : sign));
+    }
+  }
+  ws.closed = true;
+  for (int64_t e = 0; e < mesh.edges.count; ++e) ws.closed &= ws.front_edges[e] == ws.back_edges[e];
+  return true;
+}
+
+// An edge in the image, from a by (dx, dy).
+struct Segment {
+  float ax, ay, dx, dy;
+};
+
+// Calls visit(column, row, t0, t1) for each pixel that the segment crosses from the share t0 to t1 of its length. The
+// columns -1 and `size`, and the rows likewise, hold everything outside the image.
+template <typename Visit>
+INLINE void walk(Segment s, int64_t size, Visit visit) {
+  const float last = static_cast<float>(size), never = 2.f;
+  const auto cell = [&](float a, float d) {
+    const float low = __builtin_floorf(a < -1 ? -1 : a > last ? last : a);
+    return static_cast<int64_t>(d < 0 && low == a ? low - 1 : low);
+  };
+  const auto next = [&](int64_t i, float a, float d, float inverse) {
+    if (d > 0) return i >= size ? never : (static_cast<float>(i + 1) - a) * inverse;
+    return i < 0 ? never : (static_cast<float>(i) - a) * inverse;
+  };
+  int64_t column = cell(s.ax, s.dx), row = cell(s.ay, s.dy);
+  if (column < -1) column = -1;
+  if (row < -1) row = -1;
+  const float by_x = s.dx == 0 ? 0 : 1 / s.dx, by_y = s.dy == 0 ? 0 : 1 / s.dy;
+  const int64_t right = s.dx > 0 ? 1 : -1, down = s.dy > 0 ? 1 : -1;
+  float tx = s.dx == 0 ? never : next(column, s.ax, s.dx, by_x);
+  float ty = s.dy == 0 ? never : next(row, s.ay, s.dy, by_y);
+  for (float t = 0; t < 1;) {
+    const float to = tx < ty ? tx : ty, end = to < t ? t : to < 1 ? to : 1;
+    visit(column, row, t, end);
+    t = end;
+    if (!(to < 1)) break;
+    if (tx < ty) column += right, tx = next(column, s.ax, s.dx, by_x);
+    else row += down, ty = next(row, s.ay, s.dy, by_y);
+  }
+}
+
+INLINE Segment segment_of(const Mesh& mesh, int64_t edge) {
+  const float* a = mesh.vertices + 3 * mesh.edges.ends[2 * edge];
+  const float* b = mesh.vertices + 3 * mesh.edges.ends[2 * edge + 1];
+  const float ax = clamp(a[0]), ay = clamp(a[1]);
+  return {ax, ay, clamp(b[0]) - ax, clamp(b[1]) - ay};
+}
+
+INLINE float* at(float* plane, const Workspace& ws, int64_t row) { return plane + row * ws.stride + ws.radius; }
+
+// Computes `front` and `back`. Returns false if a coordinate is not finite.
+bool render(const Mesh& mesh, Workspace& ws) {
+  if (!find_edges(mesh, ws)) return false;
+  const int64_t size = ws.size;
+  fill(ws.front, ws.closed ? ws.plane : 2 * ws.plane, 0);
+  for (int64_t e = 0; e < mesh.edges.count; ++e) {
+    const float front = ws.front_edges[e], back = ws.back_edges[e];
+    if (front == 0 && back == 0) continue;
+    const Segment s = segment_of(mesh, e);
+    walk(s, size, [&](int64_t column, int64_t row, float t0, float t1) __attribute__((always_inline)) {
+      if (column < 0 || column >= size || row >= size) return;
+      const float width = s.dx * (t1 - t0);
+      const float above = s.ay + s.dy * 0.5f * (t0 + t1) - static_cast<float>(row);
+      const float lower = row < 0 || above > 1 ? 1 : above < 0 ? 0 : above;  // share of the strip in the rows below
+      const int64_t own = (row < 0 ? -1 : row) * ws.stride + ws.radius + column;
+      if (row >= 0) ws.front[own] += front * width * (1 - lower);
+      ws.front[own + ws.stride] += front * width * lower;
+      if (ws.closed) return;
+      if (row >= 0) ws.back[own] += back * width * (1 - lower);
+      ws.back[own + ws.stride] += back * width * lower;
+    });
+  }
+  for (int64_t i = ws.stride; i < size * ws.stride; ++i) ws.front[i] += ws.front[i - ws.stride];
+  for (int64_t i = ws.stride; i < size * ws.stride && !ws.closed; ++i) ws.back[i] += ws.back[i - ws.stride];
+  return true;
+}
+
+INLINE float coverage_at(const Workspace& ws, int64_t i) {
+  const float front = ws.front[i], back = ws.closed ? front : ws.back[i];
+  const float most = front > back ? front : back;
+  return most < kCovered ? most : 1;
+}
+
+// Filters a plane in place; `ws.other` is overwritten. The filter is its own transpose.
+void filter(Workspace& ws, float* plane) {
+  const int64_t size = ws.size, width = round_up(size);
+  for (int64_t y = 0; y < size; ++y) {
+    float* to = at(ws.other, ws, y);
+    const int64_t first = y < ws.radius ? -y : -ws.radius, last = size - 1 - y < ws.radius ? size - 1 - y : ws.radius;
+    for (int64_t x = 0; x < width; x += kLanes) {
+      Vec sum = all(0.f);
+      for (int64_t k = first; k <= last; ++k)
+        sum = fma(all(ws.taps[k + ws.radius]), load(at(plane, ws, y + k) + x), sum);
+      store(to + x, sum);
+    }
+  }
+  for (int64_t y = 0; y < size; ++y) {
+    float* from = ws.other + y * ws.stride;
+    fill(from, ws.radius, 0);
+    fill(from + ws.radius + size, ws.stride - ws.radius - size, 0);
+    float* to = at(plane, ws, y);
+    for (int64_t x = 0; x < width; x += kLanes) {
+      Vec sum = all(0.f);
+      for (int64_t k = 0; k <= 2 * ws.radius; ++k) sum = fma(all(ws.taps[k]), load(from + x + k), sum);
+      store(to + x, sum);
+    }
+    fill(to + size, width - size, 0);
+  }
+}
+
+// Adds the derivatives of Σ plane · coverage. Overwrites `front` and `back`.
+void add_gradient(const Mesh& mesh, Workspace& ws, const float* plane, float* gradient) {
+  const int64_t size = ws.size;
+  for (int64_t i = 0; i < size * ws.stride; ++i) {
+    const float front = ws.front[i], back = ws.closed ? front : ws.back[i];
+    ws.front[i] = front >= back && front < kCovered ? plane[i] : 0;
+    if (!ws.closed) ws.back[i] = back > front && back < kCovered ? plane[i] : 0;
+  }
+  for (int64_t e = 0; e < mesh.edges.count; ++e) {
+    const float front = ws.front_edges[e], back = ws.back_edges[e];
+    if (front == 0 && back == 0) continue;
+    const Segment s = segment_of(mesh, e);
+    float to_a = 0, to_b = 0;
+    walk(s, size, [&](int64_t column, int64_t row, float t0, float t1) __attribute__((always_inline)) {
+      if (column < 0 || column >= size || row < 0 || row >= size) return;
+      const int64_t i = row * ws.stride + ws.radius + column;
+      const float factor = (front * ws.front[i] + (ws.closed ? 0 : back * ws.back[i])) * (t1 - t0);
+      const float middle = 0.5f * (t0 + t1);
+      to_a += factor * (1 - middle);
+      to_b += factor * middle;
+    });
+    float* a = gradient + 3 * mesh.edges.ends[2 * e];
+    float* b = gradient + 3 * mesh.edges.ends[2 * e + 1];
+    a[0] += s.dy * to_a, a[1] -= s.dx * to_a;
+    b[0] += s.dy * to_b, b[1] -= s.dx * to_b;
+  }
+  for (int64_t i = 0; i < mesh.num_vertices; ++i)
+    for (int c = 0; c < 2; ++c) {
+      const float v = mesh.vertices[3 * i + c];
+      if (v < -kFarAway || v > kFarAway) gradient[3 * i + c] = 0;
+    }
+}
+
+void clear_gradient(float* gradient, int64_t vertices, float value) {
+  for (int64_t i = 0; i < vertices; ++i) gradient[3 * i] = gradient[3 * i + 1] = value, gradient[3 * i + 2] = 0;
+}
+
+INLINE bool known(Target target, int64_t i) { return !target.bytes || target.bytes[i] != kUnknown; }
+
+INLINE float value_of(Target target, int64_t i) {
+  return target.bytes ? (target.bytes[i] == kBackground ? 0.f : 1.f) : target.floats[i];
+}
+
+// Clears a plane with its margins.
+INLINE void clear(float* plane, const Workspace& ws) { fill(plane, ws.size * ws.stride, 0); }
+
+void silhouette(const Mesh& mesh, Blur blur, int64_t size, void* memory, float* image) {
+  Workspace ws = carve(mesh, blur, size, memory);
+  if (!render(mesh, ws)) return fill(image, size * size, __builtin_nanf(""));
+  clear(ws.error, ws);
+  for (int64_t y = 0; y < size; ++y)
+    for (int64_t x = 0; x < size; ++x) at(ws.error, ws, y)[x] = coverage_at(ws, y * ws.stride + ws.radius + x);
+  filter(ws, ws.error);
+  for (int64_t y = 0; y < size; ++y)
+    for (int64_t x = 0; x < size; ++x) image[y * size + x] = at(ws.error, ws, y)[x];
+}
+
+void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory, const float* cotangent,
+                         float* gradient) {
+  Workspace ws = carve(mesh, blur, size, memory);
+  if (!render(mesh, ws)) return clear_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
+  clear(ws.error, ws);
+  for (int64_t y = 0; y < size; ++y)
+    for (int64_t x = 0; x < size; ++x) at(ws.error, ws, y)[x] = cotangent[y * size + x];
+  filter(ws, ws.error);
+  clear_gradient(gradient, mesh.num_vertices, 0);
+  add_gradient(mesh, ws, ws.error, gradient);
+}
+
+void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target target, LossKind kind, float* loss,
+               float* gradient) {
+  Workspace ws = carve(mesh, blur, size, memory);
+  if (!render(mesh, ws)) {
+    *loss = __builtin_nanf("");
+    if (gradient) clear_gradient(gradient, mesh.num_vertices, *loss);
+    return;
+  }
+  clear(ws.error, ws);
+  for (int64_t y = 0; y < size; ++y)
+    for (int64_t x = 0; x < size; ++x) {
+      const int64_t i = y * size + x;
+      if (!known(target, i)) continue;
+      at(ws.error, ws, y)[x] = coverage_at(ws, y * ws.stride + ws.radius + x) - value_of(target, i);
+    }
+  filter(ws, ws.error);
+  double total = 0;
+  for (int64_t y = 0; y < size; ++y) {
+    float* error = at(ws.error, ws, y);
+    float of_row = 0;
+    for (int64_t x = 0; x < size; ++x) {
+      const float e = error[x], magnitude = __builtin_fabsf(e);
+      if (kind == LossKind::kL1) {
+        of_row += magnitude;
+        error[x] = e > 0 ? 1.f : e < 0 ? -1.f : 0.f;
+      } else {
+        of_row += magnitude > 1 ? magnitude - 0.5f : 0.5f * e * e;
+        error[x] = e > 1 ? 1.f : e < -1 ? -1.f : e;
+      }
+    }
+    total += of_row;
+  }
+  *loss = static_cast<float>(total);
+  if (!gradient) return;
+  filter(ws, ws.error);
+  for (int64_t y = 0; y < size; ++y)
+    for (int64_t x = 0; x < size; ++x)
+      if (!known(target, y * size + x)) at(ws.error, ws, y)[x] = 0;
+  clear_gradient(gradient, mesh.num_vertices, 0);
+  add_gradient(mesh, ws, ws.error, gradient);
+}
+
+// Rows d coverage / d parameters of the pixels at the outline, in the order of the pixels.
+struct Rows {
+  float *values, *filtered;  // (limit, D); `filtered` has the rows of FᵀF · values, with the filter F
+  int32_t* of_pixel;         // (size, size): the row of a pixel, -1 without one
+  int32_t *pixel, *order;    // (limit): the pixel of each row; the rows in the order of the pixels
+  int32_t* line;             // (size + 1): the first place in `order` of each line of the image
+  float* overlap;            // (size, 2·radius + 1): products of the taps at a pixel and at 0, 1, … pixels beyond
+  VertexRows of_vertex;
+  int64_t count, limit;
+};
+
+INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, const Workspace& ws, void* memory, size_t before,
+                       size_t* bytes = nullptr) {
+  const int64_t size = ws.size, D = skin.parameters;
+  Rows rows;
+  rows.limit = kRowsPerColumn * size, rows.count = 0;
+  float* p = reinterpret_cast<float*>(static_cast<char*>(memory) + before);
+  rows.values = p, p += rows.limit * D;
+  rows.filtered = p, p += rows.limit * D;
+  rows.of_vertex.values = p, p += 2 * mesh.num_vertices * D;
+  rows.overlap = p, p += size * (2 * ws.radius + 1);
+  int32_t* q = reinterpret_cast<int32_t*>(p);
+  rows.of_pixel = q, q += size * size;
+  rows.pixel = q, q += rows.limit;
+  rows.order = q, q += rows.limit;
+  rows.line = q, q += size + 1;
+  rows.of_vertex.ready = reinterpret_cast<uint8_t*>(q);
+  if (bytes) *bytes = reinterpret_cast<char*>(q) - static_cast<char*>(memory) + mesh.num_vertices;
+  return rows;
+}
+
+size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size) {
+  size_t before, bytes;
+  const Workspace ws = carve(mesh, blur, size, nullptr, &before);
+  carve_rows(mesh, skin, ws, nullptr, before, &bytes);
+  return bytes;
+}
+
+// Fills the rows of the known pixels at the outline. Pixels beyond the limit have no row.
+void fill_rows(const Mesh& mesh, const Skin& skin, const Workspace& ws, const uint8_t* target, Rows& rows) {
+  const int64_t size = ws.size, D = skin.parameters;
+  for (int64_t i = 0; i < size * size; ++i) rows.of_pixel[i] = -1;
+  for (int64_t i = 0; i < mesh.num_vertices; ++i) rows.of_vertex.ready[i] = 0;
+  for (int64_t e = 0; e < mesh.edges.count; ++e) {
+    const float front = ws.front_edges[e], back = ws.back_edges[e];
+    if (front == 0 && back == 0) continue;
+    const Segment s = segment_of(mesh, e);
+    const float* a = nullptr;
+    const float* b = nullptr;
+    walk(s, size, [&](int64_t column, int64_t row, float t0, float t1) __attribute__((always_inline)) {
+      if (column < 0 || column >= size || row < 0 || row >= size) return;
+      const int64_t i = row * ws.stride + ws.radius + column, pixel = row * size + column;
+      const float of_front = ws.front[i], of_back = ws.closed ? of_front : ws.back[i];
+      const bool in_front = of_front >= of_back;
+      const float turns = in_front ? front : back;
+      if (turns == 0 || !((in_front ? of_front : of_back) < kCovered) || target[pixel] == kUnknown) return;
+      if (rows.of_pixel[pixel] < 0) {
+        if (rows.count == rows.limit) return;
+        rows.pixel[rows.count] = static_cast<int32_t>(pixel);
+        fill(rows.values + rows.count * D, D, 0);
+        rows.of_pixel[pixel] = static_cast<int32_t>(rows.count++);
+      }
+      if (!a) {
+        a = vertex_rows(mesh, skin, mesh.edges.ends[2 * e], rows.of_vertex);
+        b = vertex_rows(mesh, skin, mesh.edges.ends[2 * e + 1], rows.of_vertex);
+      }
+      const float share = turns * (t1 - t0), middle = 0.5f * (t0 + t1);
+      const float x = share * s.dy, y = -share * s.dx;
+      add_vertices(a, b, (1 - middle) * x, (1 - middle) * y, middle * x, middle * y, D,
+                   rows.values + rows.of_pixel[pixel] * D);
+    });
+  }
+}
+
+// Fills `filtered`. Only pairs of rows within twice the radius of the filter have an entry of FᵀF that is not 0.
+void filter_rows(const Workspace& ws, int64_t D, Rows& rows) {
+  const int64_t size = ws.size, r = ws.radius, reach = 2 * r;
+  for (int64_t u = 0; u < size; ++u)
+    for (int64_t k = 0; k <= reach; ++k) {
+      float sum = 0;
+      for (int64_t v = u + k - r; v <= u + r; ++v)
+        if (v >= 0 && v < size) sum += ws.taps[v - u + r] * ws.taps[v - u - k + r];
+      rows.overlap[u * (reach + 1) + k] = sum;
+    }
+  const auto overlap = [&](int64_t u, int64_t v) {
+    return u < v ? rows.overlap[u * (reach + 1) + v - u] : rows.overlap[v * (reach + 1) + u - v];
+  };
+  int32_t place = 0;
+  for (int64_t y = 0; y < size; ++y) {
+    rows.line[y] = place;
+    for (int64_t x = 0; x < size; ++x)
+      if (rows.of_pixel[y * size + x] >= 0) rows.order[place++] = rows.of_pixel[y * size + x];
+  }
+  rows.line[size] = place;
+  for (int64_t row = 0; row < rows.count; ++row) {
+    float* to = rows.filtered + row * D;
+    fill(to, D, 0);
+    const int64_t x = rows.pixel[row] % size, y = rows.pixel[row] / size;
+    const int64_t top = y < reach ? 0 : y - reach, bottom = y + reach < size ? y + reach : size - 1;
+    for (int64_t line = top; line <= bottom; ++line) {
+      const float down = overlap(y, line);
+      for (int32_t n = rows.line[line]; n < rows.line[line + 1]; ++n) {
+        const int64_t other = rows.order[n], column = rows.pixel[other] % size;
+        if (column < x - reach || column > x + reach) continue;
+        const Vec weight = all(down * overlap(x, column));
+        const float* from = rows.values + other * D;
+        for (int64_t d = 0; d < D; d += kLanes) store(to + d, fma(weight, load(from + d), load(to + d)));
+      }
+    }
+  }
+}
+
+void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory,
+                             const uint8_t* target, float* block) {
+  Workspace ws = carve(mesh, blur, size, memory);
+  if (!render(mesh, ws)) return fill(block, skin.parameters * skin.parameters, __builtin_nanf(""));
+  Rows rows = carve_rows(mesh, skin, ws, memory, workspace(mesh, blur, size));
+  fill_rows(mesh, skin, ws, target, rows);
+  filter_rows(ws, skin.parameters, rows);
+  multiply_rows(rows.values, rows.filtered, rows.count, skin.parameters, block);
+}
+
+}  // namespace
+
+extern const Kernels KERNELS;
+const Kernels KERNELS = {
+    workspace, silhouette, silhouette_gradient, mask_loss, gauss_newton_workspace, silhouette_gauss_newton};
+
+}  // namespace jaxfit

@@ -1,0 +1,69 @@
+// Derivatives of the vertices with respect to the parameters of a pose, and products of rows of derivatives. Part of
+// silhouette.cc and filtered.cc.
+#pragma once
+
+#include "silhouette.h"
+#include "simd.h"
+
+namespace jaxfit {
+namespace {
+
+struct VertexRows {
+  float* values;   // (V, 2, D): d vertex / d parameters in px, for the vertices that are ready
+  uint8_t* ready;  // (V)
+};
+
+// Returns d vertex / d parameters in px: D derivatives of x, then D of y. Computes them where they are not ready.
+INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, const VertexRows& rows) {
+  const int64_t D = skin.parameters, P = skin.transforming;
+  float* out = rows.values + 2 * v * D;
+  if (rows.ready[v]) return out;
+  rows.ready[v] = 1;
+  const float* at = mesh.vertices + 3 * v;
+  const float* rest = skin.rest + 3 * v;
+  const float zoom = skin.focal / at[2];
+  const float by_depth[2] = {(skin.centre - at[0]) / at[2], (skin.centre - at[1]) / at[2]};
+  for (int64_t d = 0; d < D; d += kLanes) {
+    Vec x[3] = {all(0.f), all(0.f), all(0.f)};  // d position / d parameters, camera frame
+    for (int64_t m = 0; d < P && m < skin.per_vertex; ++m) {
+      const float w = skin.weight[v * skin.per_vertex + m];
+      if (w == 0) continue;
+      const float* slope = skin.slope + skin.joint[v * skin.per_vertex + m] * 12 * P + d;
+      for (int i = 0; i < 3; ++i, slope += 4 * P)
+        for (int c = 0; c < 4; ++c) x[i] = fma(all(c < 3 ? w * rest[c] : w), load(slope + c * P), x[i]);
+    }
+    for (int i = 0; d >= P && i < 3; ++i) x[i] = load(skin.shape + (3 * v + i) * (D - P) + d - P);
+    for (int i = 0; i < 2; ++i) store(out + i * D + d, fma(all(zoom), x[i], all(by_depth[i]) * x[2]));
+  }
+  return out;
+}
+
+// row += ax · (x of a) + ay · (y of a) + bx · (x of b) + by · (y of b), with the rows a and b of two vertices.
+INLINE void add_vertices(const float* a, const float* b, float ax, float ay, float bx, float by, int64_t D,
+                         float* row) {
+  const Vec wax = all(ax), way = all(ay), wbx = all(bx), wby = all(by);
+  for (int64_t d = 0; d < D; d += kLanes) {
+    Vec sum = load(row + d);
+    sum = fma(wax, load(a + d), fma(way, load(a + D + d), sum));
+    sum = fma(wbx, load(b + d), fma(wby, load(b + D + d), sum));
+    store(row + d, sum);
+  }
+}
+
+// block = leftᵀ · right, which is symmetric, four lines of the block at a time.
+void multiply_rows(const float* left, const float* right, int64_t count, int64_t D, float* block) {
+  for (int64_t i = 0; i < D; i += 4)
+    for (int64_t d = i / kLanes * kLanes; d < D; d += kLanes) {
+      Vec sums[4] = {all(0.f), all(0.f), all(0.f), all(0.f)};
+      for (int64_t r = 0; r < count; ++r) {
+        const Vec own = load(right + r * D + d);
+        for (int k = 0; k < 4; ++k) sums[k] = fma(all(left[r * D + i + k]), own, sums[k]);
+      }
+      for (int k = 0; k < 4; ++k) store(block + (i + k) * D + d, sums[k]);
+    }
+  for (int64_t i = 0; i < D; ++i)
+    for (int64_t d = 0; d < i; ++d) block[i * D + d] = block[d * D + i];
+}
+
+}  // namespace
+}  // namespace jaxfit
