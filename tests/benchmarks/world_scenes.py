@@ -82,6 +82,8 @@ class World(NamedTuple):
     """The config that no other config may be worse than."""
     pictures: bool = False
     """Whether frames are single pictures without motion."""
+    birds: str = "birds"
+    """What is resampled for the intervals."""
     seeds: bool = True
     """Whether the scenes differ between seeds."""
 
@@ -110,7 +112,9 @@ def published(kind: str, folder: str) -> Bird:
     """
     reference = reference_folder()
     if reference is None:
-        raise InputError("reference data", "are missing", "set JAXFIT_REFERENCE to their folder, or choose world 1 or 2")
+        raise InputError(
+            "reference data", "are missing", "set JAXFIT_REFERENCE to their folder, or choose world 1 or 2"
+        )
     return import_model(kind, [reference / "models" / folder])
 
 
@@ -353,7 +357,7 @@ WORLDS = {
     1: World("murres, simulated detections", murres, "paper"),
     2: World("murres from pixels", murre_pixels, "paper"),
     3: World("windows of AVES, exact masks", aves_windows, "paper"),
-    4: World("random species, single pictures", species, "aves", pictures=True),
+    4: World("random species, single pictures", species, "aves", pictures=True, birds="species"),
     5: World("photographs of five species (CUB)", cub, "aves", pictures=True, seeds=False),
     6: World("windows of avian-mesh, 12 keypoints", avian_windows, "paper"),
 }

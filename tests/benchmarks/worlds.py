@@ -106,7 +106,7 @@ def code_hash() -> str:
     package, digest = Path(jaxfit.__file__).parent, hashlib.sha256()
     files = [Path(__file__).with_name("world_scenes.py")]
     for name in MEASURED_PACKAGES:
-        files += sorted(path for path in (package / name).rglob("*") if path.suffix in (".py", ".so", ".onnx"))
+        files += sorted(path for path in (package / name).rglob("*") if path.suffix in (".py", ".so", ".npz", ".onnx"))
     for path in files:
         digest.update(path.name.encode() + hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:16]
@@ -166,18 +166,8 @@ def errors_3d(solution: Solution, scene: Scene, pictures: bool) -> dict[str, Flo
     }
 
 
-class Measured(NamedTuple):
-    """Errors of one fit."""
-
-    sums: BirdSums
-    missing: int
-    """Number of true birds and frames without a pose."""
-    frames: int
-    """Number of measured birds and frames."""
-
-
-def measure(solution: Solution, scene: Scene, pictures: bool) -> Measured:
-    """Compare a result with the truth of its scene."""
+def measure(solution: Solution, scene: Scene, pictures: bool) -> tuple[BirdSums, int]:
+    """Return the errors of a result per bird, and the number of true birds and frames without a pose."""
     solution, _ = match_tracks(solution, scene.exact)
     evaluation = evaluate(solution, scene.bird, scene.exact)
     sums = evaluation.sums
@@ -187,7 +177,7 @@ def measure(solution: Solution, scene: Scene, pictures: bool) -> Measured:
         own = {name: values[rows] for name, values in errors_3d(solution, scene, pictures).items()}
         spatial = BirdSums.of(sums.birds, own)
         sums = BirdSums(sums.birds, sums.numerators | spatial.numerators, sums.counts | spatial.counts)
-    return Measured(sums, evaluation.missing, evaluation.frames)
+    return sums, evaluation.missing
 
 
 def run(scenes: Sequence[Scene], config: Config, pictures: bool, compiled: set[Any]) -> dict[str, Any]:
@@ -203,9 +193,7 @@ def run(scenes: Sequence[Scene], config: Config, pictures: bool, compiled: set[A
     Returns:
         An entry of the stored results.
     """
-    parts: dict[str, list[dict[str, Any]]] = {}
-    seconds = compile_s = 0.0
-    frames = missing = 0
+    parts: dict[str, dict[str, Any]] = {}
     for scene in scenes:
         init = scene.initial_poses if config.name.split()[0] == "aves" else None
         key = config.key, scene.bird.name, scene.part, scene.observations.present.shape
@@ -216,11 +204,13 @@ def run(scenes: Sequence[Scene], config: Config, pictures: bool, compiled: set[A
             compiled.add(key)
         ready = time.perf_counter()
         solution = fit(scene.observations, scene.bird, config.config, init, terminal)
-        seconds, compile_s = seconds + time.perf_counter() - ready, compile_s + ready - start
-        measured = measure(solution, scene, pictures)
-        frames, missing = frames + measured.frames, missing + measured.missing
-        parts.setdefault(scene.part, []).append(dataclasses.asdict(measured.sums))
-    return {"seconds": seconds, "compile_s": compile_s, "frames": frames, "missing": missing, "parts": parts}
+        seconds, compile_s = time.perf_counter() - ready, ready - start
+        sums, missing = measure(solution, scene, pictures)
+        part = parts.setdefault(scene.part, {"seconds": 0.0, "compile_s": 0.0, "missing": 0, "scenes": []})
+        part |= {"seconds": part["seconds"] + seconds, "compile_s": part["compile_s"] + compile_s}
+        part["missing"] += missing
+        part["scenes"].append(dataclasses.asdict(sums))
+    return {"parts": parts}
 
 
 def pooled(parts: Sequence[tuple[str, BirdSums]]) -> BirdSums:
@@ -244,30 +234,33 @@ def pooled(parts: Sequence[tuple[str, BirdSums]]) -> BirdSums:
     )
 
 
-def sums_of(runs: Sequence[Mapping[str, Any]], part: str | None) -> BirdSums | None:
-    """Return the sums over some stored runs; None where they are empty.
-
-    Args:
-        runs: stored runs of one world and one config.
-        part: part of the world; None for all parts.
-    """
-    named = [
-        (str(each["seed"]), BirdSums(tuple(sums["birds"]), sums["numerators"], sums["counts"]))
-        for each in runs
-        for name, scenes in each["parts"].items()
-        for sums in scenes
-        if part in (None, name)
-    ]
-    return pooled(named) if named else None
-
-
 class Line(NamedTuple):
     """The results of one config in one world."""
 
     name: str
     sums: BirdSums
     seconds: float
+    """Duration of the fits, without compilation."""
     missing: int
+    """Number of true birds and frames without a pose."""
+
+
+def line_of(name: str, runs: Sequence[Mapping[str, Any]], part: str | None) -> Line:
+    """Return the results over some stored runs of one world.
+
+    Args:
+        name: of the config.
+        runs: stored runs.
+        part: part of the world; None for all parts.
+    """
+    kept = [(str(run["seed"]), own) for run in runs for key, own in run["parts"].items() if part in (None, key)]
+    sums = [
+        (seed, BirdSums(tuple(scene["birds"]), scene["numerators"], scene["counts"]))
+        for seed, own in kept
+        for scene in own["scenes"]
+    ]
+    seconds, missing = sum(own["seconds"] for _, own in kept), sum(own["missing"] for _, own in kept)
+    return Line(name, pooled(sums), seconds, missing)
 
 
 def table(lines: Sequence[Line], pictures: bool) -> str:
@@ -292,7 +285,9 @@ def table(lines: Sequence[Line], pictures: bool) -> str:
         rows += [intervals] + ([ratios] if line is not lines[0] else [])
     widths = [max(len(row[c]) for row in rows if c < len(row)) for c in range(len(rows[0]))]
     return "\n".join(
-        "  ".join(cell.ljust(width) if c == 0 else cell.rjust(width) for c, (cell, width) in enumerate(zip(row, widths)))
+        "  ".join(
+            cell.ljust(width) if c == 0 else cell.rjust(width) for c, (cell, width) in enumerate(zip(row, widths))
+        )
         for row in rows
     )
 
@@ -326,14 +321,11 @@ def world_report(number: int, configs: Mapping[str, Sequence[Mapping[str, Any]]]
     names = sorted({part for run in first for part in run["parts"]})
     blocks = []
     for part in [None, *(names if len(names) > 1 else [])]:
-        lines = [
-            Line(name, sums, sum(run["seconds"] for run in runs), sum(run["missing"] for run in runs))
-            for name, runs in configs.items()
-            if (sums := sums_of(runs, part)) is not None
-        ]
+        lines = [line_of(name, runs, part) for name, runs in configs.items()]
         seeds = ", ".join(sorted({str(run["seed"]) for run in first}))
+        birds, poses = lines[0].sums.birds, sum(lines[0].sums.counts["iou"])
         title = f"World {number}: {world.name}{f', {part}' if part else ''}; seeds {seeds}; "
-        title += f"{len(lines[0].sums.birds)} {'species' if number == 4 else 'birds'}, {sum(r['frames'] for r in first)} poses"
+        title += f"{len(birds)} {world.birds}, {poses} poses"
         blocks.append("\n".join([title, table(lines, world.pictures), *verdict(lines, world.reference)]))
     return "\n\n".join(blocks)
 
@@ -357,9 +349,7 @@ class Store:
             write_whole(self.path, json.dumps({"runs": self.runs}).encode())
 
 
-def compare(
-    configs: Sequence[Config], worlds: Sequence[int], seeds: Sequence[int], quick: bool, store: Store
-) -> None:
+def compare(configs: Sequence[Config], worlds: Sequence[int], seeds: Sequence[int], quick: bool, store: Store) -> None:
     """Fit and measure all runs that are not stored, and print the report of every world."""
     code, compiled = code_hash(), set()
     for number in worlds:
