@@ -120,17 +120,18 @@ def published(kind: str, folder: str) -> Bird:
 
 def aves_windows(seed: int, quick: bool) -> list[Scene]:
     """Draw windows of the AVES model; keypoints have Gaussian errors of 2 px, and 5 % are outliers."""
-    return [windows_of(published("aves", "aves"), seed, *((2, 20) if quick else (3, 100)), _gaussian_errors)]
+    return [windows_of(published("aves", "aves"), (3, seed), *((2, 20) if quick else (3, 100)), _gaussian_errors)]
 
 
 def avian_windows(seed: int, quick: bool) -> list[Scene]:
     """Draw windows of the avian-mesh model with 12 keypoints, of which some are missing."""
-    return [windows_of(published("avian-mesh", "avian_mesh"), seed, *((2, 20) if quick else (3, 100)), _heavy_errors)]
+    bird = published("avian-mesh", "avian_mesh")
+    return [windows_of(bird, (6, seed), *((2, 20) if quick else (3, 100)), _heavy_errors)]
 
 
 def windows_of(
     bird: Bird,
-    seed: int,
+    seed: tuple[int, int],
     birds: int,
     frames: int,
     errors: Callable[[np.random.Generator, Observations], Observations],
@@ -139,12 +140,12 @@ def windows_of(
 
     Args:
         bird: the model.
-        seed: seed of the motion and of the errors; different seeds have no bird in common.
+        seed: number of the world, and seed; every pair has other motion and other errors.
         birds: number of birds.
         frames: number of frames.
         errors: from exact observations to observations with errors of the keypoints.
     """
-    poses = [smooth_motion(bird, frames, 1000 * seed + n) for n in range(birds)]
+    poses = [smooth_motion(bird, frames, int(motion)) for motion in np.random.SeedSequence(seed).generate_state(birds)]
     exact = detect(bird, poses, camera=WIDE)
     own_images = {(n, t): (f"bird_{n}/{t:06d}.png", *exact.image_size(n, t)) for n, t in exact.masks}
     exact = replace(exact, own_images=own_images, amodal_masks=exact.masks)
@@ -159,7 +160,7 @@ def windows_of(
         bone_length=each_frame(stacked.bone_length),
         betas=each_frame(stacked.betas),
     )
-    observations = errors(np.random.default_rng((seed, 8)), exact)
+    observations = errors(np.random.default_rng((*seed, 8)), exact)
     return Scene(bird, observations, exact, true_solution(bird, stacked, exact, WIDE))
 
 

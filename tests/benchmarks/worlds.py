@@ -283,13 +283,14 @@ def table(lines: Sequence[Line], pictures: bool) -> str:
             ratios.append(f"{ratio.value:.3f} ({ratio.low:.2f}…{ratio.high:.2f}){mark}")
         rows[-1] += [f"{line.seconds:.1f}", str(line.missing)]
         rows += [intervals] + ([ratios] if line is not lines[0] else [])
-    widths = [max(len(row[c]) for row in rows if c < len(row)) for c in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if c == 0 else cell.rjust(width) for c, (cell, width) in enumerate(zip(row, widths))
-        )
-        for row in rows
-    )
+    filled = [row + [""] * (len(rows[0]) - len(row)) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*filled, strict=True)]
+
+    def aligned(row: Sequence[str]) -> str:
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        return "  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip()
+
+    return "\n".join(map(aligned, filled))
 
 
 def verdict(lines: Sequence[Line], reference: str) -> list[str]:
@@ -349,6 +350,12 @@ class Store:
             write_whole(self.path, json.dumps({"runs": self.runs}).encode())
 
 
+def say(text: str) -> None:
+    """Print a text; long lines of tables stay whole."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
+
+
 def compare(configs: Sequence[Config], worlds: Sequence[int], seeds: Sequence[int], quick: bool, store: Store) -> None:
     """Fit and measure all runs that are not stored, and print the report of every world."""
     code, compiled = code_hash(), set()
@@ -364,7 +371,7 @@ def compare(configs: Sequence[Config], worlds: Sequence[int], seeds: Sequence[in
                     known = keys | {"config": config.name} | run(scenes, config, world.pictures, compiled)
                     store.add(known)
                 results[config.name].append(known)
-        print(f"\n{world_report(number, results)}", flush=True)
+        say(f"\n{world_report(number, results)}")
 
 
 def show(configs: Sequence[str], worlds: Sequence[int], seeds: Sequence[int], quick: bool, store: Store) -> None:
@@ -379,7 +386,7 @@ def show(configs: Sequence[str], worlds: Sequence[int], seeds: Sequence[int], qu
             if runs:
                 results[name] = runs
         if results:
-            print(f"\n{world_report(number, results)}")
+            say(f"\n{world_report(number, results)}")
 
 
 def check_seeds(seeds: Sequence[int]) -> str | None:
@@ -415,11 +422,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not configs or not options.seeds:
             parser.error("--configs and --seeds are needed")
         if reminder:
-            print(f"NOTE: {reminder}")
+            say(f"NOTE: {reminder}")
         use_cache()
         compare(configs, options.worlds, options.seeds, options.quick, store)
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        sys.stderr.write(f"error: {error}\n")
         return 2
     return 0
 
