@@ -1,0 +1,160 @@
+"""The worlds: true poses have no error, known errors are measured, and worse configs are named."""
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.birds import toy_bird
+
+from jaxfit.evaluation.bootstrap import BirdSums
+from jaxfit.evaluation.metrics import pa_mpjpe
+from jaxfit.foundation.errors import InputError
+
+FOLDER = Path(__file__).parent
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _scripts_can_be_imported():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(FOLDER))
+        yield
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    return importlib.import_module("world_scenes")
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    return importlib.import_module("worlds")
+
+
+@pytest.fixture(scope="module")
+def window(scenes):
+    return scenes.windows_of(toy_bird(), (3, 1), 2, 4, scenes._gaussian_errors)
+
+
+@pytest.fixture(scope="module")
+def pictures(scenes):
+    return scenes.pictures_of(toy_bird(), 1, range(2), 2)
+
+
+@pytest.mark.parametrize("name", ["window", "pictures"])
+def test_true_poses_have_no_error(name, worlds, request):
+    scene = request.getfixturevalue(name)
+    sums, missing = worlds.measure(scene.poses, scene, name == "pictures")
+    values = sums.values()
+    assert missing == 0
+    assert values["iou"] == pytest.approx(1, abs=1e-3)
+    for metric in ("me_p", "aligned", "mpjpe/length", "size_error"):
+        assert values[metric] == pytest.approx(0, abs=1e-4), metric
+
+
+def test_known_errors_are_measured(window, worlds):
+    poses = window.poses
+    moved = poses.keypoints_cam.copy()
+    bill = poses.keypoint_names.index("bill_tip")
+    moved[:, :, bill] += [0, 0, 1.2]
+    wrong = replace(poses, keypoints_cam=moved, scale=1.1 * poses.scale)
+    values = worlds.measure(wrong, window, False)[0].values()
+    # the mean over 12 keypoints of one error of 1.2 is 0.1; alignment distributes the error over all keypoints
+    assert values["aligned"] == pytest.approx(pa_mpjpe(moved, poses.keypoints_cam))
+    assert 0.05 < values["aligned"] < 0.25
+    assert values["size_bias"] == pytest.approx(0.1, abs=0.01)
+    length = np.linalg.norm(np.subtract((0, 9, 2.8), (0, -7.9, 0))) * poses.scale.mean()
+    assert values["aligned"] / values["aligned/length"] == pytest.approx(length, rel=0.03)
+
+
+def test_rotation_and_size_are_no_aligned_error(window, worlds):
+    turn = Rotation.from_rotvec([0, 0, 0.3]).as_matrix()
+    centre = window.poses.keypoints_cam.mean(2, keepdims=True)
+    turned = 1.2 * (window.poses.keypoints_cam - centre) @ turn.T + centre
+    values = worlds.measure(replace(window.poses, keypoints_cam=turned), window, False)[0].values()
+    assert values["aligned"] == pytest.approx(0, abs=1e-4)
+    assert values["mpjpe/length"] > 0.02
+
+
+def test_an_image_without_a_pose_is_missing(window, worlds):
+    valid = window.poses.valid.copy()
+    valid[0, 1] = False
+    assert worlds.measure(replace(window.poses, valid=valid), window, False)[1] == 1
+
+
+def test_annotators_keypoints_are_constant_and_near(scenes):
+    bird = toy_bird()
+    first, second = (scenes._annotator_offsets(bird, np.random.default_rng(seed)) for seed in (1, 1))
+    np.testing.assert_array_equal(first, second)
+    share = np.linalg.norm(first, axis=1) / np.linalg.norm(np.subtract((0, 9, 2.8), (0, -7.9, 0)))
+    assert (share > 0.009).all()
+    assert (share < 0.031).all()
+    for left, right in bird.keypoint_pairs:
+        np.testing.assert_allclose(first[left], first[right] * [-1, 1, 1])
+
+
+def _line(worlds, name, factor):
+    squares = tuple(factor * value for value in (1.0, 2.0, 1.5, 1.2, 0.9))
+    counts = (10,) * 5
+    birds = tuple("abcde")
+    return worlds.Line(name, BirdSums(birds, {"me_p": squares, "iou": counts}, {"me_p": counts, "iou": counts}), 1.0, 0)
+
+
+def test_worse_configs_are_named(worlds):
+    lines = [_line(worlds, name, factor) for name, factor in (("paper", 1.0), ("worse", 1.21), ("better", 0.8))]
+    (text,) = worlds.verdict(lines, "paper")
+    assert "worse" in text
+    assert "1.100" in text
+    assert "better" not in text
+    assert worlds.verdict([lines[0], lines[2]], "paper")[0].startswith("no config")
+    assert "not among" in worlds.verdict(lines[1:], "paper")[0]
+
+
+def test_tables_are_aligned(worlds):
+    rows = worlds.table([_line(worlds, "paper", 1.0), _line(worlds, "other", 1.21)], False).splitlines()
+    assert "1.100 (1.10…1.10)*" in rows[-1]
+    assert rows[0].index("me_p") + len("me_p") == rows[1].index("0.3633") + len("0.3633")
+
+
+def test_seeds_of_tuning_and_report_do_not_mix(worlds, capsys):
+    assert worlds.main(["--configs", "paper", "--seeds", "200", "500"]) == 2
+    assert "use two calls" in capsys.readouterr().err
+    assert "do not tune" in worlds.check_seeds([500])
+    assert worlds.check_seeds([499]) is None
+
+
+def test_words_change_a_config(worlds):
+    named = worlds.read_named_config("map terms.pose_prior=0.8 unknown_pixels=false")
+    assert named.config.terms["pose_prior"] == 0.8
+    assert named.config.unknown_pixels is False
+    assert named.key != worlds.read_named_config("map").key
+    with pytest.raises(InputError, match="pose_priorr"):
+        worlds.read_named_config("map terms.pose_priorr=0.8")
+
+
+def test_stored_runs_are_not_repeated(worlds, tmp_path, monkeypatch, capsys):
+    runs = []
+
+    def run(scenes, config, pictures, compiled):
+        runs.append(config.name)
+        sums = _line(worlds, config.name, 1.0).sums
+        entry = {"birds": sums.birds, "numerators": sums.numerators, "counts": sums.counts}
+        return {"parts": {"": {"seconds": 1.0, "compile_s": 0.0, "missing": 0, "scenes": [entry]}}}
+
+    monkeypatch.setattr(worlds, "run", run)
+    monkeypatch.setattr(worlds, "WORLDS", {1: worlds.WORLDS[1]._replace(draw=lambda seed, quick: ["scene"])})
+    path = tmp_path / "runs.json"
+    paper, fast = worlds.read_named_config("paper"), worlds.read_named_config("fast")
+    worlds.compare([paper], [1], [200], False, worlds.Store(path))
+    worlds.compare([paper, fast], [1], [200, 201], False, worlds.Store(path))
+    assert runs == ["paper", "fast", "paper", "fast"]
+    monkeypatch.setattr(worlds, "code_hash", lambda: "other code")
+    worlds.compare([paper], [1], [200], False, worlds.Store(path))
+    assert len(runs) == 5
+    capsys.readouterr()
+    worlds.show([], [1], [], False, worlds.Store(path))
+    shown = capsys.readouterr().out
+    assert "seeds 200, 201; 10 birds" in shown
+    assert "no config is significantly worse than paper" in shown

@@ -1,0 +1,365 @@
+"""The six worlds of `worlds.py`: observations of birds, and the truth about these birds.
+
+1. `murres`: murres on a ledge with simulated detections (`jaxfit.simulation.noise`).
+2. `murre_pixels`: murres from pixels. The built-in networks detect and track the birds in simulated footage.
+3. `aves_windows`: windows of the AVES model. Masks are exact at the centres of pixels; keypoints have Gaussian errors
+   and outliers.
+4. `species`: pictures of random species from all sides, for a fit with the mean model. An annotator's keypoints lie
+   beside those of the model.
+5. `cub`: photographs of five species (CUB-200-2011), without 3D truth.
+6. `avian_windows`: windows of the avian-mesh model with 12 keypoints. Keypoints have heavy-tailed errors that differ
+   between keypoints and are correlated in time, and some keypoints are missing.
+
+In worlds 3, 4 and 6, every bird has an image of its own, so that no bird hides another bird.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+from reference_data import reference_folder
+from scipy.spatial.transform import Rotation
+
+from jaxfit.config.reconstruct import load_reconstruct_config
+from jaxfit.data.formats import FOOTAGE
+from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.masks import box_of_mask, encode_mask
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
+from jaxfit.evaluation.benchmarks.fit import NOISE_PX, OUTLIERS
+from jaxfit.fitting.initial_poses import InitialPoses, load_initial_poses
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.bird import Bird
+from jaxfit.model.camera import Camera, project, to_screen
+from jaxfit.model.files import load_murre
+from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_keypoints, posed_vertices
+from jaxfit.model.published import import_model
+from jaxfit.perception.track import track_video
+from jaxfit.raster.zbuffer import hard_mask
+from jaxfit.simulation.flock import smooth_motion
+from jaxfit.simulation.noise import detect
+from jaxfit.simulation.scene import simulate, stage_scene
+from jaxfit.simulation.species import random_pose, random_species
+
+CAMERA = Camera()
+"""The camera of world 4."""
+WIDE = Camera(focal_px=CAMERA.focal_px, centre_px=256.0, size_px=512)
+"""The camera of the worlds 3 and 6. In an image of 256 pixels, the border would cut off bill or tail of most birds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Observations of some birds, and the truth about these birds."""
+
+    bird: Bird
+    """The model of the fit; the true poses have the same model, with other shapes and bone lengths in world 4."""
+    observations: Observations
+    """The input of the fit."""
+    exact: Observations
+    """True keypoints and whole masks; annotations in world 5."""
+    poses: Solution | None
+    """True poses, in the camera of the image; None without 3D truth."""
+    part: str = ""
+    """Part of the world that is also reported alone."""
+    initial_poses: InitialPoses | None = None
+    """Initial poses for the config `aves`."""
+
+
+class World(NamedTuple):
+    """A world: a name and a function that draws its scenes."""
+
+    name: str
+    draw: Callable[[int, bool], list[Scene]]
+    """From a seed, and whether the scenes are small, to the scenes."""
+    reference: str
+    """The config that no other config may be worse than."""
+    pictures: bool = False
+    """Whether frames are single pictures without motion."""
+    birds: str = "birds"
+    """What is resampled for the intervals."""
+    seeds: bool = True
+    """Whether the scenes differ between seeds."""
+
+
+def murres(seed: int, quick: bool) -> list[Scene]:
+    """Draw a scene of murres with simulated detections."""
+    bird = load_murre()
+    scene = stage_scene(bird, *((3, 20) if quick else (5, 60)), seed=seed)
+    return [Scene(bird, scene.detections, scene.truth, scene.poses)]
+
+
+def murre_pixels(seed: int, quick: bool) -> list[Scene]:
+    """Draw a scene of murres, film the scene, and track the birds in the footage with the built-in networks."""
+    bird = load_murre()
+    with tempfile.TemporaryDirectory() as folder:
+        scene = simulate(bird, Path(folder) / "scene", *((3, 20) if quick else (5, 60)), seed=seed)
+        tracks = track_video(Path(folder) / "scene" / FOOTAGE, load_reconstruct_config().track)
+    return [Scene(bird, tracks, scene.truth, scene.poses)]
+
+
+def published(kind: str, folder: str) -> Bird:
+    """Return a model of the reference data.
+
+    Raises:
+        InputError: there are no reference data.
+    """
+    reference = reference_folder()
+    if reference is None:
+        raise InputError(
+            "reference data", "are missing", "set JAXFIT_REFERENCE to their folder, or choose world 1 or 2"
+        )
+    return import_model(kind, [reference / "models" / folder])
+
+
+def aves_windows(seed: int, quick: bool) -> list[Scene]:
+    """Draw windows of the AVES model; keypoints have Gaussian errors of 2 px, and 5 % are outliers."""
+    return [windows_of(published("aves", "aves"), (3, seed), *((2, 20) if quick else (3, 100)), _gaussian_errors)]
+
+
+def avian_windows(seed: int, quick: bool) -> list[Scene]:
+    """Draw windows of the avian-mesh model with 12 keypoints, of which some are missing."""
+    bird = published("avian-mesh", "avian_mesh")
+    return [windows_of(bird, (6, seed), *((2, 20) if quick else (3, 100)), _heavy_errors)]
+
+
+def windows_of(
+    bird: Bird,
+    seed: tuple[int, int],
+    birds: int,
+    frames: int,
+    errors: Callable[[np.random.Generator, Observations], Observations],
+) -> Scene:
+    """Draw smooth random motion of some birds, each in images of its own, with exact masks.
+
+    Args:
+        bird: the model.
+        seed: number of the world, and seed; every pair has other motion and other errors.
+        birds: number of birds.
+        frames: number of frames.
+        errors: from exact observations to observations with errors of the keypoints.
+    """
+    poses = [smooth_motion(bird, frames, int(motion)) for motion in np.random.SeedSequence(seed).generate_state(birds)]
+    exact = detect(bird, poses, camera=WIDE)
+    own_images = {(n, t): (f"bird_{n}/{t:06d}.png", *exact.image_size(n, t)) for n, t in exact.masks}
+    exact = replace(exact, own_images=own_images, amodal_masks=exact.masks)
+    stacked = jax.tree.map(lambda *values: np.stack(values), *poses)
+
+    def each_frame(values: np.ndarray) -> np.ndarray:
+        return np.repeat(values[:, None], frames, axis=1)
+
+    stacked = replace(
+        stacked,
+        scale=np.broadcast_to(stacked.scale, (birds, frames)),
+        bone_length=each_frame(stacked.bone_length),
+        betas=each_frame(stacked.betas),
+    )
+    observations = errors(np.random.default_rng((*seed, 8)), exact)
+    return Scene(bird, observations, exact, true_solution(bird, stacked, exact, WIDE))
+
+
+def true_solution(bird: Bird, pose: Pose, exact: Observations, camera: Camera) -> Solution:
+    """Return true poses as a result whose crop is the whole image.
+
+    Args:
+        bird: the model.
+        pose: the poses; every field has leading axes (N, T).
+        exact: the true observations.
+        camera: the camera of the image.
+    """
+    keypoints_cam = np.asarray(keypoints_of(fold_bird(bird), pose), np.float64)
+    birds, frames = exact.present.shape
+    return Solution(
+        track_id=exact.track_id,
+        frame_index=exact.frame_index,
+        valid=exact.present,
+        global_orient=np.asarray(pose.global_orient),
+        body_pose=np.asarray(pose.body_pose),
+        transl=np.asarray(pose.transl),
+        scale=np.asarray(pose.scale),
+        bone_length=np.asarray(pose.bone_length),
+        betas=np.asarray(pose.betas),
+        keypoints_cam=keypoints_cam,
+        keypoints_px=np.asarray(project(keypoints_cam, camera)),
+        crop=np.broadcast_to(np.float32([0, 0, camera.size_px]), (birds, frames, 3)),
+        image_size_px=np.full((birds, frames, 2), camera.size_px),
+        focal_px=camera.focal_px,
+        keypoint_names=bird.keypoint_names,
+        joint_names=bird.joint_names,
+        crop_px=camera.size_px,
+        loss={},
+        status=np.full(birds, "ok"),
+    )
+
+
+@jax.jit
+def keypoints_of(rig: Rig, poses: Pose) -> Float[Array, "N T K 3"]:
+    """Return the keypoints of poses with leading axes (N, T), camera frame."""
+    return jax.vmap(jax.vmap(lambda pose: posed_keypoints(rig, joint_transforms(rig, pose), pose)))(poses)
+
+
+def _gaussian_errors(rng: np.random.Generator, exact: Observations) -> Observations:
+    """Add Gaussian errors to the keypoints, and place some at random around the bird; all confidences are 1."""
+    points = exact.keypoints_px + NOISE_PX * rng.standard_normal(exact.keypoints_px.shape)
+    is_outlier = rng.random(exact.confidence.shape) < OUTLIERS
+    low, size = exact.box_px[..., None, :2], exact.box_px[..., None, 2:]
+    points = np.where(is_outlier[..., None], low + size * rng.uniform(-0.2, 1.2, points.shape), points)
+    return replace(exact.with_keypoints(points, exact.confidence), amodal_masks={})
+
+
+MISSING, RHO, DOF = 0.15, 0.7, 3.0
+"""Share of missing keypoints, correlation of an error between consecutive frames, degrees of freedom of the tails."""
+
+
+def _heavy_errors(rng: np.random.Generator, exact: Observations) -> Observations:
+    """Add errors to the keypoints whose scale differs between keypoints (0.7 to 3 px), with heavy tails.
+
+    The errors are Student-t distributed and correlated in time. A missing keypoint is missing in runs of about ten
+    frames. The confidence depends on the error weakly.
+    """
+    N, T, K = exact.confidence.shape
+    sd = np.exp(rng.uniform(np.log(0.7), np.log(3.0), (N, 1, K)))
+    normal = rng.standard_normal((N, T, K, 2))
+    for t in range(1, T):
+        normal[:, t] = RHO * normal[:, t - 1] + np.sqrt(1 - RHO**2) * normal[:, t]
+    error = sd[..., None] * normal / np.sqrt(rng.chisquare(DOF, (N, T, K, 1)) / DOF)
+    runs = np.repeat(rng.random((N, -(-T // 10), K)), 10, axis=1)[:, :T]
+    ratio = np.linalg.norm(error, axis=-1) / 3.0
+    confidence = 1 / (1 + np.exp(-(2.0 - ratio + 0.7 * rng.standard_normal(ratio.shape))))
+    confidence = np.where(runs < MISSING, 0.0, confidence)
+    return replace(exact.with_keypoints(exact.keypoints_px + error, confidence), amodal_masks={})
+
+
+OFFSET = (0.01, 0.03)
+"""Range of the distance between an annotator's keypoint and that of the model, as a share of the body length."""
+PICTURE_NOISE_PX = 1.5
+"""Standard deviation of the annotator's errors in x and y, pixels of a 256-pixel picture."""
+KEYPOINTS = (12, 18)
+"""Fewest and most annotated keypoints of a picture."""
+
+
+def species(seed: int, quick: bool) -> list[Scene]:
+    """Draw pictures of 20 random species: half of the pictures have masks.
+
+    A track is a species, and its frames are pictures of different individuals in different poses from random
+    directions.
+    """
+    bird = published("aves", "aves")
+    scenes = []
+    for part, first in (("with masks", 0), ("without masks", 1)):
+        scene = pictures_of(bird, seed, range(4 if quick else 20), 1 if quick else 2, first)
+        if part == "without masks":
+            scene = replace(scene, observations=replace(scene.observations, masks={}))
+        scenes.append(replace(scene, part=part))
+    return scenes
+
+
+def pictures_of(bird: Bird, seed: int, numbers: Sequence[int], pictures: int, stream: int = 0) -> Scene:
+    """Draw pictures of random species from all sides, with an annotator's keypoints and exact masks.
+
+    Args:
+        bird: the mean model.
+        seed: seed of species and pictures.
+        numbers: numbers of the species; a number and a seed give one species and one annotator.
+        pictures: number of pictures of each species.
+        stream: pictures of different streams differ.
+    """
+    N, T, K = len(numbers), pictures, bird.num_keypoints
+    rig, faces = fold_bird(bird), np.asarray(bird.faces)
+    pose_at = jax.jit(lambda pose: (A := joint_transforms(rig, pose), posed_vertices(rig, A, pose)))
+    weights, poses = np.asarray(bird.keypoint_weights, np.float64), []
+    exact_px, annotated_px, confidence = np.zeros((N, T, K, 2)), np.zeros((N, T, K, 2)), np.zeros((N, T, K))
+    masks, boxes = {}, np.zeros((N, T, 4), np.float32)
+    for n, number in enumerate(numbers):
+        member = random_species(bird, 1000 * seed + number)
+        betas, offsets = _shape_of(member, bird), _annotator_offsets(bird, np.random.default_rng((seed, number, 9)))
+        rng = np.random.default_rng((seed, number, 10 + stream))
+        for t in range(T):
+            pose = random_pose(member, rng)
+            bones = pose.bone_length * (1 + 0.02 * rng.standard_normal(len(pose.bone_length)))
+            shape = betas + 0.2 * np.sqrt(np.asarray(bird.shape_variance)) * rng.standard_normal(bird.num_shapes)
+            orient = Rotation.random(rng=rng).as_rotvec()
+            pose = replace(pose, global_orient=np.float32(orient), bone_length=np.float32(bones))
+            pose = replace(pose, betas=np.float32(shape))
+            A, vertices = (np.asarray(array, np.float64) for array in pose_at(pose))
+            low, high = vertices.min(0), vertices.max(0)
+            depth = CAMERA.focal_px * (high - low)[:2].max() / (CAMERA.size_px * rng.uniform(0.55, 0.8))
+            shift = np.float32(np.array([*(0.03 * depth / 10 * rng.standard_normal(2)), depth]) - (low + high) / 2)
+            pose, vertices = replace(pose, transl=shift), vertices + shift
+            points = weights @ vertices
+            moved = np.einsum("kj,jab,kb->ka", np.asarray(rig.keypoint_map)[..., 3], A[..., :3], offsets)
+            exact_px[n, t] = project(points, CAMERA)
+            noise = PICTURE_NOISE_PX * rng.standard_normal((K, 2))
+            annotated_px[n, t] = np.asarray(project(points + moved, CAMERA)) + noise
+            confidence[n, t, rng.permutation(K)[: rng.integers(KEYPOINTS[0], min(KEYPOINTS[1], K) + 1)]] = 1
+            mask = hard_mask(np.asarray(to_screen(vertices, CAMERA), np.float32), faces, CAMERA.size_px, CAMERA.size_px)
+            masks[n, t], boxes[n, t] = encode_mask(mask), box_of_mask(mask) or (0, 0, 1, 1)
+            poses.append(pose)
+    exact = Observations(
+        track_id=np.array(numbers) + 1,
+        frame_index=np.arange(T),
+        present=np.ones((N, T), bool),
+        keypoints_px=exact_px,
+        confidence=np.ones((N, T, K)),
+        box_px=boxes,
+        image_size_px=np.full((T, 2), CAMERA.size_px),
+        file_name=np.array([f"picture_{t}" for t in range(T)]),
+        keypoint_names=bird.keypoint_names,
+        masks=masks,
+        amodal_masks=masks,
+        own_images={cell: (f"species_{cell[0]}/{cell[1]}.png", CAMERA.size_px, CAMERA.size_px) for cell in masks},
+    )
+    stacked = jax.tree.map(lambda *values: np.stack(values).reshape(N, T, *np.shape(values[0])), *poses)
+    observed = replace(exact.with_keypoints(annotated_px, confidence), amodal_masks={})
+    return Scene(bird, observed, exact, true_solution(bird, stacked, exact, CAMERA))
+
+
+def _shape_of(member: Bird, bird: Bird) -> Float[np.ndarray, "S"]:
+    """Return the shape coefficients of a random species in the shape space of its model."""
+    basis = np.asarray(bird.shape_basis, np.float64).reshape(bird.num_shapes, -1)
+    change = np.asarray(member.vertices, np.float64) - np.asarray(bird.vertices, np.float64)
+    return np.linalg.lstsq(basis.T, change.ravel(), rcond=None)[0]
+
+
+def _annotator_offsets(bird: Bird, rng: np.random.Generator) -> Float[np.ndarray, "K 3"]:
+    """Draw the constant offsets of an annotator's keypoints, in the rest pose: the same on both sides of the bird."""
+    rest = np.asarray(bird.keypoints, np.float64)
+    names = bird.keypoint_names
+    length = np.linalg.norm(rest[names.index("bill_tip")] - rest[names.index("tail_tip")])
+    direction = rng.standard_normal(rest.shape)
+    paired = {k for pair in bird.keypoint_pairs for k in pair}
+    direction[[k for k in range(len(rest)) if k not in paired], 0] = 0  # x is lateral
+    offsets = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    offsets *= length * rng.uniform(*OFFSET, (len(rest), 1))
+    for left, right in bird.keypoint_pairs:
+        offsets[right] = offsets[left] * [-1, 1, 1]
+    return offsets
+
+
+def cub(seed: int, quick: bool) -> list[Scene]:
+    """Read the photographs of five species, with the initial poses of a pose regressor; the seed has no effect."""
+    bird, scenes = published("aves", "aves"), []
+    for path in sorted((reference_folder() / "cub").glob("*.json"))[: 1 if quick else None]:
+        seen = read_coco(path)
+        # birds of different species must have different names, so that the intervals count all birds
+        poses = load_initial_poses(path.with_suffix(".init.npz"), seen, bird)
+        seen = replace(seen, track_id=seen.track_id + 1000 * int(path.name.split(".")[0]))
+        scenes.append(Scene(bird, seen, seen, None, initial_poses=poses))
+    return scenes
+
+
+WORLDS = {
+    1: World("murres, simulated detections", murres, "paper"),
+    2: World("murres from pixels", murre_pixels, "paper"),
+    3: World("windows of AVES, exact masks", aves_windows, "paper"),
+    4: World("random species, single pictures", species, "aves", pictures=True, birds="species"),
+    5: World("photographs of five species (CUB)", cub, "aves", pictures=True, seeds=False),
+    6: World("windows of avian-mesh, 12 keypoints", avian_windows, "paper"),
+}
+"""The worlds by number."""
