@@ -88,11 +88,15 @@ def bench(options: argparse.Namespace) -> None:
     """Measure one part of jaxfit and print the result."""
     from jaxfit.config.fit import load_config
     from jaxfit.evaluation.benchmarks.fit import bench_fit, bench_solvers, noisy_scene, plot_solvers
+    from jaxfit.evaluation.benchmarks.outline import bench_outline
     from jaxfit.evaluation.benchmarks.raster import bench_render, bench_silhouette
 
     bird = find_bird(options.model) if options.model else None
     if options.what == "silhouette":
         result = bench_silhouette(vertices=bird and bird.vertices, faces=bird and bird.faces)
+    elif options.what == "outline":
+        bird = bird or find_bird("murre")
+        result = bench_outline({bird.name: bird})
     elif options.what == "render":
         result = bench_render(bird)
     elif options.what == "solvers":
@@ -111,8 +115,25 @@ def bench(options: argparse.Namespace) -> None:
     if options.json:
         print(json_text(result))  # noqa: T201
         return
-    for table in bench_tables(result):
+    for table in outline_tables(result) if options.what == "outline" else bench_tables(result):
         show(table)
+
+
+def outline_tables(result: dict[str, Any]) -> list[Table]:
+    """Return a table of the excess of the silhouettes for each mesh, and the times."""
+    tables = []
+    for name, rows in result.items():
+        parts = list(next(iter(rows.values())))
+        title = f"{name}: px by which the silhouette lies outside the mesh"
+        if "ms_per_frame" in rows:
+            times = ", ".join(f"{edge} {ms:.2f}" for edge, ms in rows["ms_per_frame"].items())
+            title += f"; loss and gradient in ms/frame: {times}"
+        tables.append(right_aligned("", *parts, title=title))
+        tables[-1].columns[0].justify = "left"
+        for key, values in rows.items():
+            if key != "ms_per_frame":
+                tables[-1].add_row(key, *(f"{values[part]:+.3f}" for part in parts))
+    return tables
 
 
 def bench_tables(result: dict[str, Any]) -> list[Table]:

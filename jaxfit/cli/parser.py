@@ -247,7 +247,7 @@ def _configs(commands: Any) -> None:
 
 def _bench(commands: Any) -> None:
     bench = add_command(commands, "bench", "experiments.bench", "measure speed on this machine")
-    bench.add_argument("what", choices=("silhouette", "render", "fit", "solvers"), help="part to measure")
+    bench.add_argument("what", choices=("silhouette", "outline", "render", "fit", "solvers"), help="part to measure")
     bench.add_argument("--model", help=f"model to measure with, instead of the default: {MODEL}")
     bench.add_argument("--birds", type=int, default=9, help="fit, solvers: number of birds (default %(default)s)")
     bench.add_argument("--frames", type=int, default=100, help="fit, solvers: frames per bird (default %(default)s)")

@@ -212,7 +212,7 @@ def _known(target):
     return target != UNKNOWN if target.dtype == jnp.uint8 else jnp.ones(target.shape, bool)
 
 
-def _error(vertices, faces, mask, known, blur):
+def difference(vertices, faces, mask, known, blur):
     """Return the difference of silhouette and mask, without the unknown pixels. A filter is applied to the whole."""
     size = mask.shape[-1]
     if blur.edge != "unbiased":
@@ -235,7 +235,7 @@ def mask_loss(
     missing = weight == 0
     vertices = jnp.where(missing, 0.0, vertices)
     mask = target if jnp.issubdtype(target.dtype, jnp.floating) else (target != 0).astype(vertices.dtype)
-    error = _error(vertices, faces, mask, _known(target), blur)
+    error = difference(vertices, faces, mask, _known(target), blur)
     magnitude = jnp.abs(error)
     if kind == "smooth_l1":
         magnitude = jnp.where(magnitude < 1, 0.5 * error**2, magnitude - 0.5)
@@ -263,11 +263,10 @@ def silhouette_gauss_newton(
     tangents = jnp.concatenate([moved_px, moved_cam[..., 2:]], axis=-1)
 
     def image(v):
-        return _error(v, faces, jnp.zeros(target.shape, v.dtype), _known(target), blur)
+        return difference(v, faces, jnp.zeros(target.shape, v.dtype), _known(target), blur)
 
     value = image(vertices)
     rows = jax.vmap(lambda tangent: jax.jvp(image, (vertices,), (tangent,))[1])(tangents)  # (D, size, size)
-    if blur.edge != "unbiased":
-        rows = jnp.where((value > BAND_EDGE) & (value < 1 - BAND_EDGE), rows, 0.0)
-    block = jnp.einsum("dyx,eyx->de", rows, rows)
+    counted = (value > BAND_EDGE) & (value < 1 - BAND_EDGE) | (blur.edge == "unbiased")
+    block = jnp.einsum("dyx,eyx->de", jnp.where(counted, rows, 0.0), rows)
     return jnp.where(missing, 0.0, block)

@@ -27,6 +27,7 @@ RIG = fold_bird(BIRD)
 SIZE = 40
 BLUR = silhouette_reference.Blur(sigma=1.0, radius=3.0)
 """So sharp that all pixels of the band fit into the rows of the kernels."""
+UNBIASED = silhouette_reference.Blur(sigma=1.0, radius=3.0, edge="unbiased")
 PLACED = 3 * 8 + 4
 """Columns before the lengths of the bones: 8 joints, translation, scale."""
 
@@ -93,16 +94,18 @@ def compiled_block(vertices, faces, target, weight, skin, backend, blur):
     return raster.silhouette_gauss_newton(vertices, faces, target, weight, skin, camera_px, blur=blur, backend=backend)
 
 
-@jax.jit
-def by_autodiff(row, known):
-    """JᵀJ over the known pixels of the band, and their number."""
+@functools.partial(jax.jit, static_argnames="blur")
+def by_autodiff(row, known, blur):
+    """JᵀJ over the known pixels of the band, and their number; over all pixels for an edge that is filtered."""
 
     def image(row):
-        return silhouette_reference.silhouette(on_screen(row), RIG.faces, SIZE, BLUR)
+        empty = jnp.zeros((SIZE, SIZE))
+        return silhouette_reference.difference(on_screen(row), RIG.faces, empty, known, blur)
 
     value, J = image(row), jax.jacfwd(image)(row)
     band = (value > 0.01) & (value < 0.99) & known
-    return jnp.einsum("yxd,yxe->de", jnp.where(band[..., None], J, 0.0), J), band.sum()
+    counted = band | (blur.edge == "unbiased")
+    return jnp.einsum("yxd,yxe->de", jnp.where(counted[..., None], J, 0.0), J), band.sum()
 
 
 def test_transform_derivatives():
@@ -122,17 +125,20 @@ PLACES = {"inside": (0.3, -0.2, 180.0), "at the border": (9.0, 4.0, 180.0), "par
 
 
 @functools.cache
-def expected_block(place, masked=False):
+def expected_block(place, masked=False, blur=BLUR):
     """JᵀJ and the number of pixels of its band, by automatic differentiation."""
     known = random_target(SIZE) != silhouette_reference.UNKNOWN if masked else jnp.ones((SIZE, SIZE), bool)
-    return by_autodiff(row_of(PLACES[place]), known)
+    return by_autodiff(row_of(PLACES[place]), known, blur)
 
 
+@pytest.mark.parametrize("blur", [BLUR, UNBIASED], ids=["soft_rasterizer", "unbiased"])
 @pytest.mark.parametrize("place", PLACES)
-def test_it_is_the_square_of_the_jacobian(backend, place):
-    expected, band = expected_block(place)
-    assert 10 < band <= 256
-    np.testing.assert_allclose(block(row_of(PLACES[place]), backend), expected, atol=1e-5 * np.abs(expected).max())
+def test_it_is_the_square_of_the_jacobian(backend, place, blur):
+    expected, band = expected_block(place, blur=blur)
+    assert 10 < band
+    assert band <= 256 or blur == UNBIASED
+    found = block(row_of(PLACES[place]), backend, blur=blur)
+    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
 
 
 def random_target(size):
@@ -141,14 +147,15 @@ def random_target(size):
     return jnp.asarray(np.random.default_rng(3).choice(values, (size, size)), jnp.uint8)
 
 
-def test_unknown_pixels_have_no_curvature(backend):
+@pytest.mark.parametrize("blur", [BLUR, UNBIASED], ids=["soft_rasterizer", "unbiased"])
+def test_unknown_pixels_have_no_curvature(backend, blur):
     row, target = row_of(), random_target(SIZE)
-    expected, band = expected_block("inside", masked=True)
-    assert 10 < band < 0.9 * expected_block("inside")[1]
-    found = block(row, backend, target=target)
-    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
-    assert not np.any(block(row, backend, target=jnp.full_like(target, silhouette_reference.UNKNOWN)))
-    np.testing.assert_array_equal(block(row, backend, target=target == 1), block(row, backend))
+    expected, band = expected_block("inside", masked=True, blur=blur)
+    assert 10 < band < 0.95 * expected_block("inside", blur=blur)[1]
+    found = block(row, backend, target=target, blur=blur)
+    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
+    assert not np.any(block(row, backend, target=jnp.full_like(target, silhouette_reference.UNKNOWN), blur=blur))
+    np.testing.assert_array_equal(block(row, backend, target=target == 1, blur=blur), block(row, backend, blur=blur))
 
 
 def test_a_bird_outside_the_image_has_no_curvature(backend):
