@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -108,8 +109,13 @@ def add_tracking_options(command: argparse.ArgumentParser) -> None:
     text = "YAML file with `base: reconstruct` and changed settings; `jaxfit config show reconstruct` lists them all"
     command.add_argument("--config", default="reconstruct", help=text)
     for option, (path, details) in TRACK_OPTIONS.items():
-        text = option_help(TrackConfig, path)
-        command.add_argument(option, dest=f"track.{path}", help=text[0].lower() + text[1:], **details)
+        command.add_argument(option, dest=f"track.{path}", help=_track_help(path), **details)
+
+
+@cache  # several commands have the options, and `option_help` reads source code
+def _track_help(path: str) -> str:
+    text = option_help(TrackConfig, path)
+    return text[0].lower() + text[1:]
 
 
 def add_result_commands(commands: Any) -> None:

@@ -18,7 +18,9 @@ reports frames with a larger distance."""
 CROP_IMAGE_SIDES = 2
 """Largest side of a crop, as a multiple of the longer side of its image."""
 
-# --- polygons of masks
+# --- masks of files
+MASK_RUNS = 1_000_000
+"""Largest number of runs of one mask. Reading the runs takes about a second at this limit."""
 POLYGONS = 256
 """Largest number of polygons of one mask."""
 POLYGON_LENGTH_PX = 1_000_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +28,7 @@ def random_species(bird: Bird, seed: int, bone_sd: float = 0.05) -> Bird:
     """
     random = np.random.default_rng(seed)
     betas = random.standard_normal(bird.num_shapes) * np.sqrt(np.asarray(bird.shape_variance))
-    bones = random.multivariate_normal(np.asarray(bird.bone_mean), np.asarray(bird.bone_covariance, np.float64))
+    bones = _normal(random, bird.bone_mean, bird.bone_covariance)
     factor = np.exp(bone_sd * random.standard_normal(len(bones)))
     for left, right in bird.joint_pairs:
         if left and right:
@@ -45,8 +46,7 @@ def random_species(bird: Bird, seed: int, bone_sd: float = 0.05) -> Bird:
 
 def random_pose(bird: Bird, random: np.random.Generator, spread: float = 0.7) -> Pose:
     """Return a pose from the prior of a model, with its deviations times `spread`, and the mean bones and shape."""
-    covariance = np.asarray(bird.pose_covariance, np.float64) * spread**2
-    body = random.multivariate_normal(np.asarray(bird.pose_mean), covariance)
+    body = _normal(random, bird.pose_mean, bird.pose_covariance, spread)
     return Pose(
         global_orient=np.zeros(3, np.float32),
         body_pose=body.reshape(-1, 3).astype(np.float32),
@@ -55,6 +55,16 @@ def random_pose(bird: Bird, random: np.random.Generator, spread: float = 0.7) ->
         bone_length=np.asarray(bird.bone_mean, np.float32),
         betas=np.zeros(bird.num_shapes, np.float32),
     )
+
+
+def _normal(random: np.random.Generator, mean: Any, covariance: Any, spread: float = 1.0) -> Float[np.ndarray, "D"]:
+    """Draw from a normal distribution whose deviations are multiplied by `spread`.
+
+    `Generator.multivariate_normal` decomposes into singular vectors. A covariance with equal eigenvalues has many such
+    decompositions, and the rounding of the processor selects one. The Cholesky factor is unique.
+    """
+    factor = np.linalg.cholesky(np.asarray(covariance, np.float64))
+    return np.asarray(mean) + spread * factor @ random.standard_normal(len(factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +87,8 @@ def simulate_scan(
     """Pose a bird at random and scan its surface.
 
     The mesh is divided to other vertices, only faces that are visible from outside remain, a side of a random direction
-    is missing, and every vertex has noise.
+    is missing, and every vertex has noise. The rounding of the processor affects the number of vertices, so the noise
+    of the surface is drawn last: pose and keypoints are the same on every processor.
 
     Args:
         bird: the model.
@@ -95,6 +106,9 @@ def simulate_scan(
     marked = np.asarray(bird.keypoint_weights, np.float64) @ whole
     turn = view_grid(50, 7)[random.integers(350)]
     shift = random.standard_normal(3) * length
+    direction = view_grid(200, 1)[random.integers(200), 2]
+    chosen = random.permutation(bird.num_keypoints)[:keypoints]
+    annotated = marked[chosen] + random.standard_normal((len(chosen), 3)) * noise / 2 * length
 
     def to_scan(points):
         return scale * (points @ turn.T + shift)
@@ -103,7 +117,7 @@ def simulate_scan(
     triangles = triangles[_seen(fine, triangles)]
     corners = fine[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    side = corners.mean(1) @ view_grid(200, 1)[random.integers(200), 2]
+    side = corners.mean(1) @ direction
     order = np.argsort(side)
     keep = np.ones(len(triangles), bool)
     keep[order[np.cumsum(area[order]) < missing * area.sum()]] = False
@@ -114,8 +128,6 @@ def simulate_scan(
     mesh.remove_unreferenced_vertices()
     points = np.asarray(mesh.vertices) * (length / 60)
     points = points + random.standard_normal(points.shape) * noise * length
-    chosen = random.permutation(bird.num_keypoints)[:keypoints]
-    annotated = marked[chosen] + random.standard_normal((len(chosen), 3)) * noise / 2 * length
     return SimulatedScan(
         to_scan(points),
         np.asarray(mesh.faces),

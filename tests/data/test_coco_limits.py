@@ -12,7 +12,7 @@ from support.mutations import damaged_bytes, damaged_tree
 
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import IMAGE_SIDE_PX, KEYPOINTS, POLYGON_LENGTH_PX, POLYGONS
+from jaxfit.foundation.limits import IMAGE_SIDE_PX, KEYPOINTS, MASK_RUNS, POLYGON_LENGTH_PX, POLYGONS
 
 
 def rejected(tmp_path, data, message):
@@ -49,6 +49,12 @@ def test_the_number_of_runs_is_bounded(tmp_path):
     rejected(tmp_path, data, "counts has 603 runs, more than the 600 pixels")
     data["annotations"][3]["segmentation"]["counts"] = [0, 600, 0]
     assert read_coco(saved(tmp_path, data)).mask(0, 0).all()
+    side = IMAGE_SIDE_PX
+    for counts in ("1" * (MASK_RUNS + 1), [1] * MASK_RUNS + [side**2 - MASK_RUNS]):
+        data = large_image({"size": [side, side], "counts": counts})
+        rejected(tmp_path, data, "counts has 1,000,001 runs, more than 1,000,000")
+    # a text without the end of a number takes no time either
+    rejected(tmp_path, large_image({"size": [side, side], "counts": "o" * 10 * MASK_RUNS}), "counts is corrupt")
 
 
 def tracks_and_frames(tracks, frames, keypoints=18):

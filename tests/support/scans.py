@@ -9,11 +9,13 @@ from jaxfit.model.files import load_murre
 from jaxfit.simulation.species import random_species, simulate_scan
 
 
-def small_scan(seed=6, **changes):
+def small_scan(seed=9, **changes):
     """Return the murre, a species near the murre, and a scan of this species.
 
-    The rounding of a processor decides which vertices a scan has, and so its noise. With several such noises of scan 6,
-    the bones of an adapted model are well within the bounds of the tests. Scan 5 lacks the head, and its bones are not.
+    Keypoints and surface together determine the bones. Of the scans 0 to 11, only scan 9 has keypoints on the bill, on
+    both wings, on both legs and on both ends of the tail. The rounding of a processor affects which vertices a scan
+    has. With three such roundings and with five other noises of the surface, an adapted model has 0.35 to 0.47 of the
+    error of the bones that the murre has.
     """
     bird = load_murre()
     species = random_species(bird, seed)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from jaxfit.data.formats.fields import Field
-from jaxfit.foundation.limits import POLYGON_LENGTH_PX, POLYGONS
+from jaxfit.foundation.limits import MASK_RUNS, POLYGON_LENGTH_PX, POLYGONS
 
 _MASKS_AT_ONCE = 500
 """Masks that are checked at once, which bounds the memory."""
@@ -99,6 +99,8 @@ def _polygon(polygon: Field, height: int, width: int) -> np.ndarray:
 
 def _runs(counts: Field, pixels: int) -> list[int]:
     if isinstance(counts.value, str):
+        codes = np.frombuffer(counts.value.encode("ascii", "replace"), np.uint8) - np.uint8(48)
+        _check_number_of_runs(counts, np.count_nonzero(codes & 32 == 0))
         runs = run_lengths(counts.value)
         if not runs:
             counts.fail("is corrupt: not the text that pycocotools writes for run lengths", _REMEDY)
@@ -107,9 +109,17 @@ def _runs(counts: Field, pixels: int) -> list[int]:
         counts.fail("must be text or a list of run lengths", _REMEDY)
     if len(counts.value) > pixels + 2:  # the first and the last run may be empty
         counts.fail(f"has {len(counts.value)} runs, more than the {pixels} pixels of its image", _REMEDY)
+    _check_number_of_runs(counts, len(counts.value))
     if all(type(run) is int and 0 <= run <= pixels for run in counts.value):
         return counts.value
     return [run.integer(0, 2**31) for run in counts]
+
+
+def _check_number_of_runs(counts: Field, runs: int) -> None:
+    if runs > MASK_RUNS:
+        counts.fail(
+            f"has {runs:,} runs, more than {MASK_RUNS:,}", "remove the noise of the mask, or leave segmentation out"
+        )
 
 
 def run_lengths(text: str) -> list[int]:

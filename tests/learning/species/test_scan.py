@@ -147,7 +147,7 @@ def test_files_that_are_no_scans_are_one_line_errors(tmp_path):
 
 
 def test_a_mirrored_scan_and_distant_keypoints_are_rejected(tmp_path, capsys):
-    bird, _, scan = small_scan(5)  # of scan 6, few keypoints have a left and a right side
+    bird, _, scan = small_scan()
     names = list(scan.keypoints)
     own = mean_keypoints(bird)[[bird.keypoint_names.index(name) for name in names]]
     assert not is_mirrored(own, np.stack([scan.keypoints[name] for name in names]))
