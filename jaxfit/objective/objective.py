@@ -45,12 +45,16 @@ def weighted_sum(window: PosedWindow, terms: Mapping[str, Term], settings: Setti
     return sum((jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()), start=jnp.zeros(()))
 
 
-def evaluate_curvature(window: PosedWindow, terms: Mapping[str, Term], settings: Settings) -> Curvature:
+def evaluate_curvature(
+    window: PosedWindow, terms: Mapping[str, Term], settings: Settings, second_order: bool = False
+) -> Curvature:
     """Return Σ λ · H_term over the active terms, from their own curvature or from their residuals.
 
     Args:
         window: one bird in one window.
         terms, settings: as for `evaluate_terms`.
+        second_order: whether H includes the second derivatives of robust kernels, as `residual_curvature` describes.
+            A term with its own curvature does not distinguish.
 
     Raises:
         InputError: a term has no curvature and does not return residuals; the error names the term.
@@ -64,7 +68,7 @@ def evaluate_curvature(window: PosedWindow, terms: Mapping[str, Term], settings:
                 found += [part._replace(weight=jnp.asarray(values["weight"]) * part.weight) for part in parts]
         return found
 
-    weights, curvatures = [jnp.ones(())], [residual_curvature(window, residuals_of)]
+    weights, curvatures = [jnp.ones(())], [residual_curvature(window, residuals_of, second_order)]
     for name, values in settings.items():
         curvature = terms[name].curvature
         if curvature is not None:
