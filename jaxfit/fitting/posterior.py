@@ -7,8 +7,8 @@ and a border for the parameters that all frames share (common scale, bone length
     H = [A  U; Uᵀ  S],  A_tu = 0 for |t − u| > 2.
 
 Products with H at structured probes give the blocks: frames t, t + 5, t + 10, … do not interact, so one probe gives one
-column of all their blocks. Two frames at a time, A is block-tridiagonal. A Cholesky factorisation forward in time and
-the selected inverse backward in time give the log-determinant and the blocks of H⁻¹ inside the band.
+column of all their blocks. A Cholesky factorisation forward in time and the selected inverse backward in time give the
+log-determinant and the blocks of H⁻¹ inside the band.
 
 The curvature of a robust kernel includes its second derivative (`objective.residuals.residual_curvature`). Derivatives
 of second order of the pose (of the residuals) are left out, as in Gauss-Newton.
@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.linalg import cho_solve, solve_triangular
+from scipy.linalg import cho_solve, get_lapack_funcs
 
 from jaxfit.fitting.solve import Problem, Program, problem_window
 from jaxfit.model.kinematics import Pose
@@ -106,63 +106,39 @@ def invert_blocks(H: Blocks) -> Posterior:
         numpy.linalg.LinAlgError: H is not positive definite.
     """
     (_, T, L, _), C = H.band.shape, len(H.corner)
-    diagonal, upper = _in_pairs(H.band)
-    U = np.zeros((2 * len(diagonal), L, C))
-    U[:T] = H.border
-    U = U.reshape(len(diagonal), 2 * L, C)
-    factors, gains, forward, log_determinant = [], [], [], 0.0
-    for g in range(len(diagonal)):
-        D, rest = diagonal[g], U[g]
-        if g:
-            D, rest = D - upper[g - 1].T @ gains[-1], rest - gains[-1].T @ forward[-1]
-        factor = np.linalg.cholesky(D)
-        factors.append(factor)
-        forward.append(rest)
+    band = np.concatenate([H.band, np.zeros((3, BANDWIDTH, L, L))], axis=1)  # frames after the last: 0
+    rest = np.concatenate([H.border, np.zeros((BANDWIDTH, L, C))])
+    (invert_triangle,) = get_lapack_funcs(("trtri",), dtype=np.float64)
+    inverses, gains, log_determinant = np.zeros((T, L, L)), np.zeros((2, T, L, L)), 0.0
+    for t in range(T):
+        factor = np.linalg.cholesky(band[0, t])
         log_determinant += 2 * np.log(np.diagonal(factor)).sum()
-        if g + 1 < len(diagonal):
-            gains.append(cho_solve((factor, True), upper[g], check_finite=False))
+        # products of L×L matrices only: linear algebra on several threads is slow for larger ones on a busy machine
+        inverse_factor, _ = invert_triangle(factor, lower=1)
+        inverses[t] = inverse_factor.T @ inverse_factor
+        for k in (1, 2):
+            gains[k - 1, t] = inverses[t] @ band[k, t]
+            rest[t + k] -= gains[k - 1, t].T @ rest[t]
+        band[0, t + 1] -= band[1, t].T @ gains[0, t]
+        band[1, t + 1] -= band[1, t].T @ gains[1, t]
+        band[0, t + 2] -= band[2, t].T @ gains[1, t]
     # backward: V = A⁻¹U, and the blocks of A⁻¹ inside the band
-    inner, outer, V = np.zeros_like(diagonal), np.zeros_like(upper), np.zeros_like(U)
-    for g in reversed(range(len(diagonal))):
-        inverse_factor = solve_triangular(factors[g], np.eye(2 * L), lower=True, check_finite=False)
-        inner[g], V[g] = inverse_factor.T @ inverse_factor, cho_solve((factors[g], True), forward[g])
-        if g + 1 < len(diagonal):
-            outer[g] = -gains[g] @ inner[g + 1]
-            inner[g] -= outer[g] @ gains[g].T
-            V[g] -= gains[g] @ V[g + 1]
-    band, V = _from_pairs(inner, outer, T, L), V.reshape(2 * len(V), L, C)[:T]
+    inside, V = np.zeros_like(band), np.zeros_like(rest)
+    for t in reversed(range(T)):
+        first, second = gains[:, t]
+        inside[1, t] = -first @ inside[0, t + 1] - second @ inside[1, t + 1].T
+        inside[2, t] = -first @ inside[1, t + 1] - second @ inside[0, t + 2]
+        own = inverses[t] - inside[1, t] @ first.T - inside[2, t] @ second.T
+        inside[0, t] = (own + own.T) / 2
+        V[t] = inverses[t] @ rest[t] - first @ V[t + 1] - second @ V[t + 2]
+    V, inside = V[:T], inside[:, :T]
     schur = H.corner - np.einsum("tic,tid->cd", H.border, V)
     factor = np.linalg.cholesky((schur + schur.T) / 2)
     log_determinant += 2 * np.log(np.diagonal(factor)).sum()
     corner = cho_solve((factor, True), np.eye(C)) if C else np.zeros((0, 0))
     for k in range(BANDWIDTH + 1):
-        band[k, : T - k] += np.einsum("tic,cd,tjd->tij", V[: T - k], corner, V[k:], optimize=True)
-    return Posterior(Blocks(band, -V @ corner, corner), float(log_determinant))
-
-
-def _in_pairs(band: Float[np.ndarray, "3 T L L"]) -> tuple[Float[np.ndarray, "G M M"], Float[np.ndarray, "G-1 M M"]]:
-    """Return the diagonal blocks, and the blocks above them, of pairs of frames. A missing last frame is the unit
-    matrix, which changes neither the determinant nor the inverse of the others."""
-    _, T, L, _ = band.shape
-    padded = np.zeros((3, T + T % 2, L, L))
-    padded[:, :T] = band
-    padded[0, T:] = np.eye(L)
-    (even, odd), next_to, far = (padded[0, ::2], padded[0, 1::2]), padded[1], padded[2]
-    diagonal = np.block([[even, next_to[::2]], [next_to[::2].transpose(0, 2, 1), odd]])
-    upper = np.block([[far[:-2:2], np.zeros_like(far[:-2:2])], [next_to[1:-1:2], far[1:-1:2]]])
-    return diagonal, upper
-
-
-def _from_pairs(diagonal: np.ndarray, upper: np.ndarray, T: int, L: int) -> Float[np.ndarray, "3 T L L"]:
-    """Return the band of a matrix from its blocks of pairs of frames."""
-    band = np.zeros((3, 2 * len(diagonal), L, L))
-    band[0, ::2], band[0, 1::2] = diagonal[:, :L, :L], diagonal[:, L:, L:]
-    band[1, ::2], band[1, 1:-1:2] = diagonal[:, :L, L:], upper[:, L:, :L]
-    band[2, :-2:2], band[2, 1:-1:2] = upper[:, :L, :L], upper[:, L:, L:]
-    band = band[:, :T]
-    for k in range(1, BANDWIDTH + 1):
-        band[k, max(T - k, 0) :] = 0
-    return band
+        inside[k, : T - k] += V[: T - k] @ corner @ V[k:].swapaxes(1, 2)
+    return Posterior(Blocks(inside, -V @ corner, corner), float(log_determinant))
 
 
 def trace_product(covariance: Blocks, H: Blocks) -> float:

@@ -85,8 +85,9 @@ def _checked_residuals(name: str, value: Any) -> list[Residuals]:
     """Return the residuals of a term after a check that the term returns residuals."""
     if _is_residuals(value):
         return as_list(value)
-    problem = "returns a number, but the solver levenberg_marquardt needs its residuals"
-    raise InputError(f"term {name!r}", problem, "return Residuals (docs/terms.md), or use the solver adam")
+    problem = "returns a number, but the solver levenberg_marquardt and error bars need its residuals"
+    remedy = "return Residuals (docs/terms.md), or use the solver adam without error_bars"
+    raise InputError(f"term {name!r}", problem, remedy)
 
 
 def _is_residuals(value: Any) -> bool:
