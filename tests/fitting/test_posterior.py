@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.stages import CONFIG, FIRST, MODEL, B, T, case, problems
+from support.stages import CONFIG, MODEL, POSTERIOR, SHARED, B, T, case, problems
 
 from jaxfit.fitting.posterior import (
     Blocks,
@@ -23,13 +23,6 @@ from jaxfit.objective.curvature import frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature
 from jaxfit.objective.registry import Term, find_terms
 from jaxfit.objective.residuals import Residuals, residual_curvature, student_t
-
-SHARED = ("bone_length", "betas")
-STAGE = dataclasses.replace(
-    FIRST,
-    terms=("keypoint_likelihood", "pose_prior", "bone_prior", "shape_prior", "motion_likelihood", "place_likelihood"),
-    optimised=("global_orient", "body_pose", "transl", "scale", *SHARED),
-)
 
 
 def dense(H):
@@ -110,7 +103,7 @@ def test_kalman_smoother():
     np.testing.assert_allclose(own, smoothed[::-1], rtol=1e-12)
 
 
-def fitted(confidence=1.0, stage=STAGE, terms=None):
+def fitted(confidence=1.0, stage=POSTERIOR, terms=None):
     """Return the program of a stage with all shared parameters, its problems, and poses."""
     program = stage_program(CONFIG, stage, MODEL)._replace(shared=SHARED)
     program = program if terms is None else program._replace(terms=terms)
@@ -195,7 +188,7 @@ def test_a_term_that_links_distant_frames_is_reported():
 
     terms = {**find_terms(("keypoints", "pose_prior")), "ends": Term("ends", ends, {}, frozenset(), False)}
     program = fitted()[0]._replace(terms=terms)
-    several = fitted(stage=dataclasses.replace(STAGE, terms=("keypoints", "pose_prior")))[1]
+    several = fitted(stage=dataclasses.replace(POSTERIOR, terms=("keypoints", "pose_prior")))[1]
     settings = several.hyperparameters.settings | {"ends": {"weight": jnp.full(B, 100.0)}}
     several = several._replace(hyperparameters=several.hyperparameters._replace(settings=settings))
     own = window_posteriors(program, several, fitted()[2])
