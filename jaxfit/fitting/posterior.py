@@ -370,6 +370,23 @@ def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -
     return "the curvature of the objective is not positive definite"
 
 
+def log_evidence(loss: float, posterior: WindowPosterior, prior: WindowPosterior) -> float:
+    """Return the Laplace approximation of the evidence, log p ≈ −E − ½·(log |H| − log |H_prior|), nats.
+
+    The volume of the prior is the normaliser of the product of all prior terms. The normaliser of every single term is
+    not enough: a pose prior of single frames times a motion prior is narrower than either of them, because the frames
+    of slow motion are not independent.
+
+    Args:
+        loss: the objective E at the fitted pose, plus the normalisers of the likelihood of the data.
+        posterior: the posterior (`window_posteriors`).
+        prior: the Gaussian with the curvature of the prior terms alone, as `posterior_of` of their `window_blocks`.
+
+    Source: MacKay 1992.
+    """
+    return -loss - 0.5 * (posterior.log_volume - prior.log_volume)
+
+
 def with_shared(program: Program, optimised: Collection[str]) -> Program:
     """Return a program whose derivatives have columns for all shared parameters in `optimised`, also for Adam."""
     return program._replace(shared=tuple(name for name in SHARED_PARAMETERS if name in optimised))

@@ -10,10 +10,13 @@ from support.stages import CONFIG, MODEL, POSTERIOR, SHARED, B, T, case, problem
 
 from jaxfit.fitting.posterior import (
     Blocks,
+    Columns,
     blocks_of,
     curvature_products,
     invert_blocks,
+    log_evidence,
     multiply,
+    posterior_of,
     trace_product,
     window_blocks,
     window_posteriors,
@@ -208,6 +211,27 @@ def test_effective_number_of_parameters():
         assert not isinstance(prior, str)
         effective.append(own.posterior.count - trace_product(own.posterior.covariance, prior[0]))
     assert 0 < effective[0] < effective[1] < own.posterior.count
+
+
+def test_evidence_of_a_linear_gaussian_case():
+    """One parameter per frame with prior precision p, observed once with precision q: the density of the data."""
+    rng, frames, p, q = np.random.default_rng(0), 5, 2.0, 3.0
+    data = rng.normal(size=frames)
+    empty = np.zeros((frames, 1, 0)), np.zeros((0, 0))
+    columns, broad = Columns(np.array([0]), np.zeros(0, int)), np.full((frames, 1), 1e-9)
+
+    def gaussian(precision):
+        band = np.zeros((3, frames, 1, 1))
+        band[0] = precision
+        found = posterior_of(Blocks(band, *empty), columns, broad)
+        assert not isinstance(found, str)
+        return found
+
+    mode = q * data / (p + q)
+    loss = 0.5 * (q * (data - mode) ** 2 + p * mode**2).sum() - frames / 2 * np.log(q / (2 * np.pi))
+    variance = 1 / p + 1 / q
+    expected = -0.5 * (data**2 / variance + np.log(2 * np.pi * variance)).sum()
+    assert log_evidence(loss, gaussian(p + q), gaussian(p)) == pytest.approx(expected, abs=1e-4)
 
 
 def test_second_order_curvature_of_student_t_is_its_fisher_information():
