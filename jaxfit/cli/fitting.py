@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfit.cli.observations import image_size, keypoint_map, observations_for
-from jaxfit.cli.tables import breakdown_tables, counted, evaluation_tables, right_aligned, show
+from jaxfit.cli.tables import breakdown_tables, calibration_tables, counted, evaluation_tables, right_aligned, show
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text
@@ -20,6 +20,8 @@ from jaxfit.model.files import find_bird
 if TYPE_CHECKING:
     from jaxfit.config.fit import FitConfig
     from jaxfit.data.keypoint_names import NameMap
+    from jaxfit.data.solution import Solution
+    from jaxfit.evaluation.truth import Truth
 
 LEAST_KEYPOINTS = 3
 """Fewer keypoints do not determine the orientation of a bird."""
@@ -91,10 +93,13 @@ def evaluate(options: argparse.Namespace) -> None:
     from jaxfit.evaluation.evaluate import evaluate
     from jaxfit.evaluation.truth import match_tracks, read_truth
 
+    if options.plot and not options.calibration:
+        raise InputError("--plot", "is given without --calibration", "add --calibration, or remove --plot")
     if os.path.isfile(options.result):  # noqa: PTH113 - False for paths that cannot exist
-        if options.by:
-            remedy = "give the folder of a result, or remove --by"
-            raise InputError(options.result, "holds observations, for which there are no tables --by", remedy)
+        for option, given in (("--by", options.by), ("--calibration", options.calibration)):
+            if given:
+                remedy = f"give the folder of a result, or remove {option}"
+                raise InputError(options.result, f"holds observations, for which there are no tables {option}", remedy)
         _evaluate_observations(options)
         return
     solution, bird = load_solution(options.result)
@@ -109,6 +114,9 @@ def evaluate(options: argparse.Namespace) -> None:
         remedy = "give the folder of a simulated scene, or remove --by behaviour"
         raise InputError(options.truth, "holds no behaviours of the birds", remedy)
     solution, matching = match_tracks(solution, truth, options.match)
+    if options.calibration:
+        _calibration(options, solution, truth)
+        return
     result = evaluate(solution, bird, truth, terminal)
     if options.json:
         matched = {"matched_by": matching.by, "follows": matching.follows}
@@ -124,6 +132,30 @@ def evaluate(options: argparse.Namespace) -> None:
         show(f"not counted: {counted(result.missing, 'annotated bird')} without a pose in this result")
     if result.unmatched:
         show(f"not counted: {counted(result.unmatched, 'pose')} of tracks or frames that the truth lacks")
+
+
+def _calibration(options: argparse.Namespace, solution: Solution, truth: Truth) -> None:
+    """Print the calibration of the error bars of a result, and plot it."""
+    from jaxfit.evaluation.calibration import calibration, plot_calibration
+    from jaxfit.foundation.extras import require_extra
+    from jaxfit.foundation.files import check_writable
+
+    if options.plot:
+        require_extra("report", "--plot")
+        check_writable(options.plot)
+    result = calibration(solution, truth)
+    if options.plot:
+        plot_calibration(result, options.plot)
+    if options.json:
+        print(json_text(result.to_dict()))  # noqa: T201
+        return
+    for table in calibration_tables(result):
+        show(table)
+    show("50 %, 68 %, 95 %: errors inside the region of this probability;")
+    show("sd: mean standard deviation; error: RMS error of a component; NLL: mean negative log-likelihood, nats;")
+    show("constant: NLL of a constant bar for each keypoint or joint that is fitted to the errors")
+    if result.without_error_bars:
+        show(f"not counted: {counted(result.without_error_bars, 'pose')} without error bars")
 
 
 def _evaluate_observations(options: argparse.Namespace) -> None:

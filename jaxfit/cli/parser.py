@@ -98,6 +98,10 @@ def _fitting(commands: Any) -> None:
     add_observation_options(evaluate)
     text = "also print the metrics by behaviour (of a simulated scene) or by keypoint"
     evaluate.add_argument("--by", choices=("behaviour", "keypoint"), help=text)
+    text = "print how well the error bars of a result agree with its errors, instead of the metrics"
+    evaluate.add_argument("--calibration", action="store_true", help=text)
+    text = "with --calibration: also plot the coverage over the probability"
+    evaluate.add_argument("--plot", type=Path, metavar="PLOT.png", help=text)
     text = "print JSON instead of tables, with the metrics by behaviour and keypoint"
     evaluate.add_argument("--json", action="store_true", help=text)
 

@@ -15,6 +15,7 @@ from jaxfit.foundation.errors import one_line
 if TYPE_CHECKING:
     from jaxfit.data.observations import Observations
     from jaxfit.data.solution import Solution
+    from jaxfit.evaluation.calibration import Calibration, CalibrationRow
     from jaxfit.evaluation.evaluate import Evaluation
 
 _COLUMNS_3D = {
@@ -58,6 +59,28 @@ def right_aligned(*columns: str, **options: Any) -> Table:
     for column in columns:
         table.add_column(column, justify="right")
     return table
+
+
+def calibration_tables(result: Calibration) -> list[Table]:
+    """Return a table for each group of errors: coverage, sharpness and likelihood of each keypoint or joint."""
+    tables = []
+    for name, group in result.groups.items():
+        coverage = [f"{100 * float(level):.0f} %" for level in group.overall.coverage]
+        table = right_aligned(
+            name, "errors", *coverage, "sd", "error", "NLL", "constant", title=f"{name} ({group.unit})"
+        )
+        table.columns[0].justify = "left"
+        for part, row in group.parts.items():
+            table.add_row(part, *_calibration_cells(row))
+        table.add_section()
+        table.add_row("all", *_calibration_cells(group.overall))
+        tables.append(table)
+    return tables
+
+
+def _calibration_cells(row: CalibrationRow) -> list[str]:
+    inside = [f"{100 * fraction:.1f} %" for fraction in row.coverage.values()]
+    return [str(row.count), *inside, f"{row.sd:.3g}", f"{row.error:.3g}", f"{row.nll:.2f}", f"{row.nll_constant:.2f}"]
 
 
 def evaluation_tables(result: Evaluation) -> list[Table]:

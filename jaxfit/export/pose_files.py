@@ -31,7 +31,7 @@ from jaxfit.data.formats.write_sleap import write_sleap_project
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import projected_observations
 from jaxfit.data.tracks import frame_step
-from jaxfit.export.result import CONFIDENCE, Exported, describe_tracks, export_folder
+from jaxfit.export.result import CONFIDENCE, SD, Exported, describe_tracks, export_folder
 from jaxfit.foundation.errors import InputError, one_line
 from jaxfit.foundation.extras import __version__, require_package
 from jaxfit.foundation.files import write_whole
@@ -108,6 +108,8 @@ def write_movement(
 ) -> tuple[list[Path], list[str]]:
     """Write a netCDF file with `position` (time, space, keypoint, individual) and `confidence`.
 
+    A result with error bars also has `position_sd`, with the dimensions of `position`.
+
     Frame numbers that the result lacks between its first and last frame are frames of NaN, so that the frames have
     equal distances in time. The individual of track 3 has the name `bird_3`.
 
@@ -132,15 +134,25 @@ def write_movement(
     numbers = np.arange(s.frame_index[0], s.frame_index[-1] + 1, frame_step(s.frame_index))
     column = np.searchsorted(numbers, s.frame_index)
     points = exported.keypoints_px if space == "2d" else exported.keypoints_3d
-    position = np.full((len(numbers), points.shape[3], points.shape[2], points.shape[0]), np.nan, np.float32)
-    position[column] = points.transpose(1, 3, 2, 0)
+    sd = exported.keypoints_px_sd if space == "2d" else exported.keypoints_3d_sd
+
+    def in_time(values: np.ndarray) -> np.ndarray:
+        arranged = np.full((len(numbers), *values.shape[3:1:-1], values.shape[0]), np.nan, np.float32)
+        arranged[column] = values.transpose(1, 3, 2, 0)
+        return arranged
+
+    position = in_time(points)
     confidence = np.full((len(numbers), *position.shape[2:]), np.nan, np.float32)
     confidence[column] = exported.confidence.transpose(1, 2, 0)
     keypoint, individual = ("keypoint", "individual") if dims == "singular" else ("keypoints", "individuals")
+    of_position = ("time", "space", keypoint, individual)
+    arrays = {"position": (of_position, position, {"units": _unit(exported, space)})}
+    if sd is not None:
+        arrays["position_sd"] = (of_position, in_time(sd), {"units": _unit(exported, space), "description": SD})
     with progress("Writing netCDF", None):
         dataset = xarray.Dataset(
             {
-                "position": (("time", "space", keypoint, individual), position, {"units": _unit(exported, space)}),
+                **arrays,
                 "confidence": (("time", keypoint, individual), confidence, {"description": CONFIDENCE}),
                 "status": ((individual,), s.status.astype(str), {"description": "how the fit of the track ended"}),
                 **_quality(exported, individual),
@@ -164,9 +176,7 @@ def write_movement(
         )
         content = io.BytesIO()
         compressed = {"zlib": True, "complevel": 4}
-        dataset.to_netcdf(
-            content, engine="h5netcdf", encoding={name: compressed for name in ("position", "confidence")}
-        )
+        dataset.to_netcdf(content, engine="h5netcdf", encoding={name: compressed for name in (*arrays, "confidence")})
         write_whole(out, content.getvalue())
     return [out], [_READERS[dims]]
 

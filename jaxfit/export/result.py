@@ -16,7 +16,7 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.projection import InImage, image_focal_px, in_image
-from jaxfit.data.solution import LAYOUT, Solution, load_solution
+from jaxfit.data.solution import ERROR_BARS, LAYOUT, Solution, load_solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder, write_whole
@@ -31,7 +31,7 @@ def select_solution(solution: Solution, rows: Int[np.ndarray, "M"], columns: Int
     The loss of a track stays the loss over all its frames.
     """
     arrays = {}
-    for name, (shape, _) in LAYOUT.items():
+    for name, (shape, _) in (LAYOUT | (ERROR_BARS if solution.has_error_bars else {})).items():
         if shape.split()[0] not in ("N", "T"):
             continue
         array = getattr(solution, name)
@@ -99,6 +99,12 @@ CONFIDENCE = (
     "where the keypoint was not detected; NaN where the result does not hold detections or has no pose"
 )
 """Definition of the confidences of an export."""
+SD = (
+    "standard deviation of the fit (Laplace approximation): of image positions in pixels; of positions in space "
+    "relative to the mean of the keypoints, because one camera does not observe distance and size; of rotations in "
+    "radians about the axes of the rotated part"
+)
+"""Definition of the standard deviations of an export."""
 
 _OBSERVATIONS, _SUMMARY = "observations.json", "summary.json"
 
@@ -154,6 +160,27 @@ class Exported:
         """Keypoints in the camera frame of the image (`in_image`), in `unit`; NaN without a pose."""
         points = self.in_image.points(self.solution.keypoints_cam, self.solution.scale)
         return (points * self.length).astype(np.float32)
+
+    @property
+    def keypoints_px_sd(self) -> Float[np.ndarray, "N T K 2"] | None:
+        """Standard deviations of `keypoints_px`; None without error bars."""
+        covariance = self.solution.keypoints_px_cov
+        return None if covariance is None else self._sd(covariance)
+
+    @property
+    def keypoints_3d_sd(self) -> Float[np.ndarray, "N T K 3"] | None:
+        """Standard deviations of `keypoints_3d` relative to their mean, in `unit`; None without error bars."""
+        covariance = self.solution.keypoints_centred_cov
+        if covariance is None:
+            return None
+        turn = self.in_image.turn[:, :, None]
+        scale = (self.length / self.solution.scale.astype(np.float64))[..., None, None]
+        return self._sd(turn @ covariance @ turn.swapaxes(-1, -2)) * scale
+
+    def _sd(self, covariance: np.ndarray) -> np.ndarray:
+        variance = np.einsum("...ii->...i", covariance)
+        variance = np.where(self.solution.valid[..., None, None], variance, np.nan)
+        return np.sqrt(np.maximum(variance, 0))
 
     @cached_property
     def in_image(self) -> InImage:

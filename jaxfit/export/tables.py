@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxfit.export.result import CONFIDENCE, Exported
+from jaxfit.export.result import CONFIDENCE, SD, Exported
 from jaxfit.foundation.extras import require_package
 from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.progress import ProgressTask
@@ -81,12 +81,18 @@ def _pose_columns(exported: Exported) -> Columns:
         columns[f"track_{name}"] = np.repeat(np.array(values, np.float64), T)
     columns |= _vectors(exported, {"root": exported.in_image.root * exported.length}, unit)
     columns |= _vectors(exported, {"orientation": exported.in_image.orientation}, "rad")
+    if s.global_orient_sd is not None:
+        columns |= _vectors(exported, {"orientation": s.global_orient_sd}, "sd_rad")
     columns["size"] = _known(exported, s.scale)
     confidence = exported.confidence
+    sd_px, sd = exported.keypoints_px_sd, exported.keypoints_3d_sd
     for k, name in enumerate(s.keypoint_names):
         columns |= _vectors(exported, {name: s.keypoints_px[:, :, k]}, "px")
         columns[f"{name}_confidence"] = _known(exported, confidence[:, :, k])
         columns |= _vectors(exported, {name: points[:, :, k]}, unit)
+        if sd_px is not None and sd is not None:
+            columns |= _vectors(exported, {name: sd_px[:, :, k]}, "sd_px")
+            columns |= _vectors(exported, {name: sd[:, :, k]}, f"sd_{unit}")
     return columns
 
 
@@ -94,7 +100,11 @@ def _angle_columns(exported: Exported) -> Columns:
     """Return the rotation of every joint except the root relative to its parent, as axis-angles."""
     s = exported.solution
     angles = {name: s.body_pose[:, :, j] for j, name in enumerate(s.joint_names[1:])}
-    return _row_columns(exported) | _vectors(exported, angles, "rad")
+    columns = _row_columns(exported) | _vectors(exported, angles, "rad")
+    if s.body_pose_sd is not None:
+        sd = {name: s.body_pose_sd[:, :, j] for j, name in enumerate(s.joint_names[1:])}
+        columns |= _vectors(exported, sd, "sd_rad")
+    return columns
 
 
 def _vectors(exported: Exported, points: dict[str, np.ndarray], unit: str) -> Columns:
@@ -122,6 +132,7 @@ def _facts(exported: Exported) -> dict[str, str]:
         "units": json_text(units),
         "frames": frames,
         "confidence": CONFIDENCE,
+        "sd": SD,
         "size": "size of the bird relative to the model in the result; positions are those at the size of the model",
         "focal_length_px": f"{exported.focal_px:.6g}, assumed; depths are proportional to it",
         "model": exported.bird.name,

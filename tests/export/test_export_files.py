@@ -12,6 +12,7 @@ from support.exported import BIRD, FPS, FRAMES, TRACKS, write_result
 
 import jaxfit
 from jaxfit.cli.main import main
+from jaxfit.data.solution import ERROR_BARS
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import OPTIONAL_PACKAGES
 
@@ -110,6 +111,29 @@ def test_netcdf_for_movement(folder, made, tmp_path, dims, names):
             made.valid[..., None, None], made.keypoints_cam / made.scale[..., None, None] * 0.02, np.nan
         )
         np.testing.assert_allclose(np.delete(position, 3, axis=1), expected, rtol=1e-6)
+
+
+def test_error_bars(tmp_path):
+    """Columns and a variable of standard deviations, in the units of their values."""
+    xarray = pytest.importorskip("xarray", reason="xarray is not installed")
+    pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")
+    sizes = {"N": 3, "T": len(FRAMES), "K": BIRD.num_keypoints, "J-1": BIRD.num_joints - 1, "S": BIRD.num_shapes}
+    sizes |= {"2": 2, "3": 3}
+    arrays = {name: np.full([sizes[s] for s in shape.split()], 4.0) for name, (shape, _) in ERROR_BARS.items()}
+    made = write_result(tmp_path / "result", **arrays)
+    jaxfit.export_result(tmp_path / "result", "csv", tmp_path / "birds.csv")
+    rows, angles = rows_of(tmp_path / "birds.csv"), rows_of(tmp_path / "birds_angles.csv")
+    expected = np.where(made.valid, 2.0, np.nan)
+    np.testing.assert_allclose(column(rows, "bill_tip_y_sd_px"), expected)
+    np.testing.assert_allclose(column(rows, "orientation_z_sd_rad"), 2 * expected)
+    np.testing.assert_allclose(column(angles, "neck_x_sd_rad"), 2 * expected)
+    variance = sum(column(rows, f"bill_tip_{axis}_sd_m") ** 2 for axis in "xyz")  # rotations keep the trace
+    np.testing.assert_allclose(variance, 12 * (expected / 2 * 0.02 / made.scale) ** 2, rtol=1e-5)
+    jaxfit.export_result(tmp_path / "result", "movement", tmp_path / "birds.nc")
+    with xarray.open_dataset(tmp_path / "birds.nc", engine="h5netcdf") as data:
+        assert data.position_sd.dims == data.position.dims
+        assert np.nanmax(data.position_sd) == 2
+        assert (np.isnan(data.position_sd) == np.isnan(data.position)).all()
 
 
 @pytest.mark.parametrize(

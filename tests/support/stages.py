@@ -26,6 +26,13 @@ FIRST = StageConfig(
     step_scale={"transl": (1.0, 0.5, 0.0), "scale": 0.25},
 )
 SECOND = dataclasses.replace(FIRST, name="second", learning_rate=0.01, carry_moments=True)
+SHARED = ("bone_length", "betas")
+POSTERIOR = dataclasses.replace(
+    FIRST,
+    terms=("keypoint_likelihood", "pose_prior", "bone_prior", "shape_prior", "motion_likelihood", "place_likelihood"),
+    optimised=("global_orient", "body_pose", "transl", "scale", *SHARED),
+)
+"""A stage of likelihoods that optimises all parameters. Tests of posteriors share its compiled program."""
 CONFIG = FitConfig((FIRST, SECOND), {"pose_prior": 10, "velocity": 5})
 
 
