@@ -179,7 +179,7 @@ def calibrate(options: argparse.Namespace) -> None:
     scales.caption = "scale: relative to the scale of all keypoints"
     show(scales)
     if noise.outline is None:
-        show("the labels hold no masks of the matched birds: the config leaves out mask and grow_masks_px")
+        show("the labels hold no masks of the matched birds: the config leaves out mask_smooth_l1")
     counts = (counted(noise.frames, "frame"), counted(noise.birds, "bird"), counted(noise.keypoints, "keypoint"))
     show(f"{', '.join(counts)}, {counted(noise.masks, 'mask')} → {options.out}")
     show(f"next: jaxfit fit {options.detections} --config {options.out} --out result")

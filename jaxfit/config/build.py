@@ -34,7 +34,9 @@ def build_config(kind: type[Config], values: Any, where: str = "") -> Config:
     fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, kind))}
     for key in values:
         if key not in fields:
-            raise ConfigKeyError(join_keys(where, key), "is not a known key", known_names(key, fields))
+            removed = getattr(kind, "removed", {}).get(key)
+            problem = "was removed" if removed else "is not a known key"
+            raise ConfigKeyError(join_keys(where, key), problem, removed or known_names(key, fields))
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in values:

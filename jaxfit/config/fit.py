@@ -182,6 +182,8 @@ class FitConfig:
     """All settings of a fit; the defaults are the paper's best setting."""
 
     shipped: ClassVar[str] = "paper"
+    removed: ClassVar[Mapping[str, str]] = {"grow_masks_px": "remove the key and set `edge: unbiased`"}
+    """Keys of earlier versions → what to do."""
 
     stages: tuple[StageConfig, ...]
     """The stages of the fit, in their order."""
@@ -202,9 +204,6 @@ class FitConfig:
     unknown_pixels: bool = False
     """Whether the mask terms skip the pixels that may or may not show the bird: pixels outside its mask, but in the
     masks of other birds or close to them, or beyond the border of the image. False: these pixels are background."""
-    grow_masks_px: float = 0.0
-    """Pixels of a 256-pixel crop by which masks are enlarged before they are compared with silhouettes. The 0.5 level
-    of a soft silhouette lies outside the mesh (murre, blur 1: 2.3 pixels), so birds are fitted too small without it."""
     edge: Literal["soft_rasterizer", "unbiased"] = "soft_rasterizer"
     """Edge of the silhouette. `soft_rasterizer`: as published; the silhouette is larger than its mesh, by 1.5 pixels at
     blur 1. `unbiased`: the covered area of the pixels, filtered like the mask; the silhouette has the area of its
@@ -226,7 +225,6 @@ class FitConfig:
     def __post_init__(self):
         require_within(self, 1, limits.WINDOW_FRAMES, "window")
         require_within(self, 0, limits.WINDOW_FRAMES, "overlap")
-        require_within(self, 0, limits.GROW_MASKS_PX, "grow_masks_px")
         require_within(self, 1, limits.KEYPOINTS, "min_keypoints")
         require_within(self, 1, limits.FILTER_FRAMES, "filter_window")
         odd = self.filter_window % 2 == 1

@@ -26,14 +26,10 @@ from jaxfit.evaluation.noise_estimates import (
 )
 from jaxfit.evaluation.truth import Truth
 from jaxfit.foundation.errors import InputError, one_line
-from jaxfit.foundation.limits import GROW_MASKS_PX
 from jaxfit.foundation.progress import ProgressTask, silent
 
 BASE = "map"
 """The shipped config whose settings are estimated."""
-SHIPPED_OFFSET_PX = -0.67
-"""Mean offset of the outlines of the simulated masks with which `grow_masks_px` of the config `map` gives fitted birds
-without a systematic error of size, crop pixels (scenes of the seeds 100 to 104)."""
 LAGS = (1, 4)
 """Numbers of frames of the correlations in time."""
 LEAST_KEYPOINTS = 50
@@ -111,11 +107,11 @@ def estimate_noise(
         """Return the settings if every bird occurs as often as the counts say."""
         again = [each for r, each in zip(row, outlines, strict=True) if each is not None for _ in range(counts[r])]
         fitted = fit_student_t(error_px, confidence, prior, counts[row_of_error].astype(float), keypoint)
-        return _settings(config, fitted, outline_noise(again) if again else outline)
+        return _settings(fitted, outline_noise(again) if again else outline)
 
     scaled = noise_estimates.scaled_errors(pairs, keypoint)
     step = frame_step(detected.frame_index)
-    settings = _settings(config, keypoint, outline)
+    settings = _settings(keypoint, outline)
     return DetectionNoise(
         frames=len(np.unique(pairs.frame_index)),
         birds=len(birds),
@@ -159,13 +155,10 @@ def _prior(config: FitConfig) -> KeypointNoise:
     return KeypointNoise(*(term[name] for name in KeypointNoise._fields))
 
 
-def _settings(config: FitConfig, keypoint: KeypointNoise, outline: OutlineNoise | None) -> Mapping[str, float]:
+def _settings(keypoint: KeypointNoise, outline: OutlineNoise | None) -> Mapping[str, float]:
     """Return path → value of the estimated settings."""
     settings = {f"terms.keypoint_likelihood.{name}": value for name, value in keypoint._asdict().items()}
-    if outline is not None:
-        grow_px = min(max(config.grow_masks_px + SHIPPED_OFFSET_PX - outline.offset_px, 0.0), GROW_MASKS_PX)
-        settings |= {"terms.mask": outline.mask_weight, "grow_masks_px": grow_px}
-    return settings
+    return settings if outline is None else settings | {"terms.mask_smooth_l1": outline.mask_weight}
 
 
 def _intervals(
@@ -188,11 +181,10 @@ def _intervals(
 
 
 _MEANINGS = {
-    "grow_masks_px": "enlargement of the masks, so that the fitted size is right on average",
     "terms.keypoint_likelihood.sd_sure_px": "scale of keypoint errors at confidence 1",
     "terms.keypoint_likelihood.sd_unsure_px": "scale of keypoint errors at confidence 0",
     "terms.keypoint_likelihood.dof": "degrees of freedom: small numbers mean heavy tails",
-    "terms.mask": "nats per pixel: 1 / (mean absolute deviation of the outline × its correlation length)",
+    "terms.mask_smooth_l1": "nats per pixel, from the deviation of the outline and its correlation length",
 }
 
 
@@ -207,11 +199,9 @@ def noise_yaml(noise: DetectionNoise, detections: object, labels: object) -> str
     own = noise.settings
     term = ", ".join(f"{name}: {rounded(own[f'terms.keypoint_likelihood.{name}'])}" for name in noise.keypoint._fields)
     lines = [*_comments(noise, detections, labels), f"base: {BASE}"]
-    if "grow_masks_px" in own:
-        lines.append(f"grow_masks_px: {rounded(own['grow_masks_px'])}")
     lines += ["terms:", f"  keypoint_likelihood: {{weight: 1, {term}}}"]
-    if "terms.mask" in own:
-        lines.append(f"  mask: {rounded(own['terms.mask'])}")
+    if "terms.mask_smooth_l1" in own:
+        lines.append(f"  mask_smooth_l1: {rounded(own['terms.mask_smooth_l1'])}")
     return "\n".join(lines) + "\n"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple, cast
 
@@ -24,7 +25,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.likelihood import keypoint_sd_px
-from jaxfit.raster.silhouette_reference import UNKNOWN
+from jaxfit.raster.silhouette_reference import UNKNOWN, Blur
 
 
 class LabelledPairs(NamedTuple):
@@ -270,12 +271,15 @@ class OutlineNoise(NamedTuple):
 
     @property
     def mask_weight(self) -> float:
-        """Weight of an L1 mask term in nats per pixel: 1 / (mean absolute deviation × correlation length).
+        """Weight of `mask_smooth_l1` with the unbiased edge, nats per pixel: λ = 2√π·f / (√π·l·s²).
 
-        Under a Laplace density, an offset d of a piece of outline costs |d| / deviation nats, and independent pieces
-        are as long as the correlation length. The L1 term costs |d| × length of the piece, in pixels.
+        A piece of outline of the length √π·l has an independent offset d of standard deviation s = √(π/2) · mean
+        absolute deviation (Gaussian errors), and costs d²/2s² nats. l is the correlation length, and √π·l the integral
+        of a Gaussian correlation. The edge has a Gaussian profile of standard deviation f, so the term costs
+        λ·d² / (4√π·f) for every pixel of length.
         """
-        return 1 / (self.deviation_px * self.length_px)
+        edge_px = math.sqrt(2 * math.log(2) * Blur.for_size(CROP_PX).sigma)
+        return 2 * edge_px / (self.length_px * math.pi / 2 * self.deviation_px**2)
 
 
 class OutlineErrors(NamedTuple):

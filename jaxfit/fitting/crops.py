@@ -121,15 +121,3 @@ def mark_unknown(
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
         unknown |= cv2.dilate(cut_mask(others, crop, mask_px), disc) > 0
     cut[unknown & (cut == 0)] = UNKNOWN
-
-
-def grow_mask(cut: UInt8[np.ndarray, "S S"], grow_px: float) -> None:
-    """Enlarge the crop of a mask into its background, not into unknown pixels.
-
-    Args:
-        cut: the crop of the mask; it is changed in place.
-        grow_px: distance in pixels of a 256-pixel crop.
-    """
-    radius = grow_px * len(cut) / CROP_PX
-    outside_px = cv2.distanceTransform((cut != 1).astype(np.uint8), cv2.DIST_L2, 5) - 0.5  # from the mask's outline
-    cut[(cut == 0) & (outside_px <= radius) & (cut == 1).any()] = 1

@@ -128,7 +128,7 @@ def _gather(shared: FitShared, task: FitTask) -> Batch:
     mask_px = config.crop.size_px if any(needs_mask(stage) for stage in config.stages) else 0
 
     def targets_of(run: Run, windows: Windows) -> Targets:
-        return load_targets(windows, mask_px, run.config.grow_masks_px)
+        return load_targets(windows, mask_px)
 
     targets, targets_row = _prepare_rows(task, windows_key, targets_of)
     poses, pose_row = _prepare_rows(task, _pose_key, partial(_initial_poses, shared))

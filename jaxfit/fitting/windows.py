@@ -20,7 +20,7 @@ from jaxfit.config.fit import FitConfig
 from jaxfit.data.masks import decode_mask
 from jaxfit.data.observations import FrameMasks, Observations
 from jaxfit.data.tracks import assumed_interval_s, frame_interval_s, frame_step
-from jaxfit.fitting.crops import crop_squares, cut_mask, grow_mask, mark_unknown
+from jaxfit.fitting.crops import crop_squares, cut_mask, mark_unknown
 from jaxfit.foundation.array_files import check_memory
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import DISTANCE_IMAGE_SIDES, TABLE_GB
@@ -235,7 +235,7 @@ class Windows:
 def windows_key(config: FitConfig) -> tuple:
     """Return the part of the config that determines the windows and their targets."""
     frames = config.filter_window, config.window, config.overlap_frames, config.min_keypoints
-    return *frames, config.crop, config.unknown_pixels, config.grow_masks_px
+    return *frames, config.crop, config.unknown_pixels
 
 
 def window_content(windows: Windows, w: int) -> tuple:
@@ -374,13 +374,12 @@ def filter_observations(observations: Observations, window: int) -> Observations
     return observations.with_keypoints(filtered, observations.confidence)
 
 
-def load_targets(windows: Windows, mask_px: int, grow_px: float = 0.0) -> Targets:
+def load_targets(windows: Windows, mask_px: int) -> Targets:
     """Decode the masks of some windows, and return the targets as NumPy arrays with a leading axis W.
 
     Args:
         windows: the windows. All their masks must fit into memory.
         mask_px: side of the masks in pixels. 0: the masks are empty and nothing is decoded.
-        grow_px: distance by which the masks are enlarged, in pixels of a 256-pixel crop.
     """
     mask = np.zeros((*windows.frame.shape, mask_px, mask_px), np.uint8)
     needed = np.flatnonzero(windows.has_mask.any(1) & (mask_px > 0))
@@ -393,8 +392,6 @@ def load_targets(windows: Windows, mask_px: int, grow_px: float = 0.0) -> Target
             if others is not False:
                 others = None if others is None else decode_mask(others)
                 mark_unknown(mask[w, t], others, cast(Any, full.shape), windows.crop[w, t])
-            if grow_px:
-                grow_mask(mask[w, t], grow_px)
     return Targets(
         keypoints_px=windows.keypoints_px,
         confidence=windows.confidence,

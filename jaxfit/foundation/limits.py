@@ -33,8 +33,6 @@ FILTER_FRAMES = 1001
 """Largest window of the median filter, in frames."""
 CROP_SIZE_PX = 1024
 """Largest side of the crops in which silhouettes are compared."""
-GROW_MASKS_PX = 16.0
-"""Largest enlargement of the masks, in pixels of a 256-pixel crop."""
 CROP_PADDING = 10.0
 """Largest margin of a crop, as a fraction of the box."""
 FOCAL_PX = 1e6

@@ -39,10 +39,14 @@ def test_the_config_of_a_fit(folder, tmp_path, capsys):
     out = tmp_path / "new" / "noise.yaml"
     assert main(command(folder, out)) == 0
     printed = capsys.readouterr().out
-    for words in ("terms.keypoint_likelihood.dof", "grow_masks_px", "2 frames, 6 birds, 240 keypoints, 12 masks"):
+    for words in (
+        "terms.keypoint_likelihood.dof",
+        "terms.mask_smooth_l1",
+        "2 frames, 6 birds, 240 keypoints, 12 masks",
+    ):
         assert words in printed
     config = load_config(out)
-    assert config.grow_masks_px > load_config("map").grow_masks_px + 1
+    assert config.terms["mask_smooth_l1"] != load_config("map").terms["mask_smooth_l1"]
     (tmp_path / "mine.yaml").write_text(f"base: reconstruct\nfit: {out}\n")
     assert load_reconstruct_config(tmp_path / "mine.yaml").fit == config
     rejected(capsys, command(folder, out), str(out), "exists already", "--overwrite")
@@ -51,9 +55,9 @@ def test_the_config_of_a_fit(folder, tmp_path, capsys):
 
 def test_labels_without_masks(folder, tmp_path, capsys):
     assert main(command(folder, tmp_path / "noise.yaml", "points.json")) == 0
-    assert "the config leaves out mask and grow_masks_px" in capsys.readouterr().out
+    assert "the config leaves out mask_smooth_l1" in capsys.readouterr().out
     config, base = load_config(tmp_path / "noise.yaml"), load_config("map")
-    assert (config.terms["mask"], config.grow_masks_px) == (base.terms["mask"], base.grow_masks_px)
+    assert config.terms["mask_smooth_l1"] == base.terms["mask_smooth_l1"]
 
 
 def test_labels_with_other_names(folder, tmp_path, capsys):

@@ -89,17 +89,21 @@ def test_a_file_beside_wins_over_a_shipped_name(tmp_path):
     assert load_config(written(tmp_path, "base: baseline\n")).window == 1
 
 
-def test_a_config_may_override_weights_alone():
-    """The stages of `fast` take the weights of `balanced`."""
+def test_balanced_overrides_weights_and_the_edge_of_fast():
     fast, balanced = load_config("fast"), load_config("balanced")
-    assert (balanced.unknown_pixels, balanced.grow_masks_px) == (True, 2.3)
-    assert (fast.unknown_pixels, fast.grow_masks_px) == (False, 0)  # the paper's objective
-    assert balanced.stages == fast.stages
-    stage = balanced.stages[-1]
+    assert (balanced.unknown_pixels, balanced.edge) == (True, "unbiased")
+    assert (fast.unknown_pixels, fast.edge) == (False, "soft_rasterizer")  # the paper's objective
+    stage = balanced.stages[0]
+    assert stage == fast.stages[0]
     weights = {"pose_prior": 30, "velocity": 50}
     settings = fast.stage_settings(stage)
     changed = {name: settings[name] | {"weight": weight} for name, weight in weights.items()}
     assert balanced.stage_settings(stage) == settings | changed
+
+
+def test_a_removed_key_is_an_error_that_says_what_to_do(tmp_path):
+    with pytest.raises(InputError, match=r"grow_masks_px.* was removed.*set `edge: unbiased`"):
+        load_config(written(tmp_path, "base: map\ngrow_masks_px: 2\n"))
 
 
 def test_stage_settings_override_defaults_then_terms():
@@ -287,4 +291,4 @@ def test_map_starts_with_a_wide_scale_of_motion():
     config = load_config("map")
     scales = [config.stage_settings(stage)["motion_likelihood"]["sd_rad_s2"] for stage in config.stages]
     assert scales == [62.5, 6.25]
-    assert (config.filter_window, config.unknown_pixels, config.grow_masks_px) == (1, True, 2.3)
+    assert (config.filter_window, config.unknown_pixels, config.edge) == (1, True, "unbiased")

@@ -11,7 +11,7 @@ from jaxfit.config.fit import load_config
 from jaxfit.config.yaml_file import rounded
 from jaxfit.data.masks import encode_mask
 from jaxfit.evaluation import detection_noise
-from jaxfit.evaluation.detection_noise import SHIPPED_OFFSET_PX, estimate_noise, noise_yaml
+from jaxfit.evaluation.detection_noise import estimate_noise, noise_yaml
 from jaxfit.evaluation.truth import Truth
 from jaxfit.foundation.errors import InputError
 
@@ -96,14 +96,11 @@ def estimated_outline(radius):
 
 @pytest.mark.parametrize("eroded_px", [-4, 0, 3])
 def test_the_offset_of_a_smaller_disc(eroded_px):
-    """Within 0.3 image pixels; a mask that is too large makes the growth smaller, but not negative."""
+    """Within 0.3 image pixels."""
     noise = estimated_outline(RADIUS - eroded_px)
     assert noise.outline.offset_px == pytest.approx(-eroded_px / UNIT, abs=0.3 / UNIT if eroded_px else 0.02)
     assert noise.outline.deviation_px < 0.4
     assert noise.outline.whole_px < 0.1
-    shipped_px = load_config("map").grow_masks_px
-    expected = max(shipped_px + SHIPPED_OFFSET_PX - noise.outline.offset_px, 0)
-    assert noise.settings["grow_masks_px"] == pytest.approx(expected)
 
 
 def test_waves_of_the_outline():
@@ -113,7 +110,9 @@ def test_waves_of_the_outline():
     deviation, length = 8 / np.pi / UNIT, np.arccos(1 / np.e) / (2 * np.pi) * wavelength / UNIT
     assert noise.outline.deviation_px == pytest.approx(deviation, rel=0.1)
     assert noise.outline.length_px == pytest.approx(length, rel=0.15)
-    assert noise.settings["terms.mask"] == pytest.approx(1 / (deviation * length), rel=0.2)
+    edge_px, sd_px = np.sqrt(2 * np.log(2) * 1.6384), np.sqrt(np.pi / 2) * deviation
+    expected = 2 * np.sqrt(np.pi) * edge_px / (np.sqrt(np.pi) * length * sd_px**2)
+    assert noise.settings["terms.mask_smooth_l1"] == pytest.approx(expected, rel=0.3)
 
 
 def test_an_outline_that_touches_another_bird_does_not_count():
@@ -139,8 +138,7 @@ def test_the_config_is_valid_and_says_where_its_numbers_come_from(tmp_path):
     config = load_config(tmp_path / "noise.yaml")
     term = config.terms["keypoint_likelihood"]
     assert term["dof"] == float(rounded(noise.keypoint.dof))
-    assert config.terms["mask"] == float(rounded(noise.outline.mask_weight))
-    assert config.grow_masks_px == float(rounded(noise.settings["grow_masks_px"]))
+    assert config.terms["mask_smooth_l1"] == float(rounded(noise.outline.mask_weight))
     assert config.stages == load_config("map").stages
     comments = " ".join(line.lstrip("# ") for line in text.splitlines() if line.startswith("#"))
     assert "4 frames, 6 birds, 480 keypoints and 24 masks" in comments

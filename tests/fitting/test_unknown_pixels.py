@@ -54,7 +54,7 @@ def config(**changes):
 
 def target_of(observations, n=0, **changes):
     settings = config(**changes)
-    return load_targets(cut_windows(observations, settings), 128, settings.grow_masks_px).mask[n, 0]
+    return load_targets(cut_windows(observations, settings), 128).mask[n, 0]
 
 
 def test_other_birds_are_unknown_with_a_margin():
@@ -74,21 +74,6 @@ def test_beyond_the_border_is_unknown():
     assert (mask[:, 84:] == UNKNOWN).all()
     assert (mask[32:96, 44:84] == BIRD).all()
     assert (mask[32:, :44] == BACKGROUND).all()
-
-
-def test_masks_grow_into_the_background_alone():
-    own, other = (100, 100, 64, 64), (170, 100, 30, 64)
-    before, after = (target_of(boxes_of(own, other), grow_masks_px=grow) for grow in (0, 6))
-    assert (after[32:96, 29:99] == BIRD).all()  # 6 pixels of 256 are 3 pixels of 128
-    assert (after[29:99, 32:96] == BIRD).all()
-    assert (before == BIRD).sum() == 64**2
-    row = after[60]
-    assert row[28] == BACKGROUND
-    assert row[100] == UNKNOWN
-    np.testing.assert_array_equal(before == UNKNOWN, after == UNKNOWN)
-    nothing = boxes_of(own)
-    nothing = dataclasses.replace(nothing, masks={(0, 0): encode_mask(np.zeros((HEIGHT, WIDTH), bool))})
-    assert not target_of(nothing, grow_masks_px=6).any()
 
 
 def test_without_the_setting_all_other_pixels_are_background():

@@ -57,7 +57,7 @@ def loss_and_gradient(vertices, faces, target, kind, blur, backend):
 
 def on_screen(mesh, place=(18.0, 21.0), depth=50.0, scale=11.0):
     turned = Rotation.from_rotvec([0.3, 0.5, 0.2]).apply(mesh.vertices) * scale
-    return jnp.asarray(turned + [*place, depth], jnp.float32), jnp.asarray(mesh.faces, jnp.int32)
+    return jnp.asarray(turned + np.array([*place, depth]), jnp.float32), jnp.asarray(mesh.faces, jnp.int32)
 
 
 def soup(seed):

@@ -208,7 +208,7 @@ def bench_solvers(
         hyperparameters = stage_hyperparameters(config, stage, bird.keypoint_names)
         repeated = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * count), hyperparameters)
         mask_px = config.crop.size_px if needs_mask(stage) else 0
-        targets = load_targets(windows, mask_px, config.grow_masks_px)
+        targets = load_targets(windows, mask_px)
         return stage_program(config, stage, model), Problem(repeated, anchor, jax.tree.map(jnp.asarray, targets))
 
     program, problems = problems_of(config.stages[0], jax.tree.map(lambda x: x[:, 0], initial_pose))

@@ -50,7 +50,7 @@ def outline_excess(
 ) -> float:
     """Return the mean distance by which a silhouette lies outside its mesh, in pixels.
 
-    This is the area of the silhouette minus the area of the mesh, over the perimeter. The mesh must be inside the image.
+    This is the area of the silhouette minus the area of the mesh, over the perimeter. The mesh must lie in the image.
     """
     area, perimeter = true_outline(vertices_screen, faces, size)
     image = silhouette(jnp.asarray(vertices_screen), jnp.asarray(faces), size, blur=blur, backend=backend)
@@ -78,7 +78,7 @@ def ball_mesh() -> Mesh:
 def _centred(points: Float[np.ndarray, "V 3"], camera: Camera) -> Float[np.ndarray, "V 3"]:
     points = points - (points.min(0) + points.max(0)) / 2
     depth = camera.focal_px * np.abs(points[:, :2]).max() / (0.42 * CROP_PX)
-    return np.asarray(to_screen(jnp.asarray(points + [0, 0, depth]), camera), np.float32)
+    return np.asarray(to_screen(jnp.asarray(points + np.array([0, 0, depth])), camera), np.float32)
 
 
 def faces_of_parts(bird: Bird) -> dict[str, Int[np.ndarray, "F 3"]]:
@@ -112,7 +112,9 @@ def bench_outline(
         name → `EDGE, blur B, SIZE px` → part → mean excess in pixels of the crop, over the poses; the part
         `whole, largest` is the largest absolute value of a pose. With `timed` also `ms_per_frame` → edge → median.
     """
-    shapes = {name: [(mesh, faces_of_parts(bird)) for mesh in posed_meshes(bird, poses)] for name, bird in birds.items()}
+    shapes = {
+        name: [(mesh, faces_of_parts(bird)) for mesh in posed_meshes(bird, poses)] for name, bird in birds.items()
+    }
     ball = ball_mesh()
     shapes["sphere"] = [(ball, {"whole": ball[1]})]
     result: dict[str, Any] = {}
