@@ -59,7 +59,8 @@ def add_model(command: argparse.ArgumentParser) -> None:
 
 
 def add_truth(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--truth", type=Path, required=True, help="annotations (formats as of OBS), or a scene")
+    text = "annotations (formats as of OBS), a folder of masks (for OBS only), or a scene"
+    command.add_argument("--truth", type=Path, required=True, help=text)
     text = "match tracks with annotated birds by track id (ids) or by overlap; auto matches by overlap only if a track "
     text += "follows another bird than its id says (default %(default)s)"
     command.add_argument("--match", choices=("auto", "ids", "overlap"), default="auto", help=text)

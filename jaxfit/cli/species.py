@@ -127,7 +127,7 @@ def adapt_photos(options: argparse.Namespace) -> None:
     for i in fit.disagreeing:
         show(f"disagrees with the other images, weight {fit.weight[i]:.2f}: {photographs.names[i]}")
     if fit.individuals < FEW_INDIVIDUALS:
-        show(f"warning: {counted(fit.individuals, 'individual')} say little about a species")
+        show(f"warning: {counted(fit.individuals, 'individual')}: too few to determine a species")
     show(f"{counted(count, 'image')} of {counted(fit.individuals, 'individual')} → {options.out}")
 
 

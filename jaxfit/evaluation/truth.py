@@ -17,12 +17,14 @@ from jaxfit.data.formats import MARKER, TRUE_POSES, TRUTH
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.coco_records import Untracked
 from jaxfit.data.formats.fields import read_json
+from jaxfit.data.formats.mask_files import mask_observations
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.masks import box_iou, box_of_keypoints
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, load_solution
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
+from jaxfit.video.pictures import IMAGE_SUFFIXES
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,19 +55,19 @@ def read_truth(
     size_px: tuple[int, int] | None = None,
     untracked: Untracked = "video",
 ) -> Truth:
-    """Read the truth from a file of annotations or from the folder of a simulated scene.
+    """Read the truth from a file of annotations, from a folder of masks or from the folder of a simulated scene.
 
     Args:
-        path: a file of annotations, as for `read_observations`; or the folder of a simulated scene, which holds the
-            annotations as ``truth.json``, the exact poses as the result folder ``truth/`` and the behaviours in
-            ``scene.json``.
+        path: a file of annotations, as for `read_observations`; a folder of pictures of masks, as for
+            `mask_observations`; or the folder of a simulated scene, which holds the annotations as ``truth.json``, the
+            exact poses as the result folder ``truth/`` and the behaviours in ``scene.json``.
         video: as for `read_observations`.
         size_px: as for `read_observations`.
         untracked: as for `read_observations`.
 
     Returns:
-        The truth; without poses, model and behaviours for a file, and without behaviours for a folder without
-        ``scene.json``.
+        The truth; without poses, model and behaviours for a file or for masks, and without behaviours for a scene
+        without ``scene.json``.
 
     Raises:
         InputError: the file does not exist, the folder holds no truth, or a file cannot be read.
@@ -74,8 +76,10 @@ def read_truth(
     if not os.path.isdir(path):  # noqa: PTH112  (Path.is_dir raises for names that are too long)
         return Truth(read_observations(path, video, size_px, untracked), source=path)
     if not (path / TRUTH).is_file():
-        remedy = "give a COCO file of annotations, or the folder of a simulated scene"
-        raise InputError(path, f"is a folder without {TRUTH}", remedy)
+        if any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()):
+            return Truth(mask_observations(path), source=path)
+        remedy = "give a file of annotations, a folder of masks, or the folder of a simulated scene"
+        raise InputError(path, f"is a folder without {TRUTH} and without pictures of masks", remedy)
     if not (path / TRUE_POSES).is_dir():
         remedy = f"give {path / TRUTH} to compare in the image alone"
         raise InputError(path, f"holds no true poses (a folder {TRUE_POSES}/)", remedy)

@@ -8,7 +8,7 @@ import pytest
 from support.tracking_files import T, write_csv
 
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.data.formats.mask_files import add_masks
+from jaxfit.data.formats.mask_files import add_masks, mask_observations
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.foundation.errors import InputError
 
@@ -72,3 +72,22 @@ def test_unusable_masks(tmp_path, birds, name, picture, message):
     cv2.imwrite(str(tmp_path / "m" / name), picture)
     with pytest.raises(InputError, match=message):
         add_masks(birds, tmp_path / "m")
+
+
+def test_every_grey_value_of_a_folder_of_masks_is_a_bird(tmp_path):
+    for frame, values in {12: (7, 3), 4: (7, 0)}.items():
+        cv2.imwrite(str(tmp_path / f"mask_{frame}.png"), halves(*values))
+    truth = mask_observations(tmp_path)
+    assert truth.track_id.tolist() == [3, 7]
+    assert truth.frame_index.tolist() == [4, 12]
+    assert truth.present.tolist() == [[False, True], [True, True]]
+    np.testing.assert_array_equal(truth.mask(1, 0), halves(1, 0) > 0)
+    np.testing.assert_array_equal(truth.mask(0, 1), halves(0, 1) > 0)
+    assert truth.box_px[1, 0].tolist() == [5, 0, 40, 100]
+    assert truth.keypoint_names == ()
+
+
+def test_a_folder_of_empty_masks_is_rejected(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), halves(0, 0))
+    with pytest.raises(InputError, match="holds no mask"):
+        mask_observations(tmp_path)

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from support.birds import toy_bird
@@ -10,6 +11,7 @@ from support.evaluated import BIRD, solution, truth
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.solution import save_solution
 from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, evaluate
+from jaxfit.evaluation.tracking import evaluate_observations
 from jaxfit.evaluation.truth import Truth, read_truth
 from jaxfit.foundation.errors import InputError
 
@@ -30,6 +32,17 @@ def test_a_coco_file(scene):
     np.testing.assert_array_equal(known.observations.track_id, [3, 5])
     assert (known.solution, known.bird, known.behaviours) == (None, None, None)
     assert known.source == scene / "truth.json"
+
+
+def test_a_folder_of_masks(tmp_path):
+    for frame in (0, 1):
+        picture = np.zeros((20, 30), np.uint8)
+        picture[2:9, 3 + frame : 12 + frame] = 5
+        cv2.imwrite(str(tmp_path / f"{frame}.png"), picture)
+    known = read_truth(tmp_path)
+    result = evaluate_observations(known.observations, known)
+    assert (result.compared, result.counts["true"], result.keypoints) == ("masks", 2, {})
+    assert (result.detection["ap50"], result.tracking["hota"]) == (pytest.approx(1), pytest.approx(1))
 
 
 def test_a_scene(scene):
@@ -73,7 +86,7 @@ def test_a_fit_is_no_truth(scene):
 
 
 def test_folders_without_truth(scene, tmp_path_factory):
-    with pytest.raises(InputError, match=r"is a folder without truth\.json \(give a COCO file"):
+    with pytest.raises(InputError, match=r"a folder without truth\.json and without pictures of masks \(give a file"):
         read_truth(tmp_path_factory.mktemp("empty"))
     with pytest.raises(InputError, match="absent"):
         read_truth(scene / "absent")

@@ -1,4 +1,4 @@
-"""Masks from a folder of pictures or from a COCO file, for observations that have keypoints only.
+"""Masks from a folder of pictures or from a COCO file, for observations that have keypoints only, or alone.
 
 A mask belongs to the bird whose keypoints it covers best. A picture of masks has the size of its image. Every grey
 value except 0 is one mask; a picture with one value holds one mask for every connected region if its frame has several
@@ -20,8 +20,9 @@ from scipy.optimize import linear_sum_assignment
 from jaxfit.data.formats.coco_records import complete_export, read_images
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.rle import read_segmentation
-from jaxfit.data.masks import decode_mask, encode_mask
+from jaxfit.data.masks import box_of_mask, decode_mask, encode_mask
 from jaxfit.data.observations import Observations
+from jaxfit.data.tracks import frame_numbers
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import FRAME_DIGITS, MASKS_PER_PICTURE
 from jaxfit.foundation.progress import ProgressTask, silent
@@ -71,6 +72,53 @@ def add_masks(observations: Observations, source: Path, progress: ProgressTask =
         remedy = "name the pictures by frame numbers or as the images, or give a COCO file with segmentation"
         raise InputError(source, "holds no mask for any image of the birds", remedy)
     return replace(observations, masks=masks)
+
+
+def mask_observations(folder: Path, progress: ProgressTask = silent) -> Observations:
+    """Return the birds of a folder of pictures of masks, without keypoints.
+
+    Every grey value except 0 is one bird, and one track in all pictures. The frame numbers are the numbers at the ends
+    of the names, or else the positions of the pictures.
+
+    Raises:
+        InputError: a picture cannot be read, or no picture holds a mask.
+    """
+    files = image_files(folder)
+    numbers = np.array(frame_numbers([file.name for file in files]) or range(len(files)), np.int64)
+    order = np.argsort(numbers)
+    sizes = np.zeros((len(files), 2), np.int64)
+    found: dict[tuple[int, int], np.ndarray] = {}
+    masks: dict[tuple[int, int], Any] = {}
+    with progress("Reading masks", len(files)) as report_progress:
+        for t, i in enumerate(order.tolist()):
+            report_progress(1, "")
+            picture = _read_mask_picture(files[i])
+            sizes[t] = picture.shape[::-1]
+            for mask in masks_of_picture(picture, files[i], several_birds=False):
+                box = box_of_mask(mask)
+                if box is not None:
+                    value = int(picture[mask].max())
+                    found[value, t], masks[value, t] = np.array(box, np.float32), encode_mask(mask)
+    if not found:
+        raise InputError(folder, "holds no mask", "give pictures in which every bird has a grey value above 0")
+    track_id = np.unique([value for value, _ in found])
+    row = {value: n for n, value in enumerate(track_id.tolist())}
+    present = np.zeros((len(track_id), len(files)), bool)
+    box_px = np.zeros((*present.shape, 4), np.float32)
+    for (value, t), box in found.items():
+        present[row[value], t], box_px[row[value], t] = True, box
+    return Observations(
+        track_id=track_id,
+        frame_index=numbers[order],
+        present=present,
+        keypoints_px=np.zeros((*present.shape, 0, 2), np.float32),
+        confidence=np.zeros((*present.shape, 0), np.float32),
+        box_px=box_px,
+        image_size_px=sizes,
+        file_name=np.array([files[i].name for i in order]),
+        keypoint_names=(),
+        masks={(row[value], t): rle for (value, t), rle in masks.items()},
+    )
 
 
 def _images(observations: Observations) -> Iterator[tuple[int, int, list[int]]]:
@@ -140,12 +188,17 @@ def _folder_masks(observations: Observations, source: Path) -> _Masks:
         file = by_stem.get(stem) if named else by_number.get(int(observations.frame_index[t]))
         if file is None:
             return []
-        picture = read_picture(file, grey=True)
-        if picture is None:
-            raise InputError(file, "is no readable picture", "write the picture again, or remove it")
-        return masks_of_picture(picture, file, int(observations.present[:, t].sum()) > 1)
+        return masks_of_picture(_read_mask_picture(file), file, int(observations.present[:, t].sum()) > 1)
 
     return masks_of
+
+
+def _read_mask_picture(file: Path) -> np.ndarray:
+    """Return the (H, W) grey values of a picture of masks."""
+    picture = read_picture(file, grey=True)
+    if picture is None:
+        raise InputError(file, "is no readable picture", "write the picture again, or remove it")
+    return picture
 
 
 def masks_of_picture(picture: np.ndarray, file: Path, several_birds: bool) -> list[np.ndarray]:
