@@ -213,6 +213,9 @@ class FitConfig:
     """Number of confident keypoints that a frame needs to be fitted."""
     crop: CropConfig = CropConfig()
     initialise: InitialiseConfig = InitialiseConfig()
+    error_bars: bool = False
+    """Whether the result has error bars: standard deviations of the pose and covariances of the keypoints
+    (docs/files.md). They assume that the terms of the last stage are negative log-likelihoods."""
     backend: Literal["auto", "native", "reference"] = "auto"
     """Implementation of the silhouette: the compiled kernel (`native`), the pure-JAX `reference`, or the kernel if
     available (`auto`)."""

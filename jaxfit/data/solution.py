@@ -22,9 +22,9 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.kinematics import Pose
 
-FORMAT_VERSION = 4
-"""Version of ``poses.npz``; increased when its arrays change. Version 3 lacks `ambiguity_deg`, version 2 also lacks
-`timestamp_s` and `fps`."""
+FORMAT_VERSION = 5
+"""Version of ``poses.npz``; increased when its arrays change. Version 4 lacks `ERROR_BARS`, version 3 also lacks
+`ambiguity_deg`, version 2 also lacks `timestamp_s` and `fps`."""
 _OLDEST_VERSION = 2
 """Older versions are not read."""
 
@@ -55,6 +55,19 @@ LAYOUT = {
     "status": ("N", np.str_),
     "ambiguity_deg": ("N T", np.float32),
 }
+ERROR_BARS = {
+    "global_orient_sd": ("N T 3", np.float32),
+    "body_pose_sd": ("N T J-1 3", np.float32),
+    "transl_sd": ("N T 3", np.float32),
+    "scale_sd": ("N T", np.float32),
+    "bone_length_sd": ("N T J-1", np.float32),
+    "betas_sd": ("N T S", np.float32),
+    "keypoints_cam_cov": ("N T K 3 3", np.float32),
+    "keypoints_centred_cov": ("N T K 3 3", np.float32),
+    "keypoints_px_cov": ("N T K 2 2", np.float32),
+    "misfit": ("N T", np.float32),
+}
+"""The arrays of error bars. A solution has all of them or none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +137,33 @@ class Solution:
     (at most 20 times less likely, turned by more than 45°); 0 where the fit found no such pose. Only fits with more
     than one hypothesis search for other poses. None means 0 everywhere."""
 
+    # error bars (`fitting/error_bars.py`): None without, NaN where a window has none; docs/files.md
+    global_orient_sd: np.ndarray | None = None
+    """(N, T, 3) float32: radians, about the axes of the root of the bird."""
+    body_pose_sd: np.ndarray | None = None
+    """(N, T, J−1, 3) float32: radians, about the axes of the joint."""
+    transl_sd: np.ndarray | None = None
+    """(N, T, 3) float32: model units."""
+    scale_sd: np.ndarray | None = None
+    """(N, T) float32: 0 where every bird has the size of the model."""
+    bone_length_sd: np.ndarray | None = None
+    """(N, T, J−1) float32: 0 where bone lengths are fixed."""
+    betas_sd: np.ndarray | None = None
+    """(N, T, S) float32: 0 where the shape is fixed."""
+    keypoints_cam_cov: np.ndarray | None = None
+    """(N, T, K, 3, 3) float32: squared model units, camera frame of the crop."""
+    keypoints_centred_cov: np.ndarray | None = None
+    """(N, T, K, 3, 3) float32: the same, of the keypoints relative to their mean."""
+    keypoints_px_cov: np.ndarray | None = None
+    """(N, T, K, 2, 2) float32: squared image pixels."""
+    misfit: np.ndarray | None = None
+    """(N, T) float32: factor on all covariances of the window, 1 or more, where the keypoints lie farther from the pose
+    than the objective assumes. The other arrays contain it."""
+
     def __post_init__(self):
         ambiguity_deg = np.zeros(np.shape(self.valid), np.float32) if self.ambiguity_deg is None else self.ambiguity_deg
-        arrays = validate_arrays(vars(self) | {"ambiguity_deg": ambiguity_deg}, LAYOUT)
+        layout = LAYOUT | (ERROR_BARS if self.has_error_bars else {})
+        arrays = validate_arrays(vars(self) | {"ambiguity_deg": ambiguity_deg}, layout)
         if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
             bones = arrays["body_pose"].shape[2]
             raise ValueError(f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}")
@@ -156,6 +193,36 @@ class Solution:
             object.__setattr__(self, name, tuple(str(text) for text in arrays.pop(name)))
         for name, value in (arrays | {"loss": loss, "focal_px": focal_px, "crop_px": crop_px}).items():
             object.__setattr__(self, name, value)
+
+    @property
+    def has_error_bars(self) -> bool:
+        """Whether the solution has the arrays `ERROR_BARS`.
+
+        Raises:
+            ValueError: the solution has some of the arrays only.
+        """
+        absent = [name for name in ERROR_BARS if getattr(self, name) is None]
+        if absent and len(absent) < len(ERROR_BARS):
+            raise ValueError(f"{absent[0]} is missing: error bars need all of {', '.join(ERROR_BARS)}")
+        return not absent
+
+    def cells(self, error_bars: bool | None = None) -> dict[str, np.ndarray]:
+        """Return the arrays (N, T, …) by name.
+
+        Args:
+            error_bars: whether the error bars belong to them; where the solution has none, they are NaN. None: if the
+                solution has error bars.
+        """
+        wanted = self.has_error_bars if error_bars is None else error_bars
+        layout = LAYOUT | (ERROR_BARS if wanted else {})
+        found = {}
+        sizes = {"N": self.valid.shape[0], "T": self.valid.shape[1], "K": len(self.keypoint_names)}
+        sizes |= {"J-1": len(self.joint_names) - 1, "S": self.betas.shape[2], "2": 2, "3": 3}
+        for name, (shape, dtype) in layout.items():
+            if shape.startswith("N T"):
+                values = getattr(self, name)
+                found[name] = np.full([sizes[s] for s in shape.split()], np.nan, dtype) if values is None else values
+        return found
 
     @property
     def pose(self) -> Pose:
@@ -232,7 +299,8 @@ def save_solution(
 def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Mapping[str, Any], folder: Path) -> None:
     """Write the files of `save_solution` into an existing folder, such as a temporary folder of `new_folder`."""
     summary_json = json_text(summary)
-    arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in LAYOUT}
+    names = [*LAYOUT, *(ERROR_BARS if solution.has_error_bars else ())]
+    arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in names}
     terms = list(solution.loss)
     arrays["loss"] = np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
     arrays["loss_terms"] = np.array(terms, dtype=np.str_)
@@ -261,7 +329,8 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     path = folder / _POSES
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
-    optional = {name: shape for name, (shape, _) in _TIMES.items()} | {"ambiguity_deg": shapes.pop("ambiguity_deg")}
+    optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS).items()}
+    optional["ambiguity_deg"] = shapes.pop("ambiguity_deg")
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
     arrays |= {name: arrays[name].item() for name in _CAMERA}
     arrays |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}

@@ -171,7 +171,7 @@ class SpatialErrors:
             raise InputError(source, "its true poses have other keypoints than the result", _REMEDY)
         self.measured = shared & solution.valid & truth.valid[n, t]
         self.frame_index = solution.frame_index
-        principal, focal = _real_camera(truth, source)
+        principal, focal = real_camera(truth, source)
         centre = solution.crop[..., :2] + solution.crop[..., 2:] / 2
         R = crop_rotation(centre, principal, focal)  # here and below: arbitrary or NaN where not measured
 
@@ -219,7 +219,7 @@ class SpatialErrors:
         }
 
 
-def _real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:
+def real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:
     """Return the principal point and the focal length of the real camera, image pixels."""
     crops = truth.crop[truth.valid].astype(np.float64)
     if not len(crops):

@@ -13,6 +13,7 @@ The next stage continues from the poses of this module.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,6 +27,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.diagnose import name_failures
+from jaxfit.fitting.error_bars import ErrorBars, window_error_bars
+from jaxfit.fitting.posterior import with_shared
 from jaxfit.fitting.solve import (
     FitModel,
     Hyperparameters,
@@ -75,6 +78,8 @@ def take_tile(tree: Any, rows: Int[np.ndarray, "G"]) -> Any:
     """Return some rows of a pytree of arrays as JAX arrays; −1 is the last row."""
     return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), tree)
 
+
+_logger = logging.getLogger(__name__)
 
 OFFSETS = (-1, 1, -2, 2, -4, 4, -8, 8)
 """Distances of the near frames, in frames."""
@@ -170,6 +175,8 @@ class Fitted(NamedTuple):
     """(B,) text: the terms that were not finite, and the step of the failure; empty without failure."""
     ambiguity_deg: Float[np.ndarray, "B T"]
     """As `Solution.ambiguity_deg`."""
+    error_bars: ErrorBars | None = None
+    """Of all problems; None if the config has none."""
 
 
 class _Rows(NamedTuple):
@@ -230,7 +237,11 @@ def fit_batch(model: FitModel, configs: Sequence[FitConfig], batch: Batch, repor
         kept = rows.pose, rows.solver, rows.failure, rows.ambiguity_deg, final
         pose, solver, failure, ambiguity_deg, final = jax.tree.map(lambda x, best=best: x[best], kept)
         rows = _Rows(pose, solver, failure, ambiguity_deg, rows.row, 1)
-    return Fitted(*jax.tree.map(lambda x: x[rows.row], (rows.pose, final, rows.failure, rows.ambiguity_deg)))
+    bars = None
+    if configs[0].error_bars:
+        tiles = _stage_tiles(rows, hyperparameters, config_of_row, batch.targets, targets_row, needs_mask(stage))
+        bars = _error_bars(with_shared(program, stage.optimised), tiles, rows, configs[0].common_size)
+    return Fitted(*jax.tree.map(lambda x: x[rows.row], (rows.pose, final, rows.failure, rows.ambiguity_deg, bars)))
 
 
 def _initial_rows(batch: Batch) -> _Rows:
@@ -342,6 +353,18 @@ def _name_failures(
             pose = take_tile(rows.pose, at)
             failure[at[real]] = name_failures(failure[at], steps, stage.name, program, problems, pose)[real]
     return rows._replace(failure=failure)
+
+
+def _error_bars(program: Program, tiles: Sequence[_Tile], rows: _Rows, common_size: bool) -> ErrorBars:
+    """Return the error bars of all rows, and log why a row that did not diverge has none."""
+    found = []
+    for tile in tiles:
+        bars, reasons = window_error_bars(program, tile.problems, take_tile(rows.pose, tile.rows), common_size)
+        found.append(jax.tree.map(lambda *x: np.stack(x), *bars))
+        for row, reason in zip(tile.rows.tolist(), reasons, strict=True):
+            if row >= 0 and reason and not rows.failure[row]:
+                _logger.warning("a window has no error bars: %s", reason)
+    return join_tiles(found, len(rows.failure))
 
 
 def _compare_hypotheses(

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution, ambiguous_frames
 from jaxfit.fitting.batch import Fitted
+from jaxfit.fitting.error_bars import ErrorBars, blend_error_bars, error_bar_shapes
 from jaxfit.fitting.solve import FitModel
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.extras import LIBRARIES, library_versions
@@ -49,6 +50,8 @@ class FittedWindow(NamedTuple):
     """Reason why the fit diverged; empty if the fit did not diverge."""
     ambiguity_deg: np.ndarray
     """(T,) as `Solution.ambiguity_deg`."""
+    error_bars: ErrorBars | None = None
+    """None if the config has none."""
 
 
 def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
@@ -60,7 +63,8 @@ def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
     if not failure and not (pose.scale > 0).all():  # a solver may step across 0
         failure = "the size of the bird is not above 0"
     ambiguity_deg = fitted.ambiguity_deg[i].copy()
-    return FittedWindow(pose, loss, report.keypoints_cam, report.keypoints_px, failure, ambiguity_deg)
+    bars = None if fitted.error_bars is None else jax.tree.map(lambda x: x[i].copy(), fitted.error_bars)
+    return FittedWindow(pose, loss, report.keypoints_cam, report.keypoints_px, failure, ambiguity_deg, bars)
 
 
 def collect_windows(
@@ -93,7 +97,7 @@ def collect_windows(
         skipped: track → text about its skipped frames, for `Solution.failures`.
     """
     birds, frames = observations.num_tracks, observations.num_frames
-    arrays = _empty_frame_values(birds, frames, bird)
+    arrays = _empty_frame_values(birds, frames, bird, any(result.error_bars is not None for result in results))
     valid = np.zeros((birds, frames), bool)
     image_size_px = np.zeros((birds, frames, 2), np.int64)
     fitted, diverged = np.zeros(birds, int), np.zeros(birds, int)
@@ -144,7 +148,7 @@ def collect_windows(
     return solution
 
 
-def _empty_frame_values(birds: int, frames: int, bird: Bird) -> dict[str, Any]:
+def _empty_frame_values(birds: int, frames: int, bird: Bird, error_bars: bool) -> dict[str, Any]:
     """Return the arrays that `_frame_values` fills, for all birds and frames; NaN."""
     bones, keypoints = bird.num_joints - 1, bird.num_keypoints
     shapes = {
@@ -158,6 +162,7 @@ def _empty_frame_values(birds: int, frames: int, bird: Bird) -> dict[str, Any]:
         "keypoints_px": (keypoints, 2),
         "crop": (3,),
         "ambiguity_deg": (),
+        **(error_bar_shapes(bones, bird.num_shapes, keypoints) if error_bars else {}),
     }
     return {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
 
@@ -182,7 +187,21 @@ def _frame_values(
         "keypoints_px": crop_to_image(result.keypoints_px[present], crop, camera.size_px),
         "crop": crop,
         "ambiguity_deg": result.ambiguity_deg[present],
+        **_frame_error_bars(result.error_bars, crop, present, bird, camera),
     }
+
+
+def _frame_error_bars(
+    bars: ErrorBars | None, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: Camera
+) -> dict[str, Any]:
+    """Return the error bars of a solution at the present frames of one window; `crop` is that of these frames."""
+    if bars is None:
+        return {}
+    values = {name: value[present] for name, value in bars._asdict().items()}
+    missing = bird.num_shapes - bars.betas_sd.shape[1]  # a fit without shape coefficients
+    values["betas_sd"] = np.pad(values["betas_sd"], ((0, 0), (0, missing)))
+    values["keypoints_px_cov"] = values["keypoints_px_cov"] * (crop[:, 2, None, None, None] / camera.size_px) ** 2
+    return values
 
 
 def track_status(fitted: int, diverged: int) -> str:
@@ -212,7 +231,7 @@ def blend_seams(windows: Windows, results: Sequence[FittedWindow], model: FitMod
     The poses of the shared frames in the earlier window do not change. If the orientations of the two windows differ by
     more than 90° in a shared frame, the first half of the shared frames has the poses of the earlier window, and the
     second half those of the later window. A window that diverged has no part in a seam. The lengths of bones and the
-    shape coefficients are those of the later window.
+    shape coefficients are those of the later window. Error bars: `blend_error_bars`.
 
     Args:
         windows: W windows, by track and time. A frame is in at most two windows.
@@ -244,7 +263,13 @@ def _blend(
     rotations = np.asarray(_nearest_axis_angle(jnp.asarray(later.rotations), matrix_to_axis_angle(R)))
     root_px = earlier.root_px + weight[:, None] * (later.root_px - earlier.root_px)
     size = earlier.size * (later.size / earlier.size) ** weight
-    return _with_poses(own, windows.crop[w], at_own, _InImage(rotations, root_px, size, later.depth), model)
+    blended = _with_poses(own, windows.crop[w], at_own, _InImage(rotations, root_px, size, later.depth), model)
+    if before.error_bars is None or own.error_bars is None:
+        return blended
+    ratio = windows.crop[w - 1][at_before, 2] / windows.crop[w][at_own, 2]
+    return blended._replace(
+        error_bars=blend_error_bars(before.error_bars, own.error_bars, at_before, at_own, weight, ratio)
+    )
 
 
 class _InImage(NamedTuple):

@@ -62,7 +62,7 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
                 checked.add(name)
                 continue
             _trace(term, jax.grad(_share_of(program, name)), pose, problem)
-            if stage.solver == "levenberg_marquardt":
+            if stage.solver == "levenberg_marquardt" or (config.error_bars and stage is config.stages[-1]):
                 _trace(term, _curvature_of(program, name), pose, problem)
 
 

@@ -47,7 +47,10 @@ def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[F
     config, N, T = configs[0], observations.num_tracks, observations.num_frames
     bones, K = bird.num_joints - 1, bird.num_keypoints
     # numbers of a pose, of its keypoints and of its crop; the validation of a solution copies them
-    pose_bytes = 2 * 4 * (4 * bones + 5 * K + bird.num_shapes + 16)
+    numbers = 4 * bones + 5 * K + bird.num_shapes + 16
+    if config.error_bars:
+        numbers += 4 * bones + 22 * K + bird.num_shapes + 8
+    pose_bytes = 2 * 4 * numbers
     held = 2 * N * T * (26 + 13 * K)  # the observations as read, and with the keypoints in the order of the model
     needed = observations_bytes(N, T, K) + held + N * T * len(configs) * pose_bytes
     runs = f" in {len(configs)} runs" if len(configs) > 1 else ""

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxfit.fitting.batch import tile_size
 from jaxfit.fitting.collect import FittedWindow
+from jaxfit.fitting.error_bars import ErrorBars, pack, unpack
 from jaxfit.fitting.windows import Windows, window_hash
 from jaxfit.foundation.unfinished import Parts
 from jaxfit.model.kinematics import Pose
@@ -31,6 +32,7 @@ _LAYOUT = {
     "keypoints_cam": "W T K 3",
     "keypoints_px": "W T K 2",
     "ambiguity_deg": "W T",
+    "error_bars": "W T E",  # no number (E = 0) for a config without error bars
     **_POSE,
 }
 
@@ -84,6 +86,7 @@ class StoredWindows:
                     arrays["keypoints_px"][i],
                     str(arrays["failure"][i]),
                     arrays["ambiguity_deg"][i],
+                    _error_bars(arrays, i),
                 )
                 found |= {w: result for w in rows.get(content, ())}
         self._count = len(found)
@@ -110,9 +113,23 @@ class StoredWindows:
                 "keypoints_cam": np.stack([result.keypoints_cam for result in some]),
                 "keypoints_px": np.stack([result.keypoints_px for result in some]),
                 "ambiguity_deg": np.stack([result.ambiguity_deg for result in some]),
+                "error_bars": np.stack([_packed(result) for result in some]),
                 **poses,
             }
         )
+
+
+def _packed(result: FittedWindow) -> np.ndarray:
+    no_numbers = np.zeros((len(result.ambiguity_deg), 0), np.float32)
+    return no_numbers if result.error_bars is None else pack(result.error_bars)
+
+
+def _error_bars(arrays: Mapping[str, np.ndarray], i: int) -> ErrorBars | None:
+    packed = arrays["error_bars"][i]
+    if not packed.shape[1]:
+        return None
+    sizes = arrays["body_pose"].shape[2], arrays["betas"].shape[1], arrays["keypoints_cam"].shape[2]
+    return unpack(packed, *sizes)
 
 
 def windows_per_part(birds: int, frames: int) -> int:

@@ -45,12 +45,16 @@ def weighted_sum(window: PosedWindow, terms: Mapping[str, Term], settings: Setti
     return sum((jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()), start=jnp.zeros(()))
 
 
-def evaluate_curvature(window: PosedWindow, terms: Mapping[str, Term], settings: Settings) -> Curvature:
+def evaluate_curvature(
+    window: PosedWindow, terms: Mapping[str, Term], settings: Settings, second_order: bool = False
+) -> Curvature:
     """Return Σ λ · H_term over the active terms, from their own curvature or from their residuals.
 
     Args:
         window: one bird in one window.
         terms, settings: as for `evaluate_terms`.
+        second_order: whether H includes the second derivatives of robust kernels, as `residual_curvature` describes.
+            A term with its own curvature does not distinguish.
 
     Raises:
         InputError: a term has no curvature and does not return residuals; the error names the term.
@@ -64,7 +68,7 @@ def evaluate_curvature(window: PosedWindow, terms: Mapping[str, Term], settings:
                 found += [part._replace(weight=jnp.asarray(values["weight"]) * part.weight) for part in parts]
         return found
 
-    weights, curvatures = [jnp.ones(())], [residual_curvature(window, residuals_of)]
+    weights, curvatures = [jnp.ones(())], [residual_curvature(window, residuals_of, second_order)]
     for name, values in settings.items():
         curvature = terms[name].curvature
         if curvature is not None:
@@ -81,8 +85,9 @@ def _checked_residuals(name: str, value: Any) -> list[Residuals]:
     """Return the residuals of a term after a check that the term returns residuals."""
     if _is_residuals(value):
         return as_list(value)
-    problem = "returns a number, but the solver levenberg_marquardt needs its residuals"
-    raise InputError(f"term {name!r}", problem, "return Residuals (docs/terms.md), or use the solver adam")
+    problem = "returns a number, but the solver levenberg_marquardt and error bars need its residuals"
+    remedy = "return Residuals (docs/terms.md), or use the solver adam without error_bars"
+    raise InputError(f"term {name!r}", problem, remedy)
 
 
 def _is_residuals(value: Any) -> bool:

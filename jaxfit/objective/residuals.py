@@ -95,9 +95,16 @@ def residual_sum(residuals: Residuals | Sequence[Residuals]) -> Scalar:
 
 
 def residual_curvature(
-    window: PosedWindow, residuals_of: Callable[[PosedWindow], Residuals | Sequence[Residuals]]
+    window: PosedWindow,
+    residuals_of: Callable[[PosedWindow], Residuals | Sequence[Residuals]],
+    second_order: bool = False,
 ) -> Curvature:
     """Return H = Jᵀ·diag(2w·ρ′)·J of the residuals of a window.
+
+    This H bounds the curvature of a robust kernel from above. With `second_order`, H is the curvature of the kernel
+    itself, as an average over the directions of a group of n residuals: Jᵀ·diag(2w·max(ρ′ + 2sρ″/n, 0))·J with
+    s = ‖r‖². For Student's t, the mean of this H over the density is the Fisher information. The bound is larger by
+    the factor (ν + n + 2)/(ν + n), so standard deviations from the bound would be too small.
 
     If the residuals have no `jacobian`, the product with H is exact and its diagonal is an estimate: the mean of
     (Jᵀ·√(2w·ρ′)·u)² over `PROBES` vectors u of random signs, which are always the same.
@@ -105,6 +112,7 @@ def residual_curvature(
     Args:
         window: one bird in one window.
         residuals_of: returns the residuals of a window.
+        second_order: whether H includes the second derivative ρ″ of the kernels.
 
     Source: Holland and Welsch 1977, Robust regression using iteratively reweighted least-squares; Hutchinson 1990, A
     stochastic estimator of the trace of the influence matrix (random signs).
@@ -112,7 +120,8 @@ def residual_curvature(
     current = as_list(residuals_of(window))
     factors = []
     for each in current:
-        factor = 2 * each.weight * each.kernel.slope(_squared(each))
+        slope = _mean_slope(each) if second_order else each.kernel.slope(_squared(each))
+        factor = 2 * each.weight * slope
         factors.append(jnp.broadcast_to(jax.lax.stop_gradient(factor)[..., None], each.values.shape))
     by_formula = [i for i, each in enumerate(current) if each.jacobian is not None]
     by_jax = [i for i in range(len(current)) if i not in by_formula]
@@ -167,6 +176,13 @@ def _from_jax(window: PosedWindow, values_at: Callable[[Rows], list], factors: l
 def as_list(residuals: Residuals | Sequence[Residuals]) -> list[Residuals]:
     """Return residuals as a list."""
     return [residuals] if isinstance(residuals, Residuals) else list(residuals)
+
+
+def _mean_slope(residuals: Residuals) -> Float[Array, "*G"]:
+    """Return max(ρ′ + 2sρ″/n, 0) of each group of n residuals."""
+    squared = _squared(residuals)
+    slope, bend = jax.jvp(residuals.kernel.slope, (squared,), (jnp.ones_like(squared),))
+    return jnp.maximum(slope + 2 * squared * bend / residuals.values.shape[-1], 0)
 
 
 def _squared(residuals: Residuals) -> Float[Array, "*G"]:

@@ -16,7 +16,7 @@ from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.observations import Observations, check_keypoints
-from jaxfit.data.solution import LAYOUT, Solution, load_solution, write_solution
+from jaxfit.data.solution import Solution, load_solution, write_solution
 from jaxfit.data.tracks import track_quality
 from jaxfit.fitting.collect import summarise, track_status
 from jaxfit.fitting.fit import check_observations, fit_runs, windows_of
@@ -28,8 +28,6 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.reading import read_file
 from jaxfit.model.bird import Bird
 from jaxfit.review.edits import Edit, apply_edits
-
-_CELLS = tuple(name for name, (shape, _) in LAYOUT.items() if shape.startswith("N T"))
 
 
 class Refit(NamedTuple):
@@ -84,7 +82,9 @@ def refit(
     result = _empty(solution, after)
     if len(touched):
         result = fit_runs(after, bird, [config], None, progress, source, select=touched)[0]
-    arrays = {name: getattr(result, name).copy() for name in _CELLS}
+    with_bars = result.has_error_bars or solution.has_error_bars
+    copied = solution.cells(with_bars)
+    arrays = {name: values.copy() for name, values in result.cells(with_bars).items()}
     counts = np.zeros((after.num_tracks, 2), int)  # windows with poses, windows that diverged
     loss = {term: np.full(after.num_tracks, np.nan) for term in result.loss or solution.loss}
     failures = {track: list(texts) for track, texts in result.failures.items()}
@@ -92,8 +92,8 @@ def refit(
         n, at = int(new.track[w]), new.frame[w][new.present[w]]
         if source_row[w] >= 0:
             m = _row_of(solution, int(old.track_id[source_row[w]]))
-            for name in _CELLS:
-                arrays[name][n, at] = getattr(solution, name)[m, at]
+            for name, values in copied.items():
+                arrays[name][n, at] = values[m, at]
             if not solution.valid[m, at].any():
                 first, last = after.frame_index[at[[0, -1]]]
                 text = f"frames {first} to {last}: the window diverged in the earlier fit"
@@ -144,8 +144,7 @@ def _empty(solution: Solution, observations: Observations) -> Solution:
     """Return a result without poses for the tracks of the observations."""
     count = observations.num_tracks
     arrays = {}
-    for name in _CELLS:
-        values = getattr(solution, name)
+    for name, values in solution.cells().items():
         filler = np.nan if values.dtype.kind == "f" else 0
         arrays[name] = np.full((count, *values.shape[1:]), filler, values.dtype)
     status = np.full(count, "no usable frame")

@@ -26,7 +26,7 @@ from jaxfit.config.perception import TrackerConfig
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.observations import Observations
-from jaxfit.data.solution import LAYOUT, Solution, write_solution
+from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.tracks import frame_step, track_quality
 from jaxfit.fitting.collect import summarise
 from jaxfit.foundation.errors import InputError
@@ -70,11 +70,13 @@ def concatenate_solutions(
     """Return the poses of all frames; arguments as of `concatenate_observations`.
 
     The status of a track is `ok` if the track has this status in all parts, and the losses of its parts are summed.
+    Error bars are NaN in parts without error bars.
     """
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _TIMES}
-    for name, (shape, _) in LAYOUT.items():
-        if shape.startswith("N T"):
-            arrays[name] = _cells(name, parts, rows, len(track_id))
+    if any(part.has_error_bars for part in parts):
+        parts = [replace(part, **part.cells(error_bars=True)) for part in parts]
+    for name in parts[0].cells():
+        arrays[name] = _cells(name, parts, rows, len(track_id))
     loss = {term: np.full(len(track_id), np.nan) for term in dict.fromkeys(t for part in parts for t in part.loss)}
     statuses: list[list[str]] = [[] for _ in track_id]
     failures: dict[int, tuple[str, ...]] = {}

@@ -1,0 +1,300 @@
+"""Error bars of a fitted window: standard deviations of the pose, covariances of the keypoints.
+
+The posterior (`fitting/posterior.py`) is a Gaussian over the columns of a frame. This module converts it:
+
+- Rotations: the tangent δ of SO(3) with R = R_fit·exp(δ), δ = Jr(r)·dr with the right Jacobian Jr of the axis-angle r.
+  The axes of δ are those of the rotated part: of the bird's root for the global orientation, of the joint for a joint.
+- Keypoints: J·Σ·Jᵀ with the derivatives J of the keypoints, in the camera frame and in pixels.
+- Size: one camera cannot distinguish a small near bird from a large distant bird. The fit keeps the distance fixed and
+  finds a size; a `Solution` has the size of the model and the distance that gives the same picture (`common_size`).
+  The covariance follows this change: the deviation of size becomes one of distance. The variance along depth is
+  therefore that of the distance *if the bird has exactly the size of the model*, in units of that size. Without
+  `common_size`, distance is fixed, its deviation is 0, and `scale` has the deviation of the size.
+
+Misfit: if the keypoints lie farther from the fitted pose than the objective assumes, the posterior is too narrow. The
+covariance of a window is multiplied by one factor, the ratio of the median squared standardised residual to its
+expected median, if this is above 1. A residual is standardised by the scale of its likelihood and by its leverage: a
+keypoint that determines the pose pulls the pose to itself, and its residual is too small.
+
+The error bars are those of the reported pose. Where a second pose explains the keypoints almost as well
+(`Solution.ambiguity_deg`), they do not contain the other pose.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.stats import f as f_distribution
+
+from jaxfit.fitting.posterior import WindowPosterior, window_posteriors
+from jaxfit.fitting.solve import Problem, Program
+from jaxfit.model.kinematics import (
+    Pose,
+    window_keypoint_derivatives,
+    window_keypoint_rows,
+    window_keypoints,
+    window_transforms,
+)
+from jaxfit.model.rotation import right_jacobian
+from jaxfit.objective.likelihood import keypoint_sd_px
+
+LEAST_RESIDUALS = 20
+"""Number of detected keypoints that a misfit factor needs."""
+MOST_MISFIT = 100.0
+MOST_LEVERAGE = 0.9
+
+
+class ErrorBars(NamedTuple):
+    """Error bars of one window, as NumPy arrays, float32; NaN in frames without the bird and without a posterior."""
+
+    global_orient_sd: np.ndarray
+    """(T, 3) radians, about the axes of the bird's root."""
+    body_pose_sd: np.ndarray
+    """(T, J−1, 3) radians, about the axes of the joint."""
+    transl_sd: np.ndarray
+    """(T, 3) as `Solution.transl`."""
+    scale_sd: np.ndarray
+    """(T,) as `Solution.scale`."""
+    bone_length_sd: np.ndarray
+    """(T, J−1)."""
+    betas_sd: np.ndarray
+    """(T, S)."""
+    keypoints_cam_cov: np.ndarray
+    """(T, K, 3, 3) as `Solution.keypoints_cam`."""
+    keypoints_centred_cov: np.ndarray
+    """(T, K, 3, 3) the same, of the keypoints relative to their mean."""
+    keypoints_px_cov: np.ndarray
+    """(T, K, 2, 2) crop pixels²."""
+    misfit: np.ndarray
+    """(T,) factor on the covariance, 1 or more; all others contain it."""
+
+
+def error_bar_shapes(bones: int, shapes: int, keypoints: int) -> dict[str, tuple[int, ...]]:
+    """Return the shape of each array of `ErrorBars` in one frame."""
+    return {
+        "global_orient_sd": (3,),
+        "body_pose_sd": (bones, 3),
+        "transl_sd": (3,),
+        "scale_sd": (),
+        "bone_length_sd": (bones,),
+        "betas_sd": (shapes,),
+        "keypoints_cam_cov": (keypoints, 3, 3),
+        "keypoints_centred_cov": (keypoints, 3, 3),
+        "keypoints_px_cov": (keypoints, 2, 2),
+        "misfit": (),
+    }
+
+
+def no_error_bars(frames: int, bones: int, shapes: int, keypoints: int) -> ErrorBars:
+    """Return the error bars of a window without a posterior: NaN."""
+    shapes_of = error_bar_shapes(bones, shapes, keypoints)
+    return ErrorBars(**{name: np.full((frames, *shape), np.nan, np.float32) for name, shape in shapes_of.items()})
+
+
+def pack(bars: ErrorBars) -> Float[np.ndarray, "T E"]:
+    """Return all error bars of a window in one array, for files."""
+    return np.concatenate([values.reshape(len(values), -1) for values in bars], axis=1)
+
+
+def unpack(packed: Float[np.ndarray, "T E"], bones: int, shapes: int, keypoints: int) -> ErrorBars:
+    """Return the error bars of a window from `pack`."""
+    sizes = error_bar_shapes(bones, shapes, keypoints)
+    ends = np.cumsum([0, *(math.prod(shape) for shape in sizes.values())])
+    pairs = zip(sizes.items(), ends[:-1], ends[1:], strict=True)
+    return ErrorBars(**{name: packed[:, a:b].reshape(len(packed), *shape) for (name, shape), a, b in pairs})
+
+
+def blend_error_bars(
+    before: ErrorBars, own: ErrorBars, at_before: np.ndarray, at_own: np.ndarray, weight: np.ndarray, ratio: np.ndarray
+) -> ErrorBars:
+    """Return the error bars of a window, blended with those of the window before in their shared frames.
+
+    Variances are interpolated linearly, as the poses are. Both windows use the same detections in these frames, so
+    their errors may agree fully; the variance of the blended pose is then at most the interpolated variance.
+
+    Args:
+        before, own: error bars of the earlier and the later window.
+        at_before, at_own: positions of the shared frames in both windows.
+        weight: weight of the later window in each shared frame.
+        ratio: size of the crop in the earlier window over that in the later window, for each shared frame.
+    """
+    blended = {}
+    for name, value in own._asdict().items():
+        w = weight.reshape(-1, *(1,) * (value.ndim - 1))
+        earlier, later = getattr(before, name)[at_before], value[at_own]
+        if name == "keypoints_px_cov":
+            earlier = earlier * ratio[:, None, None, None] ** 2
+        is_sd = name.endswith("_sd")
+        mean = (1 - w) * earlier ** (2 if is_sd else 1) + w * later ** (2 if is_sd else 1)
+        blended[name] = value.copy()
+        blended[name][at_own] = np.sqrt(mean) if is_sd else mean
+    return ErrorBars(**blended)
+
+
+def window_error_bars(
+    program: Program, problems: Problem, pose: Pose, common_size: bool
+) -> tuple[list[ErrorBars], list[str]]:
+    """Return the error bars of each of B problems of a stage at its fitted pose, and the reason why it has none.
+
+    Args:
+        program: the program of the stage, as for `posterior.window_blocks`.
+        problems: B problems.
+        pose: their fitted poses.
+        common_size: as in the config.
+
+    Returns:
+        The error bars, and for each problem a reason, which is empty if it has error bars.
+    """
+    posteriors = window_posteriors(program, problems, pose)
+    keypoints = jax.tree.map(np.asarray, _keypoints_and_derivatives(program, problems, pose))
+    pose, problems = jax.tree.map(np.asarray, (pose, problems))
+    bars, reasons = [], []
+    for b, posterior in enumerate(posteriors):
+        one, problem, own = jax.tree.map(lambda x, b=b: x[b], (pose, problems, keypoints))
+        if isinstance(posterior, str):
+            sizes = one.body_pose.shape[1], len(one.betas), own.points_cam.shape[1]
+            bars.append(no_error_bars(len(one.transl), *sizes))
+            reasons.append(posterior)
+            continue
+        bars.append(_error_bars(program, problem, one, posterior, own, common_size))
+        reasons.append("")
+    return bars, reasons
+
+
+class _Keypoints(NamedTuple):
+    """Keypoints and their derivatives at some poses, camera frame, model units."""
+
+    points_cam: Float[Array, "*B T K 3"]
+    derivative: Float[Array, "*B T K 3 D"]
+    """In the columns of `curvature.frame_rows`."""
+
+
+@eqx.filter_jit
+def _keypoints_and_derivatives(program: Program, problems: Problem, pose: Pose) -> _Keypoints:
+    def one(pose: Pose) -> _Keypoints:
+        A = window_transforms(program.rig, pose)
+        points = window_keypoints(program.rig, A, pose)
+        axes = jnp.broadcast_to(jnp.eye(3), (*points.shape, 3))
+        by_angles = window_keypoint_rows(program.rig, A, pose, axes)
+        scale = jnp.broadcast_to(pose.scale, points.shape[:1])
+        by_scale = (points - pose.transl[:, None]) / scale[:, None, None]
+        by_shared = (window_keypoint_derivatives(program.rig, A, pose, name) for name in program.shared)
+        return _Keypoints(points, jnp.concatenate([by_angles, axes, by_scale[..., None], *by_shared], axis=-1))
+
+    return jax.vmap(one)(pose)
+
+
+def _error_bars(
+    program: Program, problem: Problem, pose: Pose, window: WindowPosterior, keypoints: _Keypoints, common_size: bool
+) -> ErrorBars:
+    """Return the error bars of one window."""
+    T, _, _, D = keypoints.derivative.shape
+    columns = np.concatenate([window.columns.own, window.columns.shared])
+    covariance = window.posterior.frame_covariance()
+    bones, shapes = pose.body_pose.shape[1], len(pose.betas)
+    focal_px, points = program.camera.focal_px, np.asarray(keypoints.points_cam, np.float64)
+    by_cam = np.array(keypoints.derivative, np.float64)
+    x, z = points[..., :2], points[..., 2:]
+    by_px = focal_px * (by_cam[..., :2, :] / z[..., None] - (x / z**2)[..., None] * by_cam[..., 2:, :])
+    px_cov = _propagate(by_px[..., columns], covariance)
+    misfit = _misfit(program, problem, _project_px(points, program), px_cov)
+    by_transl, scale = np.zeros((T, 3, D)), np.broadcast_to(pose.scale, T).astype(np.float64)
+    by_transl[:, :, 3 * bones + 3 : 3 * bones + 6] = np.eye(3)
+    at_scale = 3 * bones + 6
+    if common_size:  # points/scale: its derivative has a part along the point itself
+        by_cam /= scale[:, None, None, None]
+        by_cam[..., at_scale] -= points / scale[:, None, None] ** 2
+        by_transl /= scale[:, None, None]
+        by_transl[..., at_scale] -= pose.transl / scale[:, None] ** 2
+
+    variance = np.zeros((T, D))
+    variance[:, columns] = np.einsum("tii->ti", covariance)
+    ends = np.cumsum([at_scale + 1, *(bones if name == "bone_length" else shapes for name in program.shared)])
+    shared_variance = {name: variance[:, a:b] for name, a, b in zip(program.shared, ends[:-1], ends[1:], strict=True)}
+    angles_sd = _tangent_sd(pose, columns, covariance)
+    transl_cov = _propagate(by_transl[:, None][..., columns], covariance)[:, 0]
+    values = ErrorBars(
+        global_orient_sd=angles_sd[:, 0] ** 2,
+        body_pose_sd=angles_sd[:, 1:] ** 2,
+        transl_sd=np.einsum("tii->ti", transl_cov),
+        scale_sd=np.zeros(T) if common_size else variance[:, at_scale],
+        bone_length_sd=shared_variance.get("bone_length", np.zeros((T, bones))),
+        betas_sd=shared_variance.get("betas", np.zeros((T, shapes))),
+        keypoints_cam_cov=_propagate(by_cam[..., columns], covariance),
+        keypoints_centred_cov=_propagate((by_cam - by_cam.mean(axis=1, keepdims=True))[..., columns], covariance),
+        keypoints_px_cov=px_cov,
+        misfit=np.full(T, misfit),
+    )
+    present = np.asarray(problem.targets.present, bool)
+    scaled = {}
+    for name, value in values._asdict().items():
+        value = value if name == "misfit" else misfit * value
+        value = np.sqrt(value) if name.endswith("_sd") else value
+        value[~present] = np.nan
+        scaled[name] = value.astype(np.float32)
+    return ErrorBars(**scaled)
+
+
+def _propagate(J: Float[np.ndarray, "T K R P"], covariance: Float[np.ndarray, "T P P"]) -> np.ndarray:
+    """Return J·Σ·Jᵀ of each point, (T, K, R, R)."""
+    T, K, R, P = J.shape
+    half = (J.reshape(T, K * R, P) @ covariance).reshape(T, K, R, P)
+    return half @ J.swapaxes(-1, -2)
+
+
+def _tangent_sd(pose: Pose, columns: np.ndarray, covariance: np.ndarray) -> Float[np.ndarray, "T J 3"]:
+    """Return the standard deviations of the tangents δ of all rotations; 0 for rotations that are fixed."""
+    angles = np.concatenate([pose.global_orient[:, None], pose.body_pose], axis=1)
+    T, J, _ = angles.shape
+    full = np.zeros((T, J, 3, 3))
+    position = np.full(3 * J, -1)
+    inside = columns < 3 * J
+    position[columns[inside]] = np.flatnonzero(inside)
+    for j in range(J):
+        at = position[3 * j : 3 * j + 3]
+        if (at >= 0).all():
+            full[:, j] = covariance[:, at[:, None], at]
+    Jr = np.asarray(right_jacobian(jnp.asarray(angles, jnp.float32)), np.float64)
+    return np.sqrt(np.einsum("tjab,tjbc,tjac->tja", Jr, full, Jr))
+
+
+def _project_px(points_cam: np.ndarray, program: Program) -> np.ndarray:
+    return program.camera.focal_px * points_cam[..., :2] / points_cam[..., 2:] + program.camera.centre_px
+
+
+def _misfit(program: Program, problem: Problem, keypoints_px: np.ndarray, px_cov: np.ndarray) -> float:
+    """Return the factor on the covariance of a window, see the head of this module.
+
+    It is 1 for objectives without a keypoint term of the library, and for windows with few detected keypoints.
+    """
+    settings = problem.hyperparameters.settings
+    confidence = np.asarray(problem.targets.confidence * problem.hyperparameters.keypoints_on, np.float64)
+    if "keypoint_likelihood" in settings:
+        own = {name: float(value) for name, value in settings["keypoint_likelihood"].items()}
+        if own["weight"] <= 0:
+            return 1.0
+        variance = keypoint_sd_px(confidence, own["sd_sure_px"], own["sd_unsure_px"]) ** 2 / own["weight"]
+        gaussian = (own["dof"] + 4) / (own["dof"] + 2)  # variance of equal Fisher information
+        expected = 2 * float(f_distribution.median(2, own["dof"]))
+    elif "keypoints" in settings:
+        weight = float(settings["keypoints"]["weight"])
+        if weight <= 0:
+            return 1.0
+        variance, gaussian = 1 / (2 * weight * np.maximum(confidence, 1e-6)), 1.0
+        expected = 2 * np.log(2)
+    else:
+        return 1.0
+    error_px = keypoints_px - np.asarray(problem.targets.keypoints_px, np.float64)
+    leverage = np.einsum("tkii->tk", px_cov) / (2 * gaussian * variance)
+    squared = (error_px**2).sum(-1) / (variance * (1 - np.minimum(leverage, MOST_LEVERAGE)))
+    counted = squared[(confidence > 0) & np.asarray(problem.targets.present, bool)[:, None]]
+    counted = counted[np.isfinite(counted)]
+    if len(counted) < LEAST_RESIDUALS:
+        return 1.0
+    return float(np.clip(np.median(counted) / expected, 1, MOST_MISFIT))
