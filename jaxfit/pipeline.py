@@ -6,6 +6,7 @@ import hashlib
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.tracks import track_quality
 from jaxfit.fitting.collect import summarise
-from jaxfit.fitting.fit import fit
+from jaxfit.fitting.fit import fit, learn_weights
 from jaxfit.fitting.provisional import ProvisionalFit
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
@@ -179,6 +180,7 @@ def reconstruct(
         networks = file_hashes(own_networks)
         empty = TrackRecorder(keypoints.keypoint_names).observations()
         check_keypoints(empty, bird.keypoint_names, config.track.keypoints.file)
+    learns = config.fit.learn_weights
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
             stored, workers = None, None
@@ -195,6 +197,8 @@ def reconstruct(
             with ProvisionalFit(bird, config.fit, windows, fit_progress, video, cluster) as provisional_fit:
 
                 def on_frame(observations_from: ObservationsFrom) -> None:
+                    if learns:
+                        return  # the weights are learnt from the whole video
                     with clock("fit"):
                         provisional_fit(observations_from)
 
@@ -202,7 +206,11 @@ def reconstruct(
                 tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
         _check_tracking(tracking, stored)
         observations = tracking.observations
+        learnt = None
         with clock("fit"):
+            if config.fit.learn_weights:
+                learnt = learn_weights(observations, bird, config.fit, progress=progress, source=video)
+                config = replace(config, fit=learnt.config)
             more = {"stored": windows, "cluster": cluster}
             solution = fit(observations, bird, config.fit, progress=fit_progress, source=video, **more)
         with new_folder(folder, overwrite, marker=MARKER) as part:
@@ -211,7 +219,7 @@ def reconstruct(
                 _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
             settings = config_to_yaml(config)
-            write_solution(solution, bird, settings, summary, part)
+            write_solution(solution, bird, settings, summary, part, learnt and learnt.to_yaml())
             write_report(part / REPORT, solution, bird, observations, summary, settings, folder, video, force=True)
     return Reconstruction(tracking, solution, summary)
 

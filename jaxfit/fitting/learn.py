@@ -1,7 +1,7 @@
 """Weights and scales of the objective from the data: empirical Bayes with the effective number of parameters.
 
 A term whose weight or scale is learnt has, up to constants, the form E = ½·β·Σ w‖e‖² − ½·N·log β, with the precision β:
-1/s² for a scale s, 2λ for the weight λ of `pose_prior`, λ for the weight of `mask_smooth_l1`. The weights w are those
+1/s² for a scale s, λ for the weight of `mask_smooth_l1`. The weights w are those
 of Student's t, (ν + n)/(ν + β‖e‖²) for groups of n errors, and 1 for squares. The Laplace approximation of the evidence
 is largest where
 
@@ -10,6 +10,10 @@ is largest where
 with H the curvature of the term, Σ the covariance of the posterior, and Σ₀ that of the prior (the terms without
 observations). A fit takes up a part of the errors, which tr(Σ·H) counts. Σ₀ stands for the normaliser of the prior: the
 pose prior and the motion terms limit the same poses, so that a long window has fewer independent poses than frames.
+
+The weight of `pose_prior` is not learnt. With the formula, the weight on AVES windows fell from 1.4 to 0.07, and poses
+flipped in some frames: the weight that is right for the whole window, where every frame counts, is too small for the
+single frame that the solver must keep near its minimum. `jaxfit prior learn` takes the weight from results.
 
 A round computes γ and Σ w‖e‖² at the poses of a sample of windows, sets β, and continues the fit with the new values.
 
@@ -64,7 +68,6 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.curvature import frame_rows
 from jaxfit.objective.objective import evaluate_curvature
-from jaxfit.objective.registry import find_terms
 from jaxfit.objective.residuals import as_list
 from jaxfit.raster.silhouette import silhouette
 
@@ -81,8 +84,8 @@ LEAST_KEYPOINTS, LEAST_FRAMES, LEAST_MASKS = 200, 20, 20
 """Fewer detected keypoints, frames or masks in the sample teach nothing about the values that depend on them."""
 MASKS_PER_WINDOW = 25
 """Number of masks of a window whose errors are filtered."""
-LARGEST_RATIO = 0.45
-"""Largest r; r is ½ for a displacement of the whole outline."""
+LARGEST_RATIO = 0.49
+"""Largest r, for which τ is 12σ. For a displacement of the whole outline, r is ½."""
 LEAST_SHARE = 0.1
 """Least part of N that remains after tr(Σ·H), which is only an approximation."""
 
@@ -91,7 +94,6 @@ MOTION, PLACE = "motion_likelihood", "place_likelihood"
 SETTINGS: Mapping[str, tuple[str, ...]] = {
     KEYPOINTS: ("sd_sure_px", "sd_unsure_px"),
     MASK: ("weight",),
-    POSE_PRIOR: ("weight",),
     MOTION: ("sd_rad_s2",),
     PLACE: ("sd_px_s2",),
 }
@@ -191,7 +193,7 @@ def _learnable(config: FitConfig, windows: Windows, remarks: list[str]) -> list[
         remarks.append(f"no weights are learnt: {keypoints} keypoints in {frames} frames are too few")
         return []
     masks = int((windows.has_mask & windows.present).sum())
-    known = {*SETTINGS, *_OF_OTHER_COLUMNS, "mask", "keypoints"}
+    known = {*SETTINGS, POSE_PRIOR, *_OF_OTHER_COLUMNS, "mask", "keypoints"}
     names = []
     for name in SETTINGS:
         if name not in stage.terms or set(SETTINGS[name]) & set(term_settings(stage.override.get(name, {}))):
@@ -202,7 +204,7 @@ def _learnable(config: FitConfig, windows: Windows, remarks: list[str]) -> list[
             remarks.append(f"the weight of {MASK} is not learnt: it needs `edge: unbiased`")
         elif name == MASK and masks < LEAST_MASKS:
             remarks.append(f"the weight of {MASK} is not learnt: {masks} masks are too few")
-        elif name in (POSE_PRIOR, MOTION, PLACE) and set(stage.terms) - known:
+        elif name in (MOTION, PLACE) and set(stage.terms) - known:
             others = ", ".join(sorted(set(stage.terms) - known))
             remarks.append(f"{name} is not learnt: it cannot be separated from {others}")
         else:
@@ -319,7 +321,7 @@ def measure(
     for rows in tile_rows(count, size):
         own = take_tile(targets, rows)
         own = replace(own, has_mask=own.has_mask & (rows >= 0)[:, None] & own.present)
-        settings = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(rows), *np.shape(x))), hyperparameters)
+        settings = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *[hyperparameters] * len(rows))
         anchor = take_tile(pose, rows)
         problems = Problem(settings, anchor, own)
         full, prior = window_blocks(program, problems, anchor), _prior_blocks(program, problems, anchor)
@@ -327,25 +329,24 @@ def measure(
         for b, row in enumerate(rows.tolist()):
             if row < 0 or not usable[row]:
                 continue
-            one = jax.tree.map(lambda x, b=b: x[b], (anchor, local, own))
-            added = _window_sums(program, full[b], prior[b], *one[:2], _no_arrays(hyperparameters.settings))
+            own_pose, statistics, target = jax.tree.map(lambda x, b=b: x[b], (anchor, local, own))
+            added = _window_sums(program, full[b], prior[b], own_pose, statistics)
             if added is None:
                 continue
             found = True
             for name in names:
                 sums[name] += added[name]
             if MASK in names:
-                outlines.append(outline_errors(one[1].silhouette, np.asarray(one[2].mask), one[2].has_mask, program))
+                masks = np.asarray(target.mask), np.asarray(target.has_mask)
+                outlines.append(outline_errors(statistics.silhouette, *masks, program))
     if not found:
         return None
     evidence = {name: _evidence(name, *sums[name]) for name in names}
     if MASK in names:
-        evidence[MASK] = _mask_evidence(np.concatenate(outlines), *sums[MASK][:2], program, hyperparameters.settings)
+        area = (program.camera.size_px / program.raster.size_px) ** 2
+        weight = float(hyperparameters.settings[MASK]["weight"]) * area
+        evidence[MASK] = mask_evidence(np.concatenate(outlines), *sums[MASK][:2], weight, filter_sd_px(program))
     return evidence
-
-
-def _no_arrays(settings: Any) -> Any:
-    return jax.tree.map(float, settings)
 
 
 def _evidence(name: str, total: float, taken: float, energy: float) -> Evidence:
@@ -387,7 +388,7 @@ def _frame_statistics(program: Program, problems: Problem, pose: Pose) -> _Frame
         T, D = frame_rows(pose, program.shared).shape
         for name in settings:
             own = {name: settings[name]}
-            if name in (KEYPOINTS, POSE_PRIOR, MOTION, PLACE):
+            if name in (KEYPOINTS, MOTION, PLACE):
                 more = {key: value for key, value in settings[name].items() if key != "weight"}
                 energy[name] = settings[name]["weight"] * sum(
                     jnp.sum(each.weight * 2 * each.kernel.slope(squared) * squared)
@@ -423,7 +424,6 @@ def _window_sums(
     prior: tuple[Blocks, Columns] | str,
     pose: Pose,
     local: _FrameStatistics,
-    settings: Any,
 ) -> dict[str, np.ndarray] | None:
     """Return, for each term: number of errors (priors: tr(Σ₀·H)), tr(Σ·H), and energy. None without a posterior."""
     if isinstance(full, str) or isinstance(prior, str):
@@ -435,23 +435,19 @@ def _window_sums(
     covariance, prior_covariance = posterior.posterior.covariance, before.posterior.covariance
     columns = full[1]
     both = np.concatenate([columns.own, columns.shared])
-    at = np.ix_(range(len(pose.transl)), both, both)
 
-    def frame_trace(name: str, of: Any) -> float:
-        return float(np.sum(of.posterior.frame_covariance() * local.curvature[name][at]))
+    def frame_trace(name: str) -> float:
+        return float(np.sum(posterior.posterior.frame_covariance() * local.curvature[name][:, both[:, None], both]))
 
     sums = {}
     if KEYPOINTS in local.energy:
-        sums[KEYPOINTS] = np.array([2 * local.keypoints, frame_trace(KEYPOINTS, posterior), local.energy[KEYPOINTS]])
+        sums[KEYPOINTS] = np.array([2 * local.keypoints, frame_trace(KEYPOINTS), local.energy[KEYPOINTS]])
     if MASK in local.curvature:
-        sums[MASK] = np.array([local.masks, frame_trace(MASK, posterior), 0.0])
+        sums[MASK] = np.array([local.masks, frame_trace(MASK), 0.0])
     temporal = prior[0]
     if POSE_PRIOR in local.curvature:
-        traces = frame_trace(POSE_PRIOR, before), frame_trace(POSE_PRIOR, posterior)
-        sums[POSE_PRIOR] = np.array([*traces, local.energy[POSE_PRIOR]])
-        own = np.ix_(range(len(pose.transl)), columns.own, columns.own)
         band = temporal.band.copy()
-        band[0] -= local.curvature[POSE_PRIOR][own]
+        band[0] -= local.curvature[POSE_PRIOR][:, columns.own[:, None], columns.own]
         temporal = temporal._replace(band=band)
     angles = columns.own < 3 * (1 + pose.body_pose.shape[-2])
     for name, inside in ((MOTION, angles), (PLACE, ~angles)):
@@ -513,24 +509,25 @@ def outline_correlation_px(ratio: float, sigma: float) -> float:
     return float(np.sqrt(max((8 * q - 2) * sigma**2 / (1 - q), 0.0)))
 
 
-def _mask_evidence(
-    outlines: Float[np.ndarray, "M 3"], masks: float, taken: float, program: Program, settings: Any
+def mask_evidence(
+    outlines: Float[np.ndarray, "M 3"], masks: float, taken: float, weight: float, sigma: float
 ) -> Evidence:
     """Return the evidence about the weight of the mask term.
 
+    For a displacement of the outline with standard deviation s and correlation length τ, energy = γ at the weight
+    √2·σ/(τ·s²): the mask term then knows the mean displacement of a piece of the outline as well as the data do.
+
     Args:
-        outlines: `outline_errors` of some masks.
+        outlines: `outline_error` of some masks.
         masks: number of all masks.
         taken: tr(Σ·H) over all masks.
-        program, settings: of the stage.
+        weight: current weight, for pixels of the silhouette.
+        sigma: width of the filter, in pixels of the silhouette.
     """
     squared, wider, length = outlines[(outlines[:, 0] > 0) & (outlines[:, 2] > 0)].T
     if not len(squared):
         return Evidence(0.0, 0.0)
-    sigma = filter_sd_px(program)
     tau = outline_correlation_px(float(np.median(wider / squared)), sigma)
     count = length / np.sqrt(2 * np.pi * (tau**2 + 2 * sigma**2))
     total = masks * float(count.mean())
-    area = (program.camera.size_px / program.raster.size_px) ** 2
-    energy = total * float(settings[MASK]["weight"]) * area * float(np.median(squared / count))
-    return _evidence(MASK, total, taken, energy)
+    return _evidence(MASK, total, taken, total * weight * float(np.median(squared / count)))

@@ -183,7 +183,9 @@ def _coverage(vertices, faces, size):
         corners = vertices[indices]
         a, b, c = ((corners[:, i, 0, None, None], corners[:, i, 1, None, None]) for i in range(3))
         turn = _side(c[0], c[1], a, b)
-        skipped = jnp.any(corners[..., 2] <= MIN_DEPTH, -1)[:, None, None] | (jnp.abs(turn) <= MIN_AREA * (size / 2) ** 2)
+        skipped = jnp.any(corners[..., 2] <= MIN_DEPTH, -1)[:, None, None] | (
+            jnp.abs(turn) <= MIN_AREA * (size / 2) ** 2
+        )
         below = (_areas_below(*ends, pixel[None, :], pixel[:, None]) for ends in ((a, b), (b, c), (c, a)))
         area = jnp.where(skipped | ~is_real[:, None, None], 0.0, sum(below) * jnp.sign(turn))
         return jnp.stack([jnp.sum(jnp.where(side, area, 0.0), 0) for side in (turn > 0, turn < 0)])
