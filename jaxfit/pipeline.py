@@ -180,7 +180,6 @@ def reconstruct(
         networks = file_hashes(own_networks)
         empty = TrackRecorder(keypoints.keypoint_names).observations()
         check_keypoints(empty, bird.keypoint_names, config.track.keypoints.file)
-    learns = config.fit.learn_weights
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
             stored, workers = None, None
@@ -197,8 +196,6 @@ def reconstruct(
             with ProvisionalFit(bird, config.fit, windows, fit_progress, video, cluster) as provisional_fit:
 
                 def on_frame(observations_from: ObservationsFrom) -> None:
-                    if learns:
-                        return  # the weights are learnt from the whole video
                     with clock("fit"):
                         provisional_fit(observations_from)
 
@@ -206,22 +203,28 @@ def reconstruct(
                 tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
         _check_tracking(tracking, stored)
         observations = tracking.observations
-        learnt = None
         with clock("fit"):
-            if config.fit.learn_weights:
-                learnt = learn_weights(observations, bird, config.fit, progress=progress, source=video)
-                config = replace(config, fit=learnt.config)
-            more = {"stored": windows, "cluster": cluster}
-            solution = fit(observations, bird, config.fit, progress=fit_progress, source=video, **more)
+            config, learnt_yaml = _learn_weights(config, observations, bird, video, progress)
+            solution = fit(observations, bird, config.fit, None, fit_progress, video, windows, cluster)
         with new_folder(folder, overwrite, marker=MARKER) as part:
             write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
             with clock("overlay"):
                 _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
             settings = config_to_yaml(config)
-            write_solution(solution, bird, settings, summary, part, learnt and learnt.to_yaml())
+            write_solution(solution, bird, settings, summary, part, learnt_yaml)
             write_report(part / REPORT, solution, bird, observations, summary, settings, folder, video, force=True)
     return Reconstruction(tracking, solution, summary)
+
+
+def _learn_weights(
+    config: ReconstructConfig, observations: Observations, bird: Bird, video: Path, progress: ProgressTask
+) -> tuple[ReconstructConfig, str | None]:
+    """Return the config with learnt weights, and the content of `learnt.yaml`, if the config of the fit says so."""
+    if not config.fit.learn_weights:
+        return config, None
+    learnt = learn_weights(observations, bird, config.fit, progress=progress, source=video)
+    return replace(config, fit=learnt.config), learnt.to_yaml()
 
 
 def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:

@@ -17,20 +17,14 @@ single frame that the solver must keep near its minimum. `jaxfit prior learn` ta
 
 A round computes γ and Σ w‖e‖² at the poses of a sample of windows, sets β, and continues the fit with the new values.
 
-Errors of the outline are not independent from pixel to pixel. If the outline is displaced by an error with a Gaussian
-correlation of length τ, the filtered mask error ẽ (σ: the width of the filter) has
-
-    N = L/√(2π(τ² + 2σ²)),   r = Σ(ẽ filtered to the width 2σ)²/Σẽ² = ½·√((τ² + 2σ²)/(τ² + 8σ²)),
-
-with the length L of the outline. r gives τ. N and Σẽ² of a mask enter as a median over masks, so that torn masks and
-hidden parts of a bird do not set the weight.
+Errors of the outline are not independent from pixel to pixel: `fitting/outline_noise.py` counts them.
 
 Hyperpriors: the values of the config count as `PRIOR_COUNT` observations, and limit the result to a factor of
 `MOST_FACTOR`.
 
 Source: MacKay 1992, *Bayesian interpolation* (γ and the fixed point); Lange, Little and Taylor 1989, *Robust
 statistical modeling using the t distribution* (w); Tipping 2001, *Sparse Bayesian learning and the relevance vector
-machine* (several precisions at once). The outline: ours.
+machine* (several precisions at once).
 """
 
 from __future__ import annotations
@@ -45,13 +39,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.ndimage import gaussian_filter
 
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import FitConfig, StageConfig, term_settings
 from jaxfit.config.yaml_file import config_to_yaml, rounded
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch, take_tile, tile_rows, tile_size
 from jaxfit.fitting.initial_poses import InitialPoses
+from jaxfit.fitting.outline_noise import filter_sd_px, independent_errors, outline_errors, shown_frames
 from jaxfit.fitting.posterior import (
     Blocks,
     Columns,
@@ -82,10 +76,6 @@ MOST_CHANGE = 4.0
 """Largest factor on a value in one round."""
 LEAST_KEYPOINTS, LEAST_FRAMES, LEAST_MASKS = 200, 20, 20
 """Fewer detected keypoints, frames or masks in the sample teach nothing about the values that depend on them."""
-MASKS_PER_WINDOW = 25
-"""Number of masks of a window whose errors are filtered."""
-LARGEST_RATIO = 0.49
-"""Largest r, for which τ is 12σ. For a displacement of the whole outline, r is ½."""
 LEAST_SHARE = 0.1
 """Least part of N that remains after tr(Σ·H), which is only an approximation."""
 
@@ -345,13 +335,30 @@ def measure(
     if MASK in names:
         area = (program.camera.size_px / program.raster.size_px) ** 2
         weight = float(hyperparameters.settings[MASK]["weight"]) * area
-        evidence[MASK] = mask_evidence(np.concatenate(outlines), *sums[MASK][:2], weight, filter_sd_px(program))
+        masks, taken, _ = sums[MASK].tolist()
+        evidence[MASK] = mask_evidence(np.concatenate(outlines), masks, taken, weight, filter_sd_px(program))
     return evidence
 
 
 def _evidence(name: str, total: float, taken: float, energy: float) -> Evidence:
     is_likelihood = name in (KEYPOINTS, MASK)
     return Evidence(max(total - taken, (LEAST_SHARE if is_likelihood else 0.01) * total), energy)
+
+
+def mask_evidence(
+    outlines: Float[np.ndarray, "M 3"], masks: float, taken: float, weight: float, sigma: float
+) -> Evidence:
+    """Return the evidence about the weight of the mask term.
+
+    Args:
+        outlines: `outline_error` of some masks.
+        masks: number of all masks.
+        taken: tr(Σ·H) over all masks.
+        weight: current weight, for pixels of the silhouette.
+        sigma: width of the filter, in pixels of the silhouette.
+    """
+    count, variance = independent_errors(outlines, sigma)
+    return _evidence(MASK, masks * count, taken, masks * count * weight * variance)
 
 
 def _prior_blocks(program: Program, problems: Problem, pose: Pose) -> list[tuple[Blocks, Columns] | str]:
@@ -402,7 +409,7 @@ def _frame_statistics(program: Program, problems: Problem, pose: Pose) -> _Frame
         shown = jnp.zeros((0, 0, 0))
         if MASK in settings:
             raster = program.raster
-            at = _shown_frames(T)
+            at = shown_frames(T)
             shown = jax.vmap(
                 lambda v: silhouette(v, window.faces, raster.size_px, blur=raster.blur, backend=raster.backend)
             )(window.vertices_screen[at])
@@ -411,11 +418,6 @@ def _frame_statistics(program: Program, problems: Problem, pose: Pose) -> _Frame
         return _FrameStatistics(energy, detected, masks, curvature, shown)
 
     return jax.vmap(one)(problems, pose)
-
-
-def _shown_frames(frames: int) -> np.ndarray:
-    """Return the positions of the frames whose outlines are compared."""
-    return np.unique(np.linspace(0, frames - 1, min(frames, MASKS_PER_WINDOW)).round().astype(int))
 
 
 def _window_sums(
@@ -462,72 +464,3 @@ def _only(H: Blocks, inside: np.ndarray) -> Blocks:
     """Return a matrix without the rows and columns of other parameters of the frames."""
     band = H.band * (inside[:, None] & inside)
     return Blocks(band, np.zeros_like(H.border), np.zeros_like(H.corner))
-
-
-def outline_errors(
-    shown: Float[np.ndarray, "M H W"],
-    mask: np.ndarray,
-    has_mask: np.ndarray,
-    program: Program,
-) -> Float[np.ndarray, "M 3"]:
-    """Return Σẽ², Σ(ẽ filtered to twice the width)², and the length of the outline in pixels, of each mask."""
-    sigma, rows = filter_sd_px(program), []
-    for silhouette_px, t in zip(shown, _shown_frames(len(has_mask)).tolist(), strict=True):
-        if has_mask[t]:
-            target = mask[t]
-            rows.append(outline_error(silhouette_px, target == 1, target == 2, sigma))
-    return np.array(rows).reshape(-1, 3)
-
-
-def outline_error(
-    shown: Float[np.ndarray, "H W"], mask: np.ndarray, unknown: np.ndarray, sigma: float
-) -> tuple[float, float, float]:
-    """Return Σẽ², Σ(ẽ filtered to twice the width)², and the length of the outline in pixels, of one mask.
-
-    Args:
-        shown: the filtered silhouette.
-        mask, unknown: the pixels of the mask, and those without information.
-        sigma: width of the filter of the silhouette, in pixels.
-    """
-    known = np.ones(mask.shape, bool)
-    if unknown.any():
-        known = gaussian_filter(unknown.astype(np.float32), sigma, mode="constant") < 0.01
-    error = np.where(known, shown - gaussian_filter(mask.astype(np.float32), sigma, mode="constant"), 0)
-    wider = gaussian_filter(error, np.sqrt(3) * sigma, mode="constant")
-    length = (np.hypot(*np.gradient(shown)) * known).sum()
-    return float((error**2).sum()), float((wider**2).sum()), float(length)
-
-
-def filter_sd_px(program: Program) -> float:
-    """Return the width of the filter of the silhouette, in pixels of the silhouette."""
-    return float(np.sqrt(2 * np.log(2) * program.raster.blur.sigma))
-
-
-def outline_correlation_px(ratio: float, sigma: float) -> float:
-    """Return the correlation length τ of the displacement of an outline, from the ratio r; 0 for r ≤ ¼."""
-    q = min(4 * min(ratio, LARGEST_RATIO) ** 2, 1.0)  # (τ² + 2σ²)/(τ² + 8σ²)
-    return float(np.sqrt(max((8 * q - 2) * sigma**2 / (1 - q), 0.0)))
-
-
-def mask_evidence(
-    outlines: Float[np.ndarray, "M 3"], masks: float, taken: float, weight: float, sigma: float
-) -> Evidence:
-    """Return the evidence about the weight of the mask term.
-
-    For a displacement of the outline with standard deviation s and correlation length τ, energy = γ at the weight
-    √2·σ/(τ·s²): the mask term then knows the mean displacement of a piece of the outline as well as the data do.
-
-    Args:
-        outlines: `outline_error` of some masks.
-        masks: number of all masks.
-        taken: tr(Σ·H) over all masks.
-        weight: current weight, for pixels of the silhouette.
-        sigma: width of the filter, in pixels of the silhouette.
-    """
-    squared, wider, length = outlines[(outlines[:, 0] > 0) & (outlines[:, 2] > 0)].T
-    if not len(squared):
-        return Evidence(0.0, 0.0)
-    tau = outline_correlation_px(float(np.median(wider / squared)), sigma)
-    count = length / np.sqrt(2 * np.pi * (tau**2 + 2 * sigma**2))
-    total = masks * float(count.mean())
-    return _evidence(MASK, total, taken, total * weight * float(np.median(squared / count)))

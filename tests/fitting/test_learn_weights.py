@@ -20,10 +20,9 @@ from jaxfit.fitting.learn import (
     Evidence,
     choose_windows,
     mask_evidence,
-    outline_correlation_px,
-    outline_error,
     updated_precision,
 )
+from jaxfit.fitting.outline_noise import outline_correlation_px, outline_error
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.errors import InputError
 from jaxfit.simulation.noise import detect
