@@ -67,12 +67,15 @@ from jaxfit.raster.silhouette import silhouette
 
 MOST_WINDOWS, MOST_FRAMES = 30, 800
 """Size of the sample. Further frames change the learnt values little."""
-ROUNDS = 5
+LARGEST_SHARE, LEAST_WINDOWS = 0.4, 2
+"""Largest share of the windows in the sample, and the number of windows that the sample may always have. Learning takes
+about 2.5 times as long as the fit of the sample, so that learning and fit take at most twice as long as the fit."""
+ROUNDS = 3
 CONVERGED = 0.05
 """Relative change of all values, below which no further round follows."""
 PRIOR_COUNT = 10.0
 MOST_FACTOR = 30.0
-MOST_CHANGE = 4.0
+MOST_CHANGE = 10.0
 """Largest factor on a value in one round."""
 LEAST_KEYPOINTS, LEAST_FRAMES, LEAST_MASKS = 200, 20, 20
 """Fewer detected keypoints, frames or masks in the sample teach nothing about the values that depend on them."""
@@ -168,7 +171,8 @@ def choose_windows(windows: Windows, most: int = MOST_WINDOWS) -> Int[np.ndarray
     turns = [turn[n] for n in windows.track[shuffled].tolist() if turn.update({n: turn.get(n, -1) + 1}) is None]
     ordered = shuffled[np.argsort(turns, kind="stable")]
     frames = np.cumsum(windows.present[ordered].sum(1))
-    count = min(int(np.searchsorted(frames, MOST_FRAMES)) + 1, max(most, 1), MOST_WINDOWS)
+    share = max(int(LARGEST_SHARE * len(windows)), LEAST_WINDOWS)
+    count = min(int(np.searchsorted(frames, MOST_FRAMES)) + 1, max(most, 1), MOST_WINDOWS, share)
     return np.sort(ordered[:count])
 
 

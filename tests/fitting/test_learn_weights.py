@@ -16,6 +16,7 @@ from jaxfit.fitting.fit import fit, fit_runs, learn_weights
 from jaxfit.fitting.learn import (
     MOST_FACTOR,
     MOST_FRAMES,
+    MOST_WINDOWS,
     PRIOR_COUNT,
     Evidence,
     choose_windows,
@@ -187,7 +188,8 @@ def test_the_sample_takes_tracks_in_turn():
     windows = empty_windows(tracks, 10)
     rows = choose_windows(windows)
     np.testing.assert_array_equal(rows, choose_windows(windows))
-    assert len(rows) == 30
+    assert len(rows) == 21  # 40 %
+    assert len(choose_windows(empty_windows(np.arange(100), 10))) == MOST_WINDOWS
     assert set(tracks[rows]) == {0, 1, 2}
     assert len(choose_windows(empty_windows(tracks, 200))) == MOST_FRAMES // 200
     assert len(choose_windows(windows, 1)) == 1
