@@ -25,6 +25,7 @@ from .evaluation.truth import match_tracks as match_tracks
 from .evaluation.truth import read_truth as read_truth
 from .export.export import export_result as export_result
 from .fitting.fit import fit as fit
+from .fitting.fit import learn_weights as learn_weights
 from .foundation.errors import InputError as InputError
 from .foundation.extras import __version__ as __version__
 from .foundation.workers import open_cluster as open_cluster

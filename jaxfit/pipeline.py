@@ -6,6 +6,7 @@ import hashlib
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.tracks import track_quality
 from jaxfit.fitting.collect import summarise
-from jaxfit.fitting.fit import fit
+from jaxfit.fitting.fit import fit, learn_weights
 from jaxfit.fitting.provisional import ProvisionalFit
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
@@ -203,17 +204,27 @@ def reconstruct(
         _check_tracking(tracking, stored)
         observations = tracking.observations
         with clock("fit"):
-            more = {"stored": windows, "cluster": cluster}
-            solution = fit(observations, bird, config.fit, progress=fit_progress, source=video, **more)
+            config, learnt_yaml = _learn_weights(config, observations, bird, video, progress)
+            solution = fit(observations, bird, config.fit, None, fit_progress, video, windows, cluster)
         with new_folder(folder, overwrite, marker=MARKER) as part:
             write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
             with clock("overlay"):
                 _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
             settings = config_to_yaml(config)
-            write_solution(solution, bird, settings, summary, part)
+            write_solution(solution, bird, settings, summary, part, learnt_yaml)
             write_report(part / REPORT, solution, bird, observations, summary, settings, folder, video, force=True)
     return Reconstruction(tracking, solution, summary)
+
+
+def _learn_weights(
+    config: ReconstructConfig, observations: Observations, bird: Bird, video: Path, progress: ProgressTask
+) -> tuple[ReconstructConfig, str | None]:
+    """Return the config with learnt weights, and the content of `learnt.yaml`, if the config of the fit says so."""
+    if not config.fit.learn_weights:
+        return config, None
+    learnt = learn_weights(observations, bird, config.fit, progress=progress, source=video)
+    return replace(config, fit=learnt.config), learnt.to_yaml()
 
 
 def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:

@@ -33,7 +33,7 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import save_solution
     from jaxfit.fitting.collect import summarise
-    from jaxfit.fitting.fit import fit
+    from jaxfit.fitting.fit import fit, learn_weights
     from jaxfit.fitting.initial_poses import load_initial_poses
     from jaxfit.foundation.files import check_replaceable
     from jaxfit.foundation.workers import open_cluster
@@ -47,13 +47,18 @@ def fit(options: argparse.Namespace) -> None:
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
     read = time.perf_counter()
     with open_cluster(options.workers, options.scheduler) as cluster:
-        source = options.observations
+        source, learnt = options.observations, None
+        if config.learn_weights:
+            learnt = learn_weights(observations, bird, config, initial_poses, terminal, source)
+            config = learnt.config
         solution = fit(observations, bird, config, initial_poses, terminal, source=source, cluster=cluster)
     seconds = {"read": read - start, "fit": time.perf_counter() - read}
     summary = summarise(solution, bird, seconds)
     if observations.photographs:
         summary["photographs"] = observations.photographs
-    save_solution(solution, bird, config_to_yaml(config), summary, options.out, options.overwrite)
+    save_solution(
+        solution, bird, config_to_yaml(config), summary, options.out, options.overwrite, learnt and learnt.to_yaml()
+    )
     table = right_aligned("track", "frames", "objective")
     table.add_column("status")
     total = np.sum(list(solution.loss.values()), axis=0)

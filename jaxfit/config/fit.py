@@ -215,6 +215,10 @@ class FitConfig:
     error_bars: bool = False
     """Whether the result has error bars: standard deviations of the pose and covariances of the keypoints
     (docs/files.md). They assume that the terms of the last stage are negative log-likelihoods."""
+    learn_weights: bool = False
+    """Whether weights and scales of the terms are learnt from the data before the fit (docs/configs.md). The values of
+    the config are then the initial values, and weak prior knowledge. The result holds the learnt values in
+    `learnt.yaml`."""
     backend: Literal["auto", "native", "reference"] = "auto"
     """Implementation of the silhouette: the compiled kernel (`native`), the pure-JAX `reference`, or the kernel if
     available (`auto`)."""

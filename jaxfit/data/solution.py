@@ -32,6 +32,7 @@ STATUSES = ("ok", "partly diverged", "diverged", "no usable frame")
 """The words of `Solution.status`."""
 
 _POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
+_LEARNT = "learnt.yaml"
 
 _CAMERA = {"focal_px": ("", np.float64), "crop_px": ("", np.int64)}
 _TIMES = {"timestamp_s": ("T", np.float64), "fps": ("", np.float64)}
@@ -277,6 +278,7 @@ def save_solution(
     summary: Mapping[str, Any],
     folder: str | Path,
     overwrite: bool = False,
+    learnt_yaml: str | None = None,
 ) -> None:
     """Write a result folder, completely or not at all: ``poses.npz``, ``config.yaml``, ``summary.json``, ``model.npz``.
 
@@ -287,16 +289,24 @@ def save_solution(
         summary: metrics, timings, versions; see `jaxfit.foundation.reading.json_values`.
         folder: the folder to write.
         overwrite: replace an older result folder, as soon as the new folder is complete.
+        learnt_yaml: the config with learnt weights, for ``learnt.yaml``; None without learnt weights.
 
     Raises:
         InputError: the folder holds results already or something else, or cannot be written.
         TypeError: ``summary`` holds a value that JSON cannot represent.
     """
     with new_folder(folder, overwrite, marker=_POSES) as part:
-        write_solution(solution, bird, config_yaml, summary, part)
+        write_solution(solution, bird, config_yaml, summary, part, learnt_yaml)
 
 
-def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Mapping[str, Any], folder: Path) -> None:
+def write_solution(
+    solution: Solution,
+    bird: Bird,
+    config_yaml: str,
+    summary: Mapping[str, Any],
+    folder: Path,
+    learnt_yaml: str | None = None,
+) -> None:
     """Write the files of `save_solution` into an existing folder, such as a temporary folder of `new_folder`."""
     summary_json = json_text(summary)
     names = [*LAYOUT, *(ERROR_BARS if solution.has_error_bars else ())]
@@ -311,6 +321,8 @@ def write_solution(solution: Solution, bird: Bird, config_yaml: str, summary: Ma
     arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
     write_whole(folder / _POSES, lambda file: np.savez_compressed(file, **arrays))
     write_whole(folder / _CONFIG, config_yaml.encode())
+    if learnt_yaml is not None:
+        write_whole(folder / _LEARNT, learnt_yaml.encode())
     write_whole(folder / _SUMMARY, summary_json.encode())
     save_bird(bird, folder / _MODEL)
 

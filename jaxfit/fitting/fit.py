@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Hashable, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Int
 
+from jaxfit.config.build import with_values
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
@@ -19,6 +21,7 @@ from jaxfit.fitting.batch import bytes_per_frame
 from jaxfit.fitting.collect import FittedWindow, blend_seams, collect_windows
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.initial_poses import InitialPoses
+from jaxfit.fitting.learn import Learnt, learn
 from jaxfit.fitting.solve import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
@@ -71,6 +74,8 @@ def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[F
 
 _logger = logging.getLogger(__name__)
 
+LEARN_REMEDY = "set `learn_weights: false`, or use the learnt.yaml of a result as config"
+
 
 def fit(
     observations: Observations,
@@ -103,7 +108,40 @@ def fit(
             unusable term, initial poses that do not match the windows, a fit that needs too much memory, or a cluster
             that ends.
     """
+    if config.learn_weights:
+        config = learn_weights(observations, bird, config, initial_poses, progress, source).config
     return fit_runs(observations, bird, [config], initial_poses, progress, source, stored=stored, cluster=cluster)[0]
+
+
+def learn_weights(
+    observations: Observations,
+    bird: Bird,
+    config: FitConfig,
+    initial_poses: InitialPoses | None = None,
+    progress: ProgressTask = silent,
+    source: object = "observations",
+) -> Learnt:
+    """Learn weights and scales of the terms of a config from observations (`jaxfit.fitting.learn`).
+
+    The work is done in this process, also where workers fit the windows.
+
+    Args:
+        observations, bird, config, initial_poses, progress, source: as for `fit`.
+
+    Returns:
+        The config with the learnt values and without `learn_weights`, the learnt values, and the reasons why values
+        were not learnt.
+
+    Raises:
+        InputError: as for `fit`.
+    """
+    observations = check_observations(observations, bird, source)
+    used = config if observations.masks else without_mask_stages(config)
+    model = checked_model(observations, bird, [used], initial_poses, source)
+    windows = _cut_runs(observations, [used], initial_poses, source)[0].windows
+    learnt = learn(model, used, windows, initial_poses, progress, source)
+    config = replace(config, learn_weights=False)
+    return learnt._replace(config=with_values(config, learnt.values) if learnt.values else config)
 
 
 def fit_runs(
@@ -131,6 +169,8 @@ def fit_runs(
         InputError: as for `fit`.
         ValueError: the configs need different programs.
     """
+    if any(config.learn_weights for config in configs):
+        raise InputError("config", "`learn_weights` is true, but several fits at once learn no weights", LEARN_REMEDY)
     observations = check_observations(observations, bird, source)
     skipped = report_distant_birds(observations, source)
     if not observations.masks:

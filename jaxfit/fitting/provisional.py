@@ -34,7 +34,8 @@ class ProvisionalFit:
 
     `fit` takes windows with the same content from the store and fits all others. Its result therefore does not depend
     on provisional fits. Where a later frame changes the content of a window, for example because the track of a
-    neighbour is skipped in the end, `fit` does not use the provisional fit.
+    neighbour is skipped in the end, `fit` does not use the provisional fit. With `learn_weights`, nothing is fitted:
+    the weights are learnt from the whole video.
 
     Use it as a context manager, which ends the display of its progress, and call it after each frame. The frames of
     every search depend on the number of frames only. After an interruption, the calls for the earlier frames therefore
@@ -82,6 +83,8 @@ class ProvisionalFit:
         Raises:
             InputError: as `fit`.
         """
+        if self._config.learn_weights:
+            return
         self._frames += 1
         margin = max(self._config.filter_window // 2, LATER_FRAMES)
         if self._frames % STEP_FRAMES or self._frames < self._config.window + margin:

@@ -80,7 +80,7 @@ def fit_task(shared: FitShared, task: FitTask, report_progress: ReportProgress =
     Returns:
         The result of every problem.
     """
-    batch = _gather(shared, task)
+    batch = gather_batch(shared, task)
     fitted = fit_batch(shared.model, [run.config for run in task.runs], batch, report_progress)
     return [window_of_batch(fitted, i) for i in range(len(task.problems))]
 
@@ -122,7 +122,7 @@ def _pose_key(config: FitConfig) -> Hashable:
     return *windows_key(config), config.initialise, config.common_size
 
 
-def _gather(shared: FitShared, task: FitTask) -> Batch:
+def gather_batch(shared: FitShared, task: FitTask) -> Batch:
     """Return the batch of the problems of a task."""
     config = task.runs[0].config
     mask_px = config.crop.size_px if any(needs_mask(stage) for stage in config.stages) else 0

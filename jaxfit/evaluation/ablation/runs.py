@@ -15,8 +15,9 @@ from jaxfit.data.solution import Solution, write_solution
 from jaxfit.evaluation.ablation.grid import Run
 from jaxfit.fitting.batch import frames_per_batch
 from jaxfit.fitting.collect import summarise
-from jaxfit.fitting.fit import fit_runs, windows_of
+from jaxfit.fitting.fit import LEARN_REMEDY, fit_runs, windows_of
 from jaxfit.fitting.solve import compiled_part
+from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.workers import Cluster
@@ -84,7 +85,12 @@ def fit_batches(
         stored: positions of the runs that are stored already.
         source: name of the observations in error messages.
         cluster: worker processes that fit the windows. None: this process.
+
+    Raises:
+        InputError: as `fit_runs`; a config learns its weights.
     """
+    if any(run.config.learn_weights for run in runs):
+        raise InputError("config", "`learn_weights` is true, but an ablation varies weights", LEARN_REMEDY)
     for batch in plan_batches(observations, bird, runs, source):
         if not all(r in stored for r in batch):
             began = time.perf_counter()
