@@ -55,6 +55,7 @@ def learnt(exact):
     return learn_weights(noisy(exact, 3.0), BIRD, LEARNING)
 
 
+@pytest.mark.extended
 def test_the_learnt_scale_is_that_of_the_noise_and_follows_it(exact, learnt):
     scales = {factor: learn_weights(noisy(exact, 3.0 * factor), BIRD, LEARNING).values[SD] for factor in (0.5, 2, 4)}
     scales[1] = learnt.values[SD]
@@ -64,6 +65,7 @@ def test_the_learnt_scale_is_that_of_the_noise_and_follows_it(exact, learnt):
         assert scale == pytest.approx(scales[1] * factor, rel=0.15), scales
 
 
+@pytest.mark.extended
 def test_the_learnt_config_is_complete_and_its_fit_learns_nothing(exact, learnt, caplog):
     observations = noisy(exact, 3.0)
     assert not learnt.config.learn_weights
@@ -81,6 +83,7 @@ def test_the_learnt_config_is_complete_and_its_fit_learns_nothing(exact, learnt,
     np.testing.assert_array_equal(by_fit.body_pose, given.body_pose)
 
 
+@pytest.mark.extended
 def test_a_file_of_learnt_values_is_a_config(learnt, tmp_path):
     (tmp_path / "learnt.yaml").write_text(learnt.to_yaml())
     assert load_config(tmp_path / "learnt.yaml") == learnt.config
@@ -200,6 +203,7 @@ def empty_windows(tracks, frames):
     return Windows(**values | {"track": tracks, "present": np.ones((len(tracks), frames), bool)})
 
 
+@pytest.mark.extended
 def test_noisy_masks_lower_the_weight_of_the_outline():
     own = dataclasses.replace(
         LEARNING,
