@@ -100,7 +100,7 @@ def _polygon(polygon: Field, height: int, width: int) -> np.ndarray:
 def _runs(counts: Field, pixels: int) -> list[int]:
     if isinstance(counts.value, str):
         codes = np.frombuffer(counts.value.encode("ascii", "replace"), np.uint8) - np.uint8(48)
-        _check_number_of_runs(counts, np.count_nonzero(codes & 32 == 0))
+        _check_number_of_runs(counts, int(np.count_nonzero(codes & 32 == 0)))
         runs = run_lengths(counts.value)
         if not runs:
             counts.fail("is corrupt: not the text that pycocotools writes for run lengths", _REMEDY)
