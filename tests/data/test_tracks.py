@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.observations import assert_same
 
+from jaxfit.config.fit import load_config
 from jaxfit.data.formats.coco import read_coco, write_coco
 from jaxfit.data.masks import encode_mask, encode_patch
 from jaxfit.data.observations import Observations
@@ -79,7 +80,7 @@ def test_a_video_without_birds_is_a_file_like_any_other(tmp_path):
     assert track_quality(seen) == []
     assert filter_observations(seen, 5).num_tracks == 0
     with pytest.raises(InputError, match=r"none\.json: holds no bird"):
-        fit(seen, None, None, source="none.json")
+        fit(seen, None, load_config("paper"), source="none.json")
 
 
 def test_a_recorder_refuses_what_contradicts_itself():

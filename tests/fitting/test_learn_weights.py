@@ -104,6 +104,7 @@ def test_without_data_the_values_of_the_config_stay(exact, caplog, changes):
     assert caplog.text.count("no weights are learnt") == 1
 
 
+@pytest.mark.extended
 def test_overridden_settings_and_terms_of_others_keep_their_values(exact):
     stage = dataclasses.replace(STAGE, override={"motion_likelihood": {"sd_rad_s2": 20.0}})
     learnt = learn_weights(noisy(exact, 3.0), BIRD, dataclasses.replace(LEARNING, stages=(stage,)))

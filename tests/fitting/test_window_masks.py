@@ -65,7 +65,7 @@ def test_pickled_windows_hold_their_masks(observed, unknown):
     sent = pickle.loads(pickle.dumps(some))
     assert {t for _, t in observed.masks.read} == set(range(8, 12))
     observed.masks.clear()
-    np.testing.assert_array_equal(load_targets(sent, 16, 2.0).mask, load_targets(some, 16, 2.0).mask)
+    np.testing.assert_array_equal(load_targets(sent, 16).mask, load_targets(some, 16).mask)
     assert window_hash(sent, 1) == window_hash(some, 1)
 
 

@@ -233,7 +233,7 @@ def test_keypoint_terms_do_not_couple_frames():
 def test_a_term_that_returns_a_number_has_no_curvature():
     term = Term("number", lambda window: jnp.zeros(()), {}, frozenset(), False)
     with pytest.raises(
-        InputError, match="'number': returns a number, but the solver levenberg_marquardt needs its res"
+        InputError, match="'number': returns a number, but the solver levenberg_marquardt and error bars need its"
     ):
         evaluate_curvature(window_of(*case()), {"number": term}, {"number": {"weight": 1.0}})
 

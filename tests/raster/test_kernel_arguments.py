@@ -108,20 +108,21 @@ SHAPES = {
 
 def call_handler(handler, **changed):
     """Calls one of XLA's handlers with arrays of zeros, of which some have another shape."""
-    attributes = {"sigma": 1.0, "radius": 2.0} | ({"kind": 0} if "loss" in handler else {})
+    attributes = {"sigma": 1.0, "radius": 2.0, "edge": 0} | ({"kind": 0} if "loss" in handler else {})
     attributes |= {name: changed.pop(name) for name in list(changed) if name in attributes}
     shapes = SHAPES | changed
     operands, results = HANDLERS[handler]
     types = [jax.ShapeDtypeStruct(shapes[name], jnp.float32) for name in results]
     call = jax.ffi.ffi_call(handler, types if len(types) > 1 else types[0])
     arrays = [jnp.zeros(shapes[name], jnp.int32 if name == "faces" else jnp.float32) for name in operands]
-    settings = {name: np.int32(v) if name == "kind" else np.float32(v) for name, v in attributes.items()}
+    settings = {name: np.int32(v) if name in ("kind", "edge") else np.float32(v) for name, v in attributes.items()}
     return jax.block_until_ready(call(*arrays, **settings))
 
 
 def test_the_handlers_accept_shapes_that_fit():
     for handler in HANDLERS:
-        call_handler(handler)
+        for edge in (0, 1):
+            call_handler(handler, edge=edge)
 
 
 @pytest.mark.parametrize(
@@ -132,6 +133,7 @@ def test_the_handlers_accept_shapes_that_fit():
         ("jaxfit_silhouette", {"vertices": (3, V, 3)}, r"vertices: expected .* \(2\) .* got \(3, 3, 3\)"),
         ("jaxfit_silhouette", {"faces": (1, 1, 4)}, r"faces: expected .* followed by \(any, 3\), got \(1, 1, 4\)"),
         ("jaxfit_silhouette", {"sigma": 0}, "blur: expected a positive sigma"),
+        ("jaxfit_silhouette", {"edge": 2}, "edge: expected 0 or 1, got 2"),
         ("jaxfit_silhouette_gradient", {"gradient": (B, 1, 3)}, FITTING_GRADIENT + r"\(2, 1, 3\)"),
         ("jaxfit_silhouette_gradient", {"gradient": (B, V, 1)}, FITTING_GRADIENT + r"\(2, 3, 1\)"),
         ("jaxfit_silhouette_gradient", {"cotangent": (B, 0, 0)}, "cotangent: expected a square image"),
