@@ -26,13 +26,17 @@ def silhouette(
     blur: Blur | None = None,
     backend: Backend = "auto",
 ) -> Float[Array, "{size} {size}"]:
-    """Return the soft silhouette of a triangle mesh in a square image.
+    """Return the silhouette of a triangle mesh with a soft edge in a square image.
 
-    S = 1 − Π_f (1 − sigmoid(−d_f / s)) over every face f that contains the pixel's centre or is closer to the centre
+    With `blur.edge` `soft_rasterizer`, S = 1 − Π_f (1 − sigmoid(−d_f / s)) over every face f that contains the pixel's centre or is closer to the centre
     than the blur radius. d_f is the squared distance in px² to the nearest edge of the face, negative inside.
 
     Skipped are faces with |2·area| ≤ 1e-8 (size/2)² px², with two equal corners, or with a vertex at a depth of 1e-8 or
-    less. If any coordinate of any vertex is NaN or infinite, the whole image and its gradient are NaN. Coordinates
+    less. With `unbiased`, S = G * min(1, max(F, B)): F and B are the mean numbers of faces over the area of the pixel,
+    of those that turn to one side of the image and to the other, and G is a Gaussian of variance 2·ln(2)·s px². Pixels
+    outside the image are 0. The sum of S is the area of the mesh, where no two outlines share a pixel.
+
+    If any coordinate of any vertex is NaN or infinite, the whole image and its gradient are NaN. Coordinates
     beyond ±2²⁰ px are clamped. The kernels stop evaluating a block of pixels when all its S are within 1e-5 of 1.
 
     Args:
@@ -40,7 +44,7 @@ def silhouette(
             in any unit. The gradient with respect to depth is 0.
         faces: vertex indices, in any orientation.
         size: width and height of the image in pixels.
-        blur: softness and radius. The default is `Blur.for_size(size)`.
+        blur: softness, radius and kind of the edge. The default is `Blur.for_size(size)`.
         backend: "native" runs the compiled kernels and "reference" runs plain JAX. "auto" runs the kernels if they are
             built and the platform is the CPU, and otherwise the reference.
 
@@ -72,9 +76,10 @@ def mask_loss(
     blur: Blur | None = None,
     backend: Backend = "auto",
 ) -> Float[Array, ""]:
-    """Return the difference between the soft silhouette of a mesh and a mask, summed over the pixels.
+    """Return the difference between the silhouette of a mesh and a mask, summed over the pixels.
 
-    L = w · Σ ρ(S − target) over the known pixels. For "l1", ρ(e) = |e|. For "smooth_l1", ρ(e) = e²/2 if |e| < 1, else
+    L = w · Σ ρ(S − target) over the known pixels. With the edge `unbiased`, the coverage C = min(1, max(F, B)) and the
+    mask are filtered together: L = w · Σ ρ(G * (C − target)) over all pixels, with a difference of 0 at the unknown ones. For "l1", ρ(e) = |e|. For "smooth_l1", ρ(e) = e²/2 if |e| < 1, else
     |e| − 1/2.
 
     The loss is differentiable in reverse mode with respect to the weight and to x and y of the vertices. The target is
@@ -128,10 +133,11 @@ def silhouette_gauss_newton(
     """Return the Gauss-Newton block of the soft silhouette for the D parameters of a skinned mesh.
 
     H = w · Σ j·jᵀ over the known pixels with 0.01 < S < 0.99, where S is `silhouette` and j = dS / d parameters. H is
-    the curvature of ½ Σ (S − target)², and the solver uses H for both mask losses.
+    the curvature of ½ Σ (S − target)², and the solver uses H for both mask losses. The kernels sum over at most 256
+    pixels. Of more pixels they take an evenly spread part, and scale the sum.
 
-    The kernels sum over at most 256 pixels. Of more pixels they take an evenly spread part, and scale the sum. H has no
-    gradient.
+    With the edge `unbiased`, j is the derivative of the filtered difference of `mask_loss`, and the sum is over all
+    pixels; the kernels take at most 16 · size pixels of the outline. H has no gradient.
 
     Args:
         vertices_screen, faces, blur, backend: as for `silhouette`. The depth is that of the camera frame of
