@@ -28,8 +28,9 @@ def silhouette(
 ) -> Float[Array, "{size} {size}"]:
     """Return the silhouette of a triangle mesh with a soft edge in a square image.
 
-    With `blur.edge` `soft_rasterizer`, S = 1 − Π_f (1 − sigmoid(−d_f / s)) over every face f that contains the pixel's
-    centre or is closer to the centre than the blur radius. d_f is the squared distance in px² to the nearest edge of the face, negative inside.
+    With the edge `soft_rasterizer`, S = 1 − Π_f (1 − sigmoid(−d_f / s)) over every face f that contains the pixel's
+    centre or is closer to the centre than the blur radius. d_f is the squared distance in px² to the nearest edge of the
+    face, negative inside.
 
     Skipped are faces with |2·area| ≤ 1e-8 (size/2)² px², with two equal corners, or with a vertex at a depth of 1e-8 or
     less. With `unbiased`, S = G * min(1, max(F, B)): F and B are the mean numbers of faces over the area of the pixel,
@@ -79,7 +80,7 @@ def mask_loss(
     """Return the difference between the silhouette of a mesh and a mask, summed over the pixels.
 
     L = w · Σ ρ(S − target) over the known pixels. With the edge `unbiased`, the coverage C = min(1, max(F, B)) and the
-    mask are filtered together: L = w · Σ ρ(G * (C − target)) over all pixels, with a difference of 0 at the unknown ones.
+    mask are filtered together: L = w · Σ ρ(G * (C − target)) over all pixels; the difference is 0 where unknown.
     For "l1", ρ(e) = |e|. For "smooth_l1", ρ(e) = e²/2 if |e| < 1, else |e| − 1/2.
 
     The loss is differentiable in reverse mode with respect to the weight and to x and y of the vertices. The target is
