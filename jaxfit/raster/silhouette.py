@@ -29,7 +29,7 @@ def silhouette(
     """Return the silhouette of a triangle mesh with a soft edge in a square image.
 
     With the edge `soft_rasterizer`, S = 1 − Π_f (1 − sigmoid(−d_f / s)) over every face f that contains the pixel's
-    centre or is closer than the blur radius to the centre. d_f is the squared distance in px² to the nearest edge of it,
+    centre or is closer to the centre than the blur radius. d_f is the squared distance in px² to the nearest edge,
     negative inside.
 
     Skipped are faces with |2·area| ≤ 1e-8 (size/2)² px², with two equal corners, or with a vertex at a depth of 1e-8 or
