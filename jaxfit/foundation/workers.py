@@ -164,7 +164,7 @@ def _local_client(workers: int) -> Iterator[Any]:
         "memory_limit": 0,
         "host": "127.0.0.1",
         "dashboard_address": "127.0.0.1:0",
-        "env": {name.upper(): str(getattr(jax.config, name) or "") for name in cached},
+        "env": {name.upper(): str(value) for name in cached if (value := getattr(jax.config, name)) is not None},
         "silence_logs": logging.ERROR,
     }
     with ExitStack() as stack, config.set(settings):
