@@ -131,6 +131,8 @@ class _Reader:
             yield from yaml.parse(text, Loader=_LOADER)
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+            if mark and "nesting depth" in str(error):  # PyYAML has a limit of its own from version 6.0.4
+                self._fail_nested(mark.line + 1)
             where = f"line {mark.line + 1} " if mark else ""
             problem = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
             raise InputError(self._source, f"{where}is not valid YAML: {problem}") from None
@@ -144,7 +146,7 @@ class _Reader:
         if not isinstance(event, yaml.ScalarEvent):
             part = _Part({} if isinstance(event, yaml.MappingStartEvent) else [], line, event.anchor)
             if len(self._open) >= CONFIG_LEVELS:
-                self._fail(line, f"is nested more than {CONFIG_LEVELS} levels deep", "use fewer levels")
+                self._fail_nested(line)
             if self._open and self._is_key():
                 self._fail_key(line, part.value)
             self._count(1, line)
@@ -159,7 +161,7 @@ class _Reader:
             self._fail(line, f"uses `*{anchor}`, which no earlier value defines", f"write `&{anchor}` before a value")
         value, size, height = self._anchors[anchor]
         if len(self._open) + height > CONFIG_LEVELS:
-            self._fail(line, f"is nested more than {CONFIG_LEVELS} levels deep", "use fewer levels")
+            self._fail_nested(line)
         self._count(size, line)
         self._complete(_copied(value), size, height, None, line)
 
@@ -243,6 +245,9 @@ class _Reader:
     def _fail_key(self, line: int, value: Any) -> NoReturn:
         kind = _WORDS.get(type(value), "a number")
         self._fail(line, f"holds a key that is {kind}, not text", "write the key in quotes")
+
+    def _fail_nested(self, line: int) -> NoReturn:
+        self._fail(line, f"is nested more than {CONFIG_LEVELS} levels deep", "use fewer levels")
 
     def _fail(self, line: int, problem: str, remedy: str) -> NoReturn:
         raise InputError(self._source, f"line {line} {problem}", remedy)

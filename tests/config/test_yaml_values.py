@@ -64,8 +64,7 @@ def test_lines():
         ("a: " + "9" * 5000, "a number of 5000 digits"),
         ("a: 99999999999999999999", "exceeds 64 bits"),
         ("a: 0x_", "'0x_', which is no number"),
-        # PyYAML has a limit of its own from version 6.0.4
-        ("a: " + "[" * 2000 + "]" * 2000, "more than 50 levels|nesting depth"),
+        ("a: " + "[" * 2000 + "]" * 2000, "more than 50 levels"),
         (DEEPEST.replace("[]", "[[]]"), "more than 50 levels"),
         ("{a: " * 200_000, "more than 50 levels"),
         ("- " * 200_000, "more than 50 levels"),
