@@ -18,3 +18,24 @@ def each_isa(request, monkeypatch):
     native.choose_isa(request.param)
     yield
     native.choose_isa("auto")
+
+
+@pytest.fixture(params=["reference", *native.available_isas()])
+def backend(request):
+    """The reference, and the kernels of each instruction set."""
+    if request.param == "reference":
+        yield request.param
+    else:
+        native.choose_isa(request.param)
+        yield "native"
+        native.choose_isa("auto")
+
+
+@pytest.fixture(name="native", params=native.available_isas() or [None])
+def _native(request):
+    """The kernels of each instruction set."""
+    if request.param is None:
+        pytest.skip("no compiled kernels here")
+    native.choose_isa(request.param)
+    yield "native"
+    native.choose_isa("auto")

@@ -18,10 +18,9 @@ from jaxfit.model.kinematics import (
     shaped_vertices,
     transform_derivatives,
 )
-from jaxfit.raster import kernels, silhouette_reference
 from jaxfit.raster import silhouette as raster
+from jaxfit.raster import silhouette_reference
 
-ISAS = kernels.available_isas()
 BIRD = toy_bird()
 RIG = fold_bird(BIRD)
 SIZE = 40
@@ -30,26 +29,6 @@ BLUR = silhouette_reference.Blur(sigma=1.0, radius=3.0)
 UNBIASED = silhouette_reference.Blur(sigma=1.0, radius=3.0, edge="unbiased")
 PLACED = 3 * 8 + 4
 """Columns before the lengths of the bones: 8 joints, translation, scale."""
-
-
-@pytest.fixture(params=ISAS or [None])
-def native(request):
-    if request.param is None:
-        pytest.skip("no compiled kernels here")
-    kernels.choose_isa(request.param)
-    yield "native"
-    kernels.choose_isa("auto")
-
-
-@pytest.fixture(params=["reference", *ISAS])
-def backend(request):
-    """The reference, and the kernels of each instruction set."""
-    if request.param == "reference":
-        yield request.param
-    else:
-        kernels.choose_isa(request.param)
-        yield "native"
-        kernels.choose_isa("auto")
 
 
 def pose_of(row) -> Pose:
@@ -138,7 +117,7 @@ def test_it_is_the_square_of_the_jacobian(backend, place, blur):
     assert band > 10
     assert band <= 256 or blur == UNBIASED
     found = block(row_of(PLACES[place]), backend, blur=blur)
-    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
 
 
 def random_target(size):
@@ -151,9 +130,9 @@ def random_target(size):
 def test_unknown_pixels_have_no_curvature(backend, blur):
     row, target = row_of(), random_target(SIZE)
     expected, band = expected_block("inside", masked=True, blur=blur)
-    assert 10 < band < 0.95 * expected_block("inside", blur=blur)[1]
+    assert 10 < band < 0.9 * expected_block("inside", blur=blur)[1]
     found = block(row, backend, target=target, blur=blur)
-    np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
     assert not np.any(block(row, backend, target=jnp.full_like(target, silhouette_reference.UNKNOWN), blur=blur))
     np.testing.assert_array_equal(block(row, backend, target=target == 1, blur=blur), block(row, backend, blur=blur))
 

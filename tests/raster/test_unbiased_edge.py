@@ -12,33 +12,11 @@ from scipy.spatial.transform import Rotation
 from support.birds import toy_bird
 
 from jaxfit.evaluation.benchmarks.outline import bench_outline, outline_excess
-from jaxfit.raster import kernels
 from jaxfit.raster import silhouette as raster
 from jaxfit.raster.silhouette_reference import UNKNOWN, Blur
 
-ISAS = kernels.available_isas()
 SIZE = 40
 EDGE = Blur(1.6, 4.0, "unbiased")
-
-
-@pytest.fixture(params=["reference", *ISAS])
-def backend(request):
-    """The reference, and the kernels of each instruction set."""
-    if request.param == "reference":
-        yield request.param
-    else:
-        kernels.choose_isa(request.param)
-        yield "native"
-        kernels.choose_isa("auto")
-
-
-@pytest.fixture(params=ISAS or [None])
-def native(request):
-    if request.param is None:
-        pytest.skip("no compiled kernels here")
-    kernels.choose_isa(request.param)
-    yield "native"
-    kernels.choose_isa("auto")
 
 
 @functools.partial(jax.jit, static_argnames=("size", "blur", "backend"))
