@@ -278,7 +278,7 @@ class OutlineNoise(NamedTuple):
         of a Gaussian correlation. The edge has a Gaussian profile of standard deviation f, so the term costs
         λ·d² / (4√π·f) for every pixel of length.
         """
-        edge_px = math.sqrt(2 * math.log(2) * Blur.for_size(CROP_PX).sigma)
+        edge_px = Blur.for_size(CROP_PX).filter_sd_px
         return 2 * edge_px / (self.length_px * math.pi / 2 * self.deviation_px**2)
 
 

@@ -240,7 +240,7 @@ def fit_batch(model: FitModel, configs: Sequence[FitConfig], batch: Batch, repor
     bars = None
     if configs[0].error_bars:
         tiles = _stage_tiles(rows, hyperparameters, config_of_row, batch.targets, targets_row, needs_mask(stage))
-        bars = _error_bars(with_shared(program, stage.optimised), tiles, rows, configs[0].common_size)
+        bars = _error_bars(with_shared(program, stage), tiles, rows, configs[0].common_size)
     return Fitted(*jax.tree.map(lambda x: x[rows.row], (rows.pose, final, rows.failure, rows.ambiguity_deg, bars)))
 
 

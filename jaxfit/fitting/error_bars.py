@@ -32,6 +32,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.stats import f as f_distribution
 
+from jaxfit.data.solution import ERROR_BARS
 from jaxfit.fitting.posterior import WindowPosterior, window_posteriors
 from jaxfit.fitting.solve import Problem, Program
 from jaxfit.model.kinematics import (
@@ -77,18 +78,8 @@ class ErrorBars(NamedTuple):
 
 def error_bar_shapes(bones: int, shapes: int, keypoints: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array of `ErrorBars` in one frame."""
-    return {
-        "global_orient_sd": (3,),
-        "body_pose_sd": (bones, 3),
-        "transl_sd": (3,),
-        "scale_sd": (),
-        "bone_length_sd": (bones,),
-        "betas_sd": (shapes,),
-        "keypoints_cam_cov": (keypoints, 3, 3),
-        "keypoints_centred_cov": (keypoints, 3, 3),
-        "keypoints_px_cov": (keypoints, 2, 2),
-        "misfit": (),
-    }
+    sizes = {"J-1": bones, "S": shapes, "K": keypoints, "2": 2, "3": 3}
+    return {name: tuple(sizes[axis] for axis in ERROR_BARS[name][0].split()[2:]) for name in ErrorBars._fields}
 
 
 def no_error_bars(frames: int, bones: int, shapes: int, keypoints: int) -> ErrorBars:

@@ -139,9 +139,9 @@ def learn_weights(
     used = config if observations.masks else without_mask_stages(config)
     model = checked_model(observations, bird, [used], initial_poses, source)
     windows = _cut_runs(observations, [used], initial_poses, source)[0].windows
-    learnt = learn(model, used, windows, initial_poses, progress, source)
+    values, remarks = learn(model, used, windows, initial_poses, progress, source)
     config = replace(config, learn_weights=False)
-    return learnt._replace(config=with_values(config, learnt.values) if learnt.values else config)
+    return Learnt(with_values(config, values) if values else config, values, remarks)
 
 
 def fit_runs(

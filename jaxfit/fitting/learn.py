@@ -45,7 +45,7 @@ from jaxfit.config.fit import FitConfig, StageConfig, term_settings
 from jaxfit.config.yaml_file import config_to_yaml, rounded
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch, take_tile, tile_rows, tile_size
 from jaxfit.fitting.initial_poses import InitialPoses
-from jaxfit.fitting.outline_noise import filter_sd_px, independent_errors, outline_errors, shown_frames
+from jaxfit.fitting.outline_noise import independent_errors, outline_errors, shown_frames
 from jaxfit.fitting.posterior import (
     Blocks,
     Columns,
@@ -129,8 +129,8 @@ def learn(
     initial_poses: InitialPoses | None = None,
     progress: ProgressTask = silent,
     source: object = "observations",
-) -> Learnt:
-    """Learn the weights and scales of the terms of the last stage from a sample of windows.
+) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return `Learnt.values` and `Learnt.remarks`: weights and scales of the terms of the last stage.
 
     The result depends on the windows and the config only. Terms that the last stage lacks, or whose learnt settings the
     last stage overrides, keep their values. Without `keypoint_likelihood`, nothing is learnt: other keypoint terms are
@@ -156,7 +156,7 @@ def learn(
     for remark in remarks:
         _logger.warning("%s: %s", source, remark)
     _logger.info("learnt: %s", ", ".join(f"{path} = {value:g}" for path, value in values.items()) or "nothing")
-    return Learnt(with_values(first, values) if values else first, values, tuple(remarks))
+    return values, tuple(remarks)
 
 
 def choose_windows(windows: Windows, most: int = MOST_WINDOWS) -> Int[np.ndarray, "S"]:
@@ -306,7 +306,7 @@ def measure(
         usable: (W,) bool: the windows that count.
         names: the terms.
     """
-    program = with_shared(stage_program(config, stage, model), stage.optimised)
+    program = with_shared(stage_program(config, stage, model), stage)
     hyperparameters = stage_hyperparameters(config, stage, model.bird.keypoint_names)
     count, size = len(usable), tile_size(pose.global_orient.shape[1])
     sums = {name: np.zeros(3) for name in names}  # number of errors, tr(Σ·H), energy
@@ -340,7 +340,7 @@ def measure(
         area = (program.camera.size_px / program.raster.size_px) ** 2
         weight = float(hyperparameters.settings[MASK]["weight"]) * area
         masks, taken, _ = sums[MASK].tolist()
-        evidence[MASK] = mask_evidence(np.concatenate(outlines), masks, taken, weight, filter_sd_px(program))
+        evidence[MASK] = mask_evidence(np.concatenate(outlines), masks, taken, weight, program.raster.blur.filter_sd_px)
     return evidence
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 
 from jaxfit.fitting.solve import Program
+from jaxfit.raster.silhouette_reference import UNKNOWN
 
 MASKS_PER_WINDOW = 25
 """Number of masks of a window whose errors are filtered."""
@@ -40,11 +41,11 @@ def outline_errors(
     program: Program,
 ) -> Float[np.ndarray, "M 3"]:
     """Return Σẽ², Σ(ẽ filtered to twice the width)², and the length of the outline in pixels, of each mask."""
-    sigma, rows = filter_sd_px(program), []
+    sigma, rows = program.raster.blur.filter_sd_px, []
     for silhouette_px, t in zip(shown, shown_frames(len(has_mask)).tolist(), strict=True):
         if has_mask[t]:
-            target = mask[t]
-            rows.append(outline_error(silhouette_px, target == 1, target == 2, sigma))
+            unknown = mask[t] == UNKNOWN
+            rows.append(outline_error(silhouette_px, (mask[t] != 0) & ~unknown, unknown, sigma))
     return np.array(rows).reshape(-1, 3)
 
 
@@ -65,11 +66,6 @@ def outline_error(
     wider = gaussian_filter(error, np.sqrt(3) * sigma, mode="constant")
     length = (np.hypot(*np.gradient(shown)) * known).sum()
     return float((error**2).sum()), float((wider**2).sum()), float(length)
-
-
-def filter_sd_px(program: Program) -> float:
-    """Return the width of the filter of the silhouette, in pixels of the silhouette."""
-    return float(np.sqrt(2 * np.log(2) * program.raster.blur.sigma))
 
 
 def outline_correlation_px(ratio: float, sigma: float) -> float:

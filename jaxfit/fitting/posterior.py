@@ -14,9 +14,8 @@ The curvature of a robust kernel includes its second derivative (`objective.resi
 of second order of the pose (of the residuals) are left out, as in Gauss-Newton.
 
 The mask terms enter with their Gauss-Newton block times their weight, as in the solver. This is the curvature of
-λ·Σ ½e². For the L1 norm, this is a choice: its own second derivative depends on the distance between outline and mask,
-and vanishes if they agree exactly. The block treats λ as the precision of a pixel: with λ = 0.12, an outline of 400 px
-fixes the position of a bird to about 0.5 px in x and y.
+λ·Σ ½e², that is of `mask_smooth_l1`. For the L1 norm, this is a choice: its own second derivative depends on the
+distance between outline and mask, and vanishes if they agree exactly. The block treats λ as the precision of a pixel.
 
 Source: MacKay 1992, *A practical Bayesian framework for backpropagation networks* (evidence, effective number of
 parameters); Takahashi et al. 1973, *Formation of a sparse bus impedance matrix* (selected inverse).
@@ -24,7 +23,7 @@ parameters); Takahashi et al. 1973, *Formation of a sparse bus impedance matrix*
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -34,9 +33,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.linalg import cho_solve, get_lapack_funcs
 
-from jaxfit.fitting.solve import Problem, Program, problem_window
+from jaxfit.config.fit import StageConfig
+from jaxfit.fitting.solve import Problem, Program, problem_window, shared_parameters
 from jaxfit.model.kinematics import Pose
-from jaxfit.objective.curvature import SHARED_PARAMETERS, frame_rows, shared_columns
+from jaxfit.objective.curvature import frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature
 
 BANDWIDTH = 2
@@ -387,9 +387,9 @@ def log_evidence(loss: float, posterior: WindowPosterior, prior: WindowPosterior
     return -loss - 0.5 * (posterior.log_volume - prior.log_volume)
 
 
-def with_shared(program: Program, optimised: Collection[str]) -> Program:
-    """Return a program whose derivatives have columns for all shared parameters in `optimised`, also for Adam."""
-    return program._replace(shared=tuple(name for name in SHARED_PARAMETERS if name in optimised))
+def with_shared(program: Program, stage: StageConfig) -> Program:
+    """Return the program of a stage whose derivatives have columns for all shared parameters, also for Adam."""
+    return program._replace(shared=shared_parameters(stage))
 
 
 def _row(tree, b: int):

@@ -421,8 +421,7 @@ def _terms_without_masks(stage: StageConfig) -> tuple[str, ...]:
 
 def stage_program(config: FitConfig, stage: StageConfig, model: FitModel) -> Program:
     """Return the program of one stage. The functions of the terms are part of the program."""
-    paper_blur = Blur.for_size(config.crop.size_px)
-    blur = Blur(paper_blur.sigma * stage.blur**2, paper_blur.radius * stage.blur, config.edge)
+    blur = Blur.for_size(config.crop.size_px, stage.blur, config.edge)
     raster = Raster(blur, config.crop.size_px, config.backend)
     return Program(
         model.rig,
@@ -437,8 +436,11 @@ def stage_program(config: FitConfig, stage: StageConfig, model: FitModel) -> Pro
 
 def _shared_columns(stage: StageConfig) -> tuple[str, ...]:
     """Return the shared parameters that Levenberg-Marquardt optimises; Adam does not need their names."""
-    if stage.solver == "adam":
-        return ()
+    return () if stage.solver == "adam" else shared_parameters(stage)
+
+
+def shared_parameters(stage: StageConfig) -> tuple[str, ...]:
+    """Return the parameters of `curvature.SHARED_PARAMETERS` that a stage optimises."""
     return tuple(name for name in SHARED_PARAMETERS if name in stage.optimised)
 
 

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt8
 
 KINDS = ("l1", "smooth_l1")
-EDGES = ("soft_rasterizer", "unbiased")
+Edge = Literal["soft_rasterizer", "unbiased"]
+EDGES: tuple[Edge, ...] = ("soft_rasterizer", "unbiased")
 MIN_DEPTH = 1e-8  # a face with a vertex at or behind this depth is skipped
 MIN_AREA = 1e-8  # a face with at most this |2·area|, in units of half the image, is skipped
 FAR_AWAY = 2.0**20  # px; coordinates are clamped to ± this, so that their squares stay finite
@@ -35,7 +36,7 @@ class Blur:
     radius: float
     """px. A face does not affect the pixels outside it at this distance or farther. Only for `soft_rasterizer`."""
 
-    edge: Literal["soft_rasterizer", "unbiased"] = "soft_rasterizer"
+    edge: Edge = "soft_rasterizer"
     """`soft_rasterizer`: every face has a soft edge, as published; the silhouette is larger than its mesh.
     `unbiased`: the covered area of the pixels, filtered by a Gaussian with the variance 2·ln(2)·s of that edge."""
 
@@ -48,10 +49,19 @@ class Blur:
             raise ValueError(f"radius: expected a number of px, at least 0, got {self.radius}")
 
     @staticmethod
-    def for_size(size: int) -> "Blur":
-        """Return the usual blur of a square image: s = 1e-4 (size/2)², radius = (size/2) √(1e-4 ln(1e4 − 1))."""
+    def for_size(size: int, blur: float = 1.0, edge: Edge = "soft_rasterizer") -> "Blur":
+        """Return the usual blur of a square image, times `blur`.
+
+        s = 1e-4 (blur · size/2)², radius = (blur · size/2) √(1e-4 ln(1e4 − 1)).
+        """
         half = size / 2
-        return Blur(sigma=1e-4 * half**2, radius=half * math.sqrt(1e-4 * math.log(1e4 - 1)))
+        return Blur(1e-4 * half**2 * blur**2, half * math.sqrt(1e-4 * math.log(1e4 - 1)) * blur, edge)
+
+    @property
+    def filter_sd_px(self) -> float:
+        """Standard deviation of the Gaussian of an unbiased edge, √(2·ln(2)·s): that of the soft rasteriser's edge,
+        whose profile is sigmoid(−x·|x|/s)."""
+        return math.sqrt(2 * math.log(2) * self.sigma)
 
 
 class Skin(NamedTuple):
@@ -138,10 +148,10 @@ def _sum_over_faces(function, start, faces):
 
 
 def _filtered(image: Float[Array, "size size"], blur: Blur) -> Float[Array, "size size"]:
-    """Filter an image by a Gaussian of the variance 2·ln(2)·s; pixels outside the image are 0."""
-    size, variance = image.shape[0], 2 * math.log(2) * blur.sigma
-    radius = math.ceil(3 * math.sqrt(variance))
-    taps = [math.exp(-0.5 * k * k / variance) for k in range(-radius, radius + 1)]
+    """Filter an image by the Gaussian of a blur; pixels outside the image are 0."""
+    size, sd = image.shape[0], blur.filter_sd_px
+    radius = math.ceil(3 * sd)
+    taps = [math.exp(-0.5 * (k / sd) ** 2) for k in range(-radius, radius + 1)]
     weights = jnp.asarray(taps, image.dtype) / sum(taps)
     apart = jnp.arange(size)[:, None] - jnp.arange(size)
     matrix = jnp.where(abs(apart) <= radius, weights[jnp.clip(apart + radius, 0, 2 * radius)], 0.0)

@@ -24,7 +24,7 @@ from jaxfit.model.kinematics import window_keypoints, window_transforms
 from jaxfit.objective.curvature import add_rows, frame_rows
 from jaxfit.simulation.noise import detect
 
-PROGRAM = with_shared(stage_program(CONFIG, POSTERIOR, MODEL), POSTERIOR.optimised)
+PROGRAM = with_shared(stage_program(CONFIG, POSTERIOR, MODEL), POSTERIOR)
 SAMPLES = 4000
 
 

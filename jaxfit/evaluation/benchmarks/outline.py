@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -31,7 +31,9 @@ FINE = 16
 Mesh = tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"]]
 
 
-def true_outline(vertices_screen: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], size: int) -> tuple:
+def true_outline(
+    vertices_screen: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], size: int
+) -> tuple[float, float]:
     """Return the area (px²) and the perimeter (px) of a mesh in an image of `size` pixels."""
     fine = vertices_screen * np.array([FINE, FINE, 1], np.float32)
     mask = hard_mask(fine.astype(np.float32), faces, FINE * size, FINE * size)
@@ -44,15 +46,17 @@ def true_outline(vertices_screen: Float[np.ndarray, "V 3"], faces: Int[np.ndarra
 def outline_excess(
     vertices_screen: Float[np.ndarray, "V 3"],
     faces: Int[np.ndarray, "F 3"],
+    outline: tuple[float, float],
     size: int,
     blur: Blur,
     backend: Backend = "auto",
 ) -> float:
     """Return the mean distance by which a silhouette lies outside its mesh, in pixels.
 
-    This is the area of the silhouette minus the area of the mesh, over the perimeter. The mesh must lie in the image.
+    This is the area of the silhouette minus the area of the mesh, over the perimeter; `outline` holds area and
+    perimeter (`true_outline`). The mesh must lie in the image.
     """
-    area, perimeter = true_outline(vertices_screen, faces, size)
+    area, perimeter = outline
     image = silhouette(jnp.asarray(vertices_screen), jnp.asarray(faces), size, blur=blur, backend=backend)
     return (float(image.sum()) - area) / perimeter
 
@@ -123,12 +127,12 @@ def bench_outline(
         for (vertices, _), parts in meshes:
             for part, faces in parts.items():
                 area, perimeter = true_outline(vertices, faces, CROP_PX)
-                for edge, size, blur in ((e, s, b) for e in EDGES for b in blurs for s in sizes):
+                for edge, blur, size in itertools.product(EDGES, blurs, sizes):
                     ratio = size / CROP_PX
-                    placed = jnp.asarray(vertices * np.array([ratio, ratio, 1], np.float32))
-                    image = silhouette(placed, jnp.asarray(faces), size, blur=scaled_blur(size, blur, edge))
+                    placed = vertices * np.array([ratio, ratio, 1], np.float32)
+                    scaled = area * ratio**2, perimeter * ratio
                     key = f"{edge}, blur {blur:g}, {size} px"
-                    value = (float(image.sum()) - area * ratio**2) / (perimeter * ratio)
+                    value = outline_excess(placed, faces, scaled, size, Blur.for_size(size, blur, edge))
                     excess.setdefault(key, {}).setdefault(part, []).append(value)
         result[name] = {
             key: {part: float(np.mean(values)) for part, values in parts.items()}
@@ -140,19 +144,13 @@ def bench_outline(
     return result
 
 
-def scaled_blur(size: int, blur: float, edge: str) -> Blur:
-    """Return the paper's blur of an image of `size` pixels, times `blur`."""
-    paper = Blur.for_size(size)
-    return replace(Blur(paper.sigma * blur**2, paper.radius * blur), edge=edge)
-
-
 def _times(meshes: Sequence[Mesh], repeats: int = 7) -> dict[str, float]:
     """Return the median time of loss and gradient of a frame in milliseconds, for each edge."""
     vertices, faces = jnp.asarray(np.stack([mesh[0] for mesh in meshes])), jnp.asarray(meshes[0][1])
     target = silhouette(vertices[0], faces, CROP_PX) > 0.5
     times = {}
     for edge in EDGES:
-        blur = scaled_blur(CROP_PX, 1.0, edge)
+        blur = Blur.for_size(CROP_PX, 1.0, edge)
 
         def loss(v, blur=blur):
             return mask_loss(v, faces, target, blur=blur)
