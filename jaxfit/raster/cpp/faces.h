@@ -1,8 +1,7 @@
 // The scratch memory of one image, and its faces, prepared sixteen at a time. Part of silhouette.cc.
 #pragma once
 
-#include "silhouette.h"
-#include "simd.h"
+#include "vertices.h"
 
 namespace jaxfit {
 namespace {
@@ -34,8 +33,6 @@ struct Workspace {
   int64_t blocks, row_bytes;  // number of blocks along a side; bytes of a row in `open`
   int64_t num_chunks;
 };
-
-INLINE int64_t round_up(int64_t n) { return (n + kLanes - 1) / kLanes * kLanes; }
 
 struct Layout {
   int64_t blocks, row_bytes, vertices, products, open, chunks;  // the last four in floats
@@ -89,8 +86,7 @@ bool load_vertices(const Mesh& mesh, Workspace& ws) {
   for (int64_t i = 0; i < mesh.num_vertices; ++i) {
     const float* v = mesh.vertices + 3 * i;
     zero += 0 * v[0] + 0 * v[1] + 0 * v[2];
-    const float x = v[0] < -kFarAway ? -kFarAway : v[0] > kFarAway ? kFarAway : v[0];
-    const float y = v[1] < -kFarAway ? -kFarAway : v[1] > kFarAway ? kFarAway : v[1];
+    const float x = clamp_far(v[0]), y = clamp_far(v[1]);
     ws.x[i] = v[2] > kMinDepth ? x : __builtin_nanf("");
     ws.y[i] = y;
   }

@@ -25,8 +25,6 @@ namespace {
 constexpr float kCovered = 0.9999f;  // from this mean of N on, a pixel is covered
 constexpr int64_t kRowsPerColumn = 16;  // the Gauss-Newton block has at most this many rows per column of the image
 
-INLINE int64_t round_up(int64_t n) { return (n + kLanes - 1) / kLanes * kLanes; }
-
 // Taps of a Gaussian with the variance of the soft rasteriser's edge, whose profile is sigmoid(-x·|x| / s): 2·ln(2)·s.
 struct Filter {
   double variance;
@@ -68,8 +66,8 @@ INLINE Workspace carve(const Mesh& mesh, Blur blur, int64_t size, void* memory, 
   ws.front_edges = reinterpret_cast<int16_t*>(p);
   ws.back_edges = ws.front_edges + mesh.edges.count;
   if (bytes) {
-    const size_t edges = round_up(mesh.edges.count) * sizeof(float);
-    *bytes = (p - static_cast<float*>(nullptr)) * sizeof(float) + edges;
+    const char* end = reinterpret_cast<char*>(ws.back_edges + round_up(mesh.edges.count));
+    *bytes = end - static_cast<char*>(memory);
   } else {
     filter.fill_taps(ws.taps);
   }
@@ -81,12 +79,6 @@ size_t workspace(const Mesh& mesh, Blur blur, int64_t size) {
   carve(mesh, blur, size, nullptr, &bytes);
   return bytes;
 }
-
-void fill(float* p, int64_t n, float value) {
-  for (int64_t i = 0; i < n; ++i) p[i] = value;
-}
-
-INLINE float clamp(float a) { return a < -kFarAway ? -kFarAway : a > kFarAway ? kFarAway : a; }
 
 // Finds the edges that remain of each side. Returns false if a coordinate is not finite.
 bool find_edges(const Mesh& mesh, Workspace& ws) {
@@ -100,8 +92,8 @@ bool find_edges(const Mesh& mesh, Workspace& ws) {
     const float *a = mesh.vertices + 3 * corner[0], *b = mesh.vertices + 3 * corner[1],
                 *c = mesh.vertices + 3 * corner[2];
     if (!(a[2] > kMinDepth && b[2] > kMinDepth && c[2] > kMinDepth)) continue;
-    const float ax = clamp(a[0]), ay = clamp(a[1]);
-    const float area = (clamp(b[0]) - ax) * (clamp(c[1]) - ay) - (clamp(b[1]) - ay) * (clamp(c[0]) - ax);
+    const float ax = clamp_far(a[0]), ay = clamp_far(a[1]);
+    const float area = (clamp_far(b[0]) - ax) * (clamp_far(c[1]) - ay) - (clamp_far(b[1]) - ay) * (clamp_far(c[0]) - ax);
     if (!(__builtin_fabsf(area) > least)) continue;
     int16_t* edges = area > 0 ? ws.front_edges : ws.back_edges;
     const int sign = area > 0 ? 1 : -1;
@@ -153,8 +145,8 @@ INLINE void walk(Segment s, int64_t size, Visit visit) {
 INLINE Segment segment_of(const Mesh& mesh, int64_t edge) {
   const float* a = mesh.vertices + 3 * mesh.edges.ends[2 * edge];
   const float* b = mesh.vertices + 3 * mesh.edges.ends[2 * edge + 1];
-  const float ax = clamp(a[0]), ay = clamp(a[1]);
-  return {ax, ay, clamp(b[0]) - ax, clamp(b[1]) - ay};
+  const float ax = clamp_far(a[0]), ay = clamp_far(a[1]);
+  return {ax, ay, clamp_far(b[0]) - ax, clamp_far(b[1]) - ay};
 }
 
 INLINE float* at(float* plane, const Workspace& ws, int64_t row) { return plane + row * ws.stride + ws.radius; }
@@ -245,15 +237,7 @@ void add_gradient(const Mesh& mesh, Workspace& ws, const float* plane, float* gr
     a[0] += s.dy * to_a, a[1] -= s.dx * to_a;
     b[0] += s.dy * to_b, b[1] -= s.dx * to_b;
   }
-  for (int64_t i = 0; i < mesh.num_vertices; ++i)
-    for (int c = 0; c < 2; ++c) {
-      const float v = mesh.vertices[3 * i + c];
-      if (v < -kFarAway || v > kFarAway) gradient[3 * i + c] = 0;
-    }
-}
-
-void clear_gradient(float* gradient, int64_t vertices, float value) {
-  for (int64_t i = 0; i < vertices; ++i) gradient[3 * i] = gradient[3 * i + 1] = value, gradient[3 * i + 2] = 0;
+  clear_far_gradient(mesh, gradient);
 }
 
 INLINE bool known(Target target, int64_t i) { return !target.bytes || target.bytes[i] != kUnknown; }
@@ -279,12 +263,12 @@ void silhouette(const Mesh& mesh, Blur blur, int64_t size, void* memory, float* 
 void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory, const float* cotangent,
                          float* gradient) {
   Workspace ws = carve(mesh, blur, size, memory);
-  if (!render(mesh, ws)) return clear_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
+  if (!render(mesh, ws)) return set_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
   clear(ws.error, ws);
   for (int64_t y = 0; y < size; ++y)
     for (int64_t x = 0; x < size; ++x) at(ws.error, ws, y)[x] = cotangent[y * size + x];
   filter(ws, ws.error);
-  clear_gradient(gradient, mesh.num_vertices, 0);
+  set_gradient(gradient, mesh.num_vertices, 0);
   add_gradient(mesh, ws, ws.error, gradient);
 }
 
@@ -293,7 +277,7 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
   Workspace ws = carve(mesh, blur, size, memory);
   if (!render(mesh, ws)) {
     *loss = __builtin_nanf("");
-    if (gradient) clear_gradient(gradient, mesh.num_vertices, *loss);
+    if (gradient) set_gradient(gradient, mesh.num_vertices, *loss);
     return;
   }
   clear(ws.error, ws);
@@ -326,7 +310,7 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
   for (int64_t y = 0; y < size; ++y)
     for (int64_t x = 0; x < size; ++x)
       if (!known(target, y * size + x)) at(ws.error, ws, y)[x] = 0;
-  clear_gradient(gradient, mesh.num_vertices, 0);
+  set_gradient(gradient, mesh.num_vertices, 0);
   add_gradient(mesh, ws, ws.error, gradient);
 }
 

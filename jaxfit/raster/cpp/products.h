@@ -56,10 +56,6 @@ INLINE Vec load_unequal(const uint8_t* image, int64_t size, int64_t column, int6
   return unequal(bytes, kBlock, value);
 }
 
-void fill(float* p, int64_t n, float value) {
-  for (int64_t i = 0; i < n; ++i) p[i] = value;
-}
-
 // Computes `products`. Returns false if a coordinate is not finite.
 bool render(const Mesh& mesh, int64_t size, Scale scale, Workspace& ws) {
   if (!load_vertices(mesh, ws)) return false;

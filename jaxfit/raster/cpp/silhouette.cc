@@ -121,18 +121,10 @@ float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, boo
   return static_cast<float>(total + sum(part));
 }
 
-void clear_gradient(float* gradient, int64_t vertices, float value) {
-  for (int64_t i = 0; i < vertices; ++i) gradient[3 * i] = gradient[3 * i + 1] = value, gradient[3 * i + 2] = 0;
-}
-
 void finish_gradient(const Mesh& mesh, Scale scale, Workspace& ws, float* gradient) {
-  clear_gradient(gradient, mesh.num_vertices, 0);
+  set_gradient(gradient, mesh.num_vertices, 0);
   accumulate_gradient(scale, ws, gradient);
-  for (int64_t i = 0; i < mesh.num_vertices; ++i)
-    for (int c = 0; c < 2; ++c) {
-      const float v = mesh.vertices[3 * i + c];
-      if (v < -kFarAway || v > kFarAway) gradient[3 * i + c] = 0;
-    }
+  clear_far_gradient(mesh, gradient);
 }
 
 void silhouette(const Mesh& mesh, Blur blur, int64_t size, void* memory, float* image) {
@@ -154,7 +146,7 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
   if (!render(mesh, size, scale, ws))
-    return clear_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
+    return set_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     const Vec transmitted = all(1.f) / load(place);
     set_factor(load_block(cotangent, size, column, row, 0.f), transmitted, scale, ws, place, column, row);
@@ -168,7 +160,7 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
   const Scale scale = scale_of(blur, size);
   if (!render(mesh, size, scale, ws)) {
     *loss = __builtin_nanf("");
-    if (gradient) clear_gradient(gradient, mesh.num_vertices, *loss);
+    if (gradient) set_gradient(gradient, mesh.num_vertices, *loss);
     return;
   }
   const bool l1 = kind == LossKind::kL1, with = gradient != nullptr;

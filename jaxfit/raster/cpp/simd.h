@@ -1,5 +1,5 @@
-// Vectors of sixteen floats, defined for each instruction set. Only silhouette.cc includes this file, and silhouette.cc
-// is compiled once for each instruction set.
+// Vectors of sixteen floats, defined for each instruction set. Only silhouette.cc and filtered.cc include this file, and
+// both are compiled once for each instruction set.
 //
 // Everything is in an anonymous namespace, and templates of the standard library are not used. The linker may merge
 // equal functions of different object files, which could bring AVX-512 instructions into code for an older processor.

@@ -2,8 +2,7 @@
 // silhouette.cc and filtered.cc.
 #pragma once
 
-#include "silhouette.h"
-#include "simd.h"
+#include "vertices.h"
 
 namespace jaxfit {
 namespace {
