@@ -33,9 +33,11 @@ def silhouette(
     negative inside.
 
     Skipped are faces with |2·area| ≤ 1e-8 (size/2)² px², with two equal corners, or with a vertex at a depth of 1e-8 or
-    less. With `unbiased`, S = G * min(1, max(F, B)): F and B are the mean numbers of faces over the area of the pixel,
-    of those that turn to one side of the image and to the other, and G is a Gaussian of variance 2·ln(2)·s px². Pixels
-    outside the image are 0. The sum of S is the area of the mesh, where no two outlines share a pixel.
+    less.
+
+    With the edge `unbiased`, S = G * min(1, max(F, B)). F is the mean number, over the area of a pixel, of the faces
+    whose corners turn from +x to +y; B is the same for the other faces. G is a Gaussian of variance 2·ln(2)·s px².
+    Pixels outside the image are 0. The sum of S is the area of the mesh, where no two outlines share a pixel.
 
     If any coordinate of any vertex is NaN or infinite, the whole image and its gradient are NaN. Coordinates
     beyond ±2²⁰ px are clamped. The kernels stop evaluating a block of pixels when all its S are within 1e-5 of 1.

@@ -1,11 +1,12 @@
 // The filtered silhouette: the area of each pixel that the mesh covers, filtered by a Gaussian. This file is compiled
 // once for each instruction set, as silhouette.cc is.
 //
-// N(x) is the number of faces that turn to one side and contain the point x. The mean of N over a pixel is exact: each
-// face adds its directed edges, edges between two such faces cancel, and only the edges that remain are walked through
-// the pixels. An edge adds the area below itself to the pixels of each column, so that sums down the columns give the
-// mean of N. The coverage of a pixel is the larger mean of the two sides, at most 1: a closed surface has equal means, a
-// sheet has one. Coverage is too large only where two outlines share a pixel.
+// The faces have two sides: the corners of a face turn from +x to +y, or the other way. N(x) is the number of faces of
+// one side that contain the point x. The mean of N over a pixel is exact: each face adds its directed edges, edges between
+// two faces of one side cancel, and only the edges that remain are walked through the pixels. An edge adds the area below
+// itself to the pixels of each column, so that sums down the columns give the mean of N. The coverage of a pixel is the
+// larger mean of the two sides, at most 1: a closed surface has equal means, a sheet has faces of one side only. Coverage
+// is too large only where two outlines share a pixel.
 //
 // The error, coverage minus mask at the known pixels, is filtered as a whole, so that both have the same softness: the
 // silhouette has the area of its mesh, whatever the width of the filter and of the part.
