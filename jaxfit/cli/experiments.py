@@ -120,20 +120,20 @@ def bench(options: argparse.Namespace) -> None:
 
 
 def outline_tables(result: dict[str, Any]) -> list[Table]:
-    """Return a table of the excess of the silhouettes for each mesh, and the times."""
-    tables = []
+    """Return a table of the excess of the silhouettes for each mesh and edge; the title holds the time."""
+    tables: dict[tuple[str, str], Table] = {}
     for name, rows in result.items():
-        parts = list(next(iter(rows.values())))
-        title = f"{name}: px by which the silhouette lies outside the mesh"
-        if "ms_per_frame" in rows:
-            times = ", ".join(f"{edge} {ms:.2f}" for edge, ms in rows["ms_per_frame"].items())
-            title += f"; loss and gradient in ms/frame: {times}"
-        tables.append(right_aligned("", *parts, title=title))
-        tables[-1].columns[0].justify = "left"
         for key, values in rows.items():
-            if key != "ms_per_frame":
-                tables[-1].add_row(key, *(f"{values[part]:+.3f}" for part in parts))
-    return tables
+            if key == "ms_per_frame":
+                for edge, ms in values.items():
+                    tables[name, edge].title = f"{tables[name, edge].title}; loss and gradient {ms:.2f} ms/frame"
+                continue
+            edge, blur, size = key.split(", ")
+            title = f"{name}, {edge}: px by which the silhouette lies outside the mesh"
+            table = tables.setdefault((name, edge), right_aligned("blur", "px", *values, title=title))
+            cells = (f"{value:+.3f}" for value in values.values())
+            table.add_row(blur.removeprefix("blur "), size.removesuffix(" px"), *cells)
+    return list(tables.values())
 
 
 def bench_tables(result: dict[str, Any]) -> list[Table]:
