@@ -23,7 +23,7 @@ POSE = """
 import jax.numpy as jnp
 import numpy as np
 from support.birds import random_pose, toy_bird
-from jaxfit.fitting import filtering
+from jaxfit.fitting import windows
 from jaxfit.model import camera, kinematics, rotation
 from jaxfit.model.kinematics import rest_pose
 
@@ -38,7 +38,7 @@ R = rotation.axis_angle_to_matrix(jnp.ones((4, 3)))
 rotation.unwrap_axis_angle(rotation.matrix_to_axis_angle(R))
 rotation.geodesic_distance(R, R)
 rotation.view_grid(5, 4), rotation.viewing_axis_rotations(30)
-filtering.weighted_median_filter(np.ones((6, 5, 2), np.float32), np.ones((6, 5), np.float32))
+windows.weighted_median_filter(np.ones((6, 5, 2), np.float32), np.ones((6, 5), np.float32))
 assert bird.keypoints.shape == (12, 3)
 """
 

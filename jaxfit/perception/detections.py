@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -103,6 +103,7 @@ class FrameDetections(NamedTuple):
     """None where another process has read the picture."""
 
 
+@runtime_checkable
 class Detections(Protocol):
     """Detections of the frames of a video, in the order of the frames."""
 

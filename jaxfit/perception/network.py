@@ -22,7 +22,7 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -108,6 +108,7 @@ def collect_instances(
     return collected
 
 
+@runtime_checkable
 class Segmenter(Protocol):
     """Detects the instances of a frame."""
 
@@ -119,6 +120,7 @@ class Segmenter(Protocol):
         ...
 
 
+@runtime_checkable
 class KeypointDetector(Protocol):
     """Detects the keypoints of instances."""
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -86,6 +86,7 @@ TRACKERS = ("iou", *EXTERNAL_TRACKERS)
 """The names that `load_tracker` accepts."""
 
 
+@runtime_checkable
 class Tracker(Protocol):
     """Assigns each bird an identity that is constant from frame to frame."""
 
