@@ -61,6 +61,8 @@ write_inputs(folder)
 (folder / "full.yaml").write_text('''
 base: paper
 window: 6
+edge: unbiased
+error_bars: true
 crop: {{size_px: 64}}
 initialise: {{method: so3, turns: 6, directions: 8, hypotheses: 2}}
 terms: {{keypoints: 100, mask: 1, mask_smooth_l1: 1, bone_prior: 1, shape_prior: 1, shape_norm: 1, stage_anchor: 1}}
