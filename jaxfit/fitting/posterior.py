@@ -92,8 +92,8 @@ class Posterior(NamedTuple):
         T, L, C = self.covariance.border.shape
         return T * L + C
 
-    def frame_covariance(self) -> Float[np.ndarray, "T L+C L+C"]:
-        """Return the covariance of the parameters of each frame, followed by the shared parameters."""
+    def frame_covariance(self) -> Float[np.ndarray, "T P P"]:
+        """Return the covariance of the P = L + C parameters of each frame: its own, followed by the shared parameters."""
         own, border, corner = self.covariance.band[0], self.covariance.border, self.covariance.corner
         shared = np.broadcast_to(corner, (len(own), *corner.shape))
         return np.block([[own, border], [border.transpose(0, 2, 1), shared]])
