@@ -178,6 +178,15 @@ class Observations:
         own = self.own_images.get((n, t))
         return own[1:] if own else (int(self.image_size_px[t, 0]), int(self.image_size_px[t, 1]))
 
+    def image_sizes_px(self) -> np.ndarray:
+        """Return the width and height in pixels of the images of all tracks and frames, (N, T, 2) int64."""
+        sizes = np.broadcast_to(self.image_size_px, (*self.present.shape, 2))
+        if self.own_images:
+            sizes = sizes.copy()
+            for at, (_, width, height) in self.own_images.items():
+                sizes[at] = width, height
+        return sizes
+
     def image_file(self, n: int, t: int) -> str:
         """Return the file name of the image of track ``n`` at frame ``t``."""
         n, t = self._position(n, t)

@@ -34,46 +34,49 @@ def crop_squares(
     Raises:
         InputError: `mode: image` with images that are not square or not of one size.
     """
-    crop = np.zeros((*frame.shape, 3))
+    crop, sizes_px = np.zeros((*frame.shape, 3)), observations.image_sizes_px()
     for w, n in enumerate(track.tolist()):
-        make = _whole_image if config.mode == "image" else _around_the_bird
-        crop[w] = make(observations, n, frame[w], present[w], config)
+        image_px = sizes_px[n, frame[w, present[w]]]
+        if config.mode == "image":
+            crop[w] = _whole_image(image_px)
+        else:
+            crop[w] = _around_the_bird(observations, n, frame[w], present[w], CROP_IMAGE_SIDES * image_px.max(), config)
     return crop
 
 
-def _whole_image(observations: Observations, n: int, frame, present, config: CropConfig) -> Float[np.ndarray, "3"]:
+def _whole_image(image_px: Int[np.ndarray, "P 2"]) -> Float[np.ndarray, "3"]:
     """Return the whole image as the crop of all frames of one window."""
-    sizes = {observations.image_size(n, int(t)) for t in frame[present]}
+    sizes = sorted({(width, height) for width, height in image_px.tolist()})
     if len(sizes) > 1 or any(width != height for width, height in sizes):
         raise InputError(
             "crop.mode: image",
-            f"needs square images of one size, not {sorted(sizes)} (width, height)",
+            f"needs square images of one size, not {sizes} (width, height)",
             "use crop.mode: box",
         )
-    return np.array([0.0, 0.0, sizes.pop()[0]])
+    return np.array([0.0, 0.0, sizes[0][0]])
 
 
 def _around_the_bird(
-    observations: Observations, n: int, frame, present, config: CropConfig
+    observations: Observations, n: int, frame, present, largest_px: float, config: CropConfig
 ) -> Float[np.ndarray, "T 3"]:
     """Return the crops of one window: the size of the largest box, with the centres of the boxes.
 
     A frame without the bird has the crop of the nearest frame with the bird.
     """
-    corners = np.zeros((len(frame), 4))  # x0, y0, x1, y1 of the box of each frame
-    for i in np.flatnonzero(present):
-        box, confident = observations.box_px[n, frame[i]], observations.confidence[n, frame[i]] > 0
-        points = observations.keypoints_px[n, frame[i]][confident]
-        if min(box[2:]) > 0:  # the box is more reliable: a single keypoint may be an outlier
-            corners[i] = [*box[:2], *(box[:2] + box[2:])]
-        else:
-            corners[i] = [*points.min(0), *points.max(0)]
+    at = frame[present]
+    box = observations.box_px[n, at]
+    corners = np.concatenate([box[:, :2], box[:, :2] + box[:, 2:]], axis=1).astype(np.float64)  # x0, y0, x1, y1
+    without_box = box[:, 2:].min(axis=1) <= 0
+    if without_box.any():  # a box is more reliable: a single keypoint may be an outlier
+        confident = (observations.confidence[n, at[without_box]] > 0)[..., None]
+        points = observations.keypoints_px[n, at[without_box]]
+        first = np.where(confident, points, np.inf).min(axis=1)
+        corners[without_box] = np.concatenate([first, np.where(confident, points, -np.inf).max(axis=1)], axis=1)
     longest = (corners[:, 2:] - corners[:, :2]).max()
-    largest = CROP_IMAGE_SIDES * max(max(observations.image_size(n, int(t))) for t in frame[present])
-    size = max(min(np.ceil(longest * (1 + 2 * config.padding)), largest), LEAST_SIZE_PX)
+    size = max(min(np.ceil(longest * (1 + 2 * config.padding)), largest_px), LEAST_SIZE_PX)
     centre = (corners[:, :2] + corners[:, 2:]) / 2
-    nearest = np.abs(np.arange(len(frame))[:, None] - np.flatnonzero(present)).argmin(1)
-    centre = centre[np.flatnonzero(present)[nearest]]
+    if len(at) < len(frame):
+        centre = centre[np.abs(np.arange(len(frame))[:, None] - np.flatnonzero(present)).argmin(1)]
     return np.concatenate([np.round(centre - size / 2), np.full((len(frame), 1), size)], axis=1)
 
 

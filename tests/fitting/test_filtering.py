@@ -29,7 +29,7 @@ def slow_filter(keypoints, confidence, window):
 
 
 # fixed lengths, so that hypothesis does not compile a new program for every example
-@pytest.mark.parametrize(("T", "window"), [(1, 5), (3, 5), (7, 3), (8, 5), (4, 1)])
+@pytest.mark.parametrize(("T", "window"), [(1, 5), (3, 5), (7, 3), (8, 5), (4, 1), (14, 21)])
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
 def test_agrees_with_the_plain_loop(T, window, data):
