@@ -454,4 +454,4 @@ def _is_finished(state: Checkpoint, schedule: Schedule) -> bool:
 
 
 def _note(state: Checkpoint) -> str:
-    return f"best score on the held-out part {state.history[:, 1].max():.3f}" if len(state.history) else ""
+    return f"best score during training {state.history[:, 1].max():.3f}" if len(state.history) else ""

@@ -172,7 +172,7 @@ def _answer(report: Report, warned: Sequence[Warned]) -> Html:
     if not report.photographs and report.duration_s is not None:
         length += f", {duration(report.duration_s)}"
     share = report.poses / max(report.detections, 1)
-    what = "detections" if report.has_detections else "frames of the tracks"
+    what = "detections" if report.has_detections else "photographs" if report.photographs else "frames of the tracks"
     noun = "bird" if report.photographs else "track"
     cards = [
         _card(f"{len(report.tracks):,}", noun if len(report.tracks) == 1 else f"{noun}s", f"in {length}"),
