@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.table import Table
 
 from jaxfit.cli.observations import matching_line, observation_tables
-from jaxfit.cli.tables import counted, evaluation_tables, show, track_table
+from jaxfit.cli.tables import counted, evaluation_tables, flag_quality_line, show, track_table
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats import FOOTAGE, MARKER
@@ -105,7 +105,7 @@ def _answer(trust: Trust, observed: ObservationsEvaluation, result: Evaluation, 
         f"mean IoU of the masks {detection['mean_iou']:.2f} (1 is perfect)",
         f"keypoints: {100 * keypoints.annotated_pck_05:.0f} % within 5 % of the bird's size, hidden keypoints included",
         f"poses: joints {100 * result.overall['mpjpe/length']:.1f} % of the body length from the truth, "
-        f"worst in track {worst} ({100 * errors[worst]:.1f} %){wrong}",
+        f"worst in track {worst} ({100 * errors[worst]:.1f} %){wrong}; {flag_quality_line(result)}",
     ]
 
 

@@ -11,7 +11,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jaxfit.cli.observations import image_size, keypoint_map, observations_for
-from jaxfit.cli.tables import breakdown_tables, calibration_tables, counted, evaluation_tables, right_aligned, show
+from jaxfit.cli.tables import (
+    FIT_COLUMNS,
+    breakdown_tables,
+    calibration_tables,
+    counted,
+    evaluation_tables,
+    fit_cells,
+    flag_line,
+    flag_quality_line,
+    right_aligned,
+    show,
+)
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text
@@ -59,13 +70,14 @@ def fit(options: argparse.Namespace) -> None:
     save_solution(
         solution, bird, config_to_yaml(config), summary, options.out, options.overwrite, learnt and learnt.to_yaml()
     )
-    table = right_aligned("track", "frames", "objective")
-    table.add_column("status")
-    total = np.sum(list(solution.loss.values()), axis=0)
-    for n, track in enumerate(solution.track_id):
+    show(flag_line(solution))
+    table = right_aligned("track", "frames", "objective", *FIT_COLUMNS[:-1])
+    table.add_column(FIT_COLUMNS[-1])
+    total, cells = np.sum(list(solution.loss.values()), axis=0), fit_cells(solution)
+    for n, track in enumerate(solution.track_id.tolist()):
         frames = int(solution.valid[n].sum())
-        table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", str(solution.status[n]))
-    table.title = "objective: final value per frame"
+        table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", *cells[track])
+    table.title = "objective: final value per frame; ok, unsure, contradicted: poses with this flag"
     show(table)
     # every bird has a photograph of its own
     photographs = f" in {counted(observations.photographs, 'photograph')}" if observations.photographs else ""
@@ -136,6 +148,8 @@ def evaluate(options: argparse.Namespace) -> None:
         show(table)
     if matching.by == "overlap":
         show(matching_line(matching))
+    if line := flag_quality_line(result):
+        show(line)
     if result.missing:
         show(f"not counted: {counted(result.missing, 'annotated bird')} without a pose in this result")
     if result.unmatched:

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from jaxfit.cli.tables import counted, right_aligned, show, track_table
+from jaxfit.cli.tables import counted, flag_line, right_aligned, show, track_table
 from jaxfit.foundation.progress import terminal
 from jaxfit.model.files import find_bird
 
@@ -66,6 +66,7 @@ def reconstruct(options: argparse.Namespace) -> None:
             _show_failure(error.tracking, config.track.min_track_frames)
             raise
     show(done.tracking.trust.sentence())
+    show(flag_line(done.solution))
     show(track_table(done.tracking.observations, done.solution))
     _show_skipped_tracks(done.tracking, config.track.min_track_frames)
     tracks = counted(done.summary["tracks"], "track")

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -119,6 +120,16 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
     return tables
 
 
+def flag_quality_line(result: Evaluation) -> str:
+    """Return a line that says how well the flags find wrong poses; empty without true poses or flags."""
+    quality = result.flags
+    if not quality:
+        return ""
+    found = f"{quality['found']:.0f} of {counted(int(quality['wrong']), 'wrong pose')}"
+    right = f"{quality['found']:.0f} of {counted(int(quality['flagged']), 'flagged pose')} wrong"
+    return f"flags find {found} (mean error above 10 % of the length); {right}"
+
+
 def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -> list[Table]:
     """Return tables of metrics with one row per behaviour or per keypoint."""
     from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_KEYPOINT
@@ -142,6 +153,32 @@ def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -
     return tables
 
 
+FIT_COLUMNS = ("ok", "unsure", "contradicted", "status")
+"""Columns of the cells of `fit_cells`."""
+
+
+def fit_cells(solution: Solution) -> dict[int, list[str]]:
+    """Return track → number of poses with each flag, and status of the fit."""
+    from jaxfit.data.flags import FLAGS, flags
+
+    found = flags(np.asarray(solution.doubts))
+    return {
+        track: [*(f"{(found[n] == flag).sum()}" for flag in FLAGS), str(solution.status[n])]
+        for n, track in enumerate(solution.track_id.tolist())
+    }
+
+
+def flag_line(solution: Solution) -> str:
+    """Return a line with the share of poses of each flag."""
+    from jaxfit.data.flags import flag_counts
+
+    counts = flag_counts(np.asarray(solution.doubts))
+    total = sum(counts.values())
+    return (
+        "poses: " + ", ".join(f"{100 * count / total:.1f} % {flag}" for flag, count in counts.items()) if total else ""
+    )
+
+
 def track_table(observations: Observations, solution: Solution | None = None) -> Table:
     """Return a table with the quality of every track, and with the status of its fit if there is a solution."""
     table = right_aligned("track", "frames", "coverage", "confidence", "jitter")
@@ -149,14 +186,15 @@ def track_table(observations: Observations, solution: Solution | None = None) ->
         "coverage: fraction of the frames between the first and the last detection that have a detection; confidence: "
         "mean over all keypoints; jitter: median second difference of keypoints divided by the longer side of the box"
     )
-    status = None
+    fitted: dict[int, list[str]] = {}
     if solution is not None:
-        table.add_column("status")
-        status = dict(zip(solution.track_id.tolist(), solution.status.tolist(), strict=True))
+        fitted = fit_cells(solution)
+        for name in FIT_COLUMNS:
+            table.add_column(name)
     for row in track_quality(observations):
         jitter = "–" if row.jitter is None else f"{row.jitter:.4f}"
         cells = [str(row.track_id), str(row.frames), f"{row.coverage:.2f}", f"{row.mean_confidence:.2f}", jitter]
-        table.add_row(*cells, *([] if status is None else [str(status[row.track_id])]))
+        table.add_row(*cells, *fitted.get(row.track_id, ()))
     return table
 
 

@@ -1,4 +1,4 @@
-"""`Solution`: fitted poses, frames with a second pose, and the result folder."""
+"""`Solution`: fitted poses, and the result folder."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.kinematics import Pose
 
-FORMAT_VERSION = 5
-"""Version of ``poses.npz``; increased when its arrays change. Version 4 lacks `ERROR_BARS`, version 3 also lacks
-`ambiguity_deg`, version 2 also lacks `timestamp_s` and `fps`."""
+FORMAT_VERSION = 6
+"""Version of ``poses.npz``; increased when its arrays change. Version 5 lacks `doubts`, version 4 also `ERROR_BARS`,
+version 3 also `ambiguity_deg`, version 2 also `timestamp_s` and `fps`."""
 _OLDEST_VERSION = 2
 """Older versions are not read."""
 
@@ -55,6 +55,7 @@ LAYOUT = {
     "joint_names": ("J", np.str_),
     "status": ("N", np.str_),
     "ambiguity_deg": ("N T", np.float32),
+    "doubts": ("N T", np.int8),
 }
 ERROR_BARS = {
     "global_orient_sd": ("N T 3", np.float32),
@@ -138,6 +139,10 @@ class Solution:
     (at most 20 times less likely, turned by more than 45°); 0 where the fit found no such pose. Only fits with more
     than one hypothesis search for other poses. None means 0 everywhere."""
 
+    doubts: np.ndarray | None = None
+    """(N, T) int8: sum of 2^i over the doubts i of `jaxfit.data.flags.DOUBTS` about the pose; 0: no doubt; −1: no pose,
+    or not judged. None means −1 everywhere."""
+
     # error bars (`fitting/error_bars.py`): None without, NaN where a window has none; docs/files.md
     global_orient_sd: np.ndarray | None = None
     """(N, T, 3) float32: radians, about the axes of the root of the bird."""
@@ -163,8 +168,9 @@ class Solution:
 
     def __post_init__(self):
         ambiguity_deg = np.zeros(np.shape(self.valid), np.float32) if self.ambiguity_deg is None else self.ambiguity_deg
+        doubts = np.full(np.shape(self.valid), -1, np.int8) if self.doubts is None else self.doubts
         layout = LAYOUT | (ERROR_BARS if self.has_error_bars else {})
-        arrays = validate_arrays(vars(self) | {"ambiguity_deg": ambiguity_deg}, layout)
+        arrays = validate_arrays(vars(self) | {"ambiguity_deg": ambiguity_deg, "doubts": doubts}, layout)
         if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
             bones = arrays["body_pose"].shape[2]
             raise ValueError(f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}")
@@ -342,7 +348,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
     optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS).items()}
-    optional["ambiguity_deg"] = shapes.pop("ambiguity_deg")
+    optional |= {name: shapes.pop(name) for name in ("ambiguity_deg", "doubts")}
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
     arrays |= {name: arrays[name].item() for name in _CAMERA}
     arrays |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
@@ -371,21 +377,3 @@ def _footage(summary: Path) -> FootageIdentity | None:
     if content is None or not content.has("video"):
         return None
     return footage_of(content["video"])
-
-
-def ambiguous_frames(solution: Solution) -> dict[int, tuple[str, ...]]:
-    """Return track → a text for each range of frames with a second pose (`Solution.ambiguity_deg`)."""
-    assert solution.ambiguity_deg is not None  # `Solution` replaces None
-    texts = {}
-    for n, track in enumerate(solution.track_id.tolist()):
-        angle_deg = np.where(solution.valid[n], solution.ambiguity_deg[n], 0)
-        inside = np.concatenate([[0], angle_deg > 0, [0]])
-        first, after = (np.flatnonzero(np.diff(inside) == sign) for sign in (1, -1))
-        ranges = [
-            f"frames {solution.frame_index[a]} to {solution.frame_index[b - 1]}: a pose that is turned by "
-            f"{np.median(angle_deg[a:b]):.0f}° explains the keypoints almost as well"
-            for a, b in zip(first.tolist(), after.tolist(), strict=True)
-        ]
-        if ranges:
-            texts[track] = tuple(ranges)
-    return texts

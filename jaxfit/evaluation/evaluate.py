@@ -11,11 +11,12 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.data.flags import OK, WRONG_SHARE, flags
+from jaxfit.data.mask_comparison import compare_masks
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation import metrics
 from jaxfit.evaluation.bootstrap import BirdSums, Interval
-from jaxfit.evaluation.mask_comparison import compare_masks
 from jaxfit.evaluation.metrics import correct_keypoints, squared_errors, squared_velocity_errors
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.evaluation.truth import Truth, match
@@ -59,6 +60,10 @@ class Evaluation:
     keypoints: dict[str, dict[str, float]] = field(default_factory=dict)
     """Keypoint → COLUMNS_KEYPOINT of this keypoint over all birds, and the number of frames that annotate the
     keypoint as `count`."""
+    flags: dict[str, float] = field(default_factory=dict)
+    """Number of poses with a 3D error that are `wrong` (mean error of the joints above `WRONG_SHARE` of the body
+    length), `flagged` (`unsure` or `contradicted`), and both (`found`). Empty without true poses, or if the result has
+    no flags."""
     sums: BirdSums = field(default_factory=lambda: BirdSums((), {}, {}))
     """Sums per bird, from which `paired_ratio` compares results of the same birds."""
 
@@ -89,6 +94,7 @@ class Evaluation:
             },
             behaviours=rows("behaviours"),
             keypoints=rows("keypoints"),
+            flags=content.get("flags", {}),
             sums=BirdSums(
                 tuple(sums["birds"]),
                 {metric: tuple(values) for metric, values in sums["numerators"].items()},
@@ -201,8 +207,20 @@ def evaluate(
         intervals=sums.intervals(),
         behaviours=_metrics_of_behaviours(behaviour, errors, measured, either),
         keypoints=_metrics_of_keypoints(bird.keypoint_names, errors, keypoints, masks.true_side_px),
+        flags={} if spatial is None else _flag_quality(solution, errors["mpjpe/length"]),
         sums=sums,
     )
+
+
+def _flag_quality(solution: Solution, error: Float[np.ndarray, "N T J"]) -> dict[str, float]:
+    """Return `Evaluation.flags`; `error` is a share of the body length, NaN where nothing is measured."""
+    found = flags(np.asarray(solution.doubts))
+    measured = np.isfinite(error).any(-1) & (found != "")
+    if not measured.any():
+        return {}
+    wrong = np.nanmean(error[measured], axis=-1) > WRONG_SHARE
+    flagged = found[measured] != OK
+    return {"wrong": float(wrong.sum()), "flagged": float(flagged.sum()), "found": float((wrong & flagged).sum())}
 
 
 def _metrics_of_behaviours(

@@ -19,7 +19,7 @@ from jaxfit.evaluation import metrics
 from jaxfit.evaluation.metrics import distances
 from jaxfit.evaluation.truth import match
 from jaxfit.foundation.errors import InputError
-from jaxfit.model.bird import Bird
+from jaxfit.model.bird import Bird, rest_length
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_joints
 from jaxfit.model.rotation import axis_angle_to_matrix, geodesic_distance
 
@@ -188,13 +188,13 @@ class SpatialErrors:
         p, self.truth = (p - root_p) @ np.swapaxes(R, -1, -2), q - root_q
         self.predicted = p * best_scale(p, self.truth, self.measured)[:, None, None, None]
 
-        self.body_length = np.broadcast_to(_rest_length(truth_bird) * truth.scale[n, t], self.measured.shape)
+        self.body_length = np.broadcast_to(rest_length(truth_bird) * truth.scale[n, t], self.measured.shape)
         orient_p = jnp.asarray(R) @ axis_angle_to_matrix(jnp.asarray(solution.global_orient))
         orient_q = axis_angle_to_matrix(jnp.asarray(truth.global_orient[n, t]))
         angle = np.rad2deg(np.asarray(geodesic_distance(orient_p, orient_q), np.float64))
         self.angle_deg = angle if same else np.full(angle.shape, np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
-            rest = _rest_length(bird) / _rest_length(truth_bird)
+            rest = rest_length(bird) / rest_length(truth_bird)
             ratio = _apparent_size(solution, bird) / _apparent_size(truth, truth_bird)[n, t]
         self.size_ratio = ratio * (rest if np.isfinite(rest) else 1.0)
 
@@ -229,15 +229,6 @@ def real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:
         raise InputError(source, problem, f"{_REMEDY}; the result of a fit is no truth")
     x0, y0, size = crops[0]
     return np.array([x0 + size / 2, y0 + size / 2]), truth.focal_px * size / truth.crop_px
-
-
-def _rest_length(bird: Bird) -> float:
-    """Return the distance from bill tip to tail tip at rest, model units; NaN without these keypoints."""
-    names = bird.keypoint_names
-    if not {"bill_tip", "tail_tip"} <= set(names):
-        return float("nan")
-    rest = np.asarray(bird.keypoints, np.float64)
-    return float(np.linalg.norm(rest[names.index("bill_tip")] - rest[names.index("tail_tip")]))
 
 
 def _apparent_size(solution: Solution, bird: Bird) -> np.ndarray:

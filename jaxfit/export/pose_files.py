@@ -25,6 +25,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from jaxfit.data.flags import flags
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.write_deeplabcut import write_deeplabcut_predictions
 from jaxfit.data.formats.write_sleap import write_sleap_project
@@ -154,8 +155,7 @@ def write_movement(
             {
                 **arrays,
                 "confidence": (("time", keypoint, individual), confidence, {"description": CONFIDENCE}),
-                "status": ((individual,), s.status.astype(str), {"description": "how the fit of the track ended"}),
-                **_quality(exported, individual),
+                **_quality(exported, individual, column, len(numbers)),
             },
             coords={
                 "time": np.interp(numbers, s.frame_index, exported.times_s),
@@ -181,14 +181,28 @@ def write_movement(
     return [out], [_READERS[dims]]
 
 
-def _quality(exported: Exported, individual: str) -> dict[str, tuple]:
-    """Return the quality of the tracks, if the result has detections."""
-    if not exported.quality:
-        return {}
-    rows = [exported.quality.get(track) for track in exported.solution.track_id.tolist()]
-    names = ("coverage", "mean_confidence")
-    values = {name: np.array([np.nan if row is None else getattr(row, name) for row in rows]) for name in names}
-    return {f"track_{name}": ((individual,), column) for name, column in values.items()}
+def _quality(exported: Exported, individual: str, column: np.ndarray, length: int) -> dict[str, tuple]:
+    """Return the flags of the poses, the status of the tracks, and the quality of their detections if it is known.
+
+    Args:
+        exported: the result.
+        individual: name of the dimension of the tracks.
+        column: position of each frame of the result in the dimension `time`.
+        length: length of the dimension `time`.
+    """
+    s = exported.solution
+    flag = np.full((length, len(s.track_id)), "", "<U12")
+    flag[column] = flags(np.asarray(s.doubts)).T
+    found: dict[str, tuple] = {
+        "flag": (("time", individual), flag, {"description": "ok, unsure, contradicted; empty: no pose"}),
+        "status": ((individual,), s.status.astype(str), {"description": "how the fit of the track ended"}),
+    }
+    if exported.quality:
+        rows = [exported.quality.get(track) for track in s.track_id.tolist()]
+        for name in ("coverage", "mean_confidence"):
+            values = np.array([np.nan if row is None else getattr(row, name) for row in rows])
+            found[f"track_{name}"] = ((individual,), values)
+    return found
 
 
 def _unit(exported: Exported, space: str) -> str:

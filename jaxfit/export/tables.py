@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.flags import doubt_texts, flags
 from jaxfit.export.result import CONFIDENCE, SD, Exported
 from jaxfit.foundation.extras import require_package
 from jaxfit.foundation.files import write_whole
@@ -58,8 +59,8 @@ def _write(
 
 
 def _row_columns(exported: Exported) -> Columns:
-    """Return the columns that both tables share: track, frame, time, fitted and status."""
-    s = exported.solution
+    """Return the columns that both tables share: track, frame, time, fitted, status, flag and doubts."""
+    s, doubts = exported.solution, np.asarray(exported.solution.doubts)
     N, T = s.valid.shape
     return {
         "track": np.repeat(s.track_id, T),
@@ -67,6 +68,8 @@ def _row_columns(exported: Exported) -> Columns:
         "time_s": np.tile(exported.times_s, N),
         "fitted": s.valid.reshape(-1),
         "status": np.repeat(s.status.astype(object), T),
+        "flag": flags(doubts).astype(object).reshape(-1),
+        "doubts": np.array(["; ".join(doubt_texts(each)) for each in doubts.reshape(-1).tolist()], object),
     }
 
 

@@ -21,8 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxfit.data.flags import flag_counts, flagged_ranges
 from jaxfit.data.observations import Observations
-from jaxfit.data.solution import Solution, ambiguous_frames
+from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import Fitted
 from jaxfit.fitting.error_bars import ErrorBars, blend_error_bars, error_bar_shapes
 from jaxfit.fitting.solve import FitModel
@@ -142,9 +143,6 @@ def collect_windows(
         fps=observations.fps,
         footage=observations.footage,
     )
-    for track, texts in ambiguous_frames(solution).items():
-        for text in texts:
-            _logger.warning("track %d, %s", track, text)
     return solution
 
 
@@ -341,7 +339,7 @@ def _keypoints(model: FitModel, pose: Pose) -> tuple[Float[Array, "T K 3"], Floa
 
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:
-    """Return the content of `summary.json`: counts; status, failures, second poses and loss of every track; timings;
+    """Return the content of `summary.json`: counts; status, failures, flagged frames and loss of every track; timings;
     the identity of the video, where it is known.
 
     Args:
@@ -358,7 +356,8 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         "status": dict(Counter(str(status) for status in solution.status)),
         "track_status": {int(t): str(s) for t, s in zip(solution.track_id, solution.status, strict=True)},
         "failures": solution.failures,
-        "ambiguous": ambiguous_frames(solution),
+        "flags": flag_counts(np.asarray(solution.doubts)),
+        "flagged": flagged_ranges(solution),
         "loss": {name: np.asarray(value).tolist() for name, value in solution.loss.items()},
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "model": {"name": bird.name, "hash": model_hash(bird)},

@@ -15,6 +15,7 @@ from jaxtyping import Int
 
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import FitConfig
+from jaxfit.data.flags import with_doubts
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import bytes_per_frame
@@ -193,7 +194,7 @@ def fit_runs(
     _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), configs[0].window, len(batches))
     with progress(f"Fitting {subject}", steps_per_batch(configs[0]) * len(batches)) as report_progress:
         results |= fit_batches(batches, runs, shared, stored, cluster, report_progress)
-    return [
+    solutions = (
         collect_windows(
             observations,
             run.windows,
@@ -204,7 +205,8 @@ def fit_runs(
             skipped,
         )
         for r, run in enumerate(runs)
-    ]
+    )
+    return [with_doubts(solution, observations, bird, progress) for solution in solutions]
 
 
 def checked_model(

@@ -245,6 +245,15 @@ class _Checker:
         self.require("joint_limits", valid, f"{largest:.4g} radians is beyond a full turn")
 
 
+def rest_length(bird: Bird) -> float:
+    """Return the distance from bill tip to tail tip at rest, model units; NaN without these keypoints."""
+    names = bird.keypoint_names
+    if not {"bill_tip", "tail_tip"} <= set(names):
+        return float("nan")
+    rest = np.asarray(bird.keypoints, np.float64)
+    return float(np.linalg.norm(rest[names.index("bill_tip")] - rest[names.index("tail_tip")]))
+
+
 def model_hash(bird: Bird) -> str:
     """Return the SHA-256 hash (hexadecimal) of all parts of a bird that a fit depends on.
 

@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from jaxfit.data.flags import LARGEST_SHARE, keypoint_distances
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import frame_step, second_differences
 from jaxfit.model.anatomy import mirror_pairs
 from jaxfit.perception.network import Instance, KeypointDetector, instance_of
 
-LARGEST_SHARE = 0.5
-"""Upper bound of distances as shares of the longer side of the box; farther keypoints are wrong all the same."""
 NEAR_FRAMES = 25
 """Number of frames before and after a frame that give the usual number of birds."""
 
@@ -44,7 +43,6 @@ def frame_signals(observations: Observations, solution: Solution | None = None) 
         Name of the signal → (T,).
     """
     present = observations.present
-    side = np.where(present, observations.box_px[..., 2:].max(-1), np.nan)
     signals = {
         "low confidence": mean_over_birds(1 - observations.confidence.mean(-1), present),
         "low bird score": mean_over_birds(1 - cast(np.ndarray, observations.score), present),
@@ -52,7 +50,7 @@ def frame_signals(observations: Observations, solution: Solution | None = None) 
         "missing birds": _missing_birds(observations),
     }
     if solution is not None:
-        signals["fit residual"] = mean_over_birds(_residual(observations, solution, side), present)
+        signals["fit residual"] = mean_over_birds(keypoint_distances(observations, solution), present)
     return signals
 
 
@@ -110,26 +108,6 @@ def _missing_birds(observations: Observations) -> Float[np.ndarray, "T"]:
     first, last = np.searchsorted(numbers, numbers - reach), np.searchsorted(numbers, numbers + reach, "right")
     usual = np.array([np.median(count[a:b]) for a, b in zip(first, last, strict=True)])
     return (gaps + np.abs(count - usual)) / np.maximum(usual, 1)
-
-
-def _residual(
-    observations: Observations, solution: Solution, side: Float[np.ndarray, "N T"]
-) -> Float[np.ndarray, "N T"]:
-    residual = np.full(observations.present.shape, np.nan)
-    names = [name for name in observations.keypoint_names if name in solution.keypoint_names]
-    own, fitted = ([seen.keypoint_names.index(name) for name in names] for seen in (observations, solution))
-    tracks = np.intersect1d(observations.track_id, solution.track_id, return_indices=True)[1:]
-    frames = np.intersect1d(observations.frame_index, solution.frame_index, return_indices=True)[1:]
-    if not (names and len(tracks[0]) and len(frames[0])):
-        return residual
-    here, there = np.ix_(tracks[0], frames[0]), np.ix_(tracks[1], frames[1])
-    offset = observations.keypoints_px[here][:, :, own] - solution.keypoints_px[there][:, :, fitted]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        share = np.minimum(np.linalg.norm(offset, axis=-1) / side[here][..., None], LARGEST_SHARE)
-        weight = observations.confidence[here][:, :, own]
-        values = np.where(weight > 0, share * weight, 0).sum(-1) / weight.sum(-1)
-    residual[here] = np.where(solution.valid[there], values, np.nan)
-    return residual
 
 
 THUMBNAIL_PX = (32, 20)

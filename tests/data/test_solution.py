@@ -12,7 +12,7 @@ from support.birds import toy_bird
 from support.hostile import Isolated, fewer_examples
 from support.mutations import damaged_npz
 
-from jaxfit.data.solution import FORMAT_VERSION, Solution, ambiguous_frames, load_solution, save_solution
+from jaxfit.data.solution import FORMAT_VERSION, Solution, load_solution, save_solution
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import save_bird
 
@@ -49,6 +49,7 @@ def make(**changes):
         "timestamp_s": [0.2, np.nan, 0.36],
         "fps": 25.0,
         "ambiguity_deg": some() ** 2,
+        "doubts": rng.integers(-1, 32, (N, T)),
     }
     return Solution(**values | changes)
 
@@ -211,9 +212,9 @@ def test_a_folder_of_an_older_version_is_rejected_by_its_version(tmp_path):
 def test_a_folder_without_times_is_read(tmp_path):
     """Version 2 of the file has no times."""
     save_solution(make(), BIRD, "", {}, tmp_path / "out")
-    rewrite(tmp_path / "out", format_version=np.int64(2), timestamp_s=None, fps=None, ambiguity_deg=None)
+    rewrite(tmp_path / "out", format_version=np.int64(2), timestamp_s=None, fps=None, ambiguity_deg=None, doubts=None)
     solution, _ = load_solution(tmp_path / "out")
-    assert_same(solution, make(timestamp_s=None, fps=None, ambiguity_deg=None))
+    assert_same(solution, make(timestamp_s=None, fps=None, ambiguity_deg=None, doubts=None))
     assert np.isnan(solution.timestamp_s).all()
     assert solution.fps is None
 
@@ -297,13 +298,3 @@ def test_any_damage_is_one_error(tmp_path):
             assert outcome.acceptable, outcome
 
         check()
-
-
-def test_ranges_of_frames_with_a_second_pose_are_texts():
-    valid = np.array([[True, True, True], [True, False, True]])
-    angle_deg = np.array([[0.0, 170.0, 90.0], [60.0, 60.0, 80.0]])
-    first = "frames 6 to 9: a pose that is turned by 130° explains the keypoints almost as well"
-    alone = "frames {0} to {0}: a pose that is turned by {1}° explains the keypoints almost as well".format
-    expected = {3: (first,), 8: (alone(5, 60), alone(9, 80))}
-    assert ambiguous_frames(make(valid=valid, ambiguity_deg=angle_deg)) == expected
-    assert ambiguous_frames(make(ambiguity_deg=None)) == {}

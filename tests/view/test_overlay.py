@@ -201,7 +201,7 @@ def test_long_results_are_posed_chunk_by_chunk(tmp_path):
     """Longer than a chunk and no multiple of it: every frame still shows its own pose."""
     frames, still = CHUNK + 5, solution()
     names = ("valid", "global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "image_size_px")
-    names += ("keypoints_cam", "keypoints_px", "ambiguity_deg")
+    names += ("keypoints_cam", "keypoints_px", "ambiguity_deg", "doubts")
     many = {name: np.repeat(getattr(still, name)[:1, :1], frames, 1) for name in names}
     crop = np.repeat(still.crop[:1, :1], frames, 1).copy()
     crop[:, :, 0] += np.arange(frames)  # it walks to the right, a pixel a frame

@@ -147,9 +147,9 @@ def test_frames_with_many_poses_are_chosen():
 
 
 def states(svg, columns):
-    """Return the class of every column of a row; empty where nothing is drawn."""
+    """Return the class of every column of a row; empty where nothing is drawn. Flags lie above it."""
     drawn = np.full(columns, "", object)
-    for name, path in re.findall(r'<path class="(s\d)" d="([^"]*)"', svg):
+    for name, path in re.findall(r'<path class="(s[1-5])" d="([^"]*)"', svg):
         for start, width in re.findall(r"M(\d+) [\d.]+h(\d+)v", path):
             assert not any(drawn[int(start) : int(start) + int(width)])
             drawn[int(start) : int(start) + int(width)] = name
@@ -181,14 +181,18 @@ def test_long_footage_has_several_frames_in_a_column(folder, made):
     valid = np.zeros(2000, bool)
     valid[:1001] = True  # the last column of poses has one pose of four frames
     confidence = np.where(np.arange(2000) < 600, 0.95, 0.6)
-    long = dataclasses.replace(track, valid=valid, present=valid, confidence=confidence, size=np.ones(2000))
+    flagged = np.where(np.arange(2000) == 402, "contradicted", "ok")
+    long = dataclasses.replace(
+        track, valid=valid, present=valid, confidence=confidence, size=np.ones(2000), flags=flagged
+    )
     report = dataclasses.replace(report, frames=np.arange(2000), step=1, tracks=(long,))
     assert states(bands(timeline(report))[3], 500) == ["s5"] * 150 + ["s3"] * 100 + [""] * 250
+    assert 'class="s7" d="M100 0.65h1v' in timeline(report)  # the column of frame 402
 
 
 def test_warnings_name_what_was_skipped(folder, made):
-    def titles(ambiguity_deg=None, **summary):
-        fitted = dataclasses.replace(made, status=np.full(3, "ok"), ambiguity_deg=ambiguity_deg)
+    def titles(doubts=None, **summary):
+        fitted = dataclasses.replace(made, status=np.full(3, "ok"), doubts=doubts)
         return [(each.title, each.text) for each in warnings_of(gather(fitted, None, summary, "", folder))]
 
     assert titles() == []
@@ -197,8 +201,9 @@ def test_warnings_name_what_was_skipped(folder, made):
     assert text.endswith("10 (2), 11 (2) and 8 more.")
     assert titles(low_score_tracks={"6": 0.6})[0][1].endswith("6 (0.60).")
     assert titles(failures={"7": ["frames 12 to 14: not finite"]})[0][0] == "1 problem of the fit"
-    ((title, _),) = titles(ambiguity_deg=np.full(made.valid.shape, 170.0))
-    assert title == "Frames with a second pose"
+    poses = int(made.valid.sum())
+    ((title, _),) = titles(doubts=np.where(made.valid, 4, -1))
+    assert title == f"Poses that may be wrong: {poses} unsure"
     assert titles(video={"damaged": [3, 4]})[0][1] == "2 frames of the video could not be decoded: 3, 4."
 
 

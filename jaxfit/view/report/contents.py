@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.data.flags import CONTRADICTED, FLAGS, UNSURE, flagged_ranges, flags
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.observations import Observations
-from jaxfit.data.solution import Solution, ambiguous_frames
+from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
 
 
@@ -42,8 +43,10 @@ class Track:
     """Size in the image relative to the median of the track; NaN without a pose."""
     problems: tuple[str, ...]
     """Texts about skipped frames and diverged windows."""
-    ambiguous: tuple[str, ...]
-    """Texts about frames with a second pose (`ambiguous_frames`)."""
+    flags: np.ndarray
+    """(T,) str: flag of each pose (`jaxfit.data.flags.flags`); empty without a pose, or if poses were not judged."""
+    flagged: tuple[str, ...]
+    """Texts about frames whose poses are not `ok`."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,12 @@ class Report:
     def poses(self) -> int:
         """Number of poses of all birds."""
         return sum(track.poses for track in self.tracks)
+
+    @property
+    def flags(self) -> dict[str, int]:
+        """Number of poses of all birds with each flag; empty if no pose was judged."""
+        counts = {flag: sum(int((track.flags == flag).sum()) for track in self.tracks) for flag in FLAGS}
+        return counts if any(counts.values()) else {}
 
     @property
     def detections(self) -> int:
@@ -176,7 +185,7 @@ def _tracks(
     rows = {} if observations is None else {track: n for n, track in enumerate(observations.track_id.tolist())}
     size = _image_size(solution)
     total = np.sum(list(solution.loss.values()), axis=0) if solution.loss else np.full(len(solution.track_id), np.nan)
-    ambiguous = ambiguous_frames(solution)
+    found, flagged = flags(np.asarray(solution.doubts)), flagged_ranges(solution)
     tracks = []
     for n, track_id in enumerate(solution.track_id.tolist()):
         valid, present, confidence = solution.valid[n], solution.valid[n], None
@@ -199,7 +208,8 @@ def _tracks(
                 confidence=confidence,
                 size=np.where(valid, size[n] / median, np.nan),
                 problems=problems.get(str(track_id), ()),
-                ambiguous=ambiguous.get(track_id, ()),
+                flags=found[n],
+                flagged=flagged.get(track_id, ()),
             )
         )
     return tracks
@@ -269,6 +279,11 @@ def warnings_of(report: Report) -> list[Warned]:
         warned.append(
             Warned("No track has a pose", "Every fit failed. The table of tracks shows the status of each fit.")
         )
+    flagged = tuple(f"track {track.track_id}: {text}" for track in report.tracks for text in track.flagged)
+    if flagged:
+        shares = ", ".join(f"{report.flags[flag]:,} {flag}" for flag in (CONTRADICTED, UNSURE) if report.flags[flag])
+        text = "Look at these frames first. Poses that are contradicted should not be used without a look."
+        warned.append(Warned(f"Poses that may be wrong: {shares}", text, flagged))
     if report.trust == "low":
         text = "The networks do not work on this footage as on simulated footage. Tracks and poses may be wrong."
         warned.append(Warned("Trust in the tracking is low", text, report.trust_reasons))
@@ -280,12 +295,6 @@ def warnings_of(report: Report) -> list[Warned]:
     if problems:
         text = "Windows of frames whose fit diverged, and frames that were skipped, have no pose."
         warned.append(Warned(counted(len(problems), "problem") + " of the fit", text, problems))
-    ambiguous = tuple(f"track {track.track_id}: {text}" for track in report.tracks for text in track.ambiguous)
-    if ambiguous:
-        text = (
-            "Two different poses explain the keypoints of these frames almost as well. The result holds the better one."
-        )
-        warned.append(Warned("Frames with a second pose", text, ambiguous))
     if report.damaged:
         text = f"{counted(len(report.damaged), 'frame')} of the video could not be decoded: {numbers(report.damaged)}."
         warned.append(Warned("Damaged frames", text))

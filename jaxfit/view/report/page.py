@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from jaxfit.data.flags import CONTRADICTED, FLAGS, OK, UNSURE
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
@@ -79,6 +80,11 @@ _MEANINGS = (
     ("Track", "The path of one bird through the frames. A bird that was lost and detected again has two tracks."),
     ("Pose", "Position, orientation, joint angles and size of a bird in one frame."),
     ("Status", "Whether the fit of every window of frames succeeded (ok), of some windows, or of no window."),
+    (
+        "Flags",
+        "Whether the detections agree with a pose (ok), do not determine the pose (unsure), or speak against the pose "
+        "(contradicted). Where the detections themselves are wrong, a wrong pose may be ok.",
+    ),
     ("Coverage", "Share of the frames between the first and the last detection of a bird that have a detection."),
     ("Gaps", "Number of interruptions between the first and the last detection of a bird."),
     ("Confidence", "Mean confidence of all keypoints. A keypoint that was not detected counts as 0."),
@@ -177,6 +183,7 @@ def _answer(report: Report, warned: Sequence[Warned]) -> Html:
     cards = [
         _card(f"{len(report.tracks):,}", noun if len(report.tracks) == 1 else f"{noun}s", f"in {length}"),
         _card(f"{report.poses:,}", "poses", f"{100 * share:.1f} % of the {what}"),
+        _flags(report),
         _trust(report),
         _card(f"{len(warned)}", "warning" if len(warned) == 1 else "warnings", "see below" if warned else "none"),
     ]
@@ -186,6 +193,16 @@ def _answer(report: Report, warned: Sequence[Warned]) -> Html:
 def _card(value: str, unit: str, text: str, kind: str = "") -> Html:
     content = element("b", value), " ", element("span", unit), element("p", text)
     return element("div", *content, class_=f"card {kind}".strip())
+
+
+def _flags(report: Report) -> Html | None:
+    """Return the card with the share of poses that the detections agree with; None if poses were not judged."""
+    counts = report.flags
+    if not counts:
+        return None
+    share = {flag: f"{100 * count / sum(counts.values()):.0f} %" for flag, count in counts.items()}
+    text = f"{share[UNSURE]} unsure, {share[CONTRADICTED]} contradicted by the detections"
+    return _card(share[OK], OK, text, "bad" if counts[UNSURE] + counts[CONTRADICTED] else "good")
 
 
 def _trust(report: Report) -> Html:
@@ -236,17 +253,18 @@ def _table(report: Report) -> Html:
     names = [("Track", ""), ("Status", "")]
     names += [("Frames", "first to last")] if over_time else []
     names.append(("Poses", "number"))
+    names += [("Flags", "ok / unsure / contradicted")] if report.flags else []
     if detected:
         names += [("Detections", "number"), ("Coverage", "%"), ("Gaps", "number"), ("Confidence", "0 to 1")]
         names += [("Jitter", "% of box")]
     names.append(("Objective", "per pose"))
     names += [("Size in the image", "±30 %")] if over_time else []
     head = element("tr", *(element("th", name, element("small", unit)) for name, unit in names))
-    rows = [element("tr", *_cells(track, detected, over_time)) for track in report.tracks]
+    rows = [element("tr", *_cells(track, detected, over_time, bool(report.flags))) for track in report.tracks]
     return element("div", element("table", element("thead", head), element("tbody", *rows)), class_="wide")
 
 
-def _cells(track: Track, detected: bool, over_time: bool) -> list[Html]:
+def _cells(track: Track, detected: bool, over_time: bool, judged: bool) -> list[Html]:
     """Return the cells of a bird."""
     quality = track.quality
     frames = "–" if track.frames is None else f"{track.frames[0]:,} to {track.frames[1]:,}"
@@ -257,6 +275,8 @@ def _cells(track: Track, detected: bool, over_time: bool) -> list[Html]:
         element("td", frames) if over_time else Html(),
         element("td", f"{track.poses:,}"),
     ]
+    if judged:
+        cells.append(element("td", " / ".join(f"{(track.flags == flag).sum():,}" for flag in FLAGS)))
     if detected:
         shown = ["–"] * 5
         if quality is not None:

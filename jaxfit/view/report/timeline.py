@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Int
 
+from jaxfit.data.flags import CONTRADICTED, UNSURE
 from jaxfit.foundation.errors import one_line
 from jaxfit.view.colours import track_colour
 from jaxfit.view.report.contents import Report, Track
@@ -49,6 +50,8 @@ LEVELS = (0.5, 0.75, 0.9)
 """Mean confidences of the keypoints at which the colour changes."""
 _ABSENT, _NO_POSE, _POSE = 0, 1, 2
 """States of a bird in a frame; poses of level i have the state `_POSE + i`."""
+_FLAGGED = {UNSURE: 6, CONTRADICTED: 7}
+"""Flag → state of the mark below the pose."""
 _COLUMNS = 500
 """Most columns of a row: longer results have several frames in a column."""
 _TICKS = 5
@@ -68,7 +71,10 @@ def timeline(report: Report) -> Html:
         states = np.zeros(length, int)
         states[at] = _states(track)
         label = element("span", swatch(track.position), f"{track.track_id}", class_="label")
-        rows.append(element("div", label, _band(track, _binned(states, per_column)), class_="row"))
+        flagged = np.zeros(length, int)
+        flagged[at] = [_FLAGGED.get(flag, 0) for flag in track.flags.tolist()]
+        worst = np.pad(flagged, (0, -length % per_column)).reshape(-1, per_column).max(1)
+        rows.append(element("div", label, _band(track, _binned(states, per_column), worst), class_="row"))
     if report.damaged:
         states = np.zeros(length, int)
         damaged = (np.array(report.damaged) - first) // report.step
@@ -78,7 +84,7 @@ def timeline(report: Report) -> Html:
         rows.append(element("div", element("span", "damaged", class_="label"), band, class_="row"))
     note = None
     if per_column > 1:
-        text = f"One column shows {per_column} frames: their most frequent state, and their mean confidence."
+        text = f"One column shows {per_column} frames: the most frequent state, the mean confidence, the worst flag."
         note = element("p", text, class_="note")
     return joined(_legend(report), element("div", *rows, class_="timeline"), note)
 
@@ -138,10 +144,11 @@ def _binned(states: Int[np.ndarray, "L"], per_column: int) -> Int[np.ndarray, "C
     return np.where(kinds.argmax(1) == _POSE, np.round(mean).astype(int), kinds.argmax(1))
 
 
-def _band(track: Track, states: Int[np.ndarray, "C"]) -> Html:
-    """Return the row of a bird."""
+def _band(track: Track, states: Int[np.ndarray, "C"], flagged: Int[np.ndarray, "C"]) -> Html:
+    """Return the row of a bird; `flagged` is the worst flag in each column, as a value of `_FLAGGED`."""
     parts = [_bars(states, _NO_POSE, 0.3, 0.4)]
     parts += [_bars(states, _POSE + level, 0, 1) for level in range(len(LEVELS) + 1)]
+    parts += [_bars(flagged, state, 0.65, 0.35) for state in _FLAGGED.values()]
     return element("svg", element("title", f"track {track.track_id}"), *parts, class_="band", **_stretched(len(states)))
 
 
@@ -199,4 +206,6 @@ def _legend(report: Report) -> Html:
         entries.append(entry(f"s{_NO_POSE}", "detected, without a pose"))
     else:
         entries = [entry(f"s{_POSE + len(LEVELS)}", "pose")]
+    if report.flags:
+        entries += [element("b", "Flags:"), *(entry(f"s{state}", flag) for flag, state in _FLAGGED.items())]
     return element("p", *entries, class_="legend")

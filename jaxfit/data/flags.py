@@ -1,0 +1,182 @@
+"""Flags of single poses: what speaks against the pose of a bird in a frame.
+
+A doubt is one reason; the bits of `Solution.doubts` name the doubts of a pose. The flag follows from them:
+`contradicted` (the detections speak against the pose), else `unsure` (the detections do not determine the pose), else
+`ok`. A flag compares the pose with what was detected. Where detections are wrong and agree with each other, the flag is
+`ok` all the same.
+
+Two measures compare a pose with its detections: the mean distance of the keypoints, weighted by their confidence, as a
+share of the longer side of the box; and 1 − IoU of the mesh and the mask. A pose is contradicted if a measure is an
+outlier among all poses of the result, so that the limit follows from the noise of the user's detections; or if it is
+larger than any good pose allows, which also holds where most poses are wrong.
+
+Source: Iglewicz and Hoaglin 1993, *How to detect and handle outliers* (modified z-score, limit 3.5); for the IoU of
+½, the usual limit of a matching detection (Everingham et al. 2010, *The PASCAL visual object classes challenge*).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int8
+
+from jaxfit.data.mask_comparison import compare_masks
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.model.bird import Bird, rest_length
+
+FLAGS = OK, UNSURE, CONTRADICTED = "ok", "unsure", "contradicted"
+
+
+class Doubt(NamedTuple):
+    """One reason to doubt a pose."""
+
+    flag: str
+    text: str
+
+
+DOUBTS = (
+    Doubt(CONTRADICTED, "keypoints far from the pose"),
+    Doubt(CONTRADICTED, "mask unlike the mesh"),
+    Doubt(UNSURE, "a second pose fits almost as well"),
+    Doubt(UNSURE, "error bars above 10 % of the length"),
+    Doubt(UNSURE, "keypoints with low confidence"),
+)
+"""The doubts; doubt i has the value 2^i in `Solution.doubts`."""
+WRONG_SHARE = 0.1
+"""A pose whose keypoints are wrong by more than this share of the length of the bird counts as wrong."""
+LEAST_IOU = 0.5
+LEAST_CONFIDENCE = 0.5
+"""Mean confidence of all keypoints of a bird, below which they are doubtful; missing keypoints count as 0."""
+OUTLIER_Z = 3.5
+LEAST_POSES = 20
+"""Fewer poses have no outliers."""
+LARGEST_SHARE = 0.5
+"""Upper bound of distances as shares of the longer side of the box; farther keypoints are wrong all the same."""
+
+
+def keypoint_distances(observations: Observations, solution: Solution) -> Float[np.ndarray, "N T"]:
+    """Return the mean distance between the keypoints of the poses and of the observations, weighted by confidence.
+
+    Distances are shares of the longer side of the box, at most `LARGEST_SHARE`. Tracks, frames and keypoints are
+    matched by track id, frame number and name; NaN where there is nothing to compare.
+
+    Args:
+        observations: N tracks over T frames.
+        solution: a fit of these birds.
+    """
+    distance = np.full(observations.present.shape, np.nan)
+    names = [name for name in observations.keypoint_names if name in solution.keypoint_names]
+    own, fitted = ([seen.keypoint_names.index(name) for name in names] for seen in (observations, solution))
+    tracks = np.intersect1d(observations.track_id, solution.track_id, return_indices=True)[1:]
+    frames = np.intersect1d(observations.frame_index, solution.frame_index, return_indices=True)[1:]
+    if not (names and len(tracks[0]) and len(frames[0])):
+        return distance
+    here, there = np.ix_(tracks[0], frames[0]), np.ix_(tracks[1], frames[1])
+    offset = observations.keypoints_px[here][:, :, own] - solution.keypoints_px[there][:, :, fitted]
+    side = observations.box_px[here][..., 2:].max(-1)
+    weight = observations.confidence[here][:, :, own]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = np.minimum(np.linalg.norm(offset, axis=-1) / side[..., None], LARGEST_SHARE)
+        values = np.where(weight > 0, share * weight, 0).sum(-1) / weight.sum(-1)
+    counted = solution.valid[there] & observations.present[here] & (side > 0)
+    distance[here] = np.where(counted, values, np.nan)
+    return distance
+
+
+def with_doubts(
+    solution: Solution, observations: Observations, bird: Bird, progress: ProgressTask = silent
+) -> Solution:
+    """Return a solution with the doubts about each pose (`Solution.doubts`).
+
+    Args:
+        solution: the poses.
+        observations: the observations that were fitted: the same tracks, frames and keypoints.
+        bird: the model.
+        progress: shows the progress of the comparison with masks.
+    """
+    N, T = solution.valid.shape
+    has_mask = np.zeros((N, T), bool)
+    if observations.masks:
+        for n, t in np.argwhere(solution.valid).tolist():
+            has_mask[n, t] = (n, t) in observations.masks
+    overlap = np.full((N, T), np.nan)
+    if has_mask.any():
+        at = np.arange(N)[:, None], np.arange(T)
+        overlap = compare_masks(solution, bird, observations, has_mask, at, progress).iou
+    far = keypoint_distances(observations, solution)
+    doubtful = (
+        is_outlier(far) | (far > WRONG_SHARE),
+        is_outlier(1 - overlap) | (overlap < LEAST_IOU),
+        np.asarray(solution.ambiguity_deg) > 0,
+        _mean_sd(solution, bird) > WRONG_SHARE,
+        observations.confidence.mean(-1) < LEAST_CONFIDENCE,
+    )
+    doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
+    return replace(solution, doubts=np.where(solution.valid, doubts, -1).astype(np.int8))
+
+
+def is_outlier(values: Float[np.ndarray, "N T"]) -> Bool[np.ndarray, "N T"]:
+    """Return where values are outliers above the median of all values; NaN is no outlier.
+
+    The modified z-score of a value x is 0.6745·(x − m)/MAD, with the median m and the median absolute deviation MAD.
+    Values of equal rounding are no outliers, and fewer than `LEAST_POSES` values have none.
+    """
+    known = values[np.isfinite(values)]
+    if len(known) < LEAST_POSES:
+        return np.zeros(values.shape, bool)
+    median = np.median(known)
+    deviation = np.median(np.abs(known - median))
+    with np.errstate(invalid="ignore"):
+        return 0.6745 * (values - median) > OUTLIER_Z * max(deviation, 1e-6)
+
+
+def flags(doubts: Int8[np.ndarray, "N T"]) -> np.ndarray:
+    """Return the flag of each pose, (N, T) str: `ok`, `unsure`, `contradicted`; empty where `doubts` is −1."""
+    contradicted, unsure = (
+        sum(1 << i for i, doubt in enumerate(DOUBTS) if doubt.flag == flag) for flag in (CONTRADICTED, UNSURE)
+    )
+    conditions = [doubts < 0, (doubts & contradicted) > 0, (doubts & unsure) > 0]
+    return np.select(conditions, ["", CONTRADICTED, UNSURE], OK)
+
+
+def doubt_texts(doubts: int) -> tuple[str, ...]:
+    """Return the texts of the doubts about one pose."""
+    return tuple(doubt.text for i, doubt in enumerate(DOUBTS) if doubts > 0 and doubts >> i & 1)
+
+
+def flag_counts(doubts: Int8[np.ndarray, "N T"]) -> dict[str, int]:
+    """Return the number of poses with each flag; empty if no pose was judged."""
+    found = flags(doubts)
+    counts = {flag: int((found == flag).sum()) for flag in FLAGS}
+    return counts if any(counts.values()) else {}
+
+
+def flagged_ranges(solution: Solution) -> dict[int, tuple[str, ...]]:
+    """Return track → a text for each range of frames whose poses are not `ok`, with the reasons."""
+    assert solution.doubts is not None  # `Solution` replaces None
+    found, texts = flags(solution.doubts), {}
+    for n, track in enumerate(solution.track_id.tolist()):
+        edges = np.flatnonzero(found[n, 1:] != found[n, :-1]) + 1
+        ranges = []
+        for a, b in zip([0, *edges.tolist()], [*edges.tolist(), found.shape[1]], strict=True):
+            if a < b and found[n, a] in (UNSURE, CONTRADICTED):
+                numbers = solution.frame_index[[a, b - 1]].tolist()
+                where = f"frame {numbers[0]}" if b - a == 1 else f"frames {numbers[0]} to {numbers[1]}"
+                reasons = doubt_texts(int(np.bitwise_or.reduce(solution.doubts[n, a:b])))
+                ranges.append(f"{where} {found[n, a]}: {'; '.join(reasons)}")
+        if ranges:
+            texts[track] = tuple(ranges)
+    return texts
+
+
+def _mean_sd(solution: Solution, bird: Bird) -> Float[np.ndarray, "N T"]:
+    """Return the RMS error that the error bars expect of the keypoints, as a share of the length of the bird."""
+    if solution.keypoints_centred_cov is None:
+        return np.zeros(solution.valid.shape)
+    variance = np.trace(solution.keypoints_centred_cov, axis1=-2, axis2=-1).mean(-1)
+    with np.errstate(invalid="ignore"):
+        return np.sqrt(variance) / (rest_length(bird) * solution.scale)

@@ -1,0 +1,100 @@
+"""Flags of poses follow from their detections."""
+
+import dataclasses
+
+import numpy as np
+from support.evaluated import BIRD, N, T, solution, truth
+
+from jaxfit.data.flags import (
+    DOUBTS,
+    doubt_texts,
+    flag_counts,
+    flagged_ranges,
+    flags,
+    is_outlier,
+    keypoint_distances,
+    with_doubts,
+)
+
+FAR, UNLIKE, SECOND, WIDE, WEAK = (1 << i for i in range(len(DOUBTS)))
+
+
+def test_the_truth_has_no_doubts():
+    judged = with_doubts(solution(), truth(), BIRD)
+    assert not judged.doubts.any()
+    assert flag_counts(judged.doubts) == {"ok": N * T, "unsure": 0, "contradicted": 0}
+    assert flagged_ranges(judged) == {}
+
+
+def test_every_doubt_has_its_cause():
+    seen = truth()
+    keypoints, confidence = seen.keypoints_px.copy(), seen.confidence.copy()
+    keypoints[0, 1] += 0.2 * seen.box_px[0, 1, 2:].max()
+    confidence[0, 2] = 0.4
+    masks = {**seen.masks, (1, 0): seen.masks[0, 0]}  # the mask of another bird, which lies elsewhere
+    ambiguity_deg = np.zeros((N, T))
+    ambiguity_deg[1, 1] = 170
+    valid = np.ones((N, T), bool)
+    valid[1, 3] = False
+    seen = dataclasses.replace(seen, keypoints_px=keypoints, confidence=confidence, masks=masks)
+    judged = with_doubts(solution(ambiguity_deg=ambiguity_deg, valid=valid), seen, BIRD)
+    np.testing.assert_array_equal(judged.doubts, [[0, FAR, WEAK, 0], [UNLIKE, SECOND, 0, -1]])
+    words = [["ok", "contradicted", "unsure", "ok"], ["contradicted", "unsure", "ok", ""]]
+    np.testing.assert_array_equal(flags(judged.doubts), words)
+    assert flagged_ranges(judged) == {
+        5: (
+            "frame 11 contradicted: keypoints far from the pose",
+            "frame 12 unsure: keypoints with low confidence",
+        ),
+        3: ("frame 10 contradicted: mask unlike the mesh", "frame 11 unsure: a second pose fits almost as well"),
+    }
+    assert np.isnan(keypoint_distances(seen, judged)[1, 3])
+
+
+def test_wide_error_bars_are_a_doubt():
+    cells = solution().cells(error_bars=True)
+    bars = {name: np.zeros_like(values) for name, values in cells.items() if name.endswith(("_sd", "_cov"))}
+    length = np.linalg.norm(
+        np.subtract(*(BIRD.keypoints[BIRD.keypoint_names.index(k)] for k in ("bill_tip", "tail_tip")))
+    )
+    for axis in range(3):
+        bars["keypoints_centred_cov"][0, :, :, axis, axis] = (0.11 * length) ** 2 / 3
+        bars["keypoints_centred_cov"][1, :, :, axis, axis] = (0.09 * length) ** 2 / 3
+    judged = with_doubts(solution(**bars, misfit=np.ones((N, T))), truth(), BIRD)
+    np.testing.assert_array_equal(judged.doubts, [[WIDE] * T, [0] * T])
+
+
+def test_outliers_have_a_large_modified_z_score():
+    rng = np.random.default_rng(0)
+    values = np.abs(rng.normal(1, 0.1, (10, 100)))
+    values[3, 4], values[5, 6] = 1.6, np.nan
+    known = values[np.isfinite(values)]
+    deviation = np.median(np.abs(known - np.median(known)))
+    score = 0.6745 * (values - np.median(known)) / deviation
+    np.testing.assert_array_equal(is_outlier(values), score > 3.5)
+    assert is_outlier(values)[3, 4]
+    assert is_outlier(values).sum() < 5
+    assert not is_outlier(np.array([[0.01] * 18 + [9.0]])).any()  # too few values
+    assert not is_outlier(np.full((3, 50), 0.2)).any()
+
+
+def test_codes():
+    assert doubt_texts(0) == doubt_texts(-1) == ()
+    assert doubt_texts(FAR + WIDE) == ("keypoints far from the pose", "error bars above 10 % of the length")
+    assert flag_counts(np.array([[-1, -1]])) == {}
+    np.testing.assert_array_equal(flags(np.array([[FAR + WIDE, WIDE, 0, -1]])), [["contradicted", "unsure", "ok", ""]])
+
+
+def test_frames_with_the_same_flag_are_one_range():
+    doubts = np.array([[FAR, FAR + UNLIKE, 0, FAR], [WIDE, -1, WIDE, WIDE]])
+    first = "frames 10 to 11 contradicted: keypoints far from the pose; mask unlike the mesh"
+    wide = "unsure: error bars above 10 % of the length"
+    assert flagged_ranges(solution(doubts=doubts)) == {
+        5: (first, "frame 14 contradicted: keypoints far from the pose"),
+        3: (f"frame 10 {wide}", f"frames 12 to 14 {wide}"),
+    }
+
+
+def test_without_masks_only_keypoints_are_compared():
+    seen = dataclasses.replace(truth(), masks={})
+    assert not with_doubts(solution(), seen, BIRD).doubts.any()
