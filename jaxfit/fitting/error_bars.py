@@ -15,9 +15,9 @@ Assumptions: the covariance is not H⁻¹ alone. `fitting/sandwich.py` adds what
 in the whole window does to the fit, and what errors of keypoints do that agree between frames.
 
 Misfit: if the keypoints lie farther from the fitted pose than the objective assumes, the posterior is too narrow. The
-noise, and H⁻¹ with it, is multiplied by one factor for a window, the ratio of the median squared standardised residual to its
-expected median, if this is above 1. A residual is standardised by the scale of its likelihood and by its leverage: a
-keypoint that determines the pose pulls the pose to itself, and its residual is too small.
+noise, and H⁻¹ with it, is multiplied by one factor for a window, the ratio of the median squared standardised residual
+to its expected median, if this is above 1. A residual is standardised by the scale of its likelihood and by its
+leverage: a keypoint that determines the pose pulls the pose to itself, and its residual is too small.
 
 The error bars are those of the reported pose. Where a second pose explains the keypoints almost as well
 (`Solution.ambiguity_deg`), they do not contain the other pose.
@@ -334,7 +334,7 @@ def _covariance(
         factor = time_factor(lag_correlations(error_px, counted), fit_correlation(J, window.posterior, present))
         if factor > 1:
             data = data_blocks(J, counted * noise.precision(error_px), len(window.columns.own))
-            covariance = covariance + (factor - 1) * spread(window.precision, data)
+            covariance = covariance + (factor - 1) * spread(window.precision, covariance, data)
     prior = problem.hyperparameters.settings.get("pose_prior")
     covariance = misfit * covariance
     if prior is not None:

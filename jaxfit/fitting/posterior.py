@@ -94,7 +94,7 @@ class Posterior(NamedTuple):
         return T * L + C
 
     def frame_covariance(self) -> Float[np.ndarray, "T P P"]:
-        """Return the covariance of the P = L + C parameters of each frame: its own, followed by the shared parameters."""
+        """Return the covariance of the P = L + C parameters of each frame: its own, then the shared parameters."""
         own, border, corner = self.covariance.band[0], self.covariance.border, self.covariance.corner
         shared = np.broadcast_to(corner, (len(own), *corner.shape))
         return np.block([[own, border], [border.transpose(0, 2, 1), shared]])

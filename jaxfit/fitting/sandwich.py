@@ -54,17 +54,18 @@ def data_blocks(J: Float[np.ndarray, "T K 2 P"], precision: Float[np.ndarray, "T
     return Blocks(band, full[:, :own, own:], full[:, own:, own:].sum(axis=0))
 
 
-def spread(H: Blocks, B: Blocks) -> Float[np.ndarray, "T P P"]:
+def spread(H: Blocks, covariance: Float[np.ndarray, "T P P"], B: Blocks) -> Float[np.ndarray, "T P P"]:
     """Return H⁻¹B·H⁻¹ for the P = L + C parameters of each frame.
 
-    H⁻¹B·H⁻¹ is minus the derivative of (H + ε·B)⁻¹ at ε = 0, so two selected inverses give its blocks.
+    H⁻¹B·H⁻¹ is minus the derivative of (H + ε·B)⁻¹ at ε = 0, so a second selected inverse gives its blocks.
 
     Args:
         H: a positive definite matrix.
+        covariance: the blocks of H⁻¹, as `Posterior.frame_covariance`.
         B: a positive semi-definite matrix, not much greater than H.
     """
     more = Blocks(*(h + STEP * b for h, b in zip(H, B, strict=True)))
-    return (invert_blocks(H).frame_covariance() - invert_blocks(more).frame_covariance()) / STEP
+    return (covariance - invert_blocks(more).frame_covariance()) / STEP
 
 
 def constant_deviation(

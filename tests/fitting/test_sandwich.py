@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import toeplitz
 from support.precisions import blocks, dense, random_precision
 
-from jaxfit.fitting.posterior import Columns, factorise, posterior_of, solve_blocks
+from jaxfit.fitting.posterior import Columns, factorise, invert_blocks, posterior_of, solve_blocks
 from jaxfit.fitting.sandwich import (
     constant_deviation,
     data_blocks,
@@ -25,7 +25,7 @@ def test_solutions_and_spread_are_those_of_dense_matrices(frames, L, C):
     np.testing.assert_allclose(found, np.linalg.solve(dense(H), right), atol=1e-9)
     inverse = np.linalg.inv(dense(H))
     expected = inverse @ dense(B) @ inverse
-    for t, own_frame in enumerate(spread(H, B)):
+    for t, own_frame in enumerate(spread(H, invert_blocks(H).frame_covariance(), B)):
         at = [*range(t * L, (t + 1) * L), *range(frames * L, frames * L + C)]
         np.testing.assert_allclose(own_frame, expected[np.ix_(at, at)], rtol=0.01, atol=0.01 * np.abs(expected).max())
 
@@ -114,7 +114,9 @@ def test_noise_that_agrees_between_frames():
     kappa = fit_correlation(J, line.window.posterior, present)
     factor = time_factor(rho ** np.arange(1, line.frames), kappa)
     data = data_blocks(J, np.full((line.frames, 1), line.noise_precision), 2)
-    found = factor * np.einsum("tii->ti", spread(line.window.precision, data))[5:-5].mean(axis=0)
+    found = factor * np.einsum(
+        "tii->ti", spread(line.window.precision, line.window.posterior.frame_covariance(), data)
+    )[5:-5].mean(axis=0)
     assert (measured > 2 * independent).all()
     np.testing.assert_allclose(found, measured, rtol=0.25)
 
