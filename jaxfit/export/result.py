@@ -102,8 +102,8 @@ CONFIDENCE = (
 SD = (
     "standard deviation of the fit (Laplace approximation): of image positions in pixels; of positions in space "
     "relative to the mean of the keypoints, because one camera does not observe distance and size; of rotations in "
-    "radians about the axes of the rotated part. The terms of the fit treat all errors as independent, so with "
-    "detections of networks these values are too small: 6 to 18 times on a simulated film"
+    "radians about the axes of the rotated part. The terms of the fit treat errors of different keypoints as "
+    "independent, so with detections of networks these values are too small: 3 to 4 times in a simulated scene"
 )
 """Definition of the standard deviations of an export."""
 

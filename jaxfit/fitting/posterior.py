@@ -8,7 +8,8 @@ and a border for the parameters that all frames share (common scale, bone length
 
 Products with H at structured probes give the blocks: frames t, t + 5, t + 10, … do not interact, so one probe gives one
 column of all their blocks. A Cholesky factorisation forward in time and the selected inverse backward in time give the
-log-determinant and the blocks of H⁻¹ inside the band.
+log-determinant and the blocks of H⁻¹ inside the band. `fitting/sandwich.py` widens H⁻¹ for errors that the objective
+does not assume.
 
 The curvature of a robust kernel includes its second derivative (`objective.residuals.residual_curvature`). Derivatives
 of second order of the pose (of the residuals) are left out, as in Gauss-Newton.
@@ -99,15 +100,29 @@ class Posterior(NamedTuple):
         return np.block([[own, border], [border.transpose(0, 2, 1), shared]])
 
 
-def invert_blocks(H: Blocks) -> Posterior:
-    """Return the Gaussian with the precision H: log-determinant and selected inverse.
+class Factors(NamedTuple):
+    """The block factorisation of a positive definite H, by elimination of the frames forward in time."""
+
+    inverses: Float[np.ndarray, "T L L"]
+    """Inverse of the block of each frame after the elimination of the frames before."""
+    gains: Float[np.ndarray, "2 T L L"]
+    """Entry k − 1, t: `inverses[t]` times the block of the frames t and t + k after the same elimination."""
+    border: Float[np.ndarray, "T L C"]
+    """A⁻¹U."""
+    corner: Float[np.ndarray, "C C"]
+    """The block of H⁻¹ of the shared parameters: the inverse of S − UᵀA⁻¹U."""
+    log_determinant: float
+    """log |H|."""
+
+
+def factorise(H: Blocks) -> Factors:
+    """Return the factorisation of H.
 
     Raises:
         numpy.linalg.LinAlgError: H is not positive definite.
     """
     (_, T, L, _), C = H.band.shape, len(H.corner)
     band = np.concatenate([H.band, np.zeros((3, BANDWIDTH, L, L))], axis=1)  # frames after the last: 0
-    rest = np.concatenate([H.border, np.zeros((BANDWIDTH, L, C))])
     (invert_triangle,) = get_lapack_funcs(("trtri",), dtype=np.float64)
     inverses, gains, log_determinant = np.zeros((T, L, L)), np.zeros((2, T, L, L)), 0.0
     for t in range(T):
@@ -118,27 +133,64 @@ def invert_blocks(H: Blocks) -> Posterior:
         inverses[t] = inverse_factor.T @ inverse_factor
         for k in (1, 2):
             gains[k - 1, t] = inverses[t] @ band[k, t]
-            rest[t + k] -= gains[k - 1, t].T @ rest[t]
         band[0, t + 1] -= band[1, t].T @ gains[0, t]
         band[1, t + 1] -= band[1, t].T @ gains[1, t]
         band[0, t + 2] -= band[2, t].T @ gains[1, t]
-    # backward: V = A⁻¹U, and the blocks of A⁻¹ inside the band
-    inside, V = np.zeros_like(band), np.zeros_like(rest)
+    border = _solve_band(inverses, gains, H.border)
+    schur = H.corner - np.einsum("tic,tid->cd", H.border, border)
+    factor = np.linalg.cholesky((schur + schur.T) / 2)
+    log_determinant += 2 * np.log(np.diagonal(factor)).sum()
+    corner = cho_solve((factor, True), np.eye(C)) if C else np.zeros((0, 0))
+    return Factors(inverses, gains, border, corner, float(log_determinant))
+
+
+def _solve_band(inverses: np.ndarray, gains: np.ndarray, right: Float[np.ndarray, "T L R"]) -> np.ndarray:
+    """Return A⁻¹ times some right-hand sides, (T, L, R)."""
+    T = len(inverses)
+    rest = np.concatenate([right, np.zeros((BANDWIDTH, *right.shape[1:]))])
+    for t in range(T):
+        for k in (1, 2):
+            rest[t + k] -= gains[k - 1, t].T @ rest[t]
+    found = np.zeros_like(rest)
+    for t in reversed(range(T)):
+        found[t] = inverses[t] @ rest[t] - gains[0, t] @ found[t + 1] - gains[1, t] @ found[t + 2]
+    return found[:T]
+
+
+def solve_blocks(
+    factors: Factors, own: Float[np.ndarray, "T L R"], shared: Float[np.ndarray, "C R"]
+) -> tuple[Float[np.ndarray, "T L R"], Float[np.ndarray, "C R"]]:
+    """Return x with H·x = b for R right-hand sides b: the part of the frames and that of the shared parameters."""
+    inside = _solve_band(factors.inverses, factors.gains, own)
+    # UᵀA⁻¹b = (A⁻¹U)ᵀb
+    of_window = factors.corner @ (shared - np.einsum("tic,tir->cr", factors.border, own))
+    return inside - factors.border @ of_window, of_window
+
+
+def invert_blocks(H: Blocks, factors: Factors | None = None) -> Posterior:
+    """Return the Gaussian with the precision H: log-determinant and selected inverse.
+
+    Args:
+        H: the precision.
+        factors: its factorisation (`factorise`), where it exists.
+
+    Raises:
+        numpy.linalg.LinAlgError: H is not positive definite.
+    """
+    (_, T, L, _) = H.band.shape
+    inverses, gains, V, corner, log_determinant = factorise(H) if factors is None else factors
+    # backward: the blocks of A⁻¹ inside the band
+    inside = np.zeros((BANDWIDTH + 1, T + BANDWIDTH, L, L))
     for t in reversed(range(T)):
         first, second = gains[:, t]
         inside[1, t] = -first @ inside[0, t + 1] - second @ inside[1, t + 1].T
         inside[2, t] = -first @ inside[1, t + 1] - second @ inside[0, t + 2]
         own = inverses[t] - inside[1, t] @ first.T - inside[2, t] @ second.T
         inside[0, t] = (own + own.T) / 2
-        V[t] = inverses[t] @ rest[t] - first @ V[t + 1] - second @ V[t + 2]
-    V, inside = V[:T], inside[:, :T]
-    schur = H.corner - np.einsum("tic,tid->cd", H.border, V)
-    factor = np.linalg.cholesky((schur + schur.T) / 2)
-    log_determinant += 2 * np.log(np.diagonal(factor)).sum()
-    corner = cho_solve((factor, True), np.eye(C)) if C else np.zeros((0, 0))
+    inside = inside[:, :T]
     for k in range(BANDWIDTH + 1):
         inside[k, : T - k] += V[: T - k] @ corner @ V[k:].swapaxes(1, 2)
-    return Posterior(Blocks(inside, -V @ corner, corner), float(log_determinant))
+    return Posterior(Blocks(inside, -V @ corner, corner), log_determinant)
 
 
 def trace_product(covariance: Blocks, H: Blocks) -> float:
@@ -255,6 +307,10 @@ class WindowPosterior(NamedTuple):
     log_volume: float
     """log |H| − log |B| with B the precision of the broad prior: the log-determinant for the Laplace approximation of
     the evidence, log p ≈ −E − ½·log_volume, where the broad prior is normalised. Parameters without data count 0."""
+    precision: Blocks
+    """H, with the broad prior."""
+    factors: Factors
+    """The factorisation of H."""
 
 
 def optimised_columns(program: Program, step_size: Pose, pose: Pose) -> Columns:
@@ -361,12 +417,14 @@ def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -
     own, shared = broad[:, columns.own], broad[0, columns.shared]
     of_frames, of_window = H.diagonal
     for ridge in RIDGES:
+        precision = H.plus_diagonal(own + ridge * of_frames, shared + ridge * of_window)
         try:
-            posterior = invert_blocks(H.plus_diagonal(own + ridge * of_frames, shared + ridge * of_window))
+            factors = factorise(precision)
         except np.linalg.LinAlgError:
             continue
         broad_log = float(np.log(own).sum() + np.log(shared).sum())
-        return WindowPosterior(posterior, columns, posterior.log_determinant - broad_log)
+        posterior = invert_blocks(precision, factors)
+        return WindowPosterior(posterior, columns, factors.log_determinant - broad_log, precision, factors)
     return "the curvature of the objective is not positive definite"
 
 
