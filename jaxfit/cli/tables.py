@@ -122,12 +122,11 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
 
 def flag_quality_line(result: Evaluation) -> str:
     """Return a line that says how well the flags find wrong poses; empty without true poses or flags."""
-    quality = result.flags
-    if not quality:
+    if not result.flags:
         return ""
-    found = f"{quality['found']:.0f} of {counted(int(quality['wrong']), 'wrong pose')}"
-    right = f"{quality['found']:.0f} of {counted(int(quality['flagged']), 'flagged pose')} wrong"
-    return f"flags find {found} (mean error above 10 % of the length); {right}"
+    wrong, flagged, found = (round(result.flags[name]) for name in ("wrong", "flagged", "found"))
+    subject = f"{found} of {counted(wrong, 'pose')} with a joint wrong by more than 10 % of the length"
+    return f"flagged: {subject}, and {counted(flagged - found, 'other pose')}"
 
 
 def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -> list[Table]:

@@ -61,9 +61,9 @@ class Evaluation:
     """Keypoint → COLUMNS_KEYPOINT of this keypoint over all birds, and the number of frames that annotate the
     keypoint as `count`."""
     flags: dict[str, float] = field(default_factory=dict)
-    """Number of poses with a 3D error that are `wrong` (mean error of the joints above `WRONG_SHARE` of the body
-    length), `flagged` (`unsure` or `contradicted`), and both (`found`). Empty without true poses, or if the result has
-    no flags."""
+    """Number of poses with a 3D error that are `wrong` (a joint wrong by more than `WRONG_SHARE` of the body length),
+    `flagged` (`unsure` or `contradicted`), and both (`found`). Empty without true poses, or if the result has no
+    flags."""
     sums: BirdSums = field(default_factory=lambda: BirdSums((), {}, {}))
     """Sums per bird, from which `paired_ratio` compares results of the same birds."""
 
@@ -218,7 +218,7 @@ def _flag_quality(solution: Solution, error: Float[np.ndarray, "N T J"]) -> dict
     measured = np.isfinite(error).any(-1) & (found != "")
     if not measured.any():
         return {}
-    wrong = np.nanmean(error[measured], axis=-1) > WRONG_SHARE
+    wrong = np.nanmax(error[measured], axis=-1) > WRONG_SHARE
     flagged = found[measured] != OK
     return {"wrong": float(wrong.sum()), "flagged": float(flagged.sum()), "found": float((wrong & flagged).sum())}
 

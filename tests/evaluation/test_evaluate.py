@@ -196,3 +196,15 @@ def test_progress_counts_the_birds():
 
     evaluate(solution(), BIRD, truth(), progress=watch)
     assert reported[0] == N * T == -sum(reported[1:])
+
+
+def test_wrong_poses_are_counted_with_their_flags():
+    """Two poses have joints turned far away, and one of them is flagged."""
+    body_pose, doubts = solution().body_pose.copy(), np.zeros((N, T), np.int8)
+    body_pose[0, 1:3] += 1.5
+    doubts[0, 1] = doubts[1, 3] = 1
+    exact = Truth(truth(), solution())
+    result = evaluate(solution(body_pose=body_pose, doubts=doubts), BIRD, exact)
+    assert result.flags == {"wrong": 2, "flagged": 2, "found": 1}
+    assert evaluate(solution(body_pose=body_pose), BIRD, exact).flags == {}
+    assert evaluate(solution(doubts=doubts), BIRD, truth()).flags == {}
