@@ -156,8 +156,6 @@ class StageConfig:
     """Whether Adam starts with the moments of the previous stage instead of zeros."""
     keep_best: bool = False
     """Whether only the best hypothesis of each bird continues after this stage."""
-    near_poses: bool = False
-    """Whether frames that are far from their keypoints after this stage take over the pose of a near frame."""
 
     def __post_init__(self):
         require_within(self, 1, limits.STEPS, "steps")

@@ -221,7 +221,7 @@ def _learn_values(
     batch = gather_batch(shared, task)
     stages = (*config.stages[:-1], replace(stage, steps=max(stage.steps // 2, 1)))
     fitted = fit_batch(model, [replace(config, stages=stages, error_bars=False)], batch, report_progress)
-    more = replace(stage, steps=max(stage.steps // 4, 1), carry_moments=False, near_poses=False, keep_best=False)
+    more = replace(stage, steps=max(stage.steps // 4, 1), carry_moments=False, keep_best=False)
     values: dict[str, float] = {}
     for n in range(ROUNDS):
         usable = fitted.failure == ""

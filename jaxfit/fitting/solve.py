@@ -410,7 +410,6 @@ def _continuation(before: StageConfig, stage: StageConfig) -> StageConfig:
         override=stage.override,
         carry_moments=before.solver == "adam",
         keep_best=stage.keep_best,
-        near_poses=stage.near_poses,
     )
 
 

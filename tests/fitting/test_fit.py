@@ -302,18 +302,6 @@ def test_the_better_hypothesis_is_kept(observed, after_first):
         assert not fitted.ambiguity_deg.any()  # the reversed pose is much less likely
 
 
-@pytest.mark.parametrize("near_poses", [True, False])
-def test_a_stage_ends_with_the_poses_of_near_frames(observed, near_poses):
-    """The initial pose is reversed in one frame, and the stages hardly move."""
-    settings = two_stages(True)
-    first, second = (dataclasses.replace(stage, steps=1, learning_rate=1e-6) for stage in settings.stages)
-    settings = dataclasses.replace(settings, stages=(dataclasses.replace(first, near_poses=near_poses), second))
-    fitted = fit_from(observed, settings, [reversed_except(np.arange(T) != 2)])
-    error_px = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of(truths()[:1]), axis=-1)
-    assert (error_px[0, 2].mean() < 2) == near_poses
-    assert error_px[0, np.arange(T) != 2].mean() < 0.1
-
-
 def test_poses_of_frames_without_the_bird_are_no_second_pose(observed):
     """The hypotheses differ everywhere, but agree in most frames without the bird."""
     settings = two_stages(True)

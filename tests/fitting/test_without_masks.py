@@ -32,7 +32,6 @@ def test_the_fit_ends_with_the_settings_of_its_last_stage():
     first, last = without_mask_stages(load_config("map")).stages
     assert first.override
     assert not last.override
-    assert not last.near_poses
 
 
 def total_loss(observations, config, bird=BIRD):
