@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfit.data.flags import flags, with_flag
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import PosedBirds
 from jaxfit.data.solution import Solution
@@ -86,7 +87,8 @@ def contact_sheet(
     Left tile: the annotated mask (grey) and keypoints (black rings), the outline of the fitted mesh (green) and the
     fitted keypoints (red), with lines to the annotated keypoints. With footage, the left tile shows the footage, the
     outline of the mesh in the colour of the track, fitted keypoints as white dots and annotated keypoints as yellow
-    rings. Right tile: the mesh as the camera sees it, lit from above. A legend above the tiles explains these symbols.
+    rings. The flag of a pose that is not `ok` stands beside the number of the frame. Right tile: the mesh as the camera
+    sees it, lit from above. A legend above the tiles explains these symbols.
 
     Args:
         solution, bird: a result and its model.
@@ -191,6 +193,7 @@ def _observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footag
     for k in range(len(fitted)) if footage is not None else np.flatnonzero(confidence > 0):
         dot(tile, fitted[k], 2, fill, None if footage is None else INK)
     name, frame = f"track {solution.track_id[n]}", f"frame {solution.frame_index[t]}"
+    frame = with_flag(frame, flags(np.asarray(solution.doubts)[n : n + 1, t : t + 1]).item())
     if footage is None:
         text(tile, f"{name}  {frame}", 6, 11, 11, ON_PAPER_DETECTED)
     else:

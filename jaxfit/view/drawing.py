@@ -48,6 +48,15 @@ def line(image: UInt8[np.ndarray, "H W 3"], a_px, b_px, colour: Colour, width: i
     cv2.line(image, fixed(a_px), fixed(b_px), colour, width, cv2.LINE_AA, SHIFT)
 
 
+def closed_curve(
+    image: UInt8[np.ndarray, "H W 3"], points_px: Float[np.ndarray, "P 2"], colour: Colour, width: int = 1
+) -> None:
+    """Draw a closed line through positions in pixels, with a dark edge, so that it contrasts with any background."""
+    at = np.array([fixed(point) for point in points_px], np.int32)
+    cv2.polylines(image, [at], True, INK, width + 1, cv2.LINE_AA, SHIFT)
+    cv2.polylines(image, [at], True, colour, width, cv2.LINE_AA, SHIFT)
+
+
 def text(image: UInt8[np.ndarray, "H W 3"], words: str, left: float, middle: float, size: float, colour=INK) -> None:
     """Draw text from column `left` on, `size` pixels high, vertically centred on row `middle`."""
     cv2.putText(
