@@ -182,11 +182,11 @@ def regions_95(
     Returns:
         P points around every ellipse; NaN where the covariance is not finite.
     """
-    known = np.isfinite(covariance).all((1, 2)) & np.isfinite(points_px).all(1)
-    variance, axes = np.linalg.eigh(np.where(known[:, None, None], covariance, 0).astype(np.float64))
+    known = np.isfinite(covariance).all((1, 2), keepdims=True)
+    variance, axes = np.linalg.eigh(np.where(known, covariance, 0).astype(np.float64))
     semi = np.minimum(np.sqrt(REGION_95 * np.maximum(variance, 0)), largest_px)
     around = points_px[:, None] + _CIRCLE @ (axes * semi[:, None]).swapaxes(1, 2)
-    return np.where(known[:, None, None], around, np.nan)
+    return np.where(known, around, np.nan)
 
 
 def draw_regions(image: UInt8[np.ndarray, "H W 3"], bird: DrawnBird, style: Style) -> None:

@@ -20,7 +20,7 @@ from jaxfit.simulation.flock import smooth_motion
 from jaxfit.video.reader import probe_video, read_frames
 from jaxfit.view.birds import DrawnBird, Style, draw_birds, draw_regions, regions_95
 from jaxfit.view.colours import DETECTED, FITTED, TRACK_COLOURS, track_colour
-from jaxfit.view.contact_sheet import TILE_PX
+from jaxfit.view.contact_sheet import TILE_PX, contact_sheet
 from jaxfit.view.legend import FLAGGED, REGION, Legend
 from jaxfit.view.mesh_views import SideViews, up_direction
 from jaxfit.view.overlay import CHUNK, overlay, overlay_frame
@@ -251,6 +251,24 @@ def test_the_legend_explains_regions_and_flags(monkeypatch):
     assert words[6:] == [REGION, FLAGGED]
     assert "95 % region" in REGION
     assert "contradicted" in FLAGGED
+
+
+@pytest.mark.parametrize("on_footage", [True, False])
+def test_the_contact_sheet_shows_flags(tmp_path, monkeypatch, on_footage):
+    words = []
+    for module in ("contact_sheet", "legend"):
+        monkeypatch.setattr(f"jaxfit.view.{module}.text", lambda image, text, *more: words.append(text))
+    monkeypatch.setattr("jaxfit.view.contact_sheet.tag", lambda image, text, *more: words.append(text))
+    doubts = np.array([[0, 1, 0, 0, 0, 4], [0, 0, -1, 0, 0, 0]], np.int8)
+    tile = np.zeros((TILE_PX, TILE_PX, 3), np.uint8)
+    footage = {(n, t): tile for n in range(N) for t in range(T)} if on_footage else None
+    made = dataclasses.replace(solution(), doubts=doubts)
+    contact_sheet(made, BIRD, None, tmp_path / "sheet.png", columns=T, footage=footage)
+    assert f"track 4  frame {FIRST + 1} contradicted" in words
+    assert f"track 4  frame {FIRST + 5} unsure" in words
+    assert f"track 4  frame {FIRST}" in words
+    assert f"track 11  frame {FIRST + 5}" in words
+    assert FLAGGED in words
 
 
 def test_only_every_second_frame_and_a_small_picture(tmp_path):

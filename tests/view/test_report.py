@@ -119,7 +119,7 @@ def test_the_table_shows_error_bars(written, folder, tmp_path):
     write_result(tmp_path / "bars", **error_bars(shape, keypoints_centred_cov=covariance), doubts=doubts)
     page = page_of(tmp_path / "bars")
     rows = {row[0]: row[1:] for row in page.rows}
-    assert rows["Track"][-2] == "Error bars% of length"
+    assert rows["Track"][-2] == "Error bars% of length, 0 to 10 %"
     # the text of a cell also has the title of the curve
     assert rows["3"][-2].startswith("5.0")
     assert rows["8"][-2] == "–"  # no pose
@@ -127,9 +127,9 @@ def test_the_table_shows_error_bars(written, folder, tmp_path):
     row = (tmp_path / "bars" / "report.html").read_text().split("5.0<svg")[1].split("</svg>")[0]
     points = re.search(r'class="curve" d="M([^"]*)"', row)
     heights = [float(point.split()[1]) for point in points[1].split("L")]
-    np.testing.assert_allclose(heights, 22 * (1 - np.array([0.1, 0.15, 0.25, 0.5, 0.95])), atol=0.06)
-    assert re.search(r'class="s7" d="M2 0.75h1v', row)
-    assert re.search(r'class="s6" d="M3 0.75h2v', row)
+    np.testing.assert_allclose(heights, 22 * (1 - np.array([0.2, 0.3, 0.5, 0.95, 0.95])), atol=0.06)
+    assert re.search(r'class="s7" d="M2 0h1v', row)
+    assert re.search(r'class="s6" d="M3 0h2v', row)
 
 
 def test_the_page_stands_alone_and_shows_names_as_text(folder):

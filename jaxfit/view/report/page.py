@@ -102,8 +102,8 @@ _MEANINGS = (
         "Error bars",
         "Error of the keypoints in space that the fit expects: root mean square over the keypoints, in per cent of the "
         "length of the bird, without the error of the position of the whole bird. The number is the median. The curve "
-        "goes from 0 % to 20 %; above the line at 10 %, a pose is unsure. Marks at the lower edge show flags. With "
-        "detections of networks, error bars are too narrow.",
+        "goes from 0 % to 10 %, above which a pose is unsure. Marks at the upper edge show the flags unsure and "
+        "contradicted. With detections of networks, error bars are too narrow.",
     ),
     ("Objective", "Final value of the objective of the fit for each pose. Compare birds of one result only."),
     (
@@ -265,7 +265,7 @@ def _table(report: Report) -> Html:
         names += [("Detections", "number"), ("Coverage", "%"), ("Gaps", "number"), ("Confidence", "0 to 1")]
         names += [("Jitter", "% of box")]
     names.append(("Objective", "per pose"))
-    names += [("Error bars", "% of length")] if report.has_error_bars else []
+    names += [("Error bars", "% of length, 0 to 10 %" if over_time else "% of length")] if report.has_error_bars else []
     names += [("Size in the image", "±30 %")] if over_time else []
     head = element("tr", *(element("th", name, element("small", unit)) for name, unit in names))
     rows = [element("tr", *_cells(report, track)) for track in report.tracks]

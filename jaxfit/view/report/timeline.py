@@ -115,9 +115,9 @@ def size_curve(track: Track) -> Html:
 
 
 def error_curve(track: Track) -> Html:
-    """Return the error that the error bars expect over the frames of a track, as a small curve from 0 to 20 %.
+    """Return the error that the error bars expect over the frames of a track, as a small curve from 0 to `WRONG_SHARE`.
 
-    The line in the middle is the limit of the flag `unsure`; marks at the lower edge are the worst flags.
+    The upper edge is the limit of the flag `unsure`. Marks at the upper edge are the worst flags of the frames.
     """
     width, height = _CURVE_PX
     at = np.flatnonzero(np.isfinite(track.expected_error))
@@ -132,12 +132,12 @@ def error_curve(track: Track) -> Html:
         worst[i] = max(_FLAGGED.get(flag, 0) for flag in track.flags[here].tolist())
         known = track.expected_error[here][np.isfinite(track.expected_error[here])]
         if len(known):
-            y = height * (1 - min(float(known.mean()) / (2 * WRONG_SHARE), 0.95))
+            y = height * (1 - min(float(known.mean()) / WRONG_SHARE, 0.95))
             lines.append(f"{'L' if drawing else 'M'}{(i + 0.5) * width / columns:.1f} {y:.1f}")
         drawing = bool(len(known))
     low, high = np.quantile(track.expected_error[at], [0.05, 0.95])
     title = element("title", f"90 % of the frames: {low:.1%} to {high:.1%}")
-    marks = [_bars(worst, state, 0.75, 0.25) for state in _FLAGGED.values()]
+    marks = [_bars(worst, state, 0, 0.25) for state in _FLAGGED.values()]
     marks = element("g", *marks, transform=f"scale({width / columns:.4f} {height})")
     middle = element("path", class_="middle", d=f"M0 {height / 2}H{width}")
     paths = title, marks, middle, element("path", class_="curve", d="".join(lines))
