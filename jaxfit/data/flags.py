@@ -112,7 +112,7 @@ def with_doubts(
         is_outlier(far) | (far > WRONG_SHARE),
         is_outlier(1 - overlap) | (overlap < LEAST_IOU),
         np.asarray(solution.ambiguity_deg) > 0,
-        _mean_sd(solution, bird) > WRONG_SHARE,
+        expected_error(solution, bird) > WRONG_SHARE,
         observations.confidence.mean(-1) < LEAST_CONFIDENCE,
     )
     doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
@@ -143,6 +143,11 @@ def flags(doubts: Int8[np.ndarray, "N T"]) -> np.ndarray:
     return np.select(conditions, ["", CONTRADICTED, UNSURE], OK)
 
 
+def with_flag(name: str, flag: str) -> str:
+    """Return a name with the flag of a pose, for pictures; the name alone for `ok` and for poses without a flag."""
+    return f"{name} {flag}" if flag in (UNSURE, CONTRADICTED) else name
+
+
 def doubt_texts(doubts: int) -> tuple[str, ...]:
     """Return the texts of the doubts about one pose."""
     return tuple(doubt.text for i, doubt in enumerate(DOUBTS) if doubts > 0 and doubts >> i & 1)
@@ -155,28 +160,37 @@ def flag_counts(doubts: Int8[np.ndarray, "N T"]) -> dict[str, int]:
     return counts if any(counts.values()) else {}
 
 
+def flag_ranges(doubts: Int8[np.ndarray, "T"]) -> list[tuple[int, int, tuple[str, ...]]]:
+    """Return the ranges of frames whose poses have the same flag: first position, position after the last, reasons."""
+    found = flags(doubts[None])[0]
+    edges = (np.flatnonzero(found[1:] != found[:-1]) + 1).tolist()
+    pairs = zip([0, *edges], [*edges, len(found)], strict=True)
+    return [(a, b, doubt_texts(int(np.bitwise_or.reduce(doubts[a:b])))) for a, b in pairs if a < b]
+
+
 def flagged_ranges(solution: Solution) -> dict[int, tuple[str, ...]]:
     """Return track → a text for each range of frames whose poses are not `ok`, with the reasons."""
     assert solution.doubts is not None  # `Solution` replaces None
     found, texts = flags(solution.doubts), {}
     for n, track in enumerate(solution.track_id.tolist()):
-        edges = np.flatnonzero(found[n, 1:] != found[n, :-1]) + 1
         ranges = []
-        for a, b in zip([0, *edges.tolist()], [*edges.tolist(), found.shape[1]], strict=True):
-            if a < b and found[n, a] in (UNSURE, CONTRADICTED):
+        for a, b, reasons in flag_ranges(solution.doubts[n]):
+            if found[n, a] in (UNSURE, CONTRADICTED):
                 numbers = solution.frame_index[[a, b - 1]].tolist()
                 where = f"frame {numbers[0]}" if b - a == 1 else f"frames {numbers[0]} to {numbers[1]}"
-                reasons = doubt_texts(int(np.bitwise_or.reduce(solution.doubts[n, a:b])))
                 ranges.append(f"{where} {found[n, a]}: {'; '.join(reasons)}")
         if ranges:
             texts[track] = tuple(ranges)
     return texts
 
 
-def _mean_sd(solution: Solution, bird: Bird) -> Float[np.ndarray, "N T"]:
-    """Return the RMS error that the error bars expect of the keypoints, as a share of the length of the bird."""
+def expected_error(solution: Solution, bird: Bird) -> Float[np.ndarray, "N T"]:
+    """Return the RMS error that the error bars expect of the keypoints in space, as a share of the length of the bird.
+
+    The error is relative to the mean of the keypoints. NaN without error bars.
+    """
     if solution.keypoints_centred_cov is None:
-        return np.zeros(solution.valid.shape)
+        return np.full(solution.valid.shape, np.nan)
     variance = np.trace(solution.keypoints_centred_cov, axis1=-2, axis2=-1).mean(-1)
     with np.errstate(invalid="ignore"):
         return np.sqrt(variance) / (rest_length(bird) * solution.scale)

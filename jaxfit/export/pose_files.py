@@ -25,7 +25,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jaxfit.data.flags import flags
+from jaxfit.data.flags import flag_ranges, flags
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.write_deeplabcut import write_deeplabcut_predictions
 from jaxfit.data.formats.write_sleap import write_sleap_project
@@ -298,9 +298,10 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str
     file.add_acquisition(footage)
     edges = np.array(skeleton_pairs(s.keypoint_names), np.uint8).reshape(-1, 2)
     skeleton = ndx_pose.Skeleton(name="bird", nodes=list(s.keypoint_names), edges=edges, subject=subject)
+    series = _series(exported, n)
     pose = ndx_pose.PoseEstimation(
         name="PoseEstimation",
-        pose_estimation_series=_series(exported, n),
+        pose_estimation_series=series,
         description=f"projected keypoints of the fitted mesh; the fit ended with the status: {facts['status']}",
         original_videos=[video],
         scorer="jaxfit",
@@ -312,19 +313,49 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str
     behaviour = file.create_processing_module("behavior", "poses of the bird")
     behaviour.add(ndx_pose.Skeletons(skeletons=[skeleton]))
     behaviour.add(pose)
+    sd = exported.keypoints_px_sd
+    if sd is not None:
+        description = f"axes: time, node of the skeleton, (x, y). {SD}"
+        timing = {"unit": "pixels", **_timing(exported, series[0])}
+        behaviour.add(pynwb.TimeSeries(name="keypoints_sd", data=sd[n], description=description, **timing))
+    intervals = _flag_intervals(exported, n)
+    if intervals is not None:
+        file.add_time_intervals(intervals)
     with pynwb.NWBHDF5IO(path, "w") as io:
         io.write(file)
+
+
+def _flag_intervals(exported: Exported, n: int) -> Any:
+    """Return the flags of the poses, one interval for a range of frames with the same flag; None without flags."""
+    s, frame_s = exported.solution, 1 / exported.sampling_fps
+    doubts = np.asarray(s.doubts)[n]
+    found, times = flags(doubts[None])[0], exported.times_s
+    rows = [(a, b, reasons) for a, b, reasons in flag_ranges(doubts) if found[a]]
+    if not rows:
+        return None
+    description = "flags of poses: whether the detections agree with the pose"
+    intervals = _library("pynwb").epoch.TimeIntervals(name="pose_flags", description=description)
+    intervals.add_column("flag", "ok, unsure (not determined by the detections) or contradicted by the detections")
+    intervals.add_column("doubts", "the reasons; empty for ok")
+    for a, b, reasons in rows:
+        start, stop = float(times[a]), float(times[b - 1] + frame_s)
+        intervals.add_row(start_time=start, stop_time=stop, flag=str(found[a]), doubts="; ".join(reasons))
+    return intervals
+
+
+def _timing(exported: Exported, first: Any = None) -> dict[str, Any]:
+    """Return the times of a series: start and rate where frames are even, else times, as a link to `first` if given."""
+    times = exported.times_s
+    steps = np.diff(times)
+    if len(steps) and np.abs(steps - steps[0]).max() < 1e-6:
+        return {"starting_time": float(times[0]), "rate": float(1 / steps.mean())}
+    return {"timestamps": times if first is None else first}
 
 
 def _series(exported: Exported, n: int) -> list[Any]:
     """Return one series for every keypoint. The series share their times."""
     ndx_pose = _library("ndx_pose")
     points, confidence = exported.keypoints_px[n], exported.confidence[n]
-    times = exported.times_s
-    steps = np.diff(times)
-    timing: dict[str, Any] = {"timestamps": times}
-    if len(steps) and np.abs(steps - steps[0]).max() < 1e-6:
-        timing = {"starting_time": float(times[0]), "rate": float(1 / steps.mean())}
     series: list[Any] = []
     for k, name in enumerate(_series_names(exported.solution.keypoint_names)):
         one = ndx_pose.PoseEstimationSeries(
@@ -333,12 +364,10 @@ def _series(exported: Exported, n: int) -> list[Any]:
             data=points[:, k],
             unit="pixels",
             reference_frame=_ORIGIN,
-            **timing,
+            **_timing(exported, series[0] if series else None),
             confidence=confidence[:, k],
             confidence_definition=CONFIDENCE,
         )
-        if "timestamps" in timing and not series:
-            timing = {"timestamps": one}  # a link to the times of the first series
         series.append(one)
     return series
 

@@ -13,7 +13,7 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.raster.zbuffer import interpolate
 from jaxfit.view.colours import DETECTED, FITTED, track_colour
-from jaxfit.view.drawing import dot, line, ring, tag, text_width
+from jaxfit.view.drawing import closed_curve, dot, line, ring, tag, text_width
 
 HEAD = ("crown", "forehead", "nape", "left_eye", "right_eye", "bill_base", "neck", "bill_tip")
 """Keypoints near which the number of a bird is placed, in order of preference."""
@@ -21,6 +21,9 @@ _TURNS = np.radians([50, -50, 85, -85, 0, 120, -120])
 """Directions from the head to the number, relative to the direction of the bill, in order of preference."""
 _REACHES = (2.6, 4.2, 6.0)
 """Distances from the head to the number, in text heights, in order of preference."""
+REGION_95 = 5.991
+"""Quantile 0.95 of χ² with two degrees of freedom: squared Mahalanobis radius of a region of 95 % in the image."""
+_CIRCLE = np.column_stack([f(np.linspace(0, 2 * np.pi, 48, endpoint=False)) for f in (np.cos, np.sin)])
 _STEP = 100.0  # depth between two layers; each layer has depth 1, so that perspective is negligible
 
 
@@ -64,6 +67,8 @@ class DrawnBird(NamedTuple):
     keypoints_px: Float[np.ndarray, "K 2"]
     detected_px: Float[np.ndarray, "D 2"]
     """Detected keypoints; D may be 0."""
+    regions_px: Float[np.ndarray, "K P 2"] | None = None
+    """Points around the region of 95 % of every fitted keypoint (`regions_95`); None without error bars."""
 
 
 def draw_birds(
@@ -160,6 +165,37 @@ def draw_keypoints(
         ring(image, point, max(2.2 * radius, 3.2), DETECTED, max(1, round(0.6 * radius)))
     for point in points:
         dot(image, point, radius, FITTED)
+
+
+def regions_95(
+    points_px: Float[np.ndarray, "K 2"], covariance: Float[np.ndarray, "K 2 2"], largest_px: float
+) -> Float[np.ndarray, "K P 2"]:
+    """Return points around the ellipses that contain keypoints with a probability of 95 %.
+
+    The ellipse of a Gaussian with covariance C is x = μ + √5.991·C^½·u for unit vectors u.
+
+    Args:
+        points_px: the keypoints μ.
+        covariance: their covariances C, squared pixels.
+        largest_px: longer semi-axes are drawn with this length.
+
+    Returns:
+        P points around every ellipse; NaN where the covariance is not finite.
+    """
+    known = np.isfinite(covariance).all((1, 2), keepdims=True)
+    variance, axes = np.linalg.eigh(np.where(known, covariance, 0).astype(np.float64))
+    semi = np.minimum(np.sqrt(REGION_95 * np.maximum(variance, 0)), largest_px)
+    around = points_px[:, None] + _CIRCLE @ (axes * semi[:, None]).swapaxes(1, 2)
+    return np.where(known, around, np.nan)
+
+
+def draw_regions(image: UInt8[np.ndarray, "H W 3"], bird: DrawnBird, style: Style) -> None:
+    """Draw the regions of 95 % of the keypoints that the dots of the keypoints do not hide."""
+    if bird.regions_px is None:
+        return
+    reach = np.linalg.norm(bird.regions_px - bird.keypoints_px[:, None], axis=-1).max(1)
+    for k in np.flatnonzero(reach > style.mark_px + 2):  # NaN is not drawn
+        closed_curve(image, bird.regions_px[k], track_colour(bird.position))
 
 
 class Numbers:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfit.data.flags import CONTRADICTED, UNSURE, flags, with_flag
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import PosedBirds
 from jaxfit.data.solution import Solution
@@ -27,7 +28,7 @@ from jaxfit.view.colours import (
     track_colour,
 )
 from jaxfit.view.drawing import dot, line, ring, tag, text, write_png
-from jaxfit.view.legend import Symbol, symbol_strip
+from jaxfit.view.legend import FLAGGED, Symbol, symbol_strip
 
 TILE_PX = 256
 """Side of a tile."""
@@ -86,7 +87,8 @@ def contact_sheet(
     Left tile: the annotated mask (grey) and keypoints (black rings), the outline of the fitted mesh (green) and the
     fitted keypoints (red), with lines to the annotated keypoints. With footage, the left tile shows the footage, the
     outline of the mesh in the colour of the track, fitted keypoints as white dots and annotated keypoints as yellow
-    rings. Right tile: the mesh as the camera sees it, lit from above. A legend above the tiles explains these symbols.
+    rings. The flag of a pose that is not `ok` stands beside the number of the frame. Right tile: the mesh as the camera
+    sees it, lit from above. A legend above the tiles explains these symbols.
 
     Args:
         solution, bird: a result and its model.
@@ -117,10 +119,12 @@ def contact_sheet(
             ground = None if footage is None else footage.get((n, t))
             tiles.append(np.hstack([_observed_tile(posed, detected, n, t, ground), _mesh_tile(posed, n, t, colours)]))
         drawn.append(np.hstack(tiles + [blank] * (columns - len(row))))
-    write_png(path, np.vstack([_legend(drawn[0].shape[1], footage is not None, observations is not None), *drawn]))
+    flagged = bool(np.isin(flags(np.asarray(solution.doubts)), (UNSURE, CONTRADICTED)).any())
+    legend = _legend(drawn[0].shape[1], footage is not None, observations is not None, flagged)
+    write_png(path, np.vstack([legend, *drawn]))
 
 
-def _legend(width: int, on_footage: bool, has_detections: bool) -> UInt8[np.ndarray, "H W 3"]:
+def _legend(width: int, on_footage: bool, has_detections: bool, flagged: bool) -> UInt8[np.ndarray, "H W 3"]:
     """Return the meaning of the symbols in the left tiles, and of the right tiles."""
     rim, fill = (DETECTED, FITTED) if on_footage else (ON_PAPER_DETECTED, ON_PAPER_FITTED)
     edge = INK if on_footage else None
@@ -146,6 +150,7 @@ def _legend(width: int, on_footage: bool, has_detections: bool) -> UInt8[np.ndar
     if has_detections:
         entries.append((detected, "detected keypoint, with a line to the fitted keypoint"))
         entries += [] if on_footage else [(mask, "detected mask")]
+    entries += [(None, FLAGGED)] if flagged else []
     return symbol_strip(
         width, _TEXT_PX, [*entries, (None, "right of each pair: the fitted bird as the camera sees it")]
     )
@@ -191,6 +196,7 @@ def _observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footag
     for k in range(len(fitted)) if footage is not None else np.flatnonzero(confidence > 0):
         dot(tile, fitted[k], 2, fill, None if footage is None else INK)
     name, frame = f"track {solution.track_id[n]}", f"frame {solution.frame_index[t]}"
+    frame = with_flag(frame, flags(np.asarray(solution.doubts)[n : n + 1, t : t + 1]).item())
     if footage is None:
         text(tile, f"{name}  {frame}", 6, 11, 11, ON_PAPER_DETECTED)
     else:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from jaxfit.foundation.files import write_whole
 from jaxfit.view.colours import INK, Colour
@@ -16,8 +16,12 @@ SHIFT = 4  # OpenCV draws in units of 1/16 pixel; pixel centres are whole number
 
 def fixed(point_px: Float[np.ndarray, "2"] | tuple[float, float]) -> tuple[int, int]:
     """Convert a position in image pixels to OpenCV's fixed-point numbers with `SHIFT`."""
-    x, y = np.clip(np.round((np.asarray(point_px, np.float64) - 0.5) * (1 << SHIFT)), -(2**19), 2**19)
-    return int(x), int(y)
+    x, y = _fixed(point_px).tolist()
+    return x, y
+
+
+def _fixed(points_px) -> Int[np.ndarray, "..."]:
+    return np.clip(np.round((np.asarray(points_px, np.float64) - 0.5) * (1 << SHIFT)), -(2**19), 2**19).astype(np.int32)
 
 
 def dot(image: UInt8[np.ndarray, "H W 3"], point_px, radius: float, colour: Colour, edge: Colour | None = INK) -> None:
@@ -46,6 +50,15 @@ def ring(
 def line(image: UInt8[np.ndarray, "H W 3"], a_px, b_px, colour: Colour, width: int = 1) -> None:
     """Draw a straight line between two positions in pixels."""
     cv2.line(image, fixed(a_px), fixed(b_px), colour, width, cv2.LINE_AA, SHIFT)
+
+
+def closed_curve(
+    image: UInt8[np.ndarray, "H W 3"], points_px: Float[np.ndarray, "P 2"], colour: Colour, width: int = 1
+) -> None:
+    """Draw a closed line through positions in pixels, with a dark edge, so that it contrasts with any background."""
+    at = [_fixed(points_px)]
+    cv2.polylines(image, at, True, INK, width + 1, cv2.LINE_AA, SHIFT)
+    cv2.polylines(image, at, True, colour, width, cv2.LINE_AA, SHIFT)
 
 
 def text(image: UInt8[np.ndarray, "H W 3"], words: str, left: float, middle: float, size: float, colour=INK) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from jaxfit.view.birds import Style
 from jaxfit.view.colours import DETECTED, FITTED, PAPER, track_colour
-from jaxfit.view.drawing import dot, line, ring, tag, text, text_width
+from jaxfit.view.drawing import closed_curve, dot, line, ring, tag, text, text_width
 
 Symbol = Callable[[np.ndarray, float, float, float], None]
 """Draws a symbol, 1.7 times as wide as the text is high: image, left end, middle row, height of the text."""
@@ -52,14 +52,28 @@ class Legend:
         style: style of the overlay.
         detected: explain the rings of detected keypoints.
         side_views: explain the side views.
+        regions: explain the regions of 95 % of keypoints.
+        flagged: explain the flags beside track numbers.
     """
 
-    def __init__(self, width: int, style: Style, detected: bool, side_views: bool):
+    def __init__(
+        self,
+        width: int,
+        style: Style,
+        detected: bool,
+        side_views: bool,
+        regions: bool = False,
+        flagged: bool = False,
+    ):
         self._style, size = style, style.text_px
         entries: list[tuple[Symbol | None, str]] = [(self._number, "track"), (self._mesh, "fitted bird")]
         entries.append((self._fitted, "fitted keypoint"))
         if detected:
             entries.append((self._detected, "detected keypoint"))
+        if regions:
+            entries.append((self._region, REGION))
+        if flagged:
+            entries.append((None, FLAGGED))
         if side_views:
             entries.append((None, "below: each bird from its left, upright as birds stand"))
         frame_px = text_width("frame 000000   00:00:00.00", size) + 2.4 * size
@@ -91,5 +105,12 @@ class Legend:
     def _detected(self, image, x, y, size):
         ring(image, (x + 0.85 * size, y), 0.34 * size, DETECTED, max(1, round(0.1 * size)))
 
+    def _region(self, image, x, y, size):
+        around = [[x + 0.85 * size + 0.8 * size * np.cos(a), y + 0.42 * size * np.sin(a)] for a in _TURN]
+        closed_curve(image, np.array(around), track_colour(0))
+        dot(image, (x + 0.85 * size, y), 0.17 * size, FITTED)
 
+
+REGION = "95 % region of a fitted keypoint, if larger than the dot"
+FLAGGED = "unsure, contradicted: flag of the pose"
 _TURN = np.linspace(0, 2 * np.pi, 40)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfit.data.flags import CONTRADICTED, UNSURE, flags, with_flag
 from jaxfit.data.footage import FootageIdentity, read_footage
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import PosedBirds
@@ -24,7 +25,16 @@ from jaxfit.model.bird import Bird
 from jaxfit.raster.zbuffer import shade
 from jaxfit.video.reader import VideoInfo, probe_video, read_frames
 from jaxfit.video.writer import SLOWEST_FPS, VideoWriter
-from jaxfit.view.birds import Detected, DrawnBird, Numbers, Style, draw_birds, draw_keypoints
+from jaxfit.view.birds import (
+    Detected,
+    DrawnBird,
+    Numbers,
+    Style,
+    draw_birds,
+    draw_keypoints,
+    draw_regions,
+    regions_95,
+)
 from jaxfit.view.colours import tinted
 from jaxfit.view.contact_sheet import contact_sheet, cut_tiles, sheet_pairs
 from jaxfit.view.legend import Legend
@@ -153,9 +163,11 @@ def overlay(
 
     The overlay shows the frames from the first to the last frame of the result. It shows the meshes, transparent and
     outlined in the colour of the track; fitted keypoints as dots, detected keypoints as rings; and the track number at
-    the head. `draw_birds` defines the order of overlapping birds. Below the image are a legend and, with `side_views`,
-    every bird from its left (`SideViews`). The overlay of a result of every n-th frame has these frames only, at 1/n of
-    the frame rate; frames that the result lacks between them show the footage.
+    the head, with the flag of a pose that is not `ok`. A result with error bars also shows the 95 % region of every
+    fitted keypoint, where the region is larger than the dot. `draw_birds` defines the order of overlapping birds. Below
+    the image are a legend and, with `side_views`, every bird from its left (`SideViews`). The overlay of a result of
+    every n-th frame has these frames only, at 1/n of the frame rate; frames that the result lacks between them show the
+    footage.
 
     Args:
         solution: the result.
@@ -322,7 +334,15 @@ class _Drawing:
         self._pairs = skeleton_pairs(solution.keypoint_names)
         self._detected = Detected(solution, observations)
         text_px = self.style.text_px
-        self._legend = Legend(self.picture_px[0], self.style, observations is not None, side_views)
+        self._flags = flags(np.asarray(solution.doubts))
+        self._legend = Legend(
+            self.picture_px[0],
+            self.style,
+            detected=observations is not None,
+            side_views=side_views,
+            regions=solution.has_error_bars,
+            flagged=bool(np.isin(self._flags, (UNSURE, CONTRADICTED)).any()),
+        )
         self._side = SideViews(solution, bird, self.picture_px[0], text_px) if side_views else None
         strip = 0 if self._side is None else self._side.height
         self.size_px = self.picture_px[0], self.picture_px[1] + self._legend.height + strip
@@ -338,6 +358,8 @@ class _Drawing:
         crops = self.solution.crop[shown, t] if t is not None else np.zeros((0, 3))
         draw_birds(image, birds, self._faces, self.style, one_camera=bool((crops == crops[:1]).all()))
         for bird in birds:
+            draw_regions(image, bird, self.style)
+        for bird in birds:
             draw_keypoints(image, bird, self._pairs, self.style)
         self._numbers.draw(image, birds)
         parts = [image, self._legend.draw(number, seconds)]
@@ -350,13 +372,18 @@ class _Drawing:
         cam, span = self._vertices_cam(n, t), slice(t, t + 1)
         shrink = np.array([self.zoom, self.zoom, 1], np.float32)
         places, confidence = self._detected.keypoints(n, t)
+        points, covariance, regions = self.solution.keypoints_px[n, t] * self.zoom, self.solution.keypoints_px_cov, None
+        if covariance is not None:
+            half = float(self.solution.crop[n, t, 2]) / 2 * self.zoom
+            regions = regions_95(points, covariance[n, t] * self.zoom**2, half)
         return DrawnBird(
             position=n,
-            name=str(self.solution.track_id[n]),
+            name=with_flag(str(self.solution.track_id[n]), self._flags[n, t]),
             screen=self.posed.to_image(cam[None], n, span)[0] * shrink,
             colours=shade(cam, self._faces, self._colours[n]),
-            keypoints_px=self.solution.keypoints_px[n, t] * self.zoom,
+            keypoints_px=points,
             detected_px=places[confidence > 0] * self.zoom,
+            regions_px=regions,
         )
 
     def _vertices_cam(self, n: int, t: int) -> Float[np.ndarray, "V 3"]:

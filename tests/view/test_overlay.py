@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.birds import filled_mask, pose_window
+from support.exported import error_bars
 from support.overlays import BIRD, CAMERA, CROPS, FIRST, FPS, GREY, HEIGHT, WIDTH, N, T, film, solution
 
 from jaxfit.data.observations import Observations
@@ -17,11 +18,12 @@ from jaxfit.model.camera import project
 from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.video.reader import probe_video, read_frames
-from jaxfit.view.birds import DrawnBird, Style, draw_birds
+from jaxfit.view.birds import DrawnBird, Style, draw_birds, draw_regions, regions_95
 from jaxfit.view.colours import DETECTED, FITTED, TRACK_COLOURS, track_colour
-from jaxfit.view.contact_sheet import TILE_PX
+from jaxfit.view.contact_sheet import TILE_PX, contact_sheet
+from jaxfit.view.legend import FLAGGED, REGION, Legend
 from jaxfit.view.mesh_views import SideViews, up_direction
-from jaxfit.view.overlay import CHUNK, overlay
+from jaxfit.view.overlay import CHUNK, overlay, overlay_frame
 
 
 def detections(size=(WIDTH, HEIGHT)) -> Observations:
@@ -168,6 +170,105 @@ def test_which_bird_hides_the_other(one_camera):
         assert image[30, 30].tolist() == [255, 0, 0]
         assert image[100, 90].tolist() == [0, 255, 0]
         assert (image[130:] == 0).all()
+
+
+def marked(points, regions, size=400):
+    """Where the regions of these keypoints change a grey picture."""
+    image, points = np.full((size, size, 3), GREY, np.uint8), np.array(points, float)
+    bird = DrawnBird(0, "1", np.zeros((3, 3)), np.zeros((3, 3)), points, np.zeros((0, 2)), regions)
+    draw_regions(image, bird, Style(1, 2))
+    return (image != GREY).any(-1)
+
+
+def test_regions_contain_95_per_cent():
+    """The line is where the Mahalanobis distance is √5.991, and the enclosed area is π·5.991·√det C."""
+    point, covariance = np.array([[200.0, 180.0]]), np.array([[[900.0, 350.0], [350.0, 400.0]]])
+    drawn = marked(point, regions_95(point, covariance, 500))
+    y, x = np.mgrid[:400, :400] + 0.5
+    offset = np.stack([x, y], axis=-1) - point[0]
+    distance = np.sqrt(np.einsum("yxi,ij,yxj->yx", offset, np.linalg.inv(covariance[0]), offset) / 5.991)
+    assert np.abs(distance[drawn] - 1).max() < 0.08
+    angles = np.linspace(0, 2 * np.pi, 90)
+    around = (
+        point + np.sqrt(5.991) * np.column_stack([np.cos(angles), np.sin(angles)]) @ np.linalg.cholesky(covariance[0]).T
+    )
+    assert drawn[tuple(np.floor(around).astype(int).T[::-1])].all()
+    inside = cv2.connectedComponents((~drawn).astype(np.uint8), connectivity=4)[1]
+    area = (inside == inside[180, 200]).sum() + drawn.sum() / 2
+    assert area == pytest.approx(np.pi * 5.991 * np.sqrt(np.linalg.det(covariance[0])), rel=0.01)
+
+
+def test_regions_without_a_size():
+    """NaN, zero and small covariances draw nothing; a region beyond all bounds has the largest size."""
+    points = np.full((5, 2), 200.0)
+    covariance = np.where(np.eye(2) > 0, np.array([np.nan, np.inf, 0, 1, 1e12])[:, None, None], 0)
+    regions = regions_95(points, covariance, 100)
+    assert not marked(points[:4], regions[:4]).any()
+    rows, columns = np.nonzero(marked(points, regions))
+    assert [rows.min(), rows.max(), columns.min(), columns.max()] == pytest.approx([99, 301, 99, 301], abs=2)
+    line = regions_95(points[:1], np.diag([400.0, -1e-9])[None], 100)  # rounding may give negative variances
+    rows, columns = np.nonzero(marked(points[:1], line))
+    assert np.ptp(rows) <= 4
+    assert np.ptp(columns) == pytest.approx(2 * np.sqrt(5.991) * 20, abs=6)
+    assert not marked(points[:1], None).any()
+
+
+def test_a_frame_shows_regions_and_flags(tmp_path):
+    """The largest region is that of the covariance in pixels of the footage, also in a smaller picture."""
+    video, shape = film(tmp_path / "f.mp4"), (N, T, BIRD.num_keypoints)
+    covariance = np.zeros((*shape, 2, 2), np.float32)
+    covariance[0, :, 0] = np.diag([400, 25])
+    plain = dataclasses.replace(solution(), **error_bars(shape, BIRD))
+    doubts = np.where(np.arange(N)[:, None] == 1, 4, np.zeros((N, T), np.int8)).astype(np.int8)
+    changes = {
+        "none": solution(),
+        "plain": plain,
+        "wide": dataclasses.replace(plain, keypoints_px_cov=covariance),
+        "flag": dataclasses.replace(solution(), doubts=doubts),
+    }
+    images = {}
+    for name, made in changes.items():
+        overlay_frame(made, BIRD, video, FIRST + 1, tmp_path / f"{name}.png", max_width=160)
+        images[name] = cv2.imread(str(tmp_path / f"{name}.png"))[: HEIGHT // 2].astype(int)
+    assert (images["none"] == images["plain"]).all()  # dots hide regions without an extent
+    rows, columns = np.nonzero(np.abs(images["wide"] - images["plain"]).sum(-1) > 60)
+    x, y = solution().keypoints_px[0, 1, 0] / 2
+    half = np.sqrt(5.991) * 10  # half the size of the footage
+    assert columns.min() == pytest.approx(max(x - half, 0), abs=3)
+    assert columns.max() == pytest.approx(x + half, abs=3)
+    assert [rows.min(), rows.max()] == pytest.approx([y - half / 4, y + half / 4], abs=3)
+    differs = np.abs(images["flag"] - images["none"]).sum(-1) > 60
+    assert differs.sum() > 100
+    assert np.nonzero(differs)[1].min() > CROPS[0][0] / 2 + 30  # the second bird only
+
+
+def test_the_legend_explains_regions_and_flags(monkeypatch):
+    words = []
+    monkeypatch.setattr("jaxfit.view.legend.text", lambda image, text, *more: words.append(text))
+    Legend(900, Style(1, 2), detected=False, side_views=False)
+    assert words == ["track", "fitted bird", "fitted keypoint"]
+    Legend(900, Style(1, 2), detected=False, side_views=False, regions=True, flagged=True)
+    assert words[6:] == [REGION, FLAGGED]
+    assert "95 % region" in REGION
+    assert "contradicted" in FLAGGED
+
+
+@pytest.mark.parametrize("on_footage", [True, False])
+def test_the_contact_sheet_shows_flags(tmp_path, monkeypatch, on_footage):
+    words = []
+    for module in ("contact_sheet", "legend"):
+        monkeypatch.setattr(f"jaxfit.view.{module}.text", lambda image, text, *more: words.append(text))
+    monkeypatch.setattr("jaxfit.view.contact_sheet.tag", lambda image, text, *more: words.append(text))
+    doubts = np.array([[0, 1, 0, 0, 0, 4], [0, 0, -1, 0, 0, 0]], np.int8)
+    tile = np.zeros((TILE_PX, TILE_PX, 3), np.uint8)
+    footage = {(n, t): tile for n in range(N) for t in range(T)} if on_footage else None
+    made = dataclasses.replace(solution(), doubts=doubts)
+    contact_sheet(made, BIRD, None, tmp_path / "sheet.png", columns=T, footage=footage)
+    assert f"track 4  frame {FIRST + 1} contradicted" in words
+    assert f"track 4  frame {FIRST + 5} unsure" in words
+    assert f"track 4  frame {FIRST}" in words
+    assert f"track 11  frame {FIRST + 5}" in words
+    assert FLAGGED in words
 
 
 def test_only_every_second_frame_and_a_small_picture(tmp_path):

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from support import overlays
 from support.cli_files import rejected
-from support.exported import TRACKS, write_result
+from support.exported import BIRD, FRAMES, TRACKS, error_bars, write_result
 
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.solution import load_solution, save_solution
+from jaxfit.model.bird import rest_length
 from jaxfit.view.report.contents import gather, next_steps, warnings_of
 from jaxfit.view.report.page import Measured, page, spread_frames
 from jaxfit.view.report.timeline import element, timeline
@@ -103,6 +104,32 @@ def test_the_table_holds_the_numbers_of_the_result(folder, made, caplog):
     assert [rows[track][-2] for track in "378"] == ["2.1", "1.3", "–"]
     assert "8 poses53.3 % of the detections" in page.text
     assert "Tracks 7, 8: some or all frames have no pose" in page.text
+
+
+def test_the_table_shows_error_bars(written, folder, tmp_path):
+    """The median expected error as a share of the length, and a curve with marks at flagged frames."""
+    assert "Error bars" not in page_of(folder).text
+    shape = len(TRACKS), len(FRAMES), BIRD.num_keypoints
+    length = rest_length(BIRD) * load_solution(written)[0].scale[0]
+    share = np.array([0.02, 0.03, 0.05, 0.1, 0.5])
+    covariance = np.zeros((*shape, 3, 3), np.float32)
+    covariance[0] = ((share * length) ** 2 / 3)[:, None, None, None] * np.eye(3)
+    doubts = np.zeros(shape[:2], np.int8)
+    doubts[0] = [0, 0, 1, 8, 8]
+    write_result(tmp_path / "bars", **error_bars(shape, keypoints_centred_cov=covariance), doubts=doubts)
+    page = page_of(tmp_path / "bars")
+    rows = {row[0]: row[1:] for row in page.rows}
+    assert rows["Track"][-2] == "Error bars% of length, 0 to 10 %"
+    # the text of a cell also has the title of the curve
+    assert rows["3"][-2].startswith("5.0")
+    assert rows["8"][-2] == "–"  # no pose
+    assert "With detections of networks, error bars are too narrow" in page.text
+    row = (tmp_path / "bars" / "report.html").read_text().split("5.0<svg")[1].split("</svg>")[0]
+    points = re.search(r'class="curve" d="M([^"]*)"', row)
+    heights = [float(point.split()[1]) for point in points[1].split("L")]
+    np.testing.assert_allclose(heights, 22 * (1 - np.array([0.2, 0.3, 0.5, 0.95, 0.95])), atol=0.06)
+    assert re.search(r'class="s7" d="M2 0h1v', row)
+    assert re.search(r'class="s6" d="M3 0h2v', row)
 
 
 def test_the_page_stands_alone_and_shows_names_as_text(folder):

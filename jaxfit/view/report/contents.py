@@ -11,11 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit.data.flags import CONTRADICTED, FLAGS, UNSURE, flagged_ranges, flags
+from jaxfit.data.flags import CONTRADICTED, FLAGS, UNSURE, expected_error, flagged_ranges, flags
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
+from jaxfit.model.bird import Bird
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,9 @@ class Track:
     """(T,) str: flag of each pose (`jaxfit.data.flags.flags`); empty without a pose, or if poses were not judged."""
     flagged: tuple[str, ...]
     """Texts about frames whose poses are not `ok`."""
+    expected_error: Float[np.ndarray, "T"]
+    """RMS error of the keypoints that the error bars expect, as a share of the length of the bird
+    (`jaxfit.data.flags.expected_error`); NaN without a pose or without error bars."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,11 @@ class Report:
         return any(track.quality is not None for track in self.tracks)
 
     @property
+    def has_error_bars(self) -> bool:
+        """Whether a pose has error bars."""
+        return any(bool(np.isfinite(track.expected_error).any()) for track in self.tracks)
+
+    @property
     def over_time(self) -> bool:
         """Whether the result has several frames of one video, so that changes over time mean something."""
         return not self.photographs and len(self.frames) > 1
@@ -123,7 +132,12 @@ class Report:
 
 
 def gather(
-    solution: Solution, observations: Observations | None, summary: Mapping[str, Any], config: str, folder: Path
+    solution: Solution,
+    observations: Observations | None,
+    summary: Mapping[str, Any],
+    config: str,
+    folder: Path,
+    bird: Bird | None = None,
 ) -> Report:
     """Return the content of the report of a result.
 
@@ -133,6 +147,7 @@ def gather(
         summary: content of `summary.json`, in the types of JSON.
         config: the config as YAML.
         folder: folder of the result.
+        bird: the model of the result; None leaves out error bars, which are shares of the length of the bird.
 
     Raises:
         InputError: an entry of the summary has another type than jaxfit writes.
@@ -144,7 +159,10 @@ def gather(
     times_s = np.full(len(solution.frame_index), np.nan) if solution.timestamp_s is None else solution.timestamp_s
     if solution.fps and not np.isfinite(times_s).all():
         times_s = solution.frame_index / solution.fps
-    tracks = _tracks(solution, observations, _texts_of(field, "failures"))
+    expected = np.full(solution.valid.shape, np.nan)
+    if bird is not None:
+        expected = np.where(solution.valid, expected_error(solution, bird), np.nan)
+    tracks = _tracks(solution, observations, _texts_of(field, "failures"), expected)
     return Report(
         folder=str(folder),
         title=Path(named).name or named if named else folder.name,
@@ -179,7 +197,10 @@ def _first(track: Track) -> int:
 
 
 def _tracks(
-    solution: Solution, observations: Observations | None, problems: Mapping[str, tuple[str, ...]]
+    solution: Solution,
+    observations: Observations | None,
+    problems: Mapping[str, tuple[str, ...]],
+    expected: Float[np.ndarray, "N T"],
 ) -> list[Track]:
     quality = {} if observations is None else {row.track_id: row for row in track_quality(observations)}
     rows = {} if observations is None else {track: n for n, track in enumerate(observations.track_id.tolist())}
@@ -210,6 +231,7 @@ def _tracks(
                 problems=problems.get(str(track_id), ()),
                 flags=found[n],
                 flagged=flagged.get(track_id, ()),
+                expected_error=expected[n],
             )
         )
     return tracks

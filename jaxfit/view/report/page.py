@@ -19,7 +19,7 @@ from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.view.overlay import overlay_pictures
 from jaxfit.view.report.contents import Report, Step, Track, Warned, counted, next_steps, warnings_of
-from jaxfit.view.report.timeline import Html, duration, element, joined, size_curve, swatch, timeline
+from jaxfit.view.report.timeline import Html, duration, element, error_curve, joined, size_curve, swatch, timeline
 
 _COUNT, _WIDTH_PX, _QUALITY = 6, 960, 80
 
@@ -97,6 +97,13 @@ _MEANINGS = (
         "Size in the image",
         "Size of the fitted bird in the image over time, relative to its median. The curve ends at ±30 %. One camera "
         "cannot tell a larger bird from a nearer bird. A sudden change is a sign of a wrong fit.",
+    ),
+    (
+        "Error bars",
+        "Error of the keypoints in space that the fit expects: root mean square over the keypoints, in per cent of the "
+        "length of the bird, without the error of the position of the whole bird. The number is the median. The curve "
+        "goes from 0 % to 10 %, above which a pose is unsure. Marks at the upper edge show the flags unsure and "
+        "contradicted. With detections of networks, error bars are too narrow.",
     ),
     ("Objective", "Final value of the objective of the fit for each pose. Compare birds of one result only."),
     (
@@ -258,15 +265,16 @@ def _table(report: Report) -> Html:
         names += [("Detections", "number"), ("Coverage", "%"), ("Gaps", "number"), ("Confidence", "0 to 1")]
         names += [("Jitter", "% of box")]
     names.append(("Objective", "per pose"))
+    names += [("Error bars", "% of length, 0 to 10 %" if over_time else "% of length")] if report.has_error_bars else []
     names += [("Size in the image", "±30 %")] if over_time else []
     head = element("tr", *(element("th", name, element("small", unit)) for name, unit in names))
-    rows = [element("tr", *_cells(track, detected, over_time, bool(report.flags))) for track in report.tracks]
+    rows = [element("tr", *_cells(report, track)) for track in report.tracks]
     return element("div", element("table", element("thead", head), element("tbody", *rows)), class_="wide")
 
 
-def _cells(track: Track, detected: bool, over_time: bool, judged: bool) -> list[Html]:
+def _cells(report: Report, track: Track) -> list[Html]:
     """Return the cells of a bird."""
-    quality = track.quality
+    quality, over_time = track.quality, report.over_time
     frames = "–" if track.frames is None else f"{track.frames[0]:,} to {track.frames[1]:,}"
     kind = "good" if track.status == "ok" else "bad"
     cells = [
@@ -275,9 +283,9 @@ def _cells(track: Track, detected: bool, over_time: bool, judged: bool) -> list[
         element("td", frames) if over_time else Html(),
         element("td", f"{track.poses:,}"),
     ]
-    if judged:
+    if report.flags:
         cells.append(element("td", " / ".join(f"{(track.flags == flag).sum():,}" for flag in FLAGS)))
-    if detected:
+    if report.has_detections:
         shown = ["–"] * 5
         if quality is not None:
             jitter = "–" if quality.jitter is None else f"{100 * quality.jitter:.1f}"
@@ -285,6 +293,10 @@ def _cells(track: Track, detected: bool, over_time: bool, judged: bool) -> list[
             shown += [f"{quality.mean_confidence:.2f}", jitter]
         cells += [element("td", text) for text in shown]
     cells.append(element("td", "–" if track.objective is None else f"{track.objective:,.1f}"))
+    if report.has_error_bars:
+        known = track.expected_error[np.isfinite(track.expected_error)]
+        median = f"{100 * np.median(known):.1f}" if len(known) else "–"
+        cells.append(element("td", median, error_curve(track) if over_time else None))
     return [*cells, element("td", size_curve(track))] if over_time else cells
 
 
@@ -297,7 +309,9 @@ def _measured(table: Measured) -> Html:
 
 def _meanings(report: Report) -> list[tuple[str, str]]:
     """Return the definitions of the words on the page."""
-    return [pair for pair in _MEANINGS if report.over_time or pair[0] != "Size in the image"]
+    absent = [] if report.over_time else ["Size in the image"]
+    absent += [] if report.has_error_bars else ["Error bars"]
+    return [pair for pair in _MEANINGS if pair[0] not in absent]
 
 
 def _definitions(pairs: Sequence[tuple[str, str]]) -> Html:

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Int
 
-from jaxfit.data.flags import CONTRADICTED, UNSURE
+from jaxfit.data.flags import CONTRADICTED, UNSURE, WRONG_SHARE
 from jaxfit.foundation.errors import one_line
 from jaxfit.view.colours import track_colour
 from jaxfit.view.report.contents import Report, Track
@@ -111,6 +111,36 @@ def size_curve(track: Track) -> Html:
     title = element("title", f"90 % of the frames: {low:+.0%} to {high:+.0%}")
     middle = element("path", class_="middle", d=f"M0 {height / 2}H{width}")
     paths = title, middle, element("path", class_="curve", d=line)
+    return element("svg", *paths, class_="size", viewBox=f"0 0 {width} {height}", width=width, height=height)
+
+
+def error_curve(track: Track) -> Html:
+    """Return the error that the error bars expect over the frames of a track, as a small curve from 0 to `WRONG_SHARE`.
+
+    The upper edge is the limit of the flag `unsure`. Marks at the upper edge are the worst flags of the frames.
+    """
+    width, height = _CURVE_PX
+    at = np.flatnonzero(np.isfinite(track.expected_error))
+    if not len(at):
+        return Html()
+    first, span = int(at[0]), int(at[-1] - at[0]) + 1
+    columns = min(span, width // 2)
+    column = (np.arange(span) * columns) // span
+    lines, drawing, worst = [], False, np.zeros(columns, int)
+    for i in range(columns):
+        here = first + np.flatnonzero(column == i)
+        worst[i] = max(_FLAGGED.get(flag, 0) for flag in track.flags[here].tolist())
+        known = track.expected_error[here][np.isfinite(track.expected_error[here])]
+        if len(known):
+            y = height * (1 - min(float(known.mean()) / WRONG_SHARE, 0.95))
+            lines.append(f"{'L' if drawing else 'M'}{(i + 0.5) * width / columns:.1f} {y:.1f}")
+        drawing = bool(len(known))
+    low, high = np.quantile(track.expected_error[at], [0.05, 0.95])
+    title = element("title", f"90 % of the frames: {low:.1%} to {high:.1%}")
+    marks = [_bars(worst, state, 0, 0.25) for state in _FLAGGED.values()]
+    marks = element("g", *marks, transform=f"scale({width / columns:.4f} {height})")
+    middle = element("path", class_="middle", d=f"M0 {height / 2}H{width}")
+    paths = title, marks, middle, element("path", class_="curve", d="".join(lines))
     return element("svg", *paths, class_="size", viewBox=f"0 0 {width} {height}", width=width, height=height)
 
 

@@ -55,7 +55,7 @@ def write_report(
     Raises:
         InputError: the footage does not belong to the result, or the file cannot be written.
     """
-    report = gather(solution, observations, json_values(summary), config, folder)
+    report = gather(solution, observations, json_values(summary), config, folder, bird)
     pictures = []
     if video is not None and solution.valid.any():
         pictures = report_pictures(solution, bird, video, observations, force)
