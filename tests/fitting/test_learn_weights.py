@@ -20,6 +20,7 @@ from jaxfit.fitting.learn import (
     PRIOR_COUNT,
     Evidence,
     choose_windows,
+    expanded,
     mask_evidence,
     updated_precision,
 )
@@ -140,6 +141,23 @@ def test_the_fixed_point_is_the_posterior_mean_of_a_variance():
     # the weight of the mask does not fall
     assert updated_precision(1.0, Evidence(90.0, 180.0), 1, 1.0) == 1
     assert updated_precision(1.0, Evidence(180.0, 90.0), 1, 1.0) == pytest.approx(190 / 100)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0, 4.0])
+def test_three_rounds_find_the_scale_of_heavy_tailed_errors(scale):
+    rng, dof, n = np.random.default_rng(0), 4.0, 3000
+    squared = (rng.normal(size=(n, 2)) ** 2).sum(1) * scale**2 / (rng.chisquare(dof, n) / dof)
+
+    def after_rounds(step):
+        precision = 1.0
+        for _ in range(3):
+            energy = precision * (squared * (dof + 2) / (dof + precision * squared)).sum()
+            precision = updated_precision(precision, step(Evidence(2.0 * n, energy)), 2)
+        return precision**-0.5
+
+    assert after_rounds(lambda evidence: expanded(evidence, dof)) == pytest.approx(scale, rel=0.05)
+    if scale == 4:
+        assert after_rounds(lambda evidence: evidence) < 0.8 * scale
 
 
 def test_linear_gaussian_errors_and_parameters():
