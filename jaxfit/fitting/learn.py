@@ -254,7 +254,8 @@ def _updated(config: FitConfig, first: FitConfig, evidence: Mapping[str, Evidenc
         is_weight = path.endswith(".weight")
         ratio = now[path] / default[path]
         precision = ratio if is_weight else ratio**-2  # in units of the default
-        new = updated_precision(precision, Evidence(count, energy), *((1, 1.0) if is_weight else (2,)))
+        power, least = (1, 1.0) if is_weight else (2, 0.0)
+        new = updated_precision(precision, Evidence(count, energy), power, least)
         factor = new if is_weight else new**-0.5
         values |= {each: default[each] * factor for each in _paths(name)}
     return values
@@ -401,11 +402,13 @@ def _frame_statistics(program: Program, problems: Problem, pose: Pose) -> _Frame
             units = jnp.broadcast_to(jnp.eye(D)[:, None], (D, T, D))
             curvature[name] = jax.lax.map(H.product, units).transpose(1, 2, 0)
         of_keypoints = dict(settings[KEYPOINTS])
-        energy = of_keypoints.pop("weight") * sum(
+        weight = of_keypoints.pop("weight")
+        energy = sum(
             jnp.sum(each.weight * 2 * each.kernel.slope(squared) * squared)
             for each in as_list(program.terms[KEYPOINTS].function(window, **of_keypoints))
             for squared in [jnp.sum(each.values**2, axis=-1)]
         )
+        energy = jnp.asarray(weight * energy)
         shown = jnp.zeros((0, 0, 0))
         if MASK in settings:
             raster = program.raster
