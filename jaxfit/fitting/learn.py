@@ -1,26 +1,25 @@
-"""Weights and scales of the objective from the data: empirical Bayes with the effective number of parameters.
+"""Weights and scales of the objective from the data: empirical Bayes with the effective number of errors.
 
 A term whose weight or scale is learnt has, up to constants, the form E = ½·β·Σ w‖e‖² − ½·N·log β, with the precision β:
-1/s² for a scale s, λ for the weight of `mask_smooth_l1`. The weights w are those
-of Student's t, (ν + n)/(ν + β‖e‖²) for groups of n errors, and 1 for squares. The Laplace approximation of the evidence
-is largest where
+1/s² for the scale s of keypoint errors, λ for the weight of `mask_smooth_l1`. The weights w are those of Student's t,
+(ν + n)/(ν + β‖e‖²) for groups of n errors, and 1 for squares. The Laplace approximation of the evidence is largest
+where
 
-    β = γ / Σ w‖e‖²,   likelihoods: γ = N − tr(Σ·H),   priors: γ = tr(Σ₀·H) − tr(Σ·H),
+    β = γ / Σ w‖e‖²,   γ = N − tr(Σ·H),
 
-with H the curvature of the term, Σ the covariance of the posterior, and Σ₀ that of the prior (the terms without
-observations). A fit takes up a part of the errors, which tr(Σ·H) counts. Σ₀ stands for the normaliser of the prior: the
-pose prior and the motion terms limit the same poses, so that a long window has fewer independent poses than frames.
-
-The weight of `pose_prior` is not learnt. With the formula, the weight on AVES windows fell from 1.4 to 0.07, and poses
-flipped in some frames: the weight that is right for the whole window, where every frame counts, is too small for the
-single frame that the solver must keep near its minimum. `jaxfit prior learn` takes the weight from results.
+with H the curvature of the term and Σ the covariance of the posterior. A fit takes up a part of the errors, which
+tr(Σ·H) counts.
 
 A round computes γ and Σ w‖e‖² at the poses of a sample of windows, sets β, and continues the fit with the new values.
 
 Errors of the outline are not independent from pixel to pixel: `fitting/outline_noise.py` counts them.
 
 Hyperpriors: the values of the config count as `PRIOR_COUNT` observations, and limit the result to a factor of
-`MOST_FACTOR`.
+`MOST_FACTOR`. The weight of the mask does not fall below its value in the config: the errors of the outline contain
+errors of the poses, so the learnt weight is a lower limit. A smaller weight would move the fit away from the masks, and
+the errors would then lower the weight again.
+
+Not learnt, with reasons in docs/configs.md: the weight of `pose_prior` and the scales of the motion terms.
 
 Source: MacKay 1992, *Bayesian interpolation* (γ and the fixed point); Lange, Little and Taylor 1989, *Robust
 statistical modeling using the t distribution* (w); Tipping 2001, *Sparse Bayesian learning and the relevance vector
@@ -51,7 +50,6 @@ from jaxfit.fitting.posterior import (
     Columns,
     broad_precision,
     posterior_of,
-    trace_product,
     window_blocks,
     with_shared,
 )
@@ -78,21 +76,18 @@ MOST_FACTOR = 30.0
 MOST_CHANGE = 10.0
 """Largest factor on a value in one round."""
 LEAST_KEYPOINTS, LEAST_FRAMES, LEAST_MASKS = 200, 20, 20
-"""Fewer detected keypoints, frames or masks in the sample teach nothing about the values that depend on them."""
+"""Fewer detected keypoints, frames or masks in the sample do not determine the values that depend on them."""
+LEAST_MEAN_WEIGHT = 0.1
+"""Least mean weight of the keypoint errors that an update uses."""
 LEAST_SHARE = 0.1
 """Least part of N that remains after tr(Σ·H), which is only an approximation."""
 
-KEYPOINTS, MASK, POSE_PRIOR = "keypoint_likelihood", "mask_smooth_l1", "pose_prior"
-MOTION, PLACE = "motion_likelihood", "place_likelihood"
+KEYPOINTS, MASK = "keypoint_likelihood", "mask_smooth_l1"
 SETTINGS: Mapping[str, tuple[str, ...]] = {
     KEYPOINTS: ("sd_sure_px", "sd_unsure_px"),
     MASK: ("weight",),
-    MOTION: ("sd_rad_s2",),
-    PLACE: ("sd_px_s2",),
 }
 """Learnt settings of each term. Settings of one term change by one factor."""
-_OF_OTHER_COLUMNS = ("bone_prior", "shape_prior", "shape_norm")
-"""Prior terms of parameters that the learnt terms do not share."""
 
 _logger = logging.getLogger(__name__)
 
@@ -187,7 +182,6 @@ def _learnable(config: FitConfig, windows: Windows, remarks: list[str]) -> list[
         remarks.append(f"no weights are learnt: {keypoints} keypoints in {frames} frames are too few")
         return []
     masks = int((windows.has_mask & windows.present).sum())
-    known = {*SETTINGS, POSE_PRIOR, *_OF_OTHER_COLUMNS, "mask", "keypoints"}
     names = []
     for name in SETTINGS:
         if name not in stage.terms or set(SETTINGS[name]) & set(term_settings(stage.override.get(name, {}))):
@@ -198,9 +192,6 @@ def _learnable(config: FitConfig, windows: Windows, remarks: list[str]) -> list[
             remarks.append(f"the weight of {MASK} is not learnt: it needs `edge: unbiased`")
         elif name == MASK and masks < LEAST_MASKS:
             remarks.append(f"the weight of {MASK} is not learnt: {masks} masks are too few")
-        elif name in (MOTION, PLACE) and set(stage.terms) - known:
-            others = ", ".join(sorted(set(stage.terms) - known))
-            remarks.append(f"{name} is not learnt: it cannot be separated from {others}")
         else:
             names.append(name)
     return names
@@ -263,13 +254,14 @@ def _updated(config: FitConfig, first: FitConfig, evidence: Mapping[str, Evidenc
         is_weight = path.endswith(".weight")
         ratio = now[path] / default[path]
         precision = ratio if is_weight else ratio**-2  # in units of the default
-        new = updated_precision(precision, Evidence(count, energy), 1 if is_weight else 2)
+        power, least = (1, 1.0) if is_weight else (2, 0.0)
+        new = updated_precision(precision, Evidence(count, energy), power, least)
         factor = new if is_weight else new**-0.5
         values |= {each: default[each] * factor for each in _paths(name)}
     return values
 
 
-def updated_precision(precision: float, evidence: Evidence, power: int = 1) -> float:
+def updated_precision(precision: float, evidence: Evidence, power: int = 1, least: float = 0.0) -> float:
     """Return the precision after one round, in units of the default, 1.
 
     1/β = (γ·v + n₀)/(γ + n₀) with v = energy/(β·γ), the variance that the data give, and n₀ = `PRIOR_COUNT`.
@@ -278,10 +270,11 @@ def updated_precision(precision: float, evidence: Evidence, power: int = 1) -> f
         precision: β before.
         evidence: of the term.
         power: the value of the config is β^(±1/power); its bounds are those of this module.
+        least: least precision.
     """
     count, energy = max(evidence.count, 0.0), max(evidence.energy, 1e-12)
     variance = (energy / precision + PRIOR_COUNT) / (count + PRIOR_COUNT)
-    low, high = MOST_FACTOR ** -float(power), MOST_FACTOR ** float(power)
+    low, high = max(MOST_FACTOR ** -float(power), least), MOST_FACTOR ** float(power)
     change = MOST_CHANGE ** float(power)
     return float(np.clip(np.clip(1 / variance, precision / change, precision * change), low, high))
 
@@ -318,13 +311,13 @@ def measure(
         settings = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *[hyperparameters] * len(rows))
         anchor = take_tile(pose, rows)
         problems = Problem(settings, anchor, own)
-        full, prior = window_blocks(program, problems, anchor), _prior_blocks(program, problems, anchor)
+        full = window_blocks(program, problems, anchor)
         local = jax.tree.map(np.asarray, _frame_statistics(program, problems, anchor))
         for b, row in enumerate(rows.tolist()):
             if row < 0 or not usable[row]:
                 continue
             own_pose, statistics, target = jax.tree.map(lambda x, b=b: x[b], (anchor, local, own))
-            added = _window_sums(program, full[b], prior[b], own_pose, statistics)
+            added = _window_sums(program, full[b], own_pose, statistics)
             if added is None:
                 continue
             found = True
@@ -335,7 +328,10 @@ def measure(
                 outlines.append(outline_errors(statistics.silhouette, *masks, program))
     if not found:
         return None
-    evidence = {name: _evidence(name, *sums[name]) for name in names}
+    evidence = {name: _evidence(*sums[name]) for name in names}
+    if KEYPOINTS in names:
+        dof = float(hyperparameters.settings[KEYPOINTS]["dof"])
+        evidence[KEYPOINTS] = expanded(evidence[KEYPOINTS], dof)
     if MASK in names:
         area = (program.camera.size_px / program.raster.size_px) ** 2
         weight = float(hyperparameters.settings[MASK]["weight"]) * area
@@ -344,9 +340,24 @@ def measure(
     return evidence
 
 
-def _evidence(name: str, total: float, taken: float, energy: float) -> Evidence:
-    is_likelihood = name in (KEYPOINTS, MASK)
-    return Evidence(max(total - taken, (LEAST_SHARE if is_likelihood else 0.01) * total), energy)
+def _evidence(total: float, taken: float, energy: float) -> Evidence:
+    return Evidence(max(total - taken, LEAST_SHARE * total), energy)
+
+
+def expanded(evidence: Evidence, dof: float) -> Evidence:
+    """Return the evidence about the scale of a bivariate Student t, with the energy divided by the mean weight w.
+
+    The mean of w is 1 + (2/ν)(1 − energy/count). At the fixed point the mean is 1, and the energy does not change.
+    Three rounds then reach 97 % of a scale that is 4 times the initial value (ν = 4); without the division, 70 %.
+
+    Source: Kent, Tyler and Vardi 1994, *A curious likelihood identity for the multivariate t-distribution*.
+
+    Args:
+        evidence: the effective number of errors, and β·Σ w‖e‖².
+        dof: degrees of freedom ν.
+    """
+    mean_weight = 1 + 2 / dof * (1 - evidence.energy / evidence.count)
+    return evidence._replace(energy=evidence.energy / max(mean_weight, LEAST_MEAN_WEIGHT))
 
 
 def mask_evidence(
@@ -362,31 +373,20 @@ def mask_evidence(
         sigma: width of the filter, in pixels of the silhouette.
     """
     count, variance = independent_errors(outlines, sigma)
-    return _evidence(MASK, masks * count, taken, masks * count * weight * variance)
-
-
-def _prior_blocks(program: Program, problems: Problem, pose: Pose) -> list[tuple[Blocks, Columns] | str]:
-    """Return the curvature of the prior terms alone. It needs no further compiled program."""
-    own = problems.hyperparameters
-    settings = {
-        name: values | {"weight": 0.0 * values["weight"]} if name in (KEYPOINTS, MASK, "mask", "keypoints") else values
-        for name, values in own.settings.items()
-    }
-    targets = replace(problems.targets, has_mask=jnp.zeros_like(problems.targets.has_mask))
-    return window_blocks(program, Problem(own._replace(settings=settings), problems.anchor, targets), pose)
+    return _evidence(masks * count, taken, masks * count * weight * variance)
 
 
 class _FrameStatistics(NamedTuple):
     """Quantities of the terms at some poses."""
 
-    energy: dict[str, Float[Array, "*B"]]
-    """λ·Σ w‖r‖² of each learnt term with residuals."""
+    energy: Float[Array, "*B"]
+    """λ·Σ w‖r‖² of the keypoints."""
     keypoints: Float[Array, "*B"]
     """Number of detected keypoints."""
     masks: Float[Array, "*B"]
     """Number of masks."""
     curvature: dict[str, Float[Array, "*B T D D"]]
-    """H of each frame, of the terms without links between frames."""
+    """H of each frame, of both terms."""
     silhouette: Float[Array, "*B M H W"]
 
 
@@ -395,21 +395,20 @@ def _frame_statistics(program: Program, problems: Problem, pose: Pose) -> _Frame
     def one(problem: Problem, pose: Pose) -> _FrameStatistics:
         window = problem_window(program, problem, pose)
         settings = problem.hyperparameters.settings
-        energy, curvature = {}, {}
+        curvature = {}
         T, D = frame_rows(pose, program.shared).shape
-        for name in settings:
-            own = {name: settings[name]}
-            if name in (KEYPOINTS, MOTION, PLACE):
-                more = {key: value for key, value in settings[name].items() if key != "weight"}
-                energy[name] = settings[name]["weight"] * sum(
-                    jnp.sum(each.weight * 2 * each.kernel.slope(squared) * squared)
-                    for each in as_list(program.terms[name].function(window, **more))
-                    for squared in [jnp.sum(each.values**2, axis=-1)]
-                )
-            if name in (KEYPOINTS, MASK, POSE_PRIOR):
-                H = evaluate_curvature(window, program.terms, own, second_order=True)
-                units = jnp.broadcast_to(jnp.eye(D)[:, None], (D, T, D))
-                curvature[name] = jax.lax.map(H.product, units).transpose(1, 2, 0)
+        for name in (each for each in (KEYPOINTS, MASK) if each in settings):
+            H = evaluate_curvature(window, program.terms, {name: settings[name]}, second_order=True)
+            units = jnp.broadcast_to(jnp.eye(D)[:, None], (D, T, D))
+            curvature[name] = jax.lax.map(H.product, units).transpose(1, 2, 0)
+        of_keypoints = dict(settings[KEYPOINTS])
+        weight = of_keypoints.pop("weight")
+        energy = sum(
+            jnp.sum(each.weight * 2 * each.kernel.slope(squared) * squared)
+            for each in as_list(program.terms[KEYPOINTS].function(window, **of_keypoints))
+            for squared in [jnp.sum(each.values**2, axis=-1)]
+        )
+        energy = jnp.asarray(weight * energy)
         shown = jnp.zeros((0, 0, 0))
         if MASK in settings:
             raster = program.raster
@@ -425,46 +424,18 @@ def _frame_statistics(program: Program, problems: Problem, pose: Pose) -> _Frame
 
 
 def _window_sums(
-    program: Program,
-    full: tuple[Blocks, Columns] | str,
-    prior: tuple[Blocks, Columns] | str,
-    pose: Pose,
-    local: _FrameStatistics,
+    program: Program, full: tuple[Blocks, Columns] | str, pose: Pose, local: _FrameStatistics
 ) -> dict[str, np.ndarray] | None:
-    """Return, for each term: number of errors (priors: tr(Σ₀·H)), tr(Σ·H), and energy. None without a posterior."""
-    if isinstance(full, str) or isinstance(prior, str):
+    """Return, for each term: number of errors (masks: number of masks), tr(Σ·H), energy. None without a posterior."""
+    if isinstance(full, str):
         return None
-    broad = broad_precision(program, pose)
-    posterior, before = posterior_of(*full, broad), posterior_of(*prior, broad)
-    if isinstance(posterior, str) or isinstance(before, str):
+    posterior = posterior_of(*full, broad_precision(program, pose))
+    if isinstance(posterior, str):
         return None
-    covariance, prior_covariance = posterior.posterior.covariance, before.posterior.covariance
-    columns = full[1]
-    both = np.concatenate([columns.own, columns.shared])
-
-    def frame_trace(name: str) -> float:
-        return float(np.sum(posterior.posterior.frame_covariance() * local.curvature[name][:, both[:, None], both]))
-
-    sums = {}
-    if KEYPOINTS in local.energy:
-        sums[KEYPOINTS] = np.array([2 * local.keypoints, frame_trace(KEYPOINTS), local.energy[KEYPOINTS]])
-    if MASK in local.curvature:
-        sums[MASK] = np.array([local.masks, frame_trace(MASK), 0.0])
-    temporal = prior[0]
-    if POSE_PRIOR in local.curvature:
-        band = temporal.band.copy()
-        band[0] -= local.curvature[POSE_PRIOR][:, columns.own[:, None], columns.own]
-        temporal = temporal._replace(band=band)
-    angles = columns.own < 3 * (1 + pose.body_pose.shape[-2])
-    for name, inside in ((MOTION, angles), (PLACE, ~angles)):
-        if name in local.energy:
-            part = _only(temporal, inside)
-            traces = trace_product(prior_covariance, part), trace_product(covariance, part)
-            sums[name] = np.array([*traces, local.energy[name]])
+    covariance = posterior.posterior.frame_covariance()
+    both = np.concatenate([full[1].own, full[1].shared])
+    taken = {name: np.sum(covariance * H[:, both[:, None], both]) for name, H in local.curvature.items()}
+    sums = {KEYPOINTS: np.array([2 * local.keypoints, taken[KEYPOINTS], local.energy])}
+    if MASK in taken:
+        sums[MASK] = np.array([local.masks, taken[MASK], 0.0])
     return sums
-
-
-def _only(H: Blocks, inside: np.ndarray) -> Blocks:
-    """Return a matrix without the rows and columns of other parameters of the frames."""
-    band = H.band * (inside[:, None] & inside)
-    return Blocks(band, np.zeros_like(H.border), np.zeros_like(H.corner))

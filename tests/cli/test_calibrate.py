@@ -47,6 +47,7 @@ def test_the_config_of_a_fit(folder, tmp_path, capsys):
         assert words in printed
     config = load_config(out)
     assert config.terms["mask_smooth_l1"] != load_config("map").terms["mask_smooth_l1"]
+    assert not config.learn_weights
     (tmp_path / "mine.yaml").write_text(f"base: reconstruct\nfit: {out}\n")
     assert load_reconstruct_config(tmp_path / "mine.yaml").fit == config
     rejected(capsys, command(folder, out), str(out), "exists already", "--overwrite")

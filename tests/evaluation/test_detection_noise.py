@@ -149,7 +149,7 @@ def test_labels_without_masks_leave_the_settings_of_masks_out():
     error, confidence = draws(4)
     noise = estimate_noise(detected(range(4), error, confidence), Truth(labelled(range(4), masks=False)))
     assert noise.outline is None
-    assert yaml.safe_load(noise_yaml(noise, "a", "b")).keys() == {"base", "terms"}
+    assert yaml.safe_load(noise_yaml(noise, "a", "b")).keys() == {"base", "learn_weights", "terms"}
 
 
 def without_birds(found, labels):

@@ -7,7 +7,7 @@ import logging
 import math
 import re
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -143,13 +143,16 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
     """Return a run for each point; runs with equal configs are merged.
 
     Args:
-        base: the config that every run starts from.
+        base: the config that every run starts from. Its `learn_weights` does not count, because runs vary weights.
         points: for each run, path of a config key → value that replaces the value of the base.
         source: the grid file, for error messages.
 
     Raises:
         InputError: a key is unknown, or a value is invalid.
     """
+    if base.learn_weights:
+        _logger.warning("%s: the runs learn no weights, because runs vary weights", source)
+        base = replace(base, learn_weights=False)
     kept: dict[Hashable, tuple[FitConfig, Mapping[str, Any]]] = {}
     repeated = []
     for point in points:

@@ -71,6 +71,15 @@ def test_equal_runs_are_one(tmp_path, caplog):
     assert "one run is kept" in caplog.text
 
 
+def test_the_runs_of_a_config_that_learns_weights_learn_none(tmp_path, caplog):
+    (tmp_path / "fit.yaml").write_text("base: map\nlearn_weights: true")
+    (tmp_path / "grid.yaml").write_text(
+        f"config: {tmp_path / 'fit.yaml'}\ncrosses: [{{cross: {{terms.pose_prior: [1, 2]}}}}]"
+    )
+    assert not any(run.config.learn_weights for run in load_grid(tmp_path / "grid.yaml").runs)
+    assert "learn no weights" in caplog.text
+
+
 def test_many_equal_runs_are_one_warning(tmp_path, caplog):
     text = "crosses:\n  - cross: {terms.velocity: [" + "1, 1.0, " * 100 + "2]}"
     assert len(load_grid(grid_file(tmp_path, text)).runs) == 2
