@@ -175,6 +175,10 @@ class StageConfig:
         check_terms("override", self.override)
 
 
+LEARNABLE = ("keypoint_likelihood", "mask_smooth_l1")
+"""Terms whose scale or weight can be learnt from the data."""
+
+
 @dataclass(frozen=True)
 class FitConfig:
     """All settings of a fit; the defaults are the paper's best setting."""
@@ -213,10 +217,10 @@ class FitConfig:
     error_bars: bool = False
     """Whether the result has error bars: standard deviations of the pose and covariances of the keypoints
     (docs/files.md). They assume that the terms of the last stage are negative log-likelihoods."""
-    learn_weights: bool = False
-    """Whether weights and scales of the terms are learnt from the data before the fit (docs/configs.md). The values of
-    the config are then the initial values, and weak prior knowledge. The result holds the learnt values in
-    `learnt.yaml`."""
+    learn_weights: tuple[str, ...] = ()
+    """Terms whose scale or weight is learnt from the data before the fit (docs/configs.md): `keypoint_likelihood`,
+    `mask_smooth_l1`. The values of the config are then the initial values, and weak prior knowledge. The result holds
+    the learnt values in `learnt.yaml`."""
     backend: Literal["auto", "native", "reference"] = "auto"
     """Implementation of the silhouette: the compiled kernel (`native`), the pure-JAX `reference`, or the kernel if
     available (`auto`)."""
@@ -237,6 +241,8 @@ class FitConfig:
         problem, remedy = f"holds {len(self.stages)} stages", f"expected at most {limits.STAGES}"
         require(len(self.stages) <= limits.STAGES, "stages", problem, remedy)
         check_terms("terms", self.terms)
+        for name in self.learn_weights:
+            require(name in LEARNABLE, "learn_weights", f"names {name!r}", f"expected some of {', '.join(LEARNABLE)}")
         for i, stage in enumerate(self.stages):
             if stage.carry_moments:
                 adam = stage.solver == self.stages[max(i - 1, 0)].solver == "adam"

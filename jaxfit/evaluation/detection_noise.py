@@ -199,7 +199,7 @@ def noise_yaml(noise: DetectionNoise, detections: object, labels: object) -> str
     own = noise.settings
     term = ", ".join(f"{name}: {rounded(own[f'terms.keypoint_likelihood.{name}'])}" for name in noise.keypoint._fields)
     lines = [*_comments(noise, detections, labels), f"base: {BASE}"]
-    lines.append("learn_weights: false # the labels give the values")
+    lines.append("learn_weights: [] # the labels give the values")
     lines += ["terms:", f"  keypoint_likelihood: {{weight: 1, {term}}}"]
     if "terms.mask_smooth_l1" in own:
         lines.append(f"  mask_smooth_l1: {rounded(own['terms.mask_smooth_l1'])}")

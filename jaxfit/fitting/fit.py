@@ -75,7 +75,7 @@ def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[F
 
 _logger = logging.getLogger(__name__)
 
-LEARN_REMEDY = "set `learn_weights: false`, or use the learnt.yaml of a result as config"
+LEARN_REMEDY = "set `learn_weights: []`, or use the learnt.yaml of a result as config"
 
 
 def fit(
@@ -141,7 +141,7 @@ def learn_weights(
     model = checked_model(observations, bird, [used], initial_poses, source)
     windows = _cut_runs(observations, [used], initial_poses, source)[0].windows
     values, remarks = learn(model, used, windows, initial_poses, progress, source)
-    config = replace(config, learn_weights=False)
+    config = replace(config, learn_weights=())
     return Learnt(with_values(config, values) if values else config, values, remarks)
 
 
@@ -171,7 +171,9 @@ def fit_runs(
         ValueError: the configs need different programs.
     """
     if any(config.learn_weights for config in configs):
-        raise InputError("config", "`learn_weights` is true, but several fits at once learn no weights", LEARN_REMEDY)
+        raise InputError(
+            "config", "`learn_weights` names terms, but several fits at once learn no weights", LEARN_REMEDY
+        )
     observations = check_observations(observations, bird, source)
     skipped = report_distant_birds(observations, source)
     if not observations.masks:

@@ -139,9 +139,9 @@ def learn(
         progress: shows progress.
         source: name of the observations in messages.
     """
-    first, remarks = replace(config, learn_weights=False), []
+    first, remarks = replace(config, learn_weights=()), []
     some = windows[choose_windows(windows, frames_per_batch(model.bird, config) // config.window)]
-    names = _learnable(first, some, remarks)
+    names = _learnable(config, some, remarks)
     values: dict[str, float] = {}
     if names:
         steps = config.stages[-1].steps
@@ -183,7 +183,7 @@ def _learnable(config: FitConfig, windows: Windows, remarks: list[str]) -> list[
         return []
     masks = int((windows.has_mask & windows.present).sum())
     names = []
-    for name in SETTINGS:
+    for name in config.learn_weights:
         if name not in stage.terms or set(SETTINGS[name]) & set(term_settings(stage.override.get(name, {}))):
             continue
         if settings[name]["weight"] <= 0:

@@ -1,4 +1,4 @@
-"""The Laplace approximation of a window: curvature blocks, log-determinant, covariances.
+"""The Laplace approximation of a window: curvature blocks and covariances.
 
 The posterior of a window is approximated by a Gaussian at the fitted pose. Its precision H is the curvature of the
 objective, in nats. All terms of the library link a frame with at most the next two frames, so H has a band of blocks,
@@ -8,7 +8,7 @@ and a border for the parameters that all frames share (common scale, bone length
 
 Products with H at structured probes give the blocks: frames t, t + 5, t + 10, … do not interact, so one probe gives one
 column of all their blocks. A Cholesky factorisation forward in time and the selected inverse backward in time give the
-log-determinant and the blocks of H⁻¹ inside the band. `fitting/sandwich.py` widens H⁻¹ for errors that the objective
+blocks of H⁻¹ inside the band. `fitting/sandwich.py` widens H⁻¹ for errors that the objective
 does not assume.
 
 The curvature of a robust kernel includes its second derivative (`objective.residuals.residual_curvature`). Derivatives
@@ -18,8 +18,8 @@ The mask terms enter with their Gauss-Newton block times their weight, as in the
 λ·Σ ½e², that is of `mask_smooth_l1`. For the L1 norm, this is a choice: its own second derivative depends on the
 distance between outline and mask, and vanishes if they agree exactly. The block treats λ as the precision of a pixel.
 
-Source: MacKay 1992, *A practical Bayesian framework for backpropagation networks* (evidence, effective number of
-parameters); Takahashi et al. 1973, *Formation of a sparse bus impedance matrix* (selected inverse).
+Source: MacKay 1992, *A practical Bayesian framework for backpropagation networks* (the Laplace
+approximation); Takahashi et al. 1973, *Formation of a sparse bus impedance matrix* (selected inverse).
 """
 
 from __future__ import annotations
@@ -84,14 +84,6 @@ class Posterior(NamedTuple):
 
     covariance: Blocks
     """The blocks of H⁻¹ inside the band. Blocks outside the band are not 0; they are not computed."""
-    log_determinant: float
-    """log |H|."""
-
-    @property
-    def count(self) -> int:
-        """The number of parameters."""
-        T, L, C = self.covariance.border.shape
-        return T * L + C
 
     def frame_covariance(self) -> Float[np.ndarray, "T P P"]:
         """Return the covariance of the P = L + C parameters of each frame: its own, then the shared ones."""
@@ -111,8 +103,6 @@ class Factors(NamedTuple):
     """A⁻¹U."""
     corner: Float[np.ndarray, "C C"]
     """The block of H⁻¹ of the shared parameters: the inverse of S − UᵀA⁻¹U."""
-    log_determinant: float
-    """log |H|."""
 
 
 def factorise(H: Blocks) -> Factors:
@@ -124,10 +114,9 @@ def factorise(H: Blocks) -> Factors:
     (_, T, L, _), C = H.band.shape, len(H.corner)
     band = np.concatenate([H.band, np.zeros((3, BANDWIDTH, L, L))], axis=1)  # frames after the last: 0
     (invert_triangle,) = get_lapack_funcs(("trtri",), dtype=np.float64)
-    inverses, gains, log_determinant = np.zeros((T, L, L)), np.zeros((2, T, L, L)), 0.0
+    inverses, gains = np.zeros((T, L, L)), np.zeros((2, T, L, L))
     for t in range(T):
         factor = np.linalg.cholesky(band[0, t])
-        log_determinant += 2 * np.log(np.diagonal(factor)).sum()
         # products of L×L matrices only: linear algebra on several threads is slow for larger ones on a busy machine
         inverse_factor, _ = invert_triangle(factor, lower=1)
         inverses[t] = inverse_factor.T @ inverse_factor
@@ -139,9 +128,8 @@ def factorise(H: Blocks) -> Factors:
     border = _solve_band(inverses, gains, H.border)
     schur = H.corner - np.einsum("tic,tid->cd", H.border, border)
     factor = np.linalg.cholesky((schur + schur.T) / 2)
-    log_determinant += 2 * np.log(np.diagonal(factor)).sum()
     corner = cho_solve((factor, True), np.eye(C)) if C else np.zeros((0, 0))
-    return Factors(inverses, gains, border, corner, float(log_determinant))
+    return Factors(inverses, gains, border, corner)
 
 
 def _solve_band(inverses: np.ndarray, gains: np.ndarray, right: Float[np.ndarray, "T L R"]) -> np.ndarray:
@@ -178,7 +166,7 @@ def invert_blocks(H: Blocks, factors: Factors | None = None) -> Posterior:
         numpy.linalg.LinAlgError: H is not positive definite.
     """
     (_, T, L, _) = H.band.shape
-    inverses, gains, V, corner, log_determinant = factorise(H) if factors is None else factors
+    inverses, gains, V, corner = factorise(H) if factors is None else factors
     # backward: the blocks of A⁻¹ inside the band
     inside = np.zeros((BANDWIDTH + 1, T + BANDWIDTH, L, L))
     for t in reversed(range(T)):
@@ -190,17 +178,7 @@ def invert_blocks(H: Blocks, factors: Factors | None = None) -> Posterior:
     inside = inside[:, :T]
     for k in range(BANDWIDTH + 1):
         inside[k, : T - k] += V[: T - k] @ corner @ V[k:].swapaxes(1, 2)
-    return Posterior(Blocks(inside, -V @ corner, corner), log_determinant)
-
-
-def trace_product(covariance: Blocks, H: Blocks) -> float:
-    """Return tr(Σ·H) of two symmetric matrices; blocks outside the band of H are 0.
-
-    With Σ the covariance of a posterior and H the curvature of its prior terms alone, n − tr(Σ·H) is MacKay's
-    effective number of parameters.
-    """
-    double = 2 * (np.sum(covariance.band[1:] * H.band[1:]) + np.sum(covariance.border * H.border))
-    return float(np.sum(covariance.band[0] * H.band[0]) + double + np.sum(covariance.corner * H.corner))
+    return Posterior(Blocks(inside, -V @ corner, corner))
 
 
 class Products(NamedTuple):
@@ -304,9 +282,6 @@ class WindowPosterior(NamedTuple):
 
     posterior: Posterior
     columns: Columns
-    log_volume: float
-    """log |H| − log |B| with B the precision of the broad prior: the log-determinant for the Laplace approximation of
-    the evidence, log p ≈ −E − ½·log_volume, where the broad prior is normalised. Parameters without data count 0."""
     precision: Blocks
     """H, with the broad prior."""
     factors: Factors
@@ -422,27 +397,8 @@ def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -
             factors = factorise(precision)
         except np.linalg.LinAlgError:
             continue
-        broad_log = float(np.log(own).sum() + np.log(shared).sum())
-        posterior = invert_blocks(precision, factors)
-        return WindowPosterior(posterior, columns, factors.log_determinant - broad_log, precision, factors)
+        return WindowPosterior(invert_blocks(precision, factors), columns, precision, factors)
     return "the curvature of the objective is not positive definite"
-
-
-def log_evidence(loss: float, posterior: WindowPosterior, prior: WindowPosterior) -> float:
-    """Return the Laplace approximation of the evidence, log p ≈ −E − ½·(log |H| − log |H_prior|), nats.
-
-    The volume of the prior is the normaliser of the product of all prior terms. The normaliser of every single term is
-    not enough: a pose prior of single frames times a motion prior is narrower than either of them, because the frames
-    of slow motion are not independent.
-
-    Args:
-        loss: the objective E at the fitted pose, plus the normalisers of the likelihood of the data.
-        posterior: the posterior (`window_posteriors`).
-        prior: the Gaussian with the curvature of the prior terms alone, as `posterior_of` of their `window_blocks`.
-
-    Source: MacKay 1992.
-    """
-    return -loss - 0.5 * (posterior.log_volume - prior.log_volume)
 
 
 def with_shared(program: Program, stage: StageConfig) -> Program:

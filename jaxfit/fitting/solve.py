@@ -486,7 +486,7 @@ def compiled_part(config: FitConfig) -> FitConfig:
         overlap=0,
         filter_window=1,
         min_keypoints=1,
-        learn_weights=False,
+        learn_weights=(),
         crop=replace(config.crop, padding=0.0),
         initialise=InitialiseConfig(hypotheses=config.initialise.hypotheses),
     )

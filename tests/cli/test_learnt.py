@@ -13,7 +13,7 @@ CONFIG = """
 base: paper
 window: 6
 crop: {mode: image, size_px: 64}
-learn_weights: true
+learn_weights: [keypoint_likelihood, mask_smooth_l1]
 terms: {keypoint_likelihood: {sd_sure_px: 2}, pose_prior: 0.5, motion_likelihood: 1}
 stages:
   - name: only

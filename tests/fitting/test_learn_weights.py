@@ -18,6 +18,7 @@ from jaxfit.fitting.learn import (
     MOST_FRAMES,
     MOST_WINDOWS,
     PRIOR_COUNT,
+    SETTINGS,
     Evidence,
     choose_windows,
     expanded,
@@ -37,7 +38,7 @@ TERMS = {
     "place_likelihood": {"sd_px_s2": 300.0},
 }
 STAGE = StageConfig("only", 12, tuple(TERMS), step_scale={"transl": (1, 1, 0)}, solver="levenberg_marquardt")
-LEARNING = dataclasses.replace(config(T), stages=(STAGE,), terms=TERMS, learn_weights=True, memory_gb=1.0)
+LEARNING = dataclasses.replace(config(T), stages=(STAGE,), terms=TERMS, learn_weights=tuple(SETTINGS), memory_gb=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +100,7 @@ def test_without_data_the_values_of_the_config_stay(exact, caplog, changes):
     own = dataclasses.replace(LEARNING, min_keypoints=2, **changes)
     learnt = learn_weights(observations, BIRD, own)
     assert learnt.values == {}
-    assert learnt.config == dataclasses.replace(own, learn_weights=False)
+    assert learnt.config == dataclasses.replace(own, learn_weights=())
     assert len(learnt.remarks) == 1
     assert caplog.text.count("no weights are learnt") == 1
 

@@ -152,7 +152,7 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
     """
     if base.learn_weights:
         _logger.warning("%s: the runs learn no weights, because runs vary weights", source)
-        base = replace(base, learn_weights=False)
+        base = replace(base, learn_weights=())
     kept: dict[Hashable, tuple[FitConfig, Mapping[str, Any]]] = {}
     repeated = []
     for point in points:

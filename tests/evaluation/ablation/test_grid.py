@@ -72,7 +72,7 @@ def test_equal_runs_are_one(tmp_path, caplog):
 
 
 def test_the_runs_of_a_config_that_learns_weights_learn_none(tmp_path, caplog):
-    (tmp_path / "fit.yaml").write_text("base: map\nlearn_weights: true")
+    (tmp_path / "fit.yaml").write_text("base: map\nlearn_weights: [mask_smooth_l1]")
     (tmp_path / "grid.yaml").write_text(
         f"config: {tmp_path / 'fit.yaml'}\ncrosses: [{{cross: {{terms.pose_prior: [1, 2]}}}}]"
     )
