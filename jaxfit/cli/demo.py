@@ -71,7 +71,7 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     measured[-1] = measured[-1]._replace(note=f"{measured[-1].note}; {numbers}")
     write_report(result_folder / REPORT, *report, scene_folder / FOOTAGE, measured=measured)
     if verbose:
-        for output in (track_table(observations, done.solution), *compared, numbers):
+        for output in (track_table(observations, done.solution), *compared, flag_quality_line(result), numbers):
             show(output)
     for line in _answer(done.tracking.trust, observed, result, matching):
         show(line)
@@ -93,6 +93,8 @@ def _answer(trust: Trust, observed: ObservationsEvaluation, result: Evaluation, 
     birds = counted(len(matching.follows) + len(matching.missed), "bird")
     found = len(matching.follows) + len(matching.unmatched)
     wrong = f"; {counted(len(matching.unmatched), 'track')} too wrong to measure" if matching.unmatched else ""
+    found_wrong, of_wrong = (round(result.flags.get(name, 0)) for name in ("found", "wrong"))
+    flagged = f"; {found_wrong} of {of_wrong} wrong poses flagged" if of_wrong else ""
     detection, keypoints = observed.detection, observed.keypoints["all"]
     tracks = {bird: track for track, bird in matching.follows.items()}
     errors = {tracks[bird]: row["mpjpe/length"] for bird, row in result.tracks.items()}
@@ -105,7 +107,7 @@ def _answer(trust: Trust, observed: ObservationsEvaluation, result: Evaluation, 
         f"mean IoU of the masks {detection['mean_iou']:.2f} (1 is perfect)",
         f"keypoints: {100 * keypoints.annotated_pck_05:.0f} % within 5 % of the bird's size, hidden keypoints included",
         f"poses: joints {100 * result.overall['mpjpe/length']:.1f} % of the body length from the truth, "
-        f"worst in track {worst} ({100 * errors[worst]:.1f} %){wrong}; {flag_quality_line(result)}",
+        f"worst track {worst} ({100 * errors[worst]:.1f} %){wrong}{flagged}",
     ]
 
 

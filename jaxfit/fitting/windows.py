@@ -379,7 +379,7 @@ def filter_observations(observations: Observations, window: int) -> Observations
     at = np.maximum(line, 0)
     known = line >= 0
     bird_bytes = 40 * len(line) * observations.num_keypoints
-    what = f"the filter over {len(line):,} frame numbers"
+    what = f"the arrays of the filter over {len(line):,} frame numbers"
     check_memory("observations", what, bird_bytes, "number the frames consecutively")
     at_once = max(int(FILTER_BYTES / max(bird_bytes, 1)), 1)
     filtered = np.empty_like(observations.keypoints_px)

@@ -182,7 +182,7 @@ def test_the_demo_writes_the_files_that_it_names(tmp_path, monkeypatch, capsys):
     assert lines[2].startswith(
         "detections: 100 % of the birds in all frames, 100 % are right, mean IoU of the masks 1.00"
     )
-    assert re.match(r"poses: joints \d+\.\d % of the body length from the truth, worst in track \d ", lines[4])
+    assert re.match(r"poses: joints \d+\.\d % of the body length from the truth, worst track \d \(", lines[4])
     for name, line in zip(("result/report.html", "result/overlay.mp4", "birds.glb"), lines[6:9], strict=True):
         assert line.startswith(f"  {tmp_path / 'demo' / name}: ")
     page = (tmp_path / "demo" / "result" / "report.html").read_text()
