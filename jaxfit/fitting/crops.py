@@ -40,7 +40,8 @@ def crop_squares(
         if config.mode == "image":
             crop[w] = _whole_image(image_px)
         else:
-            crop[w] = _around_the_bird(observations, n, frame[w], present[w], CROP_IMAGE_SIDES * image_px.max(), config)
+            largest_px = float(CROP_IMAGE_SIDES * image_px.max())
+            crop[w] = _around_the_bird(observations, n, frame[w], present[w], largest_px, config)
     return crop
 
 
