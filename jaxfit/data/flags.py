@@ -116,7 +116,7 @@ def with_doubts(
         observations.confidence.mean(-1) < LEAST_CONFIDENCE,
     )
     doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
-    return replace(solution, doubts=np.where(solution.valid, doubts, -1).astype(np.int8))
+    return replace(solution, doubts=doubts)
 
 
 def is_outlier(values: Float[np.ndarray, "N T"]) -> Bool[np.ndarray, "N T"]:

@@ -171,6 +171,9 @@ class Solution:
         doubts = np.full(np.shape(self.valid), -1, np.int8) if self.doubts is None else self.doubts
         layout = LAYOUT | (ERROR_BARS if self.has_error_bars else {})
         arrays = validate_arrays(vars(self) | {"ambiguity_deg": ambiguity_deg, "doubts": doubts}, layout)
+        # a frame without a pose has no flag, whatever the array holds there
+        arrays["doubts"] = np.where(arrays["valid"], arrays["doubts"], np.int8(-1))
+        arrays["doubts"].flags.writeable = False
         if len(self.joint_names) != arrays["body_pose"].shape[2] + 1:
             bones = arrays["body_pose"].shape[2]
             raise ValueError(f"joint_names must be {bones + 1} for body_pose of {bones}, not {len(self.joint_names)}")

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxfit.config.fit import FitConfig, load_config
 from jaxfit.config.reconstruct import ReconstructConfig, load_reconstruct_config
+from jaxfit.data.flags import with_doubts
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.recognise import read_observations
@@ -117,6 +118,8 @@ def refit(
         status=np.array([track_status(*count) for count in counts.tolist()], "<U32"),
         failures={track: tuple(texts) for track, texts in failures.items()},
     )
+    # copied poses too: whether a pose is an outlier depends on all poses
+    merged = with_doubts(merged, after, bird, progress)
     fitted = [(int(new.track_id[w]), *_ends(after, new, w)) for w in touched.tolist()]
     return Refit(merged, fitted, len(new))
 

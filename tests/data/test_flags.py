@@ -85,6 +85,13 @@ def test_codes():
     np.testing.assert_array_equal(flags(np.array([[FAR + WIDE, WIDE, 0, -1]])), [["contradicted", "unsure", "ok", ""]])
 
 
+def test_frames_without_a_pose_have_no_flag():
+    """Also where arrays of other results are put together, and the rest is filled with 0."""
+    valid = np.ones((N, T), bool)
+    valid[0, 2:] = False
+    assert flag_counts(solution(valid=valid, doubts=np.zeros((N, T), np.int8)).doubts)["ok"] == N * T - 2
+
+
 def test_frames_with_the_same_flag_are_one_range():
     doubts = np.array([[FAR, FAR + UNLIKE, 0, FAR], [WIDE, -1, WIDE, WIDE]])
     first = "frames 10 to 11 contradicted: keypoints far from the pose; mask unlike the mesh"
