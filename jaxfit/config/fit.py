@@ -175,8 +175,8 @@ class StageConfig:
         check_terms("override", self.override)
 
 
-LEARNABLE = ("keypoint_likelihood", "mask_smooth_l1")
-"""Terms whose scale or weight can be learnt from the data."""
+LEARNABLE = ("keypoint_likelihood", "mask_smooth_l1", "keypoint_offsets")
+"""Terms whose scale or weight can be learnt from the data, and the key `keypoint_offsets`."""
 
 
 @dataclass(frozen=True)
@@ -218,9 +218,12 @@ class FitConfig:
     """Whether the result has error bars: standard deviations of the pose and covariances of the keypoints
     (docs/files.md). They assume that the terms of the last stage are negative log-likelihoods."""
     learn_weights: tuple[str, ...] = ()
-    """Terms whose scale or weight is learnt from the data before the fit (docs/configs.md): `keypoint_likelihood`,
-    `mask_smooth_l1`. The values of the config are then the initial values, and weak prior knowledge. The result holds
-    the learnt values in `learnt.yaml`."""
+    """What is learnt from the data before the fit (docs/configs.md): the scale of `keypoint_likelihood`, the weight of
+    `mask_smooth_l1`, and `keypoint_offsets`. The values of the config are then the initial values, and weak prior
+    knowledge. The result holds the learnt values in `learnt.yaml`."""
+    keypoint_offsets: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """Keypoint → [x, y, z]: offset of the keypoint in the observations from the keypoint of the model, in the rest
+    pose: sideways, towards the bill, upwards; model units. The keypoints of the result have these offsets, too."""
     backend: Literal["auto", "native", "reference"] = "auto"
     """Implementation of the silhouette: the compiled kernel (`native`), the pure-JAX `reference`, or the kernel if
     available (`auto`)."""
@@ -241,6 +244,11 @@ class FitConfig:
         problem, remedy = f"holds {len(self.stages)} stages", f"expected at most {limits.STAGES}"
         require(len(self.stages) <= limits.STAGES, "stages", problem, remedy)
         check_terms("terms", self.terms)
+        for name, offset in self.keypoint_offsets.items():
+            key, far = f"keypoint_offsets.{name}", limits.KEYPOINT_OFFSET
+            require(len(offset) == 3, key, f"has {len(offset)} numbers", "expected three: x, y, z")
+            near = all(abs(number) <= far for number in offset)  # false for NaN
+            require(near, key, f"is {list(offset)}", f"expected numbers from -{far:g} to {far:g}")
         for name in self.learn_weights:
             require(name in LEARNABLE, "learn_weights", f"names {name!r}", f"expected some of {', '.join(LEARNABLE)}")
         for i, stage in enumerate(self.stages):

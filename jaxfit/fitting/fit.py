@@ -224,9 +224,13 @@ def checked_model(
         observations, bird, configs, initial_poses, source: as for `fit_runs`.
 
     Raises:
-        InputError: the fit needs too much memory, or a term is unusable.
+        InputError: the fit needs too much memory, a term is unusable, or a keypoint with an offset is unknown.
     """
     check_fit_memory(observations, bird, configs, source)
+    unknown = set(configs[0].keypoint_offsets) - set(bird.keypoint_names)
+    if unknown:
+        problem = f"`keypoint_offsets` names keypoints that the model lacks: {', '.join(sorted(unknown))}"
+        raise InputError("config", problem, f"the model has {', '.join(bird.keypoint_names)}")
     model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
     check_terms(configs[0], model)
     return model

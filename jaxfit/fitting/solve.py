@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from jaxfit.config.fit import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX, Camera
-from jaxfit.model.kinematics import Pose, Rig, fold_bird
+from jaxfit.model.kinematics import Pose, Rig, fold_bird, move_keypoints
 from jaxfit.objective.curvature import SHARED_PARAMETERS, Rows, add_rows, frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature, evaluate_terms, weighted_sum
 from jaxfit.objective.posed_window import PosedWindow, Priors, Raster, Targets, priors_of
@@ -357,13 +357,18 @@ class FitModel(NamedTuple):
 
     bird: Bird
     rig: Rig
+    """With the keypoints of the config (`keypoint_offsets`)."""
     priors: Priors
     camera: Camera
 
 
 def fit_model(bird: Bird, config: FitConfig) -> FitModel:
-    """Return the model of a fit: the bird, folded, and the crop camera of the config."""
-    return FitModel(bird, fold_bird(bird), priors_of(bird), crop_camera(config))
+    """Return the model of a fit: the bird, folded, with the keypoints of the config, and its crop camera."""
+    rig = fold_bird(bird)
+    if config.keypoint_offsets:
+        offsets = [config.keypoint_offsets.get(name, (0.0, 0.0, 0.0)) for name in bird.keypoint_names]
+        rig = move_keypoints(rig, np.array(offsets, np.float32))
+    return FitModel(bird, rig, priors_of(bird), crop_camera(config))
 
 
 def crop_camera(config: FitConfig) -> Camera:

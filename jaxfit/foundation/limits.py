@@ -37,6 +37,8 @@ CROP_PADDING = 10.0
 """Largest margin of a crop, as a fraction of the box."""
 FOCAL_PX = 1e6
 """Largest focal length of the crop camera."""
+KEYPOINT_OFFSET = 1e4
+"""Largest offset of a keypoint, model units."""
 STAGES = 50
 """Largest number of stages of a fit; each stage compiles a program."""
 STEPS = 100_000

@@ -6,6 +6,8 @@ keypoints are a linear map (K, J, 4) of A that needs no mesh, and vertices need 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -110,6 +112,19 @@ def fold_bird(bird: Bird) -> Rig:
         joint_names=bird.joint_names,
         keypoint_names=bird.keypoint_names,
     )
+
+
+def move_keypoints(rig: Rig, offsets: Float[Array | np.ndarray, "K 3"]) -> Rig:
+    """Return the rig with other keypoints.
+
+    The joints move a new point with the weights of the old point.
+
+    Args:
+        rig: the folded bird.
+        offsets: added to the rest positions of the keypoints, model units.
+    """
+    linear, constant = rig.keypoint_map[..., :3], rig.keypoint_map[..., 3:]
+    return replace(rig, keypoint_map=jnp.concatenate([linear + offsets[:, None] * constant, constant], axis=-1))
 
 
 def joint_transforms(rig: Rig, pose: Pose) -> Float[Array, "J 3 4"]:

@@ -12,6 +12,7 @@ from jaxfit.config.fit import StageConfig, load_config
 from jaxfit.data.masks import decode_mask, encode_mask
 from jaxfit.evaluation.ablation.grid import Run
 from jaxfit.evaluation.ablation.runs import fit_batches
+from jaxfit.fitting.evidence import Evidence, expanded, mask_evidence
 from jaxfit.fitting.fit import fit, fit_runs, learn_weights
 from jaxfit.fitting.learn import (
     MOST_FACTOR,
@@ -19,10 +20,7 @@ from jaxfit.fitting.learn import (
     MOST_WINDOWS,
     PRIOR_COUNT,
     SETTINGS,
-    Evidence,
     choose_windows,
-    expanded,
-    mask_evidence,
     updated_precision,
 )
 from jaxfit.fitting.outline_noise import outline_correlation_px, outline_error
