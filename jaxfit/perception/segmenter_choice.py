@@ -3,15 +3,15 @@
 Trust (`jaxfit.perception.trust`) cannot compare the two segmenters: most of its signals compare a network with its own
 training, and only networks of `jaxfit train` store the statistics for that; the other signals need consecutive frames.
 High trust in the built-in segmenter decides alone. Under low trust, the agreement decides, which is defined for every
-segmenter: how well the birds of a frame agree with the birds of its mirror image. The agreement is the panoptic quality
-of the two sets of masks over all frames,
+segmenter. Each segmenter runs on every frame and on its mirror image. A bird is stable if both runs detect the bird: a
+pair of masks with an IoU above ½, whose intersection is the stable mask. With the pixels S of all stable masks and the
+pixels D of all masks of both runs, summed over the frames,
 
-    PQ = Σ IoU / (matched + ½ unmatched),
+    agreement of a = Σ |S_a| / Σ |D_a ∪ S_b|,
 
-where the sum and `matched` count pairs of masks with an IoU above ½, and `unmatched` counts the masks of both sets
-without a partner.
-
-Source: Kirillov et al. 2019, *Panoptic Segmentation*, equation 1.
+where b is the other segmenter. Masks that only one run detects lower the agreement, and so do birds that only the other
+segmenter detects in both runs. Without the term S_b, a segmenter that detects few birds reliably would win against a
+segmenter that detects all birds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, UInt8
 from scipy.optimize import linear_sum_assignment
 
 from jaxfit.config.perception import AUTO, BUILTIN, GENERAL, FramesConfig, SegmenterConfig, TrackConfig
@@ -40,7 +40,7 @@ from jaxfit.video.reader import read_frames
 FRAMES = 8
 """Number of frames, spread evenly over the video, on which the segmenters are compared."""
 MIN_IOU = 0.5
-"""Masks with a larger IoU are a pair; the published limit of the panoptic quality."""
+"""Masks with a larger IoU are a pair, which is the usual limit of a matching detection (Everingham et al. 2010)."""
 
 _logger = logging.getLogger(__name__)
 
@@ -131,8 +131,8 @@ def _compare(
         if not any(others):
             what = "the general segmenter detects no bird" if any(own) else "no bird was detected"
             return SegmenterChoice(BUILTIN, f"{what} on {len(pictures)} frames", is_compared=True)
-        of_builtin = agreement(own, detected(builtin, mirrored=True))
-        of_general = agreement(others, detected(general, mirrored=True))
+        runs = (own, detected(builtin, mirrored=True)), (others, detected(general, mirrored=True))
+    of_builtin, of_general = agreements(*runs, (pictures[0].shape[1], pictures[0].shape[0]))
     name, other = (GENERAL, BUILTIN) if of_general > of_builtin else (BUILTIN, GENERAL)
     better, worse = max(of_general, of_builtin), min(of_general, of_builtin)
     reason = f"agreement with the mirror image {better:.2f}, {other} {worse:.2f}, on {len(pictures)} frames"
@@ -174,15 +174,47 @@ def first_trust(
     )
 
 
-def agreement(first: Sequence[Sequence[Instance]], second: Sequence[Sequence[Instance]]) -> float:
-    """Compute the panoptic quality of two detections of the same frames, within [0, 1]; 0 without any bird."""
-    total, pairs, birds = 0.0, 0, 0
-    for own, others in zip(first, second, strict=True):
-        iou = np.array([[_iou(a, b) for b in others] for a in own]).reshape(len(own), len(others))
-        matched = iou[linear_sum_assignment(iou, maximize=True)]
-        matched = matched[matched > MIN_IOU]
-        total, pairs, birds = total + float(matched.sum()), pairs + len(matched), birds + len(own) + len(others)
-    return total / (birds / 2) if birds else 0.0
+Runs = tuple[Sequence[Sequence[Instance]], Sequence[Sequence[Instance]]]
+"""The birds of every frame, and the birds of every mirror image, mirrored back."""
+
+
+def agreements(first: Runs, second: Runs, size_px: tuple[int, int]) -> tuple[float, float]:
+    """Compute the agreement of two segmenters, each within [0, 1]; 0 without any bird.
+
+    Args:
+        first, second: the birds of the segmenters in the same frames.
+        size_px: width and height of the frames.
+    """
+    stable, contested = np.zeros(2), np.zeros(2)
+    for own, other in zip(zip(*first, strict=True), zip(*second, strict=True), strict=True):
+        (own_stable, own_all), (other_stable, other_all) = _pixels(*own, size_px), _pixels(*other, size_px)
+        stable += own_stable.sum(), other_stable.sum()
+        contested += (own_all | other_stable).sum(), (other_all | own_stable).sum()
+    of_first, of_second = (stable / np.maximum(contested, 1)).tolist()
+    return of_first, of_second
+
+
+def _pixels(
+    birds: Sequence[Instance], mirrored: Sequence[Instance], size_px: tuple[int, int]
+) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """Return the pixels of the stable masks and of all masks of two runs on one frame."""
+    stable, reported = (np.zeros(size_px[::-1], bool) for _ in range(2))
+    for bird in (*birds, *mirrored):
+        _window(reported, bird)[:] |= bird.mask
+    iou = np.array([[_iou(a, b) for b in mirrored] for a in birds]).reshape(len(birds), len(mirrored))
+    for i, j in zip(*linear_sum_assignment(iou, maximize=True), strict=True):
+        if iou[i, j] > MIN_IOU:
+            both = np.zeros_like(stable)
+            _window(both, birds[i])[:] = birds[i].mask
+            part = _window(both, mirrored[j])
+            _window(stable, mirrored[j])[:] |= part & mirrored[j].mask
+    return stable, reported
+
+
+def _window(pixels: Bool[np.ndarray, "H W"], bird: Instance) -> Bool[np.ndarray, "h w"]:
+    """Return the part of a frame that the mask of a bird covers, as a view."""
+    height, width = bird.mask.shape
+    return pixels[bird.y0 : bird.y0 + height, bird.x0 : bird.x0 + width]
 
 
 def _iou(first: Instance, second: Instance) -> float:

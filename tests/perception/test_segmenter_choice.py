@@ -11,7 +11,7 @@ from jaxfit.config.perception import FramesConfig, SegmenterConfig, TrackConfig
 from jaxfit.foundation.errors import InputError
 from jaxfit.perception import segmenter_choice, track
 from jaxfit.perception.network import instance_of
-from jaxfit.perception.segmenter_choice import agreement, choose_segmenter, with_chosen_segmenter
+from jaxfit.perception.segmenter_choice import agreements, choose_segmenter, with_chosen_segmenter
 from jaxfit.perception.track import run_tracking
 
 FOOTAGE = Footage()
@@ -23,13 +23,23 @@ def bird(x0, width=10):
 
 
 def test_agreement_by_hand():
-    assert agreement([[bird(0), bird(50)]], [[bird(50), bird(0)]]) == 1
-    assert agreement([[], []], [[], []]) == 0
-    assert agreement([[bird(0)]], [[]]) == 0
-    assert agreement([[bird(0)]], [[bird(2)]]) == pytest.approx(8 / 12)
-    assert agreement([[bird(0)]], [[bird(4)]]) == 0  # IoU 6/14
-    # a pair, and one bird alone in each of two frames
-    assert agreement([[bird(0), bird(50)], []], [[bird(0)], [bird(7)]]) == pytest.approx(1 / 2)
+    def of(first, first_mirrored, second=(), second_mirrored=()):
+        return agreements(([first], [first_mirrored]), ([second], [second_mirrored]), (100, 4))
+
+    two = [bird(0), bird(50)]
+    assert of(two, two[::-1], two, two) == (1, 1)
+    assert of([], []) == (0, 0)
+    assert of([bird(0)], []) == (0, 0)
+    assert of([bird(0)], [bird(2)]) == pytest.approx((8 / 12, 0))
+    assert of([bird(0)], [bird(4)]) == (0, 0)  # IoU 6/14
+    assert of(two, [bird(0)]) == pytest.approx((1 / 2, 0))
+    # only the second segmenter detects the other bird in both runs
+    assert of([bird(0)], [bird(0)], two, two) == pytest.approx((1 / 2, 1))
+    # what the second segmenter detects in one run does not count against the first
+    assert of([bird(0)], [bird(0)], two, [bird(0)]) == pytest.approx((1, 1 / 2))
+    # the sums over the frames are divided, not the frames
+    runs = [[bird(0)], [bird(0, 30)]], [[bird(0)], []]
+    assert agreements(runs, ([[], []], [[], []]), (100, 4)) == pytest.approx((10 / 40, 0))
 
 
 class Mirrored(TrueSegmenter):
@@ -87,8 +97,8 @@ def test_high_trust_in_the_builtin_segmenter_decides(video, networks):
 @pytest.mark.parametrize(
     ("builtin", "general", "name", "reason"),
     [
-        ({"missed_in_mirror": FIRST}, {}, "general", "agreement with the mirror image 1.00, builtin 0.80, on 8 frames"),
-        ({}, {"missed_in_mirror": FIRST}, "builtin", "agreement with the mirror image 1.00, general 0.80, on 8 frames"),
+        ({"missed_in_mirror": FIRST}, {}, "general", "agreement with the mirror image 1.00, builtin 0.67, on 8 frames"),
+        ({}, {"missed_in_mirror": FIRST}, "builtin", "agreement with the mirror image 1.00, general 0.67, on 8 frames"),
         ({}, {}, "builtin", "agreement with the mirror image 1.00, general 1.00, on 8 frames"),
         ({"missed": ALL}, {}, "general", "agreement with the mirror image 1.00, builtin 0.00, on 8 frames"),
         ({}, {"missed": ALL}, "builtin", "the general segmenter detects no bird on 8 frames"),
