@@ -39,7 +39,7 @@ def track(options: argparse.Namespace) -> None:
     if tracking.failure:
         _show_failure(tracking, config.min_track_frames)
     else:
-        _show_trust(tracking)
+        _show_trust(tracking, tracking.trust.sentence())
         show(track_table(tracking.observations))
         _show_skipped_tracks(tracking, config.min_track_frames)
     tracks, frames = tracking.observations.present.shape
@@ -65,7 +65,7 @@ def reconstruct(options: argparse.Namespace) -> None:
         except NoTrackError as error:
             _show_failure(error.tracking, config.track.min_track_frames)
             raise
-    _show_trust(done.tracking)
+    _show_trust(done.tracking, done.tracking.trust.sentence())
     show(flag_line(done.solution))
     show(track_table(done.tracking.observations, done.solution))
     _show_skipped_tracks(done.tracking, config.track.min_track_frames)
@@ -92,22 +92,22 @@ def reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
     return with_values(load_reconstruct_config(options.config), settings)
 
 
-def _show_trust(tracking: TrackingResult) -> None:
-    """Print which segmenter `auto` chose, and the judgement of the video."""
-    _show_choice(tracking)
-    show(tracking.trust.sentence())
+def _show_trust(tracking: TrackingResult, judgement: str) -> None:
+    """Print which segmenter `auto` chose, and the judgement of the video.
 
-
-def _show_choice(tracking: TrackingResult) -> None:
-    """Print the choice of `auto`. Without the files of the general segmenter, only low trust makes it worth a line."""
-    if tracking.choice and (tracking.choice.is_compared or tracking.trust.level == "low"):
-        show(tracking.choice.sentence())
+    Without a comparison of the segmenters, the line about the segmenter is a hint, which follows low trust.
+    """
+    choice = tracking.choice
+    if choice and choice.is_compared:
+        show(choice.sentence())
+    show(judgement)
+    if choice and not choice.is_compared and tracking.trust.level == "low":
+        show(choice.sentence())
 
 
 def _show_failure(tracking: TrackingResult, min_frames: int) -> None:
     """Print why no track counts, but not what to do: `TrackingResult.failure` says so in the last line."""
-    _show_choice(tracking)
-    show(tracking.trust.judgement())
+    _show_trust(tracking, tracking.trust.judgement())
     _show_skipped_tracks(tracking, min_frames)
 
 

@@ -65,10 +65,10 @@ class TrackingResult(NamedTuple):
     """The reason and the remedy if there is no track."""
     trust: Trust
     """Whether tracking worked as it works on simulated footage, and the reasons if not."""
+    choice: SegmenterChoice | None
+    """The segmenter that `auto` stands for; None if the config or the caller names a segmenter."""
     seconds: dict[str, float]
     """Duration of each part; for decoding and for workers (`detect`), only the time that the other parts waited."""
-    choice: SegmenterChoice | None = None
-    """The segmenter that `auto` stands for; None if the config or the caller names a segmenter."""
 
     def info(self) -> dict[str, str]:
         """Return the judgement and the choice of the segmenter as texts, for the `info` of a COCO file."""
@@ -173,7 +173,7 @@ def run_tracking(
     distances = [each.tolist() for each in processed.distances]
     trust = judge(footage_signals(all_tracks, short_tracks, distances, getattr(keypoints, "curve", None) is not None))
     skipped = short_tracks, low_score_tracks, processed.damaged
-    result = TrackingResult(observations, *skipped, None, trust, clock.seconds, choice)
+    result = TrackingResult(observations, *skipped, None, trust, choice, clock.seconds)
     if observations.num_tracks:
         return result
     return result._replace(failure=_failure(source, config, result, processed.frames, least, has_own_segmenter))
