@@ -37,9 +37,9 @@ from .model.files import save_bird as save_bird
 from .objective.registry import term as term
 from .perception.keypoints import load_keypoint_detector as load_keypoint_detector
 from .perception.segmentation import load_segmenter as load_segmenter
-from .perception.track import Trust as Trust
 from .perception.track import run_tracking as run_tracking
 from .perception.track import track_video as track_video
+from .perception.trust import Trust as Trust
 from .pipeline import Reconstruction as Reconstruction
 from .pipeline import reconstruct as reconstruct
 from .review.suggest import suggest as suggest

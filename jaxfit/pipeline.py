@@ -33,6 +33,7 @@ from jaxfit.model.bird import Bird, model_hash
 from jaxfit.model.files import load_murre
 from jaxfit.perception.detections import check_segmenter, network_files, open_keypoint_detector
 from jaxfit.perception.network import KeypointDetector, Segmenter
+from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segmenter
 from jaxfit.perception.track import ObservationsFrom, TrackingResult, run_tracking
 from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.video.pictures import image_files
@@ -174,8 +175,7 @@ def reconstruct(
         _check_folder(folder, video, overwrite)  # before the long work
         bird = bird or load_murre()
         keypoints = keypoints or open_keypoint_detector(config.track)
-        if not replaced["segmenter"]:
-            check_segmenter(config.track)
+        config, choice = (config, None) if replaced["segmenter"] else _with_segmenter(config, video, progress)
         own_networks = {kind: files for kind, files in network_files(config.track).items() if not replaced[kind]}
         networks = file_hashes(own_networks)
         empty = TrackRecorder(keypoints.keypoint_names).observations()
@@ -201,13 +201,14 @@ def reconstruct(
 
                 more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
                 tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
+                tracking = tracking._replace(choice=choice)
         _check_tracking(tracking, stored)
         observations = tracking.observations
         with clock("fit"):
             config, learnt_yaml = _learn_weights(config, observations, bird, video, progress)
             solution = fit(observations, bird, config.fit, None, fit_progress, video, windows, cluster)
         with new_folder(folder, overwrite, marker=MARKER) as part:
-            write_coco(observations, part / OBSERVATIONS, tracking.trust.info())
+            write_coco(observations, part / OBSERVATIONS, tracking.info())
             with clock("overlay"):
                 _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
@@ -215,6 +216,15 @@ def reconstruct(
             write_solution(solution, bird, settings, summary, part, learnt_yaml)
             write_report(part / REPORT, solution, bird, observations, summary, settings, folder, video, force=True)
     return Reconstruction(tracking, solution, summary)
+
+
+def _with_segmenter(
+    config: ReconstructConfig, video: Path, progress: ProgressTask
+) -> tuple[ReconstructConfig, SegmenterChoice | None]:
+    """Return the config with a checked segmenter in place of `auto`, and the choice."""
+    track_config, choice = with_chosen_segmenter(video, config.track, progress)
+    check_segmenter(track_config)
+    return replace(config, track=track_config), choice
 
 
 def _learn_weights(
@@ -311,6 +321,7 @@ def _summary(
         "quality": {row.track_id: row._asdict() for row in track_quality(tracking.observations)},
         "short_tracks": tracking.short_tracks,
         "low_score_tracks": tracking.low_score_tracks,
+        **(tracking.choice.info() if tracking.choice else {}),
         "trust": tracking.trust.level,
         "trust_reasons": list(tracking.trust.reasons),
         "trust_signals": tracking.trust.signals._asdict(),

@@ -9,6 +9,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # the first process of a run;
     _cache = tempfile.TemporaryDirectory(prefix="jaxfit-tests-")
     os.environ |= {
         "XDG_CACHE_HOME": _cache.name,  # never the user's cache
+        "XDG_DATA_HOME": _cache.name,  # never the user's networks
         "JAX_COMPILATION_CACHE_DIR": f"{_cache.name}/jaxfit",
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     }

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from jaxfit.cli.observations import matching_line, observation_tables
 from jaxfit.cli.tables import counted, evaluation_tables, flag_quality_line, show, track_table
+from jaxfit.config.build import with_values
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats import FOOTAGE, MARKER
@@ -22,7 +23,7 @@ from jaxfit.foundation.files import check_replaceable, check_writable, remove_le
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text
 from jaxfit.model.files import find_bird, load_murre
-from jaxfit.perception.track import Trust
+from jaxfit.perception.trust import Trust
 from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.simulation.scene import simulate
 from jaxfit.view.report.page import Measured
@@ -53,7 +54,7 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     _check_folder(folder)
     check_replaceable(scene_folder, True, MARKER)
     check_replaceable(result_folder, True, "poses.npz")
-    bird, config = load_murre(), load_reconstruct_config()
+    bird, config = load_murre(), with_values(load_reconstruct_config(), {"track.segmenter.file": "builtin"})
     show(f"simulating {BIRDS} murres on a ledge over {FRAMES} frames, then reconstructing them from the footage alone")
     scene = simulate(bird, scene_folder, BIRDS, FRAMES, SIZE, seed=SEED, overwrite=True, progress=terminal)
     done = reconstruct(scene_folder / FOOTAGE, result_folder, bird, config, overwrite=True, progress=terminal)

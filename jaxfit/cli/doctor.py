@@ -136,6 +136,21 @@ def _networks() -> Iterator[Finding]:
             yield Finding(name, "loads")
         except InputError as error:
             yield Finding(name, str(error), "reinstall jaxfit")
+    yield _general_segmenter()
+
+
+def _general_segmenter() -> Finding:
+    from jaxfit.perception.general_networks import general_files
+    from jaxfit.perception.segmentation import load_segmenter
+
+    name = "general segmenter"
+    if not any(path.exists() for path in general_files()):
+        return Finding(name, "not installed (optional): docs/usage.md#general-birds")
+    try:
+        load_segmenter("general")
+    except InputError as error:
+        return Finding(name, f"{error.source}: {error.problem}", error.remedy)
+    return Finding(name, "loads")
 
 
 def _optional_packages() -> Iterator[Finding]:

@@ -35,11 +35,11 @@ def track(options: argparse.Namespace) -> None:
     config = reconstruct_config(options).track
     with open_cluster(options.workers, options.scheduler) as cluster:
         tracking = run_tracking(options.video, config, progress=terminal, cluster=cluster)
-    write_coco(tracking.observations, options.out, tracking.trust.info())
+    write_coco(tracking.observations, options.out, tracking.info())
     if tracking.failure:
         _show_failure(tracking, config.min_track_frames)
     else:
-        show(tracking.trust.sentence())
+        _show_trust(tracking, tracking.trust.sentence())
         show(track_table(tracking.observations))
         _show_skipped_tracks(tracking, config.min_track_frames)
     tracks, frames = tracking.observations.present.shape
@@ -65,7 +65,7 @@ def reconstruct(options: argparse.Namespace) -> None:
         except NoTrackError as error:
             _show_failure(error.tracking, config.track.min_track_frames)
             raise
-    show(done.tracking.trust.sentence())
+    _show_trust(done.tracking, done.tracking.trust.sentence())
     show(flag_line(done.solution))
     show(track_table(done.tracking.observations, done.solution))
     _show_skipped_tracks(done.tracking, config.track.min_track_frames)
@@ -92,9 +92,22 @@ def reconstruct_config(options: argparse.Namespace) -> ReconstructConfig:
     return with_values(load_reconstruct_config(options.config), settings)
 
 
+def _show_trust(tracking: TrackingResult, judgement: str) -> None:
+    """Print which segmenter `auto` chose, and the judgement of the video.
+
+    Without a comparison of the segmenters, the line about the segmenter is a hint, which follows low trust.
+    """
+    choice = tracking.choice
+    if choice and choice.is_compared:
+        show(choice.sentence())
+    show(judgement)
+    if choice and not choice.is_compared and tracking.trust.level == "low":
+        show(choice.sentence())
+
+
 def _show_failure(tracking: TrackingResult, min_frames: int) -> None:
     """Print why no track counts, but not what to do: `TrackingResult.failure` says so in the last line."""
-    show(tracking.trust.judgement())
+    _show_trust(tracking, tracking.trust.judgement())
     _show_skipped_tracks(tracking, min_frames)
 
 

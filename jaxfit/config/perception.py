@@ -26,13 +26,18 @@ class FramesConfig:
         require(self.stop is None or self.stop > self.start, "stop", problem, "expected a frame after `start`, or null")
 
 
+AUTO, BUILTIN, GENERAL = "auto", "builtin", "general"
+"""Names of segmenters in place of a file."""
+
+
 @dataclass(frozen=True)
 class SegmenterConfig:
     """The network that detects birds in a frame."""
 
-    file: str = "builtin"
-    """Network that detects birds: `builtin` (for murres, trained on simulated footage), an ONNX file, or
-    `detector.onnx+saliency.onnx`."""
+    file: str = AUTO
+    """Network that detects birds: `builtin` (for murres, trained on simulated footage), `general` (for all birds; two
+    files that the user downloads), `auto` (one of both, by eight frames; without the two files, `builtin`), an ONNX
+    file, or `detector.onnx+saliency.onnx`."""
     kind: str = "auto"
     """Layout of the network's output: bottom_up, rf_detr, mask_rcnn, yolo, yolox+saliency; `auto` infers the layout
     from the file."""

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jaxfit.config.checks import require
-from jaxfit.config.perception import FramesConfig, TrackConfig
+from jaxfit.config.perception import AUTO, BUILTIN, FramesConfig, TrackConfig
 from jaxfit.foundation.errors import one_line
 from jaxfit.foundation.progress import Clock, ProgressTask
 from jaxfit.foundation.unfinished import Parts
@@ -30,7 +30,8 @@ def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segme
     """Load the segmenter of a config.
 
     Args:
-        config: the whole config of tracking.
+        config: the whole config of tracking. `auto` is the built-in segmenter here
+            (`jaxfit.perception.segmenter_choice` replaces `auto` by the name of a segmenter).
         min_score: replaces the score of the config; None keeps the score of the config.
 
     Raises:
@@ -39,7 +40,7 @@ def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segme
     settings = config.segmenter
     require(settings.kind in KINDS, "track.segmenter.kind", f"is {settings.kind!r}", f"one of {', '.join(KINDS)}")
     return load_segmenter(
-        settings.file,
+        _segmenter_name(config),
         kind=settings.kind,
         names=settings.names or None,
         classes=settings.classes or None,
@@ -80,7 +81,11 @@ def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
 def network_files(config: TrackConfig) -> dict[str, list[Path]]:
     """Return the files of the networks of a config, under the keys `segmenter` and `keypoints`."""
     keypoints = BUILTIN_PATH if config.keypoints.file == "builtin" else Path(config.keypoints.file)
-    return {"segmenter": segmenter_files(config.segmenter.file), "keypoints": [keypoints]}
+    return {"segmenter": segmenter_files(_segmenter_name(config)), "keypoints": [keypoints]}
+
+
+def _segmenter_name(config: TrackConfig) -> str:
+    return BUILTIN if config.segmenter.file == AUTO else config.segmenter.file
 
 
 Keypoints = tuple[Float[np.ndarray, "_ K 2"], Float[np.ndarray, "_ K"]]

@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jaxfit.config.perception import GENERAL
 from jaxfit.data.masks import box_of_mask
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import INSTANCES
+from jaxfit.perception.general_networks import check_general_files, general_files
 from jaxfit.perception.network import Instance, OnnxModel, Segmenter, activation_monitor, collect_instances
 from jaxfit.perception.segmentation_inputs import Placement, SegmentationNetwork
 from jaxfit.perception.segmentation_layouts import DetectorAndSaliency, MaskRcnn, RfDetrSeg, Saliency, YoloSeg, Yolox
@@ -44,7 +46,7 @@ def replace_parts(
     for whole in birds_of_smaller_input:
         if length_px(whole) < least_length_px:
             continue
-        common = [_common_pixels(bird, whole) for bird in kept]
+        common = [common_pixels(bird, whole) for bird in kept]
         is_part = [n >= MIN_PART_SHARE * np.count_nonzero(bird.mask) for n, bird in zip(common, kept, strict=True)]
         least = MIN_PART_SHARE * np.count_nonzero(whole.mask)
         if any(n >= least and not part for n, part in zip(common, is_part, strict=True)):
@@ -53,7 +55,7 @@ def replace_parts(
     return kept
 
 
-def _common_pixels(first: Instance, second: Instance) -> int:
+def common_pixels(first: Instance, second: Instance) -> int:
     """Count the pixels that belong to both birds."""
     corners = [(i.x0, i.y0, i.x0 + i.mask.shape[1], i.y0 + i.mask.shape[0]) for i in (first, second)]
     (x0, y0), (x1, y1) = np.max(corners, 0)[:2].tolist(), np.min(corners, 0)[2:].tolist()
@@ -401,8 +403,9 @@ def load_segmenter(
     """Load a segmenter from one or two ONNX files; the inputs and outputs determine its layout.
 
     Args:
-        spec: `builtin`; or a file; or two files as `detector.onnx+saliency.onnx`: a YOLOX detector, and a network such
-            as U²-Net that segments the salient object in each box.
+        spec: `builtin`; `general`, whose files `jaxfit.perception.general_networks` describes; or a file; or two files
+            as `detector.onnx+saliency.onnx`: a YOLOX detector, and a network such as U²-Net that segments the salient
+            object in each box.
         kind: one of `KINDS`; a name requires this layout, `auto` uses the layout that fits.
         classes: names of the classes to keep; None keeps `bird`, or the only class.
         min_score: least score of an instance, within [0, 1]; None uses the default of the layout.
@@ -414,8 +417,9 @@ def load_segmenter(
 
     Raises:
         ValueError: unknown kind, or an invalid size of tiles, overlap or score.
-        InputError: a file does not exist, cannot be loaded, has an unknown layout (the message lists the outputs
-            and names the supported layouts), has not three channels, or lacks a class.
+        InputError: a file does not exist, cannot be loaded, has an unknown layout (the message lists the outputs and
+            names the supported layouts), has not three channels, or lacks a class; a file of `general` has another
+            content than the published file.
     """
     if kind not in KINDS:
         raise ValueError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}")
@@ -426,7 +430,9 @@ def load_segmenter(
 
 
 def segmenter_files(spec: str) -> list[Path]:
-    """Return the one or two files of a `spec` of `load_segmenter`."""
+    """Return the one or two files of a `spec` of `load_segmenter`; those of `general` are not checked."""
+    if spec == GENERAL:
+        return general_files()
     first, plus, second = spec.partition(".onnx+")
     if plus and not Path(spec).is_file():
         return [Path(first + ".onnx"), Path(second)]
@@ -441,7 +447,7 @@ def _load(
     names: Sequence[str] | None,
     threads: int | None,
 ) -> Segmenter:
-    path, *second = segmenter_files(spec)
+    path, *second = check_general_files() if spec == GENERAL else segmenter_files(spec)
     if second:
         if kind not in ("auto", "yolox+saliency"):
             raise InputError(spec, f"is two files, but kind {kind} needs one file", "give one file, or kind auto")

@@ -1,13 +1,11 @@
-"""`track_video`: segmentation, tracking, keypoints; the judgement of a video."""
+"""`track_video`: segmentation, tracking, keypoints."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, cast
-
-import numpy as np
+from typing import NamedTuple
 
 from jaxfit.config.perception import TrackConfig
 from jaxfit.data.footage import read_footage
@@ -26,6 +24,7 @@ from jaxfit.perception.detections import (
     process_frames,
 )
 from jaxfit.perception.network import KeypointDetector, Segmenter
+from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segmenter
 from jaxfit.perception.tracking import (
     RecordedFrame,
     Tracker,
@@ -36,176 +35,9 @@ from jaxfit.perception.tracking import (
     mean_scores,
     repair_left_right_flips,
 )
+from jaxfit.perception.trust import Trust, footage_signals, judge
 from jaxfit.perception.worker_tasks import WorkerDetections
 from jaxfit.video.reader import read_frames
-
-REMEDY = (
-    "use another network (--segmenter, --keypoints), label frames of this footage (jaxfit suggest), "
-    "or crop the video to the birds"
-)
-"""What to do when trust is low."""
-
-# The limits were set on 15 simulated clips (seeds 700 to 714, random cameras of `jaxfit.learning.networks.scenes`,
-# 960×640, 12 or 20 consecutive frames at 12 frames/s) and on a clip from the side (seed 790, 8° below the horizontal).
-# In 13 good clips, 78 to 95 % of the keypoints are right; in the two other clips, 79 and 81 %; in the clip from the
-# side, 50 %. The limits except MIN_CONFIDENCE were set with an earlier segmenter, and hold for the present segmenter.
-MAX_FRAME_DISTANCE = 1.0
-"""Largest median distance of the frames: 99 % of the training inputs are nearer. The clips have 0.27 to 0.58."""
-MAX_BIRD_DISTANCE = 1.0
-"""Largest median distance of the birds: 99 % of the training inputs are nearer. The clips have 0.48 to 0.76."""
-MIN_SCORE = 0.8
-"""Least median score. The good clips have 0.92 to 0.97, the others 0.89 and 0.91, the clip from the side 0.88."""
-MIN_CONFIDENCE = 0.75
-"""Least median confidence of a bird. The good clips have 0.80 to 0.95, the others 0.65 and 0.72, the clip from the side
-0.72."""
-MAX_SHORT_SHARE = 0.2
-"""Largest share of the detections in short tracks. The good clips have 0 to 0.11, the others 0.05 and 0.16. A clip of
-12 frames has more short tracks than a video."""
-MAX_COUNT_CHANGE = 0.15
-"""Largest change of the number of birds. The good clips have 0 to 0.05, the others 0.07 and 0.10. The limit is higher,
-because the number changes more in footage with fewer frames per second."""
-
-
-class FootageSignals(NamedTuple):
-    """Signals of the tracking of a video; None for a signal that this video or its networks do not give."""
-
-    birds_per_frame: float
-    """Mean number of tracked birds in a frame, short tracks included."""
-    short_tracks: int
-    """Number of tracks that are too short."""
-    tracks: int
-    """Number of all tracks."""
-    short_share: float | None
-    """Share of the detections that belong to tracks that are too short."""
-    count_change: float | None
-    """Mean change of the number of birds between consecutive frames, divided by `birds_per_frame`."""
-    score: float | None
-    """Median score of the birds; None for a segmenter without statistics, because scores of networks differ."""
-    confidence: float | None
-    """Median over the birds of the mean confidence of a bird's keypoints; None for confidences without a curve."""
-    frame_distance: float | None
-    """Median over the frames of the distance of the segmenter's activations."""
-    bird_distance: float | None
-    """Median over the birds of the distance of the activations of the keypoint network."""
-
-
-class Trust(NamedTuple):
-    """The judgement of a video."""
-
-    level: str
-    """`high` or `low`."""
-    reasons: tuple[str, ...]
-    """Why trust is low; empty if trust is high."""
-    signals: FootageSignals
-
-    def judgement(self) -> str:
-        """Return the level and its reasons for the user."""
-        if self.level == "high":
-            if None in (self.signals.frame_distance, self.signals.bird_distance):
-                return "trust is high, but not certain: a network stores no statistics of its training"
-            return "trust is high: the networks work on this footage as on simulated footage"
-        return f"trust is low: {'; '.join(self.reasons)}"
-
-    def sentence(self) -> str:
-        """Return the judgement for the user, and what to do if trust is low."""
-        return self.judgement() + ("" if self.level == "high" else f"; {REMEDY}")
-
-    def info(self) -> dict[str, str]:
-        """Return the judgement as texts, for the `info` of a COCO file."""
-        return {"trust": self.level, "trust_reasons": "; ".join(self.reasons)}
-
-
-def footage_signals(
-    observations: Observations,
-    short_tracks: Mapping[int, int],
-    distances: Sequence[Sequence[float]] = ((), ()),
-    calibrated: bool = False,
-) -> FootageSignals:
-    """Compute the signals of a video.
-
-    Args:
-        observations: all tracks, short tracks included.
-        short_tracks: track → number of frames, for the tracks that are too short.
-        distances: distances of the segmenter's activations and of the keypoint network's activations.
-        calibrated: whether the confidences of the keypoints are calibrated.
-    """
-    present, scores = observations.present, cast(np.ndarray, observations.score)
-    detections = int(present.sum())
-    counts = present.sum(0)
-    frame_distance, bird_distance = (float(np.median(values)) if len(values) else None for values in distances)
-    confidence = observations.confidence.mean(-1)[present] if observations.num_keypoints and calibrated else ()
-    is_changing = detections and len(counts) > 1
-    return FootageSignals(
-        birds_per_frame=float(counts.mean()),
-        short_tracks=len(short_tracks),
-        tracks=observations.num_tracks,
-        short_share=sum(short_tracks.values()) / detections if detections else None,
-        count_change=float(np.abs(np.diff(counts)).mean() / counts.mean()) if is_changing else None,
-        score=float(np.median(scores[present])) if detections and frame_distance is not None else None,
-        confidence=float(np.median(confidence)) if len(confidence) else None,
-        frame_distance=frame_distance,
-        bird_distance=bird_distance,
-    )
-
-
-def judge(signals: FootageSignals) -> Trust:
-    """Judge a video: trust is low if a signal lies beyond its limit, or if there is no bird.
-
-    Args:
-        signals: the signals; a signal that is None is not judged.
-    """
-    reasons = tuple(rule.reason(signals) for rule in _RULES if rule.is_broken(signals))
-    if not signals.tracks:
-        reasons = ("no bird was tracked", *reasons)
-    return Trust("low" if reasons else "high", reasons, signals)
-
-
-class _Rule(NamedTuple):
-    """The limit of a signal, and the reason that the user reads if the signal lies beyond it."""
-
-    signal: str
-    limit: float
-    is_upper: bool
-    text: str
-
-    def is_broken(self, signals: FootageSignals) -> bool:
-        value = getattr(signals, self.signal)
-        return value is not None and (value > self.limit if self.is_upper else value < self.limit)
-
-    def reason(self, signals: FootageSignals) -> str:
-        bound = "at most" if self.is_upper else "at least"
-        return self.text.format(**signals._asdict()) + f" ({bound} {self.limit:.2g} on simulated footage)"
-
-
-_RULES = (
-    _Rule(
-        "frame_distance",
-        MAX_FRAME_DISTANCE,
-        True,
-        "the frames differ from the training of the segmenter: distance {frame_distance:.2f}",
-    ),
-    _Rule(
-        "bird_distance",
-        MAX_BIRD_DISTANCE,
-        True,
-        "the birds differ from the training of the keypoint network: distance {bird_distance:.2f}",
-    ),
-    _Rule("score", MIN_SCORE, False, "the scores of the birds are low: median {score:.2f}"),
-    _Rule("confidence", MIN_CONFIDENCE, False, "the confidences of the keypoints are low: median {confidence:.2f}"),
-    _Rule(
-        "short_share",
-        MAX_SHORT_SHARE,
-        True,
-        "{short_tracks} of {tracks} tracks are too short: they hold a share of {short_share:.2f} of the detections",
-    ),
-    _Rule(
-        "count_change",
-        MAX_COUNT_CHANGE,
-        True,
-        "the number of birds changes from frame to frame by a share of {count_change:.2f}",
-    ),
-)
-
 
 _logger = logging.getLogger(__name__)
 
@@ -233,8 +65,14 @@ class TrackingResult(NamedTuple):
     """The reason and the remedy if there is no track."""
     trust: Trust
     """Whether tracking worked as it works on simulated footage, and the reasons if not."""
+    choice: SegmenterChoice | None
+    """The segmenter that `auto` stands for; None if the config or the caller names a segmenter."""
     seconds: dict[str, float]
     """Duration of each part; for decoding and for workers (`detect`), only the time that the other parts waited."""
+
+    def info(self) -> dict[str, str]:
+        """Return the judgement and the choice of the segmenter as texts, for the `info` of a COCO file."""
+        return self.trust.info() | (self.choice.info() if self.choice else {})
 
 
 def track_video(
@@ -293,8 +131,8 @@ def run_tracking(
     """
     frames, has_own_segmenter = config.frames, segmenter is not None
     reader, given_tracker = read_frames(source, frames.start, frames.stop, frames.step), tracker
-    keypoints = keypoints or open_keypoint_detector(config)
-    segmenter = segmenter or open_segmenter(config)
+    config, choice = (config, None) if has_own_segmenter else with_chosen_segmenter(source, config, progress)
+    keypoints, segmenter = keypoints or open_keypoint_detector(config), segmenter or open_segmenter(config)
     footage, names = read_footage(source, reader.info.frames), keypoints.keypoint_names
     recorder = TrackRecorder(names, skeleton_pairs(names), reader.info.fps, footage)
     clock = Clock()
@@ -332,10 +170,10 @@ def run_tracking(
     short_tracks = {track: length for track, length in lengths.items() if track not in long_tracks.track_id}
     scores = dict(zip(long_tracks.track_id.tolist(), mean_scores(long_tracks).tolist(), strict=True))
     low_score_tracks = {track: score for track, score in scores.items() if track not in observations.track_id}
-    is_calibrated = getattr(keypoints, "curve", None) is not None
     distances = [each.tolist() for each in processed.distances]
-    trust = judge(footage_signals(all_tracks, short_tracks, distances, is_calibrated))
-    result = TrackingResult(observations, short_tracks, low_score_tracks, processed.damaged, None, trust, clock.seconds)
+    trust = judge(footage_signals(all_tracks, short_tracks, distances, getattr(keypoints, "curve", None) is not None))
+    skipped = short_tracks, low_score_tracks, processed.damaged
+    result = TrackingResult(observations, *skipped, None, trust, choice, clock.seconds)
     if observations.num_tracks:
         return result
     return result._replace(failure=_failure(source, config, result, processed.frames, least, has_own_segmenter))

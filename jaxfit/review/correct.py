@@ -165,7 +165,7 @@ def _ends(observations: Observations, windows: Windows, w: int) -> tuple[int, in
 
 OBSERVATIONS, CONFIG, MARKER = "observations.json", "config.yaml", "poses.npz"
 _SUMMARY = "summary.json"
-_KEPT = ("video", "trust", "trust_reasons", "networks")
+_KEPT = ("video", "trust", "trust_reasons", "networks", "segmenter", "segmenter_reason")
 """Entries of the summary that corrections do not change."""
 
 

@@ -11,7 +11,8 @@ from jaxfit.model.files import load_murre
 from jaxfit.perception.keypoints import BUILTIN_PATH, load_keypoint_detector
 from jaxfit.perception.network import OnnxModel
 from jaxfit.perception.segmentation import BUILTIN, load_segmenter
-from jaxfit.perception.track import MAX_FRAME_DISTANCE, run_tracking
+from jaxfit.perception.track import run_tracking
+from jaxfit.perception.trust import MAX_FRAME_DISTANCE
 from jaxfit.simulation.scene import simulate
 
 FILES = BUILTIN, BUILTIN_PATH

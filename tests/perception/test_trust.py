@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from jaxfit.perception import track
+from jaxfit.perception import trust
 from jaxfit.perception.network import instance_of
-from jaxfit.perception.track import FootageSignals, footage_signals, judge
 from jaxfit.perception.tracking import TrackRecorder
+from jaxfit.perception.trust import FootageSignals, footage_signals, judge
 
 GOOD = FootageSignals(
     birds_per_frame=5.0,
@@ -54,12 +54,12 @@ def test_networks_without_statistics():
 @pytest.mark.parametrize(
     ("signal", "limit", "beyond"),
     [
-        ("frame_distance", track.MAX_FRAME_DISTANCE, 1),
-        ("bird_distance", track.MAX_BIRD_DISTANCE, 1),
-        ("score", track.MIN_SCORE, -1),
-        ("confidence", track.MIN_CONFIDENCE, -1),
-        ("short_share", track.MAX_SHORT_SHARE, 1),
-        ("count_change", track.MAX_COUNT_CHANGE, 1),
+        ("frame_distance", trust.MAX_FRAME_DISTANCE, 1),
+        ("bird_distance", trust.MAX_BIRD_DISTANCE, 1),
+        ("score", trust.MIN_SCORE, -1),
+        ("confidence", trust.MIN_CONFIDENCE, -1),
+        ("short_share", trust.MAX_SHORT_SHARE, 1),
+        ("count_change", trust.MAX_COUNT_CHANGE, 1),
     ],
 )
 def test_every_signal_has_a_limit(signal, limit, beyond):
