@@ -43,10 +43,10 @@ def _pairs(names):
     return tuple((i, names.index("right" + n[4:])) for i, n in enumerate(names) if n.startswith("left"))
 
 
-def toy_bird(shapes: int = 2) -> Bird:
+def toy_bird(shapes: int = 2, subdivisions: int = 2) -> Bird:
     """A bird of eight ellipsoids, each moved by its own joint and a little by its parent's."""
     names = tuple(PARTS)
-    sphere = trimesh.creation.icosphere(subdivisions=2)
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices, faces, weights = [], [], []
     for j, (parent, _, centre, axes) in enumerate(PARTS.values()):
         faces.append(sphere.faces + j * len(sphere.vertices))
