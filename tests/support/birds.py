@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -158,9 +159,14 @@ def random_pose(bird: Bird, seed: int, spread: float = 0.5) -> Pose:
 
 def pose_window(bird: Bird, pose: Pose):
     """Posed keypoints and vertices of a window, camera frame: (T, K, 3) and (T, V, 3)."""
-    rig = fold_bird(bird)
+    keypoints, vertices = _posed(fold_bird(bird), pose)
+    return np.asarray(keypoints), np.asarray(vertices)
+
+
+@jax.jit  # one program is compiled faster than a hundred operations
+def _posed(rig, pose):
     A = window_transforms(rig, pose)
-    return np.asarray(window_keypoints(rig, A, pose)), np.asarray(window_vertices(rig, A, pose))
+    return window_keypoints(rig, A, pose), window_vertices(rig, A, pose)
 
 
 def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> Solution:
