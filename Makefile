@@ -4,10 +4,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS ?= dev
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
-# `make test` compiles thousands of small programs, which takes longer than running them. `make extended` and the last
-# step of .ci/run compile as for users.
+# The tests compile thousands of small programs, which takes longer than running them. So most tests do not optimise their
+# programs. The fixture `optimised` makes exceptions, with the flags in `make test`, and as for users in the extended tests
+# of fits. The last step of .ci/run compiles as for users, too.
+UNOPTIMISED := JAX_DISABLE_MOST_OPTIMIZATIONS=1
 QUICK_COMPILATION := --xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false
 export JAXFIT_REFERENCE
+# Some machines set this variable. Every process of the tests would then compile all imported modules again.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: install test extended lint bench demo notebooks clean
 .DEFAULT_GOAL := help
@@ -37,10 +41,10 @@ $(VENV)/installed: pyproject.toml $(wildcard jaxfit/raster/cpp/*)
 	@touch $@
 
 test: install
-	XLA_FLAGS="$$XLA_FLAGS $(QUICK_COMPILATION)" $(PYTEST)
+	$(UNOPTIMISED) XLA_FLAGS="$$XLA_FLAGS $(QUICK_COMPILATION)" $(PYTEST)
 
 extended: install
-	$(PYTEST) -m extended
+	$(UNOPTIMISED) $(PYTEST) -m extended
 
 lint: install
 	$(BIN)/ruff check jaxfit tests notebooks

@@ -32,6 +32,13 @@ ACCEPTED_SKIPS = (
 """Reasons of the skips that do not fail a run with JAXFIT_FAIL_ON_SKIP=1, which is how the gate runs the tests."""
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Skip files without extended tests if only these run: the import of all files takes half a minute."""
+    if config.option.markexpr == "extended" and collection_path.match("test_*.py"):
+        return True if "mark.extended" not in collection_path.read_text() else None
+    return None
+
+
 def pytest_sessionfinish(session):
     """Fail a run with JAXFIT_FAIL_ON_SKIP if tests were skipped for other than accepted reasons."""
     terminal = session.config.pluginmanager.get_plugin("terminalreporter")
@@ -73,6 +80,15 @@ def _settings_of_the_cache():
     yield
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+
+@pytest.fixture(scope="module")
+def optimised():
+    """Optimise the programs, unlike most tests that the Makefile runs: for tests whose programs run long."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture

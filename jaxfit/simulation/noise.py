@@ -26,14 +26,15 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import cv2
+import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxfit.data.masks import box_of_mask, encode_mask, encode_patch
 from jaxfit.data.observations import Observations
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import Camera, project, to_screen
-from jaxfit.model.kinematics import Pose, fold_bird, window_keypoints, window_transforms, window_vertices
+from jaxfit.model.kinematics import Pose, Rig, fold_bird, window_keypoints, window_transforms, window_vertices
 from jaxfit.raster.zbuffer import hard_mask
 
 JITTER, MOTION, OCCLUDED = 0.012, 0.15, 2.5
@@ -210,6 +211,13 @@ def _with_neighbour(truth: Observations, n: int, t: int, mask: np.ndarray, reach
     return mask
 
 
+@jax.jit  # one program is compiled faster than a hundred operations
+def _on_screen(rig: Rig, pose: Pose, camera: Camera) -> tuple[Float[Array, "T K 2"], Float[Array, "T V 3"]]:
+    """Return the keypoints in pixels, and the vertices in pixels and depth."""
+    A = window_transforms(rig, pose)
+    return project(window_keypoints(rig, A, pose), camera), to_screen(window_vertices(rig, A, pose), camera)
+
+
 def detect(
     bird: Bird,
     poses: Sequence[Pose],
@@ -235,12 +243,11 @@ def detect(
     size, frames = camera.size_px, poses[0].global_orient.shape[0]
     keypoints_px, boxes, rle = [], [], {}
     for n, pose in enumerate(poses):
-        A = window_transforms(rig, pose)
-        points = np.asarray(project(window_keypoints(rig, A, pose), camera), np.float64)
+        projected, screen = map(np.asarray, _on_screen(rig, pose, camera))
+        points = projected.astype(np.float64)
         points = points + rng.normal(size=points.shape) * noise_px
         is_outlier = rng.random(points.shape[:2]) < outliers
         keypoints_px.append(np.where(is_outlier[..., None], rng.uniform(0, size, points.shape), points))
-        screen = np.asarray(to_screen(window_vertices(rig, A, pose), camera))
         low, high = screen[..., :2].min(1), screen[..., :2].max(1)
         boxes.append(np.concatenate([low, high - low], axis=-1))
         if masks:

@@ -46,6 +46,7 @@ def with_last_steps(config, steps):
     )
 
 
+@pytest.mark.usefixtures("optimised")  # another rounding can lead one of these birds to another minimum
 def test_a_stage_that_was_to_be_followed_by_masks_converges():
     """The keypoint stage alone ends far from the minimum. The fit comes as near as with many more steps."""
     first = StageConfig("first", 4, ("keypoints", "pose_prior"), solver="levenberg_marquardt")

@@ -39,7 +39,7 @@ def new_environment(folder, *requirements):
     """Makes a virtual environment with some packages, and returns its Python."""
     run(sys.executable, "-m", "venv", folder)
     python = folder / "bin" / "python"
-    run(python, "-m", "pip", "install", "--quiet", *requirements)
+    run(python, "-m", "pip", "install", "--quiet", "--no-compile", *requirements)  # few modules are imported
     return python
 
 
@@ -122,7 +122,7 @@ def test_the_wheel_works_in_a_clean_environment(clean_python):
 
 def test_the_extra_trackers(clean_python, wheel):
     """The extra brings another OpenCV, so its tests run in an environment of their own. None of them may skip."""
-    run(clean_python, "-m", "pip", "install", "--quiet", f"{wheel}[trackers]", "pytest", "hypothesis")
+    run(clean_python, "-m", "pip", "install", "--quiet", "--no-compile", f"{wheel}[trackers]", "pytest", "hypothesis")
     tests = [ROOT / name for name in TRACKER_TESTS]
     pytest_command = (clean_python.with_name("pytest"), "-rA", "-p", "no:cacheprovider", "--rootdir", ROOT)
     output = run(*pytest_command, "-c", ROOT / "pyproject.toml", *tests)

@@ -10,6 +10,8 @@ import pytest
 from jaxfit.raster import kernels, silhouette_reference
 from jaxfit.raster import silhouette as raster
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 CASES = ("triangle", "triangle_edge_of_frame", "icosphere", "aves_template_a", "aves_template_b", "avian_mesh_a")
 SMALL = CASES[:3]
 SLOW = pytest.param("aves_template_a", marks=pytest.mark.extended)  # 20 s, so one bird stands for all

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import trimesh
@@ -43,10 +44,10 @@ def _pairs(names):
     return tuple((i, names.index("right" + n[4:])) for i, n in enumerate(names) if n.startswith("left"))
 
 
-def toy_bird(shapes: int = 2) -> Bird:
+def toy_bird(shapes: int = 2, subdivisions: int = 2) -> Bird:
     """A bird of eight ellipsoids, each moved by its own joint and a little by its parent's."""
     names = tuple(PARTS)
-    sphere = trimesh.creation.icosphere(subdivisions=2)
+    sphere = trimesh.creation.icosphere(subdivisions=subdivisions)
     vertices, faces, weights = [], [], []
     for j, (parent, _, centre, axes) in enumerate(PARTS.values()):
         faces.append(sphere.faces + j * len(sphere.vertices))
@@ -158,9 +159,14 @@ def random_pose(bird: Bird, seed: int, spread: float = 0.5) -> Pose:
 
 def pose_window(bird: Bird, pose: Pose):
     """Posed keypoints and vertices of a window, camera frame: (T, K, 3) and (T, V, 3)."""
-    rig = fold_bird(bird)
+    keypoints, vertices = _posed(fold_bird(bird), pose)
+    return np.asarray(keypoints), np.asarray(vertices)
+
+
+@jax.jit  # one program is compiled faster than a hundred operations
+def _posed(rig, pose):
     A = window_transforms(rig, pose)
-    return np.asarray(window_keypoints(rig, A, pose)), np.asarray(window_vertices(rig, A, pose))
+    return window_keypoints(rig, A, pose), window_vertices(rig, A, pose)
 
 
 def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> Solution:

@@ -1,5 +1,7 @@
 """A video of three toy birds side by side, and stand-ins for networks that report the truth."""
 
+import functools
+
 import cv2
 import numpy as np
 
@@ -27,15 +29,26 @@ fit:
 """A config with a short fit of these birds."""
 
 
+@functools.cache
+def _truth():
+    """Return the masks by frame and bird, and the keypoints (T, N, K, 2). The first use compiles many programs."""
+    motion = [smooth_motion(BIRD, FRAMES, seed) for seed in range(BIRDS)]
+    detections = detect(BIRD, motion, camera=Camera(541.75, SIDE / 2, SIDE))
+    masks = [[detections.mask(n, t) for n in range(BIRDS)] for t in range(FRAMES)]
+    shift = np.array([SIDE, 0]) * np.arange(BIRDS)[:, None, None, None]
+    return masks, np.moveaxis(detections.keypoints_px + shift, 0, 1)
+
+
 class Footage:
     """The video of 192×64 pixels and its truth: bird n lies between columns 64 n and 64 (n + 1)."""
 
-    def __init__(self):
-        motion = [smooth_motion(BIRD, FRAMES, seed) for seed in range(BIRDS)]
-        detections = detect(BIRD, motion, camera=Camera(541.75, SIDE / 2, SIDE))
-        self.masks = [[detections.mask(n, t) for n in range(BIRDS)] for t in range(FRAMES)]
-        shift = np.array([SIDE, 0]) * np.arange(BIRDS)[:, None, None, None]
-        self.keypoints_px = np.moveaxis(detections.keypoints_px + shift, 0, 1)  # T N K 2
+    @property
+    def masks(self):
+        return _truth()[0]
+
+    @property
+    def keypoints_px(self):
+        return _truth()[1]
 
     def frame(self, t):
         """Grey birds on black; the first pixel is the number of the frame."""
