@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
 from jaxfit.foundation.errors import InputError  # noqa: E402
-from jaxfit.learning.networks import keypoints, segmenter  # noqa: E402
+from jaxfit.learning.networks import keypoints, scenes, segmenter  # noqa: E402
 from jaxfit.learning.networks.augment import randomise_appearance  # noqa: E402
 from jaxfit.learning.networks.labelled_frames import LabelledFrames, load_frames  # noqa: E402
 from jaxfit.learning.networks.loop import Schedule  # noqa: E402
@@ -60,6 +60,13 @@ def test_visible_keypoints_lie_on_their_bird(frames):
         x, y = frames.keypoints_px[s, n, k].astype(int)
         own += (frames.owner[s, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] == n + 1).any()
     assert own > 0.99 * len(visible)  # the thinnest tips fall between pixels
+
+
+@pytest.mark.extended
+def test_same_seed_gives_the_same_frames(frames):
+    again = scenes._film_scene(0)
+    assert np.array_equal(again.owner, frames.owner)
+    assert np.array_equal(again.pictures, frames.pictures)
 
 
 def test_random_appearance():
