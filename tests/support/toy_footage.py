@@ -42,11 +42,11 @@ def _truth():
 class Footage:
     """The video of 192×64 pixels and its truth: bird n lies between columns 64 n and 64 (n + 1)."""
 
-    @property
+    @functools.cached_property
     def masks(self):
         return _truth()[0]
 
-    @property
+    @functools.cached_property
     def keypoints_px(self):
         return _truth()[1]
 
