@@ -5,8 +5,8 @@ correlation of length τ, the filtered mask error ẽ (σ: the width of the filt
 
     N = L/√(2π(τ² + 2σ²)),   r = Σ(ẽ filtered to the width 2σ)²/Σẽ² = ½·√((τ² + 2σ²)/(τ² + 8σ²)),
 
-with the length L of the outline. r gives τ. N and Σẽ² of a mask enter as a median over masks, so that torn masks and
-hidden parts of a bird do not set the weight.
+with the length L of the outline. r gives τ, as a median over masks. The variance Σẽ²/N is a mean over masks: it contains
+the outlines that the fit does not reach, so that the weight does not count all outlines as known.
 
 The precision N/Σẽ² makes the mask term know the mean displacement of a piece of the outline as well as the data do: for
 a standard deviation s of the displacement, it is √2·σ/(τ·s²).
@@ -75,7 +75,7 @@ def outline_correlation_px(ratio: float, sigma: float) -> float:
 
 
 def independent_errors(outlines: Float[np.ndarray, "M 3"], sigma: float) -> tuple[float, float]:
-    """Return the mean number N of independent errors of a mask, and the median over masks of Σẽ²/N.
+    """Return the mean number N of independent errors of a mask, and the mean over masks of Σẽ²/N.
 
     Args:
         outlines: `outline_error` of some masks.
@@ -86,4 +86,4 @@ def independent_errors(outlines: Float[np.ndarray, "M 3"], sigma: float) -> tupl
         return 0.0, 0.0
     tau = outline_correlation_px(float(np.median(wider / squared)), sigma)
     count = length / np.sqrt(2 * np.pi * (tau**2 + 2 * sigma**2))
-    return float(count.mean()), float(np.median(squared / count))
+    return float(count.mean()), float((squared / count).mean())
