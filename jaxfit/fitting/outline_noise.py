@@ -5,8 +5,8 @@ correlation of length τ, the filtered mask error ẽ (σ: the width of the filt
 
     N = L/√(2π(τ² + 2σ²)),   r = Σ(ẽ filtered to the width 2σ)²/Σẽ² = ½·√((τ² + 2σ²)/(τ² + 8σ²)),
 
-with the length L of the outline. r gives τ, as a median over masks. The variance Σẽ²/N is a mean over masks: it contains
-the outlines that the fit does not reach, so that the weight does not count all outlines as known.
+with the length L of the outline. r gives τ, as a median over masks. The variance Σẽ²/N is a mean over masks: it
+contains the outlines that the fit does not reach, so that the weight does not count all outlines as known.
 
 The precision N/Σẽ² makes the mask term know the mean displacement of a piece of the outline as well as the data do: for
 a standard deviation s of the displacement, it is √2·σ/(τ·s²).
