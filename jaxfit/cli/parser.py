@@ -172,8 +172,9 @@ def _training(commands: Any) -> None:
     train.add_argument("--images", type=Path, nargs="+", metavar="DIR|VIDEO", help=text)
     text = "masks of the labelled birds: a folder of pictures, or a COCO file"
     train.add_argument("--masks", type=Path, metavar="DIR|OBS.json", help=text)
-    text = "network to start from: `builtin`, or a network that this command wrote (default %(default)s)"
-    train.add_argument("--base", default="builtin", metavar="N.onnx", help=text)
+    text = "network to start from: `builtin`, or a network that this command wrote (default: builtin with labels, else "
+    text += "random weights)"
+    train.add_argument("--base", metavar="N.onnx", help=text)
     text = "share of the labelled frames for the check of the result; 0 trains without a check (default %(default)s)"
     train.add_argument("--holdout", type=float, default=0.2, metavar="SHARE", help=text)
     text = "folder of simulated scenes; absent scenes are filmed: with labels while the network trains, else before it "
@@ -184,6 +185,8 @@ def _training(commands: Any) -> None:
     )
     text = "without labels: share of scenes with other birds in other landscapes (default %(default)s)"
     train.add_argument("--varied", type=float, default=0.0, metavar="SHARE", help=text)
+    text = "without labels: share of scenes in which the birds flap or fly (default %(default)s)"
+    train.add_argument("--wings", type=float, default=0.0, metavar="SHARE", help=text)
     text = "without labels: weights of EfficientNet-lite0, .pth (default: the encoder of the built-in segmenter)"
     train.add_argument("--encoder", type=Path, metavar="FILE", help=text)
     train.add_argument("--steps", type=int, help="number of training steps (default: by the number of labels)")

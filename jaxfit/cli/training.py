@@ -58,14 +58,16 @@ def train(options: argparse.Namespace) -> None:
 
 
 def _train_on_simulation(options: argparse.Namespace) -> None:
-    from jaxfit.learning.networks.train import SCHEDULES, train_network
+    from jaxfit.learning.networks.train import Simulation, default_schedule, train_network
 
     start = time.perf_counter()
-    steps = SCHEDULES[options.network].steps if options.steps is None else options.steps
-    schedule = SCHEDULES[options.network]._replace(steps=steps)
-    paths = options.out, options.frames or Path("training_frames")
+    schedule = default_schedule(options.network, options.base)
+    if options.steps is not None:
+        schedule = schedule._replace(steps=options.steps)
+    folder = options.frames or Path("training_frames")
     scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
-    what = options.network, *paths, scenes, schedule, options.seed, terminal, options.varied, options.encoder
+    simulation = Simulation(folder, scenes, options.varied, options.wings)
+    what = options.network, options.out, simulation, schedule, options.seed, terminal, options.encoder, options.base
     losses = train_network(*what)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
     show(f"{options.network} trained in {(time.perf_counter() - start) / 60:.0f} min, loss {loss} → {options.out}")
@@ -81,7 +83,7 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     steps = options.steps
     schedule = None if steps is None else default_schedule(options.network, 0)._replace(steps=steps)
     scenes = LABEL_SCENES if options.scenes is None else options.scenes
-    settings = Settings(options.base, options.holdout, scenes, schedule, options.seed)
+    settings = Settings(options.base or "builtin", options.holdout, scenes, schedule, options.seed)
     frames = options.frames or Path("simulated_frames")
     missing = missing_scenes(frames, scenes) if scenes > 0 else 0
     if missing:

@@ -100,7 +100,7 @@ def _build_value(hint: Any, value: Any, where: str) -> Any:
         if not isinstance(value, str) or value not in arguments:
             raise ConfigKeyError(where, f"is {shown(value)}", f"expected one of {', '.join(arguments)}")
         return value
-    if origin is types.UnionType:
+    if origin in (types.UnionType, typing.Union):  # `Literal[…] | None` has the second type
         options = [option for option in arguments if option is not types.NoneType]
         if value is None and len(options) < len(arguments):
             return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from jaxfit.config.checks import require, require_fraction, require_within
 from jaxfit.foundation import limits
@@ -75,8 +76,11 @@ class KeypointsConfig:
     """Margin of a bird's crop around the bird's mask, in image pixels; null uses the value in the file, or the paper's
     40."""
     dilate_px: int | None = None
-    """Side of the square that dilates the mask before the pixels outside the mask are blanked, in image pixels; null
-    uses the value in the file, or the paper's 70."""
+    """Side of the square that dilates the masks before the blanking, in image pixels; null uses the value in the file,
+    or the paper's 70 (14 for a visible background)."""
+    background: Literal["black", "visible"] | None = None
+    """What a bird's crop shows around the bird: `black` blanks everything outside the bird's mask, as the paper does;
+    `visible` blanks other birds only; null uses the value in the file, or `black`."""
     batch: int = 16
     """Number of crops per network call, for a network that does not fix the number."""
 

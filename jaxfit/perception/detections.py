@@ -73,6 +73,7 @@ def open_keypoint_detector(config: TrackConfig) -> KeypointDetector:
         names=settings.names or None,
         pad_px=settings.pad_px,
         dilate_px=settings.dilate_px,
+        background=settings.background,
         batch=settings.batch,
         threads=config.threads,
     )
@@ -155,7 +156,9 @@ class LocalDetections:
 
     def _keypoints_of(self, picture: np.ndarray, instances: Sequence[Instance], some: Sequence[int]) -> Keypoints:
         with self._clock("keypoints"):
-            return self._keypoints(picture, [instances[i] for i in some])
+            # a crop shows neighbours in black, so the network gets all birds
+            points_px, confidence = self._keypoints(picture, instances)
+            return points_px[list(some)], confidence[list(some)]
 
     def take_distances(self) -> Distances:
         """Return the distances of the frames since the last call."""

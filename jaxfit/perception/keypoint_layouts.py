@@ -1,13 +1,17 @@
 """Metadata, inputs and output layouts of keypoint networks, and their decoding.
 
-Metadata of a keypoint network: keys and values of `metadata_props` in the ONNX file. | key | value | default |
-|---|---|---| | `keypoint_names` | names in the order of the output, separated by commas | none: the user must give the
-names | | `mean`, `std` | one or three numbers of 0–255, separated by commas, in the network's colour order | see
-`inputs` | | `colour` | `rgb` or `bgr`, the colour order of the input | `rgb` | | `input_size` | `width,height`, for an
-input of variable size | `256,256` | | `activation` | `none`, `sigmoid` or `softmax`: the function that turns the output
-into confidences | `none` | | `alignment` | position of the cells of a heatmap, see `ALIGNMENTS` | `centres`; with
-offsets `deeplabcut` | | `locref_std` | length in pixels of an offset of 1 | 7.2801, DeepLabCut's | | `pad_px`,
-`dilate_px` | parameters of the training crops, see `crops` | 40, 70 |
+Metadata of a keypoint network: keys and values of `metadata_props` in the ONNX file.
+
+- `keypoint_names`: names in the order of the output, separated by commas; without the key, the user must give them.
+- `mean`, `std`: one or three numbers of 0–255, separated by commas, in the network's colour order; default:
+  see `read_input`.
+- `colour`: `rgb` or `bgr`, the colour order of the input; default `rgb`.
+- `input_size`: `width,height`, for an input of variable size; default `256,256`.
+- `activation`: `none`, `sigmoid` or `softmax`, the function that turns the output into confidences; default `none`.
+- `alignment`: position of the cells of a heatmap, see `ALIGNMENTS`; default `centres`, with offsets `deeplabcut`.
+- `locref_std`: length in pixels of an offset of 1; default 7.2801, DeepLabCut's.
+- `pad_px`, `dilate_px`, `background`: the crops of the training, see `crop_bird`; default 40, 70 (`visible`: 14),
+  `black`.
 """
 
 from __future__ import annotations
@@ -39,6 +43,9 @@ ALIGNMENTS = ("centres", "deeplabcut", "msra", "udp")
 
 Source: `HeatmapPredictor` of DeepLabCut 3, `MSRAHeatmap` and `UDPHeatmap` of MMPose 1."""
 
+BACKGROUNDS = "black", "visible"
+"""Backgrounds of the crops: `black` outside the bird's dilated mask, or `visible` except other birds (`crop_bird`)."""
+
 T = TypeVar("T")
 
 
@@ -55,6 +62,7 @@ class KeypointMetadata(NamedTuple):
     locref_std: float
     pad_px: int | None
     dilate_px: int | None
+    background: str | None
 
 
 def read_metadata(model: OnnxModel) -> KeypointMetadata:
@@ -84,6 +92,7 @@ def read_metadata(model: OnnxModel) -> KeypointMetadata:
         locref_std=value("locref_std", lambda text: _positive(_numbers(text, 1))[0], 7.2801),
         pad_px=value("pad_px", _pixels),
         dilate_px=value("dilate_px", _pixels),
+        background=value("background", _one_of(*BACKGROUNDS)),
     )
 
 

@@ -15,6 +15,7 @@ from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, MURRE_KEY
 from jaxfit.perception.keypoint_layouts import (
     HeatmapLayout,
     KeypointInput,
+    KeypointMetadata,
     SimccLayout,
     detect_layout,
     read_input,
@@ -23,8 +24,9 @@ from jaxfit.perception.keypoint_layouts import (
 from jaxfit.perception.network import CONFIDENCE_KEY, OUTPUT, Instance, OnnxModel, activation_monitor, read_curve
 
 PAD_PX = 40
-DILATE_PX = 70
-"""The paper's values, for footage in which birds are about 250 pixels long."""
+DILATE_PX = {"black": 70, "visible": 14}
+"""Defaults of `crop_bird` for each background, for footage in which birds are about 250 pixels long; 40 and 70 are the
+paper's."""
 
 
 class Crop(NamedTuple):
@@ -60,9 +62,14 @@ def crop_bird(
     instance: Instance,
     size_px: tuple[int, int],
     pad_px: int = PAD_PX,
-    dilate_px: int = DILATE_PX,
+    dilate_px: int = DILATE_PX["black"],
+    neighbours: Sequence[Instance] | None = None,
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Crop]:
-    """Crop one bird and set every pixel outside its dilated mask to black, including other birds.
+    """Crop one bird, and set other birds to black.
+
+    The background is black or visible. If the background is black, every pixel outside the dilated mask of the bird is
+    black, so parts that the mask lacks are lost. If the background is visible, only the dilated masks of the neighbours
+    are black, except where the bird's own mask is.
 
     The tight box of the mask is padded, then enlarged about its centre (to half a pixel) to the aspect ratio of the
     picture. Reduction averages over areas, which avoids aliasing.
@@ -72,29 +79,47 @@ def crop_bird(
         instance: its mask lies within the frame.
         size_px: width and height of the picture.
         pad_px: margin on every side of the box, image pixels; 0 or more.
-        dilate_px: side of the square that dilates the mask, image pixels; 0 does not dilate.
+        dilate_px: side of the square that dilates the mask, or the masks of the neighbours, image pixels; 0 does not
+            dilate.
+        neighbours: the other birds of the frame, for a visible background; None for a black background.
 
     Returns:
         The picture, black where the box extends beyond the frame, and the crop that converts to image pixels.
 
-    Source: Hägerlind et al. 2024, the crops of its keypoint network (40 and 70 pixels).
+    Source: Hägerlind et al. 2024, the crops of its keypoint network (black background, 40 and 70 pixels).
     """
     crop = _padded_box(instance, size_px, pad_px)
-    mask = np.zeros((crop.height, crop.width), np.uint8)
-    h, w = instance.mask.shape
-    left, top = instance.x0 - crop.x0, instance.y0 - crop.y0
-    mask[top : top + h, left : left + w] = instance.mask
-    if dilate_px > 1:
-        mask = cv2.dilate(mask, np.ones((dilate_px, dilate_px), np.uint8))
+    own = _mask_in(crop, [instance])
+    if neighbours is None:
+        visible = _dilated(own, dilate_px)
+    else:
+        visible = own | (_dilated(_mask_in(crop, neighbours), dilate_px) == 0)
     rows = slice(max(crop.y0, 0), min(crop.y0 + crop.height, frame.shape[0]))
     columns = slice(max(crop.x0, 0), min(crop.x0 + crop.width, frame.shape[1]))
     inside = slice(rows.start - crop.y0, rows.stop - crop.y0), slice(columns.start - crop.x0, columns.stop - crop.x0)
     part = frame[rows, columns]
     picture = np.zeros((crop.height, crop.width, 3), np.uint8)
-    picture[inside] = cv2.bitwise_and(part, part, mask=mask[inside])
+    picture[inside] = cv2.bitwise_and(part, part, mask=visible[inside])
     is_reduction = crop.width >= size_px[0] and crop.height >= size_px[1]
     # when it enlarges, OpenCV's area mode shifts the pixel centres
     return cv2.resize(picture, size_px, interpolation=cv2.INTER_AREA if is_reduction else cv2.INTER_LINEAR), crop
+
+
+def _mask_in(crop: Crop, birds: Sequence[Instance]) -> UInt8[np.ndarray, "h w"]:
+    """Return 1 where the box of a crop shows one of the birds, else 0."""
+    mask = np.zeros((crop.height, crop.width), np.uint8)
+    for bird in birds:
+        low = np.array([bird.y0 - crop.y0, bird.x0 - crop.x0])
+        top, left = np.maximum(low, 0)
+        bottom, right = np.minimum(low + bird.mask.shape, mask.shape)
+        if top < bottom and left < right:
+            part = bird.mask[top - low[0] : bottom - low[0], left - low[1] : right - low[1]]
+            mask[top:bottom, left:right] |= part.astype(np.uint8)
+    return mask
+
+
+def _dilated(mask: UInt8[np.ndarray, "h w"], side_px: int) -> UInt8[np.ndarray, "h w"]:
+    return np.asarray(cv2.dilate(mask, np.ones((side_px, side_px), np.uint8)), np.uint8) if side_px > 1 else mask
 
 
 def _padded_box(instance: Instance, size_px: tuple[int, int], pad_px: int) -> Crop:
@@ -105,6 +130,38 @@ def _padded_box(instance: Instance, size_px: tuple[int, int], pad_px: int) -> Cr
     x0 = instance.x0 - pad_px - (width - padded_w) // 2
     y0 = instance.y0 - pad_px - (height - padded_h) // 2
     return Crop(x0, y0, width, height, size_px)
+
+
+class CropSettings(NamedTuple):
+    """The crops that a keypoint network expects; the fields are those of `crop_bird`."""
+
+    pad_px: int = PAD_PX
+    dilate_px: int = DILATE_PX["black"]
+    background: str = "black"
+    """One of `BACKGROUNDS`."""
+
+    def crop(
+        self, frame: UInt8[np.ndarray, "H W 3"], birds: Sequence[Instance], n: int, size_px: tuple[int, int]
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], Crop]:
+        """Crop bird n of all birds of a frame, as `crop_bird` describes."""
+        neighbours = None if self.background == "black" else [*birds[:n], *birds[n + 1 :]]
+        return crop_bird(frame, birds[n], size_px, self.pad_px, self.dilate_px, neighbours)
+
+
+def crop_settings(
+    metadata: KeypointMetadata, pad_px: int | None = None, dilate_px: int | None = None, background: str | None = None
+) -> CropSettings:
+    """Return the crops of a network: the given values, else those of its file, else the defaults of `CropSettings`."""
+    background = background or metadata.background or "black"
+    return CropSettings(
+        _first_given(pad_px, metadata.pad_px, PAD_PX),
+        _first_given(dilate_px, metadata.dilate_px, DILATE_PX[background]),
+        background,
+    )
+
+
+def _first_given(*values: int | None) -> int:
+    return next(value for value in values if value is not None)
 
 
 BUILTIN_PATH = Path(__file__).parent / "networks" / "keypoints.onnx"
@@ -122,14 +179,13 @@ class OnnxKeypoints:
         network_input: KeypointInput,
         layout: HeatmapLayout | SimccLayout,
         keypoint_names: Sequence[str],
-        pad_px: int,
-        dilate_px: int,
+        crops: CropSettings,
         batch: int,
         shapes: Mapping[str, tuple[int, ...]],
     ):
         self.keypoint_names = tuple(keypoint_names)
         self._model, self._input, self._layout = model, network_input, layout
-        self._pad_px, self._dilate_px = pad_px, dilate_px
+        self._crops = crops
         self._batch = network_input.batch or batch
         self._shapes = shapes
         self.activations = activation_monitor(model)
@@ -142,7 +198,7 @@ class OnnxKeypoints:
         K = len(self.keypoint_names)
         points_px, confidence = np.zeros((len(instances), K, 2), np.float32), np.zeros((len(instances), K), np.float32)
         for start in range(0, len(instances), self._batch):
-            array, crops = self.network_input(frame, instances[start : start + self._batch])
+            array, crops = self.network_input(frame, instances, range(len(instances))[start : start + self._batch])
             outputs = self._model(array)
             self._model.check_outputs(outputs, {name: (len(array), *shape) for name, shape in self._shapes.items()})
             if self.activations is not None:
@@ -156,14 +212,20 @@ class OnnxKeypoints:
         return points_px, confidence
 
     def network_input(
-        self, frame: UInt8[np.ndarray, "H W 3"], birds: Sequence[Instance]
+        self, frame: UInt8[np.ndarray, "H W 3"], birds: Sequence[Instance], some: Sequence[int]
     ) -> tuple[Num[np.ndarray, "N _ _ _"], list[Crop]]:
-        """Return the input of the network for the birds of a frame, and their crops; a fixed batch is filled with 0."""
+        """Return the input of the network for some birds of a frame, and their crops; a fixed batch is filled with 0.
+
+        Args:
+            frame: blue, green, red.
+            birds: all birds of the frame.
+            some: positions of the N birds of the input.
+        """
         width, height = self._input.size_px
-        batch = np.zeros((self._input.batch or len(birds), height, width, 3), np.uint8)
+        batch = np.zeros((self._input.batch or len(some), height, width, 3), np.uint8)
         crops = []
-        for i, bird in enumerate(birds):
-            batch[i], crop = crop_bird(frame, bird, (width, height), self._pad_px, self._dilate_px)
+        for i, n in enumerate(some):
+            batch[i], crop = self._crops.crop(frame, birds, n, (width, height))
             crops.append(crop)
         return self._input.array(batch), crops
 
@@ -175,6 +237,7 @@ def load_keypoint_detector(
     names: Sequence[str] | str | None = None,
     pad_px: int | None = None,
     dilate_px: int | None = None,
+    background: str | None = None,
     batch: int = 16,
     threads: int | None = None,
 ) -> OnnxKeypoints:
@@ -185,8 +248,8 @@ def load_keypoint_detector(
         kind: one of `KINDS`; `auto` uses the layout that fits.
         names: names of the keypoints in the order of the output, or a key of `NAME_SETS`; None or empty uses the
             names in the file.
-        pad_px, dilate_px: parameters of the crops (`crop_bird`), image pixels; None uses the values in the file, or
-            the paper's 40 and 70.
+        pad_px, dilate_px, background: parameters of the crops (`CropSettings`), image pixels; None uses the values in
+            the file, or a black background and the defaults of the background.
         batch: number of crops in one run, if the network does not fix it.
         threads: number of cores for one run; None uses all cores.
 
@@ -208,8 +271,7 @@ def load_keypoint_detector(
         network_input,
         layout,
         _choose_names(model, count, names or metadata.keypoint_names),
-        _first_given(pad_px, metadata.pad_px, PAD_PX),
-        _first_given(dilate_px, metadata.dilate_px, DILATE_PX),
+        crop_settings(metadata, pad_px, dilate_px, background),
         batch,
         {name: outputs[name].shape[1:] for name in layout.outputs},
     )
@@ -228,7 +290,3 @@ def _choose_names(model: OnnxModel, count: int, given: Sequence[str] | str | Non
         remedy = f"give one name for each keypoint in the order of the output: {model.describe()}"
         raise InputError(model.path, problem, remedy)
     return names
-
-
-def _first_given(*values: int | None) -> int:
-    return next(value for value in values if value is not None)

@@ -97,7 +97,7 @@ class SimulatedBird:
 
 
 def simulate_flock(
-    bird: Bird, birds: int, frames: int, fps: float, ledge_depth: float, view: Viewpoint, seed: int
+    bird: Bird, birds: int, frames: int, fps: float, ledge_depth: float, view: Viewpoint, seed: int, wings: bool = False
 ) -> list[SimulatedBird]:
     """Simulate the motion of several birds on a ledge.
 
@@ -111,10 +111,12 @@ def simulate_flock(
         ledge_depth: distance from the edge of the ledge to the wall, model units.
         view: the camera.
         seed: seed of the motion.
+        wings: every bird flaps again and again, or flies off.
     """
     rng = np.random.default_rng((seed, 1))
     positions = _draw_positions(rng, birds, ledge_depth, view)
-    keyframes = _draw_keyframes(rng, positions, ledge_depth, frames / fps)
+    draw = _draw_wingbeats if wings else _draw_keyframes
+    keyframes = draw(rng, positions, ledge_depth, frames / fps)
     motions = [interpolate_keyframes(keys, frames, fps) for keys in keyframes]
     bodies = [_Body(bird, motion, rng, KNOT_S * fps) for motion in motions]
     _separate(bodies, AVOIDANCE_S * fps)
@@ -163,6 +165,23 @@ def _draw_keyframes(
                 break
             if behaviour != "incubate":
                 behaviour = str(rng.choice(behaviours[:-1], p=np.array(weights[:-1]) / 0.9))
+        keyframes.append(bird)
+    return keyframes
+
+
+def _draw_wingbeats(
+    rng: np.random.Generator, positions: Sequence[tuple[float, float]], _depth: float, seconds: float
+) -> list[Keyframes]:
+    """Draw birds of which 30 % fly off at a random time; all birds flap again and again before."""
+    keyframes = []
+    for position in positions:
+        bird = Keyframes(rng, [Key(-1.0, POSTURES["standing"], position, float(rng.uniform(-np.pi, np.pi)))])
+        leaves_s = rng.uniform(0, seconds) if rng.random() < 0.3 else np.inf
+        bird.add_behaviour("stand", rng.uniform(0.0, 0.4))
+        while bird.last.time_s < min(seconds, leaves_s):
+            bird.add_behaviour("flap", bird.last.time_s + rng.uniform(0.5, 2.0))
+        if bird.last.time_s < seconds:
+            bird.add_behaviour("fly_off", seconds)
         keyframes.append(bird)
     return keyframes
 

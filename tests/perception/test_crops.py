@@ -77,3 +77,24 @@ def test_reduction_does_not_alias():
     picture, crop = crop_bird(frame, rectangle_instance(0, 0, 512, 512), (64, 64), pad_px=0)
     assert crop.scale.tolist() == [8, 8]
     np.testing.assert_array_equal(picture, 125)
+
+
+def test_visible_background_blanks_neighbours_only():
+    frame = np.full((60, 80, 3), 200, np.uint8)
+    bird, neighbour = rectangle_instance(20, 20, 10, 10), rectangle_instance(34, 20, 10, 10)
+    picture, crop = crop_bird(frame, bird, (40, 40), pad_px=15, dilate_px=5, neighbours=[neighbour])
+    assert (crop.x0, crop.y0, crop.width, crop.height) == (5, 5, 40, 40)
+    expected = np.full((40, 40), 200, np.uint8)
+    expected[13:27, 27:40] = 0  # the neighbour is 29 to 39 and 15 to 25; two pixels of dilation on every side
+    np.testing.assert_array_equal(picture[..., 0], expected)
+
+
+def test_own_mask_stays_visible_under_a_neighbour():
+    frame = np.full((60, 80, 3), 200, np.uint8)
+    bird, neighbour = rectangle_instance(20, 20, 10, 10), rectangle_instance(25, 25, 30, 30)
+    picture, _ = crop_bird(frame, bird, (20, 20), pad_px=5, dilate_px=0, neighbours=[neighbour])
+    assert (picture[5:15, 5:15] == 200).all()  # the own mask
+    assert (picture[15:, 10:] == 0).all()  # the neighbour beside the own mask
+    assert (picture[:10] == 200).all()  # the ground
+    whole, _ = crop_bird(frame, bird, (20, 20), pad_px=5, dilate_px=0, neighbours=[])
+    assert (whole == 200).all()

@@ -110,7 +110,7 @@ def test_tracks_with_low_scores_are_excluded_and_reported(video):
     assert "no tracked bird has a mean score of 0.95: the highest of 3 tracks is 0.900" in str(failure)
 
 
-def test_no_keypoints_for_birds_without_a_track(video):
+def test_birds_without_a_track_are_neighbours_in_crops_only(video):
     class OneBird:
         def update(self, frame_index, instances, frame=None):
             return [7 if bird.x0 >= 2 * SIDE else None for bird in instances]
@@ -118,7 +118,7 @@ def test_no_keypoints_for_birds_without_a_track(video):
     tracking, _, keypoints = tracked(video, tracker=OneBird())
     assert tracking.observations.track_id.tolist() == [7]
     assert columns(tracking.observations) == [2]
-    assert keypoints.counts == [1] * FRAMES
+    assert keypoints.counts == [3] * FRAMES
 
 
 def test_repair_of_left_right_flips_is_optional(video):

@@ -18,7 +18,7 @@ from jaxfit.raster.zbuffer import hard_mask
 from jaxfit.simulation.behaviour import BEHAVIOURS
 from jaxfit.simulation.flock import simulate_flock
 from jaxfit.simulation.footage import Footage, random_light
-from jaxfit.simulation.scene import LEDGE_DEPTH, simulate, stage_scene
+from jaxfit.simulation.scene import LEDGE_DEPTH, mesh_keypoints, simulate, stage_scene
 from jaxfit.simulation.viewpoint import random_viewpoint
 from jaxfit.video.reader import read_frames
 
@@ -217,3 +217,17 @@ def test_invalid_arguments_are_rejected(wrong, tmp_path):
     with pytest.raises(InputError, match=next(iter(wrong))):
         simulate(MURRE, tmp_path / "s", **({"frames": 2, "size": SIZE} | wrong))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_flock_with_wings():
+    """With `wings`, most birds spread their wings at some time; else few do."""
+    view = random_viewpoint(np.random.default_rng((1, 0)), 640, 480, LEDGE_DEPTH)
+    tips = [MURRE.keypoint_names.index(f"{side}_wingtip") for side in ("left", "right")]
+
+    def share(wings):
+        birds = simulate_flock(MURRE, 7, 60, 25.0, LEDGE_DEPTH, view, 3, wings)
+        points = mesh_keypoints(MURRE, np.stack([bird.vertices_world for bird in birds], axis=1))
+        span = np.linalg.norm(points[:, :, tips[0]] - points[:, :, tips[1]], axis=-1)
+        return (span > 20).any(0).mean()
+
+    assert share(False) < 0.5 < share(True)

@@ -219,4 +219,4 @@ def keypoint_inputs(
     detector = load_keypoint_detector(path)
     for picture, birds in pictures:
         if birds:
-            yield detector.network_input(picture, birds)[0]
+            yield detector.network_input(picture, birds, range(len(birds)))[0]

@@ -70,7 +70,7 @@ from jaxfit.learning.networks.validation import (
     torch_segmenter,
 )
 from jaxfit.perception.keypoint_layouts import read_metadata
-from jaxfit.perception.keypoints import DILATE_PX, PAD_PX, load_keypoint_detector
+from jaxfit.perception.keypoints import crop_settings, load_keypoint_detector
 from jaxfit.perception.network import OnnxModel
 from jaxfit.perception.segmentation import LONGER_SIDE_PX, load_segmenter
 
@@ -361,9 +361,7 @@ def _base_scale(network: str, base: Path, scale: Scale) -> Scale:
     if network == "segmenter":
         load_segmenter(base, kind="bottom_up")  # checks the scale
         return scale._replace(longer_side_px=int(model.metadata.get("longer_side", LONGER_SIDE_PX)))
-    stored = read_metadata(model)
-    pad_px = PAD_PX if stored.pad_px is None else stored.pad_px
-    return scale._replace(pad_px=pad_px, dilate_px=DILATE_PX if stored.dilate_px is None else stored.dilate_px)
+    return scale._replace(crops=crop_settings(read_metadata(model)))
 
 
 def _facts(
@@ -389,7 +387,7 @@ def _write(network: str, model: Any, names: tuple[str, ...], scale: Scale, facts
     if network == "segmenter":
         write_segmenter(model, facts, path, scale.longer_side_px)
     else:
-        write_keypoints(model, names, facts, path, (scale.pad_px, scale.dilate_px))
+        write_keypoints(model, names, facts, path, scale.crops)
 
 
 def _remove(folder: Path) -> None:

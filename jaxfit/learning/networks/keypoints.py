@@ -22,21 +22,27 @@ from torch.nn import functional
 from jaxfit.data.keypoint_names import opposite_keypoints
 from jaxfit.foundation.errors import InputError
 from jaxfit.learning.networks.augment import SCENE_SHARE, patch_around, random_rotation, randomise_appearance
-from jaxfit.learning.networks.labelled_frames import UNKNOWN, LabelledFrames
+from jaxfit.learning.networks.labelled_frames import UNKNOWN, LabelledFrames, birds_with_spread_wings
 from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
-from jaxfit.perception.keypoints import DILATE_PX, PAD_PX, crop_bird
+from jaxfit.perception.keypoints import DILATE_PX, CropSettings
 from jaxfit.perception.network import Instance, instance_of
 
 STRIDE, SIDE_PX = 4, 192
+CROPS = CropSettings(dilate_px=DILATE_PX["visible"], background="visible")
+"""The crops at the paper's scale. The background is visible, so that the network sees wings that a mask lacks."""
 PAPER_PIXELS_PER_UNIT = 20.7
-"""Scale of the footage for which PAD_PX and DILATE_PX are chosen: 2592 pixels for 2.5 m; one unit is 2 cm."""
+"""The paper's scale: 2592 pixels for 2.5 m; one unit is 2 cm."""
 SIGMA_CELLS = 0.9
 """Standard deviation of the target distribution. Labels are exact, but a cell is not a point."""
 WINDOW_CELLS = 1.6
 """Standard deviation of the window: 6 of 192 pixels, which is 3 % of a bird that fills its crop."""
 OCCLUDED_WEIGHT, ABSENT_WEIGHT = 0.5, 0.3
 """Weights in the loss of occluded keypoints and of keypoints outside the crop; visible keypoints have weight 1."""
+SPREAD_SHARE = 0.3
+"""Share of the samples that show a bird with spread wings, if the frames show such birds."""
+UNDETECTED_SHARE = 0.1
+"""Share of the neighbours that the segmenter does not detect, so that they stay visible."""
 MIN_VISIBLE = 4
 """Least number of visible keypoints of a bird in the training data."""
 MOST_DRAWS = 1000
@@ -92,7 +98,7 @@ def _usable_birds(frames: LabelledFrames, s: int) -> Int[np.ndarray, "M"]:
 
 
 def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: float = SCENE_SHARE) -> KeypointSample:
-    """Draw a random bird of a random frame, with random rotation, mirroring, appearance and errors of the mask.
+    """Draw a random bird of a random frame, with random rotation, mirroring, appearance and errors of the masks.
 
     Frames whose keypoints have no sides, such as numbers, are not mirrored.
 
@@ -104,12 +110,13 @@ def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: f
     Raises:
         InputError: none of many frames shows a bird.
     """
+    spread = birds_with_spread_wings(frames) if rng.random() < SPREAD_SHARE else np.zeros((0, 2), int)
     for _ in range(MOST_DRAWS):
-        s = int(rng.integers(len(frames.pictures)))
+        s, n = rng.choice(spread).tolist() if len(spread) else (int(rng.integers(len(frames.pictures))), None)
         birds = _usable_birds(frames, s)
-        if not len(birds):
+        if not len(birds) or (n is not None and n not in birds):
             continue
-        patch = _augmented_patch(rng, frames, s, int(rng.choice(birds)), scene_share)
+        patch = _augmented_patch(rng, frames, s, int(rng.choice(birds)) if n is None else n, scene_share)
         if patch is not None:
             return _crop_sample(rng, *patch)
     raise InputError("frames", f"show no bird in {MOST_DRAWS} draws", "film the frames again")
@@ -117,12 +124,12 @@ def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: f
 
 def _augmented_patch(
     rng: np.random.Generator, frames: LabelledFrames, s: int, n: int, scene_share: float
-) -> tuple[np.ndarray, Instance, np.ndarray, np.ndarray, float] | None:
+) -> tuple[np.ndarray, list[Instance], np.ndarray, np.ndarray, float] | None:
     """Resample the surroundings of a bird to about the network's scale; None if too little of the bird is visible.
 
     Returns:
-        Picture with random appearance, instance of the bird, keypoints in pixels of the picture, visibility of each
-        keypoint, and the scale of the picture relative to the paper's footage.
+        Picture with random appearance, the detected birds (first the bird itself), keypoints in pixels of the picture,
+        visibility of each keypoint, and the scale of the picture relative to the paper's footage.
     """
     bird = instance_of(frames.owner[s] == n + 1, 1.0, "")
     if bird is None:
@@ -131,7 +138,7 @@ def _augmented_patch(
     relative_scale = frames.pixels_per_unit[s] / PAPER_PIXELS_PER_UNIT
     if max(h, w) < 30 * relative_scale:
         return None
-    margin = 2 * PAD_PX * relative_scale
+    margin = 2 * CROPS.pad_px * relative_scale
     factor = SIDE_PX / (max(h, w) + margin) * rng.uniform(0.9, 1.1)
     centre_px = np.array([bird.x0 + w / 2, bird.y0 + h / 2])
     rotation, mirrored = random_rotation(rng, factor, 20)
@@ -149,43 +156,79 @@ def _augmented_patch(
     warp = np.column_stack([affine[:, :2], affine[:, 2] + shift])
     picture = cv2.warpAffine(picture, warp, (side, side), flags=cv2.INTER_LINEAR)
     owner = cv2.warpAffine(owner, warp, (side, side), flags=cv2.INTER_NEAREST)
-    instance = instance_of(_faulty_mask(rng, owner == n + 1, owner > 0), 1.0, "")
+    own, *others = (n + 1, *(k for k in np.unique(owner[owner > 0]).tolist() if k != n + 1))
+    instance = instance_of(_faulty_mask(rng, owner == own, owner > 0), 1.0, "")
     if instance is None:
         return None
+    detected = [k for k in others if rng.random() >= UNDETECTED_SHARE]
+    neighbours = (instance_of(_faulty_mask(rng, owner == k, owner > 0), 1.0, "") for k in detected)
+    birds = [instance, *(bird for bird in neighbours if bird is not None)]
     picture = randomise_appearance(rng, picture, owner > 0, scene_share)
     points_px = (points_px - low) @ affine[:, :2].T + affine[:, 2]
-    return picture, instance, points_px, visibility, float(relative_scale * factor)
+    return picture, birds, points_px, visibility, float(relative_scale * factor)
 
 
 def _faulty_mask(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) -> np.ndarray:
-    """Simulate errors of a segmenter: erosion, dilation, a missing part, or a part of a neighbour."""
-    kind = rng.random()
-    side = int(rng.integers(2, 9))
-    if kind < 0.25:
-        return cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-    if kind < 0.5:
-        return cv2.dilate(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
-    if kind < 0.7:
-        rows, columns = np.nonzero(mask)
-        if not len(rows):
-            return mask
+    """Simulate errors of a segmenter in two of three masks.
+
+    The errors: erosion, dilation, a missing part, a part of a neighbour, no thin parts such as wings, one side missing,
+    a shift.
+    """
+    error = str(rng.choice(list(_MASK_ERRORS), p=list(_MASK_ERRORS.values())))
+    rows, columns = np.nonzero(mask)
+    if error == "none" or not len(rows):
+        return mask
+    if error in ("eroded", "dilated"):
+        change = cv2.erode if error == "eroded" else cv2.dilate
+        side = int(rng.integers(2, 9))
+        return change(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+    if error in ("hole", "merged"):
         spot, i = np.zeros(mask.shape, np.uint8), int(rng.integers(len(rows)))
         cv2.circle(spot, (int(columns[i]), int(rows[i])), int(rng.integers(8, 30)), 1, -1)
-        return mask & (spot == 0) if kind < 0.6 else mask | (birds & (spot > 0))
-    return mask
+        return mask & (spot == 0) if error == "hole" else mask | (birds & (spot > 0))
+    if error == "without thin parts":
+        widest = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3).max()
+        side = max(int(widest * rng.uniform(0.8, 1.5)), 1)
+        kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+    angle, length = rng.uniform(0, 2 * np.pi), max(np.ptp(rows), np.ptp(columns))
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    if error == "torn":
+        along = columns * direction[0] + rows * direction[1]
+        torn = np.zeros_like(mask)
+        kept = along < np.quantile(along, rng.uniform(0.5, 0.9))
+        torn[rows[kept], columns[kept]] = True
+        return torn
+    shift = rng.uniform(0, 0.15) * length * direction
+    shifted = cv2.warpAffine(mask.astype(np.uint8), np.column_stack([np.eye(2), shift]), mask.shape[::-1])
+    return shifted > 0
+
+
+_MASK_ERRORS = {
+    "none": 0.3,
+    "eroded": 0.15,
+    "dilated": 0.15,
+    "hole": 0.08,
+    "merged": 0.08,
+    "without thin parts": 0.12,
+    "torn": 0.07,
+    "shifted": 0.05,
+}
+"""Errors of the masks in the training, and their shares."""
 
 
 def _crop_sample(
     rng: np.random.Generator,
     picture: np.ndarray,
-    bird: Instance,
+    birds: list[Instance],
     points_px: np.ndarray,
     visibility: np.ndarray,
     relative_scale: float,
 ) -> KeypointSample:
-    """Crop a bird as the detector does, with random margins."""
-    pad, dilate = (int(margin * relative_scale * rng.uniform(0.4, 2.0)) for margin in (PAD_PX, DILATE_PX))
-    crop_picture, crop = crop_bird(picture, bird, (SIDE_PX, SIDE_PX), pad, max(dilate, 2))
+    """Crop the first of some birds as the detector does, with random margins."""
+    pad, dilate = (int(side * relative_scale * rng.uniform(0.4, 2.0)) for side in (CROPS.pad_px, CROPS.dilate_px))
+    crops = CROPS._replace(pad_px=pad, dilate_px=dilate)
+    crop_picture, crop = crops.crop(picture, birds, 0, (SIDE_PX, SIDE_PX))
     position = crop.to_crop(points_px) / STRIDE
     known = visibility != UNKNOWN
     present = known & (visibility > 0) & ((position >= 0) & (position < SIDE_PX / STRIDE)).all(-1)

@@ -26,7 +26,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.learning.networks.filming import Filming
-from jaxfit.learning.networks.keypoints import PAPER_PIXELS_PER_UNIT
+from jaxfit.learning.networks.keypoints import CROPS, PAPER_PIXELS_PER_UNIT
 from jaxfit.learning.networks.label_checks import LeftOut, check_picture, check_sides
 from jaxfit.learning.networks.labelled_frames import (
     MARKER,
@@ -46,7 +46,7 @@ from jaxfit.learning.networks.labels import (
     read_pictures,
 )
 from jaxfit.learning.networks.segmenter import PIXELS_PER_UNIT
-from jaxfit.perception.keypoints import DILATE_PX, PAD_PX
+from jaxfit.perception.keypoints import CropSettings
 from jaxfit.perception.segmentation import LONGER_SIDE_PX, MULTIPLE
 
 GAP_FRAMES = 25
@@ -152,10 +152,8 @@ class Scale(NamedTuple):
     """Median length of the labelled birds: the longer side of their boxes, pixels of the pictures."""
     longer_side_px: int
     """Longer side of the segmenter's input."""
-    pad_px: int
-    """Margin of the crops of the keypoint network, pixels of the pictures."""
-    dilate_px: int
-    """Side of the square that dilates the masks of these crops, pixels of the pictures."""
+    crops: CropSettings
+    """The crops of the keypoint network, in pixels of the pictures."""
 
     def pixels_per_unit(self, network: str, size_px: tuple[int, int]) -> float:
         """Return the scale of a picture of this size as `LabelledFrames` stores the scale."""
@@ -175,8 +173,8 @@ def choose_scale(pictures: Iterable[LabelledPicture]) -> Scale:
     length, input_length = float(np.median(lengths)), LONGER_SIDE_PX * float(np.median(shares))
     longer_side = LONGER_SIDE_PX * float(np.clip(input_length, *INPUT_BIRD_PX)) / input_length
     longer_side = min(max(MULTIPLE * round(longer_side / MULTIPLE), 5 * MULTIPLE), LONGEST_SIDE_PX)
-    pad, dilate = (max(2, round(margin * length / PAPER_BIRD_PX)) for margin in (PAD_PX, DILATE_PX))
-    return Scale(length, longer_side, pad, dilate)
+    pad, dilate = (max(2, round(margin * length / PAPER_BIRD_PX)) for margin in (CROPS.pad_px, CROPS.dilate_px))
+    return Scale(length, longer_side, CROPS._replace(pad_px=pad, dilate_px=dilate))
 
 
 def prepare_frames(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from numpy.lib.format import open_memmap
 
 from jaxfit.data.formats.fields import LARGEST_POSITION_PX
@@ -22,6 +22,8 @@ MOST_BIRDS = 255
 """Largest number of birds in a frame."""
 UNKNOWN = 3
 """Visibility of a keypoint without a label: the keypoint does not count in the training."""
+SPREAD_UNITS = 14.0
+"""Least distance of the wingtips of spread wings in the picture, model units; a murre is 20 units long."""
 _LABELS = {"keypoints_px": "S N K 2", "visibility": "S N K", "pixels_per_unit": "S"}
 """The arrays of the labels, and their shapes."""
 
@@ -60,6 +62,17 @@ class LabelledFrames(NamedTuple):
             new, k = list(names).index(own), self.keypoint_names.index(old)
             points[:, :, new], visibility[:, :, new] = self.keypoints_px[:, :, k], self.visibility[:, :, k]
         return self._replace(keypoints_px=points, visibility=visibility, keypoint_names=tuple(names))
+
+
+def birds_with_spread_wings(frames: LabelledFrames) -> Int[np.ndarray, "M 2"]:
+    """Return frame and bird of all birds whose wingtips are far apart in the picture and that are not hidden."""
+    if not {"left_wingtip", "right_wingtip"} <= set(frames.keypoint_names):
+        return np.zeros((0, 2), int)
+    left, right = (frames.keypoint_names.index(f"{side}_wingtip") for side in ("left", "right"))
+    span_px = np.linalg.norm(frames.keypoints_px[:, :, left] - frames.keypoints_px[:, :, right], axis=-1)
+    known = frames.known
+    both = known[:, :, left] & known[:, :, right] & (frames.visibility == 2).any(-1)
+    return np.argwhere(both & (span_px > SPREAD_UNITS * frames.pixels_per_unit[:, None]))
 
 
 def create_pictures(folder: Path, count: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -177,6 +177,7 @@ def train(
     frames_folder: Path,
     schedule: Schedule,
     seed: int = 0,
+    is_folded: bool = False,
     progress: ProgressTask = silent,
     name: str = "Training",
 ) -> dict[str, float]:
@@ -189,6 +190,7 @@ def train(
         frames_folder: folder of the frames, written by `film_scenes`.
         schedule: number of steps, size of the batches, learning rate.
         seed: seed of the samples; the caller initialises the network.
+        is_folded: whether the network comes from a file, so that its normalisation is folded into the convolutions.
         progress: reports every step and the loss.
         name: name of the task, for the progress report.
 
@@ -197,6 +199,8 @@ def train(
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.to(device).train()
+    if is_folded:
+        freeze_normalisation(network)
     network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
     optimiser = schedule.optimiser(network)
     half = has_fast_bfloat16()

@@ -24,10 +24,10 @@ from jaxfit.data.keypoint_names import propose_names
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
 from jaxfit.learning.networks import keypoints
-from jaxfit.learning.networks.keypoints import keypoint_network
+from jaxfit.learning.networks.keypoints import CROPS, keypoint_network
 from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.segmenter import segmenter_network
-from jaxfit.perception.keypoints import BUILTIN_PATH
+from jaxfit.perception.keypoints import BUILTIN_PATH, CropSettings
 from jaxfit.perception.network import OnnxModel
 from jaxfit.perception.segmentation import BUILTIN, LONGER_SIDE_PX, BottomUp
 
@@ -151,7 +151,7 @@ def write_keypoints(
     names: Sequence[str],
     facts: Mapping[str, str],
     path: str | Path,
-    margins_px: tuple[int, int] | None = None,
+    crops: CropSettings = CROPS,
 ) -> None:
     """Write a keypoint network to an ONNX file.
 
@@ -160,17 +160,16 @@ def write_keypoints(
         names: names of the keypoints, without commas.
         facts: metadata about the training.
         path: the `.onnx` file; an existing file is replaced.
-        margins_px: `pad_px` and `dilate_px` of the crops; None for the defaults.
+        crops: the crops of the training.
     """
     side = keypoints.SIDE_PX
-    margins = {} if margins_px is None else {"pad_px": str(margins_px[0]), "dilate_px": str(margins_px[1])}
     metadata = {
         "keypoint_names": ",".join(names),
         "mean": "0",
         "std": "255",
         "colour": "bgr",
         "input_size": f"{side},{side}",
-        **margins,
+        **{key: str(value) for key, value in crops._asdict().items()},
         **facts,
     }
     exported = keypoints.KeypointMaps(network, len(names)).eval()

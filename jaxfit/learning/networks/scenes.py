@@ -47,7 +47,9 @@ class _Placed(NamedTuple):
     flies: bool
 
 
-def draw_frames(rng: np.random.Generator, bird: Bird, count: int, width: int, height: int) -> LabelledFrames:
+def draw_frames(
+    rng: np.random.Generator, bird: Bird, count: int, width: int, height: int, flight: float = 0.15
+) -> LabelledFrames:
     """Draw a scene, which is one or two species, one landscape, one light and one camera, and some of its frames.
 
     Birds have other places and postures in every frame.
@@ -57,6 +59,7 @@ def draw_frames(rng: np.random.Generator, bird: Bird, count: int, width: int, he
         bird: the murre.
         count: number of frames.
         width, height: size of the frames, pixels.
+        flight: share of the frames in which all birds fly.
     """
     pitch = float(rng.uniform(0, 90))
     R_cam_world = camera_axes(pitch, 0, rng.uniform(-8, 8))
@@ -71,7 +74,7 @@ def draw_frames(rng: np.random.Generator, bird: Bird, count: int, width: int, he
     pictures, owner = np.zeros((count, height, width, 3), np.uint8), np.zeros((count, height, width), np.uint8)
     for s in range(count):
         N = int(np.clip(rng.poisson(expected), 1, MAX_VARIED_BIRDS))
-        birds = _place(rng, species, N, scale, R_cam_world, landscape, (width, height))
+        birds = _place(rng, species, N, scale, R_cam_world, landscape, (width, height), rng.random() < flight)
         pictures[s], owner[s], points[s, :N], visibility[s, :N] = _render(rng, birds, landscape, light, feathers)
     return LabelledFrames(pictures, owner, points, visibility, np.full(count, scale, np.float32))
 
@@ -84,9 +87,9 @@ def _place(
     R_cam_world: np.ndarray,
     landscape: Landscape,
     size_px: tuple[int, int],
+    flies: bool,
 ) -> list[_Placed]:
     """Place birds at random points of the picture; birds that stand lower in the picture are nearer."""
-    flies = rng.random() < 0.15
     centres = rng.uniform([0, 0], size_px, (N, 2))
     for n in range(1, N):  # some birds stand close to another bird
         if rng.random() < 0.35:
@@ -255,6 +258,7 @@ def film_scenes(
     overwrite: bool = False,
     progress: ProgressTask = silent,
     varied: float = 0.0,
+    wings: float = 0.0,
 ) -> LabelledFrames:
     """Simulate scenes and write their frames to a folder; the same seeds give the same frames.
 
@@ -265,6 +269,7 @@ def film_scenes(
         overwrite: replace the frames of an earlier run.
         progress: reports every scene.
         varied: share of the scenes with other birds in other landscapes (`jaxfit.learning.networks`).
+        wings: share of the scenes in which the birds flap or fly.
 
     Raises:
         InputError: the folder contains other files, or cannot be written.
@@ -273,7 +278,7 @@ def film_scenes(
     with new_folder(folder, overwrite, marker=MARKER) as part:
         pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))  # a fork breaks compiled code
         with progress("Filming simulated scenes for the training", len(seeds)) as report_progress, pool:
-            scenes = pool.map(partial(_film_scene, varied=varied), seeds)
+            scenes = pool.map(partial(_film_scene, varied=varied, wings=wings), seeds)
             _write_scenes(part, scenes, len(seeds), most, lambda: report_progress(1, ""))
     return load_frames(folder)
 
@@ -312,18 +317,24 @@ def _write_scenes(
     save_labels(part, points, visibility, scale)
 
 
-def _film_scene(seed: int, varied: float = 0.0) -> LabelledFrames:
+FLIGHT_SHARE = 0.7
+"""Share of the frames with birds in the air, in a scene with wings of other birds than murres."""
+
+
+def _film_scene(seed: int, varied: float = 0.0, wings: float = 0.0) -> LabelledFrames:
     """Simulate the frames of one scene: with probability `varied`, other birds in another landscape."""
     bird = load_murre()
+    has_wings = bool(np.random.default_rng((seed, 13)).random() < wings)
     if np.random.default_rng((seed, 11)).random() < varied:
         rng = np.random.default_rng((seed, 12))
-        return draw_frames(rng, bird, FRAMES_PER_SCENE, WIDTH, HEIGHT)
-    return _film_ledge(seed, bird)
+        flight = {"flight": FLIGHT_SHARE} if has_wings else {}
+        return draw_frames(rng, bird, FRAMES_PER_SCENE, WIDTH, HEIGHT, **flight)
+    return _film_ledge(seed, bird, has_wings)
 
 
-def _film_ledge(seed: int, bird: Bird) -> LabelledFrames:
+def _film_ledge(seed: int, bird: Bird, wings: bool) -> LabelledFrames:
     """Simulate murres on a ledge with a random camera, light and number of birds."""
-    scene = simulate_ledge(seed, bird)
+    scene = simulate_ledge(seed, bird, wings)
     frames = list(_render_frames(scene, np.asarray(bird.faces)))
     pictures, owner, points, visibility = (np.stack(values) for values in zip(*frames, strict=True))
     scale = np.full(len(scene.kept), scene.pixels_per_unit, np.float32)
@@ -343,15 +354,15 @@ class Ledge(NamedTuple):
     pixels_per_unit: float
 
 
-def simulate_ledge(seed: int, bird: Bird) -> Ledge:
-    """Simulate the birds of a scene without rendering the pictures."""
+def simulate_ledge(seed: int, bird: Bird, wings: bool = False) -> Ledge:
+    """Simulate the birds of a scene without rendering the pictures; `wings` as in `simulate_flock`."""
     rng = np.random.default_rng((seed, 10))
     view, pixels_per_unit = _random_view(rng)
     # the expected number of birds grows with the visible area
     expected_birds = (view.width / pixels_per_unit) * (view.height / pixels_per_unit) / 170
     N = int(np.clip(rng.poisson(min(expected_birds, 9)) + 1, 1, MAX_BIRDS))
     T = FRAMES_PER_SCENE * EVERY
-    birds = simulate_flock(bird, N, T, FPS, LEDGE_DEPTH, view, seed)
+    birds = simulate_flock(bird, N, T, FPS, LEDGE_DEPTH, view, seed, wings)
     footage = Footage(bird, birds, view, LEDGE_DEPTH, random_light(rng), seed)
     kept = range(int(rng.integers(EVERY)), T, EVERY)
     vertices = np.stack([simulated.vertices_world for simulated in birds], axis=1)

@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
 from jaxfit.learning.networks.augment import SCENE_SHARE, patch_around, random_rotation, randomise_appearance
-from jaxfit.learning.networks.labelled_frames import LabelledFrames
+from jaxfit.learning.networks.labelled_frames import LabelledFrames, birds_with_spread_wings
 from jaxfit.learning.networks.networks import EFFICIENTNET_WIDTHS, FeaturePyramid, efficientnet_stages
 
 STRIDE = 2
@@ -41,8 +41,6 @@ RESAMPLING = 0.3, 1.6
 """Range of the factor between the frame and the sample; the scale of a sample may lie outside its range."""
 SPREAD_SHARE = 0.2
 """Share of the samples around a bird with spread wings, if the frames show such birds."""
-SPREAD_UNITS = 14.0
-"""Least distance of the wingtips of spread wings in the picture, model units; a murre is 20 units long."""
 CENTRE_SIGMA = 0.14
 """Standard deviation of the peak at a centre, as a share of the square root of the bird's area."""
 MIN_AREA_PX = 20
@@ -88,7 +86,7 @@ def draw_sample(
         scene_share: share of the samples with a random scene, as in `randomise_appearance`.
         wide_share: share of the samples with a scale of `WIDE_PIXELS_PER_UNIT`; all others have a usual scale.
     """
-    spread = _birds_with_spread_wings(frames) if rng.random() < SPREAD_SHARE else np.zeros((0, 2), int)
+    spread = birds_with_spread_wings(frames) if rng.random() < SPREAD_SHARE else np.zeros((0, 2), int)
     if len(spread):
         s, n = rng.choice(spread).tolist()
     else:
@@ -106,17 +104,6 @@ def draw_sample(
     picture, owner = _resampled_patch(rng, frames, s, centre_px, factor)
     picture = randomise_appearance(rng, picture, owner > 0, scene_share)
     return SegmenterSample(np.moveaxis(picture, -1, 0).astype(np.float32) / 255, *_targets(owner))
-
-
-def _birds_with_spread_wings(frames: LabelledFrames) -> Int[np.ndarray, "M 2"]:
-    """Return frame and bird of all birds whose wingtips are far apart in the picture and that are not hidden."""
-    if not {"left_wingtip", "right_wingtip"} <= set(frames.keypoint_names):
-        return np.zeros((0, 2), int)
-    left, right = (frames.keypoint_names.index(f"{side}_wingtip") for side in ("left", "right"))
-    span_px = np.linalg.norm(frames.keypoints_px[:, :, left] - frames.keypoints_px[:, :, right], axis=-1)
-    known = frames.known
-    both = known[:, :, left] & known[:, :, right] & (frames.visibility == 2).any(-1)
-    return np.argwhere(both & (span_px > SPREAD_UNITS * frames.pixels_per_unit[:, None]))
 
 
 def _resampled_patch(

@@ -68,7 +68,7 @@ def keypoint_detector(network: nn.Module, names: Sequence[str], scale: Scale) ->
     model_input = KeypointInput(size, None, False, np.float32, False, (0.0,) * 3, (255.0,) * 3)
     layout = HeatmapLayout("heatmaps", None, False, size, "none", "centres", 1.0)
     shape = {"heatmaps": (len(names), SIDE_PX // STRIDE, SIDE_PX // STRIDE)}
-    return OnnxKeypoints(model, model_input, layout, names, scale.pad_px, scale.dilate_px, CROPS, shape)
+    return OnnxKeypoints(model, model_input, layout, names, scale.crops, CROPS, shape)
 
 
 def segmenter_accuracy(segmenter: Segmenter, pictures: Sequence[StoredPicture]) -> dict[str, float]:

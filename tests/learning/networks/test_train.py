@@ -8,13 +8,13 @@ torch = pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 from jaxfit.foundation.errors import InputError  # noqa: E402
 from jaxfit.learning.networks import keypoints, scenes, segmenter  # noqa: E402
 from jaxfit.learning.networks.augment import randomise_appearance  # noqa: E402
-from jaxfit.learning.networks.labelled_frames import LabelledFrames, load_frames  # noqa: E402
+from jaxfit.learning.networks.labelled_frames import SPREAD_UNITS, LabelledFrames, birds_with_spread_wings, load_frames  # noqa: E402
 from jaxfit.learning.networks.loop import Schedule  # noqa: E402
 from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages  # noqa: E402
 from jaxfit.learning.networks.scenes import FRAMES_PER_SCENE, film_scenes  # noqa: E402
-from jaxfit.learning.networks.train import train_network  # noqa: E402
+from jaxfit.learning.networks.train import Simulation, train_network  # noqa: E402
 from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
-from jaxfit.perception.keypoints import load_keypoint_detector  # noqa: E402
+from jaxfit.perception.keypoints import BUILTIN_PATH, load_keypoint_detector  # noqa: E402
 from jaxfit.perception.network import (  # noqa: E402
     MEAN_KEY,
     WHITENING_KEY,
@@ -117,9 +117,9 @@ def test_birds_with_spread_wings():
     frames = two_squares()
     left, right = (MURRE_KEYPOINTS.index(f"{side}_wingtip") for side in ("left", "right"))
     frames.keypoints_px[0, :, left] = frames.keypoints_px[0, :, right]
-    frames.keypoints_px[0, 1:, left, 0] += 10 * (segmenter.SPREAD_UNITS + 0.1)
-    assert segmenter._birds_with_spread_wings(frames).tolist() == [[0, 1]]
-    assert not len(segmenter._birds_with_spread_wings(frames.with_keypoints(["beak", "tail"])))
+    frames.keypoints_px[0, 1:, left, 0] += 10 * (SPREAD_UNITS + 0.1)
+    assert birds_with_spread_wings(frames).tolist() == [[0, 1]]
+    assert not len(birds_with_spread_wings(frames.with_keypoints(["beak", "tail"])))
 
 
 def test_keypoint_targets():
@@ -191,7 +191,7 @@ def test_pyramid_strides():
 
 @pytest.mark.extended
 def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
-    losses = train_network("segmenter", tmp_path / "s.onnx", folder, scenes=1, schedule=QUICK)
+    losses = train_network("segmenter", tmp_path / "s.onnx", Simulation(folder, 1), QUICK)
     assert set(losses) == {"foreground", "centre", "offset"}
     model = OnnxModel(tmp_path / "s.onnx")
     assert "no real footage" in model.metadata["trained_on"]
@@ -205,10 +205,20 @@ def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
 
 @pytest.mark.extended
 def test_trained_keypoint_network_is_read_back(folder, tmp_path):
-    train_network("keypoints", tmp_path / "k.onnx", folder, scenes=1, schedule=QUICK)
+    train_network("keypoints", tmp_path / "k.onnx", Simulation(folder, 1), QUICK)
     detector = load_keypoint_detector(tmp_path / "k.onnx")
     assert detector.keypoint_names == MURRE_KEYPOINTS
     assert (tmp_path / "k.onnx").stat().st_size < 4.8e6
+    assert OnnxModel(tmp_path / "k.onnx").metadata["background"] == "visible"
+
+
+@pytest.mark.extended
+def test_a_training_from_a_base_network_begins_with_its_weights(folder, tmp_path):
+    still = QUICK._replace(learning_rate=1e-12)
+    train_network("keypoints", tmp_path / "k.onnx", Simulation(folder, 1), still, base="builtin")
+    picture = np.random.default_rng(0).uniform(0, 1, (1, 3, 192, 192)).astype(np.float32)
+    trained, builtin = (OnnxModel(path)(picture)["heatmaps"] for path in (tmp_path / "k.onnx", BUILTIN_PATH))
+    np.testing.assert_allclose(trained, builtin, atol=2e-3)
 
 
 def test_frames_of_an_earlier_version_are_rejected(frames, tmp_path):
@@ -224,11 +234,15 @@ def test_frames_of_an_earlier_version_are_rejected(frames, tmp_path):
         ({"scenes": 0}, "scenes"),
         ({"scenes": 3}, "holds 1 scenes"),
         ({"schedule": QUICK._replace(steps=3)}, "steps"),
+        ({"wings": 2}, "wings"),
         ({"path": "n.pt"}, ".onnx"),
+        ({"encoder": "e.pth", "base": "builtin"}, "is given with a base network"),
     ],
 )
 def test_invalid_arguments_are_rejected(folder, tmp_path, arguments, message):
     path = tmp_path / arguments.pop("path", "n.onnx")
+    given = {key: arguments.pop(key) for key in ("scenes", "wings") if key in arguments}
+    simulation = Simulation(folder, **{"scenes": 1, **given})
     with pytest.raises(InputError, match=message):
-        train_network("segmenter", path, folder, **{"scenes": 1, **arguments})
+        train_network("segmenter", path, simulation, **arguments)
     assert not path.exists()
