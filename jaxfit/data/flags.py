@@ -10,19 +10,25 @@ share of the longer side of the box; and 1 − IoU of the mesh and the mask. A p
 outlier among all poses of the result, so that the limit follows from the noise of the user's detections; or if it is
 larger than any good pose allows, which also holds where most poses are wrong.
 
+Keypoints and mask of a bird can also contradict each other: confident keypoints lie far outside a mask that lacks a
+wing. Such a pose is contradicted, too.
+
 Source: Iglewicz and Hoaglin 1993, *How to detect and handle outliers* (modified z-score, limit 3.5); for the IoU of
 ½, the usual limit of a matching detection (Everingham et al. 2010, *The PASCAL visual object classes challenge*).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int8
 
 from jaxfit.data.mask_comparison import compare_masks
+from jaxfit.data.masks import box_of_mask, decode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.foundation.progress import ProgressTask, silent
@@ -44,6 +50,7 @@ DOUBTS = (
     Doubt(UNSURE, "a second pose fits almost as well"),
     Doubt(UNSURE, "error bars above 10 % of the length"),
     Doubt(UNSURE, "keypoints with low confidence"),
+    Doubt(CONTRADICTED, "keypoints outside the mask"),
 )
 """The doubts; doubt i has the value 2^i in `Solution.doubts`."""
 WRONG_SHARE = 0.1
@@ -51,6 +58,9 @@ WRONG_SHARE = 0.1
 LEAST_IOU = 0.5
 LEAST_CONFIDENCE = 0.5
 """Mean confidence of all keypoints of a bird, below which they are doubtful; missing keypoints count as 0."""
+OUTSIDE_SHARE = 0.1
+"""Keypoints and mask contradict each other if more than this share of the keypoints lies outside the mask by more than
+`WRONG_SHARE` of the longer side of the box. Masks often lack one or two of 20 keypoints: bill and feet are thin."""
 OUTLIER_Z = 3.5
 LEAST_POSES = 20
 """Fewer poses have no outliers."""
@@ -87,6 +97,48 @@ def keypoint_distances(observations: Observations, solution: Solution) -> Float[
     return distance
 
 
+def contradict_masks(
+    observations: Observations, cells: Iterable[tuple[int, int]], progress: ProgressTask = silent
+) -> Bool[np.ndarray, "N T"]:
+    """Return where the keypoints of a bird contradict its mask (`OUTSIDE_SHARE`).
+
+    Keypoints with a confidence below `LEAST_CONFIDENCE` do not count.
+
+    Args:
+        observations: N tracks over T frames.
+        cells: positions (n, t) of the birds that are compared; birds without a mask contradict nothing.
+        progress: reports every bird.
+    """
+    contradicts = np.zeros(observations.present.shape, bool)
+    compared = [cell for cell in cells if cell in observations.masks]
+    with progress("Comparing keypoints with masks", len(compared)) as report_progress:
+        for n, t in compared:
+            sure_px = observations.keypoints_px[n, t, observations.confidence[n, t] >= LEAST_CONFIDENCE]
+            limit_px = WRONG_SHARE * float(observations.box_px[n, t, 2:].max())
+            if len(sure_px):
+                outside = _distances_px(sure_px, decode_mask(observations.masks[n, t]), limit_px) > limit_px
+                contradicts[n, t] = outside.mean() > OUTSIDE_SHARE
+            report_progress(1, "")
+    return contradicts
+
+
+def _distances_px(
+    points_px: Float[np.ndarray, "M 2"], mask: Bool[np.ndarray, "H W"], reach_px: float
+) -> Float[np.ndarray, "M"]:
+    """Return the distance of points to a mask in pixels; larger distances than `reach_px` are not exact."""
+    box = box_of_mask(mask)
+    if box is None:
+        return np.zeros(len(points_px))  # an empty mask says nothing
+    margin = int(reach_px) + 2
+    x0, y0, width, height = box
+    inside = mask[y0 : y0 + height, x0 : x0 + width]
+    background = np.pad(~inside, margin, constant_values=True).astype(np.uint8)
+    distance = cv2.distanceTransform(background, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    at = np.floor(points_px).astype(int) - (x0 - margin, y0 - margin)
+    column, row = np.clip(at, 0, np.array(distance.shape[::-1]) - 1).T  # the border is beyond `reach_px`
+    return distance[row, column]
+
+
 def with_doubts(
     solution: Solution, observations: Observations, bird: Bird, progress: ProgressTask = silent
 ) -> Solution:
@@ -114,6 +166,7 @@ def with_doubts(
         np.asarray(solution.ambiguity_deg) > 0,
         expected_error(solution, bird) > WRONG_SHARE,
         observations.confidence.mean(-1) < LEAST_CONFIDENCE,
+        contradict_masks(observations, map(tuple, np.argwhere(has_mask).tolist()), progress),
     )
     doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
     return replace(solution, doubts=doubts)

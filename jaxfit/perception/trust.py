@@ -7,6 +7,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
+from jaxfit.data.flags import contradict_masks
 from jaxfit.data.observations import Observations
 
 REMEDY = (
@@ -36,6 +37,12 @@ MAX_COUNT_CHANGE = 0.15
 because the number changes more in footage with fewer frames per second."""
 
 
+MAX_CONTRADICTED_SHARE = 0.1
+"""Largest share of birds whose keypoints lie outside their masks."""
+COMPARED_BIRDS = 300
+"""Number of birds, evenly spread over the video, whose keypoints are compared with their masks."""
+
+
 class FootageSignals(NamedTuple):
     """Signals of the tracking of a video; None for a signal that this video or its networks do not give."""
 
@@ -51,6 +58,8 @@ class FootageSignals(NamedTuple):
     """Mean change of the number of birds between consecutive frames, divided by `birds_per_frame`."""
     score: float | None
     """Median score of the birds; None for a segmenter without statistics, because scores of networks differ."""
+    contradicted_share: float | None
+    """Share of the birds whose keypoints contradict their masks (`jaxfit.data.flags`)."""
     confidence: float | None
     """Median over the birds of the mean confidence of a bird's keypoints; None for confidences without a curve."""
     frame_distance: float | None
@@ -104,6 +113,11 @@ def footage_signals(
     counts = present.sum(0)
     frame_distance, bird_distance = (float(np.median(values)) if len(values) else None for values in distances)
     confidence = observations.confidence.mean(-1)[present] if observations.num_keypoints and calibrated else ()
+    cells = np.argwhere(present)
+    cells = (
+        cells[np.unique(np.linspace(0, max(len(cells) - 1, 0), COMPARED_BIRDS).astype(int))] if len(cells) else cells
+    )
+    contradicts = contradict_masks(observations, map(tuple, cells.tolist()))
     is_changing = detections and len(counts) > 1
     return FootageSignals(
         birds_per_frame=float(counts.mean()),
@@ -112,6 +126,7 @@ def footage_signals(
         short_share=sum(short_tracks.values()) / detections if detections else None,
         count_change=float(np.abs(np.diff(counts)).mean() / counts.mean()) if is_changing else None,
         score=float(np.median(scores[present])) if detections and frame_distance is not None else None,
+        contradicted_share=float(contradicts[tuple(cells.T)].mean()) if len(confidence) else None,
         confidence=float(np.median(confidence)) if len(confidence) else None,
         frame_distance=frame_distance,
         bird_distance=bird_distance,
@@ -161,6 +176,12 @@ _RULES = (
         "the birds differ from the training of the keypoint network: distance {bird_distance:.2f}",
     ),
     _Rule("score", MIN_SCORE, False, "the scores of the birds are low: median {score:.2f}"),
+    _Rule(
+        "contradicted_share",
+        MAX_CONTRADICTED_SHARE,
+        True,
+        "keypoints lie outside the masks in a share of {contradicted_share:.2f} of the birds",
+    ),
     _Rule("confidence", MIN_CONFIDENCE, False, "the confidences of the keypoints are low: median {confidence:.2f}"),
     _Rule(
         "short_share",

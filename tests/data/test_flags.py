@@ -7,6 +7,7 @@ from support.evaluated import BIRD, N, T, solution, truth
 
 from jaxfit.data.flags import (
     DOUBTS,
+    contradict_masks,
     doubt_texts,
     flag_counts,
     flagged_ranges,
@@ -15,8 +16,9 @@ from jaxfit.data.flags import (
     keypoint_distances,
     with_doubts,
 )
+from jaxfit.data.masks import encode_mask
 
-FAR, UNLIKE, SECOND, WIDE, WEAK = (1 << i for i in range(len(DOUBTS)))
+FAR, UNLIKE, SECOND, WIDE, WEAK, OUTSIDE = (1 << i for i in range(len(DOUBTS)))
 
 
 def test_the_truth_has_no_doubts():
@@ -38,17 +40,42 @@ def test_every_doubt_has_its_cause():
     valid[1, 3] = False
     seen = dataclasses.replace(seen, keypoints_px=keypoints, confidence=confidence, masks=masks)
     judged = with_doubts(solution(ambiguity_deg=ambiguity_deg, valid=valid), seen, BIRD)
-    np.testing.assert_array_equal(judged.doubts, [[0, FAR, WEAK, 0], [UNLIKE, SECOND, 0, -1]])
+    np.testing.assert_array_equal(judged.doubts, [[0, FAR + OUTSIDE, WEAK, 0], [UNLIKE + OUTSIDE, SECOND, 0, -1]])
     words = [["ok", "contradicted", "unsure", "ok"], ["contradicted", "unsure", "ok", ""]]
     np.testing.assert_array_equal(flags(judged.doubts), words)
     assert flagged_ranges(judged) == {
         5: (
-            "frame 11 contradicted: keypoints far from the pose",
+            "frame 11 contradicted: keypoints far from the pose; keypoints outside the mask",
             "frame 12 unsure: keypoints with low confidence",
         ),
-        3: ("frame 10 contradicted: mask unlike the mesh", "frame 11 unsure: a second pose fits almost as well"),
+        3: (
+            "frame 10 contradicted: mask unlike the mesh; keypoints outside the mask",
+            "frame 11 unsure: a second pose fits almost as well",
+        ),
     }
     assert np.isnan(keypoint_distances(seen, judged)[1, 3])
+
+
+def test_keypoints_outside_the_mask():
+    """The mask is a square of 40 pixels, so the limit is a distance of 4 pixels; one of five keypoints lies outside."""
+    seen = truth()
+    K = len(seen.keypoint_names)
+    mask = np.zeros((280, 320), bool)
+    mask[20:60, 30:70] = True
+    keypoints, confidence = np.full((N, T, K, 2), 50.0, np.float32), np.zeros((N, T, K), np.float32)
+    confidence[..., :5] = 0.5
+    keypoints[0, :, 0] = [[74.5, 30.5], [72.5, 30.5], [119.5, 0.5], [10.5, 30.5]]  # 5, 3, far and 20 pixels outside
+    confidence[0, 3, 0] = 0.49
+    seen = dataclasses.replace(
+        seen,
+        keypoints_px=keypoints,
+        confidence=confidence,
+        box_px=np.full((N, T, 4), [30, 20, 40, 40], np.float32),
+        masks={(0, t): encode_mask(mask) for t in range(T)},
+    )
+    cells = [(n, t) for n in range(N) for t in range(T)]
+    np.testing.assert_array_equal(contradict_masks(seen, cells), [[True, False, True, False], [False] * T])
+    assert not contradict_masks(seen, cells[1:2]).any()
 
 
 def test_wide_error_bars_are_a_doubt():

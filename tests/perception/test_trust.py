@@ -13,6 +13,7 @@ GOOD = FootageSignals(
     short_tracks=1,
     tracks=6,
     short_share=0.01,
+    contradicted_share=0.0,
     count_change=0.02,
     score=0.95,
     confidence=0.9,
@@ -38,6 +39,7 @@ def test_signals_by_hand():
     assert (signals.tracks, signals.short_tracks, signals.birds_per_frame) == (2, 1, 1.25)
     assert signals.short_share == pytest.approx(1 / 5)
     assert signals.count_change == pytest.approx(2 / 3 / 1.25)
+    assert signals.contradicted_share == 0
     assert signals.score == pytest.approx(0.7)
     assert signals.confidence == pytest.approx(0.5)
     assert (signals.frame_distance, signals.bird_distance) == (2.0, 0.5)
@@ -58,6 +60,7 @@ def test_networks_without_statistics():
         ("bird_distance", trust.MAX_BIRD_DISTANCE, 1),
         ("score", trust.MIN_SCORE, -1),
         ("confidence", trust.MIN_CONFIDENCE, -1),
+        ("contradicted_share", trust.MAX_CONTRADICTED_SHARE, 1),
         ("short_share", trust.MAX_SHORT_SHARE, 1),
         ("count_change", trust.MAX_COUNT_CHANGE, 1),
     ],

@@ -91,7 +91,7 @@ def keypoint_outcomes(frames: LabelledFrames, segmenter: Segmenter, keypoints: K
         detected, true = assign(_ious(birds, masks))
         if not len(detected):
             continue
-        points_px, confidence = keypoints(picture, [birds[i] for i in detected])
+        points_px, confidence = (array[detected] for array in keypoints(picture, birds))
         for m, n in enumerate(true):
             side = _longer_side(masks[n], true_px[n, known[n]])
             error = np.linalg.norm(points_px[m] - true_px[n], axis=-1)
