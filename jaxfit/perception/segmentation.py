@@ -78,6 +78,10 @@ MIN_FOREGROUND = 0.1
 """Cells with a lower foreground belong to no bird. Masks are cut at 0.5, between cells."""
 MAX_DISTANCE_PX = 60.0
 """Cells whose offset ends at least this far from every centre belong to no bird; pixels of the input."""
+OFFSET_STEPS = 3
+"""Largest number of offsets that are followed from a cell, one after the other."""
+ARRIVED_PX = 16.0
+"""An offset that ends at most this far from a peak is not followed further; half the unit of the offsets."""
 LARGE_BIRD_PX = 200.0
 """Birds that are longer in the input are detected in parts, so an input of half the size detects them."""
 SMALLER_INPUTS = 2
@@ -244,19 +248,37 @@ def _assign_cells(
     peaks: Int[np.ndarray, "M 2"],
     cell_px: float,
 ) -> Int[np.ndarray, "h w"]:
-    """Assign each cell to the peak nearest to the end of its offset; −1 for no peak."""
+    """Assign each cell to the peak nearest to the end of its offsets; −1 for no peak.
+
+    The offset of the tip of a wing is too short, but it ends nearer to the centre, where offsets are exact. So, as long
+    as the end lies in the foreground and far from every peak, the offset at the end is added.
+    """
     assignment = np.full(foreground.shape, -1)
     rows, columns = np.nonzero(foreground > MIN_FOREGROUND)
     if not len(peaks) or not len(rows):
         return assignment
+    peaks_px = (peaks[:, ::-1] + 0.5) * cell_px
     ends = (np.stack([columns, rows], 1) + 0.5) * cell_px + offset_px[:, rows, columns].T
-    nearest, best = np.full(len(rows), -1), np.full(len(rows), MAX_DISTANCE_PX)
-    for n, (x, y) in enumerate((peaks[:, ::-1] + 0.5) * cell_px):
+    nearest, distance = _nearest_peaks(ends, peaks_px)
+    for _ in range(OFFSET_STEPS - 1):
+        column, row = np.clip(np.nan_to_num(ends / cell_px).astype(int), 0, np.array(foreground.shape[::-1]) - 1).T
+        moves = (distance > ARRIVED_PX) & (foreground[row, column] > MIN_FOREGROUND)
+        ends[moves] += offset_px[:, row[moves], column[moves]].T
+        nearest[moves], distance[moves] = _nearest_peaks(ends[moves], peaks_px)
+    assignment[rows, columns] = nearest
+    return assignment
+
+
+def _nearest_peaks(
+    ends: Float[np.ndarray, "n 2"], peaks_px: Float[np.ndarray, "M 2"]
+) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Return the nearest peak of each end and its distance; −1 and `MAX_DISTANCE_PX` if all are farther."""
+    nearest, best = np.full(len(ends), -1), np.full(len(ends), MAX_DISTANCE_PX)
+    for n, (x, y) in enumerate(peaks_px):
         distance = np.hypot(ends[:, 0] - x, ends[:, 1] - y)
         is_nearer = distance < best
         nearest[is_nearer], best[is_nearer] = n, distance[is_nearer]
-    assignment[rows, columns] = nearest
-    return assignment
+    return nearest, best
 
 
 MIN_TILE_SHARE = 0.5  # of the smaller mask within the intersection of two tiles

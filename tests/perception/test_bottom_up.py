@@ -10,6 +10,7 @@ from jaxfit.perception.network import OnnxModel
 from jaxfit.perception.segmentation import BottomUp, load_segmenter
 
 CELLS_HIGH, CELLS_WIDE, CELL_PX = 48, 64, 2  # an input of 128 x 96
+FRAME = np.zeros((96, 128, 3), np.uint8)
 
 
 def maps_of(*birds):
@@ -64,6 +65,33 @@ def test_far_offsets_and_low_peaks_give_no_instance(tmp_path):
     maps["offset"][:, 40:46, 2:10] = 3  # 96 pixels right and below: no centre is near
     birds = load_segmenter(write(tmp_path / "net.onnx", maps))(np.zeros((96, 128, 3), np.uint8))
     assert [bird.box_px.tolist() for bird in birds] == [[20, 20, 20, 20]]  # others: too few cells, low score
+
+
+def test_offsets_of_a_wing_are_followed_to_the_centre(tmp_path):
+    """The offset of the wing's tip ends on the wing's root, nearer to the centre of another bird than to its own."""
+    maps = maps_of(((6, 20, 16, 30), 0.9), ((38, 24, 48, 34), 0.9))
+    maps["foreground"][0, 20:22, 16:46] = 1  # the wing of the left bird reaches above the other bird
+    maps["offset"][0, 20:22, 16:46] = -15 * CELL_PX / 32
+    maps["offset"][1, 20:22, 16:46] = 0
+    maps["offset"][0, 20:22, 16:28] = (11 - np.arange(16, 28)) * CELL_PX / 32
+    maps["offset"][1, 20:22, 16:28] = (25 - np.arange(20, 22))[:, None] * CELL_PX / 32
+    boxes = [bird.box_px.tolist() for bird in load_segmenter(write(tmp_path / "net.onnx", maps))(FRAME)]
+    assert sorted(boxes) == [[12, 40, 80, 20], [76, 48, 20, 20]]
+
+
+def test_an_offset_that_arrives_is_not_followed(tmp_path):
+    """The centre of the occluded bird lies on the bird in front, whose offsets point elsewhere."""
+    maps = maps_of(((4, 20, 30, 30), 0.8))
+    front = maps_of(((14, 10, 24, 36), 0.9))
+    inside = front["foreground"][0] > 0
+    for name in ("foreground", "offset"):
+        maps[name][..., inside] = front[name][..., inside]
+    maps["centre"] = np.maximum(maps["centre"], front["centre"])
+    maps["centre"][0, 25, 17], maps["centre"][0, 23, 19] = 0.8, 0
+    maps["centre"][0, 14, 19] = 0.9
+    maps["offset"][1][inside] = (14 - np.indices(inside.shape)[0][inside]) * CELL_PX / 32
+    birds = load_segmenter(write(tmp_path / "net.onnx", maps))(FRAME)
+    assert sorted(bird.box_px.tolist() for bird in birds) == [[8, 40, 52, 20], [28, 20, 20, 52]]
 
 
 def write_picture_network(path, longer_side):

@@ -39,7 +39,7 @@ WINDOW_CELLS = 1.6
 """Standard deviation of the window: 6 of 192 pixels, which is 3 % of a bird that fills its crop."""
 OCCLUDED_WEIGHT, ABSENT_WEIGHT = 0.5, 0.3
 """Weights in the loss of occluded keypoints and of keypoints outside the crop; visible keypoints have weight 1."""
-SPREAD_SHARE = 0.3
+SPREAD_SHARE = 0.2
 """Share of the samples that show a bird with spread wings, if the frames show such birds."""
 UNDETECTED_SHARE = 0.1
 """Share of the neighbours that the segmenter does not detect, so that they stay visible."""

@@ -39,7 +39,7 @@ WIDE_SHARE = 0.5
 """Share of the samples with a scale of the wide range."""
 RESAMPLING = 0.3, 1.6
 """Range of the factor between the frame and the sample; the scale of a sample may lie outside its range."""
-SPREAD_SHARE = 0.2
+SPREAD_SHARE = 0.3
 """Share of the samples around a bird with spread wings, if the frames show such birds."""
 CENTRE_SIGMA = 0.14
 """Standard deviation of the peak at a centre, as a share of the square root of the bird's area."""
