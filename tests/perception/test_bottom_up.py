@@ -87,8 +87,8 @@ def test_an_offset_that_arrives_is_not_followed(tmp_path):
     for name in ("foreground", "offset"):
         maps[name][..., inside] = front[name][..., inside]
     maps["centre"] = np.maximum(maps["centre"], front["centre"])
-    maps["centre"][0, 25, 17], maps["centre"][0, 23, 19] = 0.8, 0
-    maps["centre"][0, 14, 19] = 0.9
+    maps["centre"][0, 25, 17], maps["centre"][0, 23, 19] = 0, 0
+    maps["centre"][0, 25, 18], maps["centre"][0, 14, 19] = 0.8, 0.9  # offsets end one cell beside the first
     maps["offset"][1][inside] = (14 - np.indices(inside.shape)[0][inside]) * CELL_PX / 32
     birds = load_segmenter(write(tmp_path / "net.onnx", maps))(FRAME)
     assert sorted(bird.box_px.tolist() for bird in birds) == [[8, 40, 52, 20], [28, 20, 20, 52]]
