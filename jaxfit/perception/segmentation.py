@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import find_objects
 
 from jaxfit.config.perception import GENERAL
-from jaxfit.data.masks import box_of_mask
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import INSTANCES
 from jaxfit.perception.general_networks import check_general_files, general_files
@@ -176,9 +176,11 @@ class BottomUp(SegmentationNetwork):
             problem = f"gives {len(peaks)} centres of birds in one frame"
             raise InputError(self._model.path, problem, "give another network")
         assignment = _assign_cells(foreground, outputs["offset"][0] * OFFSET_UNIT_PX, peaks, cell_px)
+        places = find_objects(assignment + 1, len(peaks))
         instances = (
-            self._instance(foreground, assignment == n, float(centre[row, column]), placement)
-            for n, (row, column) in enumerate(peaks)
+            self._instance(foreground, assignment[place] == n, place, float(centre[row, column]), placement)
+            for n, ((row, column), place) in enumerate(zip(peaks, places, strict=True))
+            if place is not None
         )
         return collect_instances(self._model.path, instances, placement.frame_px)
 
@@ -205,20 +207,28 @@ class BottomUp(SegmentationNetwork):
         return width, height
 
     def _instance(
-        self, foreground: Float[np.ndarray, "h w"], own: Bool[np.ndarray, "h w"], peak: float, placement: Placement
+        self,
+        foreground: Float[np.ndarray, "h w"],
+        own: Bool[np.ndarray, "h2 w2"],
+        place: tuple[slice, slice],
+        peak: float,
+        placement: Placement,
     ) -> Instance | None:
-        """Create the instance of the cells `own`; None if it is too small or its score too low."""
-        certain = own & (foreground > 0.5)
+        """Create the instance of the cells `own` of a part of the map; None if it is too small or its score too low."""
+        part = foreground[place]
+        certain = own & (part > 0.5)
         if np.count_nonzero(certain) < MIN_CELLS:
             return None
-        score = float(np.clip(peak, 0, 1) * foreground[certain].mean())
+        score = float(np.clip(peak, 0, 1) * part[certain].mean())
         if score < self._min_score:
             return None
-        x0, y0, width, height = cast(tuple[int, int, int, int], box_of_mask(own))
-        corners = np.array([x0, y0, x0 + width, y0 + height], np.float32)
+        rows, columns = place
+        corners = np.array([columns.start, rows.start, columns.stop, rows.stop], np.float32)
         cells = np.array(foreground.shape[::-1], np.float32)
         corners_px = placement.to_frame(corners[None] * np.tile(placement.input_px / cells, 2))[0]
-        return placement.instance(np.where(own, foreground, 0), corners_px, 0.5, score, self._label)
+        alone = np.zeros_like(foreground)
+        alone[place] = np.where(own, part, 0)
+        return placement.instance(alone, corners_px, 0.5, score, self._label)
 
 
 def _network_picture(frame: UInt8[np.ndarray, "H W 3"], placement: Placement) -> Float[np.ndarray, "h w 3"]:
@@ -249,12 +259,12 @@ def _assign_cells(
     rows, columns = np.nonzero(foreground > MIN_FOREGROUND)
     if not len(peaks) or not len(rows):
         return assignment
-    ends = (np.stack([columns, rows], 1) + 0.5) * cell_px + offset_px[:, rows, columns].T
-    nearest, best = np.full(len(rows), -1), np.full(len(rows), MAX_DISTANCE_PX)
+    ends = (np.stack([columns, rows]) + 0.5) * cell_px + offset_px[:, rows, columns]
+    nearest, best = np.full(len(rows), -1), np.full(len(rows), MAX_DISTANCE_PX**2)
     for n, (x, y) in enumerate((peaks[:, ::-1] + 0.5) * cell_px):
-        distance = np.hypot(ends[:, 0] - x, ends[:, 1] - y)
-        is_nearer = distance < best
-        nearest[is_nearer], best[is_nearer] = n, distance[is_nearer]
+        squared = (ends[0] - x) ** 2 + (ends[1] - y) ** 2
+        nearest[squared < best] = n
+        np.minimum(best, squared, out=best)
     assignment[rows, columns] = nearest
     return assignment
 
