@@ -185,7 +185,7 @@ def test_the_observations_after_each_frame(video):
 
 def test_durations_of_all_parts(video):
     tracking, _, _ = tracked(video)
-    assert set(tracking.seconds) == {"decode", "segment", "track", "keypoints", "record", "clean up"}
+    assert set(tracking.seconds) == {"detect", "track", "keypoints", "record", "clean up"}
 
 
 def test_number_of_opencv_threads_is_restored(video):
