@@ -123,7 +123,7 @@ class TrackConfig:
     repair_left_right_flips: bool = False
     """Exchange left and right keypoints in frames where the network confuses the two sides; the paper does not."""
     threads: int | None = None
-    """Number of CPU cores for the networks; null uses all cores."""
+    """Number of CPU cores for each of the two networks, which run at the same time; null uses all cores."""
 
     def __post_init__(self):
         require_within(self, 1, limits.FRAME_NUMBER, "min_track_frames")

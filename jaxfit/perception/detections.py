@@ -23,7 +23,8 @@ from jaxfit.perception.keypoints import BUILTIN_PATH, load_keypoint_detector
 from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
 from jaxfit.perception.segmentation import KINDS, load_segmenter, segmenter_files
 from jaxfit.perception.tracking import RecordedFrame, Tracker, TrackRecorder
-from jaxfit.video.reader import FrameReader
+from jaxfit.video.decoding import Frame
+from jaxfit.video.reader import FrameReader, ahead
 
 
 def open_segmenter(config: TrackConfig, min_score: float | None = None) -> Segmenter:
@@ -128,7 +129,7 @@ class Detections(Protocol):
 
 
 class LocalDetections:
-    """Detections by networks in this process.
+    """Detections by networks in this process; a thread runs the segmenter on the next frames.
 
     Args:
         reader: the frames.
@@ -136,23 +137,35 @@ class LocalDetections:
         clock: measures the parts of the work.
     """
 
+    damaged: list[int]
+    """Numbers of the frames so far that could not be read."""
+
     def __init__(self, reader: FrameReader, segmenter: Segmenter, keypoints: KeypointDetector, clock: Clock):
         self._reader, self._segmenter, self._keypoints, self._clock = reader, segmenter, keypoints, clock
+        self._distances: list[np.ndarray] = []
+        self.damaged = []
         self.take_distances()  # those of an earlier video
-
-    @property
-    def damaged(self) -> list[int]:
-        """Numbers of the frames so far that could not be read."""
-        return self._reader.damaged
+        _take_distances(segmenter)
 
     def __iter__(self) -> Generator[FrameDetections]:
-        with single_opencv_thread():
-            for number, picture, time_s in self._clock.each("decode", self._reader):
-                with self._clock("segment"):
-                    instances = self._segmenter(picture)
+        self.damaged = []
+        with single_opencv_thread(), closing(ahead(self._segmented, SEGMENTED_AHEAD)) as segmented:
+            for frame, instances, distances, num_damaged in self._clock.each("detect", segmented):
+                self.damaged = self._reader.damaged[:num_damaged]
+                self._distances.append(distances)
+                picture = frame.picture
                 size_px = (picture.shape[1], picture.shape[0])
                 keypoints = partial(self._keypoints_of, picture, instances)
-                yield FrameDetections(number, time_s, size_px, instances, keypoints, picture)
+                yield FrameDetections(frame.index, frame.time_s, size_px, instances, keypoints, picture)
+        self.damaged = self._reader.damaged
+
+    def _segmented(self, stopped: Callable[[], bool]) -> Generator[tuple[Frame, list[Instance], np.ndarray, int]]:
+        """Yield each frame with its instances, its distances, and the number of damaged frames before this frame."""
+        for frame in self._reader:
+            if stopped():
+                return
+            instances = self._segmenter(frame.picture)
+            yield frame, instances, _take_distances(self._segmenter), len(self._reader.damaged)
 
     def _keypoints_of(self, picture: np.ndarray, instances: Sequence[Instance], some: Sequence[int]) -> Keypoints:
         with self._clock("keypoints"):
@@ -162,9 +175,18 @@ class LocalDetections:
 
     def take_distances(self) -> Distances:
         """Return the distances of the frames since the last call."""
-        monitors = (getattr(network, "activations", None) for network in (self._segmenter, self._keypoints))
-        segmenter, keypoints = (np.zeros(0) if monitor is None else np.asarray(monitor.take()) for monitor in monitors)
-        return segmenter, keypoints
+        taken, self._distances = self._distances, []
+        return np.concatenate([np.zeros(0), *taken]), _take_distances(self._keypoints)
+
+
+def _take_distances(network: object) -> np.ndarray:
+    """Return the distances of the activations of a network since the last call; empty without statistics."""
+    monitor = getattr(network, "activations", None)
+    return np.zeros(0) if monitor is None else np.asarray(monitor.take())
+
+
+SEGMENTED_AHEAD = 1
+"""Segmented frames that wait; more do not make tracking faster, because the segmenter takes most of the time."""
 
 
 def joined_distances(parts: Iterable[Distances]) -> Distances:

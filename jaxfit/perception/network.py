@@ -178,6 +178,8 @@ class OnnxModel:
             raise InputError(path, problem, "save the network as one file: onnx.save(onnx.load(path), new_path)")
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads or 0
+        # threads that wait in a loop would slow down the other network, which runs at the same time
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 4  # the error below reports the problem
         try:
             self._session = ort.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])

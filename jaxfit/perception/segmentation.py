@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.ndimage import find_objects
 
 from jaxfit.config.perception import GENERAL
-from jaxfit.data.masks import box_of_mask
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import INSTANCES
 from jaxfit.perception.general_networks import check_general_files, general_files
@@ -180,9 +180,11 @@ class BottomUp(SegmentationNetwork):
             problem = f"gives {len(peaks)} centres of birds in one frame"
             raise InputError(self._model.path, problem, "give another network")
         assignment = _assign_cells(foreground, outputs["offset"][0] * OFFSET_UNIT_PX, peaks, cell_px)
+        places = find_objects(assignment + 1, len(peaks))
         instances = (
-            self._instance(foreground, assignment == n, float(centre[row, column]), placement)
-            for n, (row, column) in enumerate(peaks)
+            self._instance(foreground, assignment[place] == n, place, float(centre[row, column]), placement)
+            for n, ((row, column), place) in enumerate(zip(peaks, places, strict=True))
+            if place is not None
         )
         return collect_instances(self._model.path, instances, placement.frame_px)
 
@@ -209,20 +211,28 @@ class BottomUp(SegmentationNetwork):
         return width, height
 
     def _instance(
-        self, foreground: Float[np.ndarray, "h w"], own: Bool[np.ndarray, "h w"], peak: float, placement: Placement
+        self,
+        foreground: Float[np.ndarray, "h w"],
+        own: Bool[np.ndarray, "h2 w2"],
+        place: tuple[slice, slice],
+        peak: float,
+        placement: Placement,
     ) -> Instance | None:
-        """Create the instance of the cells `own`; None if it is too small or its score too low."""
-        certain = own & (foreground > 0.5)
+        """Create the instance of the cells `own` of a part of the map; None if it is too small or its score too low."""
+        part = foreground[place]
+        certain = own & (part > 0.5)
         if np.count_nonzero(certain) < MIN_CELLS:
             return None
-        score = float(np.clip(peak, 0, 1) * foreground[certain].mean())
+        score = float(np.clip(peak, 0, 1) * part[certain].mean())
         if score < self._min_score:
             return None
-        x0, y0, width, height = cast(tuple[int, int, int, int], box_of_mask(own))
-        corners = np.array([x0, y0, x0 + width, y0 + height], np.float32)
+        rows, columns = place
+        corners = np.array([columns.start, rows.start, columns.stop, rows.stop], np.float32)
         cells = np.array(foreground.shape[::-1], np.float32)
         corners_px = placement.to_frame(corners[None] * np.tile(placement.input_px / cells, 2))[0]
-        return placement.instance(np.where(own, foreground, 0), corners_px, 0.5, score, self._label)
+        alone = np.zeros_like(foreground)
+        alone[place] = np.where(own, part, 0)
+        return placement.instance(alone, corners_px, 0.5, score, self._label)
 
 
 def _network_picture(frame: UInt8[np.ndarray, "H W 3"], placement: Placement) -> Float[np.ndarray, "h w 3"]:
@@ -258,27 +268,28 @@ def _assign_cells(
     if not len(peaks) or not len(rows):
         return assignment
     peaks_px = (peaks[:, ::-1] + 0.5) * cell_px
-    ends = (np.stack([columns, rows], 1) + 0.5) * cell_px + offset_px[:, rows, columns].T
+    ends = (np.stack([columns, rows]) + 0.5) * cell_px + offset_px[:, rows, columns]
     nearest, distance = _nearest_peaks(ends, peaks_px)
+    last = np.array(foreground.shape[::-1])[:, None] - 1
     for _ in range(OFFSET_STEPS - 1):
-        column, row = np.clip(np.nan_to_num(ends / cell_px).astype(int), 0, np.array(foreground.shape[::-1]) - 1).T
-        moves = (distance > ARRIVED_PX) & (foreground[row, column] > MIN_FOREGROUND)
-        ends[moves] += offset_px[:, row[moves], column[moves]].T
-        nearest[moves], distance[moves] = _nearest_peaks(ends[moves], peaks_px)
+        column, row = np.clip(np.nan_to_num(ends / cell_px).astype(int), 0, last)
+        moves = np.flatnonzero((distance > ARRIVED_PX) & (foreground[row, column] > MIN_FOREGROUND))
+        ends[:, moves] += offset_px[:, row[moves], column[moves]]
+        nearest[moves], distance[moves] = _nearest_peaks(ends[:, moves], peaks_px)
     assignment[rows, columns] = nearest
     return assignment
 
 
 def _nearest_peaks(
-    ends: Float[np.ndarray, "n 2"], peaks_px: Float[np.ndarray, "M 2"]
+    ends: Float[np.ndarray, "2 n"], peaks_px: Float[np.ndarray, "M 2"]
 ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Return the nearest peak of each end and its distance; −1 and `MAX_DISTANCE_PX` if all are farther."""
-    nearest, best = np.full(len(ends), -1), np.full(len(ends), MAX_DISTANCE_PX)
+    nearest, best = np.full(ends.shape[1], -1), np.full(ends.shape[1], MAX_DISTANCE_PX**2)
     for n, (x, y) in enumerate(peaks_px):
-        distance = np.hypot(ends[:, 0] - x, ends[:, 1] - y)
-        is_nearer = distance < best
-        nearest[is_nearer], best[is_nearer] = n, distance[is_nearer]
-    return nearest, best
+        squared = (ends[0] - x) ** 2 + (ends[1] - y) ** 2
+        nearest[squared < best] = n
+        np.minimum(best, squared, out=best)
+    return nearest, np.sqrt(best)
 
 
 MIN_TILE_SHARE = 0.5  # of the smaller mask within the intersection of two tiles

@@ -269,23 +269,44 @@ class Placement(NamedTuple):
         x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, self.frame_px[0]), min(y1, self.frame_px[1])
         if x0 >= x1 or y0 >= y1:
             return None
-        columns, weights_x = self._interpolation(0, x0, x1, values.shape[-1])
-        rows, weights_y = self._interpolation(1, y0, y1, values.shape[-2])
+        columns, along_x = self._interpolation(0, x0, x1, values.shape[-1])
+        rows, along_y = self._interpolation(1, y0, y1, values.shape[-2])
         part = values[..., rows, columns].astype(np.float32)
         if coefficients is not None:
             part = np.tensordot(coefficients.astype(np.float32), part, 1)
-        mask = weights_y @ part @ weights_x.T > threshold
+        # the first axis is the axis of the interpolation: copies of whole rows are fast
+        mask = along_y(np.ascontiguousarray(along_x(np.ascontiguousarray(part.T)).T)) > threshold
         return instance_of(mask if keep is None else keep(mask), score, label, x0, y0)
 
-    def _interpolation(self, axis: int, first: int, stop: int, length: int) -> tuple[slice, Float[np.ndarray, "n m"]]:
-        """Return the range of map pixels around a range of frame pixels, and the bilinear weights (frame, map)."""
+    def _interpolation(self, axis: int, first: int, stop: int, length: int) -> tuple[slice, _Interpolation]:
+        """Return the range of map pixels around a range of frame pixels, and the interpolation from these pixels."""
         map_per_input = length / self.input_px[axis]
         centres = np.arange(first, stop) + 0.5
         at = (centres * self.scale[axis] + self.offset[axis]) * map_per_input - 0.5
         at = np.clip(at, 0, length - 1)
         low, high = int(at[0]), int(np.ceil(at[-1])) + 1
-        weights = np.maximum(0, 1 - np.abs(at[:, None] - np.arange(low, high)))
-        return slice(low, high), weights.astype(np.float32)
+        return slice(low, high), _Interpolation.at(at - low, high - low)
+
+
+class _Interpolation(NamedTuple):
+    """Linear interpolation along the first axis of an array."""
+
+    before: Int[np.ndarray, "n"]
+    after: Int[np.ndarray, "n"]
+    share: Float[np.ndarray, "n 1"]
+    """Weight of the element `after`."""
+
+    @classmethod
+    def at(cls, positions: Float[np.ndarray, "n"], length: int) -> _Interpolation:
+        """Interpolate at positions within 0 and `length` − 1."""
+        before = positions.astype(int)
+        return cls(before, np.minimum(before + 1, length - 1), (positions - before).astype(np.float32)[:, None])
+
+    def __call__(self, values: Float[np.ndarray, "m w"]) -> Float[np.ndarray, "n w"]:
+        interpolated = values[self.before]
+        interpolated *= 1 - self.share
+        interpolated += values[self.after] * self.share
+        return interpolated
 
 
 def non_maximum_suppression(

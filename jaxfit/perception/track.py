@@ -68,7 +68,7 @@ class TrackingResult(NamedTuple):
     choice: SegmenterChoice | None
     """The segmenter that `auto` stands for; None if the config or the caller names a segmenter."""
     seconds: dict[str, float]
-    """Duration of each part; for decoding and for workers (`detect`), only the time that the other parts waited."""
+    """Duration of each part; for the segmenter and for workers (`detect`), only the time that the others waited."""
 
     def info(self) -> dict[str, str]:
         """Return the judgement and the choice of the segmenter as texts, for the `info` of a COCO file."""
@@ -90,7 +90,7 @@ def track_video(
     Args:
         source: a video, or a folder of frames.
         config: frames, networks and tracker.
-        segmenter: replaces the segmenter of `config`.
+        segmenter: replaces the segmenter of `config`; a thread calls the segmenter on the next frames.
         keypoints: replaces the keypoint detector of `config`.
         tracker: replaces the tracker of `config`; it must be new.
         progress: reports every frame.

@@ -10,7 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from queue import SimpleQueue
 from threading import Event, Semaphore, Thread, current_thread
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import check_readable
@@ -117,7 +117,7 @@ class FrameReader:
     def __iter__(self) -> Iterator[Frame]:
         self.damaged = []
         try:
-            with closing(_ahead(self._read)) as items:
+            with closing(ahead(self._read, _AHEAD)) as items:
                 for item in items:
                     if isinstance(item, Frame):
                         yield item
@@ -143,9 +143,18 @@ class FrameReader:
             yield Frame(i, picture, i / fps if fps else None)
 
 
-def _ahead(source: Callable[[Callable[[], bool]], Generator[Frame | int, None, None]]) -> Generator[Frame | int]:
-    """Yield the items of a source that runs in a thread, a few items ahead."""
-    stopping, free, made = Event(), Semaphore(_AHEAD), SimpleQueue()
+T = TypeVar("T")
+
+
+def ahead(source: Callable[[Callable[[], bool]], Generator[T]], count: int) -> Generator[T]:
+    """Yield the items of a source that runs in a thread, in their order; raise the exception of the source.
+
+    Args:
+        source: function that returns the items. Its argument is a function that returns True when no further item is
+            needed.
+        count: number of items that wait for the caller; one more item waits in the thread.
+    """
+    stopping, free, made = Event(), Semaphore(count), SimpleQueue()
 
     def work() -> None:
         end: BaseException | None = None
@@ -161,7 +170,7 @@ def _ahead(source: Callable[[Callable[[], bool]], Generator[Frame | int, None, N
             end = error
         made.put(_End(end))
 
-    thread = Thread(target=work, name="frames", daemon=True)
+    thread = Thread(target=work, name="ahead", daemon=True)
     try:
         thread.start()
         while not isinstance(item := made.get(), _End):

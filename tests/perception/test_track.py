@@ -1,6 +1,7 @@
 """Tracking of a video with networks that report the truth."""
 
 import logging
+import threading
 
 import cv2
 import numpy as np
@@ -185,7 +186,37 @@ def test_the_observations_after_each_frame(video):
 
 def test_durations_of_all_parts(video):
     tracking, _, _ = tracked(video)
-    assert set(tracking.seconds) == {"decode", "segment", "track", "keypoints", "record", "clean up"}
+    assert set(tracking.seconds) == {"detect", "track", "keypoints", "record", "clean up"}
+
+
+def test_the_segmenter_runs_a_few_frames_ahead(video):
+    """The memory is bounded, however long the keypoints take."""
+    segmenter, ahead = TrueSegmenter(FOOTAGE), []
+
+    class Counting(TrueKeypoints):
+        def __call__(self, frame, instances):
+            ahead.append(len(segmenter.frames) - len(ahead))
+            return super().__call__(frame, instances)
+
+    run_tracking(video, TrackConfig(min_track_frames=2), segmenter, Counting(FOOTAGE))
+    assert segmenter.frames == list(range(FRAMES))
+    assert max(ahead) <= 3
+
+
+def test_an_error_in_the_thread_of_the_segmenter(video):
+    """The error arrives after the frames before it, and the threads end."""
+
+    class Failing(TrueSegmenter):
+        def __call__(self, frame):
+            if int(frame[0, 0, 0]) == 5:
+                raise InputError("net.onnx", "cannot be run", "check the layout of its inputs")
+            return super().__call__(frame)
+
+    keypoints = TrueKeypoints(FOOTAGE)
+    with pytest.raises(InputError, match=r"net\.onnx: cannot be run \(check the layout of its inputs\)"):
+        run_tracking(video, TrackConfig(min_track_frames=2), Failing(FOOTAGE), keypoints)
+    assert len(keypoints.counts) == 5
+    assert not [thread for thread in threading.enumerate() if thread.name == "ahead"]
 
 
 def test_number_of_opencv_threads_is_restored(video):
@@ -280,18 +311,21 @@ class Monitor:
 
 
 def test_trust_uses_the_distances_of_this_video(video):
-    segmenter = TrueSegmenter(FOOTAGE)
-    segmenter.activations = Monitor()
+    class Near(TrueSegmenter):
+        activations = Monitor()
+
+        def __call__(self, frame):
+            self.activations.distances.append(0.25)
+            return super().__call__(frame)
 
     class Distant(TrueKeypoints):
         activations = Monitor()
 
         def __call__(self, frame, instances):
             self.activations.distances += [7.0] * len(instances)
-            segmenter.activations.distances.append(0.25)
             return super().__call__(frame, instances)
 
-    judged = run_tracking(video, TrackConfig(min_track_frames=2), segmenter, Distant(FOOTAGE)).trust
+    judged = run_tracking(video, TrackConfig(min_track_frames=2), Near(FOOTAGE), Distant(FOOTAGE)).trust
     assert (judged.signals.frame_distance, judged.signals.bird_distance) == (0.25, 7.0)
     assert judged.level == "low"
     assert any("keypoint network" in reason for reason in judged.reasons)
