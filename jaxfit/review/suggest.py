@@ -34,6 +34,7 @@ from jaxfit.perception.detections import open_keypoint_detector
 from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.track import run_tracking
 from jaxfit.review.signals import (
+    SHORTLIST,
     choose,
     combine,
     frame_signals,
@@ -302,7 +303,11 @@ def suggest(
     with new_folder(out, overwrite, marker=MARKER) as part:
         (part / IMAGES).mkdir()
         signals = frame_signals(observations, found.solution)
-        candidates = shortlist(combine(signals)[0], count)
+        if teacher is None:
+            candidates = shortlist(combine(signals)[0], count)
+        else:  # no other signal counts
+            most = min(SHORTLIST * count, observations.num_frames)
+            candidates = np.linspace(0, observations.num_frames - 1, most).round().astype(int)
         detector = None if teacher is not None else _detector(observations, config, keypoints)
         examined = _examine(video, observations, candidates, detector, part / IMAGES, progress, teacher)
         _check_count(count, len(examined.positions), video)

@@ -333,7 +333,7 @@ def prepare_data(
         stored = [StoredPicture(own, picture.file) for picture, own in pairs if own.birds]
     stored.sort(key=lambda picture: (files.labels.index(picture.labels.source), picture.labels.frame))
     _check_count(stored, left_out, files, network)
-    tracked = Tracked([], [], [])
+    tracked = Tracked([], [], 0, [])
     if teacher is not None:
         shutil.rmtree(folder / TRACKED, ignore_errors=True)
         tracked = track_labels(stored, files.sources, teacher, folder / TRACKED, progress)
@@ -352,7 +352,7 @@ def prepare_data(
         if not (held and i % TRACKED_PER_HELD == 0) and not _is_within(picture.labels, known, split.holdout)
     ]
     frames = prepare_frames(folder / FRAMES, [*training, *seen], labels.keypoint_names, scale, network)
-    said = tracked.sentence() if tracked.agreement else ""
+    said = tracked.sentence() if tracked.confirmed or tracked.doubtful else ""
     kept = tracked.pictures, held, said
     return FineTuningData(labels.keypoint_names, frames, stored, holdout, left_out, split, scale, *kept)
 

@@ -61,6 +61,9 @@ SEED_IOU = 0.7
 """Least IoU of a label and the mask of the teacher at its place. With fewer than half of the labels above this value,
 the teacher does not know the birds of the labels, and nothing is tracked."""
 
+SHOWN = 10
+"""Largest number of doubtful labels that a message names."""
+
 Mask = Bool[np.ndarray, "H W"]
 
 
@@ -105,16 +108,19 @@ class Tracked(NamedTuple):
     """Frames without labels."""
     wrong: list[LabelledPicture]
     """Labels that differ from the masks of the teacher and from the masks that are tracked from other labels."""
-    agreement: list[float]
-    """For each labelled frame: least IoU of a labelled bird and the mask of the teacher at its place."""
+    confirmed: int
+    """Number of labelled frames whose birds the teacher confirms."""
+    doubtful: list[str]
+    """Names and least IoUs of labelled frames that the teacher does not confirm."""
 
     def sentence(self) -> str:
         """Return for the user how well the teacher knows the labels, and what was tracked."""
-        known = sum(iou >= SEED_IOU for iou in self.agreement)
-        text = f"the teacher confirms {known} of {len(self.agreement)} labelled frames (IoU ≥ {SEED_IOU})"
-        if not self.pictures:
-            return f"{text}, so no masks are tracked to other frames"
-        return f"{text}, and {len(self.pictures)} other frames have tracked masks"
+        text = f"labelled frames that the teacher confirms: {self.confirmed}"
+        if self.doubtful:
+            more = ", …" if len(self.doubtful) > SHOWN else ""
+            names = ", ".join(self.doubtful[:SHOWN])
+            text += f"; does not confirm: {len(self.doubtful)} (IoU below {SEED_IOU}: {names}{more})"
+        return f"{text}; other frames with tracked masks: {len(self.pictures)}"
 
 
 def teach(video: Path, teacher: Segmenter, folder: Path, progress: ProgressTask = silent) -> Taught:
@@ -205,15 +211,17 @@ def track_labels(
         for source, group in groupby(pictures, key=lambda picture: picture.labels.source)
         if (film := sources[source]) is not None and (own := numbered_by_film(list(group), film))
     ]
-    result = Tracked([], [], [])
+    result, confirmed = Tracked([], [], 0, []), 0
     for n, (source, video, labels) in enumerate(films):
         own = folder / str(n)
         own.mkdir(parents=True)
         film = read_film(video, sorted(labels), own, len(films), progress)
         labels = {number: labels[number] for number in sorted(labels) if number in film.files}
-        agreement, seeds = _confirmed(film, labels, teacher, progress)
-        result.agreement.extend(agreement)
-        if 2 * sum(iou >= SEED_IOU for iou in agreement) < len(agreement):
+        seeds, doubtful = _confirmed(film, labels, teacher, progress)
+        found = sum(map(bool, seeds.values()))
+        confirmed += found
+        result.doubtful.extend(doubtful)
+        if found < len(doubtful):
             continue
         for picture in _track(film, seeds, teacher, progress):
             label = labels.get(picture.labels.frame)
@@ -221,25 +229,28 @@ def track_labels(
                 result.pictures.append(picture._replace(labels=picture.labels._replace(source=source)))
             elif _iou(*(_union(_masks(each), film.size_px) for each in (label, picture.labels))) <= MIN_IOU:
                 result.wrong.append(label)
-    return result
+    return result._replace(confirmed=confirmed)
 
 
 def _confirmed(
     film: Film, labels: Mapping[int, LabelledPicture], teacher: Segmenter, progress: ProgressTask
-) -> tuple[list[float], dict[int, list[Mask]]]:
-    """Return the agreement of the labels with birds, and the labels that can be seeds."""
-    agreement, seeds = [], {}
+) -> tuple[dict[int, list[Mask]], list[str]]:
+    """Return the labels that can be seeds, and the names of other labels; ends when these are more than half."""
+    seeds: dict[int, list[Mask]] = {}
+    doubtful: list[str] = []
     with single_opencv_thread(), progress("Comparing labels with the teacher", len(labels)) as report_progress:
         for number, label in labels.items():
             masks = _masks(label)
             found, _ = _segment(teacher, film.picture(number), masks)
             iou = min((_iou(*both) for both in zip(masks, found, strict=True)), default=1.0)
-            if masks:
-                agreement.append(iou)
             if iou >= SEED_IOU:
                 seeds[number] = masks
+            else:
+                doubtful.append(f"{label.name} {iou:.2f}")
             report_progress(1, f"frame {number}")
-    return agreement, seeds
+            if 2 * len(doubtful) > len(labels):
+                break
+    return seeds, doubtful
 
 
 def _masks(picture: LabelledPicture) -> list[Mask]:

@@ -8,6 +8,8 @@ import pytest
 
 pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
+from support.cli_files import rejected
+
 from jaxfit.data.masks import decode_mask
 from jaxfit.foundation.errors import InputError
 from jaxfit.learning.networks import fine_tune, teacher
@@ -112,14 +114,16 @@ def test_wrong_labels_are_found_by_the_other_labels(film, tmp_path):
 
     tracked = track_labels(labelled(film, range(0, 28, 3), mask), {film: film}, Bright(), tmp_path)
     assert [label.frame for label in tracked.wrong] == [6, 18]
-    assert "confirms 8 of 10 labelled frames" in tracked.sentence()
+    assert "confirms: 8; does not confirm: 2" in tracked.sentence()
+    assert "006.png 0.00, 018.png 0.00" in tracked.sentence()
 
 
 def test_nothing_is_tracked_by_a_teacher_that_does_not_know_the_labels(film, tmp_path):
     tracked = track_labels(labelled(film, range(0, 28, 3)), {film: film}, Fixed(), tmp_path)
     assert not tracked.pictures
     assert not tracked.wrong
-    assert "no masks are tracked" in tracked.sentence()
+    assert "confirms: 0; does not confirm: 6" in tracked.sentence()
+    assert len(tracked.doubtful) == 6  # more than half of the 10 labels
 
 
 @pytest.mark.parametrize(
@@ -170,7 +174,7 @@ def test_training_data_with_tracked_frames(film, tmp_path):
     assert frames == {*range(1, 20, 2), *range(19, FRAMES)}
     assert len(data.tracked_holdout) == 4
     assert len(data.frames.pictures) == len(data.split.training) + len(frames - {17}) - 4 + (17 in _held(data))
-    assert "confirms 10 of 10" in data.teacher
+    assert "confirms: 10; other frames with tracked masks: 20" in data.teacher
 
 
 def _held(data):
@@ -199,3 +203,19 @@ def test_paths_are_of_the_film(film, tmp_path):
     picture = read_film(film, [3], tmp_path).stored(3, [true_mask(3)], np.zeros_like(true_mask(3)))
     assert picture.labels.source == Path(film)
     assert picture.labels.unknown is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["segmenter", "--video", "film", "--labels", "a.json"], "--video: is given with labels"),
+        (["keypoints", "--video", "film"], "--video: is given for keypoints"),
+        (["segmenter", "--video", "film", "--teacher", "none"], "--teacher: is `none` without labels"),
+        (["segmenter", "--video", "film"], "download"),
+        (["segmenter", "--video", "film", "--teacher", "missing.onnx"], "missing.onnx"),
+    ],
+)
+def test_wrong_use_is_one_line(arguments, problem, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("JAXFIT_NETWORKS", str(tmp_path))
+    rejected(capsys, ["train", *arguments, "--out", str(tmp_path / "n.onnx"), "--scenes", "0"], problem)
+    assert not list(tmp_path.iterdir())
