@@ -11,6 +11,7 @@ bird in a box that is known.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
@@ -64,6 +65,8 @@ the teacher does not know the birds of the labels, and nothing is tracked."""
 SHOWN = 10
 """Largest number of doubtful labels that a message names."""
 
+_logger = logging.getLogger(__name__)
+
 Mask = Bool[np.ndarray, "H W"]
 
 
@@ -83,8 +86,8 @@ class Film(NamedTuple):
         return load_npy(self.files[number], "H W 3")
 
     def stored(self, number: int, masks: Sequence[Mask], unknown: Mask) -> StoredPicture:
-        """Return the labels of a frame."""
-        birds = tuple(mask_bird(n, mask) for n, mask in enumerate(masks, 1))
+        """Return the labels of a frame; empty masks are left out."""
+        birds = tuple(mask_bird(n, mask) for n, mask in enumerate(masks, 1) if mask.any())
         name = f"{self.source.name}#{number}"
         hidden = encode_mask(unknown) if unknown.any() else None
         labels = LabelledPicture(self.source, name, number, self.size_px, birds, hidden)
@@ -160,7 +163,7 @@ def teach(video: Path, teacher: Segmenter, folder: Path, progress: ProgressTask 
         problem = f"the teacher detects {what} in {len(numbers)} frames"
         raise InputError(video, problem, "give a film with birds, or another --teacher, or labels by --labels")
     pictures = [film.stored(number, masks, unknown[number]) for number, masks in seeds.items()]
-    pictures += _track(film, seeds, teacher, progress)
+    pictures += [picture for picture, _ in _track(film, seeds, teacher, progress)]
     return Taught(sorted(pictures, key=lambda picture: picture.labels.frame), len(seeds), detected)
 
 
@@ -203,8 +206,6 @@ def track_labels(
         folder: existing folder for the pictures of other frames.
         progress: reports every frame.
 
-    Raises:
-        InputError: a film cannot be read.
     """
     films = [
         (source, film, own)
@@ -215,7 +216,13 @@ def track_labels(
     for n, (source, video, labels) in enumerate(films):
         own = folder / str(n)
         own.mkdir(parents=True)
-        film = read_film(video, sorted(labels), own, len(films), progress)
+        try:
+            film = read_film(video, sorted(labels), own, len(films), progress)
+        except InputError as error:  # pictures of several sizes
+            _logger.warning("no masks are tracked: %s", error)
+            continue
+        if not film.files.keys() - labels.keys():  # nothing to track
+            continue
         labels = {number: labels[number] for number in sorted(labels) if number in film.files}
         seeds, doubtful = _confirmed(film, labels, teacher, progress)
         found = sum(map(bool, seeds.values()))
@@ -223,11 +230,14 @@ def track_labels(
         result.doubtful.extend(doubtful)
         if found < len(doubtful):
             continue
-        for picture in _track(film, seeds, teacher, progress):
+        for picture, is_unbroken in _track(film, seeds, teacher, progress):
             label = labels.get(picture.labels.frame)
             if label is None:
                 result.pictures.append(picture._replace(labels=picture.labels._replace(source=source)))
-            elif _iou(*(_union(_masks(each), film.size_px) for each in (label, picture.labels))) <= MIN_IOU:
+            elif (
+                is_unbroken
+                and _iou(*(_union(_masks(each), film.size_px) for each in (label, picture.labels))) <= MIN_IOU
+            ):
                 result.wrong.append(label)
     return result._replace(confirmed=confirmed)
 
@@ -273,7 +283,8 @@ def read_film(video: Path, seeds: Sequence[int], folder: Path, films: int = 1, p
     reach = FLOW_FRAMES // films
     total = probe_video(video).frames
     numbers = np.arange(max(seeds[0] - reach, 0), min(seeds[-1] + reach + 1, total or seeds[-1] + reach + 1))
-    distance = np.abs(numbers[:, None] - np.array(seeds)).min(1)
+    after = np.searchsorted(seeds, numbers)
+    distance = np.min([np.abs(numbers - np.take(seeds, after - side, mode="clip")) for side in (0, 1)], axis=0)
     near = np.sort(numbers[np.argsort(distance, kind="stable")[: reach + len(seeds)]])
     others = near[~np.isin(near, seeds)]
     step = max(1, math.ceil(films * len(others) / EXAMINED))
@@ -298,11 +309,15 @@ def read_film(video: Path, seeds: Sequence[int], folder: Path, films: int = 1, p
 
 def _track(
     film: Film, seeds: Mapping[int, Sequence[Mask]], teacher: Segmenter, progress: ProgressTask
-) -> list[StoredPicture]:
-    """Track the masks of all seeds, each up to the middle between two seeds; a frame without birds ends a track."""
+) -> list[tuple[StoredPicture, bool]]:
+    """Track the masks of all seeds, each up to the middle between two seeds; a frame without birds ends a track.
+
+    Returns:
+        The examined frames with their masks, and whether flow alone leads from the seed to the frame.
+    """
     places = sorted(number for number in seeds if number in film.grey)
     numbers = list(film.grey)
-    tracked: list[StoredPicture] = []
+    tracked: list[tuple[StoredPicture, bool]] = []
     with single_opencv_thread(), progress("Tracking masks", len(numbers)) as report_progress:
         for before, seed, after in zip([None, *places], places, [*places[1:], None], strict=False):
             low = -1 if before is None else (before + seed) // 2
@@ -317,13 +332,13 @@ def _track(
 
 def _walk(
     film: Film, seed: int, masks: Sequence[Mask], numbers: Sequence[int], teacher: Segmenter
-) -> Iterator[StoredPicture]:
-    """Yield the examined frames to which all masks of a seed are tracked."""
+) -> Iterator[tuple[StoredPicture, bool]]:
+    """Yield the examined frames to which all masks of a seed are tracked; results as of `_track`."""
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     small_px = film.grey[seed].shape[::-1]
     y, x = np.mgrid[: small_px[1], : small_px[0]].astype(np.float32)
     carried = [_resized(mask, small_px) for mask in masks]
-    last, misses = seed, 0
+    last, misses, is_unbroken = seed, 0, True
     for number in numbers:
         if abs(number - last) > 2:  # beyond a damaged frame, the masks could be anywhere
             return
@@ -337,6 +352,7 @@ def _walk(
         found, others = _segment(teacher, film.picture(number), moved)
         lost = [_iou(mask, before) <= MIN_IOU for mask, before in zip(found, moved, strict=True)]
         if any(lost) or misses > MOST_MISSES:
+            is_unbroken = False
             lost = [misses > MOST_MISSES or is_lost for is_lost in lost]
             birds = _detected_again(teacher, film.picture(number), found, lost)
             found, lost = (birds, [False] * len(birds)) if birds else (found, lost)
@@ -347,7 +363,8 @@ def _walk(
         misses = misses + 1 if any(lost) else 0
         if not misses:
             total = np.sum(found, axis=0)
-            yield film.stored(number, [mask & (total == 1) for mask in found], others & (total == 0) | (total > 1))
+            unknown = others & (total == 0) | (total > 1)
+            yield film.stored(number, [mask & (total == 1) for mask in found], unknown), is_unbroken
 
 
 def _detected_again(

@@ -219,3 +219,19 @@ def test_wrong_use_is_one_line(arguments, problem, monkeypatch, tmp_path, capsys
     monkeypatch.setenv("JAXFIT_NETWORKS", str(tmp_path))
     rejected(capsys, ["train", *arguments, "--out", str(tmp_path / "n.onnx"), "--scenes", "0"], problem)
     assert not list(tmp_path.iterdir())
+
+
+def test_photographs_are_no_film(film, tmp_path, caplog):
+    """Pictures of several sizes cannot be tracked; a folder without other pictures has nothing to track."""
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    for t in (3, 6):
+        cv2.imwrite(str(photographs / f"{t:03d}.png"), cv2.imread(str(film / f"{t:03d}.png")))
+    labels = [
+        picture._replace(labels=picture.labels._replace(source=photographs)) for picture in labelled(film, (3, 6))
+    ]
+    assert track_labels(labels, {photographs: photographs}, Bright(), tmp_path / "one") == ([], [], 0, [])
+    assert not caplog.text
+    cv2.imwrite(str(photographs / "009.png"), np.zeros((8, 8, 3), np.uint8))
+    assert track_labels(labels, {photographs: photographs}, Bright(), tmp_path / "two") == ([], [], 0, [])
+    assert "no masks are tracked" in caplog.text
