@@ -61,6 +61,8 @@ def _labelling(commands: Any) -> None:
     text = "result of this video, instead of tracking: a folder of reconstruct or fit, or a file of keypoints (as OBS)"
     suggest.add_argument("--result", type=Path, metavar="DIR|OBS", help=text)
     suggest.add_argument("--count", type=int, default=40, help="number of frames (default %(default)s)")
+    text = "second segmenter, such as `general`: suggest the frames in which its masks differ most from the others"
+    suggest.add_argument("--teacher", metavar="NAME", help=text)
     suggest.add_argument("--empty", action="store_true", help="write no labels, for footage with low trust")
     add_out(suggest, "DIR", "folder for the pictures and labels", overwrite="earlier suggestions in the folder")
 
@@ -172,6 +174,11 @@ def _training(commands: Any) -> None:
     train.add_argument("--images", type=Path, nargs="+", metavar="DIR|VIDEO", help=text)
     text = "masks of the labelled birds: a folder of pictures, or a COCO file"
     train.add_argument("--masks", type=Path, metavar="DIR|OBS.json", help=text)
+    text = "segmenter without labels: film in which the teacher makes the labels"
+    train.add_argument("--video", type=Path, metavar="VIDEO|DIR", help=text)
+    text = "segmenter that makes the labels of --video, or tracks the masks of --labels to other frames of their film: "
+    text += "`general`, A.onnx+B.onnx, `none`, or `auto`: `general` if its files exist (default %(default)s)"
+    train.add_argument("--teacher", default="auto", metavar="NAME", help=text)
     text = "network to start from: `builtin`, or a network that this command wrote (default: builtin with labels, else "
     text += "random weights)"
     train.add_argument("--base", metavar="N.onnx", help=text)

@@ -130,6 +130,7 @@ def _some(texts: Iterable[str]) -> str:
 
 def suggest_frames(options: argparse.Namespace) -> None:
     """Choose frames for labelling, and write their pictures and pre-filled labels."""
+    from jaxfit.perception.segmentation import load_segmenter
     from jaxfit.review.suggest import suggest
 
     config = reconstruct_config(options).track
@@ -142,6 +143,7 @@ def suggest_frames(options: argparse.Namespace) -> None:
         overwrite=options.overwrite,
         empty=options.empty,
         progress=terminal,
+        teacher=None if options.teacher is None else load_segmenter(options.teacher),
     )
     table = right_aligned("frame", "time", "birds", "reason", "score")
     table.columns[3].justify = "left"

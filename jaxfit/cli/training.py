@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import math
 import time
 from collections.abc import Sequence
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from jaxfit.learning.networks.fine_tune import FineTuned
     from jaxfit.learning.networks.label_checks import LeftOut
 
+_logger = logging.getLogger(__name__)
+
 BUILTIN_SCENES, LABEL_SCENES = 160, 20
 """Default number of simulated scenes of a training from the beginning, and of a training on labels."""
 _SHOWN = 20
@@ -33,20 +36,25 @@ _ROWS = {
     "pck_10": "PCK@0.10",
     "error": "mean error, % of bird length",
     "score": "score: mean of rows 1 and 2",
+    "tracked_iou": "mean mask IoU with tracked masks",
 }
 _CHOSEN = {
     "base": "The base network",
     "rescaled": "The base network at the new scale",
     "trained": "The trained network",
 }
-_COLUMNS = {"base": "base network", "rescaled": "base, new scale", "trained": "trained"}
+_COLUMNS = {"base": "base network", "rescaled": "base, new scale", "trained": "trained", "teacher": "teacher"}
 
 
 def train(options: argparse.Namespace) -> None:
     """Train one network and write the network as an ONNX file: on labels, or on simulated footage only."""
     require_extra("train", "train")
     check_new_file(options.out, options.overwrite)
-    if options.labels:
+    if options.video and options.labels:
+        raise InputError("--video", "is given with labels", "give the film of the labels by --images")
+    if options.video and options.network != "segmenter":
+        raise InputError("--video", "is given for keypoints", "a teacher makes masks: give labels by --labels")
+    if options.labels or options.video:
         if options.encoder:
             raise InputError("--encoder", "is given with labels", "give the network to start from by --base")
         _train_on_labels(options)
@@ -79,11 +87,17 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     from jaxfit.learning.networks.label_data import LabelFiles
 
     start = time.perf_counter()
-    files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)
+    teacher = options.teacher if options.labels or options.teacher != "auto" else "general"
+    if options.video:
+        if teacher == "none":
+            raise InputError("--teacher", "is `none` without labels", "give --teacher general, or labels by --labels")
+        files = LabelFiles((), (options.video,))
+    else:
+        files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)
     steps = options.steps
     schedule = None if steps is None else default_schedule(options.network, 0)._replace(steps=steps)
     scenes = LABEL_SCENES if options.scenes is None else options.scenes
-    settings = Settings(options.base or "builtin", options.holdout, scenes, schedule, options.seed)
+    settings = Settings(options.base or "builtin", options.holdout, scenes, schedule, options.seed, teacher)
     frames = options.frames or Path("simulated_frames")
     missing = missing_scenes(frames, scenes) if scenes > 0 else 0
     if missing:
@@ -101,6 +115,10 @@ def _train_on_labels(options: argparse.Namespace) -> None:
         show(f"{options.network} trained in {minutes:.1f} min, {result.best_step} steps → {options.out}")
     else:
         show(f"{options.network} compared in {minutes:.1f} min, without trained weights → {options.out}")
+    if result.doubt:
+        text = "label some frames and train on them: jaxfit suggest %s --segmenter %s --teacher %s"
+        names = options.video, options.out, teacher
+        _logger.warning(f"%s: the network may be wrong: %s; {text}", options.out, result.doubt, *names)
 
 
 def _show_left_out(left_out: Sequence[LeftOut]) -> None:
@@ -119,6 +137,8 @@ def _show_result(result: FineTuned) -> None:
     parts = result.pictures
     training = counted(parts["training"], "labelled picture")
     show(f"{training} for the training, {parts['holdout']} held out, {parts['gap']} in between ({result.rule})")
+    if result.teacher:
+        show(result.teacher)
     if result.new_keypoints:
         show(f"new keypoints, which the base network lacks: {', '.join(result.new_keypoints)}")
     if not result.accuracy:
@@ -130,7 +150,9 @@ def _show_result(result: FineTuned) -> None:
         digits = 1 if key == "error" else 3
         table.add_row(_ROWS[key], *(f"{column[key]:.{digits}f}" for column in result.accuracy.values()))
     show(table)
-    show(f"{_CHOSEN[result.chosen]} has the best score. {_written(result)}")
+    show(f"{_CHOSEN[result.chosen]} has the best score of the networks that can be written. {_written(result)}")
+    if result.accuracy.get("teacher", {}).get("score", 0.0) > result.accuracy[result.chosen]["score"]:
+        show("The teacher has a better score: for this film, use the teacher itself by --segmenter")
 
 
 def _written(result: FineTuned) -> str:

@@ -61,6 +61,13 @@ class Instance(NamedTuple):
         height, width = self.mask.shape
         return np.array([self.x0, self.y0, width, height], np.float32)
 
+    def whole(self, size_px: tuple[int, int]) -> Bool[np.ndarray, "H W"]:
+        """Return the mask over a frame of the given width and height."""
+        mask = np.zeros(size_px[::-1], bool)
+        height, width = self.mask.shape
+        mask[self.y0 : self.y0 + height, self.x0 : self.x0 + width] = self.mask
+        return mask
+
     def encode(self, width: int, height: int) -> dict[str, Any]:
         """Encode the mask as run lengths over a frame of the given size, as in `Observations.masks`."""
         return encode_patch(self.mask, self.x0, self.y0, width, height)

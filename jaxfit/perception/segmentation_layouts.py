@@ -408,13 +408,35 @@ class DetectorAndSaliency:
 
     def _instances(self, frame: UInt8[np.ndarray, "H W 3"], frame_px: tuple[int, int]) -> Iterator[Instance | None]:
         for corners_px, score, label in self._detector(frame):
-            crop_px = _enlarge(corners_px, CONTEXT, frame_px)
-            if (crop_px[:2] >= crop_px[2:]).any():  # a box outside the frame
-                continue
-            placement = Placement.cropped(frame_px, self._saliency.size_px, crop_px)
-            probability = self._saliency(placement.picture(frame))
-            enlarged_px = _enlarge(corners_px, MASK_MARGIN, frame_px)
-            yield placement.instance(probability, enlarged_px, 0.5, score, label, keep=_largest_component)
+            instance = self.instance_in_box(frame, corners_px)
+            yield instance and instance._replace(score=score, label=label)
+
+    def boxes(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Float[np.ndarray, "4"]]:
+        """Return the boxes of the detector: x0, y0, x1, y1 in image pixels."""
+        return [corners_px for corners_px, _, _ in self._detector(frame)]
+
+    def instance_in_box(
+        self, frame: UInt8[np.ndarray, "H W 3"], corners_px: Float[np.ndarray, "4"], margin: float = MASK_MARGIN
+    ) -> Instance | None:
+        """Segment the salient object in a box, with the score 1.
+
+        Args:
+            frame: blue, green, red.
+            corners_px: x0, y0, x1, y1 in image pixels.
+            margin: margin of the box that the mask may cover, as a share of the sides of the box.
+
+        Returns:
+            The instance; None for a box outside the frame or without a salient object.
+        """
+        frame_px = (frame.shape[1], frame.shape[0])
+        crop_px = _enlarge(corners_px, CONTEXT, frame_px)
+        if (crop_px[:2] >= crop_px[2:]).any():  # a box outside the frame
+            return None
+        placement = Placement.cropped(frame_px, self._saliency.size_px, crop_px)
+        probability = self._saliency(placement.picture(frame))
+        enlarged_px = _enlarge(corners_px, margin, frame_px)
+        label = self.class_names[0] if self.class_names else "bird"
+        return placement.instance(probability, enlarged_px, 0.5, 1.0, label, keep=_largest_component)
 
 
 def _enlarge(corners_px: Float[np.ndarray, "4"], share: float, frame_px: tuple[int, int]) -> Int[np.ndarray, "4"]:

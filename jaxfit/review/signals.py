@@ -18,7 +18,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import frame_step, second_differences
 from jaxfit.model.anatomy import mirror_pairs
-from jaxfit.perception.network import Instance, KeypointDetector, instance_of
+from jaxfit.perception.network import Instance, KeypointDetector, Segmenter, instance_of
 
 NEAR_FRAMES = 25
 """Number of frames before and after a frame that give the usual number of birds."""
@@ -237,6 +237,28 @@ def mirror_disagreement(
     share = np.minimum(np.linalg.norm(points - observations.keypoints_px[rows, t], axis=-1) / side, LARGEST_SHARE)
     known = observations.confidence[rows, t] > 0
     return float(share[known].mean()) if known.any() else float("nan")
+
+
+def segmenter_disagreement(
+    picture: UInt8[np.ndarray, "H W 3"], observations: Observations, t: int, teacher: Segmenter
+) -> float:
+    """Return 1 − IoU of the pixels of all birds of a frame and of all birds that another segmenter detects.
+
+    Args:
+        picture: the frame.
+        observations: birds; a bird without a mask has its box as mask.
+        t: position of the frame.
+        teacher: the other segmenter.
+    """
+    size_px = picture.shape[1], picture.shape[0]
+    own = [_instance(observations, n, t) for n in np.flatnonzero(observations.present[:, t]).tolist()]
+    nothing = np.zeros(picture.shape[:2], bool)
+    first, second = (
+        np.any([nothing, *(bird.whole(size_px) for bird in birds if bird is not None)], axis=0)
+        for birds in (own, teacher(picture))
+    )
+    either = np.count_nonzero(first | second)
+    return 1 - np.count_nonzero(first & second) / either if either else 0.0
 
 
 def _instance(observations: Observations, n: int, t: int) -> Instance | None:

@@ -33,7 +33,16 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.perception.detections import open_keypoint_detector
 from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.track import run_tracking
-from jaxfit.review.signals import choose, combine, frame_signals, mirror_disagreement, shortlist, thumbnail
+from jaxfit.review.signals import (
+    SHORTLIST,
+    choose,
+    combine,
+    frame_signals,
+    mirror_disagreement,
+    segmenter_disagreement,
+    shortlist,
+    thumbnail,
+)
 from jaxfit.video.reader import probe_video, read_frames
 from jaxfit.view.drawing import write_png
 from jaxfit.view.overlay import is_inside
@@ -186,8 +195,9 @@ def _link(source: Path, target: Path) -> None:
 
 _logger = logging.getLogger(__name__)
 
-MIRROR, VARIETY = "mirror image", "variety"
-"""Reasons beside the signals of `frame_signals`: disagreement under flips; a frame unlike the others."""
+MIRROR, VARIETY, TEACHER = "mirror image", "variety", "teacher"
+"""Reasons beside the signals of `frame_signals`: disagreement under flips; a frame unlike the others; disagreement with
+another segmenter."""
 
 
 class SuggestedFrame(NamedTuple):
@@ -220,6 +230,8 @@ class _Examined(NamedTuple):
     positions: list[int]
     thumbnails: np.ndarray
     mirror: np.ndarray
+    teacher: np.ndarray | None
+    """Disagreement with the teacher; None without a teacher."""
     times_s: dict[int, float | None]
 
 
@@ -234,13 +246,14 @@ def suggest(
     overwrite: bool = False,
     empty: bool = False,
     progress: ProgressTask = silent,
+    teacher: Segmenter | None = None,
 ) -> Suggestions:
     """Choose frames of a video for labelling, and write their pictures and pre-filled labels into a folder.
 
     A frame is uncertain if the signals of `frame_signals` are large, and if the keypoint network detects other
     keypoints in the mirror image (`mirror_disagreement`). The mirror image is examined for a shortlist of frames.
     `choose` takes frames that are uncertain and differ from the frames chosen before. Without any bird, the frames are
-    chosen by variety alone.
+    chosen by variety alone. With a teacher, only the disagreement of its masks counts (`segmenter_disagreement`).
 
     The video is read once, or twice without `result`. docs/files.md describes the folder.
 
@@ -255,6 +268,7 @@ def suggest(
         overwrite: replace an earlier folder of suggestions.
         empty: write no labels, for networks that do not know the footage: wrong labels take longer than no labels.
         progress: reports every frame.
+        teacher: a second segmenter, whose disagreement is the only signal.
 
     Raises:
         InputError: the video, the result, a network or the folder cannot be used; the result belongs to another video;
@@ -289,9 +303,13 @@ def suggest(
     with new_folder(out, overwrite, marker=MARKER) as part:
         (part / IMAGES).mkdir()
         signals = frame_signals(observations, found.solution)
-        candidates = shortlist(combine(signals)[0], count)
-        detector = _detector(observations, config, keypoints)
-        examined = _examine(video, observations, candidates, detector, part / IMAGES, progress)
+        if teacher is None:
+            candidates = shortlist(combine(signals)[0], count)
+        else:  # no other signal counts
+            most = min(SHORTLIST * count, observations.num_frames)
+            candidates = np.linspace(0, observations.num_frames - 1, most).round().astype(int)
+        detector = None if teacher is not None else _detector(observations, config, keypoints)
+        examined = _examine(video, observations, candidates, detector, part / IMAGES, progress, teacher)
         _check_count(count, len(examined.positions), video)
         frames, positions = _choose(observations, signals, examined, count)
         for t in set(examined.positions) - set(positions):
@@ -342,13 +360,14 @@ def _examine(
     detector: KeypointDetector | None,
     folder: Path,
     progress: ProgressTask,
+    teacher: Segmenter | None,
 ) -> _Examined:
-    """Read the frames of the shortlist, write their pictures, and compare their mirror images."""
+    """Read the frames of the shortlist, write their pictures, and compare their mirror images, or the teacher."""
     numbers = observations.frame_index[candidates]
     position = dict(zip(numbers.tolist(), candidates.tolist(), strict=True))
     step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
     reader = read_frames(video, int(numbers[0]), int(numbers[-1]) + 1, step)
-    positions, thumbnails, mirror, times = [], [], [], {}
+    positions, thumbnails, mirror, differences, times = [], [], [], [], {}
     with progress("Examining frames", len(candidates)) as report_progress:
         for number, picture, time_s in reader:
             t = position.get(number)
@@ -357,10 +376,13 @@ def _examine(
             positions.append(t)
             thumbnails.append(thumbnail(picture))
             mirror.append(np.nan if detector is None else mirror_disagreement(picture, observations, t, detector))
+            if teacher is not None:
+                differences.append(segmenter_disagreement(picture, observations, t, teacher))
             times[t] = time_s
             write_png(folder / picture_name(video, number), picture)
             report_progress(1, f"frame {number}")
-    return _Examined(positions, np.array(thumbnails), np.array(mirror), times)
+    disagreement = None if teacher is None else np.array(differences)
+    return _Examined(positions, np.array(thumbnails), np.array(mirror), disagreement, times)
 
 
 def _choose(
@@ -368,8 +390,11 @@ def _choose(
 ) -> tuple[list[SuggestedFrame], list[int]]:
     """Return the suggested frames and their positions, in the order of their numbers."""
     at = np.array(examined.positions)
-    score, reasons = combine({name: values[at] for name, values in signals.items()} | {MIRROR: examined.mirror})
-    if not observations.present.any():
+    if examined.teacher is not None:
+        score, reasons = combine({TEACHER: examined.teacher})
+    else:
+        score, reasons = combine({name: values[at] for name, values in signals.items()} | {MIRROR: examined.mirror})
+    if examined.teacher is None and not observations.present.any():
         score, reasons = np.full(len(at), 0.5), [""] * len(at)
     picks = sorted(choose(score, examined.thumbnails, observations.frame_index[at], count))
     birds = observations.present.sum(0)

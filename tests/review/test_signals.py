@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from jaxfit.data.observations import Observations
-from jaxfit.review.signals import combine, frame_signals, mirror_disagreement, ranks
+from jaxfit.perception.network import instance_of
+from jaxfit.review.signals import combine, frame_signals, mirror_disagreement, ranks, segmenter_disagreement
 
 NAMES = ("bill_tip", "left_wrist", "right_wrist", "tail_tip")
 T, SIDE = 60, 64
@@ -108,3 +109,20 @@ def test_mirror_disagreement(calm, error, side_px, expected):
     assert (one.confidence > 0).all()
     share = mirror_disagreement(frame, one, 0, detector)
     assert share == pytest.approx(expected / one.num_keypoints, abs=1e-6)
+
+
+def test_segmenter_disagreement(calm):
+    """One box of 32×32 pixels stands for the mask; the teacher detects a half, the other side, or nothing."""
+    one = calm.select(tracks=[0], frames=[0])
+    frame = np.zeros((SIDE, SIDE, 3), np.uint8)
+
+    def disagreement(*birds):
+        return segmenter_disagreement(frame, one, 0, lambda _: [instance_of(*bird) for bird in birds])
+
+    half = np.ones((32, 16), bool), 1.0, "bird", 16, 16
+    other = np.ones((32, 16), bool), 1.0, "bird", 32, 16
+    assert disagreement(half) == pytest.approx(1 / 2)
+    assert disagreement(half, other) == 0
+    assert disagreement() == 1
+    empty = calm.select(tracks=[], frames=[0])
+    assert segmenter_disagreement(frame, empty, 0, lambda _: []) == 0

@@ -98,6 +98,16 @@ def test_without_birds_variety_decides(footage, tmp_path, caplog):
     assert read_coco(tmp_path / "label" / "coco.json").num_tracks == 0
 
 
+def test_a_teacher_decides_by_its_disagreement(footage, tmp_path):
+    """The teacher misses birds in two frames, and these frames are suggested, without a run of the keypoint network."""
+    film, video, birds = footage
+    keypoints, teacher = TrueKeypoints(film), TrueSegmenter(film, [(3, 0), (9, 1), (9, 2)])
+    done = suggest(video, tmp_path / "label", 2, birds, CONFIG, keypoints=keypoints, teacher=teacher)
+    assert [(frame.frame_index, frame.reason) for frame in done.frames] == [(3, "teacher"), (9, "teacher")]
+    assert done.frames[1].score > done.frames[0].score
+    assert not keypoints.counts
+
+
 def other_size(observations):
     return dataclasses.replace(observations, image_size_px=np.tile([64, 64], (FRAMES, 1)), masks={})
 

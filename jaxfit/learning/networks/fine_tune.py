@@ -4,7 +4,8 @@ The first training uses a part of the labelled pictures. The score on the held-o
 steps. Then three networks are compared on the held-out pictures: the base network as its file is, the base network at
 the scale of the labels, and the trained network. If the trained network is the best, the second training uses all
 labelled pictures for this number of steps, and its network is written. Every sample comes from a labelled or from a
-simulated frame. The state is stored at regular intervals, so that the same call continues an interrupted training with
+simulated frame. A teacher adds masks of unlabelled frames of the same film, or makes all labels (`teacher.py`). The
+state is stored at regular intervals, so that the same call continues an interrupted training with
 the same result.
 """
 
@@ -35,6 +36,7 @@ from jaxfit.learning.networks.label_data import (
     ALL_FRAMES,
     FRAMES,
     PICTURES,
+    TRACKED,
     FineTuningData,
     LabelFiles,
     Scale,
@@ -43,6 +45,7 @@ from jaxfit.learning.networks.label_data import (
     prepare_frames,
     read_label_files,
 )
+from jaxfit.learning.networks.labels import LabelSet
 from jaxfit.learning.networks.loop import (
     CHECKS,
     Checkpoint,
@@ -62,6 +65,7 @@ from jaxfit.learning.networks.network_files import (
 )
 from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.reference_birds import load_reference_birds
+from jaxfit.learning.networks.teacher import Taught, as_labels, open_teacher, teach
 from jaxfit.learning.networks.validation import (
     keypoint_accuracy,
     keypoint_detector,
@@ -71,7 +75,7 @@ from jaxfit.learning.networks.validation import (
 )
 from jaxfit.perception.keypoint_layouts import read_metadata
 from jaxfit.perception.keypoints import crop_settings, load_keypoint_detector
-from jaxfit.perception.network import OnnxModel
+from jaxfit.perception.network import OnnxModel, Segmenter
 from jaxfit.perception.segmentation import LONGER_SIDE_PX, load_segmenter
 
 LABELLED_SHARE = 0.6
@@ -85,13 +89,16 @@ STEPS_PER_SCENE = 8
 first scene is filmed. The default number of 20 scenes is in use after 152 steps; the shortest training has 240."""
 CHECKED_PICTURES = 16
 """Largest number of held-out pictures of a measurement during the training; the last measurement uses all."""
+LEARNT_IOU = 0.5
+"""With a smaller IoU on held-out frames, the masks of the teacher have no common rule, as those of birds have."""
 CHECKPOINT, CHECKPOINT_ALL = "checkpoint.npz", "checkpoint_all.npz"
 """States of the training on a part of the labelled pictures, and of the training on all."""
 CHECKED = "checked.onnx"
 """A network that is measured and then removed."""
 
-Candidate = Literal["base", "rescaled", "trained"]
-"""A network that may be written: the base network, the base network at the scale of the labels, the trained network."""
+Candidate = Literal["base", "rescaled", "trained", "teacher"]
+"""A network that is compared: the base network, the base network at the scale of the labels, the trained network, and
+the teacher, which is not written."""
 
 
 class Settings(NamedTuple):
@@ -107,6 +114,8 @@ class Settings(NamedTuple):
     """None chooses a schedule by the number of labelled pictures."""
     seed: int = 0
     """Seed of the samples and of new layers."""
+    teacher: str = "none"
+    """Segmenter that makes labels of a film, or tracks the masks of labels: as in `open_teacher`."""
 
 
 class FineTuned(NamedTuple):
@@ -122,7 +131,7 @@ class FineTuned(NamedTuple):
     left_out: list[LeftOut]
     """Labels that were not used."""
     pictures: dict[str, int]
-    """Number of labelled pictures: `training`, `holdout`, `gap`."""
+    """Number of labelled pictures: `training`, `holdout`, `gap`; and `tracked`: other frames, by the teacher."""
     rule: str
     """How pictures were held out."""
     new_keypoints: tuple[str, ...]
@@ -131,6 +140,10 @@ class FineTuned(NamedTuple):
     """Number of steps of the trained network."""
     steps: int
     """Number of steps on a part of the labelled pictures."""
+    teacher: str = ""
+    """What the teacher did, for the user; empty without a teacher."""
+    doubt: str = ""
+    """Why the masks of a teacher may be wrong; empty with labels of a person."""
 
 
 def default_schedule(network: str, pictures: int) -> Schedule:
@@ -154,7 +167,8 @@ def fine_tune(
 
     Args:
         network: `segmenter` or `keypoints`.
-        files: files of the labels, pictures and masks.
+        files: files of the labels, pictures and masks; without labels, the only video of `images` is the film in which
+            the teacher makes the labels.
         path: the `.onnx` file to write; an existing file is replaced.
         frames_folder: folder of simulated scenes, about 32 MB per scene; absent scenes are filmed while the network
             trains.
@@ -168,7 +182,12 @@ def fine_tune(
     path, folder = Path(path), Path(f"{path}.training")
     _check(network, path, settings)
     base = base_file(network, settings.base)
-    labels = read_label_files(network, files, progress)
+    teacher = open_teacher(settings.teacher) if network == "segmenter" else None
+    taught: Taught | None = None
+    if files.labels:
+        labels = read_label_files(network, files, progress)
+    else:
+        taught, labels, files = _taught(files, teacher, folder, progress)
     simulated = Filming(Path(frames_folder), settings.scenes, progress) if settings.scenes else None
     torch.manual_seed(settings.seed)
     found: tuple[str, ...] = labels.keypoint_names
@@ -179,14 +198,28 @@ def fine_tune(
     with nullcontext() if simulated is None else simulated:
         try:
             references = None if simulated is None else load_reference_birds()
-            data = prepare_data(network, files, settings.holdout, references, folder, labels, progress)
+            confirming = None if taught else teacher
+            data = prepare_data(network, files, settings.holdout, references, folder, labels, progress, confirming)
             base_scale = _base_scale(network, base, data.scale)
         except BaseException:
             if not (folder / CHECKPOINT).exists():
                 _remove(folder)
             raise
         named = dict(zip(data.keypoint_names, found, strict=True))
-        return _fine_tune(network, model, base, base_scale, named, data, simulated, folder, path, settings, progress)
+        files_ = network, model, base, base_scale, named, data, simulated, folder, path
+        result = _fine_tune(*files_, settings, progress, confirming)
+        return result._replace(doubt=_doubt(taught, result)) if taught else result
+
+
+def _taught(
+    files: LabelFiles, teacher: Segmenter | None, folder: Path, progress: ProgressTask
+) -> tuple[Taught, LabelSet, LabelFiles]:
+    """Return the labels of the teacher for a film, and the film as their file."""
+    if teacher is None or len(files.images) != 1:
+        raise InputError("train: labels", "are missing", "give --labels, or --video with --teacher")
+    (folder / TRACKED).mkdir(parents=True, exist_ok=True)
+    taught = teach(files.images[0], teacher, folder / TRACKED, progress)
+    return taught, as_labels(taught), LabelFiles(files.images, files.images)
 
 
 def _fine_tune(
@@ -201,10 +234,11 @@ def _fine_tune(
     path: Path,
     settings: Settings,
     progress: ProgressTask,
+    teacher: Segmenter | None = None,
 ) -> FineTuned:
     """Train the base network on prepared data, and write the best network; `names` as in `keypoint_accuracy`."""
     scales: dict[Candidate, Scale] = {"base": base_scale, "rescaled": data.scale, "trained": data.scale}
-    schedule = settings.schedule or default_schedule(network, len(data.frames.pictures))
+    schedule = settings.schedule or default_schedule(network, len(data.split.training))
     mark = fingerprint(data, simulated, base, (network, schedule, settings.seed))
     initial = flat_weights(model)
 
@@ -230,11 +264,14 @@ def _fine_tune(
             accuracy["rescaled"] = _measured(network, model, initial, data, folder / CHECKED)
         accuracy["trained"] = _measured(network, model, checkpoint.best_weights, data, folder / CHECKED)
     chosen = _best(accuracy)
+    if data.holdout and teacher is not None:
+        accuracy["teacher"] = _of_segmenter(teacher, data)
     if chosen != "trained":
         labelled = 0
         set_weights(model, initial)
     elif data.holdout:
-        frames = prepare_frames(folder / ALL_FRAMES, data.pictures, data.keypoint_names, data.scale, network)
+        everything = [*data.pictures, *data.tracked]
+        frames = prepare_frames(folder / ALL_FRAMES, everything, data.keypoint_names, data.scale, network)
         labelled = len(frames.pictures)
         train(ALL_FRAMES, CHECKPOINT_ALL, checkpoint.best_step, None)
     used = [frames]
@@ -248,6 +285,19 @@ def _fine_tune(
     return _summary(accuracy, chosen, data, names, checkpoint)
 
 
+def _doubt(taught: Taught, result: FineTuned) -> str:
+    """Return why the labels of a teacher may be wrong."""
+    reasons = ["no label of a person has checked the masks of the teacher"]
+    if 2 * taught.confirmed < taught.detected:
+        reasons.append(
+            f"a second run on smaller mirror images confirms only {taught.confirmed} of {taught.detected} frames"
+        )
+    iou = result.accuracy.get("trained", {}).get("mean_iou", 1.0)
+    if iou < LEARNT_IOU:
+        reasons.append(f"the network does not learn the masks: mean IoU {iou:.2f} on held-out frames")
+    return "; ".join(reasons)
+
+
 def _summary(
     accuracy: dict[Candidate, dict[str, float]],
     chosen: Candidate,
@@ -259,11 +309,17 @@ def _summary(
         accuracy,
         chosen,
         data.left_out,
-        {"training": len(data.split.training), "holdout": len(data.holdout), "gap": len(data.split.gap)},
+        {
+            "training": len(data.split.training),
+            "holdout": len(data.holdout),
+            "gap": len(data.split.gap),
+            "tracked": len(data.tracked),
+        },
         data.split.rule,
         tuple(name for name, known in names.items() if not known),
         checkpoint.best_step,
         checkpoint.step,
+        data.teacher,
     )
 
 
@@ -308,8 +364,9 @@ def _scenes_in_use(simulated: Filming, steps: int) -> int:
 
 def _score(network: str, model: FeaturePyramid, data: FineTuningData) -> Callable[[], float]:
     """Return a function that measures a network in training: the mean of two measures of the final table."""
-    places = np.unique(np.linspace(0, len(data.holdout) - 1, CHECKED_PICTURES).round().astype(int))
-    pictures = [data.holdout[i] for i in places.tolist()]
+    unseen = [*data.holdout, *data.tracked_holdout]
+    places = np.unique(np.linspace(0, len(unseen) - 1, CHECKED_PICTURES).round().astype(int))
+    pictures = [unseen[i] for i in places.tolist()]
     names = {name: name for name in data.keypoint_names}
 
     def score() -> float:
@@ -327,10 +384,16 @@ def _score(network: str, model: FeaturePyramid, data: FineTuningData) -> Callabl
 def _accuracy(network: str, path: Path, data: FineTuningData, names: dict[str, str]) -> dict[str, float]:
     """Measure a network file on all held-out pictures, as perception uses the file."""
     if network == "segmenter":
-        accuracy = segmenter_accuracy(load_segmenter(path, kind="bottom_up"), data.holdout)
-    else:
-        accuracy = keypoint_accuracy(load_keypoint_detector(path), data.holdout, names)
+        return _of_segmenter(load_segmenter(path, kind="bottom_up"), data)
+    accuracy = keypoint_accuracy(load_keypoint_detector(path), data.holdout, names)
     return accuracy | {"score": single_score(accuracy)}
+
+
+def _of_segmenter(segmenter: Segmenter, data: FineTuningData) -> dict[str, float]:
+    """Measure a segmenter on all held-out labels, and its masks on the tracked frames that are held out."""
+    accuracy = segmenter_accuracy(segmenter, data.holdout)
+    tracked = segmenter_accuracy(segmenter, data.tracked_holdout)["mean_iou"] if data.tracked_holdout else None
+    return accuracy | {"score": single_score(accuracy)} | ({} if tracked is None else {"tracked_iou": tracked})
 
 
 def _measured(
@@ -392,7 +455,7 @@ def _write(network: str, model: Any, names: tuple[str, ...], scale: Scale, facts
 
 def _remove(folder: Path) -> None:
     """Remove the files of a finished training; files of other programs stay."""
-    for name in (PICTURES, FRAMES, ALL_FRAMES):
+    for name in (PICTURES, FRAMES, ALL_FRAMES, TRACKED):
         shutil.rmtree(folder / name, ignore_errors=True)
     for name in (CHECKPOINT, CHECKPOINT_ALL, CHECKED):
         (folder / name).unlink(missing_ok=True)

@@ -13,6 +13,7 @@ uses the scales around this scale.
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -31,6 +32,7 @@ from jaxfit.learning.networks.label_checks import LeftOut, check_picture, check_
 from jaxfit.learning.networks.labelled_frames import (
     MARKER,
     UNKNOWN,
+    UNKNOWN_OWNER,
     LabelledFrames,
     create_pictures,
     load_frames,
@@ -46,7 +48,9 @@ from jaxfit.learning.networks.labels import (
     read_pictures,
 )
 from jaxfit.learning.networks.segmenter import PIXELS_PER_UNIT
+from jaxfit.learning.networks.teacher import Tracked, track_labels
 from jaxfit.perception.keypoints import CropSettings
+from jaxfit.perception.network import Segmenter
 from jaxfit.perception.segmentation import LONGER_SIDE_PX, MULTIPLE
 
 GAP_FRAMES = 25
@@ -210,6 +214,8 @@ def prepare_frames(
             resample = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
             stored[s, :h, :w] = cv2.resize(pictures[s].pixels(), (w, h), interpolation=resample)
             own = owner_of(picture.birds, picture.size_px)
+            if picture.unknown is not None:
+                own[decode_mask(picture.unknown)] = UNKNOWN_OWNER
             owner[s, :h, :w] = cv2.resize(own, (w, h), interpolation=cv2.INTER_NEAREST)
             per_unit[s] = factor * scale.pixels_per_unit(network, picture.size_px)
             for n, bird in enumerate(picture.birds):
@@ -234,8 +240,11 @@ def owner_of(birds: Sequence[LabelledBird], size_px: tuple[int, int]) -> np.ndar
     return owner
 
 
-PICTURES, FRAMES, ALL_FRAMES = "pictures", "frames", "all_frames"
-"""Folders of the stored pictures, of the training part and of all labelled frames, in the folder of a training."""
+PICTURES, FRAMES, ALL_FRAMES, TRACKED = "pictures", "frames", "all_frames", "tracked"
+"""Folders of the stored pictures, of the training part, of all labelled frames, and of the pictures of frames with
+tracked masks, in the folder of a training."""
+TRACKED_PER_HELD = 5
+"""Number of tracked frames for each tracked frame that the first training does not see."""
 _PICTURES_MARKER = "pictures.txt"
 
 
@@ -248,6 +257,11 @@ class LabelFiles(NamedTuple):
     """Videos or folders of pictures: one for all files, or one for each file; empty if they lie beside the files."""
     masks: Path | None = None
     """Folder of pictures of masks, or COCO file, for labels without masks."""
+
+    @property
+    def sources(self) -> dict[Path, Path | None]:
+        """The video or folder of the pictures of every file of labels; None if the pictures lie beside the file."""
+        return dict(zip(self.labels, images_of(self.labels, self.images) or [None] * len(self.labels), strict=True))
 
 
 class FineTuningData(NamedTuple):
@@ -263,6 +277,12 @@ class FineTuningData(NamedTuple):
     """Labels that are not used."""
     split: Split
     scale: Scale
+    tracked: list[StoredPicture]
+    """Other frames of the films of the labels, with masks that a teacher tracked."""
+    tracked_holdout: list[StoredPicture]
+    """The tracked frames that the first training does not see."""
+    teacher: str
+    """What the teacher did, for the user; empty without a teacher."""
 
 
 def prepare_data(
@@ -273,6 +293,7 @@ def prepare_data(
     folder: Path,
     labels: LabelSet | None = None,
     progress: ProgressTask = silent,
+    teacher: Segmenter | None = None,
 ) -> FineTuningData:
     """Read and check labels, store their pictures in a folder, and hold out a part.
 
@@ -284,6 +305,7 @@ def prepare_data(
         folder: folder of the training.
         labels: the labels, if they are read already.
         progress: reports progress.
+        teacher: tracks the masks of a segmenter's labels to other frames of their films; None for labels only.
 
     Raises:
         InputError: labels or pictures cannot be read, or too few labels can be used.
@@ -291,7 +313,7 @@ def prepare_data(
     labels = labels or read_label_files(network, files, progress)
     left_out: list[LeftOut] = []
     stored: list[StoredPicture] = []
-    sources = dict(zip(files.labels, images_of(files.labels, files.images) or [None] * len(files.labels), strict=True))
+    sources = files.sources
     with new_folder(folder / PICTURES, overwrite=True, marker=_PICTURES_MARKER) as part:
         (part / _PICTURES_MARKER).write_text("pictures of a training in progress\n")
         for source, group in groupby(labels.pictures, key=lambda picture: picture.source):
@@ -309,11 +331,36 @@ def prepare_data(
         stored = [StoredPicture(own, picture.file) for picture, own in pairs if own.birds]
     stored.sort(key=lambda picture: (files.labels.index(picture.labels.source), picture.labels.frame))
     _check_count(stored, left_out, files, network)
+    tracked = Tracked([], [], 0, [])
+    if teacher is not None:
+        shutil.rmtree(folder / TRACKED, ignore_errors=True)
+        tracked = track_labels(stored, files.sources, teacher, folder / TRACKED, progress)
+        problem = "the teacher detects another bird, and so do the masks that are tracked from other labels"
+        left_out += [LeftOut(picture.source, picture.name, "", problem) for picture in tracked.wrong]
+        wrong = {(picture.source, picture.frame) for picture in tracked.wrong}
+        stored = [picture for picture in stored if (picture.labels.source, picture.labels.frame) not in wrong]
     split = split_pictures([picture.labels for picture in stored], share)
     training, holdout = ([stored[i] for i in part] for part in (split.training, split.holdout))
     scale = choose_scale(picture.labels for picture in training)
-    frames = prepare_frames(folder / FRAMES, training, labels.keypoint_names, scale, network)
-    return FineTuningData(labels.keypoint_names, frames, stored, holdout, left_out, split, scale)
+    held = tracked.pictures[::TRACKED_PER_HELD] if holdout else []
+    known = [picture.labels for picture in stored]
+    seen = [
+        picture
+        for i, picture in enumerate(tracked.pictures)
+        if not (held and i % TRACKED_PER_HELD == 0) and not _is_within(picture.labels, known, split.holdout)
+    ]
+    frames = prepare_frames(folder / FRAMES, [*training, *seen], labels.keypoint_names, scale, network)
+    said = tracked.sentence() if tracked.confirmed or tracked.doubtful else ""
+    kept = tracked.pictures, held, said
+    return FineTuningData(labels.keypoint_names, frames, stored, holdout, left_out, split, scale, *kept)
+
+
+def _is_within(picture: LabelledPicture, labels: Sequence[LabelledPicture], holdout: Sequence[int]) -> bool:
+    """Return whether the labelled pictures before and after a picture of the film are both held out."""
+    frames = [(label.frame, i in holdout) for i, label in enumerate(labels) if label.source == picture.source]
+    before = max((frame for frame in frames if frame[0] <= picture.frame), default=(0, False))
+    after = min((frame for frame in frames if frame[0] >= picture.frame), default=(0, False))
+    return before[1] and after[1]
 
 
 def read_label_files(network: str, files: LabelFiles, progress: ProgressTask = silent) -> LabelSet:

@@ -18,8 +18,10 @@ from jaxfit.model.anatomy import MURRE_KEYPOINTS
 
 MARKER = "frames.npz"
 """The file of the labels; every folder of labelled frames contains this file."""
-MOST_BIRDS = 255
+MOST_BIRDS = 254
 """Largest number of birds in a frame."""
+UNKNOWN_OWNER = 255
+"""Owner of a pixel that may be bird or background: the pixel does not count in the training of a segmenter."""
 UNKNOWN = 3
 """Visibility of a keypoint without a label: the keypoint does not count in the training."""
 SPREAD_UNITS = 14.0
@@ -34,7 +36,7 @@ class LabelledFrames(NamedTuple):
     pictures: UInt8[np.ndarray, "S H W 3"]
     """Blue, green, red."""
     owner: UInt8[np.ndarray, "S H W"]
-    """Number of the bird of each pixel, from 1; 0 for no bird."""
+    """Number of the bird of each pixel, from 1; 0 for no bird; `UNKNOWN_OWNER` for a pixel without a label."""
     keypoints_px: Float[np.ndarray, "S N K 2"]
     """x, y of every keypoint, also if it is occluded or outside the picture."""
     visibility: UInt8[np.ndarray, "S N K"]

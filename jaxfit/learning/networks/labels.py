@@ -55,6 +55,8 @@ class LabelledPicture(NamedTuple):
     size_px: tuple[int, int]
     """Width and height, as the labels say."""
     birds: tuple[LabelledBird, ...]
+    unknown: Mapping[str, Any] | None = None
+    """Pixels that may be bird or background, as a mask; only in the labels of a teacher."""
 
 
 class LabelSet(NamedTuple):
@@ -180,11 +182,12 @@ def _mask_pictures(folder: Path, progress: ProgressTask) -> Iterator[LabelledPic
             if picture is None:
                 raise InputError(file, "is no readable picture", "write the picture again, or remove it")
             masks = [mask for mask in masks_of_picture(picture, file, several_birds=False) if mask.any()]
-            birds = tuple(_mask_bird(i, mask) for i, mask in enumerate(masks, 1))
+            birds = tuple(mask_bird(i, mask) for i, mask in enumerate(masks, 1))
             yield LabelledPicture(folder, file.name, frame, (picture.shape[1], picture.shape[0]), birds)
 
 
-def _mask_bird(number: int, mask: np.ndarray) -> LabelledBird:
+def mask_bird(number: int, mask: np.ndarray) -> LabelledBird:
+    """Return the bird of a mask, with the centre of its box as keypoint."""
     box = np.array(box_of_mask(mask), np.float32)
     centre = (box[:2] + box[2:] / 2)[None]
     return LabelledBird(f"bird {number}", box, centre, np.full(1, 2, np.uint8), encode_mask(mask))
@@ -265,6 +268,15 @@ def read_pictures(
         for picture, file in zip(pictures, files, strict=True):
             yield picture, None if file is None else read_picture(file)
             report_progress(1, "")
+
+
+def numbered_by_film(pictures: Sequence[StoredPicture], film: Path) -> dict[int, LabelledPicture]:
+    """Return the labels of one label file by the numbers of their frames in a video or folder of frames."""
+    if not film.is_dir():
+        return {picture.labels.frame: picture.labels for picture in pictures}
+    listed = image_files(film)
+    files = [_file_of(picture.labels, film, listed) for picture in pictures]
+    return {listed.index(file): own.labels for own, file in zip(pictures, files, strict=True) if file in listed}
 
 
 def _video_pictures(

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from jaxfit.learning.networks.augment import SCENE_SHARE, patch_around, random_rotation, randomise_appearance
-from jaxfit.learning.networks.labelled_frames import LabelledFrames, birds_with_spread_wings
+from jaxfit.learning.networks.labelled_frames import UNKNOWN_OWNER, LabelledFrames, birds_with_spread_wings
 from jaxfit.learning.networks.networks import EFFICIENTNET_WIDTHS, FeaturePyramid, efficientnet_stages
 
 STRIDE = 2
@@ -131,6 +131,9 @@ def _targets(owner: np.ndarray) -> tuple[np.ndarray, ...]:
     at = (np.arange(side, dtype=np.float32) + 0.5) * STRIDE
     for n in np.unique(owner[owner > 0]):
         own = cells == n
+        if n == UNKNOWN_OWNER:
+            foreground_weight[own] = 0
+            continue
         rows, columns = np.nonzero(own)
         area = len(rows) * STRIDE**2
         if area < MIN_AREA_PX:

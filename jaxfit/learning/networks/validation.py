@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.evaluation.detection import assign, average_precision, overlap
 from jaxfit.learning.networks.keypoints import SIDE_PX, STRIDE
@@ -141,9 +140,8 @@ def _observations(pictures: Sequence[StoredPicture], instances: Sequence[Sequenc
         for n, bird in enumerate(birds):
             if bird is None:
                 continue
-            whole = np.zeros((height, width), bool)
-            whole[bird.y0 : bird.y0 + bird.mask.shape[0], bird.x0 : bird.x0 + bird.mask.shape[1]] = bird.mask
-            present[n, t], score[n, t], box[n, t], masks[n, t] = True, bird.score, bird.box_px, encode_mask(whole)
+            present[n, t], score[n, t], box[n, t] = True, bird.score, bird.box_px
+            masks[n, t] = bird.encode(width, height)
     return Observations(
         track_id=np.arange(N),
         frame_index=np.arange(T),
