@@ -18,6 +18,7 @@ from jaxfit.learning.networks.labelled_frames import UNKNOWN_OWNER
 from jaxfit.learning.networks.labels import LabelledPicture, StoredPicture, mask_bird
 from jaxfit.learning.networks.segmenter import _targets
 from jaxfit.learning.networks.teacher import open_teacher, read_film, teach, track_labels
+from jaxfit.perception.keypoints import CropSettings
 from jaxfit.perception.network import instance_of
 
 SIZE = 160, 120
@@ -157,7 +158,7 @@ def test_unknown_pixels_do_not_count(film, tmp_path):
 def scale():
     from jaxfit.learning.networks.label_data import Scale
 
-    return Scale(SIDE, 160, 2, 2)
+    return Scale(SIDE, 160, CropSettings(2, 2))
 
 
 def test_training_data_with_tracked_frames(film, tmp_path):
