@@ -118,7 +118,7 @@ class TrackConfig:
     min_track_frames: int = 10
     """Tracks with fewer frames are skipped."""
     min_track_score: float | None = None
-    """Tracks with a lower mean score are skipped; null uses the value in the file of the segmenter (0.7 for the
+    """Tracks with a lower mean score are skipped; null uses the value in the file of the segmenter (0.65 for the
     built-in segmenter), or 0."""
     repair_left_right_flips: bool = False
     """Exchange left and right keypoints in frames where the network confuses the two sides; the paper does not."""
