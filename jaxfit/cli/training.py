@@ -152,7 +152,7 @@ def _show_result(result: FineTuned) -> None:
     show(table)
     show(f"{_CHOSEN[result.chosen]} has the best score of the networks that can be written. {_written(result)}")
     if result.accuracy.get("teacher", {}).get("score", 0.0) > result.accuracy[result.chosen]["score"]:
-        show("The teacher has a better score: for this film, use the teacher itself by --segmenter")
+        show("The teacher has a better score on the held-out labels. Compare both on this film (--segmenter).")
 
 
 def _written(result: FineTuned) -> str:
