@@ -19,13 +19,12 @@ Source: Iglewicz and Hoaglin 1993, *How to detect and handle outliers* (modified
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Bool, Float, Int, Int8
 
 from jaxfit.data.mask_comparison import compare_masks
 from jaxfit.data.masks import box_of_mask, decode_mask
@@ -98,7 +97,7 @@ def keypoint_distances(observations: Observations, solution: Solution) -> Float[
 
 
 def contradict_masks(
-    observations: Observations, cells: Iterable[tuple[int, int]], progress: ProgressTask = silent
+    observations: Observations, cells: Int[np.ndarray, "M 2"], progress: ProgressTask = silent
 ) -> Bool[np.ndarray, "N T"]:
     """Return where the keypoints of a bird contradict its mask (`OUTSIDE_SHARE`).
 
@@ -106,11 +105,11 @@ def contradict_masks(
 
     Args:
         observations: N tracks over T frames.
-        cells: positions (n, t) of the birds that are compared; birds without a mask contradict nothing.
+        cells: n and t of the birds that are compared; birds without a mask contradict nothing.
         progress: reports every bird.
     """
     contradicts = np.zeros(observations.present.shape, bool)
-    compared = [cell for cell in cells if cell in observations.masks]
+    compared = [(n, t) for n, t in cells.tolist() if (n, t) in observations.masks]
     with progress("Comparing keypoints with masks", len(compared)) as report_progress:
         for n, t in compared:
             sure_px = observations.keypoints_px[n, t, observations.confidence[n, t] >= LEAST_CONFIDENCE]
@@ -166,7 +165,7 @@ def with_doubts(
         np.asarray(solution.ambiguity_deg) > 0,
         expected_error(solution, bird) > WRONG_SHARE,
         observations.confidence.mean(-1) < LEAST_CONFIDENCE,
-        contradict_masks(observations, map(tuple, np.argwhere(has_mask).tolist()), progress),
+        contradict_masks(observations, np.argwhere(has_mask), progress),
     )
     doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
     return replace(solution, doubts=doubts)

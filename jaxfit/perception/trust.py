@@ -119,7 +119,7 @@ def footage_signals(
     cells = (
         cells[np.unique(np.linspace(0, max(len(cells) - 1, 0), COMPARED_BIRDS).astype(int))] if len(cells) else cells
     )
-    contradicts = contradict_masks(observations, map(tuple, cells.tolist()))
+    contradicts = contradict_masks(observations, cells)
     is_changing = detections and len(counts) > 1
     return FootageSignals(
         birds_per_frame=float(counts.mean()),

@@ -254,7 +254,7 @@ def segmenter_disagreement(
     own = [_instance(observations, n, t) for n in np.flatnonzero(observations.present[:, t]).tolist()]
     nothing = np.zeros(picture.shape[:2], bool)
     first, second = (
-        np.any([nothing, *(bird.whole(size_px) for bird in birds if bird is not None)], axis=0)
+        np.asarray(np.any([nothing, *(bird.whole(size_px) for bird in birds if bird is not None)], axis=0))
         for birds in (own, teacher(picture))
     )
     either = np.count_nonzero(first | second)

@@ -73,7 +73,7 @@ def test_keypoints_outside_the_mask():
         box_px=np.full((N, T, 4), [30, 20, 40, 40], np.float32),
         masks={(0, t): encode_mask(mask) for t in range(T)},
     )
-    cells = [(n, t) for n in range(N) for t in range(T)]
+    cells = np.argwhere(np.ones((N, T), bool))
     np.testing.assert_array_equal(contradict_masks(seen, cells), [[True, False, True, False], [False] * T])
     assert not contradict_masks(seen, cells[1:2]).any()
 

@@ -334,7 +334,7 @@ def _walk(
     film: Film, seed: int, masks: Sequence[Mask], numbers: Sequence[int], teacher: Segmenter
 ) -> Iterator[tuple[StoredPicture, bool]]:
     """Yield the examined frames to which all masks of a seed are tracked; results as of `_track`."""
-    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     small_px = film.grey[seed].shape[::-1]
     y, x = np.mgrid[: small_px[1], : small_px[0]].astype(np.float32)
     carried = [_resized(mask, small_px) for mask in masks]
