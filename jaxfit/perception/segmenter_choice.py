@@ -32,8 +32,8 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.perception.detections import expected_frames, open_keypoint_detector, open_segmenter, single_opencv_thread
 from jaxfit.perception.general_networks import check_general_files, general_files
+from jaxfit.perception.merging import common_pixels
 from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
-from jaxfit.perception.segmentation import common_pixels
 from jaxfit.perception.trust import FootageSignals, Trust, judge
 from jaxfit.video.reader import read_frames
 

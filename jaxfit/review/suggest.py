@@ -295,9 +295,8 @@ def suggest(
             )
     else:
         found = read_result(Path(result), video)
-        found = found._replace(
-            observations=found.observations.select(frames=_wanted(found.observations.frame_index, config.frames))
-        )
+        wanted = _wanted(found.observations.frame_index, config.frames)
+        found = found._replace(observations=found.observations.select(frames=wanted))
     observations = found.observations
     _check_count(count, observations.num_frames, video if result is None else Path(result))
     with new_folder(out, overwrite, marker=MARKER) as part:

@@ -22,8 +22,9 @@ from jaxfit.data.masks import decode_mask
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.perception.keypoints import load_keypoint_detector
+from jaxfit.perception.merging import common_pixels
 from jaxfit.perception.network import Instance, KeypointDetector, Segmenter, instance_of
-from jaxfit.perception.segmentation import common_pixels, load_segmenter
+from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.raster.zbuffer import zbuffer
 from jaxfit.simulation.footage import Footage, random_light
 from jaxfit.simulation.scene import LEDGE_DEPTH, Scene, mesh_keypoints, stage_scene

@@ -40,6 +40,13 @@ def run(folder, point="never", stop=KeyboardInterrupt, *more):
         return main(command(folder, *more)), segmenter.frames
 
 
+def stopped(result, first, stop):
+    """Whether a run was interrupted after the frames `first` to `stop`; the segmenter runs up to 3 frames ahead."""
+    code, frames = result
+    last = first + len(frames)
+    return code == 130 and frames == [*range(first, last)] and stop <= last <= min(stop + 3, FRAMES)
+
+
 @contextmanager
 def counting():
     """Return the hashes of the windows that are fitted and stored."""
@@ -75,13 +82,13 @@ def test_every_interruption_continues(folder, expected, caplog):
     with counting() as fitted:
         assert run(folder, "frame 3")[0] == 130
         assert not (folder / "result.unfinished").exists()  # nothing was stored yet
-        assert run(folder, "frame 7") == (130, [*range(7)])
+        assert stopped(run(folder, "frame 7"), 0, 7)
         assert "result.unfinished holds the work so far; the same command continues there" in caplog.text
-        assert run(folder, "part 1") == (130, [*range(5, 10)])
+        assert stopped(run(folder, "part 1"), 5, 10)
         assert not fitted
-        assert run(folder, "windows 1") == (130, [*range(5, 10)])
+        assert stopped(run(folder, "windows 1"), 5, 10)
         assert len(fitted) == 2  # of six windows; a tile holds two
-        assert run(folder, "frame 11") == (130, [10])
+        assert stopped(run(folder, "frame 11"), 10, 11)
         assert run(folder, "part 2") == (130, [10, 11])
         assert len(fitted) == 2
         assert run(folder, "windows 2") == (130, [10, 11])
@@ -96,7 +103,9 @@ def test_every_interruption_continues(folder, expected, caplog):
 @pytest.mark.extended
 def test_a_failed_fit_keeps_the_tracking_and_accepts_other_settings(folder, expected, caplog):
     with mock.patch("jaxfit.fitting.tasks.fit_batch", side_effect=InputError("config", "needs memory", "lower it")):
-        assert run(folder) == (2, [*range(10)])  # the first windows are fitted before the last frames are tracked
+        code, frames = run(folder)
+        assert code == 2
+        assert len(frames) >= 10  # the first windows are fitted before the last frames are tracked
     text = (folder / "quick.yaml").read_text()
     (folder / "quick.yaml").write_text(
         text.replace("pose_prior: 0.1", "pose_prior: 0.2").replace("frames: 3", "frames: 2")

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from jaxfit.perception.merging import replace_parts
 from jaxfit.perception.network import Instance
-from jaxfit.perception.segmentation import replace_parts
 
 
 def box(x0, y0, x1, y1, score=0.9):

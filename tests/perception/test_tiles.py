@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from support.instances import rectangle_instance
 
+from jaxfit.perception.merging import Tiled
 from jaxfit.perception.network import Instance, instance_of
-from jaxfit.perception.segmentation import Tiled
 
 
 class Perfect:

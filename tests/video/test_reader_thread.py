@@ -9,7 +9,10 @@ import pytest
 from support.films import encode, reader_threads
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.video.reader import _AHEAD, _ahead, read_frames
+from jaxfit.video.reader import ahead, read_frames
+
+COUNT = 3
+"""Number of items that wait."""
 
 
 def test_the_thread_ends_with_the_reading(tmp_path):
@@ -50,7 +53,7 @@ def test_an_interrupt():
 
     try:
         with pytest.raises(KeyboardInterrupt):
-            collections.deque(_ahead(source), maxlen=1)
+            collections.deque(ahead(source, COUNT), maxlen=1)
     finally:
         signal.signal(signal.SIGINT, before)
     gc.collect()
@@ -68,11 +71,11 @@ def test_the_thread_decodes_only_a_few_frames_ahead():
             most = max(most, made - taken)
             yield i
 
-    for i in _ahead(source):
+    for i in ahead(source, COUNT):
         assert i == taken
         taken += 1
     assert taken == 200
-    assert most <= _AHEAD + 2  # one in the reader's hands, one that waits for its turn
+    assert most <= COUNT + 2  # one in the reader's hands, one that waits for its turn
 
 
 def test_errors_of_the_thread_are_raised():
@@ -80,7 +83,7 @@ def test_errors_of_the_thread_are_raised():
         yield 1
         raise InputError("a", "broken")
 
-    items = _ahead(source)
+    items = ahead(source, COUNT)
     assert next(items) == 1
     with pytest.raises(InputError, match="a: broken"):
         next(items)
