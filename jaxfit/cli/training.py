@@ -62,6 +62,8 @@ def train(options: argparse.Namespace) -> None:
     for name in ("images", "masks"):
         if getattr(options, name):
             raise InputError(f"--{name}", "needs labels", "give the files of the labels by --labels")
+    if options.teacher != "auto":
+        raise InputError("--teacher", "is given without a film", "give --video, or labels by --labels")
     _train_on_simulation(options)
 
 
@@ -116,9 +118,9 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     else:
         show(f"{options.network} compared in {minutes:.1f} min, without trained weights → {options.out}")
     if result.doubt:
-        text = "label some frames and train on them: jaxfit suggest %s --segmenter %s --teacher %s"
-        names = options.video, options.out, teacher
-        _logger.warning(f"%s: the network may be wrong: %s; {text}", options.out, result.doubt, *names)
+        suggest = f"jaxfit suggest {options.video} --segmenter {options.out} --teacher {teacher}"
+        text = "%s: the network may be wrong: %s; label some frames and train on them: %s"
+        _logger.warning(text, options.out, result.doubt, suggest)
 
 
 def _show_left_out(left_out: Sequence[LeftOut]) -> None:

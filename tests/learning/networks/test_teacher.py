@@ -212,6 +212,7 @@ def test_paths_are_of_the_film(film, tmp_path):
         (["segmenter", "--video", "film", "--labels", "a.json"], "--video: is given with labels"),
         (["keypoints", "--video", "film"], "--video: is given for keypoints"),
         (["segmenter", "--video", "film", "--teacher", "none"], "--teacher: is `none` without labels"),
+        (["segmenter", "--teacher", "general"], "--teacher: is given without a film"),
         (["segmenter", "--video", "film"], "download"),
         (["segmenter", "--video", "film", "--teacher", "missing.onnx"], "missing.onnx"),
     ],
