@@ -60,6 +60,10 @@ class SegmenterConfig:
         require_within(self, 0, limits.TILE_OVERLAP, "tile_overlap")
 
 
+Background = Literal["black", "visible"]
+"""What the crop of a bird shows around the bird."""
+
+
 @dataclass(frozen=True)
 class KeypointsConfig:
     """The network that detects the keypoints of each bird."""
@@ -78,7 +82,7 @@ class KeypointsConfig:
     dilate_px: int | None = None
     """Side of the square that dilates the masks before the blanking, in image pixels; null uses the value in the file,
     or the paper's 70 (14 for a visible background)."""
-    background: Literal["black", "visible"] | None = None
+    background: Background | None = None
     """What a bird's crop shows around the bird: `black` blanks everything outside the bird's mask, as the paper does;
     `visible` blanks other birds only; null uses the value in the file, or `black`."""
     batch: int = 16

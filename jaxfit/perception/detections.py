@@ -104,8 +104,8 @@ class FrameDetections(NamedTuple):
     size_px: tuple[int, int]
     """Width and height."""
     instances: list[Instance]
-    keypoints: Callable[[Sequence[int]], Keypoints]
-    """Function that returns the keypoints of the instances at some positions."""
+    keypoints: Callable[[], Keypoints]
+    """Function that returns the keypoints of all instances."""
     picture: UInt8[np.ndarray, "H W 3"] | None
     """None where another process has read the picture."""
 
@@ -167,11 +167,9 @@ class LocalDetections:
             instances = self._segmenter(frame.picture)
             yield frame, instances, _take_distances(self._segmenter), len(self._reader.damaged)
 
-    def _keypoints_of(self, picture: np.ndarray, instances: Sequence[Instance], some: Sequence[int]) -> Keypoints:
+    def _keypoints_of(self, picture: np.ndarray, instances: Sequence[Instance]) -> Keypoints:
         with self._clock("keypoints"):
-            # a crop shows neighbours in black, so the network gets all birds
-            points_px, confidence = self._keypoints(picture, instances)
-            return points_px[list(some)], confidence[list(some)]
+            return self._keypoints(picture, instances)
 
     def take_distances(self) -> Distances:
         """Return the distances of the frames since the last call."""
@@ -398,7 +396,8 @@ def process_frames(
             tracked = [i for i, identity in enumerate(identities) if identity is not None]
             points_px = np.zeros((len(instances), recorder.num_keypoints, 2), np.float32)
             confidence = np.zeros(points_px.shape[:2], np.float32)
-            points_px[tracked], confidence[tracked] = frame.keypoints(tracked)
+            if tracked:  # crops also hide birds without a track, so the network gets all birds
+                points_px[tracked], confidence[tracked] = (array[tracked] for array in frame.keypoints())
             own_name = f"{one_line(name)}#{frame.frame_index}"  # a name on the disk may be no text
             with clock("record"):
                 given = (frame.frame_index, own_name, frame.size_px, instances, identities, points_px, confidence)

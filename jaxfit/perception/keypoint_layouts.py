@@ -20,12 +20,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import scipy.special
 from jaxtyping import Bool, Float, Int, Num, UInt8
 
+from jaxfit.config.perception import Background
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import CROP_MARGIN_PX, IMAGE_SIDE_PX, NETWORK_ASPECT
 from jaxfit.perception.network import IMAGENET_MEAN, IMAGENET_STD, OnnxModel
@@ -43,7 +44,7 @@ ALIGNMENTS = ("centres", "deeplabcut", "msra", "udp")
 
 Source: `HeatmapPredictor` of DeepLabCut 3, `MSRAHeatmap` and `UDPHeatmap` of MMPose 1."""
 
-BACKGROUNDS = "black", "visible"
+BACKGROUNDS: tuple[str, ...] = get_args(Background)
 """Backgrounds of the crops: `black` outside the bird's dilated mask, or `visible` except other birds (`crop_bird`)."""
 
 T = TypeVar("T")

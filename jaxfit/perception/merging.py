@@ -56,6 +56,12 @@ def common_pixels(first: Instance, second: Instance) -> int:
     return int(np.count_nonzero(parts[0] & parts[1]))
 
 
+def mask_iou(first: Instance, second: Instance) -> float:
+    """Return the intersection over union of the masks of two birds."""
+    common = common_pixels(first, second)
+    return common / (np.count_nonzero(first.mask) + np.count_nonzero(second.mask) - common)
+
+
 MIN_TILE_SHARE = 0.5  # of the smaller mask within the intersection of two tiles
 
 

@@ -32,7 +32,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.perception.detections import expected_frames, open_keypoint_detector, open_segmenter, single_opencv_thread
 from jaxfit.perception.general_networks import check_general_files, general_files
-from jaxfit.perception.merging import common_pixels
+from jaxfit.perception.merging import mask_iou
 from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
 from jaxfit.perception.trust import FootageSignals, Trust, judge
 from jaxfit.video.reader import read_frames
@@ -202,7 +202,7 @@ def _pixels(
     stable, reported = (np.zeros(size_px[::-1], bool) for _ in range(2))
     for bird in (*birds, *mirrored):
         _window(reported, bird)[:] |= bird.mask
-    iou = np.array([[_iou(a, b) for b in mirrored] for a in birds]).reshape(len(birds), len(mirrored))
+    iou = np.array([[mask_iou(a, b) for b in mirrored] for a in birds]).reshape(len(birds), len(mirrored))
     for i, j in zip(*linear_sum_assignment(iou, maximize=True), strict=True):
         if iou[i, j] > MIN_IOU:
             both = np.zeros_like(stable)
@@ -216,11 +216,6 @@ def _window(pixels: Bool[np.ndarray, "H W"], bird: Instance) -> Bool[np.ndarray,
     """Return the part of a frame that the mask of a bird covers, as a view."""
     height, width = bird.mask.shape
     return pixels[bird.y0 : bird.y0 + height, bird.x0 : bird.x0 + width]
-
-
-def _iou(first: Instance, second: Instance) -> float:
-    common = common_pixels(first, second)
-    return common / (np.count_nonzero(first.mask) + np.count_nonzero(second.mask) - common)
 
 
 def _mirrored_birds(segmenter: Segmenter, picture: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:

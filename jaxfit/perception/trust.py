@@ -19,7 +19,8 @@ REMEDY = (
 # The limits were set on 15 simulated clips (seeds 700 to 714, random cameras of `jaxfit.learning.networks.scenes`,
 # 960×640, 12 or 20 consecutive frames at 12 frames/s) and on a clip from the side (seed 790, 8° below the horizontal).
 # In 13 good clips, 78 to 95 % of the keypoints are right; in the two other clips, 79 and 81 %; in the clip from the
-# side, 50 %. The limits except MIN_CONFIDENCE were set with an earlier segmenter, and hold for the present segmenter.
+# side, 50 %. The limits of distances, short
+# tracks and the number of birds were set with earlier networks, and hold for the present networks.
 MAX_FRAME_DISTANCE = 1.0
 """Largest median distance of the frames: 99 % of the training inputs are nearer. The clips have 0.27 to 0.58."""
 MAX_BIRD_DISTANCE = 1.0
@@ -36,8 +37,6 @@ MAX_SHORT_SHARE = 0.2
 MAX_COUNT_CHANGE = 0.15
 """Largest change of the number of birds. The good clips have 0 to 0.05, the others 0.07 and 0.10. The limit is higher,
 because the number changes more in footage with fewer frames per second."""
-
-
 MAX_CONTRADICTED_SHARE = 0.1
 """Largest share of birds whose keypoints lie outside their masks. The 12 clips have 0 to 0.03, two scenes of 100 frames
 0.02 and 0.05; masks that lack wings give up to 0.21."""
@@ -115,11 +114,6 @@ def footage_signals(
     counts = present.sum(0)
     frame_distance, bird_distance = (float(np.median(values)) if len(values) else None for values in distances)
     confidence = observations.confidence.mean(-1)[present] if observations.num_keypoints and calibrated else ()
-    cells = np.argwhere(present)
-    cells = (
-        cells[np.unique(np.linspace(0, max(len(cells) - 1, 0), COMPARED_BIRDS).astype(int))] if len(cells) else cells
-    )
-    contradicts = contradict_masks(observations, cells)
     is_changing = detections and len(counts) > 1
     return FootageSignals(
         birds_per_frame=float(counts.mean()),
@@ -128,11 +122,18 @@ def footage_signals(
         short_share=sum(short_tracks.values()) / detections if detections else None,
         count_change=float(np.abs(np.diff(counts)).mean() / counts.mean()) if is_changing else None,
         score=float(np.median(scores[present])) if detections and frame_distance is not None else None,
-        contradicted_share=float(contradicts[tuple(cells.T)].mean()) if len(confidence) else None,
+        contradicted_share=_contradicted_share(observations) if len(confidence) else None,
         confidence=float(np.median(confidence)) if len(confidence) else None,
         frame_distance=frame_distance,
         bird_distance=bird_distance,
     )
+
+
+def _contradicted_share(observations: Observations) -> float:
+    """Return the share of the birds whose keypoints contradict their masks, of up to `COMPARED_BIRDS` birds."""
+    cells = np.argwhere(observations.present)
+    cells = cells[np.unique(np.linspace(0, len(cells) - 1, COMPARED_BIRDS).astype(int))]
+    return float(contradict_masks(observations, cells)[tuple(cells.T)].mean())
 
 
 def judge(signals: FootageSignals) -> Trust:

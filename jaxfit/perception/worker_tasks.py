@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import platform
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -122,8 +122,7 @@ class WorkerDetections:
                         self.damaged.append(damaged.pop(0))
                     self._distances.append(frame.distances)
                     instances = [_unpacked(each) for each in frame.instances]
-                    keypoints = partial(_some, frame.keypoints)
-                    yield FrameDetections(*frame[:3], instances, keypoints, None)
+                    yield FrameDetections(*frame[:3], instances, lambda found=frame.keypoints: found, None)
                 self.damaged += damaged
         finally:
             warn_of_damage(self._shared.video, self.damaged, self._step)
@@ -162,7 +161,7 @@ def detect_range(shared: DetectionShared, frames: range) -> DetectedRange:
             DetectedFrame(
                 *frame[:3],
                 [_packed(instance) for instance in frame.instances],
-                frame.keypoints(range(len(frame.instances))),
+                frame.keypoints(),
                 detections.take_distances(),
             )
             for frame in detections
@@ -215,8 +214,3 @@ def _unpacked(packed: PackedInstance) -> Instance:
     height, width = packed.shape
     mask = np.unpackbits(packed.bits, count=height * width).reshape(height, width).astype(bool)
     return Instance(mask, *packed[2:])
-
-
-def _some(keypoints: Keypoints, some: Sequence[int]) -> Keypoints:
-    points_px, confidence = keypoints
-    return points_px[list(some)], confidence[list(some)]

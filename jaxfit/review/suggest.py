@@ -303,11 +303,10 @@ def suggest(
         (part / IMAGES).mkdir()
         signals = frame_signals(observations, found.solution)
         if teacher is None:
-            candidates = shortlist(combine(signals)[0], count)
+            candidates, detector = shortlist(combine(signals)[0], count), _detector(observations, config, keypoints)
         else:  # no other signal counts
             most = min(SHORTLIST * count, observations.num_frames)
-            candidates = np.linspace(0, observations.num_frames - 1, most).round().astype(int)
-        detector = None if teacher is not None else _detector(observations, config, keypoints)
+            candidates, detector = np.linspace(0, observations.num_frames - 1, most).round().astype(int), None
         examined = _examine(video, observations, candidates, detector, part / IMAGES, progress, teacher)
         _check_count(count, len(examined.positions), video)
         frames, positions = _choose(observations, signals, examined, count)
@@ -391,9 +390,9 @@ def _choose(
     at = np.array(examined.positions)
     if examined.teacher is not None:
         score, reasons = combine({TEACHER: examined.teacher})
-    else:
+    elif observations.present.any():
         score, reasons = combine({name: values[at] for name, values in signals.items()} | {MIRROR: examined.mirror})
-    if examined.teacher is None and not observations.present.any():
+    else:
         score, reasons = np.full(len(at), 0.5), [""] * len(at)
     picks = sorted(choose(score, examined.thumbnails, observations.frame_index[at], count))
     birds = observations.present.sum(0)

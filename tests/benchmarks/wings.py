@@ -19,19 +19,20 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jaxfit.data.masks import decode_mask
+from jaxfit.learning.networks.augment import shifted_mask, torn_mask
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.perception.keypoints import load_keypoint_detector
-from jaxfit.perception.merging import common_pixels
-from jaxfit.perception.network import Instance, KeypointDetector, Segmenter, instance_of
+from jaxfit.perception.merging import mask_iou
+from jaxfit.perception.network import KeypointDetector, Segmenter, instance_of
 from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.raster.zbuffer import zbuffer
 from jaxfit.simulation.footage import Footage, random_light
 from jaxfit.simulation.scene import LEDGE_DEPTH, Scene, mesh_keypoints, stage_scene
 
 WING_JOINTS = "shoulder", "elbow", "wrist"
-SPREAD_SHARE = 0.5
-"""Wings are spread if their tips are further apart than this share of the largest distance in the scene's birds."""
+SPREAD_UNITS = 17.0
+"""Wings are spread if the distance of their tips in space is larger, model units; a murre's is 32 to 36 at most."""
 MASK_ERRORS = "true", "without wings", "shifted", "torn"
 
 
@@ -71,7 +72,7 @@ def filmed_birds(
             mask = decode_mask(truth.masks[n, t])
             if mask.sum() >= 200:
                 visible = (truth.confidence[n, t] > 0) & ~truth.occluded[n, t]
-                is_spread = bool(span[t, n] > SPREAD_SHARE * span.max())
+                is_spread = bool(span[t, n] > SPREAD_UNITS)
                 seen.append(SeenBird(mask, mask & on_wing, is_spread, truth.keypoints_px[n, t], visible))
         yield footage.frame(t), seen
 
@@ -91,26 +92,18 @@ def wing_recall(segmenter: Segmenter, pictures: Sequence[tuple[np.ndarray, list[
         for bird in birds:
             true = instance_of(bird.mask, 1.0, "")
             assert true is not None
-            iou, best = max(((_iou(true, other), i) for i, other in enumerate(found)), default=(0.0, -1))
+            iou, best = max(((mask_iou(true, other), i) for i, other in enumerate(found)), default=(0.0, -1))
             ious[bird.is_spread].append(iou)
             total[bird.is_spread] += int(bird.wings.sum())
             if iou > 0.1:
-                covered[bird.is_spread] += int((_full(found[best], bird.mask.shape) & bird.wings).sum())
+                covered[bird.is_spread] += int((found[best].whole(bird.mask.shape[::-1]) & bird.wings).sum())
     names = {True: "spread", False: "folded"}
-    recall = {f"wing recall, {name}": covered[key] / max(total[key], 1) for key, name in names.items()}
-    return recall | {f"mean IoU, {name} ({len(ious[key])})": float(np.mean(ious[key])) for key, name in names.items()}
-
-
-def _iou(first: Instance, second: Instance) -> float:
-    common = common_pixels(first, second)
-    return common / (np.count_nonzero(first.mask) + np.count_nonzero(second.mask) - common)
-
-
-def _full(instance: Instance, shape: tuple[int, ...]) -> Bool[np.ndarray, "H W"]:
-    mask = np.zeros(shape, bool)
-    h, w = instance.mask.shape
-    mask[instance.y0 : instance.y0 + h, instance.x0 : instance.x0 + w] = instance.mask
-    return mask
+    recall = {
+        f"wing recall, {name}": covered[key] / total[key] if total[key] else np.nan for key, name in names.items()
+    }
+    return recall | {
+        f"mean IoU, {name} ({len(ious[key])})": float(np.mean(ious[key] or [np.nan])) for key, name in names.items()
+    }
 
 
 def keypoint_accuracy(
@@ -144,26 +137,15 @@ def keypoint_accuracy(
 
 
 def _with_error(rng: np.random.Generator, bird: SeenBird, error: str) -> Bool[np.ndarray, "H W"]:
-    rows, columns = np.nonzero(bird.mask)
-    angle = rng.uniform(0, 2 * np.pi)
-    direction = np.array([np.cos(angle), np.sin(angle)])
+    """Return the mask with an error; the true mask where little of the bird would remain."""
+    if error == "true":
+        return bird.mask
     if error == "without wings":
-        body = bird.mask & ~bird.wings
-        return body if body.sum() > 50 else bird.mask
-    if error == "shifted":
-        length_px = max(np.ptp(rows), np.ptp(columns)) + 1
-        dy, dx = np.round(0.15 * length_px * direction).astype(int)
-        shifted = np.zeros_like(bird.mask)
-        inside = (rows + dy >= 0) & (rows + dy < len(shifted)) & (columns + dx >= 0) & (columns + dx < shifted.shape[1])
-        shifted[rows[inside] + dy, columns[inside] + dx] = True
-        return shifted if shifted.any() else bird.mask
-    if error == "torn":
-        along = rows * direction[0] + columns * direction[1]
-        kept = along < np.quantile(along, 0.65)
-        torn = np.zeros_like(bird.mask)
-        torn[rows[kept], columns[kept]] = True
-        return torn
-    return bird.mask
+        faulty = bird.mask & ~bird.wings
+    else:
+        change, share = (shifted_mask, 0.15) if error == "shifted" else (torn_mask, 0.65)
+        faulty = change(bird.mask, rng.uniform(0, 2 * np.pi), share)
+    return faulty if faulty.sum() > 50 else bird.mask
 
 
 def main() -> None:

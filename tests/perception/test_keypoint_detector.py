@@ -217,7 +217,7 @@ def test_crop_parameters_come_from_the_metadata(tmp_path):
 
 
 def test_visible_background_hides_the_other_birds(tmp_path):
-    """The confidence is the brightness of the crop's first pixel, which the neighbour covers."""
+    """Under a neighbour that covers the whole crop, only the bird's own mask is visible."""
     shape = ("n", 3, 8, 8)
     node = helper.make_node("Mul", ["input", "factor"], ["heatmaps"])
     metadata = PLAIN | {"mean": "0", "std": "255", "background": "visible", "pad_px": "4", "dilate_px": "0"}

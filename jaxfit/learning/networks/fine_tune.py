@@ -206,8 +206,8 @@ def fine_tune(
                 _remove(folder)
             raise
         named = dict(zip(data.keypoint_names, found, strict=True))
-        files_ = network, model, base, base_scale, named, data, simulated, folder, path
-        result = _fine_tune(*files_, settings, progress, confirming)
+        own = network, model, base, base_scale, named, data, simulated, folder, path, settings, progress
+        result = _fine_tune(*own, confirming)
         return result._replace(doubt=_doubt(taught, result)) if taught else result
 
 

@@ -21,8 +21,15 @@ from torch.nn import functional
 
 from jaxfit.data.keypoint_names import opposite_keypoints
 from jaxfit.foundation.errors import InputError
-from jaxfit.learning.networks.augment import SCENE_SHARE, patch_around, random_rotation, randomise_appearance
-from jaxfit.learning.networks.labelled_frames import UNKNOWN, LabelledFrames, birds_with_spread_wings
+from jaxfit.learning.networks.augment import (
+    SCENE_SHARE,
+    patch_around,
+    random_rotation,
+    randomise_appearance,
+    shifted_mask,
+    torn_mask,
+)
+from jaxfit.learning.networks.labelled_frames import UNKNOWN, LabelledFrames, draw_bird
 from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception.keypoints import DILATE_PX, CropSettings
@@ -110,9 +117,8 @@ def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: f
     Raises:
         InputError: none of many frames shows a bird.
     """
-    spread = birds_with_spread_wings(frames) if rng.random() < SPREAD_SHARE else np.zeros((0, 2), int)
     for _ in range(MOST_DRAWS):
-        s, n = rng.choice(spread).tolist() if len(spread) else (int(rng.integers(len(frames.pictures))), None)
+        s, n = draw_bird(rng, frames, SPREAD_SHARE)
         birds = _usable_birds(frames, s)
         if not len(birds) or (n is not None and n not in birds):
             continue
@@ -169,11 +175,7 @@ def _augmented_patch(
 
 
 def _faulty_mask(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) -> np.ndarray:
-    """Simulate errors of a segmenter in two of three masks.
-
-    The errors: erosion, dilation, a missing part, a part of a neighbour, no thin parts such as wings, one side missing,
-    a shift.
-    """
+    """Return a mask with a random error of a segmenter, one of `_MASK_ERRORS`."""
     error = str(rng.choice(list(_MASK_ERRORS), p=list(_MASK_ERRORS.values())))
     rows, columns = np.nonzero(mask)
     if error == "none" or not len(rows):
@@ -191,17 +193,10 @@ def _faulty_mask(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) 
         side = max(int(widest * rng.uniform(0.8, 1.5)), 1)
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
-    angle, length = rng.uniform(0, 2 * np.pi), max(np.ptp(rows), np.ptp(columns))
-    direction = np.array([np.cos(angle), np.sin(angle)])
+    angle = rng.uniform(0, 2 * np.pi)
     if error == "torn":
-        along = columns * direction[0] + rows * direction[1]
-        torn = np.zeros_like(mask)
-        kept = along < np.quantile(along, rng.uniform(0.5, 0.9))
-        torn[rows[kept], columns[kept]] = True
-        return torn
-    shift = rng.uniform(0, 0.15) * length * direction
-    shifted = cv2.warpAffine(mask.astype(np.uint8), np.column_stack([np.eye(2), shift]), mask.shape[::-1])
-    return shifted > 0
+        return torn_mask(mask, angle, rng.uniform(0.5, 0.9))
+    return shifted_mask(mask, angle, rng.uniform(0, 0.15))
 
 
 _MASK_ERRORS = {
@@ -214,7 +209,8 @@ _MASK_ERRORS = {
     "torn": 0.07,
     "shifted": 0.05,
 }
-"""Errors of the masks in the training, and their shares."""
+"""Errors of the masks in the training, and their shares. `merged`: with a part of a neighbour; `without thin parts`:
+for example without wings; `torn`: one side is missing."""
 
 
 def _crop_sample(

@@ -334,7 +334,7 @@ def prepare_data(
     tracked = Tracked([], [], 0, [])
     if teacher is not None:
         shutil.rmtree(folder / TRACKED, ignore_errors=True)
-        tracked = track_labels(stored, files.sources, teacher, folder / TRACKED, progress)
+        tracked = track_labels(stored, sources, teacher, folder / TRACKED, progress)
         problem = "the teacher detects another bird, and so do the masks that are tracked from other labels"
         left_out += [LeftOut(picture.source, picture.name, "", problem) for picture in tracked.wrong]
         wrong = {(picture.source, picture.frame) for picture in tracked.wrong}

@@ -77,6 +77,19 @@ def birds_with_spread_wings(frames: LabelledFrames) -> Int[np.ndarray, "M 2"]:
     return np.argwhere(both & (span_px > SPREAD_UNITS * frames.pixels_per_unit[:, None]))
 
 
+def draw_bird(rng: np.random.Generator, frames: LabelledFrames, spread_share: float) -> tuple[int, int | None]:
+    """Draw a frame for a sample: with probability `spread_share`, a frame and its bird with spread wings.
+
+    Returns:
+        Index of the frame, and index of the bird with spread wings; None for a random frame.
+    """
+    spread = birds_with_spread_wings(frames) if rng.random() < spread_share else np.zeros((0, 2), int)
+    if len(spread):
+        s, n = rng.choice(spread).tolist()
+        return s, n
+    return int(rng.integers(len(frames.pictures))), None
+
+
 def create_pictures(folder: Path, count: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Create the memory-mapped files of `count` pictures and of the bird of each pixel, both 0; the caller fills them.
 

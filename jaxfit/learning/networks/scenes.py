@@ -31,6 +31,8 @@ LENGTH_UNITS = 20.0
 """Length of the murre in model units; the sizes of birds refer to this length."""
 LENGTH_SHARE = 0.03, 0.44
 """Range of the length of birds, as a share of the width of the picture."""
+FLIGHT_SHARE, WINGS_FLIGHT_SHARE = 0.15, 0.7
+"""Share of the frames in which all birds fly: usually, and in scenes with wings."""
 DEPTH_STEP = 1000.0
 """Depth between birds in model units: a nearer bird hides a farther bird completely."""
 
@@ -48,7 +50,7 @@ class _Placed(NamedTuple):
 
 
 def draw_frames(
-    rng: np.random.Generator, bird: Bird, count: int, width: int, height: int, flight: float = 0.15
+    rng: np.random.Generator, bird: Bird, count: int, width: int, height: int, flight: float = FLIGHT_SHARE
 ) -> LabelledFrames:
     """Draw a scene, which is one or two species, one landscape, one light and one camera, and some of its frames.
 
@@ -317,18 +319,14 @@ def _write_scenes(
     save_labels(part, points, visibility, scale)
 
 
-FLIGHT_SHARE = 0.7
-"""Share of the frames with birds in the air, in a scene with wings of other birds than murres."""
-
-
 def _film_scene(seed: int, varied: float = 0.0, wings: float = 0.0) -> LabelledFrames:
     """Simulate the frames of one scene: with probability `varied`, other birds in another landscape."""
     bird = load_murre()
     has_wings = bool(np.random.default_rng((seed, 13)).random() < wings)
     if np.random.default_rng((seed, 11)).random() < varied:
         rng = np.random.default_rng((seed, 12))
-        flight = {"flight": FLIGHT_SHARE} if has_wings else {}
-        return draw_frames(rng, bird, FRAMES_PER_SCENE, WIDTH, HEIGHT, **flight)
+        flight = WINGS_FLIGHT_SHARE if has_wings else FLIGHT_SHARE
+        return draw_frames(rng, bird, FRAMES_PER_SCENE, WIDTH, HEIGHT, flight)
     return _film_ledge(seed, bird, has_wings)
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from jaxfit.learning.networks.augment import SCENE_SHARE, patch_around, random_rotation, randomise_appearance
-from jaxfit.learning.networks.labelled_frames import UNKNOWN_OWNER, LabelledFrames, birds_with_spread_wings
+from jaxfit.learning.networks.labelled_frames import UNKNOWN_OWNER, LabelledFrames, draw_bird
 from jaxfit.learning.networks.networks import EFFICIENTNET_WIDTHS, FeaturePyramid, efficientnet_stages
 
 STRIDE = 2
@@ -86,11 +86,7 @@ def draw_sample(
         scene_share: share of the samples with a random scene, as in `randomise_appearance`.
         wide_share: share of the samples with a scale of `WIDE_PIXELS_PER_UNIT`; all others have a usual scale.
     """
-    spread = birds_with_spread_wings(frames) if rng.random() < SPREAD_SHARE else np.zeros((0, 2), int)
-    if len(spread):
-        s, n = rng.choice(spread).tolist()
-    else:
-        s, n = int(rng.integers(len(frames.pictures))), None
+    s, n = draw_bird(rng, frames, SPREAD_SHARE)
     scales = WIDE_PIXELS_PER_UNIT if rng.random() < wide_share else PIXELS_PER_UNIT
     factor = np.clip(np.exp(rng.uniform(*np.log(scales))) / frames.pixels_per_unit[s], *RESAMPLING)
     height, width = frames.owner.shape[1:]

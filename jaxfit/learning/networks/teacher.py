@@ -25,6 +25,7 @@ from scipy.optimize import linear_sum_assignment
 
 from jaxfit.config.perception import GENERAL
 from jaxfit.data.masks import box_of_mask, decode_mask, encode_mask
+from jaxfit.evaluation.metrics import iou
 from jaxfit.foundation.array_files import load_npy
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
@@ -205,7 +206,6 @@ def track_labels(
         teacher: the teacher.
         folder: existing folder for the pictures of other frames.
         progress: reports every frame.
-
     """
     films = [
         (source, film, own)
@@ -252,11 +252,11 @@ def _confirmed(
         for number, label in labels.items():
             masks = _masks(label)
             found, _ = _segment(teacher, film.picture(number), masks)
-            iou = min((_iou(*both) for both in zip(masks, found, strict=True)), default=1.0)
-            if iou >= SEED_IOU:
+            least = min((_iou(*both) for both in zip(masks, found, strict=True)), default=1.0)
+            if least >= SEED_IOU:
                 seeds[number] = masks
             else:
-                doubtful.append(f"{label.name} {iou:.2f}")
+                doubtful.append(f"{label.name} {least:.2f}")
             report_progress(1, f"frame {number}")
             if 2 * len(doubtful) > len(labels):
                 break
@@ -439,13 +439,13 @@ def _two_runs(teacher: Segmenter, picture: UInt8[np.ndarray, "H W 3"]) -> tuple[
 
 def _pairs(first: Sequence[Mask], second: Sequence[Mask]) -> list[tuple[int, int]]:
     """Return the pairs of masks of the same bird."""
-    iou = np.array([[_iou(a, b) for b in second] for a in first]).reshape(len(first), len(second))
-    places = linear_sum_assignment(iou, maximize=True)
-    return [(int(i), int(j)) for i, j in zip(*places, strict=True) if iou[i, j] > MIN_IOU]
+    ious = np.array([[_iou(a, b) for b in second] for a in first]).reshape(len(first), len(second))
+    places = linear_sum_assignment(ious, maximize=True)
+    return [(int(i), int(j)) for i, j in zip(*places, strict=True) if ious[i, j] > MIN_IOU]
 
 
 def _iou(first: Mask, second: Mask) -> float:
-    return np.count_nonzero(first & second) / max(np.count_nonzero(first | second), 1)
+    return float(np.nan_to_num(iou(first, second)))  # 0 where both are empty
 
 
 def _union(masks: Sequence[Mask], size_px: tuple[int, int]) -> Mask:
