@@ -396,8 +396,8 @@ def process_frames(
             tracked = [i for i, identity in enumerate(identities) if identity is not None]
             points_px = np.zeros((len(instances), recorder.num_keypoints, 2), np.float32)
             confidence = np.zeros(points_px.shape[:2], np.float32)
-            if tracked:  # crops also hide birds without a track, so the network gets all birds
-                points_px[tracked], confidence[tracked] = (array[tracked] for array in frame.keypoints())
+            # crops also hide birds without a track, so the network gets all birds
+            points_px[tracked], confidence[tracked] = (array[tracked] for array in frame.keypoints())
             own_name = f"{one_line(name)}#{frame.frame_index}"  # a name on the disk may be no text
             with clock("record"):
                 given = (frame.frame_index, own_name, frame.size_px, instances, identities, points_px, confidence)
