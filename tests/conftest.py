@@ -84,11 +84,18 @@ def _settings_of_the_cache():
 
 @pytest.fixture(scope="module")
 def optimised():
-    """Optimise the programs, unlike most tests that the Makefile runs: for tests whose programs run long."""
+    """Optimise the programs, unlike most tests that the Makefile runs: for tests whose programs run long.
+
+    JAX would use a program that it has compiled before with the other setting. Its results differ in the last digits.
+    """
     before = jax.config.read("jax_disable_most_optimizations")
+    if before:
+        jax.clear_caches()
     jax.config.update("jax_disable_most_optimizations", False)
     yield
     jax.config.update("jax_disable_most_optimizations", before)
+    if before:
+        jax.clear_caches()
 
 
 @pytest.fixture
