@@ -1,0 +1,1 @@
+"""Calibrated cameras in one world: lens, pose, files of other programs, triangulation."""
