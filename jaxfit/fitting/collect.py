@@ -30,7 +30,7 @@ from jaxfit.fitting.solve import FitModel
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.extras import LIBRARIES, library_versions
 from jaxfit.model.bird import Bird, model_hash
-from jaxfit.model.camera import Camera, crop_to_image, image_to_crop, project
+from jaxfit.model.camera import CropCamera, crop_to_image, image_to_crop, project
 from jaxfit.model.kinematics import Pose, window_keypoints, window_transforms
 from jaxfit.model.rotation import axis_angle_to_matrix, matrix_to_axis_angle, unwrap_axis_angle
 
@@ -73,7 +73,7 @@ def collect_windows(
     windows: Windows,
     results: list[FittedWindow],
     bird: Bird,
-    camera: Camera,
+    camera: CropCamera,
     common_size: bool,
     skipped: Mapping[int, tuple[str, ...]],
 ) -> Solution:
@@ -166,7 +166,7 @@ def _empty_frame_values(birds: int, frames: int, bird: Bird, error_bars: bool) -
 
 
 def _frame_values(
-    result: FittedWindow, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: Camera, common_size: bool
+    result: FittedWindow, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: CropCamera, common_size: bool
 ) -> dict[str, Any]:
     """Return the arrays of a solution at the present frames of one window."""
     pose, crop = result.pose, crop[present].astype(np.float32)
@@ -190,7 +190,7 @@ def _frame_values(
 
 
 def _frame_error_bars(
-    bars: ErrorBars | None, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: Camera
+    bars: ErrorBars | None, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: CropCamera
 ) -> dict[str, Any]:
     """Return the error bars of a solution at the present frames of one window; `crop` is that of these frames."""
     if bars is None:

@@ -28,7 +28,7 @@ from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.array_files import load_npz, npz_names, validate_arrays
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import Camera
+from jaxfit.model.camera import CropCamera
 from jaxfit.model.kinematics import Pose, Rig, joint_transforms, posed_keypoints, rest_pose
 from jaxfit.model.rotation import matrix_to_axis_angle, unwrap_axis_angle, view_grid, viewing_axis_rotations
 
@@ -160,7 +160,7 @@ def search_initial_poses(
     keypoints_px: Float[Array, "W T K 2"],
     confidence: Float[Array, "W T K"],
     config: InitialiseConfig,
-    camera: Camera,
+    camera: CropCamera,
     common_size: bool,
 ) -> Pose:
     """Return initial poses of W windows: H hypotheses with the mean body pose, at a depth with scale ≈ 1.
@@ -194,7 +194,7 @@ def _search_tile(
     keypoints_px: Float[Array, "G T K 2"],
     confidence: Float[Array, "G T K"],
     config: InitialiseConfig,
-    camera: Camera,
+    camera: CropCamera,
     common_size: bool,
 ) -> Pose:
     """Return the initial poses of the G windows of a tile."""

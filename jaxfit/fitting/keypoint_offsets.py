@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from jaxfit.config.yaml_file import rounded
 from jaxfit.fitting.solve import FitModel
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import Camera, project
+from jaxfit.model.camera import CropCamera, project
 from jaxfit.model.kinematics import Pose, Rig, move_keypoints, window_keypoints, window_transforms
 from jaxfit.objective.likelihood import keypoint_sd_px
 from jaxfit.objective.posed_window import Targets
@@ -112,7 +112,7 @@ def _posterior(bird: Bird, H: Float[np.ndarray, "K 3 3"], slope: Float[np.ndarra
 
 @eqx.filter_jit
 def _keypoints_and_slopes(
-    rig: Rig, camera: Camera, pose: Pose
+    rig: Rig, camera: CropCamera, pose: Pose
 ) -> tuple[Float[Array, "W T K 2"], Float[Array, "W T K 2 3"]]:
     """Return the projected keypoints, and the derivative of each keypoint by its offset."""
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxfit.config.fit import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import CROP_PX, Camera
+from jaxfit.model.camera import CROP_PX, CropCamera
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, move_keypoints
 from jaxfit.objective.curvature import SHARED_PARAMETERS, Rows, add_rows, frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature, evaluate_terms, weighted_sum
@@ -31,7 +31,7 @@ class Program(NamedTuple):
 
     rig: Rig
     priors: Priors
-    camera: Camera
+    camera: CropCamera
     raster: Raster
     terms: Mapping[str, Term]
     """The stage's active terms, by name."""
@@ -359,7 +359,7 @@ class FitModel(NamedTuple):
     rig: Rig
     """With the keypoints of the config (`keypoint_offsets`)."""
     priors: Priors
-    camera: Camera
+    camera: CropCamera
 
 
 def fit_model(bird: Bird, config: FitConfig) -> FitModel:
@@ -371,9 +371,9 @@ def fit_model(bird: Bird, config: FitConfig) -> FitModel:
     return FitModel(bird, rig, priors_of(bird), crop_camera(config))
 
 
-def crop_camera(config: FitConfig) -> Camera:
+def crop_camera(config: FitConfig) -> CropCamera:
     """Return the crop camera, in crop pixels."""
-    return Camera(config.crop.focal_px, CROP_PX / 2, CROP_PX)
+    return CropCamera(config.crop.focal_px, CROP_PX / 2, CROP_PX)
 
 
 def needs_mask(stage: StageConfig) -> bool:

@@ -12,8 +12,8 @@ CROP_PX = 256
 """Side of every crop in crop pixels. All pixel quantities of a fit are in this unit, whatever the silhouette's size."""
 
 
-class Camera(NamedTuple):
-    """A pinhole camera without distortion: x right, y down, z forward; pixel centres at i + 0.5.
+class CropCamera(NamedTuple):
+    """The pinhole camera of a crop, without distortion: x right, y down, z forward; pixel centres at i + 0.5.
 
     The defaults are the crop camera of AVES and of Hägerlind et al. 2024: 256-pixel crops, focal length 2167 pixels.
     """
@@ -23,7 +23,7 @@ class Camera(NamedTuple):
     size_px: int = CROP_PX
 
 
-def project(points_cam: Float[Array, "*B 3"], camera: Camera) -> Float[Array, "*B 2"]:
+def project(points_cam: Float[Array, "*B 3"], camera: CropCamera) -> Float[Array, "*B 2"]:
     """Project camera-space points to pixels: focal · (x, y) / z + centre.
 
     Args:
@@ -38,7 +38,7 @@ def project(points_cam: Float[Array, "*B 3"], camera: Camera) -> Float[Array, "*
     return camera.focal_px * points_cam[..., :2] / depth + camera.centre_px
 
 
-def to_screen(points_cam: Float[Array, "*B 3"], camera: Camera) -> Float[Array, "*B 3"]:
+def to_screen(points_cam: Float[Array, "*B 3"], camera: CropCamera) -> Float[Array, "*B 3"]:
     """Return crop pixels and depth (x_px, y_px, z_cam), the input of the raster core."""
     return jnp.concatenate([project(points_cam, camera), points_cam[..., 2:]], axis=-1)
 

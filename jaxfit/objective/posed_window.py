@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird, unlimited_joints
-from jaxfit.model.camera import Camera, project, to_screen
+from jaxfit.model.camera import CropCamera, project, to_screen
 from jaxfit.model.kinematics import (
     Pose,
     Rig,
@@ -110,7 +110,7 @@ class PosedWindow:
         targets: Targets,
         rig: Rig,
         priors: Priors,
-        camera: Camera,
+        camera: CropCamera,
         raster: Raster,
         shared: tuple[str, ...] = (),
     ):

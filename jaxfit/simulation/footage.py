@@ -246,7 +246,7 @@ class Footage:
         to_sun, view = self.light.to_sun_world, self.view
         projected = vertices_world - vertices_world[..., 2:] * (to_sun / to_sun[2])
         below = vertices_world * [1, 1, 0]
-        small = view._replace(width=view.width // 4, height=view.height // 4, focal_px=view.focal_px / 4)
+        small = view.smaller(4)
         sun, sky = (np.zeros((small.height, small.width), np.float32) for _ in range(2))
         for layer, points in ((sun, projected), (sky, below)):
             for mesh in small.to_screen(points):

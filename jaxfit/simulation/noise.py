@@ -33,7 +33,7 @@ from jaxtyping import Array, Bool, Float
 from jaxfit.data.masks import box_of_mask, encode_mask, encode_patch
 from jaxfit.data.observations import Observations
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import Camera, project, to_screen
+from jaxfit.model.camera import CropCamera, project, to_screen
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, window_keypoints, window_transforms, window_vertices
 from jaxfit.raster.zbuffer import hard_mask
 
@@ -212,7 +212,7 @@ def _with_neighbour(truth: Observations, n: int, t: int, mask: np.ndarray, reach
 
 
 @jax.jit  # one program is compiled faster than a hundred operations
-def _on_screen(rig: Rig, pose: Pose, camera: Camera) -> tuple[Float[Array, "T K 2"], Float[Array, "T V 3"]]:
+def _on_screen(rig: Rig, pose: Pose, camera: CropCamera) -> tuple[Float[Array, "T K 2"], Float[Array, "T V 3"]]:
     """Return the keypoints in pixels, and the vertices in pixels and depth."""
     A = window_transforms(rig, pose)
     return project(window_keypoints(rig, A, pose), camera), to_screen(window_vertices(rig, A, pose), camera)
@@ -225,7 +225,7 @@ def detect(
     outliers: float = 0.0,
     seed: int = 0,
     masks: bool = True,
-    camera: Camera = Camera(),
+    camera: CropCamera = CropCamera(),
 ) -> Observations:
     """Simulate observations of several birds in one square image, without occlusion between birds.
 

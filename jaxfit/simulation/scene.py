@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,7 +22,7 @@ from jaxfit.foundation.files import new_folder, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird, model_hash
-from jaxfit.model.camera import Camera
+from jaxfit.model.camera import CropCamera
 from jaxfit.raster.zbuffer import hard_mask, zbuffer
 from jaxfit.simulation.behaviour import BEHAVIOURS
 from jaxfit.simulation.flock import SimulatedBird, simulate_flock
@@ -137,16 +137,40 @@ def stage_scene(
     Raises:
         InputError: a number outside its range.
     """
-    _check(birds, frames, size, fps, seed)
+    check_scene(birds, frames, size, fps, seed)
     view = random_viewpoint(np.random.default_rng((seed, 0)), *size, LEDGE_DEPTH)
-    simulated_birds = simulate_flock(bird, birds, frames, fps, LEDGE_DEPTH, view, seed)
-    vertices = np.stack([simulated.vertices_world for simulated in simulated_birds], axis=1)  # T N V 3
+    flock = simulate_flock(bird, birds, frames, fps, LEDGE_DEPTH, view, seed)
+    return stage_view(bird, flock, view, fps, seed, progress, "Staging the scene")
+
+
+def stage_view(
+    bird: Bird,
+    flock: list[SimulatedBird],
+    view: Viewpoint,
+    fps: float,
+    seed: int,
+    progress: ProgressTask,
+    title: str,
+) -> Scene:
+    """Return what one camera sees of simulated birds, and the detections of a simulated detector.
+
+    Args:
+        bird: the model.
+        flock: the birds, with their poses in the frame of this camera.
+        view: the camera.
+        fps: frames per second.
+        seed: seed of the detections.
+        progress: reports every frame.
+        title: text of the progress.
+    """
+    birds, frames, size = len(flock), len(flock[0].behaviour), (view.width, view.height)
+    vertices = np.stack([simulated.vertices_world for simulated in flock], axis=1)  # T N V 3
     keypoints = mesh_keypoints(bird, vertices)
     K = bird.num_keypoints
     points, inside, visible = np.zeros((birds, frames, K, 2)), *np.zeros((2, birds, frames, K), bool)
     boxes, amodal_masks, visible_masks = np.zeros((birds, frames, 4), np.float32), {}, {}
     faces = np.asarray(bird.faces)
-    with progress("Staging the scene", frames) as report_progress:
+    with progress(title, frames) as report_progress:
         for t in range(frames):
             rendered = render_visibility(vertices[t], keypoints[t], faces, view)
             points[:, t], inside[:, t], visible[:, t] = (
@@ -181,9 +205,9 @@ def stage_scene(
         timestamp_s=np.arange(frames) / fps,
         fps=fps,
     )
-    poses = _true_poses(bird, simulated_birds, view, truth, points, np.swapaxes(keypoints, 0, 1))
+    poses = _true_poses(bird, flock, view, truth, points, np.swapaxes(keypoints, 0, 1))
     detections = simulate_detections(truth, visible, bird.keypoint_pairs, seed)
-    return Scene(simulated_birds, view, truth, poses, detections)
+    return Scene(flock, view, truth, poses, detections)
 
 
 def simulate(
@@ -217,23 +241,51 @@ def simulate(
     """
     with new_folder(folder, overwrite, marker=MARKER) as part:
         scene = stage_scene(bird, birds, frames, size, fps, seed, progress)
-        rng = np.random.default_rng((seed, 4))
-        footage = Footage(bird, scene.birds, scene.view, LEDGE_DEPTH, random_light(rng), seed)
-        with progress("Filming", frames) as report_progress, VideoWriter(part / FOOTAGE, size, fps, codec) as video:
-            for t in range(frames):
-                video.write(footage.frame(t))
-                report_progress(1, "")
-        identity = read_footage(part / FOOTAGE, frames)
-        write_coco(replace(scene.truth, footage=identity), part / TRUTH)
-        write_coco(replace(scene.detections, footage=identity), part / DETECTIONS)
-        origin = "simulated: these poses are the truth, not a fit"
-        facts = {"origin": origin, "jaxfit": VERSION, "model": model_hash(bird), "video": identity.entries()}
-        save_solution(scene.poses, bird, f"# {origin}\n", facts, part / TRUE_POSES)
-        write_whole(part / MARKER, json.dumps(_description(scene, birds, frames, size, fps, seed), indent=2).encode())
+        arguments = {"birds": birds, "frames": frames, "size": list(size), "fps": fps, "seed": seed}
+        film_scene(bird, scene, part, arguments, codec, progress, "Filming")
     return scene
 
 
-def _check(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> None:
+def film_scene(
+    bird: Bird,
+    scene: Scene,
+    folder: Path,
+    arguments: dict[str, Any],
+    codec: str,
+    progress: ProgressTask,
+    title: str,
+) -> None:
+    """Write the files of a scene, as seen by one camera, to an existing folder; see `simulate`.
+
+    Args:
+        bird: the model.
+        scene: the scene.
+        folder: where to write.
+        arguments: the arguments of the simulation, for `scene.json`; `fps` and `seed` are used.
+        codec: codec of the footage.
+        progress: reports every frame.
+        title: text of the progress.
+    """
+    fps, seed, frames = arguments["fps"], arguments["seed"], scene.truth.num_frames
+    light = random_light(np.random.default_rng((seed, 4)))
+    footage = Footage(bird, scene.birds, scene.view, LEDGE_DEPTH, light, seed)
+    size = scene.view.width, scene.view.height
+    with progress(title, frames) as report_progress, VideoWriter(folder / FOOTAGE, size, fps, codec) as video:
+        for t in range(frames):
+            video.write(footage.frame(t))
+            report_progress(1, "")
+    identity = read_footage(folder / FOOTAGE, frames)
+    write_coco(replace(scene.truth, footage=identity), folder / TRUTH)
+    write_coco(replace(scene.detections, footage=identity), folder / DETECTIONS)
+    origin = "simulated: these poses are the truth, not a fit"
+    facts = {"origin": origin, "jaxfit": VERSION, "model": model_hash(bird), "video": identity.entries()}
+    save_solution(scene.poses, bird, f"# {origin}\n", facts, folder / TRUE_POSES)
+    write_whole(folder / MARKER, json.dumps(_description(scene, arguments), indent=2).encode())
+
+
+def check_scene(birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> None:
+    """Raise InputError if an argument of a simulation lies outside its range."""
+
     def require(name: str, value: object, holds: bool, remedy: str) -> None:
         if not holds:
             raise InputError(f"simulate: {name}", f"is {value}", remedy)
@@ -264,7 +316,7 @@ def _true_poses(
         values = stack(name)
         return np.broadcast_to(values[:, None], (N, T, *values.shape[1:]))
 
-    crop_px = Camera().size_px
+    crop_px = CropCamera().size_px
     return Solution(
         track_id=truth.track_id,
         frame_index=truth.frame_index,
@@ -290,7 +342,7 @@ def _true_poses(
     )
 
 
-def _description(scene: Scene, birds: int, frames: int, size: tuple[int, int], fps: float, seed: int) -> dict:
+def _description(scene: Scene, arguments: dict[str, Any]) -> dict:
     """Return the content of `scene.json`: arguments, camera, and the behaviours of each bird with first frames."""
     behaviours = {}
     for track, simulated in zip(scene.truth.track_id.tolist(), scene.birds, strict=True):
@@ -298,7 +350,7 @@ def _description(scene: Scene, birds: int, frames: int, size: tuple[int, int], f
         behaviours[track] = [{"from_frame": int(t), "behaviour": BEHAVIOURS[simulated.behaviour[t]]} for t in starts]
     return {
         "made_by": f"jaxfit {VERSION}, simulated",
-        "arguments": {"birds": birds, "frames": frames, "size": list(size), "fps": fps, "seed": seed},
+        "arguments": arguments,
         "camera": {
             "R_cam_world": scene.view.R_cam_world.tolist(),
             "position_world": scene.view.position_world.tolist(),

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from jaxfit.data.masks import box_of_mask, encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import Camera, project, to_screen
+from jaxfit.model.camera import CropCamera, project, to_screen
 from jaxfit.model.kinematics import Pose, fold_bird, joint_transforms, posed_vertices
 from jaxfit.model.rotation import view_grid
 from jaxfit.raster.zbuffer import hard_mask, zbuffer
@@ -154,7 +154,7 @@ def simulate_photographs(
         seen: share of the keypoints that are annotated.
     """
     random = np.random.default_rng(seed)
-    camera, rig, faces = Camera(), fold_bird(bird), np.asarray(bird.faces)
+    camera, rig, faces = CropCamera(), fold_bird(bird), np.asarray(bird.faces)
     length = float(np.ptp(np.asarray(bird.vertices)[:, 1]))
     keypoints = np.zeros((count, 1, bird.num_keypoints, 2), np.float32)
     confidence = (random.random((count, 1, bird.num_keypoints)) < seen).astype(np.float32)

@@ -37,7 +37,7 @@ from jaxfit.evaluation.benchmarks.fit import NOISE_PX, OUTLIERS
 from jaxfit.fitting.initial_poses import InitialPoses, load_initial_poses
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import Camera, project, to_screen
+from jaxfit.model.camera import CropCamera, project, to_screen
 from jaxfit.model.files import load_murre
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_keypoints, posed_vertices
 from jaxfit.model.published import import_model
@@ -48,9 +48,9 @@ from jaxfit.simulation.noise import detect
 from jaxfit.simulation.scene import simulate, stage_scene
 from jaxfit.simulation.species import random_pose, random_species
 
-CAMERA = Camera()
+CAMERA = CropCamera()
 """The camera of world 4."""
-WIDE = Camera(focal_px=CAMERA.focal_px, centre_px=256.0, size_px=512)
+WIDE = CropCamera(focal_px=CAMERA.focal_px, centre_px=256.0, size_px=512)
 """The camera of the worlds 3 and 6. In an image of 256 pixels, the border would cut off bill or tail of most birds."""
 
 
@@ -164,7 +164,7 @@ def windows_of(
     return Scene(bird, observations, exact, true_solution(bird, stacked, exact, WIDE))
 
 
-def true_solution(bird: Bird, pose: Pose, exact: Observations, camera: Camera) -> Solution:
+def true_solution(bird: Bird, pose: Pose, exact: Observations, camera: CropCamera) -> Solution:
     """Return true poses as a result whose crop is the whole image.
 
     Args:

@@ -13,12 +13,12 @@ from jaxfit.config.fit import load_config
 from jaxfit.fitting import batch, tasks
 from jaxfit.fitting import fit as fit_module
 from jaxfit.fitting.fit import fit, fit_runs
-from jaxfit.model.camera import Camera
+from jaxfit.model.camera import CropCamera
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
 
 BIRD, T, SIZE, BIRDS = toy_bird(shapes=0), 6, 64, 2
-CAMERA = Camera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
+CAMERA = CropCamera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
 ONE_WINDOW_GB = 0.002
 """Memory in GB for one window of six frames."""
 

@@ -21,11 +21,11 @@ from jaxfit.fitting.initial_poses import (
     match_candidates,
     search_initial_poses,
 )
-from jaxfit.model.camera import Camera, project
+from jaxfit.model.camera import CropCamera, project
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.model.rotation import viewing_axis_rotations
 
-BIRD, CAMERA = toy_bird(), Camera()
+BIRD, CAMERA = toy_bird(), CropCamera()
 RIG = fold_bird(BIRD)
 FROM_ABOVE = np.diag([1.0, -1.0, -1.0])
 ABOVE, AROUND = InitialiseConfig(), InitialiseConfig(method="so3", turns=16, directions=60, candidates=48)

@@ -9,7 +9,7 @@ from support.birds import pose_window
 from jaxfit.config.fit import load_config
 from jaxfit.evaluation.metrics import me_p, me_v, mpjpe, pa_mpjpe
 from jaxfit.fitting.fit import fit
-from jaxfit.model.camera import Camera, project
+from jaxfit.model.camera import CropCamera, project
 from jaxfit.model.published import import_model
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
@@ -29,8 +29,8 @@ def metrics(reference_dir):
     observed = detect(bird, poses, noise_px=2.0, outliers=0.05, seed=0)
     posed = [pose_window(bird, pose) for pose in poses]
     true_3d = np.stack([keypoints for keypoints, _ in posed])
-    true_px = np.asarray(project(true_3d, Camera()))
-    sides = np.ptp(np.stack([project(vertices, Camera()) for _, vertices in posed]), axis=2).max(-1)
+    true_px = np.asarray(project(true_3d, CropCamera()))
+    sides = np.ptp(np.stack([project(vertices, CropCamera()) for _, vertices in posed]), axis=2).max(-1)
     visible = np.ones(true_px.shape[:3], bool)
     measured = {}
     for name in ("paper", "baseline"):

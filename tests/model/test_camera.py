@@ -6,19 +6,19 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxfit.model.camera import Camera, crop_to_image, image_to_crop, project, to_screen
+from jaxfit.model.camera import CropCamera, crop_to_image, image_to_crop, project, to_screen
 
 
 def test_stored_projection(reference_dir):
     with np.load(reference_dir / "reference" / "lbs.npz") as stored:
-        camera = Camera(float(stored["camera/focal"]), float(stored["camera/center"]))
+        camera = CropCamera(float(stored["camera/focal"]), float(stored["camera/center"]))
         pixels = project(jnp.asarray(stored["camera/points"]), camera)
         np.testing.assert_allclose(pixels, stored["camera/pixels"], atol=1e-3)
-    assert camera == Camera()  # the defaults are the reference's camera
+    assert camera == CropCamera()  # the defaults are the reference's camera
 
 
 def test_projection_by_hand():
-    camera = Camera(focal_px=100, centre_px=32, size_px=64)
+    camera = CropCamera(focal_px=100, centre_px=32, size_px=64)
     points = np.array([[0, 0, 5], [1, 0, 5], [0, -2, 10], [0.3, 0.4, 2]], np.float32)
     expected = [[32, 32], [52, 32], [32, 12], [47, 52]]
     np.testing.assert_allclose(project(points, camera), expected, rtol=1e-6)
@@ -30,7 +30,7 @@ def test_projection_by_hand():
 def test_projection_at_and_behind_the_camera_is_finite():
     for depth in [0.0, -0.0, 1e-12, -1e-3, -5.0, -1e6]:
         point = jnp.array([0.5, -2.0, depth])
-        value, pullback = jax.vjp(lambda p: project(p, Camera()), point)
+        value, pullback = jax.vjp(lambda p: project(p, CropCamera()), point)
         assert np.isfinite(value).all()
         assert np.isfinite(pullback(jnp.ones(2))[0]).all()
         # a point on the right stays on the right: the projection does not mirror points behind the camera

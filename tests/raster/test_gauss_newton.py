@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.birds import toy_bird
 
-from jaxfit.model.camera import Camera, to_screen
+from jaxfit.model.camera import CropCamera, to_screen
 from jaxfit.model.kinematics import (
     Pose,
     fold_bird,
@@ -48,8 +48,8 @@ def row_of(transl=(0.3, -0.2, 180.0), seed=0):
 
 @functools.partial(jax.jit, static_argnames="size")
 def on_screen(row, size=SIZE):
-    pose, ratio = pose_of(row), size / Camera().size_px
-    screen = to_screen(posed_vertices(RIG, joint_transforms(RIG, pose), pose), Camera())
+    pose, ratio = pose_of(row), size / CropCamera().size_px
+    screen = to_screen(posed_vertices(RIG, joint_transforms(RIG, pose), pose), CropCamera())
     return screen * jnp.array([ratio, ratio, 1.0])
 
 
@@ -70,8 +70,8 @@ def block(row, backend, weight=1.0, vertices=None, faces=RIG.faces, blur=BLUR, s
 
 @functools.partial(jax.jit, static_argnames=("backend", "blur"))
 def compiled_block(vertices, faces, target, weight, skin, backend, blur):
-    ratio = target.shape[0] / Camera().size_px
-    camera_px = Camera().focal_px * ratio, Camera().centre_px * ratio
+    ratio = target.shape[0] / CropCamera().size_px
+    camera_px = CropCamera().focal_px * ratio, CropCamera().centre_px * ratio
     return raster.silhouette_gauss_newton(vertices, faces, target, weight, skin, camera_px, blur=blur, backend=backend)
 
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird, neutral_colours, unlimited_joints
-from jaxfit.model.camera import Camera, crop_to_image, project
+from jaxfit.model.camera import CropCamera, crop_to_image, project
 from jaxfit.model.kinematics import Pose, fold_bird, window_keypoints, window_transforms, window_vertices
 
 PARTS = {  # joint: parent, position, centre and half-axes of its ellipsoid (x side, y to the bill, z up)
@@ -182,7 +182,7 @@ def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> So
         return np.stack([np.broadcast_to(value, (T, *value.shape[value.ndim - ndim :])) for value in values])
 
     keypoints = np.stack([pose_window(bird, pose)[0] for pose in poses])
-    crop, camera = np.broadcast_to(np.asarray(crop, float), (N, T, 3)), Camera()
+    crop, camera = np.broadcast_to(np.asarray(crop, float), (N, T, 3)), CropCamera()
     return Solution(
         track_id=np.arange(1, N + 1),
         frame_index=np.arange(T),

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.model.camera import Camera
+from jaxfit.model.camera import CropCamera
 from jaxfit.model.files import save_bird
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
@@ -26,7 +26,7 @@ stages:
 def write_inputs(folder):
     """Write a model, observations of three birds (the last bird has three keypoints) and a config."""
     save_bird(BIRD, folder / "toy.npz")
-    observed = detect(BIRD, [smooth_motion(BIRD, T, seed) for seed in range(3)], camera=Camera(541.75, 32, SIZE))
+    observed = detect(BIRD, [smooth_motion(BIRD, T, seed) for seed in range(3)], camera=CropCamera(541.75, 32, SIZE))
     confidence = observed.confidence.copy()
     confidence[2, :, 3:] = 0
     observed = observed.with_keypoints(observed.keypoints_px, confidence)

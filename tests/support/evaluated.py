@@ -8,11 +8,11 @@ import numpy as np
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.evaluation.metrics import longest_side_of_mask
-from jaxfit.model.camera import Camera, project
+from jaxfit.model.camera import CropCamera, project
 from jaxfit.simulation.flock import smooth_motion
 from support.birds import filled_mask, pose_window, solution_of, toy_bird
 
-BIRD, CAMERA, N, T = toy_bird(), Camera(), 2, 4
+BIRD, CAMERA, N, T = toy_bird(), CropCamera(), 2, 4
 CORNER = np.array([30, 10])
 """Where the crop's upper left corner lies in the image."""
 WIDTH, HEIGHT = 320, 280

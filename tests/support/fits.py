@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 
 from jaxfit.config.fit import load_config
-from jaxfit.model.camera import Camera, project
+from jaxfit.model.camera import CropCamera, project
 from jaxfit.simulation.flock import smooth_motion
 from support.birds import pose_window, toy_bird
 
 BIRD = toy_bird(shapes=0)
 T, SIZE = 6, 64
-CAMERA = Camera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
+CAMERA = CropCamera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
 ONE_WINDOW_GB = 0.002
 """Memory in GB for one window of six frames. Most tests use it, so that they share the compiled programs."""
 

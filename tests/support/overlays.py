@@ -6,12 +6,12 @@ import functools
 import numpy as np
 
 from jaxfit.data.solution import Solution
-from jaxfit.model.camera import Camera
+from jaxfit.model.camera import CropCamera
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.video.writer import VideoWriter
 from support.birds import solution_of, toy_bird
 
-BIRD, CAMERA, N, T = toy_bird(shapes=0), Camera(), 2, 6
+BIRD, CAMERA, N, T = toy_bird(shapes=0), CropCamera(), 2, 6
 WIDTH, HEIGHT, FPS = 320, 200, 12.5
 CROPS = ((10, 40, 128), (170, 30, 160))
 FIRST = 3

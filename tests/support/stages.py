@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.solve import FitModel, Problem, advance, begin, stage_hyperparameters, stage_program
-from jaxfit.model.camera import Camera, project
+from jaxfit.model.camera import CropCamera, project
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.objective.objective import weighted_sum
 from jaxfit.objective.posed_window import PosedWindow, Targets, priors_of
@@ -16,7 +16,7 @@ from jaxfit.simulation.flock import smooth_motion
 from support.birds import toy_bird
 
 B, T, STEPS = 2, 4, 25
-BIRD, CAMERA = toy_bird(), Camera()
+BIRD, CAMERA = toy_bird(), CropCamera()
 MODEL = FitModel(BIRD, fold_bird(BIRD), priors_of(BIRD), CAMERA)
 FIRST = StageConfig(
     "first",

@@ -12,7 +12,7 @@ from scipy.fft import dct
 from scipy.spatial.transform import Rotation
 from scipy.special import huber
 
-from jaxfit.model.camera import Camera
+from jaxfit.model.camera import CropCamera
 from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.rotation import axis_angle_to_matrix
 from jaxfit.objective.objective import evaluate_terms
@@ -25,7 +25,7 @@ from support.birds import random_pose, skin_by_hand, toy_bird
 T, SIZE = 3, 32
 FRAME_S = 1 / 30
 TERMS = tuple(known_terms())
-CAMERA = Camera(focal_px=240.0, centre_px=SIZE / 2, size_px=SIZE)
+CAMERA = CropCamera(focal_px=240.0, centre_px=SIZE / 2, size_px=SIZE)
 RASTER = Raster(Blur.for_size(SIZE), SIZE)
 
 

@@ -5,7 +5,7 @@ import functools
 import cv2
 import numpy as np
 
-from jaxfit.model.camera import Camera
+from jaxfit.model.camera import CropCamera
 from jaxfit.perception.network import instance_of
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
@@ -33,7 +33,7 @@ fit:
 def _truth():
     """Return the masks by frame and bird, and the keypoints (T, N, K, 2). The first use compiles many programs."""
     motion = [smooth_motion(BIRD, FRAMES, seed) for seed in range(BIRDS)]
-    detections = detect(BIRD, motion, camera=Camera(541.75, SIDE / 2, SIDE))
+    detections = detect(BIRD, motion, camera=CropCamera(541.75, SIDE / 2, SIDE))
     masks = [[detections.mask(n, t) for n in range(BIRDS)] for t in range(FRAMES)]
     shift = np.array([SIDE, 0]) * np.arange(BIRDS)[:, None, None, None]
     return masks, np.moveaxis(detections.keypoints_px + shift, 0, 1)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxfit.evaluation.benchmarks.raster import median_seconds
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import CROP_PX, Camera, to_screen
+from jaxfit.model.camera import CROP_PX, CropCamera, to_screen
 from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_vertices
 from jaxfit.model.rotation import view_grid
 from jaxfit.raster.silhouette import Backend, mask_loss, silhouette
@@ -63,7 +63,7 @@ def outline_excess(
 
 def posed_meshes(bird: Bird, count: int) -> list[Mesh]:
     """Return a bird in random poses and views, centred in a 256-pixel crop, with room for the filter."""
-    rig, camera, faces = fold_bird(bird), Camera(), np.asarray(bird.faces, np.int32)
+    rig, camera, faces = fold_bird(bird), CropCamera(), np.asarray(bird.faces, np.int32)
     views = view_grid(count, 1)
     meshes = []
     for n in range(count):
@@ -76,10 +76,10 @@ def posed_meshes(bird: Bird, count: int) -> list[Mesh]:
 def ball_mesh() -> Mesh:
     """Return a sphere, centred in a 256-pixel crop."""
     ball = trimesh.creation.icosphere(4)
-    return _centred(np.asarray(ball.vertices), Camera()), np.asarray(ball.faces, np.int32)
+    return _centred(np.asarray(ball.vertices), CropCamera()), np.asarray(ball.faces, np.int32)
 
 
-def _centred(points: Float[np.ndarray, "V 3"], camera: Camera) -> Float[np.ndarray, "V 3"]:
+def _centred(points: Float[np.ndarray, "V 3"], camera: CropCamera) -> Float[np.ndarray, "V 3"]:
     points = points - (points.min(0) + points.max(0)) / 2
     depth = camera.focal_px * np.abs(points[:, :2]).max() / (0.42 * CROP_PX)
     return np.asarray(to_screen(jnp.asarray(points + np.array([0, 0, depth])), camera), np.float32)

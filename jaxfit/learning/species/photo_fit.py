@@ -32,7 +32,7 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.learning.species.photographs import Photographs
 from jaxfit.learning.species.species import species_bird, symmetric_bone_precision, symmetric_bones, with_offsets
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import Camera, project, to_screen
+from jaxfit.model.camera import CropCamera, project, to_screen
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_vertices
 from jaxfit.objective.objective import evaluate_curvature
 from jaxfit.objective.posed_window import PosedWindow, Priors, Raster, Targets, priors_of
@@ -115,7 +115,7 @@ class Hierarchy(eqx.Module):
 
     def image_losses(self, p: Parameters, data: Data, with_mask: Float[Array, ""]):
         """Return the loss of keypoints and of the mask for each image, (N,) each, in squared pixels and pixels."""
-        camera, size = Camera(), data.mask.shape[-1]
+        camera, size = CropCamera(), data.mask.shape[-1]
         paper = Blur.for_size(size)
         blur = Blur(paper.sigma * BLUR**2, paper.radius * BLUR)
         pose = self.pose(p, data)
@@ -270,7 +270,9 @@ def _curvatures(model: Hierarchy, priors: Priors, data: Data, p: Parameters, wit
         keypoints_px, confidence, mask, has_mask = (x[None] for x in observed)
         present, corner = jnp.ones(1, bool), jnp.zeros((1, 2))
         targets = Targets(keypoints_px, confidence, mask, has_mask > 0, present, corner, jnp.float32(1))
-        window = PosedWindow(pose, pose, targets, model.rig, priors, Camera(), raster, shared=("bone_length", "betas"))
+        window = PosedWindow(
+            pose, pose, targets, model.rig, priors, CropCamera(), raster, shared=("bone_length", "betas")
+        )
         curvature = evaluate_curvature(window, find_terms(settings), settings)
         columns = jnp.eye(curvature.diagonal.shape[1])
         return jax.vmap(lambda column: curvature.product(column[None])[0])(columns)

@@ -17,12 +17,12 @@ from jaxfit.evaluation.bootstrap import Interval
 from jaxfit.evaluation.evaluate import Evaluation
 from jaxfit.fitting.fit import fit_runs
 from jaxfit.foundation.errors import InputError
-from jaxfit.model.camera import Camera
+from jaxfit.model.camera import CropCamera
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
 
 BIRD, T, SIZE, BIRDS = toy_bird(shapes=0), 6, 64, 2
-CAMERA = Camera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
+CAMERA = CropCamera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from jaxfit.learning.species.photo_fit import (
 )
 from jaxfit.learning.species.photographs import MASK_PX
 from jaxfit.learning.species.species import symmetric_bone_precision, with_offsets
-from jaxfit.model.camera import Camera, project
+from jaxfit.model.camera import CropCamera, project
 from jaxfit.model.kinematics import joint_transforms, posed_vertices
 from jaxfit.objective.posed_window import priors_of
 
@@ -70,7 +70,7 @@ def keypoints_px(model, p, data):
     rig = eqx.tree_at(lambda r: (r.vertices, r.shape_basis), model.rig, (rest, own_basis))
 
     def image(pose):
-        return project(model.keypoint_weights @ posed_vertices(rig, joint_transforms(rig, pose), pose), Camera())
+        return project(model.keypoint_weights @ posed_vertices(rig, joint_transforms(rig, pose), pose), CropCamera())
 
     return jax.vmap(image)(model.pose(p, data))
 
