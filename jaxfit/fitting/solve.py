@@ -80,7 +80,10 @@ class Solver(NamedTuple):
 def problem_window(program: Program, problem: Problem, pose: Pose) -> PosedWindow:
     """Return the posed window that the terms evaluate."""
     targets = problem.targets
-    active = targets.confidence * problem.hyperparameters.keypoints_on
+    on = problem.hyperparameters.keypoints_on
+    if targets.views is not None:  # the keypoints of the model, once for each view
+        on = jnp.tile(on, targets.confidence.shape[-1] // on.shape[-1])
+    active = targets.confidence * on
     targets = eqx.tree_at(lambda t: t.confidence, targets, active)
     rig, priors, camera, raster = program.rig, program.priors, program.camera, program.raster
     return PosedWindow(pose, problem.anchor, targets, rig, priors, camera, raster, program.shared)

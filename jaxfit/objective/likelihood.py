@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfit.model.camera import project
 from jaxfit.model.rotation import rotation_change
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
@@ -61,15 +60,15 @@ def place_likelihood(window: PosedWindow, *, sd_px_s2: Scalar | float = 300.0, d
 
     a_i is the acceleration of the projected translation of the bird, in pixels of a 256-pixel crop per second², with
     the movement of the crop added. Its density is a bivariate Student t with the scale s = `sd_px_s2` and ν = `dof`. A
-    bird that stands, walks or flies has a small acceleration in most frames.
+    bird that stands, walks or flies has a small acceleration in most frames. With several views, a_i has three
+    components (`PosedWindow.place_acceleration_px`).
 
     Source: Lange, Little and Taylor 1989, *Robust Statistical Modeling Using the t Distribution*.
     """
     complete = jnp.asarray(complete_runs(window.present, 2), jnp.float32)
-    place_px = project(jnp.asarray(window.pose.transl), window.camera)
-    # differences of the corner first: its values are large beside the changes
-    acceleration = jnp.diff(place_px, 2, axis=0) + jnp.diff(jnp.asarray(window.targets.corner_px), 2, axis=0)
-    return Residuals(acceleration / (sd_px_s2 * window.frame_s**2), complete, student_t(dof, 2))
+    acceleration_px = window.place_acceleration_px
+    kernel = student_t(dof, acceleration_px.shape[-1])
+    return Residuals(acceleration_px / (sd_px_s2 * window.frame_s**2), complete, kernel)
 
 
 @term(positive=["sd_rad_s2", "dof"])

@@ -32,17 +32,43 @@ from jaxfit.objective.curvature import Rows, add_rows
 from jaxfit.raster.silhouette_reference import Blur, Skin
 
 
+class ViewMaps(eqx.Module):
+    """The V calibrated cameras that see a window, as affine maps to the frame of the crop camera.
+
+    The pose is then in a frame that all views share. A camera with intrinsic matrix K, which a crop changes to K' (in
+    crop pixels), and with pose R, t shows a point x at the pixel (K'·(R·x + t)) / z. With F and c the focal length and
+    the centre of the crop camera, the same pixel is F·(x', y')/z + c for x' = L·x + o, where
+    L = [[K'₀₀/F, K'₀₁/F, (K'₀₂ − c)/F], [0, K'₁₁/F, (K'₁₂ − c)/F], [0, 0, 1]] · R, and o the same matrix times t. So
+    keypoints, silhouettes and kernels need one camera only.
+    """
+
+    linear: Float[Array | np.ndarray, "*T V 3 3"]
+    """L of each frame and view."""
+    offset: Float[Array | np.ndarray, "*T V 3"]
+    """o of each frame and view, model units."""
+    px_per_unit: Float[Array | np.ndarray, "*windows"]
+    """Crop pixels of a model unit at the bird, mean over frames and views."""
+
+    def points(self, points: Float[Array, "T P 3"]) -> Float[Array, "T V P 3"]:
+        """Return points of the shared frame in the frames of the crop cameras."""
+        return jnp.einsum("tvij,tpj->tvpi", self.linear, points) + jnp.asarray(self.offset)[:, :, None]
+
+
 class Targets(eqx.Module):
-    """The observations of one bird in one window, in crop pixels; a batch has further leading axes."""
+    """The observations of one bird in one window, in crop pixels; a batch has further leading axes.
+
+    With several views, `mask` and `has_mask` have an axis V after T, and K counts the keypoints of all views: V groups
+    of the keypoints of the model.
+    """
 
     keypoints_px: Float[Array | np.ndarray, "*T K 2"]
     """Observed keypoints, crop pixels."""
     confidence: Float[Array | np.ndarray, "*T K"]
     """Confidence of each keypoint in [0, 1]; 0 where the keypoint was not observed."""
-    mask: UInt8[Array | np.ndarray, "*T H W"]
+    mask: UInt8[Array | np.ndarray, "*images H W"]
     """0, 1, or 2 where it is unknown whether the pixel shows the bird; of the silhouette's size, or empty in a stage
     that compares no masks."""
-    has_mask: Bool[Array | np.ndarray, "*T"]
+    has_mask: Bool[Array | np.ndarray, "*images"]
     """False where the frame has no mask; the mask terms skip such frames."""
     present: Bool[Array | np.ndarray, "*T"]
     """False where the bird was not observed; all terms skip such frames."""
@@ -51,6 +77,8 @@ class Targets(eqx.Module):
     between frames."""
     frame_s: Float[Array | np.ndarray, "*windows"]
     """Time between consecutive frames in seconds. A traced value: windows of any frame rate share a program."""
+    views: ViewMaps | None = None
+    """The cameras of several views; None for one view, whose pose is in the frame of the crop camera."""
 
 
 class Priors(NamedTuple):
@@ -101,6 +129,8 @@ class PosedWindow:
     """One window as the terms receive it: T frames of one bird. Posed quantities are computed on first access.
 
     Camera frame: x right, y down, z forward, of the crop camera, which follows the bird. Lengths are in model units.
+    With several views (`Targets.views`), the pose, and all that is named "camera frame", is in the frame that the views
+    share, at rest in the world. I is the number of images: T, or T·V with several views.
     """
 
     def __init__(
@@ -204,14 +234,31 @@ class PosedWindow:
         x_static = x_cam + (corner − corner of the first frame) · z / focal length, for x and y. If the filming camera
         is at rest, a point at rest in the world has a constant position here, up to the noise of the fit.
         """
+        if self.targets.views is not None:
+            return self.keypoints_cam
         x, z = self.keypoints_cam[..., :2], self.keypoints_cam[..., 2:]
         shift = jnp.asarray(self.targets.corner_px - self.targets.corner_px[:1])
         return jnp.concatenate([x + shift[:, None] * z / self.camera.focal_px, z], axis=-1)
 
     @cached_property
+    def place_acceleration_px(self) -> Float[Array, "T-2 axes"]:
+        """Acceleration of the bird, crop pixels per frame²: second differences of the projected translation (x, y),
+        with the movement of the crop added. With several views, those of the translation itself (x, y, z), times
+        `ViewMaps.px_per_unit`."""
+        views, transl = self.targets.views, jnp.asarray(self.pose.transl)
+        if views is not None:
+            return jnp.diff(transl, 2, axis=0) * views.px_per_unit
+        place_px = project(transl, self.camera)
+        # differences of the corner first: its values are large beside the changes
+        return jnp.diff(place_px, 2, axis=0) + jnp.diff(jnp.asarray(self.targets.corner_px), 2, axis=0)
+
+    @cached_property
     def keypoints_px(self) -> Float[Array, "T K 2"]:
-        """Posed keypoints, crop pixels."""
-        return project(self.keypoints_cam, self.camera)
+        """Posed keypoints, crop pixels; K counts the keypoints of all views."""
+        points = self.keypoints_cam
+        if self.targets.views is not None:
+            points = self.targets.views.points(points)
+        return project(points, self.camera).reshape(len(points), -1, 2)
 
     @cached_property
     def keypoint_jacobian_px(self) -> tuple[Float[Array, "T rows part"], ...]:
@@ -221,8 +268,13 @@ class PosedWindow:
         parameters `shared`.
         """
         scale = jnp.broadcast_to(self.pose.scale, self.pose.global_orient.shape[:1])
-        points = self.keypoints_cam
-        by_point = jax.vmap(jax.vmap(jax.jacfwd(lambda point_cam: project(point_cam, self.camera))))(points)
+        points, views = self.keypoints_cam, self.targets.views
+        slope = jax.jacfwd(lambda point_cam: project(point_cam, self.camera))
+        if views is None:
+            by_point = jax.vmap(jax.vmap(slope))(points)
+        else:  # the rows of all views of a keypoint are rows of one point
+            by_view = jax.vmap(jax.vmap(jax.vmap(slope)))(views.points(points))
+            by_point = jnp.einsum("tvkri,tvij->tkvrj", by_view, views.linear).reshape(*points.shape[:2], -1, 3)
         by_angles = window_keypoint_rows(self._rig, self._transforms, self.pose, by_point)
         unit = (points - self.pose.transl[:, None]) / scale[:, None, None]
         by_scale = jnp.sum(by_point * unit[..., None, :], axis=-1, keepdims=True)
@@ -230,26 +282,49 @@ class PosedWindow:
         by_shared = (
             by_point @ window_keypoint_derivatives(self._rig, self._transforms, self.pose, name) for name in self.shared
         )
-        rows = len(points), 2 * points.shape[1]
-        return tuple(block.reshape(*rows, -1) for block in (by_angles, by_place, *by_shared))
+        blocks = (by_angles, by_place, *by_shared)
+        if views is not None:  # keypoints of one view are neighbours, as in the targets
+            T, K, V = *points.shape[:2], views.linear.shape[1]
+            blocks = (block.reshape(T, K, V, 2, -1).swapaxes(1, 2) for block in blocks)
+        rows = len(points), self.keypoints_px.shape[1] * 2
+        return tuple(block.reshape(*rows, -1) for block in blocks)
 
     @cached_property
-    def vertices_screen(self) -> Float[Array, "T V 3"]:
+    def vertices_screen(self) -> Float[Array, "I V 3"]:
         """Posed vertices as (x, y) in pixels of the silhouette and depth z in the camera frame, for the raster core."""
-        screen = to_screen(window_vertices(self._rig, self._transforms, self.pose), self.camera)
+        vertices = window_vertices(self._rig, self._transforms, self.pose)
+        if self.targets.views is not None:
+            vertices = self.targets.views.points(vertices).reshape(-1, *vertices.shape[1:])
+        screen = to_screen(vertices, self.camera)
         ratio = self.raster.size_px / self.camera.size_px
         return screen if ratio == 1 else screen * jnp.array([ratio, ratio, 1.0])
 
     @cached_property
     def skin(self) -> Skin:
         """Derivatives of the vertices with respect to a row of `curvature.frame_rows`, in factors. Only `slope`
-        (T, J, 3, 4, D) and `shape_slope` (T, V, 3, S) have a leading frame axis."""
+        (I, J, 3, 4, D) and `shape_slope` (I, V, 3, S) have a leading axis of images."""
         rest = shaped_vertices(self._rig, self.pose)
         slope = window_transform_derivatives(self._rig, self._transforms, self.pose, "bone_length" in self.shared)
         shape_slope = jnp.zeros((*self.vertices_screen.shape, 0))
         if "betas" in self.shared:
             shape_slope = window_shape_derivatives(self._rig, self._transforms, self.pose)
+        views = self.targets.views
+        if views is not None:
+            slope = jnp.einsum("tvab,tjbcd->tvjacd", views.linear, slope).reshape(-1, *slope.shape[1:])
+            if shape_slope.shape[-1]:
+                shape_slope = jnp.einsum("tvab,tpbs->tvpas", views.linear, shape_slope)
+                shape_slope = shape_slope.reshape(-1, *shape_slope.shape[2:])
         return Skin(rest.T, self._rig.vertex_joints, self._rig.vertex_weights, slope, shape_slope)
+
+    @property
+    def mask(self) -> UInt8[Array | np.ndarray, "I H W"]:
+        """Masks of all images."""
+        return self.targets.mask.reshape(-1, *self.targets.mask.shape[-2:])
+
+    @property
+    def has_mask(self) -> Bool[Array | np.ndarray, "I"]:
+        """False for images without a mask."""
+        return self.targets.has_mask.reshape(-1)
 
     @property
     def faces(self):

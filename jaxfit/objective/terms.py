@@ -48,7 +48,9 @@ def _mask_curvature(window: PosedWindow) -> Curvature:
         return silhouette_gauss_newton(vertices_screen, window.faces, target, weight, skin, camera_px, **raster)
 
     skin = window.skin.slope, window.skin.shape_slope
-    blocks = jax.vmap(frame)(window.vertices_screen, window.targets.mask, _mask_weight(window), *skin)
+    blocks = jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window), *skin)
+    if window.targets.views is not None:
+        blocks = blocks.reshape(len(window.present), -1, *blocks.shape[1:]).sum(axis=1)
 
     def product(d: Rows) -> Rows:
         return jnp.einsum("tij,tj->ti", blocks, d)
@@ -84,12 +86,12 @@ def _mask(window: PosedWindow, kind: Kind) -> Scalar:
     def frame(vertices_screen, target, weight):
         return mask_loss(vertices_screen, window.faces, target, weight, kind=kind, **raster)
 
-    return jnp.sum(jax.vmap(frame)(window.vertices_screen, window.targets.mask, _mask_weight(window)))
+    return jnp.sum(jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window)))
 
 
-def _mask_weight(window: PosedWindow) -> Float[Array, "T"]:
-    """Return the area of a pixel of the silhouette in crop pixels, 0 for frames without a mask."""
-    return jnp.asarray(window.targets.has_mask, jnp.float32) * (window.camera.size_px / window.raster.size_px) ** 2
+def _mask_weight(window: PosedWindow) -> Float[Array, "I"]:
+    """Return the area of a pixel of the silhouette in crop pixels, 0 for images without a mask."""
+    return jnp.asarray(window.has_mask, jnp.float32) * (window.camera.size_px / window.raster.size_px) ** 2
 
 
 @term
@@ -110,6 +112,20 @@ def bone_prior(window: PosedWindow) -> Residuals:
     Source: Badger et al. 2020, bone-length prior.
     """
     return Residuals(window.priors.bone_whitener @ (window.pose.bone_length - window.priors.bone_mean))
+
+
+@term(positive=["sd_log"])
+def size_prior(window: PosedWindow, *, sd_log: Scalar | float = 0.05) -> Residuals:
+    """Penalise sizes that are improbable for the species: E = mean_t (log s_t / sd)², with s the scale.
+
+    A fit of several views estimates the size, and the term matters only where one view sees the bird. `sd_log` is the
+    relative standard deviation of lengths of adults: 5 % or less in most species of birds.
+
+    Source: ours; a log-normal size, Huxley 1932, *Problems of Relative Growth*.
+    """
+    present = jnp.asarray(window.present, jnp.float32)
+    scale = jnp.broadcast_to(jnp.maximum(jnp.asarray(window.pose.scale), 1e-3), present.shape)
+    return Residuals(jnp.log(scale)[:, None] / sd_log, present / jnp.maximum(jnp.sum(present), 1.0))
 
 
 @term

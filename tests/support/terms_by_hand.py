@@ -231,6 +231,9 @@ def oracle(name, pose, anchor, targets, seed):
     betas = np.asarray(pose.betas, np.float64)
     if name == "bone_prior":
         total = mahalanobis(pose.bone_length, BIRD.bone_mean, BIRD.bone_covariance)
+    elif name == "size_prior":
+        log_sizes = np.log(np.broadcast_to(np.asarray(pose.scale, np.float64), T))[np.asarray(targets.present)]
+        total = ((log_sizes / 0.05) ** 2).mean()
     elif name == "shape_prior":
         total = (betas**2 / np.asarray(BIRD.shape_variance)).sum()
     elif name == "shape_norm":
