@@ -192,6 +192,10 @@ def prepare_frames(
 
     Pictures of several sizes lie in the upper left corners of frames of the largest size.
 
+    DeepLabCut and SLEAP have no other mark for a hidden keypoint than a missing label. So a keypoint without a label is
+    not visible, and the network learns to give it no confidence, unless the labels mark hidden keypoints (visibility
+    1), or no bird has a label of this keypoint: then the keypoint is `UNKNOWN`.
+
     Args:
         folder: the folder.
         pictures: the pictures and their labels.
@@ -207,6 +211,8 @@ def prepare_frames(
     S, K, N = len(pictures), len(names), max(1, *(len(picture.labels.birds) for picture in pictures))
     points, visibility = np.zeros((S, N, K, 2), np.float32), np.zeros((S, N, K), np.uint8)
     per_unit = np.zeros(S, np.float32)
+    given = [bird.visibility for picture in pictures for bird in picture.labels.birds] or [np.zeros(K)]
+    without_label = np.where((np.max(given, 0) > 0) & ~(np.array(given) == 1).any(), 0, UNKNOWN)
     with new_folder(folder, overwrite=True, marker=MARKER) as part:
         stored, owner = create_pictures(part, S, height, width)
         for s, (picture, _) in enumerate(pictures):
@@ -220,7 +226,7 @@ def prepare_frames(
             per_unit[s] = factor * scale.pixels_per_unit(network, picture.size_px)
             for n, bird in enumerate(picture.birds):
                 points[s, n] = bird.keypoints_px * (w / picture.size_px[0], h / picture.size_px[1])
-                visibility[s, n] = np.where(bird.visibility > 0, bird.visibility, UNKNOWN)
+                visibility[s, n] = np.where(bird.visibility > 0, bird.visibility, without_label)
         del stored, owner  # writes the memory-mapped files
         save_labels(part, points, visibility, per_unit, names)
     return load_frames(folder)

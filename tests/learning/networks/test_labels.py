@@ -129,6 +129,16 @@ def test_keypoints_without_a_label_do_not_count(tmp_path):
     assert (data.frames.owner[0] == 2).sum() == 1600  # a bird without a mask has its box
 
 
+def test_keypoints_that_are_left_out_are_not_visible(tmp_path):
+    """Labels without marks of hidden keypoints leave hidden keypoints out; a keypoint without any label is unknown."""
+    names = ["beak", "tail", "wingL", "wingR", "crown"]
+    shown = [45, 35, 2, 65, 55, 2, 50, 40, 2, 0, 0, 0, 0, 0, 0]
+    other = [45, 35, 2, 65, 55, 2, 0, 0, 0, 60, 40, 2, 0, 0, 0]
+    frames = {t: [bird(keypoints=other if t else shown)] for t in TIMES}
+    data = prepared(tmp_path, coco(frames, names), "keypoints")
+    assert data.frames.visibility[:2, 0].tolist() == [[2, 2, 2, 0, UNKNOWN], [2, 2, 0, 2, UNKNOWN]]
+
+
 def test_unusable_label_files(tmp_path):
     content = coco({t: [bird()] for t in TIMES})
     with pytest.raises(InputError, match=r"no picture of the labels is beside the labels.*--images"):
