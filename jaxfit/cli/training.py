@@ -18,6 +18,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.files import check_new_file
 from jaxfit.foundation.progress import terminal
+from jaxfit.learning.networks.ranges import check_numbers
 
 if TYPE_CHECKING:
     from jaxfit.learning.networks.fine_tune import FineTuned
@@ -48,13 +49,18 @@ _COLUMNS = {"base": "base network", "rescaled": "base, new scale", "trained": "t
 
 def train(options: argparse.Namespace) -> None:
     """Train one network and write the network as an ONNX file: on labels, or on simulated footage only."""
+    has_labels = bool(options.labels or options.video)
+    if options.scenes is None:
+        options.scenes = LABEL_SCENES if has_labels else BUILTIN_SCENES
+    shares = {"holdout": options.holdout} if has_labels else {"varied": options.varied, "wings": options.wings}
+    check_numbers(has_labels, options.steps, options.scenes, **shares)  # before the imports, which take seconds
     require_extra("train", "train")
     check_new_file(options.out, options.overwrite)
     if options.video and options.labels:
         raise InputError("--video", "is given with labels", "give the film of the labels by --images")
     if options.video and options.network != "segmenter":
         raise InputError("--video", "is given for keypoints", "a teacher makes masks: give labels by --labels")
-    if options.labels or options.video:
+    if has_labels:
         if options.encoder:
             raise InputError("--encoder", "is given with labels", "give the network to start from by --base")
         _train_on_labels(options)
@@ -75,8 +81,7 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
     if options.steps is not None:
         schedule = schedule._replace(steps=options.steps)
     folder = options.frames or Path("training_frames")
-    scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
-    simulation = Simulation(folder, scenes, options.varied, options.wings)
+    simulation = Simulation(folder, options.scenes, options.varied, options.wings)
     what = options.network, options.out, simulation, schedule, options.seed, terminal, options.encoder, options.base
     losses = train_network(*what)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
@@ -98,10 +103,10 @@ def _train_on_labels(options: argparse.Namespace) -> None:
         files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)
     steps = options.steps
     schedule = None if steps is None else default_schedule(options.network, 0)._replace(steps=steps)
-    scenes = LABEL_SCENES if options.scenes is None else options.scenes
+    scenes = options.scenes
     settings = Settings(options.base or "builtin", options.holdout, scenes, schedule, options.seed, teacher)
     frames = options.frames or Path("simulated_frames")
-    missing = missing_scenes(frames, scenes) if scenes > 0 else 0
+    missing = missing_scenes(frames, scenes) if scenes else 0
     if missing:
         simulated = f"{100 * (1 - LABELLED_SHARE):.0f} %"
         show(
@@ -141,8 +146,9 @@ def _show_result(result: FineTuned) -> None:
     show(f"{training} for the training, {parts['holdout']} held out, {parts['gap']} in between ({result.rule})")
     if result.teacher:
         show(result.teacher)
-    if result.new_keypoints:
-        show(f"new keypoints, which the base network lacks: {', '.join(result.new_keypoints)}")
+    if any(name != base for name, base in result.names.items()):
+        starts = ", ".join(f"{name} from {base or 'new weights'}" for name, base in result.names.items())
+        show(f"keypoints start from those of the base network: {starts}")
     if not result.accuracy:
         show("nothing is held out, so the accuracy of the network is unknown")
         return

@@ -13,8 +13,9 @@ uses the scales around this scale.
 from __future__ import annotations
 
 import hashlib
+import logging
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -52,6 +53,8 @@ from jaxfit.learning.networks.teacher import Tracked, track_labels
 from jaxfit.perception.keypoints import CropSettings
 from jaxfit.perception.network import Segmenter
 from jaxfit.perception.segmentation import LONGER_SIDE_PX, MULTIPLE
+
+_logger = logging.getLogger(__name__)
 
 GAP_FRAMES = 25
 """Pictures that are nearer to a held-out picture of their video, in frames, belong to neither part."""
@@ -300,6 +303,7 @@ def prepare_data(
     labels: LabelSet | None = None,
     progress: ProgressTask = silent,
     teacher: Segmenter | None = None,
+    pictures_are_read: Callable[[], object] = lambda: None,
 ) -> FineTuningData:
     """Read and check labels, store their pictures in a folder, and hold out a part.
 
@@ -312,6 +316,7 @@ def prepare_data(
         labels: the labels, if they are read already.
         progress: reports progress.
         teacher: tracks the masks of a segmenter's labels to other frames of their films; None for labels only.
+        pictures_are_read: is called when all labels and pictures are read and reported.
 
     Raises:
         InputError: labels or pictures cannot be read, or too few labels can be used.
@@ -337,6 +342,11 @@ def prepare_data(
         stored = [StoredPicture(own, picture.file) for picture, own in pairs if own.birds]
     stored.sort(key=lambda picture: (files.labels.index(picture.labels.source), picture.labels.frame))
     _check_count(stored, left_out, files, network)
+    unused = [label for label in left_out if not label.bird]
+    if unused:
+        text = "%d of %d labelled pictures are not used, for example %s"
+        _logger.warning(text, len(unused), len(labels.pictures), unused[0])
+    pictures_are_read()
     tracked = Tracked([], [], 0, [])
     if teacher is not None:
         shutil.rmtree(folder / TRACKED, ignore_errors=True)
