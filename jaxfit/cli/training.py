@@ -49,18 +49,13 @@ _COLUMNS = {"base": "base network", "rescaled": "base, new scale", "trained": "t
 
 def train(options: argparse.Namespace) -> None:
     """Train one network and write the network as an ONNX file: on labels, or on simulated footage only."""
-    has_labels = bool(options.labels or options.video)
-    if options.scenes is None:
-        options.scenes = LABEL_SCENES if has_labels else BUILTIN_SCENES
-    shares = {"holdout": options.holdout} if has_labels else {"varied": options.varied, "wings": options.wings}
-    check_numbers(has_labels, options.steps, options.scenes, **shares)  # before the imports, which take seconds
     require_extra("train", "train")
     check_new_file(options.out, options.overwrite)
     if options.video and options.labels:
         raise InputError("--video", "is given with labels", "give the film of the labels by --images")
     if options.video and options.network != "segmenter":
         raise InputError("--video", "is given for keypoints", "a teacher makes masks: give labels by --labels")
-    if has_labels:
+    if options.labels or options.video:
         if options.encoder:
             raise InputError("--encoder", "is given with labels", "give the network to start from by --base")
         _train_on_labels(options)
@@ -74,6 +69,9 @@ def train(options: argparse.Namespace) -> None:
 
 
 def _train_on_simulation(options: argparse.Namespace) -> None:
+    scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
+    # before the imports, which take seconds
+    check_numbers(False, options.steps, scenes, varied=options.varied, wings=options.wings)
     from jaxfit.learning.networks.train import Simulation, default_schedule, train_network
 
     start = time.perf_counter()
@@ -81,7 +79,7 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
     if options.steps is not None:
         schedule = schedule._replace(steps=options.steps)
     folder = options.frames or Path("training_frames")
-    simulation = Simulation(folder, options.scenes, options.varied, options.wings)
+    simulation = Simulation(folder, scenes, options.varied, options.wings)
     what = options.network, options.out, simulation, schedule, options.seed, terminal, options.encoder, options.base
     losses = train_network(*what)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
@@ -89,6 +87,8 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
 
 
 def _train_on_labels(options: argparse.Namespace) -> None:
+    scenes = LABEL_SCENES if options.scenes is None else options.scenes
+    check_numbers(True, options.steps, scenes, holdout=options.holdout)  # before the imports, which take seconds
     from jaxfit.learning.networks.filming import missing_scenes
     from jaxfit.learning.networks.fine_tune import LABELLED_SHARE, Settings, default_schedule, fine_tune
     from jaxfit.learning.networks.label_data import LabelFiles
@@ -103,7 +103,6 @@ def _train_on_labels(options: argparse.Namespace) -> None:
         files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)
     steps = options.steps
     schedule = None if steps is None else default_schedule(options.network, 0)._replace(steps=steps)
-    scenes = options.scenes
     settings = Settings(options.base or "builtin", options.holdout, scenes, schedule, options.seed, teacher)
     frames = options.frames or Path("simulated_frames")
     missing = missing_scenes(frames, scenes) if scenes else 0

@@ -113,13 +113,15 @@ def comparable_boxes(detected: Observations, truth: Truth) -> tuple[Observations
     """
     seen = truth.observations
     names = [name for name in seen.keypoint_names if name in detected.keypoint_names]
+    if seen.masks or len(names) < LEAST_KEYPOINTS:
+        return detected, truth
     _, at, own_at = np.intersect1d(seen.frame_index, detected.frame_index, return_indices=True)
     k, own_k = ([each.keypoint_names.index(name) for name in names] for each in (seen, detected))
     labelled = seen.confidence > 0
     known = labelled[:, :, k]
     is_own = np.isclose(seen.box_px, box_of_keypoints(seen.keypoints_px, labelled), atol=LARGEST_ROUNDING_PX).all(-1)
     is_own &= known.sum(-1) >= LEAST_KEYPOINTS
-    if seen.masks or not is_own.any():
+    if not is_own.any():
         return detected, truth
     box_px = np.where(is_own[..., None], box_of_keypoints(seen.keypoints_px[:, :, k], known), seen.box_px)
     own_box_px = detected.box_px.copy()
