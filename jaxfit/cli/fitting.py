@@ -113,7 +113,7 @@ def evaluate(options: argparse.Namespace) -> None:
     if options.plot and not options.calibration:
         raise InputError("--plot", "is given without --calibration", "add --calibration, or remove --plot")
     if os.path.isfile(options.result):  # noqa: PTH113 - False for paths that cannot exist
-        for option, given in (("--by", options.by), ("--calibration", options.calibration)):
+        for option, given in (("--by behaviour", options.by == "behaviour"), ("--calibration", options.calibration)):
             if given:
                 remedy = f"give the folder of a result, or remove {option}"
                 raise InputError(options.result, f"holds observations, for which there are no tables {option}", remedy)

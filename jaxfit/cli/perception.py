@@ -158,4 +158,8 @@ def suggest_frames(options: argparse.Namespace) -> None:
     reasons = ", ".join(f"{reason} {number}" for reason, number in Counter(f.reason for f in done.frames).most_common())
     birds = counted(int(done.observations.present.sum()), "bird")
     show(f"{counted(len(done.frames), 'frame')} with {birds} ({reasons}) → {options.out}")
+    if not done.observations.num_tracks:
+        names = ", ".join(done.observations.keypoint_names) or "no keypoints"
+        other = "your keypoints have other names, add them in the labelling program (DeepLabCut: the bodyparts and "
+        show(f"the files have no labels and name {names}; if {other}individuals of config.yaml)")
     show(f"{options.out / 'README.txt'} says how to correct the labels and how to read them again")

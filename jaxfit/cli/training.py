@@ -18,6 +18,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.files import check_new_file
 from jaxfit.foundation.progress import terminal
+from jaxfit.learning.networks.ranges import check_numbers
 
 if TYPE_CHECKING:
     from jaxfit.learning.networks.fine_tune import FineTuned
@@ -68,6 +69,9 @@ def train(options: argparse.Namespace) -> None:
 
 
 def _train_on_simulation(options: argparse.Namespace) -> None:
+    scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
+    # before the imports, which take seconds
+    check_numbers(False, options.steps, scenes, varied=options.varied, wings=options.wings)
     from jaxfit.learning.networks.train import Simulation, default_schedule, train_network
 
     start = time.perf_counter()
@@ -75,7 +79,6 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
     if options.steps is not None:
         schedule = schedule._replace(steps=options.steps)
     folder = options.frames or Path("training_frames")
-    scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
     simulation = Simulation(folder, scenes, options.varied, options.wings)
     what = options.network, options.out, simulation, schedule, options.seed, terminal, options.encoder, options.base
     losses = train_network(*what)
@@ -84,6 +87,8 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
 
 
 def _train_on_labels(options: argparse.Namespace) -> None:
+    scenes = LABEL_SCENES if options.scenes is None else options.scenes
+    check_numbers(True, options.steps, scenes, holdout=options.holdout)  # before the imports, which take seconds
     from jaxfit.learning.networks.filming import missing_scenes
     from jaxfit.learning.networks.fine_tune import LABELLED_SHARE, Settings, default_schedule, fine_tune
     from jaxfit.learning.networks.label_data import LabelFiles
@@ -98,10 +103,9 @@ def _train_on_labels(options: argparse.Namespace) -> None:
         files = LabelFiles(tuple(options.labels), tuple(options.images or ()), options.masks)
     steps = options.steps
     schedule = None if steps is None else default_schedule(options.network, 0)._replace(steps=steps)
-    scenes = LABEL_SCENES if options.scenes is None else options.scenes
     settings = Settings(options.base or "builtin", options.holdout, scenes, schedule, options.seed, teacher)
     frames = options.frames or Path("simulated_frames")
-    missing = missing_scenes(frames, scenes) if scenes > 0 else 0
+    missing = missing_scenes(frames, scenes) if scenes else 0
     if missing:
         simulated = f"{100 * (1 - LABELLED_SHARE):.0f} %"
         show(
@@ -141,8 +145,9 @@ def _show_result(result: FineTuned) -> None:
     show(f"{training} for the training, {parts['holdout']} held out, {parts['gap']} in between ({result.rule})")
     if result.teacher:
         show(result.teacher)
-    if result.new_keypoints:
-        show(f"new keypoints, which the base network lacks: {', '.join(result.new_keypoints)}")
+    if any(name != base for name, base in result.names.items()):
+        starts = ", ".join(f"{name} from {base or 'new weights'}" for name, base in result.names.items())
+        show(f"keypoints start from those of the base network: {starts}")
     if not result.accuracy:
         show("nothing is held out, so the accuracy of the network is unknown")
         return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
@@ -13,15 +14,18 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 from scipy.optimize import linear_sum_assignment
 
+from jaxfit.data.masks import box_iou, box_of_keypoints
 from jaxfit.data.observations import Observations
 from jaxfit.evaluation import metrics
-from jaxfit.evaluation.truth import Truth
+from jaxfit.evaluation.truth import LEAST_KEYPOINTS, Truth
 from jaxfit.foundation.errors import InputError
 
 MATCH_IOU = 0.5
 """Least IoU at which a detected bird matches a true bird."""
 LEAST_VISIBLE = 0.05
 """Ground-truth birds with a smaller visible fraction of the usual area of their track are ignored."""
+LARGEST_ROUNDING_PX = 1.0
+"""Largest difference between the box of a bird's keypoints and the box in a file of labels."""
 _REMEDY = "give the annotations of the same video"
 
 
@@ -97,6 +101,38 @@ def overlap(detected: Observations, truth: Truth | Observations) -> Overlap:
     iou = np.where(excused[:, None], 0.0, iou)
     kind = "masks" if masks else "boxes"
     return Overlap(at_truth, at_detected, true, present & hidden, counted & ~excused, excused, iou, kind)
+
+
+def comparable_boxes(detected: Observations, truth: Truth) -> tuple[Observations, Truth]:
+    """Return both with boxes around the same keypoints, where labelled birds have boxes of keypoints and no masks.
+
+    Labels of keypoint programs have the box of the visible keypoints, which is smaller than the box of the mask of the
+    detected bird. Such a labelled bird gets the box of its labelled keypoints that the detections name, at least
+    ``LEAST_KEYPOINTS``. A detected bird gets the box of the same keypoints of the labelled bird that it agrees with
+    best. All other boxes stay, and so do boxes that a person drew.
+    """
+    seen = truth.observations
+    names = [name for name in seen.keypoint_names if name in detected.keypoint_names]
+    if seen.masks or len(names) < LEAST_KEYPOINTS:
+        return detected, truth
+    _, at, own_at = np.intersect1d(seen.frame_index, detected.frame_index, return_indices=True)
+    k, own_k = ([each.keypoint_names.index(name) for name in names] for each in (seen, detected))
+    labelled = seen.confidence > 0
+    known = labelled[:, :, k]
+    is_own = np.isclose(seen.box_px, box_of_keypoints(seen.keypoints_px, labelled), atol=LARGEST_ROUNDING_PX).all(-1)
+    is_own &= known.sum(-1) >= LEAST_KEYPOINTS
+    if not is_own.any():
+        return detected, truth
+    box_px = np.where(is_own[..., None], box_of_keypoints(seen.keypoints_px[:, :, k], known), seen.box_px)
+    own_box_px = detected.box_px.copy()
+    for n in range(detected.num_tracks):
+        both = known[:, at] & (detected.confidence[n, own_at][:, own_k] > 0)
+        points_px = np.broadcast_to(detected.keypoints_px[n, own_at][:, own_k], (*both.shape, 2))
+        boxes_px = box_of_keypoints(points_px, both)
+        iou = np.nan_to_num(box_iou(boxes_px, box_px[:, at])) * is_own[:, at]
+        best = iou.argmax(0), np.arange(len(at))
+        own_box_px[n, own_at] = np.where(iou[best][:, None] > 0, boxes_px[best], own_box_px[n, own_at])
+    return replace(detected, box_px=own_box_px), replace(truth, observations=replace(seen, box_px=box_px))
 
 
 def assign(

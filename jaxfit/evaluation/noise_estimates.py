@@ -17,7 +17,7 @@ from jaxfit.config.fit import FitConfig
 from jaxfit.data.keypoint_names import opposite_keypoints
 from jaxfit.data.masks import decode_mask
 from jaxfit.data.observations import FrameMasks, Observations
-from jaxfit.evaluation.detection import matches, overlap
+from jaxfit.evaluation.detection import comparable_boxes, matches, overlap
 from jaxfit.evaluation.truth import Truth
 from jaxfit.fitting.crops import cut_mask, mark_unknown
 from jaxfit.fitting.windows import cut_windows
@@ -67,7 +67,7 @@ def labelled_pairs(detected: Observations, truth: Truth, config: FitConfig, sour
         InputError: as `overlap`; or no labelled bird matches a detected bird that a fit uses.
     """
     labels = truth.observations
-    both = overlap(detected, truth)
+    both = overlap(*comparable_boxes(detected, truth))
     i, m, n = matches(both).T
     t, s = both.true_frame[i], both.detected_frame[i]
     crops = _crops(detected, config)

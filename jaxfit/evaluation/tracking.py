@@ -19,6 +19,7 @@ from jaxfit.evaluation.detection import (
     KeypointRow,
     assign,
     average_precision,
+    comparable_boxes,
     keypoint_accuracy,
     matches,
     overlap,
@@ -159,15 +160,16 @@ class ObservationsEvaluation:
     counts: dict[str, int]
     """``frames``: compared frames. Pairs of bird and frame: ``true`` and ``detected`` count; ``ignored`` and
     ``excused`` do not count; ``true_elsewhere`` and ``detected_elsewhere`` are in frames that the other file lacks."""
-    compared: Literal["masks", "boxes"]
+    compared: Literal["masks", "boxes", "boxes of labelled keypoints"]
     """The regions of the IoU."""
 
 
 def evaluate_observations(observations: Observations, truth: Truth | Observations) -> ObservationsEvaluation:
     """Compare the detected birds of a video with annotations of the video, over the frames that both files hold.
 
-    Birds match one-to-one by the IoU of their visible masks, from 0.5 on. ``overlap`` also defines the ignored birds,
-    ``detection`` and ``tracking`` define the metrics.
+    Birds match one-to-one by the IoU of their visible masks, from 0.5 on; without masks, of their boxes as
+    ``comparable_boxes`` defines them. ``overlap`` also defines the ignored birds, ``detection`` and ``tracking`` define
+    the metrics.
 
     Args:
         observations: detected birds; their track ids are arbitrary.
@@ -177,9 +179,10 @@ def evaluate_observations(observations: Observations, truth: Truth | Observation
         InputError: no common frame, frames of different sizes, or photographs instead of video.
     """
     truth = Truth.of(truth)
-    both = overlap(observations, truth)
+    boxed, true_boxed = comparable_boxes(observations, truth)
+    both = overlap(boxed, true_boxed)
     pairs = matches(both)
-    ap50, ap = average_precision(observations, truth.observations, both)
+    ap50, ap = average_precision(boxed, true_boxed.observations, both)
     true, detected = int(both.true.sum()), int(both.detected.sum())
     birds = (both.iou, both.true, both.detected)
     return ObservationsEvaluation(
@@ -201,7 +204,7 @@ def evaluate_observations(observations: Observations, truth: Truth | Observation
             "true_elsewhere": _elsewhere(truth.observations, both.true_frame),
             "detected_elsewhere": _elsewhere(observations, both.detected_frame),
         },
-        both.kind,
+        both.kind if boxed is observations else "boxes of labelled keypoints",
     )
 
 

@@ -114,7 +114,7 @@ def read_behaviours(path: str | Path) -> dict[int, list[tuple[int, str]]] | None
 
 LEAST_IOU = 0.5
 """A track and a bird agree in a frame where the boxes of their keypoints have at least this IoU."""
-_LEAST_KEYPOINTS = 3
+LEAST_KEYPOINTS = 3
 """Fewest annotated keypoints of a box."""
 
 
@@ -215,7 +215,7 @@ def match_by_overlap(solution: Solution, truth: Truth | Observations) -> dict[in
         raise InputError(truth.source, "holds photographs, in which no bird can be followed", remedy)
     _, at_truth, at_own = np.intersect1d(seen.frame_index, solution.frame_index, return_indices=True)
     annotated = seen.confidence[:, at_truth] > 0
-    has_box = annotated.sum(-1) >= _LEAST_KEYPOINTS
+    has_box = annotated.sum(-1) >= LEAST_KEYPOINTS
     boxes_px = box_of_keypoints(seen.keypoints_px[:, at_truth], annotated)
     agree = np.zeros((len(solution.track_id), seen.num_tracks), int)
     for n, keypoints in enumerate(solution.keypoints_px[:, at_own]):

@@ -171,7 +171,7 @@ def write_labels(observations: Observations, video: Path, folder: Path, final: P
     for picture in pictures:
         _link(folder / IMAGES / picture, deeplabcut / picture)
     write_deeplabcut_labels(named, pictures, deeplabcut, scorer)
-    birds = ", ".join(f"bird{track}" for track in named.track_id[named.present.any(1)].tolist()) or "none"
+    birds = ", ".join(f"bird{track}" for track in named.track_id[named.present.any(1)].tolist()) or "bird1"
     facts = {"video": one_line(video.name), "count": len(pictures), "out": one_line(final), "birds": birds}
     write_whole(folder / "README.txt", _README.format(**facts, folder=_stem(video), scorer=scorer).encode())
 

@@ -35,6 +35,14 @@ def test_tables(tmp_path, capsys):
     assert "not counted: 1 hardly visible bird\n" in printed
 
 
+def test_by_keypoint(tmp_path, capsys):
+    """The tables of observations have the keypoints, but no behaviours."""
+    assert cli.main([*files(tmp_path), "--by", "keypoint"]) == 0
+    assert "bill" in capsys.readouterr().out
+    assert cli.main([*files(tmp_path), "--by", "behaviour"]) == 2
+    assert "no tables --by behaviour" in " ".join(capsys.readouterr().err.split())
+
+
 def test_json(tmp_path, capsys):
     assert cli.main([*files(tmp_path), "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)

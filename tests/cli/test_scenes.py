@@ -52,7 +52,7 @@ def test_metrics_by_behaviour_and_keypoint(scene, capsys):
     command[3] = str(scene / "truth.json")
     rejected(capsys, [*command, "behaviour"], "truth.json", "holds no behaviours of the birds", "--by behaviour")
     command[1] = str(scene / "detections.json")
-    rejected(capsys, [*command, "keypoint"], "detections.json", "holds observations")
+    rejected(capsys, [*command, "behaviour"], "detections.json", "holds observations")
 
 
 def test_an_overlay_of_the_truth(scene, tmp_path, capsys):

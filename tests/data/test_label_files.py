@@ -217,12 +217,13 @@ def test_a_sleap_frame_outside_the_list_of_pictures(tmp_path):
 
 
 def test_labels_without_birds(tmp_path):
-    """The files of a video without birds can be written; a file without labels is rejected when it is read."""
+    """The files of a video without birds have the names of the keypoints, or are rejected when they are read."""
     empty = labelled_birds().select(tracks=[])
     for kind in KINDS:
         path = write_label_file(kind, empty, tmp_path)
-        if kind in ("coco", "cvat"):
+        if kind in ("coco", "cvat", "deeplabcut csv", "deeplabcut h5"):
             assert read(path).num_tracks == 0
+            assert read(path).keypoint_names == NAMES
         else:
             with pytest.raises(InputError):
                 read(path)

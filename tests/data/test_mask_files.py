@@ -1,6 +1,7 @@
 """Masks of pictures and COCO files go to the birds whose keypoints they cover."""
 
 import json
+from contextlib import contextmanager
 
 import cv2
 import numpy as np
@@ -55,7 +56,27 @@ def test_masks_that_cover_no_bird_are_not_used(tmp_path, birds):
     (tmp_path / "m").mkdir()
     for t in range(T):
         cv2.imwrite(str(tmp_path / "m" / f"{t}.png"), halves(0, 9) if t else np.zeros((100, 120), np.uint8))
-    assert add_masks(birds, tmp_path / "m").masks.keys() == {(1, t) for t in range(1, T)}
+    notes = []
+
+    @contextmanager
+    def progress(_name, _total):
+        yield lambda _done, note: notes.append(note)
+
+    assert add_masks(birds, tmp_path / "m", progress).masks.keys() == {(1, t) for t in range(1, T)}
+    assert notes[-1] == "3 of 8 labelled birds have a mask"
+
+
+@pytest.mark.parametrize(("outside_px", "found"), [(1, True), (12, False)])
+def test_keypoints_on_the_outline_belong_to_the_mask(tmp_path, outside_px, found):
+    """Bill and tail lie on the outline, so a mask that is a little too small covers none of them."""
+    path = write_csv(tmp_path / "a.csv", ("b1", "b2"), ("x", "y"))
+    observed = read_observations(path, size_px=SIZE).select(tracks=[0])
+    points = np.array([[30, 10 - outside_px], [30, 90 + outside_px], [10 - outside_px, 50]]) - 0.5
+    observed = observed.with_keypoints(np.broadcast_to(points, (1, T, 3, 2)), observed.confidence)
+    mask = np.zeros((100, 120), np.uint8)
+    mask[10:90, 10:50] = 255
+    cv2.imwrite(str(tmp_path / "0.png"), mask)
+    assert bool(add_masks(observed, tmp_path).masks) == found
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,15 @@ def test_predictions_of_a_project(tmp_path):
     np.testing.assert_allclose(observed.score, 0.9, atol=1e-6)
 
 
+def test_the_box_holds_all_points_that_sleap_keeps(tmp_path):
+    """SLEAP removes points by a threshold of 0.2, and good points have scores below 0.6."""
+    parts = project()
+    parts["pred_points"]["score"] = np.tile([0.7, 0.25, 0.1], 2 * T)
+    observed = read_observations(write_project(tmp_path / "birds.slp", parts))
+    low, high = XY[:, :, :2].min(2), XY[:, :, :2].max(2)
+    np.testing.assert_allclose(observed.box_px, np.concatenate([low, high - low], -1), atol=1e-4)
+
+
 def test_labels_replace_predictions(tmp_path):
     """A label of the same track, or made from a prediction, replaces this prediction; invisible points are missing."""
     parts = project()

@@ -76,6 +76,25 @@ WHOLE = (10, 10, 50, 20)
 """1000 px, of which 5 % are 50 px."""
 
 
+def test_labels_of_keypoints_are_compared_by_boxes_of_the_same_keypoints():
+    """The box of labelled keypoints is smaller than that of the mask, and hidden keypoints have no label."""
+    names = ("bill", "eye", "tail", "far wing")
+    truth = birds({1: {0: HERE}, 2: {0: THERE}}, [0], masks=False, names=names)
+    points = truth.keypoints_px.copy()
+    boxes = np.concatenate([points[:, :, 0], points[:, :, 2] - points[:, :, 0]], -1)
+    truth = dataclasses.replace(truth.with_keypoints(points, truth.confidence * [1, 1, 1, 0]), box_px=boxes)
+    points[:, :, 3] += 25
+    found = birds({7: {0: (50, 5, 50, 50)}, 5: {0: (0, 5, 50, 50)}}, [0], names=names)
+    found = found.with_keypoints(points[::-1], np.ones((2, 1, 4), np.float32))
+    result = evaluate_observations(found, truth)
+    assert result.detection == PERFECT
+    assert result.compared == "boxes of labelled keypoints"
+    assert result.keypoints["all"] == (6, 1, 1, 6, 1, 1)
+    drawn = dataclasses.replace(truth, box_px=found.box_px[::-1])  # the boxes of a person stay
+    assert evaluate_observations(found, drawn).detection == PERFECT
+    assert evaluate_observations(found, drawn).compared == "boxes"
+
+
 @pytest.mark.parametrize(
     ("visible", "ignored"),
     [((10, 10, 7, 7), 1), ((10, 10, 10, 5), 0), (None, 1)],

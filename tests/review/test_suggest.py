@@ -116,10 +116,18 @@ def later_frames(observations):
     return dataclasses.replace(observations, frame_index=np.arange(FRAMES) + 5)
 
 
-def test_empty_labels(footage, tmp_path):
-    """Labels of a network that does not know the footage can be left out."""
+def test_empty_labels(footage, tmp_path, capsys):
+    """Labels of a network that does not know the footage can be left out; the header has the names of the keypoints."""
     _, video, birds = footage
+    command = ["suggest", str(video), "--result", str(birds), "--count", "3", "--empty", "--out", str(tmp_path / "a")]
+    assert main(command) == 0
+    assert f"name {', '.join(BIRD.keypoint_names)}; if your keypoints" in " ".join(capsys.readouterr().out.split())
     done = suggest(video, tmp_path / "label", 4, birds, CONFIG, empty=True)
+    (table,) = (tmp_path / "label").glob("deeplabcut/labeled-data/*/CollectedData_jaxfit.csv")
+    _, individuals, names, *_, row = csv.reader(table.open())
+    assert individuals[3:] == ["bird1"] * 2 * BIRD.num_keypoints
+    assert names[3::2] == list(BIRD.keypoint_names)
+    assert set(row[3:]) == {""}
     assert all(frame.birds for frame in done.frames)
     assert not done.observations.num_tracks
     assert len(read_coco(tmp_path / "label" / "coco.json").frame_index) == 4

@@ -19,7 +19,7 @@ from jaxfit.foundation.limits import CONFIDENCE, NAME_CHARACTERS, TABLE_BIRDS, T
 _log = logging.getLogger(__name__)
 
 CERTAIN = 0.6
-"""Keypoints from this confidence on determine the box of a bird; DeepLabCut draws keypoints from 0.6 on."""
+"""Confidence of a keypoint that is certain; DeepLabCut draws keypoints from 0.6 on."""
 _OUTSIDE = 0.2
 """Largest accepted fraction of certain keypoints outside their image."""
 
@@ -46,6 +46,8 @@ class KeypointTable:
     """Width and height of the images, if the file stores them."""
     video: str | None = None
     """Path of the video, if the file stores it."""
+    certain: float = CERTAIN
+    """Keypoints from this confidence on determine the box of a bird."""
 
 
 def check_table_size(source: Path, birds: int, frames: int, keypoints: int) -> None:
@@ -89,7 +91,7 @@ def table_observations(
     size = np.broadcast_to(sizes.size_px, (len(order), 2))[order]
     present = np.any(confidence > 0, axis=-1)
     _check_inside(keypoints, confidence, size, source)
-    certain = confidence >= CERTAIN
+    certain = confidence >= table.certain
     certain = np.where(certain.any(-1, keepdims=True), certain, confidence > 0)
     box = np.where(present[..., None], _with_area(box_of_keypoints(keypoints, certain)), 0)
     parts = {

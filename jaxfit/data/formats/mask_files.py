@@ -30,6 +30,9 @@ from jaxfit.video.pictures import image_files, read_picture
 
 _COVERED = 0.3
 """Least fraction of a bird's keypoints that its mask covers, weighted by confidence; another bird may hide the rest."""
+_NEAR = 0.05
+"""A keypoint outside a mask counts in part up to this distance, as a share of the longer side of the mask: the tips of
+bill, tail and wings lie on the outline, and many masks are a little too small."""
 _MOST_VALUES = 64
 """A picture with more grey values is no picture of labels: masks are where the grey value is 128 or more."""
 _NUMBER = re.compile(rf"\d{{1,{FRAME_DIGITS}}}", re.ASCII)
@@ -42,23 +45,23 @@ def add_masks(observations: Observations, source: Path, progress: ProgressTask =
 
     The pictures belong to the images of the same name, or else to the frames of the numbers in their names, or else to
     the frames in their order. The birds of a COCO file belong to the frames of the same number, or to photographs of
-    the same name. Birds without a mask that covers three tenths of their keypoints keep the mask that they had.
+    the same name. A keypoint near the outline of a mask is covered in part. Birds without a mask that covers three
+    tenths of their keypoints keep the mask that they had.
 
     Args:
         observations: birds with keypoints.
         source: the folder or the COCO file.
-        progress: shows progress.
+        progress: shows progress, and how many birds have a mask.
 
     Raises:
         InputError: the source cannot be read, holds no mask for any image, or holds a mask of another size.
     """
     masks_of = _folder_masks(observations, source) if source.is_dir() else _coco_masks(observations, source)
     masks = dict(observations.masks)
-    given = 0
+    given = labelled = 0
     images = list(_images(observations))
     with progress("Reading masks", len(images)) as report_progress:
         for n, t, birds in images:
-            report_progress(1, "")
             candidates = masks_of(n, t)
             given += len(candidates)
             width, height = observations.image_size(n, t)
@@ -68,6 +71,8 @@ def add_masks(observations: Observations, source: Path, progress: ProgressTask =
                     raise InputError(source, problem, "give masks in the size of the images")
             for bird, mask in _assigned(observations, birds, t, candidates):
                 masks[bird, t] = encode_mask(mask)
+            labelled += len(birds)
+            report_progress(1, f"{len(masks)} of {labelled} labelled birds have a mask")
     if not given:
         remedy = "name the pictures by frame numbers or as the images, or give a COCO file with segmentation"
         raise InputError(source, "holds no mask for any image of the birds", remedy)
@@ -136,15 +141,16 @@ def _assigned(
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Yield pairs of bird and mask, so that the masks cover as many keypoints of their birds as possible."""
     covered = np.zeros((len(birds), len(masks)))
-    for i, n in enumerate(birds):
-        confidence = observations.confidence[n, t]
-        known = confidence > 0
-        x, y = np.floor(observations.keypoints_px[n, t][known]).astype(int).T
-        for j, mask in enumerate(masks):
+    for j, mask in enumerate(masks):
+        _, _, *sides = box_of_mask(mask) or (0, 0, 0)
+        near_px = max(_NEAR * max(sides), 1)
+        share = 1 - cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 5) / near_px
+        for i, n in enumerate(birds):
+            confidence = observations.confidence[n, t]
+            x, y = np.floor(observations.keypoints_px[n, t][confidence > 0]).astype(int).T
             inside = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])
-            hit = np.zeros(len(x), bool)
-            hit[inside] = mask[y[inside], x[inside]]
-            covered[i, j] = (hit * confidence[known]).sum() / max(confidence[known].sum(), 1e-6)
+            hit = np.maximum(share[y[inside], x[inside]], 0) * confidence[confidence > 0][inside]
+            covered[i, j] = hit.sum() / max(confidence.sum(), 1e-6)
     for i, j in zip(*linear_sum_assignment(-covered), strict=True):
         if covered[i, j] >= _COVERED:
             yield birds[i], masks[j]

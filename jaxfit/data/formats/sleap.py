@@ -177,6 +177,8 @@ def _json(root: Hdf5Group, text: str, label: str) -> Field:
 _log = logging.getLogger(__name__)
 
 _USER, _PREDICTED = 0, 1
+_CERTAIN = 0.2
+"""Least score of a point that SLEAP keeps by default. The scores of good points are lower than in DeepLabCut."""
 _FRAMES = ("video", "frame_idx", "instance_id_start", "instance_id_end")
 _INSTANCES = (
     *("instance_id", "instance_type", "skeleton", "track", "from_predicted"),
@@ -244,6 +246,7 @@ def read_sleap_project(root: Hdf5Group, path: Path, video: Path | None = None) -
         skeleton=skeleton.edges,
         size_px=chosen.size_px,
         video=chosen.file,
+        certain=_CERTAIN,
     )
 
 
@@ -417,6 +420,7 @@ def read_sleap_analysis(root: Hdf5Group, path: Path) -> KeypointTable:
         skeleton=skeleton,
         size_px=_stored_size(root),
         video=(video or [""])[0] or None,
+        certain=_CERTAIN,
     )
 
 

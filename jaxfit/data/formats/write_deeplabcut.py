@@ -101,6 +101,8 @@ def write_deeplabcut_labels(
 ) -> None:
     """Write labels into the folder of their pictures, as `CollectedData_SCORER.csv` and `CollectedData_SCORER.h5`.
 
+    Without any bird, the columns are those of an individual `bird1` without labels, so that the header has all names.
+
     Args:
         observations: the labels; tracks without a bird are left out.
         pictures: T names of the pictures of the frames.
@@ -112,12 +114,13 @@ def write_deeplabcut_labels(
     """
     folder = Path(folder)
     kept = np.flatnonzero(observations.present.any(1))
-    birds = [f"bird{track}" for track in observations.track_id[kept].tolist()]
+    birds = [f"bird{track}" for track in observations.track_id[kept].tolist()] or ["bird1"]
     columns = [(scorer, bird, name, axis) for bird in birds for name in observations.keypoint_names for axis in "xy"]
     known = observations.confidence[kept] > 0
     shortest = observations.keypoints_px[kept].astype(str).astype(np.float64)  # the same numbers in both files
     points = np.where(known[..., None], shortest, np.nan)
     values = points.transpose(1, 0, 2, 3).reshape(len(pictures), -1)  # one row per frame: bird, keypoint, x and y
+    values = values if len(kept) else np.full((len(pictures), len(columns)), np.nan)
     rows = [(_FOLDER, folder.name, picture) for picture in pictures]
     path = folder / f"CollectedData_{scorer}"
     write_whole(path.with_name(path.name + ".csv"), _labels_csv(columns, rows, values).encode())

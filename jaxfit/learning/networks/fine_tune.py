@@ -14,9 +14,10 @@ the same result.
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -47,7 +48,6 @@ from jaxfit.learning.networks.label_data import (
 )
 from jaxfit.learning.networks.labels import LabelSet
 from jaxfit.learning.networks.loop import (
-    CHECKS,
     Checkpoint,
     Schedule,
     Source,
@@ -64,6 +64,7 @@ from jaxfit.learning.networks.network_files import (
     write_segmenter,
 )
 from jaxfit.learning.networks.networks import FeaturePyramid
+from jaxfit.learning.networks.ranges import check_numbers
 from jaxfit.learning.networks.reference_birds import load_reference_birds
 from jaxfit.learning.networks.teacher import Taught, as_labels, open_teacher, teach
 from jaxfit.learning.networks.validation import (
@@ -77,6 +78,8 @@ from jaxfit.perception.keypoint_layouts import read_metadata
 from jaxfit.perception.keypoints import crop_settings, load_keypoint_detector
 from jaxfit.perception.network import OnnxModel, Segmenter
 from jaxfit.perception.segmentation import LONGER_SIDE_PX, load_segmenter
+
+_logger = logging.getLogger(__name__)
 
 LABELLED_SHARE = 0.6
 """Share of the samples from labelled frames; all others are simulated."""
@@ -134,8 +137,8 @@ class FineTuned(NamedTuple):
     """Number of labelled pictures: `training`, `holdout`, `gap`; and `tracked`: other frames, by the teacher."""
     rule: str
     """How pictures were held out."""
-    new_keypoints: tuple[str, ...]
-    """Keypoints that the base network lacks."""
+    names: dict[str, str]
+    """Keypoint → the keypoint of the base network that it starts from; an empty text for new weights."""
     best_step: int
     """Number of steps of the trained network."""
     steps: int
@@ -195,11 +198,15 @@ def fine_tune(
         model = load_segmenter_base(base)
     else:
         model, found = load_keypoint_base(base, labels.keypoint_names)
-    with nullcontext() if simulated is None else simulated:
+    with ExitStack() as filming:
+        # the filming takes minutes, so it begins when all labels and pictures are read
+        film = nullcontext if simulated is None else partial(filming.enter_context, simulated)
         try:
             references = None if simulated is None else load_reference_birds()
             confirming = None if taught else teacher
-            data = prepare_data(network, files, settings.holdout, references, folder, labels, progress, confirming)
+            data = prepare_data(
+                network, files, settings.holdout, references, folder, labels, progress, confirming, film
+            )
             base_scale = _base_scale(network, base, data.scale)
         except BaseException:
             if not (folder / CHECKPOINT).exists():
@@ -207,7 +214,12 @@ def fine_tune(
             raise
         named = dict(zip(data.keypoint_names, found, strict=True))
         own = network, model, base, base_scale, named, data, simulated, folder, path, settings, progress
-        result = _fine_tune(*own, confirming)
+        try:
+            result = _fine_tune(*own, confirming)
+        except BaseException as error:
+            if (folder / CHECKPOINT).exists() and not isinstance(error, InputError):
+                _logger.warning("%s holds the work so far; the same command continues there", folder)
+            raise
         return result._replace(doubt=_doubt(taught, result)) if taught else result
 
 
@@ -316,7 +328,7 @@ def _summary(
             "tracked": len(data.tracked),
         },
         data.split.rule,
-        tuple(name for name, known in names.items() if not known),
+        names,
         checkpoint.best_step,
         checkpoint.step,
         data.teacher,
@@ -328,12 +340,8 @@ def _check(network: str, path: Path, settings: Settings) -> None:
         raise ValueError(f"network must be segmenter or keypoints, not {network!r}")
     if path.suffix != ".onnx":
         raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
-    if not 0 <= settings.holdout <= 0.5:
-        raise InputError("train: holdout", f"is {settings.holdout}", "give a share of 0 to 0.5")
-    if not 0 <= settings.scenes <= 900:
-        raise InputError("train: scenes", f"is {settings.scenes}", "give 0 to 900")
-    if settings.schedule is not None and settings.schedule.steps < CHECKS:
-        raise InputError("train: steps", f"is {settings.schedule.steps}", f"give {CHECKS} or more")
+    steps = None if settings.schedule is None else settings.schedule.steps
+    check_numbers(True, steps, settings.scenes, holdout=settings.holdout)
     check_writable(path)  # before the training, not after it
 
 

@@ -13,8 +13,9 @@ uses the scales around this scale.
 from __future__ import annotations
 
 import hashlib
+import logging
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -52,6 +53,8 @@ from jaxfit.learning.networks.teacher import Tracked, track_labels
 from jaxfit.perception.keypoints import CropSettings
 from jaxfit.perception.network import Segmenter
 from jaxfit.perception.segmentation import LONGER_SIDE_PX, MULTIPLE
+
+_logger = logging.getLogger(__name__)
 
 GAP_FRAMES = 25
 """Pictures that are nearer to a held-out picture of their video, in frames, belong to neither part."""
@@ -192,6 +195,10 @@ def prepare_frames(
 
     Pictures of several sizes lie in the upper left corners of frames of the largest size.
 
+    DeepLabCut and SLEAP have no other mark for a hidden keypoint than a missing label. So a keypoint without a label is
+    not visible, and the network learns to give it no confidence, unless the labels mark hidden keypoints (visibility
+    1), or no bird has a label of this keypoint: then the keypoint is `UNKNOWN`.
+
     Args:
         folder: the folder.
         pictures: the pictures and their labels.
@@ -207,6 +214,8 @@ def prepare_frames(
     S, K, N = len(pictures), len(names), max(1, *(len(picture.labels.birds) for picture in pictures))
     points, visibility = np.zeros((S, N, K, 2), np.float32), np.zeros((S, N, K), np.uint8)
     per_unit = np.zeros(S, np.float32)
+    given = [bird.visibility for picture in pictures for bird in picture.labels.birds] or [np.zeros(K)]
+    without_label = np.where((np.max(given, 0) > 0) & ~(np.array(given) == 1).any(), 0, UNKNOWN)
     with new_folder(folder, overwrite=True, marker=MARKER) as part:
         stored, owner = create_pictures(part, S, height, width)
         for s, (picture, _) in enumerate(pictures):
@@ -220,7 +229,7 @@ def prepare_frames(
             per_unit[s] = factor * scale.pixels_per_unit(network, picture.size_px)
             for n, bird in enumerate(picture.birds):
                 points[s, n] = bird.keypoints_px * (w / picture.size_px[0], h / picture.size_px[1])
-                visibility[s, n] = np.where(bird.visibility > 0, bird.visibility, UNKNOWN)
+                visibility[s, n] = np.where(bird.visibility > 0, bird.visibility, without_label)
         del stored, owner  # writes the memory-mapped files
         save_labels(part, points, visibility, per_unit, names)
     return load_frames(folder)
@@ -294,6 +303,7 @@ def prepare_data(
     labels: LabelSet | None = None,
     progress: ProgressTask = silent,
     teacher: Segmenter | None = None,
+    pictures_are_read: Callable[[], object] = lambda: None,
 ) -> FineTuningData:
     """Read and check labels, store their pictures in a folder, and hold out a part.
 
@@ -306,6 +316,7 @@ def prepare_data(
         labels: the labels, if they are read already.
         progress: reports progress.
         teacher: tracks the masks of a segmenter's labels to other frames of their films; None for labels only.
+        pictures_are_read: is called when all labels and pictures are read and reported.
 
     Raises:
         InputError: labels or pictures cannot be read, or too few labels can be used.
@@ -331,6 +342,11 @@ def prepare_data(
         stored = [StoredPicture(own, picture.file) for picture, own in pairs if own.birds]
     stored.sort(key=lambda picture: (files.labels.index(picture.labels.source), picture.labels.frame))
     _check_count(stored, left_out, files, network)
+    unused = [label for label in left_out if not label.bird]
+    if unused:
+        text = "%d of %d labelled pictures are not used, for example %s"
+        _logger.warning(text, len(unused), len(labels.pictures), unused[0])
+    pictures_are_read()
     tracked = Tracked([], [], 0, [])
     if teacher is not None:
         shutil.rmtree(folder / TRACKED, ignore_errors=True)

@@ -40,8 +40,8 @@ class LabelledFrames(NamedTuple):
     keypoints_px: Float[np.ndarray, "S N K 2"]
     """x, y of every keypoint, also if it is occluded or outside the picture."""
     visibility: UInt8[np.ndarray, "S N K"]
-    """2 if the keypoint is visible, 1 if it is occluded, 0 if it is outside the picture or the bird does not exist;
-    `UNKNOWN` if the keypoint has no label."""
+    """2 if the keypoint is visible, 1 if it is occluded, 0 if it is outside the picture, the labels leave it out as not
+    visible, or the bird does not exist; `UNKNOWN` if the keypoint may be anywhere."""
     pixels_per_unit: Float[np.ndarray, "S"]
     """Scale of the picture: pixels per model unit (2 cm). For labelled footage, the scale that the networks assume."""
     keypoint_names: tuple[str, ...] = MURRE_KEYPOINTS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +24,8 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.video.pictures import image_files, read_picture
 from jaxfit.video.reader import read_frames
+
+_logger = logging.getLogger(__name__)
 
 CENTRE = "centre"
 """The only keypoint of labels that have masks but no keypoints: the centre of the box."""
@@ -258,10 +261,13 @@ def read_pictures(
     if images is not None and not images.is_dir():
         yield from _video_pictures(pictures, images, progress)
         return
-    listed = [] if images is None else image_files(images)
-    files = [_file_of(picture, images, listed) for picture in pictures]
+    files = _files_of(pictures, images, [] if images is None else image_files(images))
+    first, file = next((pair for pair in zip(pictures, files, strict=True) if pair[1]), (pictures[0], None))
+    if file is not None and file.stem != Path(first.name.replace("\\", "/")).stem and "#" not in first.name:
+        text = "%s: %s has no picture of these names, so the pictures are read by their frame numbers: %s is %s"
+        _logger.warning(text, first.source, images, first.name, file.name)
     if not any(files):
-        place = "beside the labels" if images is None else f"in {images}"
+        place = "beside the labels" if images is None else f"in {images}, by its name or its frame number"
         problem = f"no picture of the labels is {place}, for example {pictures[0].name}"
         raise InputError(pictures[0].source, problem, "give the video, or the folder of the pictures, by --images")
     with progress("Reading labelled pictures", len(pictures)) as report_progress:
@@ -275,7 +281,7 @@ def numbered_by_film(pictures: Sequence[StoredPicture], film: Path) -> dict[int,
     if not film.is_dir():
         return {picture.labels.frame: picture.labels for picture in pictures}
     listed = image_files(film)
-    files = [_file_of(picture.labels, film, listed) for picture in pictures]
+    files = _files_of([picture.labels for picture in pictures], film, listed)
     return {listed.index(file): own.labels for own, file in zip(pictures, files, strict=True) if file in listed}
 
 
@@ -292,6 +298,16 @@ def _video_pictures(
                 yield missing.pop(frame.index), frame.picture
     for picture in missing.values():
         yield picture, None
+
+
+def _files_of(pictures: Sequence[LabelledPicture], folder: Path | None, listed: Sequence[Path]) -> list[Path | None]:
+    """Return the files of pictures as `_file_of`; by frame number as in a video if the folder has no such names."""
+    files = [_file_of(picture, folder, listed) for picture in pictures]
+    frames = [picture.frame for picture in pictures]
+    if any(files) or not 0 <= min(frames, default=-1) <= max(frames, default=0) < len(listed):
+        return files
+    numbered = frame_numbers([picture.name for picture in pictures]) is not None
+    return [listed[frame] for frame in frames] if numbered else files
 
 
 def _file_of(picture: LabelledPicture, folder: Path | None, listed: Sequence[Path]) -> Path | None:

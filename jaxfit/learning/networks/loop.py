@@ -20,6 +20,7 @@ from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.learning.networks.labelled_frames import LabelledFrames, join_frames, load_frames
 from jaxfit.learning.networks.network_files import freeze_normalisation
 from jaxfit.learning.networks.networks import FeaturePyramid
+from jaxfit.learning.networks.ranges import CHECKS
 
 # pyright: reportMissingImports=false
 
@@ -357,8 +358,6 @@ def load_checkpoint(path: Path, fingerprint: str, parameters: int) -> Checkpoint
 # pyright: reportMissingImports=false
 
 
-CHECKS = 10
-"""Number of measurements on the held-out pictures during a training."""
 PATIENCE = 4
 """Number of measurements without a better score after which the training stops."""
 

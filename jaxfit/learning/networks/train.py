@@ -27,6 +27,7 @@ from jaxfit.learning.networks.network_files import (
     write_segmenter,
 )
 from jaxfit.learning.networks.networks import FeaturePyramid, load_photograph_weights
+from jaxfit.learning.networks.ranges import check_numbers
 from jaxfit.learning.networks.scenes import FRAMES_PER_SCENE, film_scenes
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception.segmentation import load_segmenter
@@ -95,13 +96,7 @@ def train_network(
         raise InputError("train: encoder", "is given for a keypoint network", "train a segmenter, or leave it out")
     if encoder is not None and base is not None:
         raise InputError("train: encoder", "is given with a base network", "give one of the two")
-    if not 1 <= simulation.scenes <= 900:
-        raise InputError("train: scenes", f"is {simulation.scenes}", "give 1 to 900")
-    for name in ("varied", "wings"):
-        if not 0 <= getattr(simulation, name) <= 1:
-            raise InputError(f"train: {name}", f"is {getattr(simulation, name)}", "give a share of 0 to 1")
-    if schedule.steps < 20:
-        raise InputError("train: steps", f"is {schedule.steps}", "give 20 or more")
+    check_numbers(False, schedule.steps, simulation.scenes, varied=simulation.varied, wings=simulation.wings)
     if Path(path).suffix != ".onnx":
         raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
     check_writable(path)  # before the training, not after it

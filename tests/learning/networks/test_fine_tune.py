@@ -181,17 +181,19 @@ def test_the_command_says_which_networks_it_compares(tmp_path, monkeypatch, caps
         for name, iou in (("base", 0.736), ("rescaled", 0.908), ("trained", 0.8))
     }
     parts = {"training": 7, "holdout": 2, "gap": 1}
+    names = {"beak": "bill_tip", "neck_base": ""}
     for chosen, sentences in (
         ("base", ("The base network has the best score", "written without training, with its own scale")),
         ("rescaled", ("The base network at the new scale has the best", "with the scale of the labels")),
         ("trained", ("The trained network has the best score", "from step 8 of 10", "trained again")),
     ):
-        result = fine_tune.FineTuned(columns, chosen, [], parts, "held out by blocks of time", (), 8, 10)
+        result = fine_tune.FineTuned(columns, chosen, [], parts, "held out by blocks of time", names, 8, 10)
         monkeypatch.setattr(fine_tune, "fine_tune", lambda *_files, result=result, **_options: result)
         command = ["train", "segmenter", "--labels", "labels.json", "--out", str(tmp_path / "mine.onnx")]
         assert main([*command, "--frames", str(tmp_path / "simulated")]) == 0
         said = " ".join(capsys.readouterr().out.split())
         assert "20 simulated scenes will be filmed into" in said
+        assert "beak from bill_tip, neck_base from new weights" in said
         assert "so that the network does not forget birds that the labels lack" in said
         for expected in ("base network", "base, new scale", "trained", "0.736", "0.908", "0.800"):
             assert expected in said
@@ -283,6 +285,48 @@ def test_wrong_use_of_the_command(tmp_path, capsys):
         assert error.startswith("jaxfit: ")
         assert message in error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["labels"]
+
+
+def test_wrong_numbers_are_rejected_before_the_imports(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.fine_tune", None)
+    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.train", None)
+    labels = ["--labels", "none.csv"]
+    for options, message in (
+        ([*labels, "--steps", "4"], "steps: is 4 (give 10 or more)"),
+        ([*labels, "--holdout", "0.9"], "holdout: is 0.9 (give a share of 0 to 0.5)"),
+        ([*labels, "--scenes", "-1"], "scenes: is -1 (give 0 to 900)"),
+        (["--steps", "19"], "steps: is 19 (give 20 or more)"),
+        (["--scenes", "0"], "scenes: is 0 (give 1 to 900)"),
+        (["--wings", "2"], "wings: is 2.0 (give a share of 0 to 1)"),
+    ):
+        assert main(["train", "keypoints", *options, "--out", str(tmp_path / "mine.onnx")]) == 2
+        assert capsys.readouterr().err == f"jaxfit: train: {message}\n"
+
+
+def test_pictures_are_read_before_scenes_are_filmed(tmp_path, monkeypatch, caplog):
+    """Pictures that do not fit the labels are reported at once, and an interruption says how to continue."""
+    file = write_labels(tmp_path / "labels", coco({t: [bird()] for t in TIMES}), [])
+    empty, happened = tmp_path / "film", []
+    write_labels(empty, coco({900: [bird()]}), [900])
+    monkeypatch.setattr(fine_tune.Filming, "__enter__", lambda _self: happened.append("filming"))
+    out, scenes = tmp_path / "mine.onnx", tmp_path / "scenes"
+    settings = fine_tune.Settings(holdout=0, scenes=1)
+    with pytest.raises(InputError, match=r"no picture of the labels is in .*film, .*, for example frame_0000.png"):
+        fine_tune.fine_tune("segmenter", LabelFiles((file,), (empty,)), out, scenes, settings)
+    assert not happened
+    write_labels(file.parent, coco({t: [bird()] for t in TIMES}), list(TIMES)[1:])
+
+    def interrupted(*_arguments):
+        assert happened == ["filming"]
+        (tmp_path / "mine.onnx.training" / fine_tune.CHECKPOINT).touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fine_tune, "_fine_tune", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fine_tune.fine_tune("segmenter", LabelFiles((file,)), out, scenes, settings)
+    first, last = (record.getMessage() for record in caplog.records)
+    assert first.startswith("1 of 8 labelled pictures are not used, for example labels.json: frame_0000.png")
+    assert last.endswith("mine.onnx.training holds the work so far; the same command continues there")
 
 
 @pytest.mark.extended

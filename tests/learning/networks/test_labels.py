@@ -11,7 +11,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.learning.networks.label_checks import mixed_up_birds
 from jaxfit.learning.networks.label_data import LabelFiles, prepare_data
 from jaxfit.learning.networks.labelled_frames import UNKNOWN
-from jaxfit.learning.networks.labels import read_labels
+from jaxfit.learning.networks.labels import numbered_by_film, read_labels
 from jaxfit.model.files import load_murre
 
 TIMES = range(0, 400, 50)
@@ -91,6 +91,25 @@ def test_folder_of_masks(tmp_path):
         read_labels([masks], [], needs_keypoints=True)
 
 
+def test_a_folder_of_frames_with_other_names_is_a_film(tmp_path, caplog):
+    """The pictures are found by their frame numbers, as in a video, unless the folder lacks a frame."""
+    content = coco({t: [bird(20 + 10 * t, 30)] for t in range(8)})
+    film = tmp_path / "film"
+    write_labels(film, content, list(range(8)))
+    for t in range(8):
+        (film / f"frame_{t:04d}.png").rename(film / f"{t + 1}.png")
+    file = write_labels(tmp_path / "labels", content, [])
+    data = prepare_data("segmenter", LabelFiles((file,), (film,)), 0, None, tmp_path / "training")
+    assert not data.left_out
+    assert [picture.labels.frame for picture in data.pictures] == list(range(8))
+    assert all((picture.pixels()[35, 25 + 10 * t] == 250).all() for t, picture in enumerate(data.pictures))
+    assert list(numbered_by_film(data.pictures, film)) == list(range(8))
+    assert "read by their frame numbers: frame_0000.png is 1.png" in caplog.text
+    (film / "8.png").unlink()
+    with pytest.raises(InputError, match=r"no picture of the labels is in .*film, by its name or its frame number"):
+        prepare_data("segmenter", LabelFiles((file,), (film,)), 0, None, tmp_path / "training")
+
+
 def test_wrong_labels_are_named(tmp_path):
     frames = {t: [bird()] for t in range(0, 500, 50)}
     frames[50] = [bird(-30, 30)]
@@ -127,6 +146,16 @@ def test_keypoints_without_a_label_do_not_count(tmp_path):
     assert data.frames.visibility[0, 0].tolist() == [2, 1, 2, UNKNOWN]
     assert data.frames.keypoint_names == tuple(names)
     assert (data.frames.owner[0] == 2).sum() == 1600  # a bird without a mask has its box
+
+
+def test_keypoints_that_are_left_out_are_not_visible(tmp_path):
+    """Labels without marks of hidden keypoints leave hidden keypoints out; a keypoint without any label is unknown."""
+    names = ["beak", "tail", "wingL", "wingR", "crown"]
+    shown = [45, 35, 2, 65, 55, 2, 50, 40, 2, 0, 0, 0, 0, 0, 0]
+    other = [45, 35, 2, 65, 55, 2, 0, 0, 0, 60, 40, 2, 0, 0, 0]
+    frames = {t: [bird(keypoints=other if t else shown)] for t in TIMES}
+    data = prepared(tmp_path, coco(frames, names), "keypoints")
+    assert data.frames.visibility[:2, 0].tolist() == [[2, 2, 2, 0, UNKNOWN], [2, 2, 0, 2, UNKNOWN]]
 
 
 def test_unusable_label_files(tmp_path):

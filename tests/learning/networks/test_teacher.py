@@ -194,7 +194,7 @@ def test_open_teacher(monkeypatch, tmp_path):
     ("confirmed", "iou", "reasons"), [(20, 0.9, 1), (5, 0.9, 2), (5, 0.2, 3)], ids=["good", "unstable", "not learnt"]
 )
 def test_doubt(confirmed, iou, reasons):
-    result = fine_tune.FineTuned({"trained": {"mean_iou": iou}}, "trained", [], {}, "", (), 1, 1)
+    result = fine_tune.FineTuned({"trained": {"mean_iou": iou}}, "trained", [], {}, "", {}, 1, 1)
     doubt = fine_tune._doubt(teacher.Taught([], confirmed, 24), result)
     assert len(doubt.split("; ")) == reasons
     assert doubt.startswith("no label of a person")
