@@ -142,6 +142,7 @@ def _flat(source: Path, field: str, value: Any) -> tuple[list[float], tuple[int,
     if isinstance(value, dict) and "data" in value:
         flat, shape = _flat(source, f"{field}.data", value["data"])
         stated: Any = value.get("sizes", [value.get("rows"), value.get("cols")])
+        stated = [stated] if type(stated) is int else stated  # XML has no lists of one entry
         sides = [side for side in stated if type(side) is int and 0 <= side <= _LONGEST] if type(stated) is list else []
         if not sides or sides != stated or math.prod(sides) != len(flat) or len(shape) > 1:
             fail(source, field, f"has {len(flat)} numbers, which is not rows × cols")
