@@ -27,7 +27,8 @@ from typing import NamedTuple, get_args
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.formats.anipose import anipose_text, read_anipose
 from jaxfit.cameras.formats.colmap import read_colmap
-from jaxfit.cameras.formats.dannce import MAT_SIGNATURES, read_dannce, read_dannce_folder
+from jaxfit.cameras.formats.dannce import read_dannce, read_dannce_folder
+from jaxfit.cameras.formats.matlab import MAT_SIGNATURES
 from jaxfit.cameras.formats.opencv import read_opencv, read_opencv_folder
 from jaxfit.cameras.formats.values import Parsed, Unit, in_metres, natural
 from jaxfit.foundation.errors import InputError

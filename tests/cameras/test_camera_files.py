@@ -7,41 +7,26 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.camera_files import (
+    ANIPOSE,
+    FIVE,
+    MATRIX,
+    OTHER,
+    ROTATION,
+    RVEC,
+    STEREO,
+    TRANSL,
+    camera_values,
+    cell,
+    matlab_values,
+    write_colmap,
+    write_storage,
+)
 
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.files import read_camera_file, read_cameras, write_cameras
 
-MATRIX = np.array([[1200.0, 0, 640.25], [0, 1180.0, 355.5], [0, 0, 1]])
-FIVE = np.array([-0.28, 0.09, 1e-3, -5e-4, -0.01])
-RVEC = np.array([0.2, -0.4, 0.1])
-ROTATION = cv2.Rodrigues(RVEC)[0]
-TRANSL = np.array([0.1, -0.2, 2.0])
-OTHER = cv2.Rodrigues(np.array([-0.1, 0.5, 0.3]))[0], np.array([-0.3, 0.1, 2.5])
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 3))
-
-ANIPOSE = """
-[cam_0]
-name = "A"
-size = [ 1280, 720,]
-matrix = [ [ 1203.25, 0.0, 641.5,], [ 0.0, 1199.5, 358.75,], [ 0.0, 0.0, 1.0,],]
-distortions = [ -0.21, 0.08, 0.0, 0.0, 0.0,]
-rotation = [ 0.02, -0.4, 0.1,]
-translation = [ 12.5, -30.0, 1500.0,]
-
-[cam_1]
-name = "back"
-size = [ 1024, 768,]
-matrix = [ [ 700.5, 0.0, 512.0,], [ 0.0, 698.25, 380.5,], [ 0.0, 0.0, 1.0,],]
-distortions = [ 0.03, -0.01, 0.002, 0.0,]
-rotation = [ 1e-5, 0.5, -0.2,]
-translation = [ -40.0, 20.25, 1800.0,]
-fisheye = true
-
-[metadata]
-adjusted = false
-error = 0.41
-"""
-"""Written by aniposelib 0.8.0 (`CameraGroup.dump`)."""
 ANIPOSE_POINTS_MM = np.array([[0, 0, 0], [100, 50, -200], [-300, 120, 80], [250, -160, 30.0]])
 ANIPOSE_PIXELS = {  # aniposelib's `Camera.project` and `FisheyeCamera.project`
     "A": [
@@ -61,27 +46,6 @@ ANIPOSE_PIXELS = {  # aniposelib's `Camera.project` and `FisheyeCamera.project`
 
 def opencv_pixels(points, R=ROTATION, transl=TRANSL, distortion=FIVE, matrix=MATRIX):
     return cv2.projectPoints(points, cv2.Rodrigues(R)[0], transl, matrix, distortion)[0][:, 0]
-
-
-def write_storage(path, values):
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    write_values(storage, values)
-    storage.release()
-
-
-def write_values(storage, values):
-    for name, value in values.items():
-        if isinstance(value, dict):
-            storage.startWriteStruct(name, cv2.FILE_NODE_MAP)
-            write_values(storage, value)
-            storage.endWriteStruct()
-        else:
-            storage.write(name, value)
-
-
-def camera_values(matrix="camera_matrix", distortion="distortion_coefficients", R="R", T="T", pose=(ROTATION, TRANSL)):
-    size = {"image_width": 1280, "image_height": 720}
-    return {matrix: MATRIX, distortion: FIVE[None], **size, R: pose[0], T: pose[1][:, None]}
 
 
 # --- OpenCV
@@ -139,7 +103,6 @@ def test_a_folder_has_one_camera_in_each_file_in_natural_order(tmp_path):
     np.testing.assert_allclose(cameras[1].project(POINTS), opencv_pixels(POINTS, *OTHER) + 0.5, atol=1e-6)
 
 
-STEREO = {"M1": MATRIX, "D1": FIVE[None], "M2": MATRIX, "D2": FIVE[None]}
 RECTIFICATION = {"R": OTHER[0], "T": OTHER[1], "R1": np.eye(3), "R2": np.eye(3), "P1": np.eye(3, 4), "Q": np.eye(4)}
 
 
@@ -277,13 +240,6 @@ def test_pose2sim_uses_metres_and_names_its_sections_by_camera(tmp_path):
 # --- DANNCE
 
 
-def matlab_values(R=ROTATION, transl=TRANSL, radial=(-0.28, 0.09, -0.01)):
-    """Return the parameters as MATLAB's `cameraParameters` has them, for pixel centres at 1, 2, 3, …"""
-    K = MATRIX + np.array([[0, 0, 1], [0, 0, 1], [0, 0, 0]])
-    values = {"K": K.T, "RDistort": np.array([radial]), "TDistort": np.array([FIVE[2:4]])}
-    return values | {"r": R.T, "t": transl[None] * 1000}
-
-
 def matlab_pixels(points_mm, values):
     """Project as DANNCE: row vectors (`camera_matrix`), and the distortion of `distortPoints`."""
     on_plane = np.c_[points_mm, np.ones(len(points_mm))] @ np.concatenate([values["r"], values["t"]])
@@ -295,12 +251,6 @@ def matlab_pixels(points_mm, values):
     dx, dy = 2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
     homogeneous = np.c_[x * radial + dx, y * radial + dy, np.ones(len(x))] @ values["K"]
     return homogeneous[:, :2]
-
-
-def cell(values):
-    array = np.empty((len(values), 1), object)
-    array[:, 0] = values
-    return array
 
 
 @pytest.mark.parametrize("compressed", [False, True])
@@ -339,20 +289,6 @@ def test_a_calibration_folder_of_dannce(tmp_path):
 
 # --- COLMAP
 
-COLMAP_CAMERAS = """# Camera list with one line of data per camera:
-#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
-# Number of cameras: 1
-7 {}
-"""
-COLMAP_IMAGES = """# Image list with two lines of data per image:
-#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME
-#   POINTS2D[] as (X, Y, POINT3D_ID)
-# Number of images: 2, mean observations per image: 1
-1 {} {} 7 {}
-2362.39 248.498 58396 1784.7 268.254 59027 1784.7 268.254 -1
-2 {} {} 7 {}
-
-"""
 MODELS = {
     "SIMPLE_PINHOLE 1280 720 1200 640.25 355.5": [],
     "PINHOLE 1280 720 1200 1180 640.25 355.5": [],
@@ -367,15 +303,6 @@ MODELS = {
     "RADIAL_FISHEYE 1280 720 1200 640.25 355.5 0.05 -0.01": [0.05, -0.01, 0, 0],
     "OPENCV_FISHEYE 1280 720 1200 1180 640.25 355.5 0.05 -0.01 0.004 -0.001": [0.05, -0.01, 0.004, -0.001],
 }  # fmt: skip
-
-
-def write_colmap(folder, model="PINHOLE 1280 720 1200 1180 640.25 355.5", names=("left/0.jpg", "right/0.jpg")):
-    poses = []
-    for (R, transl), name in zip([(ROTATION, TRANSL), OTHER], names, strict=True):
-        quaternion = np.roll(Rotation.from_matrix(R).as_quat(), 1)
-        poses += [" ".join(map(repr, values.tolist())) for values in (quaternion, transl)] + [name]
-    (folder / "cameras.txt").write_text(COLMAP_CAMERAS.format(model))
-    (folder / "images.txt").write_text(COLMAP_IMAGES.format(*poses))
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -35,6 +35,8 @@ from jaxfit.foundation.limits import CAMERA_BYTES
 from jaxfit.foundation.reading import read_text
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
+_DOTS = 200
+"""Most points in a line. tomllib takes minutes for a key of a million parts, a.a.a.…"""
 
 
 def read_anipose(path: Path) -> Parsed:
@@ -44,6 +46,8 @@ def read_anipose(path: Path) -> Parsed:
         InputError: the file is not valid TOML, is too large, or a camera lacks a value or holds an impossible value.
     """
     text = read_text(path, CAMERA_BYTES, "a TOML file of cameras")
+    if any(line.count(".") > _DOTS for line in text.split("\n")):
+        raise InputError(path, f"has a line with more than {_DOTS} points", "give a file of cameras")
     try:
         content = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera, Lens
-from jaxfit.cameras.formats.values import Parsed, make_camera, parsed
+from jaxfit.cameras.formats.values import LARGEST, Parsed, make_camera, parsed
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import CAMERA_BYTES, CAMERAS, COLMAP_BYTES
 from jaxfit.foundation.reading import read_text
@@ -146,6 +146,8 @@ def _floats(path: Path, line: int, words: list[str]) -> list[float]:
         _fail(path, line, "holds text where numbers are expected")
     if not all(map(math.isfinite, values)):
         _fail(path, line, "holds a value that is not finite")
+    if max(map(abs, values)) > LARGEST:
+        _fail(path, line, f"holds a number above {LARGEST:g}")
     return values
 
 

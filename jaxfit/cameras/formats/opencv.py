@@ -105,13 +105,12 @@ def _parsed(source: Path, found: list[_Found]) -> Parsed:
         raise InputError(source, "holds cameras with different units", "write all cameras in one unit")
     jarvis = all(each.jarvis for each in found)
     cameras = [each.camera for each in found]
-    posed = [each.camera.name for each in found if each.posed]
     form, usual = ("JARVIS", "mm") if jarvis else ("OpenCV", None)
-    if len(cameras) > 1 and len(posed) < len(cameras) - 1:
-        absent = next(each.camera.name for each in found if not each.posed)
-        problem = f"lacks the pose of several cameras, such as {absent}"
+    absent = [each.camera.name for each in found if not each.posed]
+    if len(absent) > 1:
+        problem = f"lacks the poses of {len(absent)} cameras, such as {absent[0]}"
         raise InputError(source, problem, "add R and T of each camera, or read the files one by one")
-    return parsed(source, cameras, form, found[0].unit, usual)._replace(posed=frozenset(posed))
+    return parsed(source, cameras, form, found[0].unit, usual)
 
 
 def _plain(content: dict[str, Any]) -> dict[str, Any]:

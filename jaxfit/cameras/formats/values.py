@@ -26,6 +26,8 @@ WHOLE_PIXELS = 0.5
 MATLAB_PIXELS = -0.5
 """What to add to a principal point where pixel centres are at 1, 2, 3, …, as in MATLAB."""
 
+LARGEST = 1e12
+"""Largest absolute number of a camera; squares of larger numbers may overflow."""
 _LONGEST = 100
 """Most numbers of one field of a camera."""
 _REMEDY = "write the file again with the program that made it"
@@ -41,13 +43,9 @@ class Parsed(NamedTuple):
     """Unit that the file states."""
     usual_unit: Unit | None
     """Unit that the program uses; None for programs without a usual unit."""
-    posed: frozenset[str]
-    """Names of the cameras whose pose the file states; the others have the identity."""
 
 
-def parsed(
-    source: Path, cameras: Sequence[Camera], form: str, unit: Unit | None, usual: Unit | None, posed: Sequence[str] = ()
-) -> Parsed:
+def parsed(source: Path, cameras: Sequence[Camera], form: str, unit: Unit | None, usual: Unit | None) -> Parsed:
     """Return the cameras of a file after the checks of the whole set.
 
     Args:
@@ -56,7 +54,6 @@ def parsed(
         form: name of the program.
         unit: the unit that the file states.
         usual: the usual unit of the program.
-        posed: names of the cameras whose pose the file states; all cameras if empty.
 
     Raises:
         InputError: there is no camera, there are more than `CAMERAS`, or two cameras have one name.
@@ -69,7 +66,7 @@ def parsed(
     for name in names:
         if names.count(name) > 1:
             raise InputError(source, f'holds two cameras with the name "{name}"', "give each camera its own name")
-    return Parsed(tuple(cameras), form, unit, usual, frozenset(posed or names))
+    return Parsed(tuple(cameras), form, unit, usual)
 
 
 def make_camera(
@@ -130,6 +127,8 @@ def numbers(source: Path, field: str, value: Any, *shapes: tuple[int, ...]) -> n
     array = np.array(flat, np.float64)
     if not np.isfinite(array).all():
         fail(source, field, "holds a value that is not finite")
+    if np.abs(array).max(initial=0) > LARGEST:
+        fail(source, field, f"holds a number above {LARGEST:g}")
     sides = [side for side in shape if side != 1]
     for allowed in shapes:
         if (allowed == (-1,) and len(sides) <= 1) or sides == [side for side in allowed if side != 1]:
