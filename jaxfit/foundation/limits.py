@@ -235,3 +235,16 @@ NAME_MAP_BYTES = 100_000
 """Largest file that maps names of keypoints."""
 MASKS_PER_PICTURE = 100
 """Most connected regions of a picture of masks."""
+
+# --- cameras
+CAMERAS = 1000
+"""Most cameras of one file or folder."""
+CAMERA_BYTES = 2_000_000
+"""Largest file of cameras; of a .mat file, the variables that describe cameras, without compression. A camera takes
+about 1,000 bytes."""
+CAMERA_LEVELS = 50
+"""Largest depth of lists and mappings inside each other in a file of cameras. Real files have up to 5 levels."""
+COLMAP_BYTES = 200_000_000
+"""Largest images.txt of COLMAP, which also holds the points of the images."""
+MAT_VARIABLES = 1000
+"""Most variables in a .mat file."""
