@@ -121,7 +121,7 @@ class Camera:
     def project(self, points_world: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 2"]:
         """Project points of the world, metres, to pixels of the image; NaN for points behind the camera."""
         points_cam = self.to_camera(points_world)
-        ahead = points_cam[..., 2:] > 0
+        ahead = np.asarray(points_cam[..., 2:] > 0)
         xy = np.where(ahead, points_cam[..., :2] / np.where(ahead, points_cam[..., 2:], 1), np.nan)
         return self._to_px(self._distorted(xy))
 
@@ -157,7 +157,8 @@ class Camera:
     def inside(self, points_px: Float[np.ndarray, "*B 2"]) -> Bool[np.ndarray, "*B"]:
         """Return whether points lie in the image; without an image size, whether the points are finite."""
         upper = (np.inf, np.inf) if self.size_px is None else self.size_px
-        return np.isfinite(points_px).all(-1) & (points_px >= 0).all(-1) & (points_px < np.array(upper)).all(-1)
+        within = np.isfinite(points_px) & (points_px >= 0) & (points_px < np.array(upper))
+        return np.asarray(within.all(-1))
 
     @property
     def _coefficients(self) -> np.ndarray:

@@ -58,6 +58,14 @@ def add_model(command: argparse.ArgumentParser) -> None:
     command.add_argument("--model", default="murre", help=f"{MODEL} (default %(default)s)")
 
 
+def add_cameras(command: argparse.ArgumentParser) -> None:
+    """Add the file of calibrated cameras, and its unit."""
+    text = "calibrated cameras: OpenCV .yaml, .xml or .json, anipose .toml, DANNCE .mat, JARVIS .yaml, COLMAP text"
+    command.add_argument("cameras", type=Path, metavar="FILE", help=text)
+    text = "unit of length of the file (default: that of the file, or the usual one of the program)"
+    command.add_argument("--unit", choices=("m", "cm", "mm"), help=text)
+
+
 def add_truth(command: argparse.ArgumentParser) -> None:
     text = "annotations (formats as of OBS), a folder of masks (for OBS only), or a scene"
     command.add_argument("--truth", type=Path, required=True, help=text)

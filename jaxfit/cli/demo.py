@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
@@ -28,6 +29,9 @@ from jaxfit.pipeline import OVERLAY, reconstruct
 from jaxfit.simulation.scene import simulate
 from jaxfit.view.report.page import Measured
 from jaxfit.view.report.write import REPORT, write_report
+
+if TYPE_CHECKING:
+    from jaxfit.cameras.camera import Camera
 
 BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 1003
 METRICS, ANIMATION = "evaluation.json", "birds.glb"
@@ -134,26 +138,38 @@ def _check_folder(folder: Path) -> None:
 
 def simulate_scene(options: argparse.Namespace) -> None:
     """Simulate a scene and write its footage and ground truth."""
-    from jaxfit.simulation.scene import simulate
+    from jaxfit.simulation.rig import simulate_rig
 
     start = time.perf_counter()
-    scene = simulate(
-        find_bird("murre"),
-        options.out,
-        birds=options.birds,
-        frames=options.frames,
-        size=_size(options.size),
-        fps=options.fps,
-        seed=options.seed,
-        codec=options.codec,
-        overwrite=options.overwrite,
-        progress=terminal,
-    )
-    poses, detections = int(scene.truth.present.sum()), int(scene.detections.present.sum())
+    size = _size(options.size)
+    numbers = {name: getattr(options, name) for name in ("birds", "frames", "fps", "seed", "codec", "overwrite")}
+    if options.cameras is None:
+        if options.distortion:
+            raise InputError("--distortion", "is given without --cameras", "give the number of cameras by --cameras")
+        scenes = [simulate(find_bird("murre"), options.out, size=size, progress=terminal, **numbers)]
+    else:
+        rig = _cameras(options)
+        scenes = simulate_rig(
+            find_bird("murre"), options.out, rig, size=size, distorted=options.distortion, progress=terminal, **numbers
+        ).scenes
+    poses, detections = scenes[0].truth.present.sum(), sum(scene.detections.present.sum() for scene in scenes)
+    filmed = f" by {counted(len(scenes), 'camera')}" if options.cameras else ""
     show(
-        f"{counted(options.birds, 'bird')} over {counted(options.frames, 'frame')}: {counted(poses, 'true pose')}, "
-        f"{counted(detections, 'detection')}, in {time.perf_counter() - start:.0f} s → {options.out}"
+        f"{counted(options.birds, 'bird')} over {counted(options.frames, 'frame')}{filmed}: "
+        f"{counted(int(poses), 'true pose')}, {counted(int(detections), 'detection')}, "
+        f"in {time.perf_counter() - start:.0f} s → {options.out}"
     )
+
+
+def _cameras(options: argparse.Namespace) -> int | tuple[Camera, ...]:
+    """Return the number of cameras, or the cameras of a file."""
+    from jaxfit.cameras.files import read_cameras
+
+    if options.cameras.isascii() and options.cameras.isdigit():
+        return int(options.cameras)
+    if options.distortion:
+        raise InputError("--distortion", "is given with a file of cameras", "the file holds the distortion")
+    return read_cameras(options.cameras)
 
 
 def demo(options: argparse.Namespace) -> None:

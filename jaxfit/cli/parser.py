@@ -15,6 +15,7 @@ from jaxfit.cli.arguments import (
     OBSERVATIONS,
     Parser,
     add_adapt_commands,
+    add_cameras,
     add_cluster,
     add_codec,
     add_command,
@@ -42,6 +43,7 @@ def build_parser() -> argparse.ArgumentParser:
         _import,
         _fitting,
         add_result_commands,
+        _cameras,
         _simulation,
         _training,
         _datasets,
@@ -142,6 +144,18 @@ def _fitting(commands: Any) -> None:
     add_codec(overlay)
 
 
+def _cameras(commands: Any) -> None:
+    cameras = commands.add_parser("cameras", help="describe calibrated cameras")
+    actions = cameras.add_subparsers(required=True, metavar="ACTION")
+    text = "print the lens and the position of every camera, and draw their fields of view"
+    show = add_command(actions, "show", "cameras.show_cameras", text)
+    add_cameras(show)
+    show.add_argument(
+        "--out", type=Path, metavar="PNG", help="picture to write: the cameras from above and from the side"
+    )
+    show.add_argument("--overwrite", action="store_true", help="replace an existing file")
+
+
 def _simulation(commands: Any) -> None:
     text = "film simulated murres on a ledge and store the ground truth"
     simulate = add_command(commands, "simulate", "demo.simulate_scene", text)
@@ -152,6 +166,10 @@ def _simulation(commands: Any) -> None:
     simulate.add_argument("--fps", type=float, default=25, help="frames per second (default %(default)s)")
     text = "random seed; every seed gives another scene (default %(default)s)"
     simulate.add_argument("--seed", type=int, default=0, help=text)
+    text = "film the scene with several cameras: their number, or a file of calibrated cameras"
+    simulate.add_argument("--cameras", metavar="N|FILE", help=text)
+    text = "with a number of cameras: lenses with distortion, and principal points beside the middle of the picture"
+    simulate.add_argument("--distortion", action="store_true", help=text)
     add_codec(simulate)
 
     text = "simulate a short scene, reconstruct the scene from its footage, and measure the result"
