@@ -22,9 +22,9 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.kinematics import Pose
 
-FORMAT_VERSION = 6
-"""Version of ``poses.npz``; increased when its arrays change. Version 5 lacks `doubts`, version 4 also `ERROR_BARS`,
-version 3 also `ambiguity_deg`, version 2 also `timestamp_s` and `fps`."""
+FORMAT_VERSION = 7
+"""Version of ``poses.npz``; increased when its arrays change. Version 6 lacks `WORLD`, version 5
+also `doubts`, version 4 also `ERROR_BARS`, version 3 also `ambiguity_deg`, version 2 also `timestamp_s` and `fps`."""
 _OLDEST_VERSION = 2
 """Older versions are not read."""
 
@@ -70,6 +70,12 @@ ERROR_BARS = {
     "misfit": ("N T", np.float32),
 }
 """The arrays of error bars. A solution has all of them or none."""
+WORLD = {
+    "R_world_root": ("N T 3 3", np.float32),
+    "transl_world_m": ("N T 3", np.float64),
+    "keypoints_world_m": ("N T K 3", np.float64),
+}
+"""The arrays of fits with calibrated cameras. A solution has all of them or none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,10 +172,18 @@ class Solution:
     """(N, T) float32: factor on all covariances of the window, 1 or more, where the keypoints lie farther from the pose
     than the objective assumes. The other arrays contain it."""
 
+    # fits with calibrated cameras (`fitting/views.py`): None without
+    R_world_root: np.ndarray | None = None
+    """(N, T, 3, 3) float32: rotation from the root of the bird to the world."""
+    transl_world_m: np.ndarray | None = None
+    """(N, T, 3) float64: root joint in the world, metres."""
+    keypoints_world_m: np.ndarray | None = None
+    """(N, T, K, 3) float64: keypoints in the world, metres."""
+
     def __post_init__(self):
         ambiguity_deg = np.zeros(np.shape(self.valid), np.float32) if self.ambiguity_deg is None else self.ambiguity_deg
         doubts = np.full(np.shape(self.valid), -1, np.int8) if self.doubts is None else self.doubts
-        layout = LAYOUT | (ERROR_BARS if self.has_error_bars else {})
+        layout = LAYOUT | self.optional_layout
         arrays = validate_arrays(vars(self) | {"ambiguity_deg": ambiguity_deg, "doubts": doubts}, layout)
         # a frame without a pose has no flag, whatever the array holds there
         arrays["doubts"] = np.where(arrays["valid"], arrays["doubts"], np.int8(-1))
@@ -211,10 +225,27 @@ class Solution:
         Raises:
             ValueError: the solution has some of the arrays only.
         """
-        absent = [name for name in ERROR_BARS if getattr(self, name) is None]
-        if absent and len(absent) < len(ERROR_BARS):
-            raise ValueError(f"{absent[0]} is missing: error bars need all of {', '.join(ERROR_BARS)}")
+        return self._has("error bars", ERROR_BARS)
+
+    @property
+    def has_world(self) -> bool:
+        """Whether the solution has the arrays `WORLD`.
+
+        Raises:
+            ValueError: the solution has some of the arrays only.
+        """
+        return self._has("poses in the world", WORLD)
+
+    def _has(self, what: str, layout: Mapping[str, Any]) -> bool:
+        absent = [name for name in layout if getattr(self, name) is None]
+        if absent and len(absent) < len(layout):
+            raise ValueError(f"{absent[0]} is missing: {what} need all of {', '.join(layout)}")
         return not absent
+
+    @property
+    def optional_layout(self) -> dict[str, tuple[str, Any]]:
+        """The entries of `ERROR_BARS` and `WORLD` that the solution has."""
+        return (ERROR_BARS if self.has_error_bars else {}) | (WORLD if self.has_world else {})
 
     def cells(self, error_bars: bool | None = None) -> dict[str, np.ndarray]:
         """Return the arrays (N, T, …) by name.
@@ -318,7 +349,7 @@ def write_solution(
 ) -> None:
     """Write the files of `save_solution` into an existing folder, such as a temporary folder of `new_folder`."""
     summary_json = json_text(summary)
-    names = [*LAYOUT, *(ERROR_BARS if solution.has_error_bars else ())]
+    names = [*LAYOUT, *solution.optional_layout]
     arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in names}
     terms = list(solution.loss)
     arrays["loss"] = np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
@@ -350,7 +381,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     path = folder / _POSES
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
-    optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS).items()}
+    optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD).items()}
     optional |= {name: shapes.pop(name) for name in ("ambiguity_deg", "doubts")}
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
     arrays |= {name: arrays[name].item() for name in _CAMERA}

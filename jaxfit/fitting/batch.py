@@ -236,7 +236,8 @@ def _stage_tiles(
     for tile in tile_rows(count, tile_size(frames)):
         own = take_tile(targets, targets_row[tile])
         # without masks, the problems that fill up the last tile render no silhouettes
-        own = replace(own, has_mask=own.has_mask & (tile >= 0)[:, None])
+        real = (tile >= 0).reshape(-1, *(1,) * (own.has_mask.ndim - 1))
+        own = replace(own, has_mask=own.has_mask & real)
         repeated = [hyperparameters[c] for c in config[tile]]
         settings = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *repeated)
         tiles.append(_Tile(Problem(settings, take_tile(rows.pose, tile), own), tile))

@@ -37,7 +37,9 @@ def crop_squares(
     crop, sizes_px = np.zeros((*frame.shape, 3)), observations.image_sizes_px()
     for w, n in enumerate(track.tolist()):
         image_px = sizes_px[n, frame[w, present[w]]]
-        if config.mode == "image":
+        if not len(image_px):  # a camera that does not see the bird of the window
+            crop[w] = 0, 0, LEAST_SIZE_PX
+        elif config.mode == "image":
             crop[w] = _whole_image(image_px)
         else:
             largest_px = float(CROP_IMAGE_SIDES * image_px.max())

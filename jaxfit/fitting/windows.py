@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.masks import decode_mask
@@ -25,7 +25,7 @@ from jaxfit.foundation.array_files import check_memory
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import DISTANCE_IMAGE_SIDES, TABLE_GB
 from jaxfit.model.camera import CROP_PX, image_to_crop
-from jaxfit.objective.posed_window import Targets
+from jaxfit.objective.posed_window import Targets, ViewMaps
 
 MOST_UNROLLED = 8
 """Frames of the filter's window that are compared without a loop, which is several times faster."""
@@ -238,12 +238,15 @@ class Windows:
     """(W,) objects: the `WindowMasks` of each window. `load_targets` reads and decodes the masks."""
     frame_s: Float[np.ndarray, "W"]
     """Time between consecutive frames of the window, in seconds; of a video of 25 frames/s if the rate is unknown."""
+    views: ViewMaps | None = None
+    """The cameras of several views. Then `keypoints_px` and `confidence` hold the keypoints of all views, one view
+    after the other, and `has_mask`, `masks` and `crop` have an axis V after T (`masks`: after W)."""
 
     def __len__(self) -> int:
         return len(self.track)
 
     def __getitem__(self, rows: slice | np.ndarray) -> Windows:
-        return Windows(**{name: array[rows] for name, array in vars(self).items()})
+        return Windows(**{name: jax.tree.map(lambda x: x[rows], array) for name, array in vars(self).items()})
 
 
 def windows_key(config: FitConfig) -> tuple:
@@ -397,17 +400,16 @@ def load_targets(windows: Windows, mask_px: int) -> Targets:
         windows: the windows. All their masks must fit into memory.
         mask_px: side of the masks in pixels. 0: the masks are empty and nothing is decoded.
     """
-    mask = np.zeros((*windows.frame.shape, mask_px, mask_px), np.uint8)
-    needed = np.flatnonzero(windows.has_mask.any(1) & (mask_px > 0))
+    mask = np.zeros((*windows.has_mask.shape, mask_px, mask_px), np.uint8)
+    W, T = windows.frame.shape
+    V = 1 if windows.views is None else windows.has_mask.shape[2]
+    has_mask, crops, masks = windows.has_mask.reshape(W, T, V), windows.crop.reshape(W, T, V, 3), windows.masks
+    cuts = mask.reshape(W, T, V, mask_px, mask_px)
+    needed = np.flatnonzero(has_mask.any((1, 2)) & (mask_px > 0))
     for w in needed[np.argsort(windows.frame[needed].max(1), kind="stable")]:  # masks of a frame lie together in files
-        masks: LoadedMasks = cast(Any, windows.masks[w]).load()
-        for t in np.flatnonzero(windows.has_mask[w]).tolist():
-            full = decode_mask(cast(Any, masks.own[t]))
-            mask[w, t] = cut_mask(full, windows.crop[w, t], mask_px)
-            others = masks.others[t]
-            if others is not False:
-                others = None if others is None else decode_mask(others)
-                mark_unknown(mask[w, t], others, cast(Any, full.shape), windows.crop[w, t])
+        for v, reference in enumerate([masks[w]] if windows.views is None else masks[w]):
+            if has_mask[w, :, v].any():
+                _cut_masks(cast(Any, reference).load(), has_mask[w, :, v], crops[w, :, v], cuts[w, :, v])
     return Targets(
         keypoints_px=windows.keypoints_px,
         confidence=windows.confidence,
@@ -416,7 +418,24 @@ def load_targets(windows: Windows, mask_px: int) -> Targets:
         present=windows.present,
         corner_px=(windows.crop[..., :2] * CROP_PX / windows.crop[..., 2:]).astype(np.float32),
         frame_s=windows.frame_s,
+        views=windows.views,
     )
+
+
+def _cut_masks(
+    masks: LoadedMasks,
+    has_mask: Bool[np.ndarray, "T"],
+    crop: Float[np.ndarray, "T 3"],
+    cuts: UInt8[np.ndarray, "T S S"],
+) -> None:
+    """Write the crops of the masks of one window in one view to `cuts`."""
+    for t in np.flatnonzero(has_mask).tolist():
+        full = decode_mask(cast(Any, masks.own[t]))
+        cuts[t] = cut_mask(full, crop[t], cuts.shape[-1])
+        others = masks.others[t]
+        if others is not False:
+            others = None if others is None else decode_mask(others)
+            mark_unknown(cuts[t], others, cast(Any, full.shape), crop[t])
 
 
 def _timeline(observations: Observations) -> Int[np.ndarray, "L"]:

@@ -1,0 +1,414 @@
+"""`fit_views`: one pose of each bird in the world, from any number of calibrated cameras.
+
+The poses are in model units, in a frame with the axes of the world and an origin near the birds. Every camera is an
+affine map to the crop camera (`objective.posed_window.ViewMaps`), so that terms, solvers and kernels are those of one
+view. Depth and size of the birds are estimated.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from jaxfit.cameras.camera import Camera
+from jaxfit.cameras.triangulation import Triangulated, triangulate_robustly
+from jaxfit.config.fit import FitConfig, StageConfig
+from jaxfit.data.observations import Observations
+from jaxfit.data.solution import Solution
+from jaxfit.data.views import Views
+from jaxfit.fitting.batch import tile_size
+from jaxfit.fitting.collect import FittedWindow, track_status
+from jaxfit.fitting.fit import check_observations, checked_model
+from jaxfit.fitting.initial_poses import InitialPoses
+from jaxfit.fitting.solve import crop_camera, without_mask_stages
+from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
+from jaxfit.fitting.windows import (
+    Windows,
+    first_frames,
+    prepare_observations,
+    window_starts,
+    windows_at,
+)
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.foundation.workers import Cluster
+from jaxfit.model.bird import Bird
+from jaxfit.model.camera import CROP_PX
+from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints, rest_pose
+from jaxfit.model.rotation import unwrap_axis_angle
+from jaxfit.objective.posed_window import ViewMaps
+
+TOLERANCE = 0.1
+"""Largest reprojection error of a keypoint that agrees with the others, relative to the side of the bird's box."""
+LEAST_POINTS = 4
+"""Triangulated keypoints of a frame that determine an orientation."""
+LEAST_SPREAD = 0.05
+"""Smallest ratio of the second to the first extent of the triangulated keypoints: points on a line have no rotation."""
+ROUNDS = 5
+"""Rounds of reweighting of the alignment, and `ROBUST` its scale relative to the extent of the bird."""
+ROBUST = 0.08
+POSSIBLE_SIZES = 0.3, 3.0
+"""Sizes relative to the model that a wrong unit or wrong calibration exceeds."""
+SIZE_PRIOR = "size_prior"
+
+_logger = logging.getLogger(__name__)
+
+
+def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
+    """Return a config for several views: depth and size are optimised, with the prior of the size.
+
+    The learnt weights and error bars of the config are those of one view, and are switched off. Windows do not overlap.
+    """
+    used = config if has_masks else without_mask_stages(config)
+
+    def free(stage: StageConfig) -> StageConfig:
+        scales = {name: factor for name, factor in stage.step_scale.items() if name != "transl"}
+        optimised = (*stage.optimised, *({"transl", "scale"} - set(stage.optimised)))
+        terms = (*stage.terms, *({SIZE_PRIOR} - set(stage.terms)))
+        return replace(stage, step_scale=scales, optimised=optimised, terms=terms)
+
+    return replace(
+        used,
+        stages=tuple(free(stage) for stage in used.stages),
+        learn_weights=(),
+        error_bars=False,
+        overlap=0,
+        initialise=replace(used.initialise, hypotheses=1),
+    )
+
+
+def fit_views(
+    views: Views,
+    bird: Bird,
+    config: FitConfig,
+    progress: ProgressTask = silent,
+    source: object = "observations",
+    cluster: Cluster | None = None,
+) -> Solution:
+    """Fit the poses of birds that several calibrated cameras see.
+
+    Args:
+        views: cameras and observations (`data.views`). A view may miss a bird, a frame, a mask or keypoints.
+        bird: the model, with its unit of length.
+        config: the config of a fit, as for one view.
+        progress: shows progress.
+        source: name of the observations in error messages.
+        cluster: worker processes that fit the windows.
+
+    Returns:
+        Poses in the frame of the first camera without distortion, whose crop is the whole picture, with the arrays
+        `data.solution.WORLD`.
+
+    Raises:
+        InputError: no bird that two cameras see, a model without a unit, or a size that shows a wrong unit.
+    """
+    unit_m = bird.metres_per_unit
+    if unit_m is None:
+        remedy = "import the model again with `metres_per_unit`, or use a model of your species (docs/species.md)"
+        raise InputError(f"model {bird.name}", "has no unit of length, which cameras in metres need", remedy)
+    checked = [check_observations(own, bird, source) for own in views.observations]
+    config = views_config(config, any(own.masks for own in checked))
+    prepared = [prepare_observations(own, config) for own in checked]
+    found = triangulated_keypoints(views.cameras, prepared)
+    if not np.isfinite(found.points_world).any():
+        problem = "show no bird in two cameras whose keypoints agree"
+        raise InputError(source, problem, "see `jaxfit cameras check`, and check the order of the cameras")
+    origin_m = np.nanmedian(found.points_world.reshape(-1, 3), axis=0)
+    points = (found.points_world - origin_m) / unit_m
+    initial = initial_poses(bird, points, _weights(prepared, found), source)
+    windows = view_windows(views.cameras, prepared, config, origin_m, unit_m, points)
+    model = checked_model(prepared[0], bird, [config], initial, source)
+    run, shared = Run(config, windows), FitShared(model, initial)
+    problems = [(0, w) for w in range(len(windows))]
+    small = replace(config, memory_gb=config.memory_gb / len(views.cameras))
+    batches = in_batches(problems, [Run(small, windows)], shared, prepared[0].num_tracks, None, cluster)
+    subject = f"{prepared[0].num_tracks} birds × {len(views.cameras)} views"
+    _logger.info(
+        "%s, %d windows of %d frames, tiles of %d", subject, len(problems), config.window, tile_size(config.window)
+    )
+    with progress(f"Fitting {subject}", steps_per_batch(config) * len(batches)) as report_progress:
+        results = fit_batches(batches, [run], shared, None, cluster, report_progress)
+    ordered = [results[0, w] for w in range(len(windows))]
+    return _solution(views, prepared[0], windows, ordered, bird, origin_m, unit_m)
+
+
+def triangulated_keypoints(cameras: Sequence[Camera], observations: Sequence[Observations]) -> Triangulated:
+    """Triangulate the keypoints of all birds: points (N, T, K, 3) in metres."""
+    points_px = np.stack([own.keypoints_px for own in observations]).astype(np.float64)
+    confidence = np.stack([own.confidence for own in observations]).astype(np.float64)
+    side_px = np.stack([own.box_px[..., 2:].max(-1) for own in observations]).astype(np.float64)
+    tolerance_px = np.broadcast_to(TOLERANCE * np.maximum(side_px, 1)[..., None], confidence.shape)
+    return triangulate_robustly(cameras, points_px, confidence, tolerance_px)
+
+
+def _weights(observations: Sequence[Observations], found: Triangulated) -> Float[np.ndarray, "N T K"]:
+    """Return the weight of each triangulated keypoint: the mean confidence of the views that agree."""
+    confidence = np.stack([own.confidence for own in observations])
+    agree = found.agrees.sum(axis=0)
+    mean = (confidence * found.agrees).sum(axis=0) / np.maximum(agree, 1)
+    return np.where(np.isfinite(found.points_world).all(-1), mean, 0)
+
+
+def initial_poses(
+    bird: Bird, points: Float[np.ndarray, "N T K 3"], weight: Float[np.ndarray, "N T K"], source: object
+) -> InitialPoses:
+    """Return initial poses: the mean pose of the prior, aligned with the triangulated keypoints of each frame.
+
+    The size of a bird is the median over its frames. Frames whose keypoints do not determine the orientation have no
+    pose (NaN).
+
+    Args:
+        bird: the model.
+        points: triangulated keypoints, model units, NaN where unknown.
+        weight: weight of each keypoint, 0 where unknown.
+        source: name of the observations in error messages.
+
+    Raises:
+        InputError: a size that shows a wrong unit of length, or no frame with enough keypoints.
+
+    Source: Umeyama 1991, *Least-squares estimation of transformation parameters between two point patterns*.
+    """
+    rig, rest = fold_bird(bird), rest_pose(bird)
+    shape = np.asarray(posed_keypoints(rig, joint_transforms(rig, rest), rest), np.float64)
+    root = np.asarray(rig.joints[0], np.float64)
+    N, T = weight.shape[:2]
+    R, transl, scale = np.full((N, T, 3, 3), np.nan), np.full((N, T, 3), np.nan), np.full((N, T), np.nan)
+    for n, t in np.argwhere((weight > 0).sum(-1) >= LEAST_POINTS).tolist():
+        found = _align(shape, np.nan_to_num(points[n, t]), weight[n, t])
+        if found is not None:
+            R[n, t], scale[n, t] = found
+    if not np.isfinite(scale).any():
+        problem = f"have no frame with {LEAST_POINTS} keypoints of a bird in two cameras"
+        raise InputError(source, problem, "see `jaxfit cameras check`")
+    overall = float(np.nanmedian(scale))
+    if not POSSIBLE_SIZES[0] < overall < POSSIBLE_SIZES[1]:
+        problem = f"show birds of {overall:.3g} × the size of the model"
+        raise InputError(
+            source, problem, "check the unit of the cameras (--unit), and that the model is of your species"
+        )
+    orient = np.full((N, T, 3), np.nan)
+    for n in range(N):
+        known = np.isfinite(scale[n])
+        size = np.nanmedian(scale[n]) if known.any() else 1.0
+        scale[n] = size
+        for t in np.flatnonzero(known).tolist():
+            w = weight[n, t][:, None]
+            posed = size * ((shape - root) @ R[n, t].T + root)
+            transl[n, t] = (w * (np.nan_to_num(points[n, t]) - posed)).sum(0) / w.sum()
+        if known.any():
+            rotations = Rotation.from_matrix(R[n, known]).as_rotvec()
+            orient[n, known] = np.asarray(unwrap_axis_angle(jnp.asarray(rotations, jnp.float32)))
+    bones, shapes = bird.num_joints - 1, bird.num_shapes
+
+    def everywhere(values: Any, *axes: int) -> np.ndarray:
+        return np.broadcast_to(np.asarray(values, np.float32), (N, T, *axes))
+
+    return InitialPoses(
+        str(source),
+        global_orient=orient.astype(np.float32),
+        body_pose=everywhere(rest.body_pose, bones, 3),
+        transl=transl.astype(np.float32),
+        scale=scale.astype(np.float32),
+        bone_length=everywhere(rest.bone_length, bones),
+        betas=everywhere(0, shapes),
+    )
+
+
+def _align(
+    shape: Float[np.ndarray, "K 3"], points: Float[np.ndarray, "K 3"], weight: Float[np.ndarray, "K"]
+) -> tuple[Float[np.ndarray, "3 3"], float] | None:
+    """Return rotation and scale that align a shape with points; outliers lose weight. None for degenerate points."""
+    w = weight.copy()
+    extent = np.ptp(shape, axis=0).max()
+    R, scale = np.eye(3), 1.0
+    for _ in range(ROUNDS):
+        share = w / w.sum()
+        a, b = shape - share @ shape, points - share @ points
+        U, S, Vt = np.linalg.svd((share[:, None] * b).T @ a)
+        if S[1] < LEAST_SPREAD * S[0]:
+            return None
+        D = np.array([1, 1, np.sign(np.linalg.det(U @ Vt))])
+        R = (U * D) @ Vt
+        scale = float((S * D).sum() / (share @ (a**2).sum(-1)))
+        if scale <= 0:
+            return None
+        error = np.linalg.norm(b - scale * a @ R.T, axis=-1) / (ROBUST * extent * scale)
+        w = weight / (1 + error**2) ** 2
+    return R, scale
+
+
+def view_windows(
+    cameras: Sequence[Camera],
+    prepared: Sequence[Observations],
+    config: FitConfig,
+    origin_m: Float[np.ndarray, "3"],
+    unit_m: float,
+    points: Float[np.ndarray, "N T K 3"],
+) -> Windows:
+    """Cut the observations of all views into common windows."""
+    each = replace(config, min_keypoints=1)  # two keypoints of a view count, if the other views see more
+    confidence = np.stack([own.confidence for own in prepared])
+    together = replace(
+        prepared[0],
+        present=np.any([own.present for own in prepared], axis=0),
+        confidence=confidence.max(axis=0),
+        masks={},
+    )
+    starts = window_starts(together, config, first_frames(together, config))
+    views = [windows_at(own, each, starts) for own in prepared]
+    first = views[0]
+    usable = together.usable(config.min_keypoints)
+    present = (first.frame >= 0) & usable[starts[:, :1], np.maximum(first.frame, 0)]
+    maps = [_view_map(camera, own, config, origin_m, unit_m) for camera, own in zip(cameras, views, strict=True)]
+    linear, offset = (np.stack(each, axis=2).astype(np.float32) for each in zip(*maps, strict=True))
+    seen = np.stack([own.present & present for own in views], axis=2)
+    masks = np.empty((len(starts), len(views)), object)
+    for v, own in enumerate(views):
+        masks[:, v] = own.masks
+    return Windows(
+        track=first.track,
+        track_id=first.track_id,
+        frame=first.frame,
+        present=present,
+        crop=np.stack([own.crop for own in views], axis=2),
+        keypoints_px=np.concatenate([own.keypoints_px for own in views], axis=2),
+        confidence=np.concatenate([own.confidence * present[..., None] for own in views], axis=2),
+        has_mask=np.stack([own.has_mask for own in views], axis=2) & seen,
+        masks=masks,
+        frame_s=first.frame_s,
+        views=ViewMaps(linear, offset, _px_per_unit(linear, offset, seen, points, first, config).astype(np.float32)),
+    )
+
+
+def _view_map(
+    camera: Camera, windows: Windows, config: FitConfig, origin_m: np.ndarray, unit_m: float
+) -> tuple[Float[np.ndarray, "W T 3 3"], Float[np.ndarray, "W T 3"]]:
+    """Return L and o of `ViewMaps` for the crops of the windows of one camera."""
+    crop_cam = crop_camera(config)
+    scale = CROP_PX / windows.crop[..., 2]
+    K = np.zeros((*windows.frame.shape, 3, 3))
+    K[..., :2, :] = camera.matrix[:2] * scale[..., None, None]
+    K[..., :2, 2] -= windows.crop[..., :2] * scale[..., None]
+    K[..., :2, 2] -= crop_cam.centre_px
+    K[..., :2, :] /= crop_cam.focal_px
+    K[..., 2, 2] = 1
+    t = (camera.R_cam_world @ origin_m + camera.transl_cam) / unit_m
+    return K @ camera.R_cam_world, K @ t
+
+
+def _px_per_unit(
+    linear: np.ndarray, offset: np.ndarray, seen: np.ndarray, points: np.ndarray, windows: Windows, config: FitConfig
+) -> Float[np.ndarray, "W"]:
+    """Return the mean crop pixels of a model unit at the birds, over the frames and views that see them."""
+    at = np.maximum(windows.frame, 0)
+    with np.errstate(all="ignore"):
+        centre = np.nanmedian(points[windows.track[:, None], at], axis=2)  # W T 3
+    depth = np.einsum("wtvj,wtj->wtv", linear[..., 2, :], centre) + offset[..., 2]
+    focal = crop_camera(config).focal_px * np.linalg.norm(np.cross(linear[..., 0, :], linear[..., 2, :]), axis=-1)
+    px = np.where(seen & (depth > 0), focal / np.where(depth > 0, depth, 1), np.nan)
+    with np.errstate(all="ignore"):
+        mean = np.nanmean(px.reshape(len(px), -1), axis=1)
+    return np.where(np.isfinite(mean), mean, 10.0)
+
+
+def _solution(
+    views: Views,
+    first: Observations,
+    windows: Windows,
+    results: Sequence[FittedWindow],
+    bird: Bird,
+    origin_m: np.ndarray,
+    unit_m: float,
+) -> Solution:
+    """Return the poses of all windows, in the frame of the first camera and in the world."""
+    camera = views.cameras[0]
+    N, T, K, bones = first.num_tracks, first.num_frames, bird.num_keypoints, bird.num_joints - 1
+    shapes = {
+        "global_orient": (3,),
+        "body_pose": (bones, 3),
+        "transl": (3,),
+        "scale": (),
+        "bone_length": (bones,),
+        "betas": (bird.num_shapes,),
+        "keypoints_cam": (K, 3),
+        "keypoints_px": (K, 2),
+        "R_world_root": (3, 3),
+        "transl_world_m": (3,),
+        "keypoints_world_m": (K, 3),
+    }
+    arrays = {name: np.full((N, T, *shape), np.nan) for name, shape in shapes.items()}
+    valid = np.zeros((N, T), bool)
+    fitted, diverged = np.zeros(N, int), np.zeros(N, int)
+    loss = {name: np.full(N, np.nan) for name in results[0].loss}
+    failures: dict[int, tuple[str, ...]] = {}
+    root, R_cam_world = np.asarray(bird.joints[0], np.float64), camera.R_cam_world
+    t_cam = (R_cam_world @ origin_m + camera.transl_cam) / unit_m
+    for w, result in enumerate(results):
+        n, present = int(windows.track[w]), windows.present[w]
+        at = windows.frame[w][present]
+        if result.failure:
+            diverged[n] += 1
+            ends = first.frame_index[at[[0, -1]]]
+            text = f"frames {ends[0]} to {ends[1]}: {result.failure}"
+            track = int(windows.track_id[w])
+            _logger.warning("bird %d, %s", track, text)
+            failures[track] = (*failures.get(track, ()), text)
+            continue
+        for name, value in result.loss.items():
+            loss[name][n] = value + (loss[name][n] if fitted[n] else 0.0)
+        fitted[n] += 1
+        valid[n, at] = True
+        pose = result.pose
+        scale = np.broadcast_to(pose.scale, present.shape)[present]
+        R_world = Rotation.from_rotvec(np.asarray(pose.global_orient, np.float64)[present])
+        shift = np.asarray(pose.transl, np.float64)[present] + scale[:, None] * root
+        keypoints = np.asarray(result.keypoints_cam, np.float64)[present]
+        keypoints_cam = keypoints @ R_cam_world.T + t_cam
+        orient_cam = (Rotation.from_matrix(R_cam_world) * R_world).as_rotvec()
+        betas = np.zeros(bird.num_shapes)
+        betas[: len(pose.betas)] = pose.betas
+        values = {
+            "global_orient": np.asarray(unwrap_axis_angle(jnp.asarray(orient_cam, jnp.float32))),
+            "body_pose": np.asarray(pose.body_pose)[present],
+            "transl": shift @ R_cam_world.T + t_cam - scale[:, None] * root,
+            "scale": scale,
+            "bone_length": pose.bone_length,
+            "betas": betas,
+            "keypoints_cam": keypoints_cam,
+            "keypoints_px": np.nan_to_num(camera.project(keypoints * unit_m + origin_m)),
+            "R_world_root": R_world.as_matrix(),
+            "transl_world_m": shift * unit_m + origin_m,
+            "keypoints_world_m": keypoints * unit_m + origin_m,
+        }
+        for name, value in values.items():
+            arrays[name][n, at] = value
+    width, height = first.image_size_px[0].tolist()
+    side = max(width, height)
+    crop = np.array([*(camera.matrix[:2, 2] - side / 2), side])
+    return Solution(
+        track_id=first.track_id,
+        frame_index=first.frame_index,
+        valid=valid,
+        **arrays,
+        crop=np.broadcast_to(crop, (N, T, 3)),
+        image_size_px=np.where(valid[..., None], np.array([width, height]), 0),
+        focal_px=float(camera.matrix[0, 0]) * CROP_PX / side,
+        crop_px=CROP_PX,
+        keypoint_names=bird.keypoint_names,
+        joint_names=bird.joint_names,
+        loss=loss,
+        status=np.array(
+            [track_status(*count) for count in zip(fitted.tolist(), diverged.tolist(), strict=True)], "<U32"
+        ),
+        failures=failures,
+        timestamp_s=first.timestamp_s,
+        fps=first.fps,
+        footage=first.footage,
+    )
