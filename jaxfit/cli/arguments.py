@@ -58,12 +58,22 @@ def add_model(command: argparse.ArgumentParser) -> None:
     command.add_argument("--model", default="murre", help=f"{MODEL} (default %(default)s)")
 
 
-def add_cameras(command: argparse.ArgumentParser) -> None:
-    """Add the file of calibrated cameras, and its unit."""
-    text = "calibrated cameras: OpenCV .yaml, .xml or .json, anipose .toml, DANNCE .mat, JARVIS .yaml, COLMAP text"
-    command.add_argument("cameras", type=Path, metavar="FILE", help=text)
+CAMERAS = "calibrated cameras: OpenCV .yaml, .xml or .json, anipose .toml, DANNCE .mat, JARVIS .yaml, COLMAP text"
+
+
+def add_unit(command: argparse.ArgumentParser) -> None:
+    """Add the unit of length of a file of cameras."""
     text = "unit of length of the file (default: that of the file, or the usual one of the program)"
     command.add_argument("--unit", choices=("m", "cm", "mm"), help=text)
+
+
+def add_view_options(command: argparse.ArgumentParser) -> None:
+    """Add the options for the observations of several cameras."""
+    add_unit(command)
+    text = "numbers with commas, one for each camera: its frame at frame 0 of the first camera, such as 0,3,-0.5"
+    command.add_argument("--offsets", metavar="N,N,…", help=text)
+    text = "which tracks are one bird: a table with the columns camera, track, bird (default: by the keypoints)"
+    command.add_argument("--match", type=Path, metavar="TABLE.csv", help=text)
 
 
 def add_truth(command: argparse.ArgumentParser) -> None:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from jaxfit.data.keypoint_names import NameMap
     from jaxfit.data.solution import Solution
     from jaxfit.evaluation.truth import Truth
+    from jaxfit.model.bird import Bird
 
 LEAST_KEYPOINTS = 3
 """Fewer keypoints do not determine the orientation of a bird."""
@@ -53,6 +54,16 @@ def fit(options: argparse.Namespace) -> None:
     check_replaceable(options.out, options.overwrite, "poses.npz")  # before the long work
     config = load_config(options.config)
     bird = find_bird(options.model)
+    if options.cameras is not None:
+        _fit_views(options, config, bird, start)
+        return
+    for option in ("unit", "offsets", "match"):
+        if getattr(options, option) is not None:
+            raise InputError(f"--{option}", "is given without --cameras", "give the calibrated cameras by --cameras")
+    if len(options.observations) > 1:
+        problem = f"{len(options.observations)} files of observations without --cameras"
+        raise InputError("fit", problem, "give the calibrated cameras by --cameras, or fit the files one by one")
+    (options.observations,) = options.observations
     observations, names = observations_for(options.observations, bird.keypoint_names, options, untracked="photographs")
     config = _fewer_keypoints(config, names, options)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
@@ -70,6 +81,16 @@ def fit(options: argparse.Namespace) -> None:
     save_solution(
         solution, bird, config_to_yaml(config), summary, options.out, options.overwrite, learnt and learnt.to_yaml()
     )
+    _show_fit(solution)
+    # every bird has a photograph of its own
+    photographs = f" in {counted(observations.photographs, 'photograph')}" if observations.photographs else ""
+    poses, tracks = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird" if photographs else "track")
+    counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
+    show(f"{poses} of {tracks}{photographs} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+
+
+def _show_fit(solution: Solution) -> None:
+    """Print the table of a fit."""
     show(flag_line(solution))
     table = right_aligned("track", "frames", "objective", *FIT_COLUMNS[:-1])
     table.add_column(FIT_COLUMNS[-1])
@@ -79,11 +100,45 @@ def fit(options: argparse.Namespace) -> None:
         table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", *cells[track])
     table.title = "objective: final value per frame; ok, unsure, contradicted: poses with this flag"
     show(table)
-    # every bird has a photograph of its own
-    photographs = f" in {counted(observations.photographs, 'photograph')}" if observations.photographs else ""
-    poses, tracks = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird" if photographs else "track")
-    counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
-    show(f"{poses} of {tracks}{photographs} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+
+
+def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start: float) -> None:
+    """Fit the birds that calibrated cameras see and write a result."""
+    from jaxfit.cameras.files import write_cameras
+    from jaxfit.cli.cameras import read_views, show_matches
+    from jaxfit.config.yaml_file import config_to_yaml
+    from jaxfit.data.solution import RESULT, write_solution
+    from jaxfit.fitting.collect import summarise
+    from jaxfit.fitting.views import fit_views
+    from jaxfit.foundation.files import new_folder
+    from jaxfit.foundation.workers import open_cluster
+
+    if options.init is not None:
+        raise InputError("--init", "is given with --cameras", "leave out --init: the cameras give the initial poses")
+    views, tracks, matches = read = read_views(options, bird)
+    show_matches(read)
+    read_s = time.perf_counter()
+    with open_cluster(options.workers, options.scheduler) as cluster:
+        source = ", ".join(map(str, options.observations))
+        solution = fit_views(views, bird, config, terminal, source, cluster)
+    seconds = {"read": read_s - start, "fit": time.perf_counter() - read_s}
+    summary = summarise(solution, bird, seconds)
+    summary["cameras"] = [camera.name for camera in views.lenses]
+    summary["matches"] = {
+        f"bird {b + 1}": {
+            camera.name: own.track_id[(of == b).any(axis=1)].tolist()
+            for camera, own, of in zip(views.lenses, tracks, matches.bird, strict=True)
+        }
+        for b in range(matches.birds)
+    }
+    with new_folder(options.out, options.overwrite, marker=RESULT) as part:
+        write_solution(solution, bird, config_to_yaml(config), summary, part)
+        write_cameras(views.lenses, part / "cameras.toml")
+    _show_fit(solution)
+    show(
+        f"{counted(summary['poses'], 'pose')} of {counted(len(solution.track_id), 'bird')} "
+        f"in {counted(len(tracks), 'view')} in {seconds['fit']:.1f} s → {options.out}"
+    )
 
 
 def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namespace) -> FitConfig:

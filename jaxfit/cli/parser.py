@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from jaxfit.cli.arguments import (
+    CAMERAS,
     MODEL,
     OBSERVATIONS,
     Parser,
     add_adapt_commands,
-    add_cameras,
     add_cluster,
     add_codec,
     add_command,
@@ -27,6 +27,8 @@ from jaxfit.cli.arguments import (
     add_result_commands,
     add_tracking_options,
     add_truth,
+    add_unit,
+    add_view_options,
 )
 from jaxfit.foundation.extras import own_version
 
@@ -85,8 +87,11 @@ def _perception(commands: Any) -> None:
 
 def _fitting(commands: Any) -> None:
     fit = add_command(commands, "fit", "fitting.fit", "fit the poses of birds to keypoints and masks")
-    fit.add_argument("observations", type=Path, metavar="OBS", help=OBSERVATIONS)
+    text = f"{OBSERVATIONS}; with --cameras one file for each camera"
+    fit.add_argument("observations", type=Path, nargs="+", metavar="OBS", help=text)
     add_observation_options(fit)
+    fit.add_argument("--cameras", type=Path, metavar="FILE", help=f"fit all views at once, in the world; {CAMERAS}")
+    add_view_options(fit)
     add_model(fit)
     text = "name of a shipped config (paper, baseline, …) or a YAML file (default %(default)s)"
     fit.add_argument("--config", default="paper", help=text)
@@ -145,15 +150,24 @@ def _fitting(commands: Any) -> None:
 
 
 def _cameras(commands: Any) -> None:
-    cameras = commands.add_parser("cameras", help="describe calibrated cameras")
+    cameras = commands.add_parser("cameras", help="describe and check calibrated cameras")
     actions = cameras.add_subparsers(required=True, metavar="ACTION")
     text = "print the lens and the position of every camera, and draw their fields of view"
     show = add_command(actions, "show", "cameras.show_cameras", text)
-    add_cameras(show)
+    show.add_argument("cameras", type=Path, metavar="FILE", help=CAMERAS)
+    add_unit(show)
     show.add_argument(
         "--out", type=Path, metavar="PNG", help="picture to write: the cameras from above and from the side"
     )
     show.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    text = "check cameras against the keypoints of birds: errors, wrong order, offset in time, moved camera"
+    check = add_command(actions, "check", "cameras.check_calibration", text)
+    check.add_argument("cameras", type=Path, metavar="FILE", help=CAMERAS)
+    text = f"one file for each camera, in the order of the cameras: {OBSERVATIONS}"
+    check.add_argument("observations", type=Path, nargs="+", metavar="OBS", help=text)
+    add_observation_options(check)
+    add_view_options(check)
+    add_model(check)
 
 
 def _simulation(commands: Any) -> None:

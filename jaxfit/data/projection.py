@@ -63,7 +63,9 @@ def image_focal_px(solution: Solution) -> float:
     return float(np.median(solution.focal_px * sizes / solution.crop_px)) if sizes.size else np.nan
 
 
-def in_image(solution: Solution, bird: Bird, focal_px: float | None = None) -> InImage:
+def in_image(
+    solution: Solution, bird: Bird, focal_px: float | None = None, centre_px: tuple[float, float] | None = None
+) -> InImage:
     """Place the birds of a solution in the camera frame of the image.
 
     The camera of the image sees the root joint at the same pixel as the camera of the crop, and sees the bird at the
@@ -75,6 +77,7 @@ def in_image(solution: Solution, bird: Bird, focal_px: float | None = None) -> I
         solution: the poses.
         bird: the model of the solution.
         focal_px: focal length of the image; None takes `image_focal_px`.
+        centre_px: principal point of the image; None takes the middle of the image.
     """
     s, focal = solution, image_focal_px(solution) if focal_px is None else focal_px
     at = np.nonzero(s.valid)
@@ -83,7 +86,8 @@ def in_image(solution: Solution, bird: Bird, focal_px: float | None = None) -> I
     crop_focal = s.focal_px * crop[:, 2:] / s.crop_px
     pixel = root[:, :2] / root[:, 2:] * crop_focal + crop[:, :2] + crop[:, 2:] / 2
     # the pictures of a camera have one size; a photograph may have its own
-    ray = np.concatenate([(pixel - s.image_size_px[at] / 2) / focal, np.ones((len(root), 1))], axis=1)
+    centre = s.image_size_px[at] / 2 if centre_px is None else np.asarray(centre_px)
+    ray = np.concatenate([(pixel - centre) / focal, np.ones((len(root), 1))], axis=1)
     turn = _between(root, ray)
     orient = (turn * Rotation.from_rotvec(s.global_orient[at].astype(np.float64))).as_rotvec()
 

@@ -31,7 +31,9 @@ _OLDEST_VERSION = 2
 STATUSES = ("ok", "partly diverged", "diverged", "no usable frame")
 """The words of `Solution.status`."""
 
-_POSES, _CONFIG, _SUMMARY, _MODEL = "poses.npz", "config.yaml", "summary.json", "model.npz"
+RESULT = "poses.npz"
+"""File that marks a result folder."""
+_CONFIG, _SUMMARY, _MODEL = "config.yaml", "summary.json", "model.npz"
 _LEARNT = "learnt.yaml"
 
 _CAMERA = {"focal_px": ("", np.float64), "crop_px": ("", np.int64)}
@@ -335,7 +337,7 @@ def save_solution(
         InputError: the folder holds results already or something else, or cannot be written.
         TypeError: ``summary`` holds a value that JSON cannot represent.
     """
-    with new_folder(folder, overwrite, marker=_POSES) as part:
+    with new_folder(folder, overwrite, marker=RESULT) as part:
         write_solution(solution, bird, config_yaml, summary, part, learnt_yaml)
 
 
@@ -359,7 +361,7 @@ def write_solution(
     arrays["timestamp_s"] = solution.timestamp_s
     arrays["fps"] = np.asarray(np.nan if solution.fps is None else solution.fps, np.float64)
     arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
-    write_whole(folder / _POSES, lambda file: np.savez_compressed(file, **arrays))
+    write_whole(folder / RESULT, lambda file: np.savez_compressed(file, **arrays))
     write_whole(folder / _CONFIG, config_yaml.encode())
     if learnt_yaml is not None:
         write_whole(folder / _LEARNT, learnt_yaml.encode())
@@ -378,7 +380,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
             arrays do not agree.
     """
     folder = check_folder(folder, "a folder of results")
-    path = folder / _POSES
+    path = folder / RESULT
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
     optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD).items()}
@@ -398,9 +400,9 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         raise InputError(path, str(error), "run the fit again") from error
     bird = load_bird(folder / _MODEL)
     if (bird.joint_names, bird.keypoint_names) != (solution.joint_names, solution.keypoint_names):
-        raise InputError(folder / _MODEL, f"is not the model of {_POSES}", "run the fit again")
+        raise InputError(folder / _MODEL, f"is not the model of {RESULT}", "run the fit again")
     if bird.num_shapes != solution.betas.shape[2]:
-        problem = f"has {bird.num_shapes} shape coefficients, but {_POSES} has {solution.betas.shape[2]}"
+        problem = f"has {bird.num_shapes} shape coefficients, but {RESULT} has {solution.betas.shape[2]}"
         raise InputError(folder / _MODEL, problem, "run the fit again")
     return solution, bird
 

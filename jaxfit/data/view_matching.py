@@ -8,9 +8,12 @@ they share, so that a track that breaks, or that changes to another bird, in one
 
 from __future__ import annotations
 
+import csv
+import io
 from collections import Counter
 from collections.abc import Sequence
 from itertools import combinations
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +23,8 @@ from scipy.optimize import linear_sum_assignment
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import epipolar_error_px, fundamental_matrix
 from jaxfit.data.observations import Observations
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.reading import open_file
 
 BLOCK_FRAMES = 25
 """Frames of a block: a track that changes to another bird costs at most this many frames of one camera."""
@@ -43,6 +48,35 @@ class BirdMatches(NamedTuple):
     """For each bird, share of its blocks in which another track fits almost as well."""
 
 
+def matches_of_file(path: Path, cameras: Sequence[Camera], observations: Sequence[Observations]) -> BirdMatches:
+    """Read the bird of each track from a CSV file with the columns `camera`, `track` and `bird`.
+
+    Tracks that the file does not name show no bird. The errors of the matches are unknown (NaN).
+
+    Raises:
+        InputError: a column is missing, or a row names an unknown camera or track, or a bird that is not a number.
+    """
+    with open_file(path) as file:
+        try:
+            rows = list(csv.DictReader(io.StringIO(file.read().decode("utf-8-sig"))))
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise InputError(path, f"is not a CSV file: {error}", "write the columns camera, track, bird") from None
+    names = [camera.name for camera in cameras]
+    bird = [np.full(own.present.shape, -1) for own in observations]
+    numbers: dict[str, int] = {}
+    for line, row in enumerate(rows, start=2):
+        try:
+            v = names.index(str(row["camera"]).strip())
+            n = observations[v].track_id.tolist().index(int(row["track"]))
+            number = numbers.setdefault(str(row["bird"]).strip(), len(numbers))
+        except (KeyError, ValueError, TypeError):
+            problem = f"line {line} names no camera and track of the observations: {dict(row)}"
+            raise InputError(path, problem, f"write the columns camera ({', '.join(names)}), track, bird") from None
+        bird[v][n] = np.where(observations[v].present[n], number, -1)
+    unknown = np.full(len(numbers), np.nan)
+    return BirdMatches(tuple(bird), len(numbers), unknown, np.zeros(len(numbers)))
+
+
 class _Block(NamedTuple):
     """The tracks of a block of frames, of all cameras."""
 
@@ -56,16 +90,15 @@ def match_birds(cameras: Sequence[Camera], observations: Sequence[Observations])
     """Match the tracks of cameras without distortion, in observations with equal frames (`on_common_frames`)."""
     T = observations[0].num_frames
     bird = [np.full(own.present.shape, -1) for own in observations]
-    F = {(i, j): fundamental_matrix(cameras[i], cameras[j]) for i, j in combinations(range(len(cameras)), 2)}
     last: dict[tuple[int, int], int] = {}
     errors: dict[int, list[float]] = {}
     doubts: dict[int, list[bool]] = {}
     for first in range(0, T, BLOCK_FRAMES):
         frames = np.arange(first, min(first + BLOCK_FRAMES, T))
-        block = _block(observations, F, frames)
+        block = _block(cameras, observations, frames)
         groups = _groups(block, observations, frames)
         numbers = _continue_birds(
-            [[block.nodes[m] for m in group] for group in groups], observations, frames, last, errors
+            [[block.nodes[m] for m in group] for group in groups], observations, frames, last, len(errors)
         )
         for number, group in zip(numbers, groups, strict=True):
             inside = block.cost[np.ix_(group, group)]
@@ -81,29 +114,44 @@ def match_birds(cameras: Sequence[Camera], observations: Sequence[Observations])
     return BirdMatches(tuple(bird), count, mean, undecided)
 
 
-def _block(observations: Sequence[Observations], F: dict, frames: np.ndarray) -> _Block:
+def pair_costs(
+    cameras: tuple[Camera, Camera], observations: tuple[Observations, Observations], frames: Int[np.ndarray, "F"]
+) -> Float[np.ndarray, "N M"]:
+    """Return the median epipolar error of each track of one camera with each track of another camera.
+
+    Args:
+        cameras, observations: two cameras without distortion, and their tracks.
+        frames: positions of the frames that count.
+
+    Returns:
+        Errors relative to the side of the boxes; NaN for tracks with fewer than `LEAST_PAIRS` common keypoints.
+    """
+    one, two = observations
+    F = fundamental_matrix(*cameras)
+    cost = np.full((one.num_tracks, two.num_tracks), np.nan)
+    for n in np.flatnonzero(one.present[:, frames].any(1)).tolist():
+        for m in np.flatnonzero(two.present[:, frames].any(1)).tolist():
+            both = (one.confidence[n, frames] > 0) & (two.confidence[m, frames] > 0)
+            if both.sum() < LEAST_PAIRS:
+                continue
+            shown = (own.keypoints_px[k, frames][both].astype(np.float64) for own, k in ((one, n), (two, m)))
+            sides = [own.box_px[k, frames][:, 2:].max(-1) for own, k in ((one, n), (two, m))]
+            side = np.broadcast_to(np.sqrt(sides[0] * sides[1])[:, None], both.shape)[both]
+            cost[n, m] = np.median(epipolar_error_px(F, *shown) / np.maximum(side, 1))
+    return cost
+
+
+def _block(cameras: Sequence[Camera], observations: Sequence[Observations], frames: np.ndarray) -> _Block:
     nodes = [
         (v, n) for v, own in enumerate(observations) for n in np.flatnonzero(own.present[:, frames].any(1)).tolist()
     ]
     cost = np.full((len(nodes), len(nodes)), np.nan)
-    for a, b in combinations(range(len(nodes)), 2):
-        (v, n), (w, m) = nodes[a], nodes[b]
-        if v == w:
-            continue
-        one, two = observations[v], observations[w]
-        both = (one.confidence[n, frames] > 0) & (two.confidence[m, frames] > 0)
-        if both.sum() < LEAST_PAIRS:
-            continue
-        error_px = epipolar_error_px(
-            F[v, w],
-            *(
-                each.astype(np.float64)
-                for each in (one.keypoints_px[n, frames][both], two.keypoints_px[m, frames][both])
-            ),
-        )
-        sides = [own.box_px[k, frames][:, 2:].max(-1) for own, k in ((one, n), (two, m))]
-        side = np.broadcast_to((np.sqrt(sides[0] * sides[1]))[:, None], both.shape)[both]
-        cost[a, b] = cost[b, a] = np.median(error_px / np.maximum(side, 1))
+    at = {node: i for i, node in enumerate(nodes)}
+    for v, w in combinations(range(len(cameras)), 2):
+        own = pair_costs((cameras[v], cameras[w]), (observations[v], observations[w]), frames)
+        for n, m in np.argwhere(np.isfinite(own)).tolist():
+            a, b = at[v, n], at[w, m]
+            cost[a, b] = cost[b, a] = own[n, m]
     return _Block(nodes, cost)
 
 
@@ -131,9 +179,15 @@ def _groups(block: _Block, observations: Sequence[Observations], frames: np.ndar
     return [group for group in groups if len({block.nodes[m][0] for m in group}) > 1]
 
 
-def _continue_birds(groups, observations, frames, last, errors) -> list[int]:
+def _continue_birds(
+    groups: list[list[tuple[int, int]]],
+    observations: Sequence[Observations],
+    frames: np.ndarray,
+    last: dict[tuple[int, int], int],
+    known_birds: int,
+) -> list[int]:
     """Return the number of the bird of each group: that of earlier groups with the same tracks, or a new number."""
-    votes = [Counter() for _ in groups]
+    votes: list[Counter[int]] = [Counter() for _ in groups]
     for count, group in zip(votes, groups, strict=True):
         for v, n in group:
             if (v, n) in last:
@@ -145,7 +199,7 @@ def _continue_birds(groups, observations, frames, last, errors) -> list[int]:
     for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
         if gain[row, column] > 0:
             numbers[row] = known[column]
-    fresh = len(errors)
+    fresh = known_birds
     for g, number in enumerate(numbers):
         if number < 0:
             numbers[g], fresh = fresh, fresh + 1

@@ -26,7 +26,9 @@ class Views(NamedTuple):
     """What V cameras observe of N birds in T frames."""
 
     cameras: tuple[Camera, ...]
-    """Cameras without distortion."""
+    """Cameras without distortion (`straightened`)."""
+    lenses: tuple[Camera, ...]
+    """The same cameras as they film."""
     observations: tuple[Observations, ...]
     """Pixels of these cameras, with equal frames and tracks: row n is the same bird in all views."""
 

@@ -21,11 +21,12 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import Triangulated, triangulate_robustly
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.data.observations import Observations
+from jaxfit.data.projection import in_image
 from jaxfit.data.solution import Solution
 from jaxfit.data.views import Views
 from jaxfit.fitting.batch import tile_size
 from jaxfit.fitting.collect import FittedWindow, track_status
-from jaxfit.fitting.fit import check_observations, checked_model
+from jaxfit.fitting.fit import check_observations, checked_model, fit
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.solve import crop_camera, without_mask_stages
 from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
@@ -64,9 +65,12 @@ _logger = logging.getLogger(__name__)
 def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
     """Return a config for several views: depth and size are optimised, with the prior of the size.
 
-    The learnt weights and error bars of the config are those of one view, and are switched off. Windows do not overlap.
+    The silhouettes have an unbiased edge, and pixels that other birds may cover do not count. Learnt weights and error
+    bars are those of one view, and are switched off. Windows do not overlap.
     """
     used = config if has_masks else without_mask_stages(config)
+    # a silhouette that is larger than its mesh, or a mask that another bird cuts, would bias the size
+    used = replace(used, edge="unbiased", unknown_pixels=True)
 
     def free(stage: StageConfig) -> StageConfig:
         scales = {name: factor for name, factor in stage.step_scale.items() if name != "transl"}
@@ -104,7 +108,7 @@ def fit_views(
 
     Returns:
         Poses in the frame of the first camera without distortion, whose crop is the whole picture, with the arrays
-        `data.solution.WORLD`.
+        `data.solution.WORLD`. With one view: the result of `fit`; in the world, every bird has the size of the model.
 
     Raises:
         InputError: no bird that two cameras see, a model without a unit, or a size that shows a wrong unit.
@@ -114,6 +118,10 @@ def fit_views(
         remedy = "import the model again with `metres_per_unit`, or use a model of your species (docs/species.md)"
         raise InputError(f"model {bird.name}", "has no unit of length, which cameras in metres need", remedy)
     checked = [check_observations(own, bird, source) for own in views.observations]
+    if len(checked) == 1:
+        return _with_world(
+            fit(checked[0], bird, config, None, progress, source, cluster=cluster), bird, views.cameras[0]
+        )
     config = views_config(config, any(own.masks for own in checked))
     prepared = [prepare_observations(own, config) for own in checked]
     found = triangulated_keypoints(views.cameras, prepared)
@@ -328,7 +336,7 @@ def _solution(
     unit_m: float,
 ) -> Solution:
     """Return the poses of all windows, in the frame of the first camera and in the world."""
-    camera = views.cameras[0]
+    camera = views.lenses[0]
     N, T, K, bones = first.num_tracks, first.num_frames, bird.num_keypoints, bird.num_joints - 1
     shapes = {
         "global_orient": (3,),
@@ -389,7 +397,7 @@ def _solution(
         }
         for name, value in values.items():
             arrays[name][n, at] = value
-    width, height = first.image_size_px[0].tolist()
+    width, height = camera.size_px or first.image_size_px[0].tolist()
     side = max(width, height)
     crop = np.array([*(camera.matrix[:2, 2] - side / 2), side])
     return Solution(
@@ -411,4 +419,23 @@ def _solution(
         timestamp_s=first.timestamp_s,
         fps=first.fps,
         footage=first.footage,
+    )
+
+
+def _with_world(solution: Solution, bird: Bird, camera: Camera) -> Solution:
+    """Return the solution of one view with the birds in the world: every bird has the size of the model."""
+    unit_m = bird.metres_per_unit or 1.0
+    placed = in_image(solution, bird, float(camera.matrix[0, 0]), tuple(camera.matrix[:2, 2]))
+    orient = Rotation.from_rotvec(np.nan_to_num(placed.orientation).reshape(-1, 3)).as_matrix()
+    R = camera.R_cam_world.T @ orient.reshape(*placed.orientation.shape[:2], 3, 3)
+    keypoints_cam = placed.points(solution.keypoints_cam.astype(np.float64), solution.scale.astype(np.float64))
+
+    def to_world(points_cam: np.ndarray) -> np.ndarray:
+        return (points_cam * unit_m - camera.transl_cam) @ camera.R_cam_world
+
+    return replace(
+        solution,
+        R_world_root=np.where(solution.valid[..., None, None], R, np.nan),
+        transl_world_m=to_world(placed.root),
+        keypoints_world_m=to_world(keypoints_cam),
     )
