@@ -120,9 +120,10 @@ class Camera:
 
     def project(self, points_world: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 2"]:
         """Project points of the world, metres, to pixels of the image; NaN for points behind the camera."""
-        points_cam = self.to_camera(points_world)
-        ahead = np.asarray(points_cam[..., 2:] > 0)
-        xy = np.where(ahead, points_cam[..., :2] / np.where(ahead, points_cam[..., 2:], 1), np.nan)
+        points_cam = np.asarray(self.to_camera(points_world))
+        depth = np.asarray(points_cam[..., 2:])
+        ahead: np.ndarray = np.greater(depth, 0)
+        xy = np.where(ahead, points_cam[..., :2] / np.where(ahead, depth, 1), np.nan)
         return self._to_px(self._distorted(xy))
 
     def distort(self, points_px: Float[np.ndarray, "*B 2"]) -> Float[np.ndarray, "*B 2"]:
@@ -135,7 +136,7 @@ class Camera:
         if not self.distortion.any() and self.lens == "perspective":
             return points_px.copy()
         plane = self._to_plane(points_px).reshape(-1, 1, 2)
-        known = np.isfinite(plane).all(-1)[:, 0]
+        known = np.isfinite(plane[:, 0]).all(-1)
         straight = np.full_like(plane, np.nan)
         if known.any():
             arguments = plane[known], np.eye(3), self._coefficients

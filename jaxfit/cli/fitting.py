@@ -102,6 +102,23 @@ def _show_fit(solution: Solution) -> None:
     show(table)
 
 
+def _show_world(solution: Solution) -> None:
+    """Print the table of a fit in the world."""
+    table = right_aligned("bird", "frames", "size", "x, y, z m", "moved m", "status")
+    for n, track in enumerate(solution.track_id.tolist()):
+        valid = solution.valid[n]
+        if not valid.any():
+            table.add_row(str(track), "0", "", "", "", str(solution.status[n]))
+            continue
+        places = np.asarray(solution.transl_world_m)[n, valid]
+        moved_m = np.linalg.norm(places.max(axis=0) - places.min(axis=0))
+        place = ", ".join(f"{x:.2f}" for x in np.median(places, axis=0))
+        size = f"{np.median(solution.scale[n, valid]):.3f}"
+        table.add_row(str(track), str(int(valid.sum())), size, place, f"{moved_m:.2f}", str(solution.status[n]))
+    table.title = "size: relative to the model; x, y, z: median place of the root; moved: extent of its places"
+    show(table)
+
+
 def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start: float) -> None:
     """Fit the birds that calibrated cameras see and write a result."""
     from jaxfit.cameras.files import write_cameras
@@ -134,7 +151,7 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     with new_folder(options.out, options.overwrite, marker=RESULT) as part:
         write_solution(solution, bird, config_to_yaml(config), summary, part)
         write_cameras(views.lenses, part / "cameras.toml")
-    _show_fit(solution)
+    _show_world(solution)
     show(
         f"{counted(summary['poses'], 'pose')} of {counted(len(solution.track_id), 'bird')} "
         f"in {counted(len(tracks), 'view')} in {seconds['fit']:.1f} s → {options.out}"

@@ -44,6 +44,7 @@ def build_parser() -> argparse.ArgumentParser:
         _labelling,
         _import,
         _fitting,
+        _comparing,
         add_result_commands,
         _cameras,
         _simulation,
@@ -122,6 +123,8 @@ def _fitting(commands: Any) -> None:
     add_observation_options(calibrate)
     add_out(calibrate, "NOISE.yaml", "config to write, for `jaxfit fit --config`", overwrite="an existing file")
 
+
+def _comparing(commands: Any) -> None:
     text = "fit the same birds with a grid of configs and compare the results (needs the extra `report`)"
     ablate = add_command(commands, "ablate", "experiments.ablate", text)
     text = "COCO file with the keypoint names of the model; `jaxfit import` writes it from other files"

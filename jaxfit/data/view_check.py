@@ -181,6 +181,16 @@ def _errors(views: Views) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]
     return by_camera, by_keypoint
 
 
+def _mean_error(cameras: Sequence[Camera], px: np.ndarray, confidence: np.ndarray, side: np.ndarray) -> float:
+    """Return the mean error of all keypoints, relative to the side of the box; at most `MOST_ERROR` each.
+
+    A wrong pose of one camera can explain the keypoints of this camera, but not those of the others.
+    """
+    found = triangulate_robustly(cameras, px, confidence, MOST_ERROR * side)
+    error = np.where(np.isfinite(found.error_px), np.minimum(found.error_px / side, MOST_ERROR), MOST_ERROR)
+    return float(error[(confidence > 0) & ((confidence > 0).sum(axis=0) > 1)].mean())
+
+
 def _moved(views: Views) -> list[str]:
     """Estimate the pose of each camera from keypoints that the other cameras triangulate."""
     px, confidence, side = _stacked(views)
@@ -207,7 +217,8 @@ def _moved(views: Views) -> list[str]:
         new = replace(camera, R_cam_world=R, transl_cam=tvec[:, 0] - R @ centre)
         after = float(np.median(reprojection_error_px([new], points, shown[None])))
         if after < CLEARLY_BETTER * before:
-            found.append((after / before, camera, new, before, after))
+            corrected = [new if w == v else each for w, each in enumerate(views.cameras)]
+            found.append((_mean_error(corrected, px, confidence, side), camera, new, before, after))
     if not found:
         return []
     _, camera, new, before, after = min(found, key=lambda each: each[0])

@@ -55,11 +55,11 @@ def assign_cameras(
         sizes = {(int(w), int(h)) for w, h in own.image_size_px}
         if len(sizes) > 1 or own.own_images:
             raise InputError(source, "holds images of several sizes", "a calibrated camera has one image size")
-        size = next(iter(sizes), camera.size_px)
-        if camera.size_px is not None and size != camera.size_px:
-            problem = f"has images of {size[0]}×{size[1]}, but camera {camera.name} has {camera.size_px[0]}×"
-            remedy = "check the order of the files, or calibrate with the size of the video"
-            raise InputError(source, f"{problem}{camera.size_px[1]}", remedy)
+        expected = camera.size_px
+        size = next(iter(sizes), expected)
+        if size and expected and size != expected:
+            problem = f"has images of {size[0]}×{size[1]}, but camera {camera.name} has {expected[0]}×{expected[1]}"
+            raise InputError(source, problem, "check the order of the files, or calibrate with the size of the video")
         assigned.append(replace(camera, size_px=size))
     return tuple(assigned)
 
@@ -200,7 +200,7 @@ def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observation
         w = share.reshape(1, -1, *(1,) * (values.ndim - 2))
         return (1 - w) * values[:, i] + w * values[:, j]
 
-    present = own.present[:, i] & own.present[:, j] & known
+    present, score = own.present[:, i] & own.present[:, j] & known, np.asarray(own.score)
     confidence = np.where(present[..., None], np.minimum(own.confidence[:, i], own.confidence[:, j]), 0)
     nearest = np.where(share < 0.5, i, j)
     masks = {}
@@ -214,7 +214,7 @@ def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observation
         keypoints_px=np.where(confidence[..., None] > 0, mixed(own.keypoints_px), 0).astype(np.float32),
         confidence=confidence.astype(np.float32),
         box_px=np.where(present[..., None], mixed(own.box_px), 0).astype(np.float32),
-        score=np.where(present, np.minimum(own.score[:, i], own.score[:, j]), 0).astype(np.float32),
+        score=np.where(present, np.minimum(score[:, i], score[:, j]), 0).astype(np.float32),
         occluded=None,
         image_size_px=np.broadcast_to(own.image_size_px[:1], (len(at), 2)),
         file_name=own.file_name[nearest],
@@ -242,12 +242,11 @@ def birds_in_rows(observations: Observations, bird: Int[np.ndarray, "N T"], bird
         bird_ids: new track ids.
     """
     T, B = observations.num_frames, len(bird_ids)
-    row = np.full((B, T), -1)
-    score = np.full((B, T), -1.0)
+    row, best, own_score = np.full((B, T), -1), np.full((B, T), -1.0), np.asarray(observations.score)
     for n, t in np.argwhere((bird >= 0) & observations.present).tolist():
         b = bird[n, t]
-        if observations.score[n, t] > score[b, t]:
-            row[b, t], score[b, t] = n, observations.score[n, t]
+        if own_score[n, t] > best[b, t]:
+            row[b, t], best[b, t] = n, own_score[n, t]
     known, at, frames = row >= 0, np.maximum(row, 0), np.arange(T)
 
     def taken(values: np.ndarray) -> np.ndarray:

@@ -137,4 +137,7 @@ class ProvisionalFit:
 
 
 def _joined(parts: Sequence[Windows]) -> Windows:
-    return Windows(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0]) if name != "views"
+    }
+    return Windows(**arrays)

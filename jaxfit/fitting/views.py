@@ -14,7 +14,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
@@ -336,28 +336,12 @@ def _solution(
     unit_m: float,
 ) -> Solution:
     """Return the poses of all windows, in the frame of the first camera and in the world."""
-    camera = views.lenses[0]
-    N, T, K, bones = first.num_tracks, first.num_frames, bird.num_keypoints, bird.num_joints - 1
-    shapes = {
-        "global_orient": (3,),
-        "body_pose": (bones, 3),
-        "transl": (3,),
-        "scale": (),
-        "bone_length": (bones,),
-        "betas": (bird.num_shapes,),
-        "keypoints_cam": (K, 3),
-        "keypoints_px": (K, 2),
-        "R_world_root": (3, 3),
-        "transl_world_m": (3,),
-        "keypoints_world_m": (K, 3),
-    }
-    arrays = {name: np.full((N, T, *shape), np.nan) for name, shape in shapes.items()}
+    camera, N, T = views.lenses[0], first.num_tracks, first.num_frames
+    arrays: dict[str, np.ndarray] = {}
     valid = np.zeros((N, T), bool)
     fitted, diverged = np.zeros(N, int), np.zeros(N, int)
     loss = {name: np.full(N, np.nan) for name in results[0].loss}
     failures: dict[int, tuple[str, ...]] = {}
-    root, R_cam_world = np.asarray(bird.joints[0], np.float64), camera.R_cam_world
-    t_cam = (R_cam_world @ origin_m + camera.transl_cam) / unit_m
     for w, result in enumerate(results):
         n, present = int(windows.track[w]), windows.present[w]
         at = windows.frame[w][present]
@@ -368,35 +352,14 @@ def _solution(
             track = int(windows.track_id[w])
             _logger.warning("bird %d, %s", track, text)
             failures[track] = (*failures.get(track, ()), text)
-            continue
-        for name, value in result.loss.items():
-            loss[name][n] = value + (loss[name][n] if fitted[n] else 0.0)
-        fitted[n] += 1
-        valid[n, at] = True
-        pose = result.pose
-        scale = np.broadcast_to(pose.scale, present.shape)[present]
-        R_world = Rotation.from_rotvec(np.asarray(pose.global_orient, np.float64)[present])
-        shift = np.asarray(pose.transl, np.float64)[present] + scale[:, None] * root
-        keypoints = np.asarray(result.keypoints_cam, np.float64)[present]
-        keypoints_cam = keypoints @ R_cam_world.T + t_cam
-        orient_cam = (Rotation.from_matrix(R_cam_world) * R_world).as_rotvec()
-        betas = np.zeros(bird.num_shapes)
-        betas[: len(pose.betas)] = pose.betas
-        values = {
-            "global_orient": np.asarray(unwrap_axis_angle(jnp.asarray(orient_cam, jnp.float32))),
-            "body_pose": np.asarray(pose.body_pose)[present],
-            "transl": shift @ R_cam_world.T + t_cam - scale[:, None] * root,
-            "scale": scale,
-            "bone_length": pose.bone_length,
-            "betas": betas,
-            "keypoints_cam": keypoints_cam,
-            "keypoints_px": np.nan_to_num(camera.project(keypoints * unit_m + origin_m)),
-            "R_world_root": R_world.as_matrix(),
-            "transl_world_m": shift * unit_m + origin_m,
-            "keypoints_world_m": keypoints * unit_m + origin_m,
-        }
-        for name, value in values.items():
-            arrays[name][n, at] = value
+        else:
+            for name, value in result.loss.items():
+                loss[name][n] = value + (loss[name][n] if fitted[n] else 0.0)
+            fitted[n] += 1
+            valid[n, at] = True
+        for name, values in _frame_values(result, present, bird, camera, origin_m, unit_m).items():
+            everywhere = arrays.setdefault(name, np.full((N, T, *values.shape[1:]), np.nan))
+            everywhere[n, at] = np.nan if result.failure else values
     width, height = camera.size_px or first.image_size_px[0].tolist()
     side = max(width, height)
     crop = np.array([*(camera.matrix[:2, 2] - side / 2), side])
@@ -420,6 +383,40 @@ def _solution(
         fps=first.fps,
         footage=first.footage,
     )
+
+
+def _frame_values(
+    result: FittedWindow,
+    present: Bool[np.ndarray, "T"],
+    bird: Bird,
+    camera: Camera,
+    origin_m: Float[np.ndarray, "3"],
+    unit_m: float,
+) -> dict[str, np.ndarray]:
+    """Return the arrays of a solution at the present frames of one window."""
+    pose, root, R_cam_world = result.pose, np.asarray(bird.joints[0], np.float64), camera.R_cam_world
+    t_cam = (R_cam_world @ origin_m + camera.transl_cam) / unit_m
+    frames = int(present.sum())
+    scale = np.broadcast_to(pose.scale, present.shape)[present]
+    R_world = Rotation.from_rotvec(np.nan_to_num(np.asarray(pose.global_orient, np.float64)[present]))
+    orient_cam = (Rotation.from_matrix(R_cam_world) * R_world).as_rotvec()
+    place = np.asarray(pose.transl, np.float64)[present] + scale[:, None] * root
+    keypoints = np.asarray(result.keypoints_cam, np.float64)[present]
+    betas = np.zeros(bird.num_shapes)
+    betas[: len(pose.betas)] = pose.betas
+    return {
+        "global_orient": np.asarray(unwrap_axis_angle(jnp.asarray(orient_cam, jnp.float32))),
+        "body_pose": np.asarray(pose.body_pose)[present],
+        "transl": place @ R_cam_world.T + t_cam - scale[:, None] * root,
+        "scale": scale,
+        "bone_length": np.broadcast_to(pose.bone_length, (frames, len(pose.bone_length))),
+        "betas": np.broadcast_to(betas, (frames, len(betas))),
+        "keypoints_cam": keypoints @ R_cam_world.T + t_cam,
+        "keypoints_px": np.nan_to_num(camera.project(keypoints * unit_m + origin_m)),
+        "R_world_root": R_world.as_matrix(),
+        "transl_world_m": place * unit_m + origin_m,
+        "keypoints_world_m": keypoints * unit_m + origin_m,
+    }
 
 
 def _with_world(solution: Solution, bird: Bird, camera: Camera) -> Solution:

@@ -1,0 +1,178 @@
+"""Fits of several calibrated cameras against simulated truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jaxfit.cameras.files import read_cameras, write_cameras
+from jaxfit.cli.main import main
+from jaxfit.config.build import with_values
+from jaxfit.config.fit import load_config
+from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.solution import load_solution
+from jaxfit.data.views import Views, birds_in_rows, straightened
+from jaxfit.fitting.fit import fit
+from jaxfit.fitting.views import fit_views, initial_poses, triangulated_keypoints, views_config
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.files import load_murre
+from jaxfit.simulation.rig import stage_rig
+
+BIRD = load_murre()
+UNIT = BIRD.metres_per_unit
+FRAMES = 8
+CONFIG = with_values(load_config("fast"), {"window": FRAMES, "crop.size_px": 64, "filter_window": 1})
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return stage_rig(BIRD, 3, birds=2, frames=FRAMES, size=(640, 380), seed=3, distorted=True)
+
+
+def views_of(rig, which, observations):
+    """Views of some cameras of the truth, whose track ids agree."""
+    pairs = [straightened(rig.cameras[v], own) for v, own in zip(which, observations, strict=True)]
+    rows = []
+    for _, own in pairs:
+        bird = np.where(own.present, np.arange(own.num_tracks)[:, None], -1)
+        rows.append(birds_in_rows(own, bird, [1, 2]))
+    return Views(tuple(camera for camera, _ in pairs), tuple(rig.cameras[v] for v in which), tuple(rows))
+
+
+@pytest.fixture(scope="module")
+def truth_m(rig):
+    """True keypoints in the world, metres."""
+    camera = rig.cameras[0]
+    return (rig.scenes[0].poses.keypoints_cam.astype(float) * UNIT - camera.transl_cam) @ camera.R_cam_world
+
+
+@pytest.fixture(scope="module")
+def solution(rig):
+    return fit_views(views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes]), BIRD, CONFIG)
+
+
+def error_mm(solution, truth_m):
+    error = np.linalg.norm(solution.keypoints_world_m - truth_m, axis=-1)
+    return 1000 * error[solution.valid].mean()
+
+
+def test_exact_keypoints_give_the_birds_in_the_world(rig, solution, truth_m):
+    assert solution.status.tolist() == ["ok", "ok"]
+    assert solution.valid.all()
+    assert error_mm(solution, truth_m) < 6  # of a bird of 42 cm
+    sizes = solution.scale[:, 0] / rig.scenes[0].poses.scale[:, 0]
+    np.testing.assert_allclose(sizes, 1, atol=0.03)
+    true_root = (rig.scenes[0].poses.transl * UNIT - rig.cameras[0].transl_cam) @ rig.cameras[0].R_cam_world
+    assert np.abs(solution.transl_world_m - true_root).max() < 0.015
+
+
+def test_the_pose_in_the_first_camera_is_the_pose_in_the_world(rig, solution):
+    camera = rig.cameras[0]
+    np.testing.assert_allclose(camera.to_camera(solution.keypoints_world_m) / UNIT, solution.keypoints_cam, atol=1e-3)
+    np.testing.assert_allclose(camera.project(solution.keypoints_world_m), solution.keypoints_px, atol=1e-2)
+    crop = solution.crop[0, 0]
+    pinhole = camera.pinhole().project(solution.keypoints_world_m[0, 0])
+    focal = solution.focal_px * crop[2] / solution.crop_px
+    points = solution.keypoints_cam[0, 0].astype(float)
+    np.testing.assert_allclose(focal * points[:, :2] / points[:, 2:] + crop[:2] + crop[2] / 2, pinhole, atol=1e-2)
+
+
+def test_views_that_miss_things_cost_nothing(rig, truth_m):
+    """One view without masks and half the keypoints, one without one bird, and frames without views."""
+    first, second, third = (scene.truth for scene in rig.scenes)
+    second = replace(second, masks={}, amodal_masks={})
+    confidence = second.confidence.copy()
+    confidence[:, :, ::2] = 0
+    second = second.with_keypoints(second.keypoints_px, confidence)
+    present = third.present.copy()
+    present[1] = False
+    present[0, :3] = False
+    third = replace(
+        third,
+        present=present,
+        confidence=np.where(present[..., None], third.confidence, 0),
+        masks={cell: rle for cell, rle in third.masks.items() if present[cell]},
+        occluded=None,
+        score=None,
+    )
+    found = fit_views(views_of(rig, (0, 1, 2), [first, second, third]), BIRD, CONFIG)
+    assert found.valid.all()
+    assert error_mm(found, truth_m) < 12
+
+
+def test_one_view_is_the_fit_of_one_camera(rig, truth_m):
+    views = views_of(rig, (1,), [rig.scenes[1].truth])
+    found = fit_views(views, BIRD, CONFIG)
+    alone = fit(views.observations[0], BIRD, CONFIG)
+    for name in ("global_orient", "transl", "scale", "keypoints_px", "crop"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+    # one view does not know the size of a bird: 10 % of a distance of 5 m
+    assert error_mm(found, truth_m) < 500
+    shown = rig.cameras[1].pinhole().project(found.keypoints_world_m)
+    shift = views.cameras[0].matrix[:2, 2] - rig.cameras[1].matrix[:2, 2]
+    assert np.abs(shown + shift - found.keypoints_px)[found.valid].max() < 4
+
+
+def test_a_wrong_unit_is_reported(rig):
+    views = views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes])
+    far = views._replace(
+        cameras=tuple(camera.scaled(1000) for camera in views.cameras),
+        lenses=tuple(camera.scaled(1000) for camera in views.lenses),
+    )
+    with pytest.raises(InputError, match=r"show birds of .* the size of the model .*--unit"):
+        fit_views(far, BIRD, CONFIG)
+    with pytest.raises(InputError, match="has no unit of length"):
+        fit_views(views, replace(BIRD, metres_per_unit=None), CONFIG)
+
+
+def test_initial_poses_align_the_bird_with_triangulated_keypoints(rig, truth_m):
+    views = views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes])
+    found = triangulated_keypoints(views.cameras, views.observations)
+    both = np.isfinite(found.points_world).all(-1)
+    assert both.mean() > 0.7
+    assert np.abs(found.points_world - truth_m)[both].max() < 0.002
+    points = found.points_world / UNIT
+    initial = initial_poses(BIRD, points, both.astype(float), "truth")
+    true_scale = rig.scenes[0].poses.scale[:, 0]
+    np.testing.assert_allclose(initial.scale[:, 0] / true_scale, 1, atol=0.1)
+    nothing = np.zeros(both.shape)
+    with pytest.raises(InputError, match="have no frame with 4 keypoints"):
+        initial_poses(BIRD, points, nothing, "truth")
+
+
+def test_views_config_estimates_depth_and_size():
+    for name in ("paper", "fast", "map", "photo"):
+        config = views_config(load_config(name), has_masks=True)
+        for stage in config.stages:
+            assert {"transl", "scale"} <= set(stage.optimised)
+            assert "transl" not in stage.step_scale
+            assert "size_prior" in stage.terms
+        assert config.edge == "unbiased"
+    assert all("mask" not in stage.terms for stage in views_config(load_config("paper"), has_masks=False).stages)
+
+
+def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
+    write_cameras(rig.cameras, tmp_path / "rig.toml")
+    files = []
+    for camera, scene in zip(rig.cameras, rig.scenes, strict=True):
+        files.append(str(tmp_path / f"{camera.name}.json"))
+        write_coco(scene.detections, files[-1])
+    config = tmp_path / "quick.yaml"
+    config.write_text(f"base: fast\nwindow: {FRAMES}\nfilter_window: 1\ncrop: {{size_px: 64}}\n")
+    out = tmp_path / "result"
+    command = ["fit", *files, "--config", str(config), "--out", str(out)]
+    assert main([*command, "--cameras", str(tmp_path / "rig.toml")]) == 0
+    assert "16 poses of 2 birds in 3 views" in capsys.readouterr().out
+    solution, _ = load_solution(out)
+    assert solution.has_world
+    order = np.linalg.norm(solution.transl_world_m[:, None, 0] - truth_m[None, :, 0].mean(-2), axis=-1).argmin(1)
+    assert error_mm(solution, truth_m[order]) < 15
+    assert [camera.name for camera in read_cameras(out / "cameras.toml")] == ["cam0", "cam1", "cam2"]
+    assert main([*command[:-1], str(tmp_path / "x")]) == 2
+    assert "without --cameras" in capsys.readouterr().err
+    assert main([*command[:2], "--out", str(tmp_path / "x"), "--offsets", "1"]) == 2
+    assert main([*command, "--cameras", str(tmp_path / "rig.toml"), "--overwrite", "--offsets", "1,2"]) == 2
+    assert "give 3 numbers" in capsys.readouterr().err
+    check = ["cameras", "check", str(tmp_path / "rig.toml"), *files]
+    assert main(check) == 0
+    assert "the cameras agree" in capsys.readouterr().out
