@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import argparse
 from itertools import combinations
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jaxfit.cameras.camera import Camera
-from jaxfit.cameras.files import read_camera_file
 from jaxfit.cli.observations import observations_for
 from jaxfit.cli.tables import counted, right_aligned, show
-from jaxfit.data.observations import Observations
-from jaxfit.data.view_matching import BirdMatches, match_birds, matches_of_file
-from jaxfit.data.views import Views, assign_cameras, birds_in_rows, on_common_frames, straightened
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file
 from jaxfit.foundation.progress import terminal
-from jaxfit.model.bird import Bird
 from jaxfit.model.files import find_bird
+
+if TYPE_CHECKING:
+    from jaxfit.cameras.camera import Camera
+    from jaxfit.data.observations import Observations
+    from jaxfit.data.view_matching import BirdMatches
+    from jaxfit.data.views import Views
+    from jaxfit.model.bird import Bird
 
 
 def show_cameras(options: argparse.Namespace) -> None:
     """Print a table of the cameras, and draw a plan of them."""
+    from jaxfit.cameras.files import read_camera_file
     from jaxfit.view.camera_plan import camera_plan
     from jaxfit.view.drawing import write_png
 
@@ -65,6 +67,10 @@ def read_views(options: argparse.Namespace, bird: Bird) -> ReadViews:
     Raises:
         InputError: unusable files, or cameras and observations that do not belong together.
     """
+    from jaxfit.cameras.files import read_camera_file
+    from jaxfit.data.view_matching import BirdMatches, match_birds, matches_of_file
+    from jaxfit.data.views import Views, assign_cameras, birds_in_rows, on_common_frames, straightened
+
     file = read_camera_file(options.cameras, options.unit)
     own = [
         observations_for(path, bird.keypoint_names, options, quiet=i > 0).observations

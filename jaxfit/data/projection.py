@@ -2,7 +2,8 @@
 
 Birds in the camera frame of the whole image, which is fixed in the scene; a crop moves with its bird. x is right, y
 down, z forward, and the axis goes through the centre of the image. One camera measures directions only. Distances
-follow from two assumptions: the bird has the size of the model, and the footage has one focal length. A wrong size
+follow from two assumptions: the bird has the size of the model, and the footage has one focal length. Fits of several
+cameras need neither: they know size, focal length and principal point. A wrong size
 changes all positions by the same factor. A wrong focal length changes the depths by the same factor, and does not
 change the positions across the picture.
 """
@@ -39,6 +40,8 @@ class InImage(NamedTuple):
     """Rotation from the model to the camera frame of the image: axis-angles in radians, continuous in time."""
     root_in_crop: Float[np.ndarray, "N T 3"]
     """Position of the root joint in the camera frame of the crop, model units."""
+    size: Float[np.ndarray, "N T"]
+    """Size of the bird in these frames, relative to the model: 1, or as several cameras estimate it."""
 
     def points(
         self, points_cam: Float[np.ndarray, "N T P 3"], scale: Float[np.ndarray, "N T"]
@@ -49,7 +52,7 @@ class InImage(NamedTuple):
             points_cam: in the camera frame of the crop, such as `Solution.keypoints_cam`.
             scale: `Solution.scale`.
         """
-        from_root = points_cam / scale[..., None, None] - self.root_in_crop[:, :, None]
+        from_root = points_cam / (scale / self.size)[..., None, None] - self.root_in_crop[:, :, None]
         return np.einsum("ntij,ntpj->ntpi", self.turn, from_root) + self.root[:, :, None]
 
 
@@ -82,11 +85,20 @@ def in_image(
     s, focal = solution, image_focal_px(solution) if focal_px is None else focal_px
     at = np.nonzero(s.valid)
     crop = s.crop[at].astype(np.float64)
-    root = s.transl[at] / s.scale[at][:, None].astype(np.float64) + np.asarray(bird.joints[0], np.float64)
+    # poses in the world have the true size, which several cameras estimate
+    size = s.scale[at].astype(np.float64) if s.has_world else np.ones(len(at[0]))
+    divisor = (s.scale[at].astype(np.float64) / size)[:, None]
+    root = s.transl[at] / divisor + size[:, None] * np.asarray(bird.joints[0], np.float64)
     crop_focal = s.focal_px * crop[:, 2:] / s.crop_px
     pixel = root[:, :2] / root[:, 2:] * crop_focal + crop[:, :2] + crop[:, 2:] / 2
     # the pictures of a camera have one size; a photograph may have its own
-    centre = s.image_size_px[at] / 2 if centre_px is None else np.asarray(centre_px)
+    middle_of_crop = crop[:, :2] + crop[:, 2:] / 2
+    if centre_px is None:
+        # a crop of the whole picture has the principal point of the camera in its middle
+        whole = crop[:, 2:] >= s.image_size_px[at].max(axis=1, keepdims=True)
+        centre = np.where(whole & s.has_world, middle_of_crop, s.image_size_px[at] / 2)
+    else:
+        centre = np.asarray(centre_px)
     ray = np.concatenate([(pixel - centre) / focal, np.ones((len(root), 1))], axis=1)
     turn = _between(root, ray)
     orient = (turn * Rotation.from_rotvec(s.global_orient[at].astype(np.float64))).as_rotvec()
@@ -103,6 +115,7 @@ def in_image(
         turn=everywhere(turn.as_matrix().reshape(-1, 3, 3)),
         orientation=_continuous(everywhere(orient), s.valid),
         root_in_crop=everywhere(root),
+        size=everywhere(size),
     )
 
 

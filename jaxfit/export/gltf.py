@@ -129,14 +129,15 @@ def bird_motion(exported: Exported, n: int) -> Motion:
     offsets = joints - np.where(np.arange(len(joints))[:, None] > 0, joints[np.maximum(bird.parents, 0)], 0)
     bones = np.concatenate([np.ones((len(at), 1)), s.bone_length[n, at]], axis=1)
     turn = Rotation.from_matrix(exported.in_image.turn[n, at])
-    place = exported.in_image.root[n, at] - turn.apply(joints[0])  # the turn is about the root joint
+    size = float(np.median(exported.in_image.size[n, at]))
+    place = exported.in_image.root[n, at] - turn.apply(size * joints[0])  # the turn is about the root joint
     return Motion(
         at=at,
         rotations=_continuous(rotations),
         translations=bones[..., None] * offsets,
         place=place * exported.length,
         facing=_continuous(turn.as_quat()),
-        size=exported.length,
+        size=size * exported.length,
         betas=s.betas[n, at].astype(np.float64),
     )
 

@@ -16,7 +16,7 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.projection import InImage, image_focal_px, in_image
-from jaxfit.data.solution import ERROR_BARS, LAYOUT, Solution, load_solution
+from jaxfit.data.solution import LAYOUT, Solution, load_solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder, write_whole
@@ -31,7 +31,7 @@ def select_solution(solution: Solution, rows: Int[np.ndarray, "M"], columns: Int
     The loss of a track stays the loss over all its frames.
     """
     arrays = {}
-    for name, (shape, _) in (LAYOUT | (ERROR_BARS if solution.has_error_bars else {})).items():
+    for name, (shape, _) in (LAYOUT | solution.optional_layout).items():
         if shape.split()[0] not in ("N", "T"):
             continue
         array = getattr(solution, name)

@@ -2,7 +2,8 @@
 
 Both tables have a row for every track and frame. A row without a pose has `fitted` = false and empty values. The last
 part of the name of a column is its unit: `s`, `px` (image pixels), `m` or `unit` (model units), `rad`. Positions in
-space are those of a bird of the model's size in the camera frame of the image (`jaxfit.data.projection`).
+space are those of a bird of the model's size in the camera frame of the image (`jaxfit.data.projection`). Fits of
+several cameras have the true size, and also positions in the world (`world_m`).
 """
 
 from __future__ import annotations
@@ -96,6 +97,13 @@ def _pose_columns(exported: Exported) -> Columns:
         if sd_px is not None and sd is not None:
             columns |= _vectors(exported, {name: sd_px[:, :, k]}, "sd_px")
             columns |= _vectors(exported, {name: sd[:, :, k]}, f"sd_{unit}")
+    if s.transl_world_m is not None and s.keypoints_world_m is not None:
+        world = {"root": s.transl_world_m} | {
+            name: s.keypoints_world_m[:, :, k] for k, name in enumerate(s.keypoint_names)
+        }
+        for name, values in world.items():
+            for i, axis in enumerate("xyz"):  # in float64: a world may have its origin far away
+                columns[f"{name}_{axis}_world_m"] = np.where(s.valid, values[..., i], np.nan).reshape(-1)
     return columns
 
 

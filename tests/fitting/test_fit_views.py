@@ -1,5 +1,6 @@
 """Fits of several calibrated cameras against simulated truth."""
 
+import csv
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +10,17 @@ from jaxfit.cameras.files import read_cameras, write_cameras
 from jaxfit.cli.main import main
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import load_config
+from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.data.solution import load_solution
+from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.data.views import Views, birds_in_rows, straightened
+from jaxfit.export.export import export_result
+from jaxfit.export.result import open_result
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.views import fit_views, initial_poses, triangulated_keypoints, views_config
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import load_murre
+from jaxfit.review.correct import read_tracks
 from jaxfit.simulation.rig import stage_rig
 
 BIRD = load_murre()
@@ -111,6 +116,23 @@ def test_one_view_is_the_fit_of_one_camera(rig, truth_m):
     shown = rig.cameras[1].pinhole().project(found.keypoints_world_m)
     shift = views.cameras[0].matrix[:2, 2] - rig.cameras[1].matrix[:2, 2]
     assert np.abs(shown + shift - found.keypoints_px)[found.valid].max() < 4
+
+
+def test_exports_hold_the_world_and_the_true_size(solution, rig, tmp_path):
+    facts = {"model": "murre"}
+    save_solution(solution, BIRD, config_to_yaml(CONFIG), facts, tmp_path / "result")
+    exported = open_result(tmp_path / "result", tracks=[2])
+    np.testing.assert_array_equal(exported.solution.transl_world_m, solution.transl_world_m[1:])
+    # the camera frame of the export is that of the first camera, in metres
+    expected = rig.cameras[0].to_camera(solution.keypoints_world_m[1:])
+    np.testing.assert_allclose(exported.keypoints_3d, expected, atol=1e-3)
+    export_result(tmp_path / "result", "csv", tmp_path / "birds.csv")
+    with (tmp_path / "birds.csv").open() as file:
+        first = next(csv.DictReader(file))
+    world = [float(first[f"root_{axis}_world_m"]) for axis in "xyz"]
+    np.testing.assert_allclose(world, solution.transl_world_m[0, 0], atol=1e-9)
+    with pytest.raises(InputError, match="is a fit of calibrated cameras"):
+        read_tracks(tmp_path / "result")
 
 
 def test_a_wrong_unit_is_reported(rig):
