@@ -93,6 +93,27 @@ assert main(["overlay", scene + "/truth", "--video", scene + "/footage.mp4", "--
 assert main(["model", "view", "murre", "--out", str(folder / "views.png")]) == 0
 """
 
+VIEWS = """
+from pathlib import Path
+from jaxfit.cli.main import main
+
+folder = Path({folder!r})
+scene, quick = folder / "scene", folder / "quick.yaml"
+size = ["--birds", "2", "--frames", "12", "--size", "480x280", "--seed", "3"]
+assert main(["simulate", *size, "--cameras", "3", "--distortion", "--out", str(scene)]) == 0
+cameras, files = str(scene / "cameras.toml"), [str(scene / f"cam{{i}}" / "detections.json") for i in range(3)]
+assert main(["cameras", "show", cameras, "--out", str(folder / "plan.png")]) == 0
+assert main(["cameras", "check", cameras, *files]) == 0
+quick.write_text('''
+base: paper
+window: 12
+crop: {{size_px: 64}}
+stages:
+  - {{name: a, steps: 2, terms: [keypoints, mask, pose_prior, place_likelihood], solver: levenberg_marquardt}}
+''')
+assert main(["fit", *files, "--cameras", cameras, "--config", str(quick), "--out", str(folder / "result")]) == 0
+"""
+
 
 def run_with_checks(program, **environment):
     """Run a program in a new process with the import hook."""
@@ -108,9 +129,9 @@ def test_the_hook_catches_a_wrong_shape():
     assert "parameter 'axis_angle'" in done.stderr
 
 
-@pytest.mark.parametrize("name", ["objective", "fit", "scene"])
+@pytest.mark.parametrize("name", ["objective", "fit", "scene", "views"])
 def test_annotations_are_satisfied(name, tmp_path):
-    program = {"objective": POSE + OBJECTIVE, "fit": FIT, "scene": SCENE}[name]
+    program = {"objective": POSE + OBJECTIVE, "fit": FIT, "scene": SCENE, "views": VIEWS}[name]
     program = program if name == "objective" else program.format(folder=str(tmp_path))
     done = run_with_checks(program, XDG_CACHE_HOME=str(tmp_path / "cache"))
     assert done.returncode == 0, done.stderr[-3000:]

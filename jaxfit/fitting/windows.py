@@ -226,13 +226,13 @@ class Windows:
     """Position of each frame in the observations; −1 for frame numbers without a frame (a gap, or after the end)."""
     present: Bool[np.ndarray, "W T"]
     """Whether the bird has enough confident keypoints in the frame for a fit."""
-    crop: Float[np.ndarray, "W T 3"]
+    crop: Float[np.ndarray, "W T *V 3"]
     """(x0, y0, size) in image pixels; integers, with one size per window."""
     keypoints_px: Float[np.ndarray, "W T K 2"]
     """Crop pixels; 0 where the confidence is 0."""
     confidence: Float[np.ndarray, "W T K"]
     """In [0, 1]; 0 where a keypoint is missing."""
-    has_mask: Bool[np.ndarray, "W T"]
+    has_mask: Bool[np.ndarray, "W T *V"]
     """Whether the bird has a mask in the frame."""
     masks: np.ndarray
     """(W,) objects: the `WindowMasks` of each window. `load_targets` reads and decodes the masks."""

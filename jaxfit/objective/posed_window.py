@@ -72,7 +72,7 @@ class Targets(eqx.Module):
     """False where the frame has no mask; the mask terms skip such frames."""
     present: Bool[Array | np.ndarray, "*T"]
     """False where the bird was not observed; all terms skip such frames."""
-    corner_px: Float[Array | np.ndarray, "*T 2"]
+    corner_px: Float[Array | np.ndarray, "*images 2"]
     """Upper left corner of the crop in the image, in crop pixels. The crop follows the bird, so the corner differs
     between frames."""
     frame_s: Float[Array | np.ndarray, "*windows"]
@@ -241,7 +241,7 @@ class PosedWindow:
         return jnp.concatenate([x + shift[:, None] * z / self.camera.focal_px, z], axis=-1)
 
     @cached_property
-    def place_acceleration_px(self) -> Float[Array, "T-2 axes"]:
+    def place_acceleration_px(self) -> Float[Array, "accelerations axes"]:
         """Acceleration of the bird, crop pixels per frame²: second differences of the projected translation (x, y),
         with the movement of the crop added. With several views, those of the translation itself (x, y, z), times
         `ViewMaps.px_per_unit`."""
