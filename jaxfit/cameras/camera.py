@@ -99,6 +99,11 @@ class Camera:
         across, down = np.degrees(np.arccos(np.clip(cosines, -1, 1))).tolist()
         return across, down
 
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the lens has no distortion."""
+        return self.lens == "perspective" and not self.distortion.any()
+
     def pinhole(self) -> Camera:
         """Return the camera without its distortion. Its pixels are those of `undistort`."""
         return replace(self, distortion=np.zeros(0), lens="perspective")
@@ -133,7 +138,7 @@ class Camera:
     def undistort(self, points_px: Float[np.ndarray, "*B 2"]) -> Float[np.ndarray, "*B 2"]:
         """Convert pixels of the image to pixels of `pinhole`. NaN where the lens model has no inverse."""
         points_px = np.asarray(points_px, np.float64)
-        if not self.distortion.any() and self.lens == "perspective":
+        if self.is_pinhole:
             return points_px.copy()
         plane = self._to_plane(points_px).reshape(-1, 1, 2)
         known = np.isfinite(plane[:, 0]).all(-1)
@@ -175,7 +180,7 @@ class Camera:
         return plane @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
     def _distorted(self, plane: np.ndarray) -> np.ndarray:
-        if not self.distortion.any() and self.lens == "perspective":
+        if self.is_pinhole:
             return plane
         points = np.asarray(plane, np.float64).reshape(-1, 2)
         known = np.isfinite(points).all(-1)

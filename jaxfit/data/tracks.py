@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
@@ -52,6 +52,12 @@ def frame_numbers(pictures: Sequence[str], video: Path | None = None) -> list[in
         return None
     numbers = [int(match[2]) for match in named]
     return numbers if len(set(numbers)) == len(numbers) else None
+
+
+def positions_in(numbers: Int[np.ndarray, "A"], sequence: Int[np.ndarray, "B"]) -> Int[np.ndarray, "A"]:
+    """Return the position of each number in a sequence of different numbers, or −1 if the sequence lacks it."""
+    position = {int(number): i for i, number in enumerate(sequence)}
+    return np.array([position.get(int(number), -1) for number in numbers], int)
 
 
 UNKNOWN_FPS = 25.0

@@ -21,11 +21,10 @@ from jaxfit.cameras.triangulation import (
     epipolar_error_px,
     fundamental_matrix,
     reprojection_error_px,
-    triangulate_robustly,
 )
 from jaxfit.data.observations import Observations
-from jaxfit.data.view_matching import MOST_ERROR, BirdMatches, pair_costs
-from jaxfit.data.views import Views
+from jaxfit.data.view_matching import BirdMatches, pair_costs
+from jaxfit.data.views import MOST_ERROR, ViewKeypoints, Views, stacked_keypoints
 
 UNMATCHED = 0.5
 """Cost of a bird without a partner in another camera, relative to the side of its box."""
@@ -110,7 +109,7 @@ def _order(cameras: Sequence[Camera], observations: Sequence[Observations]) -> l
 
 def _offsets(views: Views) -> list[str]:
     """Try offsets in time of one camera, with the keypoints that move fastest: birds at rest show no offset."""
-    px, confidence, side = _stacked(views)
+    px, confidence, side = stacked_keypoints(views.observations)
     T = px.shape[2]
     most = min(MOST_OFFSET, T // 4)
     if most <= SPEED_FRAMES:
@@ -154,25 +153,17 @@ def _offsets(views: Views) -> list[str]:
     return [f"{text} (error of moving keypoints {scores[0]:.3f} → {scores[best]:.3f} of the birds' size)"]
 
 
-def _stacked(views: Views) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return keypoints in pixels (V, N, T, K, 2), confidence (V, N, T, K) and sides of the boxes (V, N, T, K)."""
-    px = np.stack([own.keypoints_px for own in views.observations]).astype(np.float64)
-    confidence = np.stack([own.confidence for own in views.observations]).astype(np.float64)
-    side = np.stack([own.box_px[..., 2:].max(-1) for own in views.observations]).astype(np.float64)
-    return px, confidence, np.broadcast_to(np.maximum(side, 1)[..., None], confidence.shape)
-
-
 def _errors(views: Views) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    px, confidence, side = _stacked(views)
-    found = triangulate_robustly(views.cameras, px, confidence, MOST_ERROR * side)
+    keypoints = stacked_keypoints(views.observations)
+    found = keypoints.triangulated(views.cameras)
     by_camera, by_keypoint = {}, {}
-    compared = (confidence > 0) & np.isfinite(found.error_px)
+    compared = (keypoints.confidence > 0) & np.isfinite(found.error_px)
     for v, camera in enumerate(views.cameras):
         own = compared[v]
         if own.any():
             error = found.error_px[v][own]
             by_camera[camera.name] = np.array(
-                [np.median(error), np.median(error / side[v][own]), found.agrees[v][own].mean()]
+                [np.median(error), np.median(error / keypoints.side_px[v][own]), found.agrees[v][own].mean()]
             )
     for k, name in enumerate(views.observations[0].keypoint_names):
         own = compared[..., k]
@@ -181,33 +172,30 @@ def _errors(views: Views) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]
     return by_camera, by_keypoint
 
 
-def _mean_error(cameras: Sequence[Camera], px: np.ndarray, confidence: np.ndarray, side: np.ndarray) -> float:
+def _mean_error(cameras: Sequence[Camera], keypoints: ViewKeypoints) -> float:
     """Return the mean error of all keypoints, relative to the side of the box; at most `MOST_ERROR` each.
 
     A wrong pose of one camera can explain the keypoints of this camera, but not those of the others.
     """
-    found = triangulate_robustly(cameras, px, confidence, MOST_ERROR * side)
-    error = np.where(np.isfinite(found.error_px), np.minimum(found.error_px / side, MOST_ERROR), MOST_ERROR)
-    return float(error[(confidence > 0) & ((confidence > 0).sum(axis=0) > 1)].mean())
+    relative, seen = keypoints.triangulated(cameras).error_px / keypoints.side_px, keypoints.confidence > 0
+    error = np.where(np.isfinite(relative), np.minimum(relative, MOST_ERROR), MOST_ERROR)
+    return float(error[seen & (seen.sum(axis=0) > 1)].mean())
 
 
 def _moved(views: Views) -> list[str]:
     """Estimate the pose of each camera from keypoints that the other cameras triangulate."""
-    px, confidence, side = _stacked(views)
-    found = []
+    keypoints, found = stacked_keypoints(views.observations), []
     for v, camera in enumerate(views.cameras):
         others = [w for w in range(len(views.cameras)) if w != v]
-        rest = triangulate_robustly(
-            [views.cameras[w] for w in others], px[others], confidence[others], MOST_ERROR * side[others]
-        )
-        known = np.isfinite(rest.points_world).all(-1) & (confidence[v] > 0)
+        rest = keypoints.of_views(others).triangulated([views.cameras[w] for w in others])
+        known = np.isfinite(rest.points_world).all(-1) & (keypoints.confidence[v] > 0)
         if known.sum() < LEAST_POINTS:
             continue
-        points, shown = rest.points_world[known], px[v][known]
+        points, shown = rest.points_world[known], keypoints.px[v][known]
         before = float(np.median(reprojection_error_px([camera], points, shown[None])))
         centre = points.mean(axis=0)
         rvec, tvec = cv2.Rodrigues(camera.R_cam_world)[0], camera.transl_cam + camera.R_cam_world @ centre
-        tolerance = 2 * float(np.median(side[v][known])) * MOST_ERROR
+        tolerance = 2 * float(np.median(keypoints.side_px[v][known])) * MOST_ERROR
         solved, rvec, tvec, _ = cv2.solvePnPRansac(
             points - centre, shown, camera.matrix, None, rvec.copy(), tvec.copy()[:, None], True, 300, tolerance
         )
@@ -218,7 +206,7 @@ def _moved(views: Views) -> list[str]:
         after = float(np.median(reprojection_error_px([new], points, shown[None])))
         if after < CLEARLY_BETTER * before:
             corrected = [new if w == v else each for w, each in enumerate(views.cameras)]
-            found.append((_mean_error(corrected, px, confidence, side), camera, new, before, after))
+            found.append((_mean_error(corrected, keypoints), camera, new, before, after))
     if not found:
         return []
     _, camera, new, before, after = min(found, key=lambda each: each[0])

@@ -23,15 +23,15 @@ from scipy.optimize import linear_sum_assignment
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import epipolar_error_px, fundamental_matrix
 from jaxfit.data.observations import Observations
+from jaxfit.data.views import MOST_ERROR
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.reading import open_file
+from jaxfit.foundation.limits import CAMERA_BYTES
+from jaxfit.foundation.reading import read_text
 
 BLOCK_FRAMES = 25
 """Frames of a block: a track that changes to another bird costs at most this many frames of one camera."""
 LEAST_PAIRS = 12
 """Two tracks with fewer common keypoints, counted over the frames of a block, are not compared."""
-MOST_ERROR = 0.1
-"""Tracks with a larger median error, relative to the longer side of their boxes, are not one bird."""
 CLEAR_RATIO = 1.5
 """A match is undecided if another track of the same camera has an error less than this times larger."""
 
@@ -54,22 +54,22 @@ def matches_of_file(path: Path, cameras: Sequence[Camera], observations: Sequenc
     Tracks that the file does not name show no bird. The errors of the matches are unknown (NaN).
 
     Raises:
-        InputError: a column is missing, or a row names an unknown camera or track, or a bird that is not a number.
+        InputError: the file cannot be read, a column is missing, or a row names no bird, or an unknown camera or track.
     """
-    with open_file(path) as file:
-        try:
-            rows = list(csv.DictReader(io.StringIO(file.read().decode("utf-8-sig"))))
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise InputError(path, f"is not a CSV file: {error}", "write the columns camera, track, bird") from None
+    text = read_text(path, CAMERA_BYTES, "a CSV file")
+    try:
+        rows = list(csv.DictReader(io.StringIO(text)))
+    except csv.Error as error:
+        raise InputError(path, f"is not a CSV file: {error}", "write the columns camera, track, bird") from None
     names = [camera.name for camera in cameras]
     bird = [np.full(own.present.shape, -1) for own in observations]
     numbers: dict[str, int] = {}
     for line, row in enumerate(rows, start=2):
         try:
-            v = names.index(str(row["camera"]).strip())
+            v = names.index(row["camera"].strip())
             n = observations[v].track_id.tolist().index(int(row["track"]))
-            number = numbers.setdefault(str(row["bird"]).strip(), len(numbers))
-        except (KeyError, ValueError, TypeError):
+            number = numbers.setdefault(row["bird"].strip(), len(numbers))
+        except (KeyError, ValueError, TypeError, AttributeError):  # a short row has None
             problem = f"line {line} names no camera and track of the observations: {dict(row)}"
             raise InputError(path, problem, f"write the columns camera ({', '.join(names)}), track, bird") from None
         bird[v][n] = np.where(observations[v].present[n], number, -1)
@@ -156,7 +156,7 @@ def _block(cameras: Sequence[Camera], observations: Sequence[Observations], fram
 
 
 def _groups(block: _Block, observations: Sequence[Observations], frames: np.ndarray) -> list[list[int]]:
-    """Merge tracks in the order of their mean cost, while no camera has two tracks of a group in one frame."""
+    """Merge tracks in the order of their mean cost; a camera has at most one track of a group in a frame."""
     groups = [[m] for m in range(len(block.nodes))]
     present = [observations[v].present[n, frames] for v, n in block.nodes]
 

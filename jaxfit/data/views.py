@@ -11,13 +11,17 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfit.cameras.camera import Camera
+from jaxfit.cameras.triangulation import Triangulated, triangulate_robustly
 from jaxfit.data.masks import decode_mask, encode_patch
 from jaxfit.data.observations import Observations
+from jaxfit.data.tracks import positions_in
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 
 MOST_CANVAS = 2.0
 """Longest side of the picture without distortion, as a multiple of that of the image."""
+MOST_ERROR = 0.1
+"""Largest error of a keypoint that agrees with other views, relative to the longer side of the box of the bird."""
 WHOLE_FRAME = 0.02
 """Times that differ by less, in frames, are one frame."""
 
@@ -31,6 +35,34 @@ class Views(NamedTuple):
     """The same cameras as they film."""
     observations: tuple[Observations, ...]
     """Pixels of these cameras, with equal frames and tracks: row n is the same bird in all views."""
+
+
+class ViewKeypoints(NamedTuple):
+    """The keypoints of N birds in all V views."""
+
+    px: Float[np.ndarray, "V N T K 2"]
+    """Pixels without distortion."""
+    confidence: Float[np.ndarray, "V N T K"]
+    side_px: Float[np.ndarray, "V N T K"]
+    """Longer side of the box of the bird, at least 1."""
+
+    def triangulated(self, cameras: Sequence[Camera]) -> Triangulated:
+        """Triangulate; a pixel agrees if its error is at most `MOST_ERROR` of the side of the box."""
+        return triangulate_robustly(cameras, self.px, self.confidence, MOST_ERROR * self.side_px)
+
+    def of_views(self, views: Sequence[int]) -> ViewKeypoints:
+        """Return the keypoints of some views."""
+        return ViewKeypoints(*(values[list(views)] for values in self))
+
+
+def stacked_keypoints(observations: Sequence[Observations]) -> ViewKeypoints:
+    """Return the keypoints of the same birds in all views, float64."""
+    px, confidence, box_px = (
+        np.stack([getattr(own, name) for own in observations]).astype(np.float64)
+        for name in ("keypoints_px", "confidence", "box_px")
+    )
+    side_px = np.maximum(box_px[..., 2:].max(-1), 1)
+    return ViewKeypoints(px, confidence, np.broadcast_to(side_px[..., None], confidence.shape))
 
 
 def assign_cameras(
@@ -78,7 +110,7 @@ def straightened(
     The picture of the new camera holds the whole image, at most `MOST_CANVAS` times its size. Keypoints that the lens
     model cannot show are missing. Masks are resampled, with half a pixel as the threshold.
     """
-    if not camera.distortion.any() and camera.lens == "perspective":
+    if camera.is_pinhole:
         return camera.pinhole(), observations
     width, height = camera.size_px or (0, 0)
     x, y = np.linspace(0, width, 65), np.linspace(0, height, 65)
@@ -192,7 +224,7 @@ def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observation
     whole = np.abs(at - np.round(at)) < WHOLE_FRAME
     before = np.where(whole, np.round(at), np.floor(at)).astype(np.int64)
     after = np.where(whole, before, before + 1)
-    i, j = _positions(own.frame_index, before), _positions(own.frame_index, after)
+    i, j = positions_in(before, own.frame_index), positions_in(after, own.frame_index)
     known, share = (i >= 0) & (j >= 0), np.where(whole, 0, at - before).astype(np.float32)
     i, j = np.maximum(i, 0), np.maximum(j, 0)
 
@@ -223,14 +255,6 @@ def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observation
         masks=masks,
         amodal_masks={},
     )
-
-
-def _positions(numbers: Int[np.ndarray, "F"], wanted: Int[np.ndarray, "T"]) -> Int[np.ndarray, "T"]:
-    """Return the position of each wanted number, or −1 without one."""
-    if not len(numbers):
-        return np.full(len(wanted), -1)
-    at = np.clip(np.searchsorted(numbers, wanted), 0, len(numbers) - 1)
-    return np.where(numbers[at] == wanted, at, -1)
 
 
 def birds_in_rows(observations: Observations, bird: Int[np.ndarray, "N T"], bird_ids: Sequence[int]) -> Observations:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import platform
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -99,16 +99,49 @@ def collect_windows(
     """
     birds, frames = observations.num_tracks, observations.num_frames
     arrays = _empty_frame_values(birds, frames, bird, any(result.error_bars is not None for result in results))
-    valid = np.zeros((birds, frames), bool)
+
+    def values_of(result: FittedWindow, w: int) -> dict[str, Any]:
+        return _frame_values(result, windows.crop[w], windows.present[w], bird, camera, common_size)
+
+    gathered = gather_windows(observations, windows, results, arrays, values_of, skipped)
     image_size_px = np.zeros((birds, frames, 2), np.int64)
+    for n, t in np.argwhere(gathered["valid"]).tolist():
+        image_size_px[n, t] = observations.image_size(n, t)
+    image_size_px.flags.writeable = False  # so that `Solution` needs no copy
+    return Solution(
+        **gathered,
+        image_size_px=image_size_px,
+        focal_px=camera.focal_px,
+        crop_px=camera.size_px,
+        keypoint_names=bird.keypoint_names,
+        joint_names=bird.joint_names,
+    )
+
+
+def gather_windows(
+    observations: Observations,
+    windows: Windows,
+    results: list[FittedWindow],
+    arrays: dict[str, Any],
+    values_of: Callable[[FittedWindow, int], dict[str, Any]],
+    skipped: Mapping[int, tuple[str, ...]],
+) -> dict[str, Any]:
+    """Return the fields of a solution that come from its windows and observations, and not from the camera.
+
+    Args:
+        observations, windows, results, skipped: as for `collect_windows`. The list `results` is emptied.
+        arrays: the arrays that `values_of` fills, for all birds and frames, NaN. They become read-only.
+        values_of: returns the arrays at the present frames of a fitted window, from its result and its row.
+    """
+    birds = observations.num_tracks
+    valid = np.zeros((birds, observations.num_frames), bool)
     fitted, diverged = np.zeros(birds, int), np.zeros(birds, int)
     loss = {name: np.full(birds, np.nan) for name in results[0].loss}
     failures = dict(skipped)
     results.reverse()
     for w in range(len(results)):
         result = results.pop()
-        n, present = int(windows.track[w]), windows.present[w]
-        at = windows.frame[w][present]
+        n, at = int(windows.track[w]), windows.frame[w][windows.present[w]]
         if result.failure:
             diverged[n] += 1
             first, last = observations.frame_index[at[[0, -1]]]
@@ -120,36 +153,35 @@ def collect_windows(
             loss[name][n] = value + (loss[name][n] if fitted[n] else 0.0)
         fitted[n] += 1
         valid[n, at] = True
-        image_size_px[n, at] = [observations.image_size(n, int(t)) for t in at]
-        for name, value in _frame_values(result, windows.crop[w], present, bird, camera, common_size).items():
+        for name, value in values_of(result, w).items():
             arrays[name][n, at] = value
-    for array in (valid, image_size_px, *arrays.values()):
+    for array in (valid, *arrays.values()):
         array.flags.writeable = False  # so that `Solution` needs no copy
     counts = zip(fitted.tolist(), diverged.tolist(), strict=True)
-    solution = Solution(
-        track_id=observations.track_id,
-        frame_index=observations.frame_index,
-        valid=valid,
-        **arrays,
-        image_size_px=image_size_px,
-        focal_px=camera.focal_px,
-        crop_px=camera.size_px,
-        keypoint_names=bird.keypoint_names,
-        joint_names=bird.joint_names,
-        loss=loss,
-        status=np.array([track_status(*count) for count in counts], "<U32"),
-        failures=failures,
-        timestamp_s=observations.timestamp_s,
-        fps=observations.fps,
-        footage=observations.footage,
-    )
-    return solution
+    return arrays | {
+        "track_id": observations.track_id,
+        "frame_index": observations.frame_index,
+        "valid": valid,
+        "loss": loss,
+        "status": np.array([track_status(*count) for count in counts], "<U32"),
+        "failures": failures,
+        "timestamp_s": observations.timestamp_s,
+        "fps": observations.fps,
+        "footage": observations.footage,
+    }
 
 
 def _empty_frame_values(birds: int, frames: int, bird: Bird, error_bars: bool) -> dict[str, Any]:
     """Return the arrays that `_frame_values` fills, for all birds and frames; NaN."""
+    bars = error_bar_shapes(bird.num_joints - 1, bird.num_shapes, bird.num_keypoints) if error_bars else {}
+    shapes = pose_shapes(bird) | {"crop": (3,), "ambiguity_deg": ()} | bars
+    return {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
+
+
+def pose_shapes(bird: Bird) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays of a pose and of its keypoints, in one frame."""
     bones, keypoints = bird.num_joints - 1, bird.num_keypoints
-    shapes = {
+    return {
         "global_orient": (3,),
         "body_pose": (bones, 3),
         "transl": (3,),
@@ -158,11 +190,7 @@ def _empty_frame_values(birds: int, frames: int, bird: Bird, error_bars: bool) -
         "betas": (bird.num_shapes,),
         "keypoints_cam": (keypoints, 3),
         "keypoints_px": (keypoints, 2),
-        "crop": (3,),
-        "ambiguity_deg": (),
-        **(error_bar_shapes(bones, bird.num_shapes, keypoints) if error_bars else {}),
     }
-    return {name: np.full((birds, frames, *shape), np.nan, np.float32) for name, shape in shapes.items()}
 
 
 def _frame_values(

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfit.config.fit import InitialiseConfig
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import LAYOUT, check_poses
+from jaxfit.data.tracks import positions_in
 from jaxfit.fitting.batch import join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.array_files import load_npz, npz_names, validate_arrays
@@ -341,8 +342,8 @@ def _from_result(path: str | Path, observations: Observations) -> InitialPoses:
         check_poses(content, np.asarray(np.isfinite(content["global_orient"]).all(axis=-1)))
     except ValueError as error:
         raise InputError(path, str(error), "use the poses.npz of a fit") from None
-    rows = _positions(observations.track_id, content["track_id"])
-    columns = _positions(observations.frame_index, content["frame_index"])
+    rows = positions_in(observations.track_id, content["track_id"])
+    columns = positions_in(observations.frame_index, content["frame_index"])
     missing = (rows < 0)[:, None] | (columns < 0)[None]
     if missing.all():
         raise InputError(path, "has no pose for any of these birds", "use initial poses of the same video")
@@ -384,9 +385,3 @@ def _from_regressor(path: str | Path, observations: Observations) -> InitialPose
         bone_length=by_track_and_frame(bone),
         betas=by_track_and_frame(np.zeros((rows, 0))),
     )
-
-
-def _positions(numbers: Int[np.ndarray, "A"], sequence: Int[np.ndarray, "B"]) -> Int[np.ndarray, "A"]:
-    """Return the position of each number in the sequence, or −1 if the sequence lacks the number."""
-    position = {int(number): i for i, number in enumerate(sequence)}
-    return np.array([position.get(int(number), -1) for number in numbers], int)

@@ -18,14 +18,13 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
-from jaxfit.cameras.triangulation import Triangulated, triangulate_robustly
+from jaxfit.cameras.triangulation import Triangulated
 from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import in_image
-from jaxfit.data.solution import Solution
-from jaxfit.data.views import Views
-from jaxfit.fitting.batch import tile_size
-from jaxfit.fitting.collect import FittedWindow, track_status
+from jaxfit.data.solution import WORLD, Solution
+from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
+from jaxfit.fitting.collect import FittedWindow, gather_windows, pose_shapes
 from jaxfit.fitting.fit import check_observations, checked_model, fit
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.solve import crop_camera, without_mask_stages
@@ -46,8 +45,6 @@ from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints
 from jaxfit.model.rotation import unwrap_axis_angle
 from jaxfit.objective.posed_window import ViewMaps
 
-TOLERANCE = 0.1
-"""Largest reprojection error of a keypoint that agrees with the others, relative to the side of the bird's box."""
 LEAST_POINTS = 4
 """Triangulated keypoints of a frame that determine an orientation."""
 LEAST_SPREAD = 0.05
@@ -124,13 +121,14 @@ def fit_views(
         )
     config = views_config(config, any(own.masks for own in checked))
     prepared = [prepare_observations(own, config) for own in checked]
-    found = triangulated_keypoints(views.cameras, prepared)
+    keypoints = stacked_keypoints(prepared)
+    found = keypoints.triangulated(views.cameras)
     if not np.isfinite(found.points_world).any():
         problem = "show no bird in two cameras whose keypoints agree"
         raise InputError(source, problem, "see `jaxfit cameras check`, and check the order of the cameras")
     origin_m = np.nanmedian(found.points_world.reshape(-1, 3), axis=0)
     points = (found.points_world - origin_m) / unit_m
-    initial = initial_poses(bird, points, _weights(prepared, found), source)
+    initial = initial_poses(bird, points, _weights(keypoints, found), source)
     windows = view_windows(views.cameras, prepared, config, origin_m, unit_m, points)
     model = checked_model(prepared[0], bird, [config], initial, source)
     run, shared = Run(config, windows), FitShared(model, initial)
@@ -138,29 +136,18 @@ def fit_views(
     small = replace(config, memory_gb=config.memory_gb / len(views.cameras))
     batches = in_batches(problems, [Run(small, windows)], shared, prepared[0].num_tracks, None, cluster)
     subject = f"{prepared[0].num_tracks} birds × {len(views.cameras)} views"
-    _logger.info(
-        "%s, %d windows of %d frames, tiles of %d", subject, len(problems), config.window, tile_size(config.window)
-    )
+    _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), config.window, len(batches))
     with progress(f"Fitting {subject}", steps_per_batch(config) * len(batches)) as report_progress:
         results = fit_batches(batches, [run], shared, None, cluster, report_progress)
     ordered = [results[0, w] for w in range(len(windows))]
     return _solution(views, prepared[0], windows, ordered, bird, origin_m, unit_m)
 
 
-def triangulated_keypoints(cameras: Sequence[Camera], observations: Sequence[Observations]) -> Triangulated:
-    """Triangulate the keypoints of all birds: points (N, T, K, 3) in metres."""
-    points_px = np.stack([own.keypoints_px for own in observations]).astype(np.float64)
-    confidence = np.stack([own.confidence for own in observations]).astype(np.float64)
-    side_px = np.stack([own.box_px[..., 2:].max(-1) for own in observations]).astype(np.float64)
-    tolerance_px = np.broadcast_to(TOLERANCE * np.maximum(side_px, 1)[..., None], confidence.shape)
-    return triangulate_robustly(cameras, points_px, confidence, tolerance_px)
-
-
-def _weights(observations: Sequence[Observations], found: Triangulated) -> Float[np.ndarray, "N T K"]:
+def _weights(keypoints: ViewKeypoints, found: Triangulated) -> Float[np.ndarray, "N T K"]:
     """Return the weight of each triangulated keypoint: the mean confidence of the views that agree."""
-    confidence = np.stack([own.confidence for own in observations])
     agree = found.agrees.sum(axis=0)
-    mean = (confidence * found.agrees).sum(axis=0) / np.maximum(agree, 1)
+    # in the precision of the observations
+    mean = (keypoints.confidence.astype(np.float32) * found.agrees).sum(axis=0) / np.maximum(agree, 1)
     return np.where(np.isfinite(found.points_world).all(-1), mean, 0)
 
 
@@ -330,58 +317,33 @@ def _solution(
     views: Views,
     first: Observations,
     windows: Windows,
-    results: Sequence[FittedWindow],
+    results: list[FittedWindow],
     bird: Bird,
     origin_m: np.ndarray,
     unit_m: float,
 ) -> Solution:
     """Return the poses of all windows, in the frame of the first camera and in the world."""
-    camera, N, T = views.lenses[0], first.num_tracks, first.num_frames
-    arrays: dict[str, np.ndarray] = {}
-    valid = np.zeros((N, T), bool)
-    fitted, diverged = np.zeros(N, int), np.zeros(N, int)
-    loss = {name: np.full(N, np.nan) for name in results[0].loss}
-    failures: dict[int, tuple[str, ...]] = {}
-    for w, result in enumerate(results):
-        n, present = int(windows.track[w]), windows.present[w]
-        at = windows.frame[w][present]
-        if result.failure:
-            diverged[n] += 1
-            ends = first.frame_index[at[[0, -1]]]
-            text = f"frames {ends[0]} to {ends[1]}: {result.failure}"
-            track = int(windows.track_id[w])
-            _logger.warning("bird %d, %s", track, text)
-            failures[track] = (*failures.get(track, ()), text)
-        else:
-            for name, value in result.loss.items():
-                loss[name][n] = value + (loss[name][n] if fitted[n] else 0.0)
-            fitted[n] += 1
-            valid[n, at] = True
-        for name, values in _frame_values(result, present, bird, camera, origin_m, unit_m).items():
-            everywhere = arrays.setdefault(name, np.full((N, T, *values.shape[1:]), np.nan))
-            everywhere[n, at] = np.nan if result.failure else values
+    camera, cells = views.lenses[0], (first.num_tracks, first.num_frames)
+    arrays = {name: np.full((*cells, *shape), np.nan, np.float32) for name, shape in pose_shapes(bird).items()}
+    sizes = {"3": 3, "K": bird.num_keypoints}
+    for name, (shape, dtype) in WORLD.items():
+        arrays[name] = np.full((*cells, *(sizes[axis] for axis in shape.split()[2:])), np.nan, dtype)
+
+    def values_of(result: FittedWindow, w: int) -> dict[str, Any]:
+        return _frame_values(result, windows.present[w], bird, camera, origin_m, unit_m)
+
+    gathered = gather_windows(first, windows, results, arrays, values_of, {})
     width, height = camera.size_px or first.image_size_px[0].tolist()
     side = max(width, height)
     crop = np.array([*(camera.matrix[:2, 2] - side / 2), side])
     return Solution(
-        track_id=first.track_id,
-        frame_index=first.frame_index,
-        valid=valid,
-        **arrays,
-        crop=np.broadcast_to(crop, (N, T, 3)),
-        image_size_px=np.where(valid[..., None], np.array([width, height]), 0),
+        **gathered,
+        crop=np.broadcast_to(crop, (*cells, 3)),
+        image_size_px=np.where(gathered["valid"][..., None], np.array([width, height]), 0),
         focal_px=float(camera.matrix[0, 0]) * CROP_PX / side,
         crop_px=CROP_PX,
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
-        loss=loss,
-        status=np.array(
-            [track_status(*count) for count in zip(fitted.tolist(), diverged.tolist(), strict=True)], "<U32"
-        ),
-        failures=failures,
-        timestamp_s=first.timestamp_s,
-        fps=first.fps,
-        footage=first.footage,
     )
 
 
@@ -392,13 +354,12 @@ def _frame_values(
     camera: Camera,
     origin_m: Float[np.ndarray, "3"],
     unit_m: float,
-) -> dict[str, np.ndarray]:
+) -> dict[str, Any]:
     """Return the arrays of a solution at the present frames of one window."""
     pose, root, R_cam_world = result.pose, np.asarray(bird.joints[0], np.float64), camera.R_cam_world
     t_cam = (R_cam_world @ origin_m + camera.transl_cam) / unit_m
-    frames = int(present.sum())
     scale = np.broadcast_to(pose.scale, present.shape)[present]
-    R_world = Rotation.from_rotvec(np.nan_to_num(np.asarray(pose.global_orient, np.float64)[present]))
+    R_world = Rotation.from_rotvec(np.asarray(pose.global_orient, np.float64)[present])
     orient_cam = (Rotation.from_matrix(R_cam_world) * R_world).as_rotvec()
     place = np.asarray(pose.transl, np.float64)[present] + scale[:, None] * root
     keypoints = np.asarray(result.keypoints_cam, np.float64)[present]
@@ -409,8 +370,8 @@ def _frame_values(
         "body_pose": np.asarray(pose.body_pose)[present],
         "transl": place @ R_cam_world.T + t_cam - scale[:, None] * root,
         "scale": scale,
-        "bone_length": np.broadcast_to(pose.bone_length, (frames, len(pose.bone_length))),
-        "betas": np.broadcast_to(betas, (frames, len(betas))),
+        "bone_length": pose.bone_length,
+        "betas": betas,
         "keypoints_cam": keypoints @ R_cam_world.T + t_cam,
         "keypoints_px": np.nan_to_num(camera.project(keypoints * unit_m + origin_m)),
         "R_world_root": R_world.as_matrix(),

@@ -13,11 +13,11 @@ from jaxfit.config.fit import load_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.solution import load_solution, save_solution
-from jaxfit.data.views import Views, birds_in_rows, straightened
+from jaxfit.data.views import Views, birds_in_rows, stacked_keypoints, straightened
 from jaxfit.export.export import export_result
 from jaxfit.export.result import open_result
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.views import fit_views, initial_poses, triangulated_keypoints, views_config
+from jaxfit.fitting.views import fit_views, initial_poses, views_config
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import load_murre
 from jaxfit.review.correct import read_tracks
@@ -150,7 +150,7 @@ def test_a_wrong_unit_is_reported(rig):
 
 def test_initial_poses_align_the_bird_with_triangulated_keypoints(rig, truth_m):
     views = views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes])
-    found = triangulated_keypoints(views.cameras, views.observations)
+    found = stacked_keypoints(views.observations).triangulated(views.cameras)
     both = np.isfinite(found.points_world).all(-1)
     assert both.mean() > 0.7
     assert np.abs(found.points_world - truth_m)[both].max() < 0.002
