@@ -76,6 +76,16 @@ def add_view_options(command: argparse.ArgumentParser) -> None:
     command.add_argument("--match", type=Path, metavar="TABLE.csv", help=text)
 
 
+def add_focal(command: argparse.ArgumentParser) -> None:
+    """Add the focal length of an uncalibrated camera above a ledge."""
+    text = "focal length of the camera in image pixels, without --cameras (default: estimated, with large errors)"
+    command.add_argument("--focal-px", type=float, metavar="F", help=text)
+
+
+PLANE = "`birds`: from the birds that stand; `world`: z = 0 in the world of --cameras; or a table of measured distances"
+PLANE += " with the columns x1_px, y1_px, x2_px, y2_px, distance_m"
+
+
 def add_truth(command: argparse.ArgumentParser) -> None:
     text = "annotations (formats as of OBS), a folder of masks (for OBS only), or a scene"
     command.add_argument("--truth", type=Path, required=True, help=text)
@@ -143,6 +153,7 @@ def add_result_commands(commands: Any) -> None:
     _export(commands)
     _tracks(commands)
     _join(commands)
+    _ledge(commands)
     text = "check the installation: kernels, FFmpeg, codecs, networks, optional packages, cache"
     add_command(commands, "doctor", "doctor.doctor", text)
 
@@ -220,6 +231,19 @@ def _join(commands: Any) -> None:
     text = "a track may continue after so many frames without the bird (default: the memory of the tracker)"
     join.add_argument("--bridge", type=int, metavar="FRAMES", help=text)
     add_out(join, "DIR", "folder for the joined result", overwrite="an earlier result in the folder")
+
+
+def _ledge(commands: Any) -> None:
+    text = "place the birds of a result on the ledge that they stand on, in a world in metres"
+    ledge = add_command(commands, "ledge", "ledge.ledge", text)
+    ledge.add_argument("result", type=Path, metavar="RESULT", help="folder of a result of one camera")
+    ledge.add_argument("--plane", default="birds", dest="ledge", metavar="PLANE", help=f"{PLANE} (default birds)")
+    ledge.add_argument(
+        "--cameras", type=Path, metavar="FILE", help=f"the calibrated camera, without distortion; {CAMERAS}"
+    )
+    add_unit(ledge)
+    add_focal(ledge)
+    add_out(ledge, "DIR", "folder for the new result", overwrite="an earlier result in the folder")
 
 
 def add_adapt_commands(commands: Any) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jaxfit.cli.ledge import CAMERAS, check_ledge_options, place, show_ledge, show_world
 from jaxfit.cli.observations import image_size, keypoint_map, observations_for
 from jaxfit.cli.tables import (
     FIT_COLUMNS,
@@ -41,18 +42,23 @@ LEAST_KEYPOINTS = 3
 
 def fit(options: argparse.Namespace) -> None:
     """Fit the poses of birds to observations and write a result."""
+    from jaxfit.cameras.files import write_cameras
     from jaxfit.config.fit import load_config
     from jaxfit.config.yaml_file import config_to_yaml
-    from jaxfit.data.solution import save_solution
+    from jaxfit.data.solution import RESULT, write_solution
     from jaxfit.fitting.collect import summarise
     from jaxfit.fitting.fit import fit, learn_weights
     from jaxfit.fitting.initial_poses import load_initial_poses
-    from jaxfit.foundation.files import check_replaceable
+    from jaxfit.fitting.ledge import ledge_config
+    from jaxfit.foundation.files import check_replaceable, new_folder
     from jaxfit.foundation.workers import open_cluster
 
     start = time.perf_counter()
-    check_replaceable(options.out, options.overwrite, "poses.npz")  # before the long work
+    check_replaceable(options.out, options.overwrite, RESULT)  # before the long work
+    check_ledge_options(options)
     config = load_config(options.config)
+    if options.ledge is not None:
+        config = ledge_config(config)
     bird = find_bird(options.model)
     if options.cameras is not None:
         _fit_views(options, config, bird, start)
@@ -75,13 +81,21 @@ def fit(options: argparse.Namespace) -> None:
             config = learnt.config
         solution = fit(observations, bird, config, initial_poses, terminal, source=source, cluster=cluster)
     seconds = {"read": read - start, "fit": time.perf_counter() - read}
+    placed = None if options.ledge is None else place(options, solution, bird, None, source)
+    solution = solution if placed is None else placed.solution
     summary = summarise(solution, bird, seconds)
+    if placed is not None:
+        summary["ledge"] = placed.facts
     if observations.photographs:
         summary["photographs"] = observations.photographs
-    save_solution(
-        solution, bird, config_to_yaml(config), summary, options.out, options.overwrite, learnt and learnt.to_yaml()
-    )
+    with new_folder(options.out, options.overwrite, marker=RESULT) as part:
+        write_solution(solution, bird, config_to_yaml(config), summary, part, learnt and learnt.to_yaml())
+        if placed is not None:
+            write_cameras(placed.cameras, part / CAMERAS)
     _show_fit(solution)
+    if placed is not None:
+        show_ledge(placed.facts)
+        show_world(solution)
     # every bird has a photograph of its own
     photographs = f" in {counted(observations.photographs, 'photograph')}" if observations.photographs else ""
     poses, tracks = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird" if photographs else "track")
@@ -99,23 +113,6 @@ def _show_fit(solution: Solution) -> None:
         frames = int(solution.valid[n].sum())
         table.add_row(str(track), str(frames), f"{total[n] / max(frames, 1):.1f}", *cells[track])
     table.title = "objective: final value per frame; ok, unsure, contradicted: poses with this flag"
-    show(table)
-
-
-def _show_world(solution: Solution) -> None:
-    """Print the table of a fit in the world."""
-    table = right_aligned("bird", "frames", "size", "x, y, z m", "moved m", "status")
-    for n, track in enumerate(solution.track_id.tolist()):
-        valid = solution.valid[n]
-        if not valid.any():
-            table.add_row(str(track), "0", "", "", "", str(solution.status[n]))
-            continue
-        places = np.asarray(solution.transl_world_m)[n, valid]
-        moved_m = np.linalg.norm(places.max(axis=0) - places.min(axis=0))
-        place = ", ".join(f"{x:.2f}" for x in np.median(places, axis=0))
-        size = f"{np.median(solution.scale[n, valid]):.3f}"
-        table.add_row(str(track), str(int(valid.sum())), size, place, f"{moved_m:.2f}", str(solution.status[n]))
-    table.title = "size: relative to the model; x, y, z: median place of the root; moved: extent of its places"
     show(table)
 
 
@@ -138,9 +135,13 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     with open_cluster(options.workers, options.scheduler) as cluster:
         source = ", ".join(map(str, options.observations))
         solution = fit_views(views, bird, config, terminal, source, cluster)
+    placed = None if options.ledge is None else place(options, solution, bird, views, source)
+    solution, lenses = (solution, views.lenses) if placed is None else placed[:2]
     seconds = {"read": read_s - start, "fit": time.perf_counter() - read_s}
     summary = summarise(solution, bird, seconds)
-    summary["cameras"] = [camera.name for camera in views.lenses]
+    summary["cameras"] = [camera.name for camera in lenses]
+    if placed is not None:
+        summary["ledge"] = placed.facts
     summary["matches"] = {
         f"bird {b + 1}": {
             camera.name: own.track_id[(of == b).any(axis=1)].tolist()
@@ -150,8 +151,10 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     }
     with new_folder(options.out, options.overwrite, marker=RESULT) as part:
         write_solution(solution, bird, config_to_yaml(config), summary, part)
-        write_cameras(views.lenses, part / "cameras.toml")
-    _show_world(solution)
+        write_cameras(lenses, part / CAMERAS)
+    if placed is not None:
+        show_ledge(placed.facts)
+    show_world(solution)
     show(
         f"{counted(summary['poses'], 'pose')} of {counted(len(solution.track_id), 'bird')} "
         f"in {counted(len(tracks), 'view')} in {seconds['fit']:.1f} s → {options.out}"

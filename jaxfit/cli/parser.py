@@ -14,11 +14,13 @@ from jaxfit.cli.arguments import (
     CAMERAS,
     MODEL,
     OBSERVATIONS,
+    PLANE,
     Parser,
     add_adapt_commands,
     add_cluster,
     add_codec,
     add_command,
+    add_focal,
     add_force,
     add_model,
     add_model_commands,
@@ -93,6 +95,9 @@ def _fitting(commands: Any) -> None:
     add_observation_options(fit)
     fit.add_argument("--cameras", type=Path, metavar="FILE", help=f"fit all views at once, in the world; {CAMERAS}")
     add_view_options(fit)
+    text = f"place the birds on the ledge that they stand on, in a world in metres; PLANE is {PLANE} (default birds)"
+    fit.add_argument("--ledge", nargs="?", const="birds", metavar="PLANE", help=text)
+    add_focal(fit)
     add_model(fit)
     text = "name of a shipped config (paper, baseline, …) or a YAML file (default %(default)s)"
     fit.add_argument("--config", default="paper", help=text)

@@ -131,7 +131,10 @@ def _continuous(axis_angle: Float[np.ndarray, "N T 3"], valid: np.ndarray) -> Fl
     """Return the same rotations without jumps by a whole turn; gaps do not interrupt."""
     latest = np.maximum.accumulate(np.where(valid, np.arange(valid.shape[1]), 0), axis=1)
     filled = jnp.asarray(np.nan_to_num(np.take_along_axis(axis_angle, latest[..., None], axis=1)))
-    return np.where(valid[..., None], np.asarray(jax.vmap(unwrap_axis_angle)(filled)), np.nan)
+    return np.where(valid[..., None], np.asarray(_unwrapped(filled)), np.nan)
+
+
+_unwrapped = jax.jit(jax.vmap(unwrap_axis_angle))
 
 
 class PosedBirds:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +22,10 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.kinematics import Pose
 
-FORMAT_VERSION = 7
-"""Version of ``poses.npz``; increased when its arrays change. Version 6 lacks `WORLD`, version 5
-also `doubts`, version 4 also `ERROR_BARS`, version 3 also `ambiguity_deg`, version 2 also `timestamp_s` and `fps`."""
+FORMAT_VERSION = 8
+"""Version of ``poses.npz``; increased when its arrays change. Version 7 lacks `LEDGE`, version 6 also `WORLD`,
+version 5 also `doubts`, version 4 also `ERROR_BARS`, version 3 also `ambiguity_deg`, version 2 also `timestamp_s` and
+`fps`."""
 _OLDEST_VERSION = 2
 """Older versions are not read."""
 
@@ -77,7 +78,9 @@ WORLD = {
     "transl_world_m": ("N T 3", np.float64),
     "keypoints_world_m": ("N T K 3", np.float64),
 }
-"""The arrays of fits with calibrated cameras. A solution has all of them or none."""
+"""The arrays of fits in a world. A solution has all of them or none."""
+LEDGE = {"contact": ("N T", np.float32)}
+"""The array of fits in a world whose plane z = 0 is the ledge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,13 +177,15 @@ class Solution:
     """(N, T) float32: factor on all covariances of the window, 1 or more, where the keypoints lie farther from the pose
     than the objective assumes. The other arrays contain it."""
 
-    # fits with calibrated cameras (`fitting/views.py`): None without
+    # fits with calibrated cameras or on a ledge (`fitting/views.py`, `fitting/ledge.py`): None without
     R_world_root: np.ndarray | None = None
     """(N, T, 3, 3) float32: rotation from the root of the bird to the world."""
     transl_world_m: np.ndarray | None = None
     """(N, T, 3) float64: root joint in the world, metres."""
     keypoints_world_m: np.ndarray | None = None
     """(N, T, K, 3) float64: keypoints in the world, metres."""
+    contact: np.ndarray | None = None
+    """(N, T) float32: probability that the bird stands on the ledge z = 0. None: no ledge is known."""
 
     def __post_init__(self):
         ambiguity_deg = np.zeros(np.shape(self.valid), np.float32) if self.ambiguity_deg is None else self.ambiguity_deg
@@ -246,8 +251,9 @@ class Solution:
 
     @property
     def optional_layout(self) -> dict[str, tuple[str, Any]]:
-        """The entries of `ERROR_BARS` and `WORLD` that the solution has."""
-        return (ERROR_BARS if self.has_error_bars else {}) | (WORLD if self.has_world else {})
+        """The entries of `ERROR_BARS`, `WORLD` and `LEDGE` that the solution has."""
+        found = (ERROR_BARS if self.has_error_bars else {}) | (WORLD if self.has_world else {})
+        return found | ({} if self.contact is None else LEDGE)
 
     def cells(self, error_bars: bool | None = None) -> dict[str, np.ndarray]:
         """Return the arrays (N, T, …) by name.
@@ -271,6 +277,31 @@ class Solution:
     def pose(self) -> Pose:
         """The poses as a `Pose` of the model, every field (N, T, …)."""
         return Pose(**{each.name: getattr(self, each.name) for each in fields(Pose)})
+
+
+def select_solution(solution: Solution, rows: np.ndarray, columns: np.ndarray) -> Solution:
+    """Return M tracks and L frames of a solution, chosen by their positions.
+
+    The loss of a track stays the loss over all its frames.
+    """
+    arrays = {}
+    for name, (shape, _) in (LAYOUT | solution.optional_layout).items():
+        if shape.split()[0] not in ("N", "T"):
+            continue
+        array = getattr(solution, name)
+        if shape.startswith("N"):
+            array = array[rows]
+        if "T" in shape.split():
+            array = array.take(columns, axis=shape.split().index("T"))
+        arrays[name] = array
+    kept = set(arrays["track_id"].tolist())
+    return replace(
+        solution,
+        **arrays,
+        loss={term: values[rows] for term, values in solution.loss.items()},
+        failures={track: texts for track, texts in solution.failures.items() if track in kept},
+        timestamp_s=None if solution.timestamp_s is None else solution.timestamp_s[columns],
+    )
 
 
 def check_poses(arrays: Mapping[str, np.ndarray], fitted: np.ndarray) -> None:
@@ -383,7 +414,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     path = folder / RESULT
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
-    optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD).items()}
+    optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | LEDGE).items()}
     optional |= {name: shapes.pop(name) for name in ("ambiguity_deg", "doubts")}
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
     arrays |= {name: arrays[name].item() for name in _CAMERA}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,38 +16,13 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.projection import InImage, image_focal_px, in_image
-from jaxfit.data.solution import LAYOUT, Solution, load_solution
+from jaxfit.data.solution import Solution, load_solution, select_solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder, write_whole
 from jaxfit.foundation.reading import json_text
 from jaxfit.model.bird import Bird
 from jaxfit.video.reader import probe_video
-
-
-def select_solution(solution: Solution, rows: Int[np.ndarray, "M"], columns: Int[np.ndarray, "L"]) -> Solution:
-    """Return M tracks and L frames of a solution, chosen by their positions.
-
-    The loss of a track stays the loss over all its frames.
-    """
-    arrays = {}
-    for name, (shape, _) in (LAYOUT | solution.optional_layout).items():
-        if shape.split()[0] not in ("N", "T"):
-            continue
-        array = getattr(solution, name)
-        if shape.startswith("N"):
-            array = array[rows]
-        if "T" in shape.split():
-            array = array.take(columns, axis=shape.split().index("T"))
-        arrays[name] = array
-    kept = set(arrays["track_id"].tolist())
-    return replace(
-        solution,
-        **arrays,
-        loss={term: values[rows] for term, values in solution.loss.items()},
-        failures={track: texts for track, texts in solution.failures.items() if track in kept},
-        timestamp_s=None if solution.timestamp_s is None else solution.timestamp_s[columns],
-    )
 
 
 def track_positions(solution: Solution, tracks: Sequence[int] | None, source: object) -> Int[np.ndarray, "M"]:

@@ -27,6 +27,7 @@ from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
 from jaxfit.fitting.collect import FittedWindow, gather_windows, pose_shapes
 from jaxfit.fitting.fit import check_observations, checked_model, fit
 from jaxfit.fitting.initial_poses import InitialPoses
+from jaxfit.fitting.ledge import metres
 from jaxfit.fitting.solve import crop_camera, without_mask_stages
 from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
 from jaxfit.fitting.windows import (
@@ -110,10 +111,7 @@ def fit_views(
     Raises:
         InputError: no bird that two cameras see, a model without a unit, or a size that shows a wrong unit.
     """
-    unit_m = bird.metres_per_unit
-    if unit_m is None:
-        remedy = "import the model again with `metres_per_unit`, or use a model of your species (docs/species.md)"
-        raise InputError(f"model {bird.name}", "has no unit of length, which cameras in metres need", remedy)
+    unit_m = metres(bird)
     checked = [check_observations(own, bird, source) for own in views.observations]
     if len(checked) == 1:
         return _with_world(
