@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxfit.cli.ledge import CAMERAS, check_ledge_options, place, show_ledge, show_world
+from jaxfit.cli.ledge import CAMERAS, WORLD, check_ledge_options, place_if_wanted, show_ledge, show_world
 from jaxfit.cli.observations import image_size, keypoint_map, observations_for
 from jaxfit.cli.tables import (
     FIT_COLUMNS,
@@ -63,14 +63,11 @@ def fit(options: argparse.Namespace) -> None:
     if options.cameras is not None:
         _fit_views(options, config, bird, start)
         return
-    for option in ("unit", "offsets", "match"):
-        if getattr(options, option) is not None:
-            raise InputError(f"--{option}", "is given without --cameras", "give the calibrated cameras by --cameras")
-    if len(options.observations) > 1:
-        problem = f"{len(options.observations)} files of observations without --cameras"
-        raise InputError("fit", problem, "give the calibrated cameras by --cameras, or fit the files one by one")
+    _check_one_camera(options)
     (options.observations,) = options.observations
     observations, names = observations_for(options.observations, bird.keypoint_names, options, untracked="photographs")
+    if observations.photographs and options.ledge is not None:
+        raise InputError(options.observations, "holds photographs, which show no common ledge", "leave out --ledge")
     config = _fewer_keypoints(config, names, options)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
     read = time.perf_counter()
@@ -81,8 +78,8 @@ def fit(options: argparse.Namespace) -> None:
             config = learnt.config
         solution = fit(observations, bird, config, initial_poses, terminal, source=source, cluster=cluster)
     seconds = {"read": read - start, "fit": time.perf_counter() - read}
-    placed = None if options.ledge is None else place(options, solution, bird, None, source)
-    solution = solution if placed is None else placed.solution
+    placed, failure = place_if_wanted(options, solution, bird, None, source)
+    solution = placed.solution if placed else solution
     summary = summarise(solution, bird, seconds)
     if placed is not None:
         summary["ledge"] = placed.facts
@@ -101,6 +98,18 @@ def fit(options: argparse.Namespace) -> None:
     poses, tracks = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird" if photographs else "track")
     counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
     show(f"{poses} of {tracks}{photographs} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+    if failure is not None:
+        raise failure
+
+
+def _check_one_camera(options: argparse.Namespace) -> None:
+    """Raise InputError if options for several cameras are given without cameras."""
+    for option in ("unit", "offsets", "match"):
+        if getattr(options, option) is not None:
+            raise InputError(f"--{option}", "is given without --cameras", "give the calibrated cameras by --cameras")
+    if len(options.observations) > 1:
+        problem = f"{len(options.observations)} files of observations without --cameras"
+        raise InputError("fit", problem, "give the calibrated cameras by --cameras, or fit the files one by one")
 
 
 def _show_fit(solution: Solution) -> None:
@@ -123,6 +132,7 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import RESULT, write_solution
     from jaxfit.fitting.collect import summarise
+    from jaxfit.fitting.ledge_plane import plane_of
     from jaxfit.fitting.views import fit_views
     from jaxfit.foundation.files import new_folder
     from jaxfit.foundation.workers import open_cluster
@@ -131,11 +141,13 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
         raise InputError("--init", "is given with --cameras", "leave out --init: the cameras give the initial poses")
     views, tracks, matches = read = read_views(options, bird)
     show_matches(read)
+    if options.ledge == WORLD:
+        plane_of(views.lenses[0], options.cameras)  # before the long work
     read_s = time.perf_counter()
     with open_cluster(options.workers, options.scheduler) as cluster:
         source = ", ".join(map(str, options.observations))
         solution = fit_views(views, bird, config, terminal, source, cluster)
-    placed = None if options.ledge is None else place(options, solution, bird, views, source)
+    placed, failure = place_if_wanted(options, solution, bird, views, source)
     solution, lenses = (solution, views.lenses) if placed is None else placed[:2]
     seconds = {"read": read_s - start, "fit": time.perf_counter() - read_s}
     summary = summarise(solution, bird, seconds)
@@ -159,6 +171,8 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
         f"{counted(summary['poses'], 'pose')} of {counted(len(solution.track_id), 'bird')} "
         f"in {counted(len(tracks), 'view')} in {seconds['fit']:.1f} s → {options.out}"
     )
+    if failure is not None:
+        raise failure
 
 
 def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namespace) -> FitConfig:

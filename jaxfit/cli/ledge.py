@@ -44,10 +44,16 @@ def check_ledge_options(options: argparse.Namespace) -> None:
         problem = "is given with --cameras" if cameras is not None else "is given without --ledge"
         raise InputError("--focal-px", problem, "leave out one of them" if cameras is not None else "add --ledge")
     if plane == WORLD and cameras is None:
-        raise InputError("--ledge world", "is given without --cameras", "give the calibrated camera by --cameras")
+        raise InputError(
+            "plane of the ledge", "is that of a world without --cameras", "give the calibrated camera by --cameras"
+        )
     if plane not in (None, WORLD, BIRDS) and not Path(plane).is_file():
         problem = f"is {plane}, which is no file"
-        raise InputError("--ledge", problem, "give birds, world, or a table of measured distances")
+        raise InputError("plane of the ledge", problem, "give birds, world, or a table of measured distances")
+    if plane not in (None, WORLD, BIRDS):
+        from jaxfit.fitting.ledge_plane import read_distances
+
+        read_distances(Path(plane))
 
 
 def place(options: argparse.Namespace, solution: Solution, bird: Bird, views: Views | None, source: object) -> OnLedge:
@@ -89,6 +95,19 @@ def place(options: argparse.Namespace, solution: Solution, bird: Bird, views: Vi
     return OnLedge(placed, tuple(lenses), {"plane": str(options.ledge), "focal_length": given} | found.facts)
 
 
+def place_if_wanted(
+    options: argparse.Namespace, solution: Solution, bird: Bird, views: Views | None, source: object
+) -> tuple[OnLedge | None, InputError | None]:
+    """Return a result on its ledge if the options ask for it, or why not, so that a fit is not lost."""
+    if options.ledge is None:
+        return None, None
+    try:
+        return place(options, solution, bird, views, source), None
+    except InputError as error:
+        problem = f"{error.problem}; the result was written without a ledge"
+        return None, InputError(error.source, problem, error.remedy)
+
+
 def show_ledge(facts: dict[str, Any]) -> None:
     """Print where the camera is above the ledge."""
 
@@ -104,7 +123,7 @@ def show_ledge(facts: dict[str, Any]) -> None:
     )
     if "birds" in facts:
         size = measured("size", "size_sd", 3)
-        show(f"from {counted(facts['birds'], 'bird')} that stand; mean size {size} relative to the model; ± is one sd")
+        show(f"from {counted(facts['birds'], 'bird')} on it; mean size {size} relative to the model; ± is one sd")
 
 
 def show_world(solution: Solution) -> None:

@@ -18,6 +18,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
+from jaxfit.data.flags import CONTRADICTED, flags
 from jaxfit.data.projection import in_image
 from jaxfit.data.solution import Solution, select_solution
 from jaxfit.fitting.contacts import SLOW, feet_cam, interval_of, speed_lengths
@@ -43,7 +44,7 @@ ALONG = 2.0
 """Places of birds that spread this many times as far in one direction as across show the direction of the ledge."""
 BACKS = 0.1
 """Weight of the direction of the backs, which decides the upward direction where the lateral axes do not."""
-MOST_ROUNDS, DIFF_STEP = 5, 1e-3
+MOST_ROUNDS, STEP = 5, 1e-3
 
 
 class Distances(NamedTuple):
@@ -114,16 +115,15 @@ def estimate_ledge(
         The camera in the world of the ledge, whose origin is the mean place of the birds.
 
     Raises:
-        InputError: no bird stands, or the birds show no plane below the camera.
+        InputError: no bird stands with a pose that agrees with the detections, or no plane lies below the camera.
     """
     problem = _Problem(solution, bird, camera, distances, source)
     # several cameras know the sizes
     size_sd = WITHIN_SD if solution.has_world else SIZE_SD_LOG
     sd, theta = _Deviations(size_sd, WITHIN_SD, TILT_SD, TILT_SD), problem.start(source)
+    how: dict[str, Any] = {"jac": problem.jacobian, "loss": "soft_l1", "x_scale": "jac"}
     for _ in range(MOST_ROUNDS):
-        # orientations have the precision of float32, which small steps would amplify
-        more: dict[str, Any] = {"loss": "soft_l1", "x_scale": "jac", "diff_step": DIFF_STEP}
-        solved = least_squares(problem.residuals, theta, args=(sd, size_sd), **more)
+        solved = least_squares(problem.residuals, theta, args=(sd, size_sd), **how)
         theta = solved.x
         log_size, level = problem.errors(theta)
         sd = _Deviations(*_learnt(log_size, size_sd, WITHIN_SD), *_learnt(level, TILT_SD, TILT_SD))
@@ -209,6 +209,12 @@ class _Problem:
             found.append(_distance_error(self._pairs, up, height * self._unit_m, f, self._centre) / DISTANCE_SD)
         return np.concatenate(found)
 
+    def jacobian(self, theta: np.ndarray, *args: Any) -> Float[np.ndarray, "residuals parameters"]:
+        """Return the derivatives of the residuals; orientations have the precision of float32, so steps are large."""
+        steps = STEP * np.eye(len(theta))
+        columns = [self.residuals(theta + step, *args) - self.residuals(theta - step, *args) for step in steps]
+        return np.stack(columns, axis=1) / (2 * STEP)
+
     def places(self, theta: np.ndarray) -> Float[np.ndarray, "N 3"]:
         """Return the mean place of each bird that stands, in the camera frame of the image, model units."""
         up, height, f, _ = self.unpacked(theta)
@@ -248,10 +254,12 @@ class _Sample:
         slow = speed_lengths(solution, bird, interval_s) < SLOW
         columns = _blocks(len(solution.frame_index), interval_s)
         self._solution = select_solution(solution, np.arange(len(solution.track_id)), columns)
-        self._usable = self._solution.valid & slow[:, columns]
+        contradicted = flags(np.asarray(self._solution.doubts)) == CONTRADICTED
+        self._usable = self._solution.valid & slow[:, columns] & ~contradicted
         if not self._usable.any():
-            remedy = "give the camera with its pose in a world whose z = 0 is the ledge, and --ledge world"
-            raise InputError(source, "shows no bird that stands", remedy)
+            remedy = "see the report of the result; with a calibrated camera, the plane can be `world`"
+            problem = "shows no bird that stands, with a pose that the detections do not contradict"
+            raise InputError(source, problem, remedy)
         self._bird, self._feet = bird, feet_cam(self._solution, bird)
         self._last: tuple[tuple[float, float, float], _Placed] | None = None
 
