@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxfit.cli.ledge import CAMERAS, WORLD, check_ledge_options, place_if_wanted, show_ledge, show_world
+from jaxfit.cli.ledge import WORLD, check_ledge_options, place_if_wanted, show_ledge, show_world
 from jaxfit.cli.observations import image_size, keypoint_map, observations_for
 from jaxfit.cli.tables import (
     FIT_COLUMNS,
@@ -46,6 +46,7 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.config.fit import load_config
     from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import RESULT, write_solution
+    from jaxfit.data.world import CAMERAS
     from jaxfit.fitting.collect import summarise
     from jaxfit.fitting.fit import fit, learn_weights
     from jaxfit.fitting.initial_poses import load_initial_poses
@@ -131,6 +132,7 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     from jaxfit.cli.cameras import read_views, show_matches
     from jaxfit.config.yaml_file import config_to_yaml
     from jaxfit.data.solution import RESULT, write_solution
+    from jaxfit.data.world import CAMERAS
     from jaxfit.fitting.collect import summarise
     from jaxfit.fitting.ledge_plane import plane_of
     from jaxfit.fitting.views import fit_views
@@ -301,14 +303,16 @@ def _evaluate_observations(options: argparse.Namespace) -> None:
 def overlay(options: argparse.Namespace) -> None:
     """Draw a result on its video, or on one frame of its video."""
     from jaxfit.data.solution import load_solution
+    from jaxfit.data.world import as_filmed
     from jaxfit.view.overlay import overlay, overlay_frame
 
     solution, bird = load_solution(options.result)
+    solution, lens = as_filmed(options.result, solution, bird, options.camera)
     observations = None
     if options.observations:
         observations, _ = observations_for(options.observations, solution.keypoint_names, options)
     drawn = {"observations": observations, "side_views": options.side_views}
-    drawn |= {"overwrite": options.overwrite, "force": options.force}
+    drawn |= {"overwrite": options.overwrite, "force": options.force, "lens": lens}
     if options.frame is not None:
         overlay_frame(solution, bird, options.video, options.frame, options.out, **drawn)
         show(f"frame {options.frame} → {options.out}")

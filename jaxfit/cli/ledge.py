@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from jaxfit.model.bird import Bird
 
 WORLD, BIRDS = "world", "birds"
-CAMERAS = "cameras.toml"
-"""File of the cameras in the folder of a result."""
 
 
 class OnLedge(NamedTuple):
@@ -67,7 +65,8 @@ def place(options: argparse.Namespace, solution: Solution, bird: Bird, views: Vi
         source: name of the result in error messages.
     """
     from jaxfit.cameras.camera import Camera
-    from jaxfit.fitting.ledge import largest_image_px, on_ledge
+    from jaxfit.data.world import largest_image_px
+    from jaxfit.fitting.ledge import on_ledge
     from jaxfit.fitting.ledge_plane import estimate_ledge, plane_of, read_distances
 
     count = 0 if views is None else len(views.cameras)
@@ -153,6 +152,7 @@ def ledge(options: argparse.Namespace) -> None:
     from jaxfit.cameras.files import write_cameras
     from jaxfit.config.reconstruct import ReconstructConfig
     from jaxfit.data.solution import RESULT, load_solution, write_solution
+    from jaxfit.data.world import CAMERAS
     from jaxfit.foundation.files import check_replaceable, new_folder
     from jaxfit.review.correct import read_config, read_summary
 
@@ -189,7 +189,7 @@ _KEPT_FILES = ("observations.json", "learnt.yaml")
 def _one_camera(options: argparse.Namespace, solution: Solution) -> Views | None:
     from jaxfit.cameras.files import read_camera_file
     from jaxfit.data.views import Views
-    from jaxfit.fitting.ledge import largest_image_px
+    from jaxfit.data.world import largest_image_px
 
     if options.cameras is None:
         return None

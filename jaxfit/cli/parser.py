@@ -146,6 +146,8 @@ def _comparing(commands: Any) -> None:
     overlay = add_command(commands, "overlay", "fitting.overlay", "draw a result on its video")
     overlay.add_argument("result", type=Path, metavar="DIR", help="folder of a result")
     overlay.add_argument("--video", type=Path, required=True, help="the video (or folder of frames) of the result")
+    text = "for a result in a world: the camera of the video, by its name in cameras.toml (default: the first camera)"
+    overlay.add_argument("--camera", metavar="NAME", help=text)
     add_out(
         overlay, "FILE", "video to write; the same folder receives a contact sheet (.png)", overwrite="existing files"
     )

@@ -2,14 +2,15 @@
 
 Birds in the camera frame of the whole image, which is fixed in the scene; a crop moves with its bird. x is right, y
 down, z forward, and the axis goes through the centre of the image. One camera measures directions only. Distances
-follow from two assumptions: the bird has the size of the model, and the footage has one focal length. Fits of several
-cameras need neither: they know size, focal length and principal point. A wrong size
-changes all positions by the same factor. A wrong focal length changes the depths by the same factor, and does not
-change the positions across the picture.
+follow from two assumptions: the bird has the size of the model, and the footage has one focal length. Poses in the
+frame of a calibrated camera need neither: size, focal length and principal point are known. A wrong size changes all
+positions by the same factor. A wrong focal length changes the depths by the same factor, and does not change the
+positions across the picture.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -18,9 +19,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
+from jaxfit.cameras.camera import Camera
 from jaxfit.data.masks import box_of_keypoints
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
+from jaxfit.data.world import in_frame_of_camera
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_vertices
@@ -94,9 +97,8 @@ def in_image(
     # the pictures of a camera have one size; a photograph may have its own
     middle_of_crop = crop[:, :2] + crop[:, 2:] / 2
     if centre_px is None:
-        # a crop of the whole picture has the principal point of the camera in its middle
-        whole = crop[:, 2:] >= s.image_size_px[at].max(axis=1, keepdims=True)
-        centre = np.where(whole & s.has_world, middle_of_crop, s.image_size_px[at] / 2)
+        # the crop of the whole picture has the principal point of the camera in its middle
+        centre = middle_of_crop if in_frame_of_camera(s) else s.image_size_px[at] / 2
     else:
         centre = np.asarray(centre_px)
     ray = np.concatenate([(pixel - centre) / focal, np.ones((len(root), 1))], axis=1)
@@ -138,10 +140,18 @@ _unwrapped = jax.jit(jax.vmap(unwrap_axis_angle))
 
 
 class PosedBirds:
-    """The posed meshes of a solution; n and t are positions of tracks and frames, not their numbers."""
+    """The posed meshes of a solution; n and t are positions of tracks and frames, not their numbers.
 
-    def __init__(self, solution: Solution, bird: Bird):
+    Args:
+        solution: the poses.
+        bird: the model of the solution.
+        lens: the camera whose frame the poses are in (`data.world.as_filmed`), as it films. None: the camera of the
+            crops, without distortion.
+    """
+
+    def __init__(self, solution: Solution, bird: Bird, lens: Camera | None = None):
         self.solution = solution
+        self._lens = None if lens is None else replace(lens, R_cam_world=np.eye(3), transl_cam=np.zeros(3))
         self._rig = fold_bird(bird)
 
     @property
@@ -178,9 +188,11 @@ class PosedBirds:
         The divisor is at least 1e-3, also for smaller depths.
         """
         s, crop = self.solution, self.solution.crop[n, frames][:, None]
-        size = crop[..., 2:]
-        scale = s.focal_px * size / s.crop_px / np.maximum(vertices_cam[..., 2:], 1e-3)
-        xy = vertices_cam[..., :2] * scale + size / 2 + crop[..., :2]
+        size, depth = crop[..., 2:], np.maximum(vertices_cam[..., 2:], 1e-3)
+        if self._lens is None:
+            xy = vertices_cam[..., :2] * (s.focal_px * size / s.crop_px / depth) + size / 2 + crop[..., :2]
+        else:
+            xy = self._lens.project(np.concatenate([vertices_cam[..., :2], depth], axis=-1))
         return np.concatenate([xy, vertices_cam[..., 2:]], axis=-1).astype(np.float32)
 
 

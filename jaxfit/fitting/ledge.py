@@ -16,10 +16,10 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.projection import InImage, in_image
 from jaxfit.data.solution import Solution
+from jaxfit.data.world import largest_image_px, whole_picture
 from jaxfit.fitting.contacts import SLOW, feet_cam, find_contacts, interval_of, speed_lengths
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
-from jaxfit.model.camera import CROP_PX
 
 
 def ledge_config(config: FitConfig) -> FitConfig:
@@ -96,20 +96,15 @@ def _in_world(
     for name in ("transl_sd", "scale_sd"):
         if (deviation := getattr(s, name)) is not None:
             turned[name] = (deviation * growth.reshape(*growth.shape, *(1,) * (deviation.ndim - 2))).astype(np.float32)
-    width, height = largest_image_px(s) if lens.size_px is None else lens.size_px
-    side = max(width, height)
     return replace(
         s,
         **turned,
+        **whole_picture(lens, s.valid, largest_image_px(s)),
         global_orient=placed.orientation.astype(np.float32),
         transl=(root - scale[..., None] * joint).astype(np.float32),
         scale=scale.astype(np.float32),
         keypoints_cam=points.astype(np.float32),
         keypoints_px=np.nan_to_num(lens.project(keypoints_world_m)).astype(np.float32),
-        crop=np.broadcast_to(np.array([*(lens.matrix[:2, 2] - side / 2), side], np.float32), (*s.valid.shape, 3)),
-        image_size_px=np.where(s.valid[..., None], np.array([width, height]), 0),
-        focal_px=float(lens.matrix[0, 0]) * CROP_PX / side,
-        crop_px=CROP_PX,
         R_world_root=np.where(s.valid[..., None, None], R, np.nan).astype(np.float32),
         transl_world_m=to_world(root),
         keypoints_world_m=keypoints_world_m,
@@ -133,8 +128,3 @@ def metres(bird: Bird) -> float:
         remedy = "import the model again with `metres_per_unit`, or use a model of your species (docs/species.md)"
         raise InputError(f"model {bird.name}", "has no unit of length, which a world in metres needs", remedy)
     return bird.metres_per_unit
-
-
-def largest_image_px(solution: Solution) -> tuple[int, int]:
-    width, height = solution.image_size_px[solution.valid].max(axis=0, initial=1).tolist()
-    return width, height

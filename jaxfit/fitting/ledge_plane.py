@@ -21,8 +21,9 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.data.flags import CONTRADICTED, flags
 from jaxfit.data.projection import in_image
 from jaxfit.data.solution import Solution, select_solution
+from jaxfit.data.world import largest_image_px
 from jaxfit.fitting.contacts import SLOW, feet_cam, interval_of, speed_lengths
-from jaxfit.fitting.ledge import largest_image_px, metres
+from jaxfit.fitting.ledge import metres
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import CAMERA_BYTES
 from jaxfit.foundation.reading import read_text

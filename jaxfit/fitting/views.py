@@ -24,6 +24,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.projection import in_image
 from jaxfit.data.solution import WORLD, Solution
 from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
+from jaxfit.data.world import whole_picture
 from jaxfit.fitting.collect import FittedWindow, gather_windows, pose_shapes
 from jaxfit.fitting.fit import check_observations, checked_model, fit
 from jaxfit.fitting.initial_poses import InitialPoses
@@ -331,15 +332,9 @@ def _solution(
         return _frame_values(result, windows.present[w], bird, camera, origin_m, unit_m)
 
     gathered = gather_windows(first, windows, results, arrays, values_of, {})
-    width, height = camera.size_px or first.image_size_px[0].tolist()
-    side = max(width, height)
-    crop = np.array([*(camera.matrix[:2, 2] - side / 2), side])
     return Solution(
         **gathered,
-        crop=np.broadcast_to(crop, (*cells, 3)),
-        image_size_px=np.where(gathered["valid"][..., None], np.array([width, height]), 0),
-        focal_px=float(camera.matrix[0, 0]) * CROP_PX / side,
-        crop_px=CROP_PX,
+        **whole_picture(camera, gathered["valid"], first.image_size_px[0].tolist()),
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
     )

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfit.cameras.camera import Camera
 from jaxfit.data.flags import CONTRADICTED, UNSURE, flags, with_flag
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import PosedBirds
@@ -81,6 +82,7 @@ def contact_sheet(
     columns: int = 4,
     most: int = 24,
     footage: Mapping[tuple[int, int], UInt8[np.ndarray, "S S 3"]] | None = None,
+    lens: Camera | None = None,
 ) -> None:
     """Draw birds of a result as pairs of tiles, and write one PNG.
 
@@ -98,11 +100,12 @@ def contact_sheet(
         most: greatest number of pairs, selected evenly over birds and frames; with footage, greatest number of rows.
         footage: (n, t) → tile of the footage, from `cut_tiles`; the sheet then has one row per track
             (`sheet_pairs`).
+        lens: as for `jaxfit.data.projection.PosedBirds`.
 
     Raises:
         InputError: the system rejects the write.
     """
-    posed = PosedBirds(solution, bird)
+    posed = PosedBirds(solution, bird, lens)
     if footage is not None:
         rows = sheet_pairs(solution, columns, most)
     else:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jaxfit.cameras.camera import Camera
 from jaxfit.data.flags import CONTRADICTED, UNSURE, flags, with_flag
 from jaxfit.data.footage import FootageIdentity, read_footage
 from jaxfit.data.observations import Observations
@@ -152,6 +153,7 @@ def overlay(
     out: str | Path,
     *,
     observations: Observations | None = None,
+    lens: Camera | None = None,
     side_views: bool = False,
     max_width: int | None = 1920,
     codec: str = "auto",
@@ -175,6 +177,7 @@ def overlay(
         video: the video of the result, a file or a folder of images.
         out: the ``.mp4`` or ``.webm`` to write; the contact sheet has the same name with the suffix ``.png``.
         observations: detected keypoints to draw.
+        lens: the camera of the video with its distortion, for a solution of `jaxfit.data.world.as_filmed`.
         side_views: add the strip of side views.
         max_width: greatest width in pixels; a wider video is scaled down. None keeps the size.
         codec: codec of `VideoWriter`.
@@ -199,7 +202,7 @@ def overlay(
     info = probe_video(video)
     check_outputs([out, out.with_suffix(".png")], video, overwrite)
     check_belongs(solution, observations, video, info, force)
-    drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
+    drawing = _Drawing(solution, bird, observations, lens, side_views, info, max_width)
     numbers = solution.frame_index
     step = frame_step(numbers)
     first, last = int(numbers[0]), int(numbers[-1])
@@ -220,7 +223,7 @@ def overlay(
             report_progress(1, f"frame {number}")
         if number is None or (info.frames is None and number != last and not force):
             raise too_short(video, solution, (info.frames or 0) if number is None else number + 1)
-    contact_sheet(solution, bird, observations, out.with_suffix(".png"), footage=tiles)
+    contact_sheet(solution, bird, observations, out.with_suffix(".png"), footage=tiles, lens=lens)
     return Overlay(
         out,
         out.with_suffix(".png"),
@@ -240,6 +243,7 @@ def overlay_frame(
     out: str | Path,
     *,
     observations: Observations | None = None,
+    lens: Camera | None = None,
     side_views: bool = False,
     max_width: int | None = 1920,
     overwrite: bool = False,
@@ -250,7 +254,7 @@ def overlay_frame(
     Args:
         frame_index: number of the frame in the video.
         out: the ``.png`` or ``.jpg`` to write.
-        solution, bird, video, observations, side_views, max_width, overwrite, force: as for `overlay`.
+        solution, bird, video, observations, lens, side_views, max_width, overwrite, force: as for `overlay`.
 
     Raises:
         InputError: as for `overlay`; or the result lacks the frame, or `out` has another suffix.
@@ -260,7 +264,7 @@ def overlay_frame(
     check_outputs([out], video, overwrite)
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(out, f"an image cannot end in {out.suffix!r}", "give a name that ends in .png or .jpg")
-    more: dict[str, Any] = {"side_views": side_views, "max_width": max_width, "force": force}
+    more: dict[str, Any] = {"lens": lens, "side_views": side_views, "max_width": max_width, "force": force}
     drawn = [*overlay_pictures(solution, bird, video, [frame_index], observations=observations, **more)]
     if not drawn:
         raise too_short(video, solution, info.frames or 0)
@@ -276,6 +280,7 @@ def overlay_pictures(
     frames: Sequence[int],
     *,
     observations: Observations | None = None,
+    lens: Camera | None = None,
     side_views: bool = False,
     max_width: int | None = 1920,
     force: bool = False,
@@ -284,7 +289,7 @@ def overlay_pictures(
 
     Args:
         frames: numbers of frames in the video, in increasing order.
-        solution, bird, video, observations, side_views, max_width, force: as for `overlay`.
+        solution, bird, video, observations, lens, side_views, max_width, force: as for `overlay`.
 
     Raises:
         InputError: as for `overlay`; or the result or the video lacks a frame.
@@ -296,7 +301,7 @@ def overlay_pictures(
         if frame not in solution.frame_index:
             problem = f"has no frame {frame}: its frames are {solution.frame_index[0]} to {solution.frame_index[-1]}"
             raise InputError("result", problem, "give one of these frames")
-    drawing = _Drawing(solution, bird, observations, side_views, info, max_width)
+    drawing = _Drawing(solution, bird, observations, lens, side_views, info, max_width)
     for frame in frames:
         found = next(iter(read_frames(video, frame, frame + 1)), None)
         if found is None and force:
@@ -316,6 +321,7 @@ class _Drawing:
         solution: Solution,
         bird: Bird,
         observations: Observations | None,
+        lens: Camera | None,
         side_views: bool,
         info: VideoInfo,
         max_width: int | None,
@@ -325,7 +331,7 @@ class _Drawing:
         self.picture_px = round(width * self.zoom), max(1, round(height * self.zoom))
         # linear interpolation is much faster, and as good while it still reads every pixel
         self._shrink = cv2.INTER_LINEAR if self.zoom > 0.6 else cv2.INTER_AREA
-        self.solution, self.posed = solution, PosedBirds(solution, bird)
+        self.solution, self.posed = solution, PosedBirds(solution, bird, lens)
         extent = np.ptp(solution.keypoints_px[solution.valid], axis=1).max(-1)
         self.style = Style.suited(self.picture_px[0], float(np.median(extent)) * self.zoom)
         self._numbers = Numbers(solution.keypoint_names, self.style)

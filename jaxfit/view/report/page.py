@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool
 
+from jaxfit.cameras.camera import Camera
 from jaxfit.data.flags import CONTRADICTED, FLAGS, OK, UNSURE
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
@@ -36,15 +37,23 @@ class Picture(NamedTuple):
 
 
 def report_pictures(
-    solution: Solution, bird: Bird, video: Path, observations: Observations | None = None, force: bool = False
+    solution: Solution,
+    bird: Bird,
+    video: Path,
+    observations: Observations | None = None,
+    force: bool = False,
+    lens: Camera | None = None,
 ) -> list[Picture]:
     """Draw some frames of a result; with `force`, also on a video that is not the video of the result.
+
+    Args:
+        solution, bird, video, observations, force, lens: as for `jaxfit.view.overlay.overlay`.
 
     Raises:
         InputError: as `jaxfit.view.overlay.overlay_frame`.
     """
     frames = solution.frame_index[spread_frames(solution.valid)].tolist()
-    more: dict[str, Any] = {"observations": observations, "max_width": _WIDTH_PX, "force": force}
+    more: dict[str, Any] = {"observations": observations, "lens": lens, "max_width": _WIDTH_PX, "force": force}
     drawn = overlay_pictures(solution, bird, video, frames, **more)
     pictures = []
     for frame, image in drawn:

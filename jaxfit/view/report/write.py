@@ -13,6 +13,7 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution, load_solution
+from jaxfit.data.world import as_filmed
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file, write_whole
 from jaxfit.foundation.limits import CONFIG_BYTES
@@ -58,7 +59,8 @@ def write_report(
     report = gather(solution, observations, json_values(summary), config, folder, bird)
     pictures = []
     if video is not None and solution.valid.any():
-        pictures = report_pictures(solution, bird, video, observations, force)
+        filmed, lens = as_filmed(folder, solution, bird)
+        pictures = report_pictures(filmed, bird, video, observations, force, lens)
     write_whole(path, page(report, pictures, measured).encode())
 
 

@@ -1,0 +1,135 @@
+"""A solution in a world, as its cameras see it.
+
+A solution in a world (`data.solution.WORLD`) holds its birds in the frame of its first camera, whose crop is the whole
+picture. A fit with one camera and no ledge holds its birds in crops.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from scipy.spatial.transform import Rotation
+
+from jaxfit.cameras.camera import Camera
+from jaxfit.cameras.files import read_cameras
+from jaxfit.data.solution import ERROR_BARS, Solution
+from jaxfit.foundation.errors import InputError
+from jaxfit.model.bird import Bird
+from jaxfit.model.camera import CROP_PX
+
+CAMERAS = "cameras.toml"
+"""File of the cameras in the folder of a result."""
+_AGREES_PX = 1.0
+"""Largest error of a pixel whose distortion is removed again; a larger error: the lens model does not hold there."""
+
+
+def whole_picture(lens: Camera, valid: Bool[np.ndarray, "N T"], size_px: tuple[int, int]) -> dict[str, Any]:
+    """Return the arrays of a solution that say that the crop of every bird is the whole picture of a camera.
+
+    Args:
+        lens: the camera, with its distortion or without.
+        valid: `Solution.valid`.
+        size_px: width and height of the picture, where the camera does not state them.
+    """
+    width, height = lens.size_px or size_px
+    side = max(width, height)
+    crop = np.array([*(lens.matrix[:2, 2] - side / 2), side], np.float32)
+    return {
+        "crop": np.broadcast_to(crop, (*valid.shape, 3)),
+        "image_size_px": np.where(valid[..., None], np.array([width, height]), 0),
+        "focal_px": float(lens.matrix[0, 0]) * CROP_PX / side,
+        "crop_px": CROP_PX,
+    }
+
+
+def largest_image_px(solution: Solution) -> tuple[int, int]:
+    """Return the width and the height of the largest picture with a pose."""
+    width, height = solution.image_size_px[solution.valid].max(axis=0, initial=1).tolist()
+    return width, height
+
+
+def in_frame_of_camera(solution: Solution) -> bool:
+    """Whether the birds are in the frame of a camera with a known focal length, not in crops."""
+    side = solution.image_size_px.max(axis=-1)
+    return solution.has_world and bool((solution.crop[..., 2] >= side)[solution.valid].all())
+
+
+def in_camera(solution: Solution, bird: Bird, camera: Camera) -> Solution:
+    """Return a solution in a world as another camera sees it.
+
+    Args:
+        solution: poses in a world.
+        bird: the model of the solution.
+        camera: a camera of this world, as it films.
+
+    Returns:
+        Poses in the frame of the camera, whose crop is the whole picture, with the distortion of the lens in
+        `keypoints_px`. A bird has no pose where it is behind the camera, or so far to the side that the lens model does
+        not hold. The solution has no error bars and no footage.
+    """
+    s, unit_m = solution, bird.metres_per_unit or 1.0
+    places_m, points_m = (np.asarray(values, np.float64) for values in (s.transl_world_m, s.keypoints_world_m))
+    root, points = camera.to_camera(places_m) / unit_m, camera.to_camera(points_m) / unit_m
+    joint = np.asarray(bird.joints[0], np.float64)
+    # birds in crops have another size than in the world: the keypoints of both have the ratio
+    extent = np.linalg.norm(points - root[:, :, None], axis=(-2, -1))
+    before = s.keypoints_cam - (s.transl + s.scale[..., None] * joint)[:, :, None]
+    with np.errstate(all="ignore"):
+        scale = s.scale * extent / np.linalg.norm(before, axis=(-2, -1))
+    pixels, straight = camera.project(points_m), camera.pinhole().project(points_m)
+    with np.errstate(invalid="ignore"):
+        known = np.abs(camera.undistort(pixels) - straight).max(axis=-1) < _AGREES_PX
+    valid = s.valid & (points[..., 2] > 0).all(axis=-1) & known.any(axis=-1)
+    turns = camera.R_cam_world @ np.where(valid[..., None, None], s.R_world_root, np.eye(3))
+    orient = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*valid.shape, 3)
+    return replace(
+        s,
+        **dict.fromkeys(ERROR_BARS),
+        **whole_picture(camera, valid, largest_image_px(s)),
+        valid=valid,
+        global_orient=orient.astype(np.float32),
+        transl=(root - scale[..., None] * joint).astype(np.float32),
+        scale=scale.astype(np.float32),
+        keypoints_cam=points.astype(np.float32),
+        keypoints_px=np.nan_to_num(pixels).astype(np.float32),
+        footage=None,
+    )
+
+
+def as_filmed(folder: Path, solution: Solution, bird: Bird, name: str | None = None) -> tuple[Solution, Camera | None]:
+    """Return the solution of a result folder in the frame of one of its cameras, and this camera.
+
+    Args:
+        folder: the result, whose cameras are in `CAMERAS`.
+        solution, bird: the content of the result.
+        name: the camera; None is the first camera.
+
+    Returns:
+        The solution as it is for the first camera, else by `in_camera`; and the camera, None for a solution without a
+        world or without cameras.
+
+    Raises:
+        InputError: a name is given and the result is in no world, has no such camera, or the camera sees no bird.
+    """
+    path = folder / CAMERAS
+    if name is not None and not solution.has_world:
+        problem = f"is {name}, but the result is in no world that several cameras could see"
+        raise InputError("--camera", problem, "remove --camera, or fit with --cameras or --ledge")
+    if name is None and not (solution.has_world and path.is_file()):
+        return solution, None
+    cameras = read_cameras(path)
+    by_name = {camera.name: camera for camera in cameras}
+    camera = cameras[0] if name is None else by_name.get(name)
+    if camera is None:
+        raise InputError("--camera", f"is {name}, which {path} does not hold", f"choose one of: {', '.join(by_name)}")
+    first = camera is cameras[0]
+    if first and in_frame_of_camera(solution):
+        return solution, camera
+    seen = in_camera(solution, bird, camera)
+    if solution.valid.any() and not seen.valid.any():
+        raise InputError("--camera", f"is {camera.name}, which sees no bird of the result", "choose another camera")
+    return replace(seen, footage=solution.footage if first else None), camera
