@@ -187,13 +187,16 @@ def _export(commands: Any) -> None:
     export.add_argument("--metres-per-unit", type=float, metavar="M", help=text)
     text = "the footage, if the result does not name the footage, or the footage was moved"
     export.add_argument("--video", type=Path, help=text)
-    text = "movement: keypoints in image pixels (2d, the default) or in the camera frame (3d)"
-    export.add_argument("--space", choices=("2d", "3d"), help=text)
+    text = (
+        "movement: keypoints in image pixels (2d, the default), in the camera frame (3d) or in the world of the result"
+    )
+    export.add_argument("--space", choices=("2d", "3d", "world"), help=text)
     text = "movement: names of the dimensions; plural for movement before 0.17 (default singular)"
     export.add_argument("--dims", choices=("singular", "plural"), help=text)
     text = "nwb: time of frame 0 of the footage, such as 2024-06-01T12:00:00+02:00"
     export.add_argument("--start", metavar="TIME", help=text)
-    export.add_argument("--ground", action="store_true", help="glb: add a level ground below the feet of the birds")
+    text = "glb: add the ground: the ledge of the result, or else a level ground below the feet of the birds"
+    export.add_argument("--ground", action="store_true", help=text)
 
 
 class _AddEdit(argparse.Action):

@@ -72,7 +72,7 @@ def in_camera(solution: Solution, bird: Bird, camera: Camera) -> Solution:
         not hold. The solution has no error bars and no footage.
     """
     s, unit_m = solution, bird.metres_per_unit or 1.0
-    places_m, points_m = (np.asarray(values, np.float64) for values in (s.transl_world_m, s.keypoints_world_m))
+    places_m, points_m = np.asarray(s.transl_world_m), np.asarray(s.keypoints_world_m)
     root, points = camera.to_camera(places_m) / unit_m, camera.to_camera(points_m) / unit_m
     joint = np.asarray(bird.joints[0], np.float64)
     # birds in crops have another size than in the world: the keypoints of both have the ratio
@@ -84,7 +84,7 @@ def in_camera(solution: Solution, bird: Bird, camera: Camera) -> Solution:
     with np.errstate(invalid="ignore"):
         known = np.abs(camera.undistort(pixels) - straight).max(axis=-1) < _AGREES_PX
     valid = s.valid & (points[..., 2] > 0).all(axis=-1) & known.any(axis=-1)
-    turns = camera.R_cam_world @ np.where(valid[..., None, None], s.R_world_root, np.eye(3))
+    turns = camera.R_cam_world @ np.where(valid[..., None, None], np.asarray(s.R_world_root), np.eye(3))
     orient = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*valid.shape, 3)
     return replace(
         s,

@@ -53,7 +53,7 @@ def export_result(
         video: the footage; None takes the footage that the result names.
         overwrite: replace existing files, or an earlier export in the folder.
         progress: shows progress.
-        **options: options of the format: `space` ("2d", "3d") and `dims` ("singular", "plural") of `movement`;
+        **options: options of the format: `space` ("2d", "3d", "world") and `dims` ("singular", "plural") of `movement`;
             `ground` (bool) of `glb`; `start` (ISO 8601, time of frame 0) of `nwb`.
 
     Returns:
@@ -62,7 +62,7 @@ def export_result(
     Raises:
         InputError: the result cannot be read or lacks a track or a frame, the frame rate or the footage is unknown but
             required, an optional package is missing or too old, an option does not belong to the format, or the output
-            exists or cannot be written.
+            exists or cannot be written; or positions in the world are required of a result without a world.
     """
     if to not in FORMATS:
         raise InputError("--to", f"is {to}, which is no format", f"choose one of: {', '.join(FORMATS)}")

@@ -3,6 +3,7 @@
 A bird is a mesh with a skeleton. The scene has y up, and lengths in metres where the length of a model unit is known.
 The node `footage_camera` is a camera with the field of view of the images: a picture of this camera shows the birds at
 their places in the footage. Birds have the size of the model, because one camera measures neither size nor distance.
+Birds in a world have their own size, and the scene of a result on a ledge is the world: its ledge is y = 0.
 """
 
 from __future__ import annotations
@@ -29,6 +30,12 @@ _BACKS = 0.1
 """Weight of the direction of the birds' backs, which decides where the lateral axes do not."""
 
 
+_CAMERA_TO_GLTF = np.diag([1.0, -1.0, -1.0])
+"""Rotation from the camera frame (y down, z forward) to that of glTF (y up, z backward)."""
+_WORLD_TO_GLTF = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
+"""Rotation from a world with z up to the frame of glTF."""
+
+
 class Ground(NamedTuple):
     """Rotation and translation from the camera frame of the image to a frame with the ground at y = 0, y up."""
 
@@ -50,18 +57,13 @@ def level_ground(exported: Exported, motions: dict[int, Motion]) -> Ground:
         exported: the result.
         motions: position of a track → its motion.
     """
-    s, bird = exported.solution, exported.bird
-    feet = [k for k, name in enumerate(s.keypoint_names) if "foot" in name] or list(range(len(s.keypoint_names)))
-    lateral, backs, points = [], [], []
+    s = exported.solution
+    lateral, backs = [], []
     for n, motion in motions.items():
         turn = Rotation.from_quat(motion.facing)
         body = turn * Rotation.from_rotvec(s.global_orient[n, motion.at].astype(np.float64))
         lateral.append(body.apply([1.0, 0, 0]))
         backs.append(body.apply([0, 0, 1.0]))
-        relative = (s.keypoints_cam[n, motion.at] - s.transl[n, motion.at][:, None])[:, feet]
-        relative = relative / s.scale[n, motion.at][:, None, None] * exported.length
-        turned = np.einsum("mij,mkj->mki", turn.as_matrix(), relative.astype(np.float64))
-        points.append(turned + motion.place[:, None])
     x, back = np.concatenate(lateral), np.concatenate(backs).mean(0)
     up = np.linalg.eigh(x.T @ x / len(x) - _BACKS * np.outer(back, back))[1][:, 0]
     up = up if up @ back > 0 else -up
@@ -69,14 +71,46 @@ def level_ground(exported: Exported, motions: dict[int, Motion]) -> Ground:
     backward = -(forward - (forward @ up) * up)
     backward /= np.linalg.norm(backward)
     rotation = np.stack([np.cross(up, backward), up, backward])
-    placed = [each @ rotation.T for each in points]
-    height = float(np.median([np.median(each[..., 1].min(axis=1)) for each in placed]))
-    flat = np.concatenate([each.reshape(-1, 3) for each in placed])[:, [0, 2]]
-    distance = np.linalg.norm(np.concatenate([each.reshape(-1, 3) for each in points]), axis=1)
-    flat = flat[distance <= _FARTHEST * np.median(distance)]
+    feet = _feet(exported, motions)
+    height = float(np.median([np.median((each @ rotation[1]).min(axis=1)) for each in feet]))
+    return _below(exported, feet, rotation, np.array([0, -height, 0]))
+
+
+def ledge_ground(exported: Exported, motions: dict[int, Motion]) -> Ground:
+    """Return the ledge of the result, the plane z = 0 of its world, as the ground.
+
+    Every pose is known in the frame of the camera and in the world, so the first pose gives the camera in the world.
+    """
+    s = exported.solution
+    n, t = np.argwhere(s.valid)[0].tolist()
+    R_cam_root = Rotation.from_rotvec(exported.in_image.orientation[n, t]).as_matrix()
+    R_world_cam = np.asarray(s.R_world_root)[n, t] @ R_cam_root.T
+    position_m = np.asarray(s.transl_world_m)[n, t] - R_world_cam @ exported.in_image.root[n, t] * exported.length
+    return _below(exported, _feet(exported, motions), _WORLD_TO_GLTF @ R_world_cam, _WORLD_TO_GLTF @ position_m)
+
+
+def _feet(exported: Exported, motions: dict[int, Motion]) -> list[Float[np.ndarray, "M F 3"]]:
+    """Return the feet of every bird in the camera frame of the image; all keypoints where none is on a foot."""
+    s = exported.solution
+    feet = [k for k, name in enumerate(s.keypoint_names) if "foot" in name] or list(range(len(s.keypoint_names)))
+    points = exported.in_image.points(s.keypoints_cam[:, :, feet], s.scale) * exported.length
+    return [points[n, motion.at] for n, motion in motions.items()]
+
+
+def _below(
+    exported: Exported,
+    feet: list[Float[np.ndarray, "M F 3"]],
+    rotation: Float[np.ndarray, "3 3"],
+    translation: Float[np.ndarray, "3"],
+) -> Ground:
+    """Return the ground of a frame, with a size that the feet of the birds determine."""
+    points = np.concatenate([each.reshape(-1, 3) for each in feet])
+    distance = np.linalg.norm(points, axis=1)
+    near = points[distance <= _FARTHEST * np.median(distance)]
+    flat = (near @ rotation.T + translation)[:, [0, 2]]
     low, high = flat.min(0), flat.max(0)
-    margin = _MARGIN * (body_length(bird) * exported.length + float((high - low).max()))
-    return Ground(rotation, np.array([0, -height, 0]), low - margin, high + margin)
+    margin = _MARGIN * (body_length(exported.bird) * exported.length + float((high - low).max()))
+    return Ground(rotation, translation, low - margin, high + margin)
 
 
 def add_ground(builder: GltfBuilder, ground: Ground) -> None:
@@ -97,10 +131,6 @@ def add_ground(builder: GltfBuilder, ground: Ground) -> None:
     builder.root["scenes"][0]["nodes"].append(builder.add("nodes", {"name": "ground", "mesh": mesh}))
 
 
-_CAMERA_TO_GLTF = np.diag([1.0, -1.0, -1.0])
-"""Rotation from the camera frame (y down, z forward) to that of glTF (y up, z backward)."""
-
-
 def write_glb(
     exported: Exported,
     out: Path,
@@ -114,7 +144,8 @@ def write_glb(
         exported: the result.
         out: a folder for a file of every bird, or a file for all birds whose name ends with `.glb`.
         progress: shows progress.
-        ground: turn the scene so that the ground is level, and add a rectangle below the feet.
+        ground: add a rectangle below the feet, and turn the scene so that the rectangle is level. A result on a ledge
+            is always in its world, and the rectangle is the ledge.
         overwrite: replace an earlier export in the folder.
 
     Returns:
@@ -125,25 +156,28 @@ def write_glb(
     """
     exported.require_poses()
     exported.require_fps()
-    focal_px = exported.focal_px
     fitted = np.flatnonzero(exported.solution.valid.any(axis=1)).tolist()
     with progress("Writing glTF", len(fitted)) as report_progress:
         motions: dict[int, Motion] = {}
         for n in fitted:
             motions[n] = bird_motion(exported, n)
             report_progress(0.5, f"track {exported.solution.track_id[n]}")
-        level = level_ground(exported, motions) if ground else None
+        scene = None
+        if exported.solution.contact is not None:
+            scene = ledge_ground(exported, motions)
+        elif ground:
+            scene = level_ground(exported, motions)
         error = weight_error(exported)
-        facts = {"largest_error_of_four_weights": error, "focal_length_px": focal_px}
+        facts = {"largest_error_of_four_weights": error, "focal_length_px": exported.focal_px}
         if out.suffix == ".glb":
-            write_whole(out, _content(exported, motions, fitted, focal_px, level, facts))
+            write_whole(out, _content(exported, motions, fitted, scene, ground, facts))
             files = [out]
         else:
             tracks = {n: int(exported.solution.track_id[n]) for n in fitted}
             names = {track: f"bird_{track}.glb" for track in tracks.values()}
             with export_folder(exported, out, overwrite, names, facts) as folder:
                 for n, track in tracks.items():
-                    write_whole(folder / names[track], _content(exported, motions, [n], focal_px, level, facts))
+                    write_whole(folder / names[track], _content(exported, motions, [n], scene, ground, facts))
                     report_progress(0.5, names[track])
             files = [out / name for name in names.values()]
     notes = []
@@ -158,8 +192,8 @@ def _content(
     exported: Exported,
     motions: dict[int, Motion],
     chosen: Sequence[int],
-    focal_px: float,
-    ground: Ground | None,
+    scene: Ground | None,
+    ground: bool,
     facts: dict[str, Any],
 ) -> bytes:
     """Return a `.glb` with some birds."""
@@ -171,14 +205,15 @@ def _content(
     builder = GltfBuilder({"generator": f"jaxfit {__version__}", "extras": extras})
     frame = builder.add("nodes", {"name": "camera_frame"})
     builder.root["scenes"][0]["nodes"].append(frame)
-    rotation = _CAMERA_TO_GLTF if ground is None else ground.rotation
+    rotation = _CAMERA_TO_GLTF if scene is None else scene.rotation
     node = builder.root["nodes"][frame]
     node["rotation"] = _quaternion(rotation)
-    if ground is not None:
-        node["translation"] = ground.translation.tolist()
-        add_ground(builder, ground)
+    if scene is not None:
+        node["translation"] = scene.translation.tolist()
+        if ground:
+            add_ground(builder, scene)
     width, height = np.median(s.image_size_px[s.valid], axis=0).tolist()
-    view = {"yfov": 2 * float(np.arctan(height / 2 / focal_px)), "aspectRatio": width / height, "znear": 0.01}
+    view = {"yfov": 2 * float(np.arctan(height / 2 / exported.focal_px)), "aspectRatio": width / height, "znear": 0.01}
     camera = builder.add("cameras", {"type": "perspective", "perspective": view})
     looking = {"name": "footage_camera", "camera": camera, "rotation": _quaternion(_CAMERA_TO_GLTF)}
     node["children"] = [builder.add("nodes", looking)]

@@ -107,8 +107,8 @@ class Motion(NamedTuple):
     """Translation of the bird in the camera frame of the image, in the unit of the export."""
     facing: Float[np.ndarray, "M 4"]
     """Rotation from the camera frame of the crop to the camera frame of the image: unit quaternions x, y, z, w."""
-    size: float
-    """Length of a model unit, in the unit of the export."""
+    size: Float[np.ndarray, "M"]
+    """Length of a model unit, in the unit of the export. It changes where the bird has another size in each frame."""
     betas: Float[np.ndarray, "M S"]
     """Shape coefficients."""
 
@@ -129,8 +129,8 @@ def bird_motion(exported: Exported, n: int) -> Motion:
     offsets = joints - np.where(np.arange(len(joints))[:, None] > 0, joints[np.maximum(bird.parents, 0)], 0)
     bones = np.concatenate([np.ones((len(at), 1)), s.bone_length[n, at]], axis=1)
     turn = Rotation.from_matrix(exported.in_image.turn[n, at])
-    size = float(np.median(exported.in_image.size[n, at]))
-    place = exported.in_image.root[n, at] - turn.apply(size * joints[0])  # the turn is about the root joint
+    size = exported.in_image.size[n, at]
+    place = exported.in_image.root[n, at] - turn.apply(size[:, None] * joints[0])  # the turn is about the root joint
     return Motion(
         at=at,
         rotations=_continuous(rotations),

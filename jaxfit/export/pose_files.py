@@ -7,8 +7,8 @@ frame without a pose has no bird.
 netCDF files for the package movement (`ds_type` = poses). Source: the layout is that of the poses of movement 0.17,
 whose dimensions have names in the singular. Versions up to 0.16 have the dimensions `keypoints` and `individuals`.
 
-Positions are in image pixels. A frame without a pose is NaN. The file has a skeleton, a series of positions and
-confidences for every keypoint, and a link to the footage.
+Positions in NWB are in image pixels, and in metres for results in a world. A frame without a pose is NaN. The file has
+a skeleton, a series of positions and confidences for every keypoint, and a link to the footage.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from jaxfit.data.formats.write_sleap import write_sleap_project
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import projected_observations
 from jaxfit.data.tracks import frame_step
-from jaxfit.export.result import CONFIDENCE, SD, Exported, describe_tracks, export_folder
+from jaxfit.export.result import CONFIDENCE, ON_LEDGE, SD, Exported, describe_tracks, export_folder
 from jaxfit.foundation.errors import InputError, one_line
 from jaxfit.foundation.extras import __version__, require_package
 from jaxfit.foundation.files import write_whole
@@ -104,12 +104,13 @@ def write_movement(
     exported: Exported,
     out: Path,
     progress: ProgressTask,
-    space: Literal["2d", "3d"] = "2d",
+    space: Literal["2d", "3d", "world"] = "2d",
     dims: Literal["singular", "plural"] = "singular",
 ) -> tuple[list[Path], list[str]]:
     """Write a netCDF file with `position` (time, space, keypoint, individual) and `confidence`.
 
-    A result with error bars also has `position_sd`, with the dimensions of `position`.
+    A result with error bars also has `position_sd`, with the dimensions of `position`, except in the world. A result on
+    a ledge also has `on_ledge` (time, individual).
 
     Frame numbers that the result lacks between its first and last frame are frames of NaN, so that the frames have
     equal distances in time. The individual of track 3 has the name `bird_3`.
@@ -118,14 +119,14 @@ def write_movement(
         exported: the result.
         out: the file to write.
         progress: shows progress.
-        space: `2d` for image pixels, `3d` for the camera frame of the image.
+        space: `2d` for image pixels, `3d` for the camera frame of the image, `world` for the world of the result.
         dims: `singular` for the dimensions `keypoint` and `individual`, `plural` for `keypoints` and `individuals`.
 
     Returns:
         The file, and a note about the versions of movement that read the file.
 
     Raises:
-        InputError: xarray or h5netcdf is not installed, or the frame rate is unknown.
+        InputError: xarray or h5netcdf is not installed, the frame rate is unknown, or the result is in no world.
     """
     for package in ("xarray", "h5netcdf"):
         require_package(package, "--to movement")
@@ -134,11 +135,10 @@ def write_movement(
     s, fps = exported.solution, exported.sampling_fps
     numbers = np.arange(s.frame_index[0], s.frame_index[-1] + 1, frame_step(s.frame_index))
     column = np.searchsorted(numbers, s.frame_index)
-    points = exported.keypoints_px if space == "2d" else exported.keypoints_3d
-    sd = exported.keypoints_px_sd if space == "2d" else exported.keypoints_3d_sd
+    points, sd, unit, facts = _positions(exported, space)
 
     def in_time(values: np.ndarray) -> np.ndarray:
-        arranged = np.full((len(numbers), *values.shape[3:1:-1], values.shape[0]), np.nan, np.float32)
+        arranged = np.full((len(numbers), *values.shape[3:1:-1], values.shape[0]), np.nan, values.dtype)
         arranged[column] = values.transpose(1, 3, 2, 0)
         return arranged
 
@@ -147,9 +147,9 @@ def write_movement(
     confidence[column] = exported.confidence.transpose(1, 2, 0)
     keypoint, individual = ("keypoint", "individual") if dims == "singular" else ("keypoints", "individuals")
     of_position = ("time", "space", keypoint, individual)
-    arrays = {"position": (of_position, position, {"units": _unit(exported, space)})}
+    arrays = {"position": (of_position, position, {"units": unit})}
     if sd is not None:
-        arrays["position_sd"] = (of_position, in_time(sd), {"units": _unit(exported, space), "description": SD})
+        arrays["position_sd"] = (of_position, in_time(sd.astype(np.float32)), {"units": unit, "description": SD})
     with progress("Writing netCDF", None):
         dataset = xarray.Dataset(
             {
@@ -170,8 +170,7 @@ def write_movement(
                 "fps": fps,
                 "time_unit": "seconds",
                 "source_file": str(exported.source),
-                "position_frame": "image, x right, y down" if space == "2d" else "camera frame of the image, z forward",
-                **({} if space == "2d" else {"focal_length_px": exported.focal_px}),
+                **facts,
             },
         )
         content = io.BytesIO()
@@ -181,8 +180,20 @@ def write_movement(
     return [out], [_READERS[dims]]
 
 
+def _positions(exported: Exported, space: str) -> tuple[np.ndarray, np.ndarray | None, str, dict[str, Any]]:
+    """Return positions (N, T, K, 2 or 3) in a space, their standard deviations, their unit, and facts about them."""
+    if space == "2d":
+        facts = {"position_frame": "image, x right, y down"}
+        return exported.keypoints_px, exported.keypoints_px_sd, "pixels", facts
+    if space == "world":
+        return exported.require_world(), None, "metres", {"position_frame": exported.world_frame}
+    facts = {"position_frame": "camera frame of the image, z forward", "focal_length_px": exported.focal_px}
+    unit = {"m": "metres", "unit": "model units"}[exported.unit]
+    return exported.keypoints_3d, exported.keypoints_3d_sd, unit, facts
+
+
 def _quality(exported: Exported, individual: str, column: np.ndarray, length: int) -> dict[str, tuple]:
-    """Return the flags of the poses, the status of the tracks, and the quality of their detections if it is known.
+    """Return flags and contacts of the poses, the status of the tracks, and the quality of their detections if known.
 
     Args:
         exported: the result.
@@ -197,16 +208,17 @@ def _quality(exported: Exported, individual: str, column: np.ndarray, length: in
         "flag": (("time", individual), flag, {"description": "ok, unsure, contradicted; empty: no pose"}),
         "status": ((individual,), s.status.astype(str), {"description": "how the fit of the track ended"}),
     }
+    contact = exported.contact
+    if contact is not None:
+        on_ledge = np.full(flag.shape, np.nan, np.float32)
+        on_ledge[column] = contact.T
+        found["on_ledge"] = (("time", individual), on_ledge, {"description": ON_LEDGE})
     if exported.quality:
         rows = [exported.quality.get(track) for track in s.track_id.tolist()]
         for name in ("coverage", "mean_confidence"):
             values = np.array([np.nan if row is None else getattr(row, name) for row in rows])
             found[f"track_{name}"] = ((individual,), values)
     return found
-
-
-def _unit(exported: Exported, space: str) -> str:
-    return "pixels" if space == "2d" else {"m": "metres", "unit": "model units"}[exported.unit]
 
 
 _ORIGIN = "(0, 0) is the upper left corner of the image, x right, y down, pixels"
@@ -313,11 +325,8 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str
     behaviour = file.create_processing_module("behavior", "poses of the bird")
     behaviour.add(ndx_pose.Skeletons(skeletons=[skeleton]))
     behaviour.add(pose)
-    sd = exported.keypoints_px_sd
-    if sd is not None:
-        description = f"axes: time, node of the skeleton, (x, y). {SD}"
-        timing = {"unit": "pixels", **_timing(exported, series[0])}
-        behaviour.add(pynwb.TimeSeries(name="keypoints_sd", data=sd[n], description=description, **timing))
+    for further in _further_series(exported, n, series[0]):
+        behaviour.add(further)
     intervals = _flag_intervals(exported, n)
     if intervals is not None:
         file.add_time_intervals(intervals)
@@ -370,6 +379,24 @@ def _series(exported: Exported, n: int) -> list[Any]:
         )
         series.append(one)
     return series
+
+
+def _further_series(exported: Exported, n: int, first: Any) -> list[Any]:
+    """Return the series that ndx-pose has no field for: standard deviations, the bird in the world and on the ledge.
+
+    A `SpatialSeries` has one point at a time, so the keypoints in the world are a `TimeSeries`, whose description
+    states the frame.
+    """
+    rows: list[tuple[str, np.ndarray, str, str]] = []
+    if (sd := exported.keypoints_px_sd) is not None:
+        rows.append(("keypoints_sd", sd[n], "pixels", f"axes: time, node of the skeleton, (x, y). {SD}"))
+    if exported.solution.has_world:
+        description = f"axes: time, node of the skeleton, (x, y, z). Reference frame: {exported.world_frame}"
+        rows.append(("keypoints_world", exported.require_world()[n], "metres", description))
+    if (contact := exported.contact) is not None:
+        rows.append(("on_ledge", contact[n], "n.a.", ON_LEDGE))
+    timing, new = _timing(exported, first), _library("pynwb").TimeSeries
+    return [new(name=name, data=data, unit=unit, description=text, **timing) for name, data, unit, text in rows]
 
 
 def _series_names(names: tuple[str, ...]) -> list[str]:

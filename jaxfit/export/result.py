@@ -69,6 +69,8 @@ def _listed(numbers: Sequence[int]) -> str:
     return f"{shown}, …" if len(numbers) > 20 else shown or "none"
 
 
+ON_LEDGE = "probability that the bird stands on the ledge, the plane z = 0 of the world"
+"""Definition of `on_ledge` in an export."""
 CONFIDENCE = (
     "confidence of the detected keypoint that the pose was fitted to, in [0, 1], as the keypoint network gives it; 0 "
     "where the keypoint was not detected; NaN where the result does not hold detections or has no pose"
@@ -150,7 +152,7 @@ class Exported:
         if covariance is None:
             return None
         turn = self.in_image.turn[:, :, None]
-        scale = (self.length / self.solution.scale.astype(np.float64))[..., None, None]
+        scale = (self.length * self.in_image.size / self.solution.scale)[..., None, None]
         return self._sd(turn @ covariance @ turn.swapaxes(-1, -2)) * scale
 
     def _sd(self, covariance: np.ndarray) -> np.ndarray:
@@ -167,6 +169,29 @@ class Exported:
     def sampling_fps(self) -> float:
         """Frames of the export per second: the frame rate divided by the step of the frame numbers."""
         return self.require_fps() / frame_step(self.solution.frame_index)
+
+    @property
+    def contact(self) -> Float[np.ndarray, "N T"] | None:
+        """The probabilities that `ON_LEDGE` defines; NaN without a pose, None for a result without a ledge."""
+        contact = self.solution.contact
+        return None if contact is None else np.where(self.solution.valid, contact, np.float32(np.nan))
+
+    @property
+    def world_frame(self) -> str:
+        """The axes of the world of a result."""
+        return "world, as the cameras define it" if self.solution.contact is None else "world, z up"
+
+    def require_world(self) -> Float[np.ndarray, "N T K 3"]:
+        """Return the keypoints in the world, metres; NaN without a pose.
+
+        Raises:
+            InputError: the result is in no world.
+        """
+        points_m = self.solution.keypoints_world_m
+        if points_m is None:
+            problem = "is in no world: one camera without a ledge does not measure places"
+            raise InputError(self.source, problem, "place the birds by `jaxfit ledge`, or fit with --cameras")
+        return np.where(self.solution.valid[..., None, None], points_m, np.nan)
 
     def require_fps(self) -> float:
         """Return the frame rate of the footage.
@@ -215,14 +240,18 @@ def open_result(
         video: the footage; None takes the footage that the result names.
 
     Raises:
-        InputError: the folder holds no result, a track or frame is not in the result, a number is not positive, the
-            video cannot be read or has other images, or the detections do not belong to the result.
+        InputError: the folder holds no result, a track or frame is not in the result, a number is not positive, a
+            length of a model unit is given for a result in a world, the video cannot be read or has other images, or
+            the detections do not belong to the result.
     """
     folder = Path(folder)
     for name, value in (("--fps", fps), ("--metres-per-unit", metres_per_unit)):
         if value is not None and not 0 < value < np.inf:
             raise InputError(name, f"is {value}, not a positive number", "give a number above 0")
     solution, bird = load_solution(folder)
+    if metres_per_unit is not None and solution.has_world:
+        remedy = f"remove --metres-per-unit: a model unit of this result is {bird.metres_per_unit:.6g} m"
+        raise InputError("--metres-per-unit", "is given for a result in a world, which is in metres", remedy)
     rows = track_positions(solution, tracks, folder)
     columns = frame_positions(solution, frames, folder)
     observations, quality = _detections(folder, solution, bird)

@@ -2,8 +2,8 @@
 
 Both tables have a row for every track and frame. A row without a pose has `fitted` = false and empty values. The last
 part of the name of a column is its unit: `s`, `px` (image pixels), `m` or `unit` (model units), `rad`. Positions in
-space are those of a bird of the model's size in the camera frame of the image (`jaxfit.data.projection`). Fits of
-several cameras have the true size, and also positions in the world (`world_m`).
+space are those of a bird of the model's size in the camera frame of the image (`jaxfit.data.projection`). Results in a
+world have the true size, and also positions in the world (`world_m`); on a ledge, also `on_ledge`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxfit.data.flags import doubt_texts, flags
-from jaxfit.export.result import CONFIDENCE, SD, Exported
+from jaxfit.data.world import in_frame_of_camera
+from jaxfit.export.result import CONFIDENCE, ON_LEDGE, SD, Exported
 from jaxfit.foundation.extras import require_package
 from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.progress import ProgressTask
@@ -88,6 +89,8 @@ def _pose_columns(exported: Exported) -> Columns:
     if s.global_orient_sd is not None:
         columns |= _vectors(exported, {"orientation": s.global_orient_sd}, "sd_rad")
     columns["size"] = _known(exported, s.scale)
+    if s.contact is not None:
+        columns["on_ledge"] = _known(exported, s.contact)
     confidence = exported.confidence
     sd_px, sd = exported.keypoints_px_sd, exported.keypoints_3d_sd
     for k, name in enumerate(s.keypoint_names):
@@ -144,11 +147,28 @@ def _facts(exported: Exported) -> dict[str, str]:
         "frames": frames,
         "confidence": CONFIDENCE,
         "sd": SD,
-        "size": "size of the bird relative to the model in the result; positions are those at the size of the model",
-        "focal_length_px": f"{exported.focal_px:.6g}, assumed; depths are proportional to it",
+        **_facts_of_space(exported),
         "model": exported.bird.name,
         "fps": str(exported.fps or "unknown"),
     }
+
+
+def _facts_of_space(exported: Exported) -> dict[str, str]:
+    """Return what is known about sizes and distances."""
+    s, focal, size = (
+        exported.solution,
+        f"{exported.focal_px:.6g}",
+        "size of the bird relative to the model in the result",
+    )
+    facts = {
+        "size": f"{size}; positions are those at the size of the {'bird' if s.has_world else 'model'}",
+        "focal_length_px": f"{focal}, of the camera"
+        if in_frame_of_camera(s)
+        else f"{focal}, assumed; depths are proportional to it",
+    }
+    if s.has_world:
+        facts["world"] = f"{exported.world_frame}, metres"
+    return facts | ({} if s.contact is None else {"on_ledge": ON_LEDGE})
 
 
 def _csv(columns: Columns, _facts: dict[str, str]) -> bytes:
