@@ -89,7 +89,7 @@ def ledge_ground(exported: Exported, motions: dict[int, Motion]) -> Ground:
     return _below(exported, _feet(exported, motions), _WORLD_TO_GLTF @ R_world_cam, _WORLD_TO_GLTF @ position_m)
 
 
-def _feet(exported: Exported, motions: dict[int, Motion]) -> list[Float[np.ndarray, "M F 3"]]:
+def _feet(exported: Exported, motions: dict[int, Motion]) -> list[Float[np.ndarray, "_ F 3"]]:
     """Return the feet of every bird in the camera frame of the image; all keypoints where none is on a foot."""
     s = exported.solution
     feet = [k for k, name in enumerate(s.keypoint_names) if "foot" in name] or list(range(len(s.keypoint_names)))
@@ -99,7 +99,7 @@ def _feet(exported: Exported, motions: dict[int, Motion]) -> list[Float[np.ndarr
 
 def _below(
     exported: Exported,
-    feet: list[Float[np.ndarray, "M F 3"]],
+    feet: list[Float[np.ndarray, "_ F 3"]],
     rotation: Float[np.ndarray, "3 3"],
     translation: Float[np.ndarray, "3"],
 ) -> Ground:
