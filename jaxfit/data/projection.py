@@ -44,7 +44,7 @@ class InImage(NamedTuple):
     root_in_crop: Float[np.ndarray, "N T 3"]
     """Position of the root joint in the camera frame of the crop, model units."""
     size: Float[np.ndarray, "N T"]
-    """Size of the bird in these frames, relative to the model: 1, or as several cameras estimate it."""
+    """Size of the bird in these frames, relative to the model: 1, or the true size in the frame of a camera."""
 
     def points(
         self, points_cam: Float[np.ndarray, "N T P 3"], scale: Float[np.ndarray, "N T"]
@@ -88,19 +88,17 @@ def in_image(
     s, focal = solution, image_focal_px(solution) if focal_px is None else focal_px
     at = np.nonzero(s.valid)
     crop = s.crop[at].astype(np.float64)
-    # poses in the world have the true size, which several cameras estimate
-    size = s.scale[at].astype(np.float64) if s.has_world else np.ones(len(at[0]))
+    of_camera = in_frame_of_camera(s)  # then the size is the true size
+    size = s.scale[at].astype(np.float64) if of_camera else np.ones(len(at[0]))
     divisor = (s.scale[at].astype(np.float64) / size)[:, None]
     root = s.transl[at] / divisor + size[:, None] * np.asarray(bird.joints[0], np.float64)
     crop_focal = s.focal_px * crop[:, 2:] / s.crop_px
     pixel = root[:, :2] / root[:, 2:] * crop_focal + crop[:, :2] + crop[:, 2:] / 2
     # the pictures of a camera have one size; a photograph may have its own
     middle_of_crop = crop[:, :2] + crop[:, 2:] / 2
-    if centre_px is None:
-        # the crop of the whole picture has the principal point of the camera in its middle
-        centre = middle_of_crop if in_frame_of_camera(s) else s.image_size_px[at] / 2
-    else:
-        centre = np.asarray(centre_px)
+    # the crop of the whole picture has the principal point of the camera in its middle
+    known = middle_of_crop if of_camera else s.image_size_px[at] / 2
+    centre = known if centre_px is None else np.asarray(centre_px)
     ray = np.concatenate([(pixel - centre) / focal, np.ones((len(root), 1))], axis=1)
     turn = _between(root, ray)
     orient = (turn * Rotation.from_rotvec(s.global_orient[at].astype(np.float64))).as_rotvec()

@@ -155,16 +155,13 @@ def _facts(exported: Exported) -> dict[str, str]:
 
 def _facts_of_space(exported: Exported) -> dict[str, str]:
     """Return what is known about sizes and distances."""
-    s, focal, size = (
-        exported.solution,
-        f"{exported.focal_px:.6g}",
-        "size of the bird relative to the model in the result",
-    )
+    s, size = exported.solution, "size of the bird relative to the model in the result"
+    owner, origin = "model", "assumed; depths are proportional to it"
+    if in_frame_of_camera(s):
+        owner, origin = "bird", "of the camera"
     facts = {
-        "size": f"{size}; positions are those at the size of the {'bird' if s.has_world else 'model'}",
-        "focal_length_px": f"{focal}, of the camera"
-        if in_frame_of_camera(s)
-        else f"{focal}, assumed; depths are proportional to it",
+        "size": f"{size}; positions are those at the size of the {owner}",
+        "focal_length_px": f"{exported.focal_px:.6g}, {origin}",
     }
     if s.has_world:
         facts["world"] = f"{exported.world_frame}, metres"
