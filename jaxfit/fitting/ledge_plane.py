@@ -21,7 +21,7 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.data.flags import CONTRADICTED, flags
 from jaxfit.data.projection import in_image
 from jaxfit.data.solution import Solution, select_solution
-from jaxfit.data.world import largest_image_px
+from jaxfit.data.world import in_frame_of_camera, largest_image_px
 from jaxfit.fitting.contacts import SLOW, feet_cam, interval_of, speed_lengths
 from jaxfit.fitting.ledge import metres
 from jaxfit.foundation.errors import InputError
@@ -120,7 +120,7 @@ def estimate_ledge(
     """
     problem = _Problem(solution, bird, camera, distances, source)
     # several cameras know the sizes
-    size_sd = WITHIN_SD if solution.has_world else SIZE_SD_LOG
+    size_sd = WITHIN_SD if in_frame_of_camera(solution) else SIZE_SD_LOG
     sd, theta = _Deviations(size_sd, WITHIN_SD, TILT_SD, TILT_SD), problem.start(source)
     how: dict[str, Any] = {"jac": problem.jacobian, "loss": "soft_l1", "x_scale": "jac"}
     for _ in range(MOST_ROUNDS):

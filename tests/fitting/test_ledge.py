@@ -145,6 +145,18 @@ def test_measured_distances_give_the_height_and_the_size_of_the_birds(seen, scen
     assert ledge.facts["size"] == pytest.approx(np.mean(scene.poses.scale[:, 0]), rel=0.02)
 
 
+def test_one_calibrated_camera_does_not_know_the_sizes(seen, camera):
+    """A fit of one calibrated camera is in a world, but its birds in crops have the size of the model."""
+    side = seen.crop[..., 2:]
+    crop = np.concatenate([seen.crop[..., :2] + (side - 100) / 2, np.full_like(side, 100)], axis=-1)
+    N, T, K, _ = seen.keypoints_cam.shape
+    world = {"R_world_root": (N, T, 3, 3), "transl_world_m": (N, T, 3), "keypoints_world_m": (N, T, K, 3)}
+    arrays = {name: np.zeros(shape) for name, shape in world.items()}
+    cropped = replace(seen, crop=crop, focal_px=seen.focal_px * float(side[0, 0, 0]) / 100, **arrays)
+    facts, alone = (estimate_ledge(each, BIRD, camera).facts for each in (cropped, seen))
+    assert facts["height_sd_m"] == pytest.approx(alone["height_sd_m"], rel=1e-3)
+
+
 def test_several_cameras_keep_places_and_sizes(placed, camera):
     ledge = estimate_ledge(placed, BIRD, camera)
     assert ledge.facts["height_m"] == pytest.approx(camera.position_world[2], rel=0.02)
