@@ -244,7 +244,11 @@ def calibrate_cameras(
             remedy = "show the board to two cameras at a time; the films must start together"
             raise InputError(films[b].source, f"{problem}{LEAST_COMMON_VIEWS}", remedy)
         first, second = lenses[a].camera, lenses[b].camera
-        R, t, pair = _relative_pose((films[a], films[b]), (first, second), board)
+        try:
+            R, t, pair = _relative_pose((films[a], films[b]), (first, second), board)
+        except cv2.error as error:
+            problem = f"OpenCV finds no pose of this camera for its {count} views in common with {films[a].source}"
+            raise InputError(films[b].source, problem, "show the board to both cameras in more places") from error
         transl_cam = R @ first.transl_cam + t * board.square_m
         lenses[b] = lenses[b]._replace(camera=replace(second, R_cam_world=R @ first.R_cam_world, transl_cam=transl_cam))
         pairs.append(pair)
@@ -255,7 +259,10 @@ def calibrate_cameras(
 def _relative_pose(
     films: tuple[BoardViews, BoardViews], cameras: tuple[Camera, Camera], board: Board
 ) -> tuple[np.ndarray, np.ndarray, Pair]:
-    """Return the rotation and translation (squares) from the first camera to the second, with their quality."""
+    """Return the rotation and translation (squares) from the first camera to the second, with their quality.
+
+    The second camera is its own world.
+    """
     at = _common(*films)
     at = at[:, _different(np.concatenate([_shapes(film)[i] for film, i in zip(films, at, strict=True)], axis=1))]
     first_px, second_px = (film.corners_px[i] for film, i in zip(films, at, strict=True))
@@ -280,10 +287,9 @@ def _consistent(
     """Return the views that agree on one relative pose, with the corners of both cameras in one order.
 
     Each view, and each order of its corners in the second camera, proposes a relative pose. The best proposal has the
-    smallest median error over all views, if each view takes its best order.
+    smallest median error over all views, if each view takes its best order. The second camera is its own world.
     """
-    first, second = ({**vars(camera), "R_cam_world": np.eye(3), "transl_cam": np.zeros(3)} for camera in cameras)
-    first, second = Camera(**first), Camera(**second)
+    first, second = cameras
     ordered_px = np.stack([second_px[:, order] for order in board.orders])
     poses = [_board_pose(first, px, board) for px in first_px]
     points_first = np.stack([board.corners @ R.T + t for R, t in poses])

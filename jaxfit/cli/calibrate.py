@@ -61,23 +61,29 @@ def _board(options: argparse.Namespace) -> Board:
 def _find_boards(films: Sequence[Path], board: Board) -> list[BoardViews]:
     """Search for the board in every film, in the same frames of all films."""
     from jaxfit.cameras.calibrate import find_boards
-    from jaxfit.video.reader import probe_video, read_frames
 
     names = [film.resolve().name if film.is_dir() else film.stem for film in films]
     for i, name in enumerate(names):
         if name in names[:i]:
             problem = f'would be a second camera with the name "{name}", after {films[names.index(name)]}'
             raise InputError(films[i], problem, "give each film its own name")
-    stored = [probe_video(film).frames for film in films]
-    counts = [
-        sum(1 for _ in read_frames(film)) if count is None else count for film, count in zip(films, stored, strict=True)
-    ]
+    counts = [_frame_count(film) for film in films]
     step = math.ceil(max(counts) / _MOST_FRAMES)
     found = []
     for name, film, count in zip(names, films, counts, strict=True):
         with terminal(f"search for the board: {name}", math.ceil(count / step)) as report_progress:
             found.append(find_boards(name, film, _pictures(film, step, report_progress), board))
     return found
+
+
+def _frame_count(film: Path) -> int:
+    from jaxfit.video.reader import probe_video
+
+    count = probe_video(film).frames
+    if count is None:  # some containers do not store it
+        with terminal(f"count the frames: {film.name}", None) as report_progress:
+            count = sum(1 for _ in _pictures(film, 1, report_progress))
+    return count
 
 
 def _pictures(film: Path, step: int, report_progress: ReportProgress) -> Iterator[tuple[int, np.ndarray]]:

@@ -16,6 +16,7 @@ from jaxfit.cameras.calibrate import (
     find_corners,
 )
 from jaxfit.cameras.files import read_camera_file
+from jaxfit.cli.calibrate import _show_pairs
 from jaxfit.cli.main import main
 from jaxfit.foundation.errors import InputError
 from jaxfit.video.writer import VideoWriter
@@ -157,7 +158,7 @@ def test_a_board_that_looks_the_same_after_a_turn_gives_the_pose(size):
 
 def test_fisheye_lenses():
     rig = [(*lens, *pose) for lens, pose in zip(FISHEYES, (WORLD, MOVED), strict=True)]
-    poses = checkerboards.board_poses(np.random.default_rng(0), 20, BOARD[:2], rig, SIZE, depth=(6, 12))
+    poses = checkerboards.board_poses(np.random.default_rng(0), 14, BOARD[:2], rig, SIZE, depth=(6, 12))
     films = [
         views(name, *part, poses) for name, part in zip("ab", zip(FISHEYES, (WORLD, MOVED), strict=True), strict=True)
     ]
@@ -218,6 +219,23 @@ def test_coverage_is_the_share_within_the_corners():
     poses = [(np.eye(3), np.array([x, 0.0, 20.0])) for x in (-2.0, 2.0)]
     shown = views("left", lens, WORLD, poses, noise_px=0).corners_px
     assert _coverage(shown, SIZE) == pytest.approx(12 * 5 * 30**2 / (640 * 480), rel=0.03)
+
+
+def test_views_without_a_camera_are_an_error():
+    poses = checkerboards.board_poses(np.random.default_rng(0), 10, BOARD[:2], [(*LEFT, *WORLD)], SIZE)
+    flat = views("left", LEFT, WORLD, poses)
+    flat.corners_px[..., 1] = 100.0  # on one line
+    for fisheye in (False, True):
+        with pytest.raises(InputError, match=r"left\.mp4: OpenCV finds no .*camera for \d+ views"):
+            calibrate_lens(flat, BOARD, fisheye)
+
+
+def test_films_that_did_not_start_together_have_a_large_error(capsys):
+    rig = [(*LEFT, *WORLD), (*RIGHT, *MOVED)]
+    poses = checkerboards.board_poses(np.random.default_rng(0), 21, BOARD[:2], rig, SIZE)
+    films = [views("left", LEFT, WORLD, poses[1:]), views("right", RIGHT, MOVED, poses[:-1])]
+    _show_pairs(*calibrate_cameras(films, BOARD))
+    assert "large error: left, right; did the films start together?" in capsys.readouterr().out
 
 
 def test_films_without_a_board_are_an_error():
