@@ -165,7 +165,7 @@ def test_fisheye_lenses():
     lenses, (pair,) = calibrate_cameras(films, BOARD, fisheye=True)
     for lens, truth in zip(lenses, FISHEYES, strict=True):
         assert (lens.camera.lens, lens.focal_sd_px) == ("fisheye", None)
-        check_lens(lens.camera, *truth, radius_px=250)  # no board is seen farther out
+        check_lens(lens.camera, *truth, radius_px=200)  # few boards reach farther out
         assert lens.rms_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
     check_pose(lenses[1].camera, MOVED)
     assert pair.rms_px < 0.3
