@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -20,6 +20,15 @@ _ROTATION_TOLERANCE = 1e-3
 """Largest deviation of RᵀR from the identity: the digits of a text file, not another matrix."""
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 _ROUND_TRIP_PX = 0.01
+
+
+def _undistort_points(points: np.ndarray, K: np.ndarray, distortion: np.ndarray, *more: Any) -> np.ndarray:
+    """Call the function of this version of OpenCV that takes a stop criterion: version 4 has a separate one."""
+    older = getattr(cv2, "undistortPointsIter", None)
+    if older is not None:
+        _, R, P, criteria = more
+        return older(points, K, distortion, R, P, criteria)
+    return cv2.undistortPoints(points, K, distortion, *more)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,12 +153,9 @@ class Camera:
         known = np.isfinite(plane[:, 0]).all(-1)
         straight = np.full_like(plane, np.nan)
         if known.any():
-            arguments = plane[known], np.eye(3), self._coefficients
+            undistort = cv2.fisheye.undistortPoints if self.lens == "fisheye" else _undistort_points
             with np.errstate(all="ignore"):
-                if self.lens == "fisheye":
-                    straight[known] = cv2.fisheye.undistortPoints(*arguments, criteria=_CRITERIA)
-                else:
-                    straight[known] = cv2.undistortPoints(*arguments, criteria=_CRITERIA)
+                straight[known] = undistort(plane[known], np.eye(3), self._coefficients, None, None, None, _CRITERIA)
         straight = straight.reshape(points_px.shape)
         error_px = np.abs(self._to_px(self._distorted(straight)) - points_px).max(-1, keepdims=True)
         return np.where(error_px < _ROUND_TRIP_PX, self._to_px(straight), np.nan)

@@ -160,7 +160,7 @@ def _comparing(commands: Any) -> None:
 
 
 def _cameras(commands: Any) -> None:
-    cameras = commands.add_parser("cameras", help="describe and check calibrated cameras")
+    cameras = commands.add_parser("cameras", help="calibrate, describe and check cameras")
     actions = cameras.add_subparsers(required=True, metavar="ACTION")
     text = "print the lens and the position of every camera, and draw their fields of view"
     show = add_command(actions, "show", "cameras.show_cameras", text)
@@ -178,6 +178,15 @@ def _cameras(commands: Any) -> None:
     add_observation_options(check)
     add_view_options(check)
     add_model(check)
+    text = "calibrate cameras from films of a checkerboard that started together, and write them as anipose TOML"
+    calibrate = add_command(actions, "calibrate", "calibrate.calibrate_films", text)
+    text = "one video or folder of pictures for each camera; its name is the name of the camera"
+    calibrate.add_argument("films", type=Path, nargs="+", metavar="FILM", help=text)
+    text = "inner corners of the board, which are one less than the squares in each direction, such as 9x6"
+    calibrate.add_argument("--board", required=True, metavar="COLSxROWS", help=text)
+    calibrate.add_argument("--square-mm", type=float, required=True, metavar="MM", help="side of a square of the board")
+    calibrate.add_argument("--fisheye", action="store_true", help="the lenses are fisheye lenses")
+    add_out(calibrate, "CAMERAS.toml", "file to write", overwrite="an existing file")
 
 
 def _simulation(commands: Any) -> None:

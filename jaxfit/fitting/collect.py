@@ -213,12 +213,12 @@ def _frame_values(
         "keypoints_px": crop_to_image(result.keypoints_px[present], crop, camera.size_px),
         "crop": crop,
         "ambiguity_deg": result.ambiguity_deg[present],
-        **_frame_error_bars(result.error_bars, crop, present, bird, camera),
+        **frame_error_bars(result.error_bars, crop, present, bird, camera.size_px),
     }
 
 
-def _frame_error_bars(
-    bars: ErrorBars | None, crop: np.ndarray, present: np.ndarray, bird: Bird, camera: CropCamera
+def frame_error_bars(
+    bars: ErrorBars | None, crop: np.ndarray, present: np.ndarray, bird: Bird, crop_px: int
 ) -> dict[str, Any]:
     """Return the error bars of a solution at the present frames of one window; `crop` is that of these frames."""
     if bars is None:
@@ -226,7 +226,7 @@ def _frame_error_bars(
     values = {name: value[present] for name, value in bars._asdict().items()}
     missing = bird.num_shapes - bars.betas_sd.shape[1]  # a fit without shape coefficients
     values["betas_sd"] = np.pad(values["betas_sd"], ((0, 0), (0, missing)))
-    values["keypoints_px_cov"] = values["keypoints_px_cov"] * (crop[:, 2, None, None, None] / camera.size_px) ** 2
+    values["keypoints_px_cov"] = values["keypoints_px_cov"] * (crop[:, 2, None, None, None] / crop_px) ** 2
     return values
 
 
@@ -277,7 +277,7 @@ def _blend(
 ) -> FittedWindow:
     """Return the result of window w with blended poses in its frames `at_own`."""
     earlier, later = (
-        _in_image(result.pose, windows.crop[i], at, model)
+        _in_image(result.pose, _crops(windows, i), at, model)
         for result, i, at in ((before, w - 1, at_before), (own, w, at_own))
     )
     weight = (np.arange(len(at_own)) + 1) / (len(at_own) + 1)
@@ -287,12 +287,12 @@ def _blend(
         weight = np.round(weight)
     R = R_before @ axis_angle_to_matrix(turn * jnp.asarray(weight, jnp.float32)[:, None, None])
     rotations = np.asarray(_nearest_axis_angle(jnp.asarray(later.rotations), matrix_to_axis_angle(R)))
-    root_px = earlier.root_px + weight[:, None] * (later.root_px - earlier.root_px)
+    root = earlier.root + weight[:, None] * (later.root - earlier.root)
     size = earlier.size * (later.size / earlier.size) ** weight
-    blended = _with_poses(own, windows.crop[w], at_own, _InImage(rotations, root_px, size, later.depth), model)
+    blended = _with_poses(own, _crops(windows, w), at_own, _InImage(rotations, root, size, later.depth), model)
     if before.error_bars is None or own.error_bars is None:
         return blended
-    ratio = windows.crop[w - 1][at_before, 2] / windows.crop[w][at_own, 2]
+    ratio = _first_crops(windows, w - 1)[at_before, 2] / _first_crops(windows, w)[at_own, 2]
     return blended._replace(
         error_bars=blend_error_bars(before.error_bars, own.error_bars, at_before, at_own, weight, ratio)
     )
@@ -303,20 +303,32 @@ class _InImage(NamedTuple):
 
     rotations: Float[np.ndarray, "m J 3"]
     """Axis-angle of the root and of the other joints."""
-    root_px: Float[np.ndarray, "m 2"]
-    """Root joint, image pixels."""
+    root: Float[np.ndarray, "m axes"]
+    """Root joint: image pixels (2 axes), or model units of the frame that several views share (3 axes)."""
     size: Float[np.ndarray, "m"]
-    """Image pixels per model unit at the root."""
+    """Image pixels per model unit at the root; with several views, the size relative to the model."""
     depth: Float[np.ndarray, "m"]
     """Depth of the root in the crop camera, model units."""
 
 
-def _in_image(pose: Pose, crop: np.ndarray, at: np.ndarray, model: FitModel) -> _InImage:
+def _crops(windows: Windows, w: int) -> Float[np.ndarray, "T 3"] | None:
+    """Return the crops of a window of one view; None for several views, whose poses are in no crop."""
+    return None if windows.views is not None else windows.crop[w]
+
+
+def _first_crops(windows: Windows, w: int) -> Float[np.ndarray, "T 3"]:
+    """Return the crops of a window in its first view."""
+    return windows.crop[w].reshape(windows.crop.shape[1], -1, 3)[:, 0]
+
+
+def _in_image(pose: Pose, crop: np.ndarray | None, at: np.ndarray, model: FitModel) -> _InImage:
     scale = np.broadcast_to(pose.scale, len(pose.transl))[at]
     root_cam = np.asarray(pose.transl)[at] + scale[:, None] * np.asarray(model.rig.joints)[0]
+    rotations = np.concatenate([np.asarray(pose.global_orient)[at, None], np.asarray(pose.body_pose)[at]], axis=1)
+    if crop is None:
+        return _InImage(rotations, root_cam, scale, root_cam[:, 2])
     root_crop_px = np.asarray(project(root_cam, model.camera))
     root_px = np.asarray(crop_to_image(root_crop_px[:, None], crop[at], model.camera.size_px))[:, 0]
-    rotations = np.concatenate([np.asarray(pose.global_orient)[at, None], np.asarray(pose.body_pose)[at]], axis=1)
     return _InImage(rotations, root_px, scale * _px_per_unit(crop[at], root_cam[:, 2], model), root_cam[:, 2])
 
 
@@ -325,13 +337,16 @@ def _px_per_unit(crop: np.ndarray, depth: np.ndarray, model: FitModel) -> np.nda
     return crop[:, 2] / model.camera.size_px * model.camera.focal_px / depth
 
 
-def _with_poses(result: FittedWindow, crop: np.ndarray, at: np.ndarray, new: _InImage, model: FitModel) -> FittedWindow:
+def _with_poses(
+    result: FittedWindow, crop: np.ndarray | None, at: np.ndarray, new: _InImage, model: FitModel
+) -> FittedWindow:
     """Return a result with other poses in the frames `at`, in the crops of its window."""
-    old = result.pose
-    scale = new.size / _px_per_unit(crop[at], new.depth, model)
-    root_crop_px = image_to_crop(new.root_px[:, None], crop[at], model.camera.size_px)[:, 0]
-    xy_cam = (root_crop_px - model.camera.centre_px) / model.camera.focal_px * new.depth[:, None]
-    root_cam = np.concatenate([xy_cam, new.depth[:, None]], axis=1)
+    old, scale, root_cam = result.pose, new.size, new.root
+    if crop is not None:
+        scale = new.size / _px_per_unit(crop[at], new.depth, model)
+        root_crop_px = image_to_crop(new.root[:, None], crop[at], model.camera.size_px)[:, 0]
+        xy_cam = (root_crop_px - model.camera.centre_px) / model.camera.focal_px * new.depth[:, None]
+        root_cam = np.concatenate([xy_cam, new.depth[:, None]], axis=1)
 
     def changed(values: Any, frames: np.ndarray) -> np.ndarray:
         values = np.array(values, np.float32)
@@ -349,7 +364,8 @@ def _with_poses(result: FittedWindow, crop: np.ndarray, at: np.ndarray, new: _In
     return result._replace(
         pose=pose,
         keypoints_cam=changed(result.keypoints_cam, keypoints_cam[at]),
-        keypoints_px=changed(result.keypoints_px, keypoints_px[at]),
+        # with several views, the pixels come from the cameras
+        keypoints_px=result.keypoints_px if crop is None else changed(result.keypoints_px, keypoints_px[at]),
     )
 
 

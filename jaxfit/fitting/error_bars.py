@@ -200,14 +200,13 @@ def _error_bars(
     T, _, _, D = keypoints.derivative.shape
     columns = np.concatenate([window.columns.own, window.columns.shared])
     bones, shapes = pose.body_pose.shape[1], len(pose.betas)
-    focal_px, points = program.camera.focal_px, np.asarray(keypoints.points_cam, np.float64)
-    by_cam = np.array(keypoints.derivative, np.float64)
-    x, z = points[..., :2], points[..., 2:]
-    by_px = focal_px * (by_cam[..., :2, :] / z[..., None] - (x / z**2)[..., None] * by_cam[..., 2:, :])
-    covariance, misfit = _covariance(program, problem, window, _project_px(points, program), by_px[..., columns])
+    points, by_cam = np.asarray(keypoints.points_cam, np.float64), np.array(keypoints.derivative, np.float64)
+    points_px, by_px = _in_views(program, problem, points, by_cam[..., columns])
+    covariance, misfit = _covariance(program, problem, window, points_px, by_px)
     by_transl, scale = np.zeros((T, 3, D)), np.broadcast_to(pose.scale, T).astype(np.float64)
     by_transl[:, :, 3 * bones + 3 : 3 * bones + 6] = np.eye(3)
     at_scale = 3 * bones + 6
+    common_size &= problem.targets.views is None  # several views know the size
     if common_size:  # points/scale: its derivative has a part along the point itself
         by_cam /= scale[:, None, None, None]
         by_cam[..., at_scale] -= points / scale[:, None, None] ** 2
@@ -229,7 +228,7 @@ def _error_bars(
         betas_sd=shared_variance.get("betas", np.zeros((T, shapes))),
         keypoints_cam_cov=_propagate(by_cam[..., columns], covariance),
         keypoints_centred_cov=_propagate((by_cam - by_cam.mean(axis=1, keepdims=True))[..., columns], covariance),
-        keypoints_px_cov=_propagate(by_px[..., columns], covariance),
+        keypoints_px_cov=_propagate(by_px[:, : points.shape[1]], covariance),  # of the first view
         misfit=np.full(T, misfit),
     )
     present = np.asarray(problem.targets.present, bool)
@@ -264,8 +263,18 @@ def _tangent_sd(pose: Pose, columns: np.ndarray, covariance: np.ndarray) -> Floa
     return np.sqrt(np.einsum("tjab,tjbc,tjac->tja", Jr, full, Jr))
 
 
-def _project_px(points_cam: np.ndarray, program: Program) -> np.ndarray:
-    return program.camera.focal_px * points_cam[..., :2] / points_cam[..., 2:] + program.camera.centre_px
+def _in_views(
+    program: Program, problem: Problem, points: Float[np.ndarray, "T K 3"], slope: Float[np.ndarray, "T K 3 P"]
+) -> tuple[Float[np.ndarray, "T KV 2"], Float[np.ndarray, "T KV 2 P"]]:
+    """Return keypoints in crop pixels and their derivatives, of all views one after the other (`Targets`)."""
+    views, T = problem.targets.views, len(points)
+    if views is not None:
+        linear, offset = np.asarray(views.linear, np.float64), np.asarray(views.offset, np.float64)
+        points = (np.einsum("tvij,tkj->tvki", linear, points) + offset[:, :, None]).reshape(T, -1, 3)
+        slope = np.einsum("tvij,tkjp->tvkip", linear, slope).reshape(T, -1, 3, slope.shape[-1])
+    x, z, camera = points[..., :2], points[..., 2:], program.camera
+    by_px = camera.focal_px * (slope[..., :2, :] / z[..., None] - (x / z**2)[..., None] * slope[..., 2:, :])
+    return camera.focal_px * x / z + camera.centre_px, by_px
 
 
 class _Noise(NamedTuple):
@@ -303,7 +312,8 @@ class _Noise(NamedTuple):
 def _noise(problem: Problem) -> _Noise | None:
     """Return the noise of the keypoints; None for objectives without a keypoint term of the library."""
     settings = problem.hyperparameters.settings
-    confidence = np.asarray(problem.targets.confidence * problem.hyperparameters.keypoints_on, np.float64)
+    on, confidence = problem.hyperparameters.keypoints_on, np.asarray(problem.targets.confidence, np.float64)
+    confidence = confidence * np.tile(on, confidence.shape[1] // len(on))  # of all views
     if "keypoint_likelihood" in settings:
         own = {name: float(value) for name, value in settings["keypoint_likelihood"].items()}
         scale_px = np.asarray(keypoint_sd_px(confidence, own["sd_sure_px"], own["sd_unsure_px"]))

@@ -200,7 +200,7 @@ def fit_runs(
         collect_windows(
             observations,
             run.windows,
-            _final_results(r, run, results, model),
+            final_results(r, run, results, model),
             bird,
             model.camera,
             run.config.common_size,
@@ -236,7 +236,7 @@ def checked_model(
     return model
 
 
-def _final_results(
+def final_results(
     r: int, run: Run, results: dict[tuple[int, int], FittedWindow], model: FitModel
 ) -> list[FittedWindow]:
     """Take the result of every window of run `r` out of `results`, blended where windows share frames."""

@@ -8,6 +8,7 @@ view. Depth and size of the birds are estimated.
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -25,8 +26,9 @@ from jaxfit.data.projection import in_image
 from jaxfit.data.solution import WORLD, Solution
 from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
 from jaxfit.data.world import whole_picture
-from jaxfit.fitting.collect import FittedWindow, gather_windows, pose_shapes
-from jaxfit.fitting.fit import check_observations, checked_model, fit
+from jaxfit.fitting.collect import FittedWindow, frame_error_bars, gather_windows, pose_shapes
+from jaxfit.fitting.error_bars import error_bar_shapes
+from jaxfit.fitting.fit import check_observations, checked_model, final_results, fit
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.ledge import metres
 from jaxfit.fitting.solve import crop_camera, without_mask_stages
@@ -64,8 +66,8 @@ _logger = logging.getLogger(__name__)
 def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
     """Return a config for several views: depth and size are optimised, with the prior of the size.
 
-    The silhouettes have an unbiased edge, and pixels that other birds may cover do not count. Learnt weights and error
-    bars are those of one view, and are switched off. Windows do not overlap.
+    The silhouettes have an unbiased edge, and pixels that other birds may cover do not count. Learnt weights are
+    those of one view, and are switched off.
     """
     used = config if has_masks else without_mask_stages(config)
     # a silhouette that is larger than its mesh, or a mask that another bird cuts, would bias the size
@@ -81,8 +83,6 @@ def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
         used,
         stages=tuple(free(stage) for stage in used.stages),
         learn_weights=(),
-        error_bars=False,
-        overlap=0,
         initialise=replace(used.initialise, hypotheses=1),
     )
 
@@ -138,7 +138,7 @@ def fit_views(
     _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), config.window, len(batches))
     with progress(f"Fitting {subject}", steps_per_batch(config) * len(batches)) as report_progress:
         results = fit_batches(batches, [run], shared, None, cluster, report_progress)
-    ordered = [results[0, w] for w in range(len(windows))]
+    ordered = final_results(0, run, results, model)
     return _solution(views, prepared[0], windows, ordered, bird, origin_m, unit_m)
 
 
@@ -302,12 +302,14 @@ def _px_per_unit(
 ) -> Float[np.ndarray, "W"]:
     """Return the mean crop pixels of a model unit at the birds, over the frames and views that see them."""
     at = np.maximum(windows.frame, 0)
-    with np.errstate(all="ignore"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # frames without keypoints
         centre = np.nanmedian(points[windows.track[:, None], at], axis=2)  # W T 3
     depth = np.einsum("wtvj,wtj->wtv", linear[..., 2, :], centre) + offset[..., 2]
     focal = crop_camera(config).focal_px * np.linalg.norm(np.cross(linear[..., 0, :], linear[..., 2, :]), axis=-1)
     px = np.where(seen & (depth > 0), focal / np.where(depth > 0, depth, 1), np.nan)
-    with np.errstate(all="ignore"):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
         mean = np.nanmean(px.reshape(len(px), -1), axis=1)
     return np.where(np.isfinite(mean), mean, 10.0)
 
@@ -323,13 +325,18 @@ def _solution(
 ) -> Solution:
     """Return the poses of all windows, in the frame of the first camera and in the world."""
     camera, cells = views.lenses[0], (first.num_tracks, first.num_frames)
-    arrays = {name: np.full((*cells, *shape), np.nan, np.float32) for name, shape in pose_shapes(bird).items()}
+    shapes = pose_shapes(bird)
+    if any(result.error_bars is not None for result in results):
+        shapes |= error_bar_shapes(bird.num_joints - 1, bird.num_shapes, bird.num_keypoints)
+    arrays = {name: np.full((*cells, *shape), np.nan, np.float32) for name, shape in shapes.items()}
     sizes = {"3": 3, "K": bird.num_keypoints}
     for name, (shape, dtype) in WORLD.items():
         arrays[name] = np.full((*cells, *(sizes[axis] for axis in shape.split()[2:])), np.nan, dtype)
 
     def values_of(result: FittedWindow, w: int) -> dict[str, Any]:
-        return _frame_values(result, windows.present[w], bird, camera, origin_m, unit_m)
+        crop = np.asarray(windows.crop[w][:, 0])[windows.present[w]]
+        values = _frame_values(result, windows.present[w], bird, camera, origin_m, unit_m)
+        return values | _frame_error_bars(result, windows.present[w], crop, bird, camera)
 
     gathered = gather_windows(first, windows, results, arrays, values_of, {})
     return Solution(
@@ -371,6 +378,21 @@ def _frame_values(
         "transl_world_m": place * unit_m + origin_m,
         "keypoints_world_m": keypoints * unit_m + origin_m,
     }
+
+
+def _frame_error_bars(
+    result: FittedWindow,
+    present: Bool[np.ndarray, "T"],
+    crop: Float[np.ndarray, "M 3"],
+    bird: Bird,
+    camera: Camera,
+) -> dict[str, Any]:
+    """Return the error bars of a solution at the present frames of one window, in the frame of the first camera."""
+    values = frame_error_bars(result.error_bars, crop, present, bird, CROP_PX)
+    for name in ("keypoints_cam_cov", "keypoints_centred_cov"):
+        if name in values:
+            values[name] = camera.R_cam_world @ values[name] @ camera.R_cam_world.T
+    return values
 
 
 def _with_world(solution: Solution, bird: Bird, camera: Camera) -> Solution:

@@ -26,7 +26,8 @@ from jaxfit.simulation.rig import stage_rig
 BIRD = load_murre()
 UNIT = BIRD.metres_per_unit
 FRAMES = 8
-CONFIG = with_values(load_config("fast"), {"window": FRAMES, "crop.size_px": 64, "filter_window": 1})
+SHORT = {"window": 6, "overlap": 4, "error_bars": True, "crop.size_px": 64, "filter_window": 1}
+CONFIG = with_values(load_config("fast"), SHORT)
 
 
 @pytest.fixture(scope="module")
@@ -199,3 +200,14 @@ def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
     check = ["cameras", "check", str(tmp_path / "rig.toml"), *files]
     assert main(check) == 0
     assert "the cameras agree" in capsys.readouterr().out
+
+
+def test_windows_that_share_frames_are_blended_and_have_error_bars(solution, truth_m):
+    assert CONFIG.window < FRAMES
+    step_mm = 1000 * np.abs(np.diff(solution.keypoints_world_m - truth_m, axis=1)).max()
+    assert step_mm < 15  # windows do not jump
+    sd_mm = 1000 * UNIT * np.sqrt(solution.keypoints_cam_cov.trace(axis1=-2, axis2=-1))
+    assert 0.5 < np.median(sd_mm) < 12
+    assert (solution.scale_sd > 0).all()  # several cameras know the size, up to an error
+    assert solution.keypoints_px_cov.shape == (2, FRAMES, BIRD.num_keypoints, 2, 2)
+    assert np.linalg.eigvalsh(solution.keypoints_cam_cov).min() > 0
