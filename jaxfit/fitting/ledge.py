@@ -7,9 +7,10 @@ distance. The ledge gives the distance: a bird that stands has its feet on the l
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
@@ -96,20 +97,15 @@ def _in_world(
     for name in ("transl_sd", "scale_sd"):
         if (deviation := getattr(s, name)) is not None:
             turned[name] = (deviation * growth.reshape(*growth.shape, *(1,) * (deviation.ndim - 2))).astype(np.float32)
-    width, height = largest_image_px(s) if lens.size_px is None else lens.size_px
-    side = max(width, height)
     return replace(
         s,
         **turned,
+        **whole_picture(lens, lens.size_px or largest_image_px(s), s.valid),
         global_orient=placed.orientation.astype(np.float32),
         transl=(root - scale[..., None] * joint).astype(np.float32),
         scale=scale.astype(np.float32),
         keypoints_cam=points.astype(np.float32),
         keypoints_px=np.nan_to_num(lens.project(keypoints_world_m)).astype(np.float32),
-        crop=np.broadcast_to(np.array([*(lens.matrix[:2, 2] - side / 2), side], np.float32), (*s.valid.shape, 3)),
-        image_size_px=np.where(s.valid[..., None], np.array([width, height]), 0),
-        focal_px=float(lens.matrix[0, 0]) * CROP_PX / side,
-        crop_px=CROP_PX,
         R_world_root=np.where(s.valid[..., None, None], R, np.nan).astype(np.float32),
         transl_world_m=to_world(root),
         keypoints_world_m=keypoints_world_m,
@@ -133,6 +129,18 @@ def metres(bird: Bird) -> float:
         remedy = "import the model again with `metres_per_unit`, or use a model of your species (docs/species.md)"
         raise InputError(f"model {bird.name}", "has no unit of length, which a world in metres needs", remedy)
     return bird.metres_per_unit
+
+
+def whole_picture(camera: Camera, size_px: tuple[int, int], valid: Bool[np.ndarray, "N T"]) -> dict[str, Any]:
+    """Return the fields of a solution whose crop is the whole picture of a camera, with the axis in its middle."""
+    side = max(size_px)
+    crop = np.array([*(camera.matrix[:2, 2] - side / 2), side], np.float32)
+    return {
+        "crop": np.broadcast_to(crop, (*valid.shape, 3)),
+        "image_size_px": np.where(valid[..., None], np.array(size_px), 0),
+        "focal_px": float(camera.matrix[0, 0]) * CROP_PX / side,
+        "crop_px": CROP_PX,
+    }
 
 
 def largest_image_px(solution: Solution) -> tuple[int, int]:

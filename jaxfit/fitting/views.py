@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import Triangulated
 from jaxfit.config.fit import FitConfig, StageConfig
+from jaxfit.data.flags import with_doubts_of_views
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import in_image
 from jaxfit.data.solution import WORLD, Solution
@@ -27,7 +28,7 @@ from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
 from jaxfit.fitting.collect import FittedWindow, gather_windows, pose_shapes
 from jaxfit.fitting.fit import check_observations, checked_model, fit
 from jaxfit.fitting.initial_poses import InitialPoses
-from jaxfit.fitting.ledge import metres
+from jaxfit.fitting.ledge import metres, whole_picture
 from jaxfit.fitting.solve import crop_camera, without_mask_stages
 from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
 from jaxfit.fitting.windows import (
@@ -138,7 +139,11 @@ def fit_views(
     with progress(f"Fitting {subject}", steps_per_batch(config) * len(batches)) as report_progress:
         results = fit_batches(batches, [run], shared, None, cluster, report_progress)
     ordered = [results[0, w] for w in range(len(windows))]
-    return _solution(views, prepared[0], windows, ordered, bird, origin_m, unit_m)
+    solution = _solution(views, prepared[0], windows, ordered, bird, origin_m, unit_m)
+    seen = (
+        (_seen_by(camera, own, solution, bird, unit_m), own) for camera, own in zip(views.cameras, checked, strict=True)
+    )
+    return with_doubts_of_views(solution, seen, bird, progress)
 
 
 def _weights(keypoints: ViewKeypoints, found: Triangulated) -> Float[np.ndarray, "N T K"]:
@@ -301,8 +306,10 @@ def _px_per_unit(
 ) -> Float[np.ndarray, "W"]:
     """Return the mean crop pixels of a model unit at the birds, over the frames and views that see them."""
     at = np.maximum(windows.frame, 0)
-    with np.errstate(all="ignore"):
-        centre = np.nanmedian(points[windows.track[:, None], at], axis=2)  # W T 3
+    own = points[windows.track[:, None], at]
+    known = np.isfinite(own).all(-1).any(-1)
+    centre = np.full((*known.shape, 3), np.nan)
+    centre[known] = np.nanmedian(own[known], axis=1)
     depth = np.einsum("wtvj,wtj->wtv", linear[..., 2, :], centre) + offset[..., 2]
     focal = crop_camera(config).focal_px * np.linalg.norm(np.cross(linear[..., 0, :], linear[..., 2, :]), axis=-1)
     px = np.where(seen & (depth > 0), focal / np.where(depth > 0, depth, 1), np.nan)
@@ -331,18 +338,17 @@ def _solution(
         return _frame_values(result, windows.present[w], bird, camera, origin_m, unit_m)
 
     gathered = gather_windows(first, windows, results, arrays, values_of, {})
-    width, height = camera.size_px or first.image_size_px[0].tolist()
-    side = max(width, height)
-    crop = np.array([*(camera.matrix[:2, 2] - side / 2), side])
     return Solution(
         **gathered,
-        crop=np.broadcast_to(crop, (*cells, 3)),
-        image_size_px=np.where(gathered["valid"][..., None], np.array([width, height]), 0),
-        focal_px=float(camera.matrix[0, 0]) * CROP_PX / side,
-        crop_px=CROP_PX,
+        **whole_picture(camera, _size_px(camera, first), gathered["valid"]),
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
     )
+
+
+def _size_px(camera: Camera, observations: Observations) -> tuple[int, int]:
+    width, height = camera.size_px or observations.image_size_px[0].tolist()
+    return width, height
 
 
 def _frame_values(
@@ -354,28 +360,57 @@ def _frame_values(
     unit_m: float,
 ) -> dict[str, Any]:
     """Return the arrays of a solution at the present frames of one window."""
-    pose, root, R_cam_world = result.pose, np.asarray(bird.joints[0], np.float64), camera.R_cam_world
-    t_cam = (R_cam_world @ origin_m + camera.transl_cam) / unit_m
+    pose, root = result.pose, np.asarray(bird.joints[0], np.float64)
     scale = np.broadcast_to(pose.scale, present.shape)[present]
     R_world = Rotation.from_rotvec(np.asarray(pose.global_orient, np.float64)[present])
-    orient_cam = (Rotation.from_matrix(R_cam_world) * R_world).as_rotvec()
     place = np.asarray(pose.transl, np.float64)[present] + scale[:, None] * root
-    keypoints = np.asarray(result.keypoints_cam, np.float64)[present]
     betas = np.zeros(bird.num_shapes)
     betas[: len(pose.betas)] = pose.betas
+    world = {
+        "R_world_root": R_world.as_matrix(),
+        "transl_world_m": place * unit_m + origin_m,
+        "keypoints_world_m": np.asarray(result.keypoints_cam, np.float64)[present] * unit_m + origin_m,
+    }
+    posed = _in_camera(camera, bird, unit_m, scale, **world)
     return {
-        "global_orient": np.asarray(unwrap_axis_angle(jnp.asarray(orient_cam, jnp.float32))),
+        **world,
+        **posed,
+        "global_orient": np.asarray(unwrap_axis_angle(jnp.asarray(posed["global_orient"], jnp.float32))),
         "body_pose": np.asarray(pose.body_pose)[present],
-        "transl": place @ R_cam_world.T + t_cam - scale[:, None] * root,
         "scale": scale,
         "bone_length": pose.bone_length,
         "betas": betas,
-        "keypoints_cam": keypoints @ R_cam_world.T + t_cam,
-        "keypoints_px": np.nan_to_num(camera.project(keypoints * unit_m + origin_m)),
-        "R_world_root": R_world.as_matrix(),
-        "transl_world_m": place * unit_m + origin_m,
-        "keypoints_world_m": keypoints * unit_m + origin_m,
     }
+
+
+def _in_camera(
+    camera: Camera,
+    bird: Bird,
+    unit_m: float,
+    scale: Float[np.ndarray, "M"],
+    R_world_root: Float[np.ndarray, "M 3 3"],
+    transl_world_m: Float[np.ndarray, "M 3"],
+    keypoints_world_m: Float[np.ndarray, "M K 3"],
+) -> dict[str, np.ndarray]:
+    """Return the arrays of M poses in the frame of a camera, model units, and their keypoints in its pixels."""
+    root = scale[:, None] * np.asarray(bird.joints[0], np.float64)
+    return {
+        "global_orient": Rotation.from_matrix(camera.R_cam_world @ R_world_root).as_rotvec(),
+        "transl": camera.to_camera(transl_world_m) / unit_m - root,
+        "keypoints_cam": camera.to_camera(keypoints_world_m) / unit_m,
+        "keypoints_px": np.nan_to_num(camera.project(keypoints_world_m)),
+    }
+
+
+def _seen_by(camera: Camera, observations: Observations, solution: Solution, bird: Bird, unit_m: float) -> Solution:
+    """Return the poses in the frame of another camera, whose crop is the whole picture."""
+    at = solution.valid
+    world = {name: np.asarray(getattr(solution, name))[at] for name in WORLD}
+    arrays = {}
+    for name, values in _in_camera(camera, bird, unit_m, solution.scale[at], **world).items():
+        arrays[name] = np.full((*at.shape, *values.shape[1:]), np.nan, np.float32)
+        arrays[name][at] = values
+    return replace(solution, **arrays, **whole_picture(camera, _size_px(camera, observations), at))
 
 
 def _with_world(solution: Solution, bird: Bird, camera: Camera) -> Solution:
