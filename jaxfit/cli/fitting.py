@@ -166,6 +166,7 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     with new_folder(options.out, options.overwrite, marker=RESULT) as part:
         write_solution(solution, bird, config_to_yaml(config), summary, part)
         write_cameras(lenses, part / CAMERAS)
+    _show_fit(solution)
     if placed is not None:
         show_ledge(placed.facts)
     show_world(solution)

@@ -19,6 +19,7 @@ Source: Iglewicz and Hoaglin 1993, *How to detect and handle outliers* (modified
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -149,6 +150,60 @@ def with_doubts(
         bird: the model.
         progress: shows the progress of the comparison with masks.
     """
+    return with_doubts_of_views(solution, [(solution, observations)], bird, progress)
+
+
+def with_doubts_of_views(
+    solution: Solution,
+    views: Iterable[tuple[Solution, Observations]],
+    bird: Bird,
+    progress: ProgressTask = silent,
+) -> Solution:
+    """Return a solution with the doubts about each pose, from the detections of one or several views.
+
+    Each measure is its median over the views that have it, so that wrong detections in one of three views do not
+    condemn a pose that the other two support; with two views, the median is the mean. Keypoints lie outside the mask
+    if they do in more than half of the views. Two views determine a point in space, so the confidence of a keypoint
+    is that of its second-best view, and 0 where only one of several views detects the bird.
+
+    Args:
+        solution: the poses.
+        views: for each view, the same poses in the frame of its camera, and its observations: the same tracks, frames
+            and keypoints.
+        bird: the model.
+        progress: shows the progress of the comparison with masks.
+    """
+    compared = [_compare(posed, observations, bird, progress) for posed, observations in views]
+    far, overlap, outside = (_median_of_views([getattr(own, name) for own in compared]) for name in _MEASURES)
+    confidence = np.sort(np.stack([own.confidence for own in compared]), axis=0)[-2:][0]
+    doubtful = (
+        is_outlier(far) | (far > WRONG_SHARE),
+        is_outlier(1 - overlap) | (overlap < LEAST_IOU),
+        np.asarray(solution.ambiguity_deg) > 0,
+        expected_error(solution, bird) > WRONG_SHARE,
+        confidence.mean(-1) < LEAST_CONFIDENCE,
+        outside > 0.5,
+    )
+    doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
+    return replace(solution, doubts=doubts)
+
+
+_MEASURES = "far", "overlap", "outside"
+
+
+class _Comparison(NamedTuple):
+    """Poses and detections of one view; NaN where a view does not measure."""
+
+    far: Float[np.ndarray, "N T"]
+    """`keypoint_distances`."""
+    overlap: Float[np.ndarray, "N T"]
+    """IoU of mesh and mask."""
+    outside: Float[np.ndarray, "N T"]
+    """1 where the keypoints contradict the mask, else 0."""
+    confidence: Float[np.ndarray, "N T K"]
+
+
+def _compare(solution: Solution, observations: Observations, bird: Bird, progress: ProgressTask) -> _Comparison:
     N, T = solution.valid.shape
     has_mask = np.zeros((N, T), bool)
     if observations.masks:
@@ -159,16 +214,17 @@ def with_doubts(
         at = np.arange(N)[:, None], np.arange(T)
         overlap = compare_masks(solution, bird, observations, has_mask, at, progress).iou
     far = keypoint_distances(observations, solution)
-    doubtful = (
-        is_outlier(far) | (far > WRONG_SHARE),
-        is_outlier(1 - overlap) | (overlap < LEAST_IOU),
-        np.asarray(solution.ambiguity_deg) > 0,
-        expected_error(solution, bird) > WRONG_SHARE,
-        observations.confidence.mean(-1) < LEAST_CONFIDENCE,
-        contradict_masks(observations, np.argwhere(has_mask), progress),
-    )
-    doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
-    return replace(solution, doubts=doubts)
+    outside = np.where(has_mask, contradict_masks(observations, np.argwhere(has_mask), progress), np.nan)
+    return _Comparison(far, overlap, outside, observations.confidence)
+
+
+def _median_of_views(values: Sequence[Float[np.ndarray, "N T"]]) -> Float[np.ndarray, "N T"]:
+    """Return the median over the views that measure; NaN without one."""
+    stacked = np.stack(values)
+    known = np.isfinite(stacked).any(axis=0)
+    median = np.full(known.shape, np.nan)
+    median[known] = np.nanmedian(stacked[:, known], axis=0)
+    return median
 
 
 def is_outlier(values: Float[np.ndarray, "N T"]) -> Bool[np.ndarray, "N T"]:

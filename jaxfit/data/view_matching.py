@@ -4,6 +4,7 @@ The frames are divided into blocks. In a block, the cost of two tracks of differ
 of their common keypoints, relative to the size of the birds. Tracks are merged to birds in the order of their mean
 cost; a bird has at most one track of a camera in a frame. Birds of consecutive blocks are joined by the tracks that
 they share, so that a track that breaks, or that changes to another bird, in one camera is corrected by the others.
+Birds of a single block are dropped.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import CAMERA_BYTES
 from jaxfit.foundation.reading import read_text
 
-BLOCK_FRAMES = 25
+BLOCK_FRAMES = 5
 """Frames of a block: a track that changes to another bird costs at most this many frames of one camera."""
 LEAST_PAIRS = 12
 """Two tracks with fewer common keypoints, counted over the frames of a block, are not compared."""
@@ -108,10 +109,13 @@ def match_birds(cameras: Sequence[Camera], observations: Sequence[Observations])
                 v, n = block.nodes[m]
                 bird[v][n, frames] = np.where(observations[v].present[n, frames], number, -1)
                 last[v, n] = number
-    count = len(errors)
-    mean = np.array([np.mean(errors[b]) for b in range(count)])
-    undecided = np.array([np.mean(doubts[b]) for b in range(count)])
-    return BirdMatches(tuple(bird), count, mean, undecided)
+    # around the frame where a track changes to another bird, rests of tracks may agree by chance
+    kept = [b for b in range(len(errors)) if len(errors[b]) > 1 or T <= BLOCK_FRAMES]
+    new = np.full(len(errors) + 1, -1)  # the last is for −1
+    new[kept] = np.arange(len(kept))
+    mean = np.array([np.mean(errors[b]) for b in kept])
+    undecided = np.array([np.mean(doubts[b]) for b in kept])
+    return BirdMatches(tuple(new[own] for own in bird), len(kept), mean, undecided)
 
 
 def pair_costs(
@@ -168,14 +172,18 @@ def _groups(block: _Block, observations: Sequence[Observations], frames: np.ndar
         between = block.cost[np.ix_(a, b)]
         return float(np.nanmean(between)) if np.isfinite(between).any() else np.inf
 
+    prices = np.full((len(groups), len(groups)), np.inf)
+    for a, b in combinations(range(len(groups)), 2):
+        prices[a, b] = price(groups[a], groups[b])
     while len(groups) > 1:
-        pairs = list(combinations(range(len(groups)), 2))
-        prices = [price(groups[a], groups[b]) for a, b in pairs]
-        best = int(np.argmin(prices))
-        if prices[best] > MOST_ERROR:
+        a, b = map(int, np.unravel_index(np.argmin(prices), prices.shape))
+        if prices[a, b] > MOST_ERROR:
             break
-        a, b = pairs[best]
         groups[a] += groups.pop(b)
+        prices = np.delete(np.delete(prices, b, axis=0), b, axis=1)
+        for c in range(len(groups)):
+            if c != a:
+                prices[min(a, c), max(a, c)] = price(groups[a], groups[c])
     return [group for group in groups if len({block.nodes[m][0] for m in group}) > 1]
 
 

@@ -21,11 +21,12 @@ from scipy.spatial.transform import Rotation
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import Triangulated
 from jaxfit.config.fit import FitConfig, StageConfig
+from jaxfit.data.flags import with_doubts_of_views
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import in_image
 from jaxfit.data.solution import WORLD, Solution
 from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
-from jaxfit.data.world import whole_picture
+from jaxfit.data.world import in_camera, whole_picture
 from jaxfit.fitting.collect import FittedWindow, frame_error_bars, gather_windows, pose_shapes
 from jaxfit.fitting.error_bars import error_bar_shapes
 from jaxfit.fitting.fit import check_observations, checked_model, final_results, fit
@@ -139,7 +140,9 @@ def fit_views(
     with progress(f"Fitting {subject}", steps_per_batch(config) * len(batches)) as report_progress:
         results = fit_batches(batches, [run], shared, None, cluster, report_progress)
     ordered = final_results(0, run, results, model)
-    return _solution(views, prepared[0], windows, ordered, bird, origin_m, unit_m)
+    solution = _solution(views, prepared[0], windows, ordered, bird, origin_m, unit_m)
+    seen = ((in_camera(solution, bird, camera), own) for camera, own in zip(views.cameras, checked, strict=True))
+    return with_doubts_of_views(solution, seen, bird, progress)
 
 
 def _weights(keypoints: ViewKeypoints, found: Triangulated) -> Float[np.ndarray, "N T K"]:
@@ -302,9 +305,10 @@ def _px_per_unit(
 ) -> Float[np.ndarray, "W"]:
     """Return the mean crop pixels of a model unit at the birds, over the frames and views that see them."""
     at = np.maximum(windows.frame, 0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # frames without keypoints
-        centre = np.nanmedian(points[windows.track[:, None], at], axis=2)  # W T 3
+    own = points[windows.track[:, None], at]
+    known = np.isfinite(own).all(-1).any(-1)
+    centre = np.full((*known.shape, 3), np.nan)
+    centre[known] = np.nanmedian(own[known], axis=1)
     depth = np.einsum("wtvj,wtj->wtv", linear[..., 2, :], centre) + offset[..., 2]
     focal = crop_camera(config).focal_px * np.linalg.norm(np.cross(linear[..., 0, :], linear[..., 2, :]), axis=-1)
     px = np.where(seen & (depth > 0), focal / np.where(depth > 0, depth, 1), np.nan)

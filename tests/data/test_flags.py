@@ -15,6 +15,7 @@ from jaxfit.data.flags import (
     is_outlier,
     keypoint_distances,
     with_doubts,
+    with_doubts_of_views,
 )
 from jaxfit.data.masks import encode_mask
 
@@ -54,6 +55,32 @@ def test_every_doubt_has_its_cause():
         ),
     }
     assert np.isnan(keypoint_distances(seen, judged)[1, 3])
+
+
+def test_one_wrong_view_of_three_condemns_no_pose():
+    """Frame 0: keypoints are wrong in one view of three; frame 1: in two; frame 2: a mask in one; frame 3: in two."""
+    seen, posed = truth(), solution()
+    side = seen.box_px[..., 2:].max(-1)[..., None, None]
+
+    def wrong(keypoint_frames, mask_frames):
+        keypoints, masks = seen.keypoints_px.copy(), dict(seen.masks)
+        keypoints[:, keypoint_frames] += 0.3 * side[:, keypoint_frames]
+        for t in mask_frames:
+            masks[1, t] = masks[0, t]
+        return dataclasses.replace(seen, keypoints_px=keypoints, masks=masks)
+
+    views = [wrong([0, 1], [2, 3]), wrong([1], [3]), seen]
+    alone = with_doubts(posed, views[0], BIRD).doubts
+    assert (alone[1] > 0).all()
+    doubts = with_doubts_of_views(posed, [(posed, own) for own in views], BIRD).doubts
+    np.testing.assert_array_equal(doubts, [[0, FAR + OUTSIDE, 0, 0], [0, FAR + OUTSIDE, 0, UNLIKE + OUTSIDE]])
+    # a view without a bird does not count: one of two views contradicts, so the median is the mean of both
+    absent = dataclasses.replace(seen, present=np.zeros((N, T), bool), confidence=seen.confidence * 0, masks={})
+    pair = with_doubts_of_views(posed, [(posed, own) for own in (views[0], absent, seen)], BIRD).doubts
+    np.testing.assert_array_equal(pair[:, :2], [[FAR, FAR]] * 2)
+    # keypoints need two views: the second-best confidence counts
+    once = with_doubts_of_views(posed, [(posed, own) for own in (absent, seen, absent)], BIRD).doubts
+    np.testing.assert_array_equal(once, [[WEAK] * T] * 2)
 
 
 def test_keypoints_outside_the_mask():

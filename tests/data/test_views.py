@@ -92,6 +92,49 @@ def test_a_track_that_changes_to_another_bird_is_corrected(rig, straight):
     np.testing.assert_array_equal(after.bird[0], before.bird[0])
 
 
+def test_tracks_that_break_and_change_inside_a_block_are_corrected(rig, straight):
+    """In camera 1, two tracks exchange their birds in frames 12 to 27; in camera 0, all tracks break at frame 18."""
+    cameras, tracks = map(list, zip(*straight, strict=True))
+    names = ("present", "keypoints_px", "confidence", "box_px")
+    swapped = {name: getattr(tracks[1], name).copy() for name in names}
+    for values in swapped.values():
+        values[[0, 1], 12:28] = values[[1, 0], 12:28]
+    tracks[1] = replace(tracks[1], **swapped, masks={}, score=None, occluded=None)
+    broken = {name: np.concatenate([getattr(tracks[0], name)] * 2) for name in names}
+    for values in broken.values():
+        values[:3, 18:], values[3:, :18] = 0, 0
+    tracks[0] = replace(tracks[0], **broken, track_id=np.arange(6), masks={}, score=None, occluded=None)
+    matches = match_birds(cameras, tracks)
+    assert matches.birds == 3
+    true = [np.repeat(true_birds(scene)[:, None], 40, axis=1) for scene in rig.scenes]
+    true[1][[0, 1], 12:28] = true[1][[1, 0], 12:28]
+    true[0] = np.concatenate([true[0], true[0]])
+    number = matches.bird[2].max(axis=1)  # camera 2 has whole tracks: its birds name the true birds
+    named = dict(zip(true_birds(rig.scenes[2]).tolist(), number.tolist(), strict=True))
+    wrong = [
+        (of != np.vectorize(named.get)(birds)) & own.present
+        for of, birds, own in zip(matches.bird, true, tracks, strict=True)
+    ]
+    assert not wrong[2].any()
+    assert not wrong[0].any()
+    assert not wrong[1][:, [*range(10), *range(15, 25), *range(30, 40)]].any()  # blocks without a change
+
+
+def test_a_bird_of_a_single_block_is_dropped(rig, straight):
+    cameras, tracks = zip(*straight, strict=True)
+    short = []
+    for own, scene in zip(tracks, rig.scenes, strict=True):
+        present, confidence = own.present.copy(), own.confidence.copy()
+        outside = [t for t in range(40) if not 10 <= t < 14]
+        gone = np.ix_(true_birds(scene) == 0, outside)
+        present[gone], confidence[gone] = False, 0
+        short.append(
+            replace(own, present=present, confidence=confidence, box_px=own.box_px * present[..., None], masks={})
+        )
+    assert match_birds(cameras, short).birds == 2
+    assert match_birds(cameras, [own.select(frames=np.arange(10, 14)) for own in short]).birds == 3
+
+
 def test_matches_by_hand(rig, straight, tmp_path):
     table = tmp_path / "birds.csv"
     table.write_text("camera,track,bird\ncam0,1,a\ncam1,2,a\ncam2,3,b\n")

@@ -1,6 +1,8 @@
 """Fits of several calibrated cameras against simulated truth."""
 
 import csv
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +13,7 @@ from jaxfit.cli.main import main
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import load_config
 from jaxfit.config.yaml_file import config_to_yaml
+from jaxfit.data.flags import flag_counts
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.data.views import Views, birds_in_rows, stacked_keypoints, straightened
@@ -65,6 +68,7 @@ def error_mm(solution, truth_m):
 def test_exact_keypoints_give_the_birds_in_the_world(rig, solution, truth_m):
     assert solution.status.tolist() == ["ok", "ok"]
     assert solution.valid.all()
+    assert not solution.doubts.any()  # keypoints and masks of all views support the poses
     assert error_mm(solution, truth_m) < 6  # of a bird of 42 cm
     sizes = solution.scale[:, 0] / rig.scenes[0].poses.scale[:, 0]
     np.testing.assert_allclose(sizes, 1, atol=0.03)
@@ -186,8 +190,12 @@ def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
     out = tmp_path / "result"
     command = ["fit", *files, "--config", str(config), "--out", str(out)]
     assert main([*command, "--cameras", str(tmp_path / "rig.toml")]) == 0
-    assert "16 poses of 2 birds in 3 views" in capsys.readouterr().out
-    solution, _ = load_solution(out)
+    printed = capsys.readouterr().out
+    assert "16 poses of 2 birds in 3 views" in printed
+    assert re.search(r"poses: [\d.]+ % ok, [\d.]+ % unsure, [\d.]+ % contradicted", printed)
+    solution, summary = load_solution(out)[0], json.loads((out / "summary.json").read_text())
+    assert summary["flags"] == flag_counts(solution.doubts)
+    assert sum(summary["flags"].values()) == 16
     assert solution.has_world
     order = np.linalg.norm(solution.transl_world_m[:, None, 0] - truth_m[None, :, 0].mean(-2), axis=-1).argmin(1)
     assert error_mm(solution, truth_m[order]) < 15
