@@ -58,11 +58,8 @@ def on_ledge(
     speed = speed_lengths(s, bird, interval_s)
     known = log_size[np.isfinite(log_size) & (np.nan_to_num(speed) < SLOW)]
     contacts = find_contacts(log_size, speed, interval_s, float(np.median(known)) if known.size else 0.0)
-    p = np.nan_to_num(contacts.probability)
-    k = np.exp(
-        np.where(p > 0, p * np.where(np.isfinite(log_size), log_size, 0), 0) + (1 - p) * contacts.log_size[:, None]
-    )
-    k = np.ones_like(k) if known_sizes else k
+    p, standing = np.nan_to_num(contacts.probability), np.where(np.isfinite(log_size), log_size, 0)
+    k = np.ones_like(p) if known_sizes else np.exp(p * standing + (1 - p) * contacts.log_size[:, None])
     return _in_world(s, bird, placed, k, camera, lens, contacts.probability, unit_m)
 
 

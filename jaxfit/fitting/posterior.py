@@ -310,19 +310,27 @@ def select_columns(H: Blocks, columns: Columns, is_shared: np.ndarray) -> Blocks
     return Blocks(band, H.border[:, own[:, None], shared], H.corner[shared[:, None], shared])
 
 
-def broad_precision(program: Program, pose: Pose) -> Float[np.ndarray, "T D"]:
+def broad_precision(program: Program, pose: Pose, px_per_unit: float | None = None) -> Float[np.ndarray, "T D"]:
     """Return the precision of a prior so broad that it matters only without data, in the columns of `frame_rows`.
 
     Standard deviations: π/√3 rad for the components of an axis-angle (uniform within ±π), the uniform distribution over
     the crop for x and y, the distance of the bird for z, the size of the bird for its scale, 1 for bone lengths, 10 for
     shape coefficients. The prior keeps directions without data finite: no matrix is singular.
+
+    Args:
+        program: the program.
+        pose: the pose of one window.
+        px_per_unit: `ViewMaps.px_per_unit` of several views, whose crops bound x, y and z; None for one view.
     """
-    crop = np.asarray(pose.transl)[:, 2:] * program.camera.size_px / program.camera.focal_px
     depth = np.abs(np.asarray(pose.transl)[:, 2:])
+    crop = depth * program.camera.size_px / program.camera.focal_px
+    if px_per_unit is not None:
+        crop = np.full_like(depth, program.camera.size_px / px_per_unit)
+        depth = crop / np.sqrt(12)
     sd = Pose(
         global_orient=np.full(np.shape(pose.global_orient), np.pi / np.sqrt(3)),
         body_pose=np.full(np.shape(pose.body_pose), np.pi / np.sqrt(3)),
-        transl=np.concatenate([np.abs(crop) / np.sqrt(12)] * 2 + [depth], axis=1),
+        transl=np.concatenate([crop / np.sqrt(12)] * 2 + [depth], axis=1),
         scale=np.abs(np.asarray(pose.scale)),
         bone_length=np.ones(np.shape(pose.bone_length)),
         betas=np.full(np.shape(pose.betas), 10.0),
@@ -374,11 +382,12 @@ def window_posteriors(program: Program, problems: Problem, pose: Pose) -> list[W
     Raises:
         InputError: a term has no curvature; the error names the term.
     """
-    blocks = window_blocks(program, problems, pose)
-    return [
-        each if isinstance(each, str) else posterior_of(*each, broad_precision(program, _row(pose, b)))
-        for b, each in enumerate(blocks)
-    ]
+    blocks, views = window_blocks(program, problems, pose), problems.targets.views
+
+    def broad(b: int) -> Float[np.ndarray, "T D"]:
+        return broad_precision(program, _row(pose, b), None if views is None else float(views.px_per_unit[b]))
+
+    return [each if isinstance(each, str) else posterior_of(*each, broad(b)) for b, each in enumerate(blocks)]
 
 
 def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -> WindowPosterior | str:
