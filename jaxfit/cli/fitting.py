@@ -56,11 +56,10 @@ def fit(options: argparse.Namespace) -> None:
 
     start = time.perf_counter()
     check_replaceable(options.out, options.overwrite, RESULT)  # before the long work
-    check_ledge_options(options)
-    config = load_config(options.config)
+    config, bird = load_config(options.config), find_bird(options.model)
+    check_ledge_options(options, bird)
     if options.ledge is not None:
         config = ledge_config(config)
-    bird = find_bird(options.model)
     if options.cameras is not None:
         _fit_views(options, config, bird, start)
         return

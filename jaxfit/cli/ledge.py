@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from jaxfit.cameras.camera import Camera
     from jaxfit.data.solution import Solution
     from jaxfit.data.views import Views
+    from jaxfit.fitting.ledge_plane import Distances
     from jaxfit.model.bird import Bird
 
 WORLD, BIRDS = "world", "birds"
@@ -33,7 +34,7 @@ class OnLedge(NamedTuple):
     """Entry of `summary.json`."""
 
 
-def check_ledge_options(options: argparse.Namespace) -> None:
+def check_ledge_options(options: argparse.Namespace, bird: Bird) -> None:
     """Raise InputError if the options of a ledge do not belong together; before the long work."""
     plane, focal_px, cameras = options.ledge, options.focal_px, options.cameras
     if focal_px is not None and not 0 < focal_px < np.inf:
@@ -41,6 +42,8 @@ def check_ledge_options(options: argparse.Namespace) -> None:
     if focal_px is not None and (cameras is not None or plane is None):
         problem = "is given with --cameras" if cameras is not None else "is given without --ledge"
         raise InputError("--focal-px", problem, "leave out one of them" if cameras is not None else "add --ledge")
+    if cameras is None and options.unit is not None:
+        raise InputError("--unit", "is given without --cameras", "give the calibrated camera by --cameras")
     if plane == WORLD and cameras is None:
         raise InputError(
             "plane of the ledge", "is that of a world without --cameras", "give the calibrated camera by --cameras"
@@ -48,9 +51,13 @@ def check_ledge_options(options: argparse.Namespace) -> None:
     if plane not in (None, WORLD, BIRDS) and not Path(plane).is_file():
         problem = f"is {plane}, which is no file"
         raise InputError("plane of the ledge", problem, "give birds, world, or a table of measured distances")
-    if plane not in (None, WORLD, BIRDS):
-        from jaxfit.fitting.ledge_plane import read_distances
+    if plane is None:
+        return
+    from jaxfit.fitting.ledge import metres
+    from jaxfit.fitting.ledge_plane import read_distances
 
+    metres(bird)
+    if plane not in (WORLD, BIRDS):
         read_distances(Path(plane))
 
 
@@ -83,6 +90,8 @@ def place(options: argparse.Namespace, solution: Solution, bird: Bird, views: Vi
         found = plane_of(camera, source)
     else:
         distances = None if options.ledge == BIRDS else read_distances(Path(options.ledge))
+        if distances is not None and views is not None and camera is not None:
+            distances = _undistorted(distances, views.lenses[0], camera, options.ledge)
         found = estimate_ledge(solution, bird, camera, distances, source)
     new, lenses = found.camera, [found.camera]
     if views is not None and camera is not None:
@@ -92,6 +101,16 @@ def place(options: argparse.Namespace, solution: Solution, bird: Bird, views: Vi
     placed = on_ledge(solution, bird, new, lenses[0], known_sizes=several)
     given = "given" if camera is not None else "estimated"
     return OnLedge(placed, tuple(lenses), {"plane": str(options.ledge), "focal_length": given} | found.facts)
+
+
+def _undistorted(distances: Distances, lens: Camera, camera: Camera, source: object) -> Distances:
+    """Return distances measured in the picture of a lens, in the pixels of the same camera without distortion."""
+    if not lens.inside(distances.points_px).all():
+        raise InputError(source, "has a point outside the picture", "give positions in image pixels")
+    points_px = lens.undistort(distances.points_px) + camera.matrix[:2, 2] - lens.matrix[:2, 2]
+    if not np.isfinite(points_px).all():
+        raise InputError(source, "has a point that the lens model does not hold for", "measure nearer to the middle")
+    return distances._replace(points_px=points_px)
 
 
 def place_if_wanted(
@@ -156,17 +175,23 @@ def ledge(options: argparse.Namespace) -> None:
     from jaxfit.foundation.files import check_replaceable, new_folder
     from jaxfit.review.correct import read_config, read_summary
 
-    check_ledge_options(options)
     check_replaceable(options.out, options.overwrite, RESULT)
     if options.out.resolve() == options.result.resolve():
         raise InputError(options.out, "is the result itself, which stays as it is", "choose another --out")
     solution, bird = load_solution(options.result)
+    check_ledge_options(options, bird)
     if solution.has_world:
-        raise InputError(options.result, "is in a world already", "give the result of one camera, without --ledge")
+        remedy = "fit its observations again with --ledge, and with the same --cameras if there were any"
+        raise InputError(options.result, "is in a world already", remedy)
+    summary = read_summary(options.result)
+    if summary.get("photographs"):
+        raise InputError(options.result, "holds photographs, which show no common ledge", "give the result of a video")
+    if not solution.valid.any():
+        raise InputError(options.result, "holds no valid pose", "see the status of each track")
     config, config_text = read_config(options.result)
     views = _one_camera(options, solution)
     done = place(options, solution, bird, views, options.result)
-    summary = read_summary(options.result) | {"ledge": done.facts}
+    summary["ledge"] = done.facts
     with new_folder(options.out, options.overwrite, marker=RESULT) as part:
         for name in _KEPT_FILES:
             if (options.result / name).is_file():
@@ -203,7 +228,8 @@ def _one_camera(options: argparse.Namespace, solution: Solution) -> Views | None
         raise InputError(options.cameras, problem, "fit the observations again with --cameras and --ledge")
     size = largest_image_px(solution)
     if camera.size_px not in (None, size):
-        problem = f"has images of {camera.size_px}, but the result has {size}"
+        own, other = (f"{w}×{h}" for w, h in (camera.size_px or size, size))
+        problem = f"has images of {own}, but the result has {other}"
         raise InputError(options.cameras, problem, "calibrate with the size of the video")
     camera = replace(camera, size_px=size)
     return Views((camera,), (camera,), ())

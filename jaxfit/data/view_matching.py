@@ -94,8 +94,9 @@ def match_birds(cameras: Sequence[Camera], observations: Sequence[Observations])
     last: dict[tuple[int, int], int] = {}
     errors: dict[int, list[float]] = {}
     doubts: dict[int, list[bool]] = {}
-    for first in range(0, T, BLOCK_FRAMES):
-        frames = np.arange(first, min(first + BLOCK_FRAMES, T))
+    starts = range(0, max(T - BLOCK_FRAMES // 2, 1), BLOCK_FRAMES)  # the last block takes a short remainder
+    for first in starts:
+        frames = np.arange(first, T if first == starts[-1] else first + BLOCK_FRAMES)
         block = _block(cameras, observations, frames)
         groups = _groups(block, observations, frames)
         numbers = _continue_birds(
@@ -109,8 +110,8 @@ def match_birds(cameras: Sequence[Camera], observations: Sequence[Observations])
                 v, n = block.nodes[m]
                 bird[v][n, frames] = np.where(observations[v].present[n, frames], number, -1)
                 last[v, n] = number
-    # around the frame where a track changes to another bird, rests of tracks may agree by chance
-    kept = [b for b in range(len(errors)) if len(errors[b]) > 1 or T <= BLOCK_FRAMES]
+    # around the frame where a track changes to another bird, short remainders of tracks may match by chance
+    kept = [b for b in range(len(errors)) if len(errors[b]) > 1 or len(starts) == 1]
     new = np.full(len(errors) + 1, -1)  # the last is for −1
     new[kept] = np.arange(len(kept))
     mean = np.array([np.mean(errors[b]) for b in kept])

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
@@ -54,8 +54,17 @@ def largest_image_px(solution: Solution) -> tuple[int, int]:
 
 def in_frame_of_camera(solution: Solution) -> bool:
     """Whether the birds are in the frame of a camera with a known focal length, not in crops."""
-    side = solution.image_size_px.max(axis=-1)
-    return solution.has_world and bool((solution.crop[..., 2] >= side)[solution.valid].all())
+    side, crops = solution.image_size_px.max(axis=-1), solution.crop[solution.valid]
+    whole = bool((solution.crop[..., 2] >= side)[solution.valid].all())
+    return solution.has_world and whole and bool((crops == crops[:1]).all())
+
+
+def _sees(camera: Camera, points_m: Float[np.ndarray, "N T K 3"]) -> Bool[np.ndarray, "N T"]:
+    """Return whether all points are before a camera, where its lens model holds."""
+    pixels, straight = camera.project(points_m), camera.pinhole().project(points_m)
+    with np.errstate(invalid="ignore"):
+        known = np.abs(camera.undistort(pixels) - straight).max(axis=-1) < _AGREES_PX
+    return (known & (camera.to_camera(points_m)[..., 2] > 0)).all(axis=-1)
 
 
 def in_camera(solution: Solution, bird: Bird, camera: Camera) -> Solution:
@@ -80,10 +89,7 @@ def in_camera(solution: Solution, bird: Bird, camera: Camera) -> Solution:
     before = s.keypoints_cam - (s.transl + s.scale[..., None] * joint)[:, :, None]
     with np.errstate(all="ignore"):
         scale = s.scale * extent / np.linalg.norm(before, axis=(-2, -1))
-    pixels, straight = camera.project(points_m), camera.pinhole().project(points_m)
-    with np.errstate(invalid="ignore"):
-        known = np.abs(camera.undistort(pixels) - straight).max(axis=-1) < _AGREES_PX
-    valid = s.valid & (points[..., 2] > 0).all(axis=-1) & known.any(axis=-1)
+    pixels, valid = camera.project(points_m), s.valid & _sees(camera, points_m)
     turns = camera.R_cam_world @ np.where(valid[..., None, None], np.asarray(s.R_world_root), np.eye(3))
     orient = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*valid.shape, 3)
     return replace(
@@ -128,7 +134,8 @@ def as_filmed(folder: Path, solution: Solution, bird: Bird, name: str | None = N
         raise InputError("--camera", f"is {name}, which {path} does not hold", f"choose one of: {', '.join(by_name)}")
     first = camera is cameras[0]
     if first and in_frame_of_camera(solution):
-        return solution, camera
+        valid = solution.valid & _sees(camera, np.asarray(solution.keypoints_world_m))
+        return (solution if (valid == solution.valid).all() else replace(solution, valid=valid)), camera
     seen = in_camera(solution, bird, camera)
     if solution.valid.any() and not seen.valid.any():
         raise InputError("--camera", f"is {camera.name}, which sees no bird of the result", "choose another camera")

@@ -71,7 +71,7 @@ def find_contacts(
     slow = meets & (quick < STANDING_SPEED)
     own = np.full(len(log_size), mean_log_size)
     for n in range(len(own)):
-        if (slow[n] | meets[n]).any():
+        if meets[n].any():
             own[n] = np.median(log_size[n, slow[n]] if slow[n].any() else log_size[n, meets[n]])
     variance, change = NOISE_SD**2, min(interval_s / STATE_S, 0.5)
     probability = np.where(seen, 0.5, np.nan)
@@ -129,7 +129,9 @@ def speed_lengths(solution: Solution, bird: Bird, interval_s: float) -> Float[np
     length_px = length / depth * s.focal_px / s.crop_px * s.crop[..., 2]
     place = np.where(s.valid[..., None], s.keypoints_px.mean(axis=2), np.nan)
     T = place.shape[1]
-    first, last = np.maximum(np.arange(T) - step // 2, 0), np.minimum(np.arange(T) + (step + 1) // 2, T - 1)
+    # about the frame; at the end of the video, before it
+    last = np.minimum(np.arange(T) + (step + 1) // 2, T - 1)
+    first = np.maximum(last - step, 0)
     seconds = np.maximum(s.frame_index[last] - s.frame_index[first], 1) / frame_step(s.frame_index) * interval_s
     return np.linalg.norm(place[:, last] - place[:, first], axis=-1) / length_px / seconds
 

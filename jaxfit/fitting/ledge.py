@@ -51,7 +51,7 @@ def on_ledge(
     lens = lens or camera
     placed = in_image(s, bird, float(camera.matrix[0, 0]), tuple(camera.matrix[:2, 2]))
     up, height = camera.R_cam_world[:, 2], float(camera.position_world[2]) / unit_m
-    low = np.stack([_lowest(s, bird, placed, up, n) for n in range(len(s.track_id))])
+    low = np.array([_lowest(s, bird, placed, up, n) for n in range(len(s.track_id))]).reshape(s.valid.shape)
     with np.errstate(all="ignore"):
         log_size = np.where(low < 0, np.log(height / -low), np.inf)
     log_size = np.where(s.valid, log_size, np.nan)

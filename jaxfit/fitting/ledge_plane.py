@@ -32,9 +32,9 @@ from jaxfit.model.bird import Bird
 SIZE_SD_LOG = 0.05
 """Relative standard deviation of lengths of adults of a species, as in the term `size_prior`."""
 TILT_SD = 0.1
-"""Standard deviation of the sideways lean of a standing bird, radians; more if the birds show it."""
+"""Standard deviation of the sideways lean of a standing bird, radians; a larger value is estimated from the birds."""
 WITHIN_SD = 0.01
-"""Standard deviation of the changes of a bird's logarithmic size between blocks; more if the birds show it."""
+"""Standard deviation of the changes of a bird's logarithmic size between blocks; or a larger one, from the birds."""
 USUAL_FOCAL, FOCAL_SD_LOG = 1.2, 0.5
 """Focal length relative to the longer side of the picture: 16 to 117 mm (2 sd) of a lens for 36 mm film."""
 DISTANCE_SD = 0.01
@@ -109,7 +109,7 @@ def estimate_ledge(
         solution: poses of one camera in crops, in the pixels of the camera without distortion.
         bird: the model, with its unit of length.
         camera: intrinsic matrix of the camera; its pose is not used. None: unknown.
-        distances: measured distances.
+        distances: measured distances, in pixels without distortion.
         source: name of the result in error messages.
 
     Returns:
@@ -121,13 +121,15 @@ def estimate_ledge(
     problem = _Problem(solution, bird, camera, distances, source)
     # several cameras know the sizes
     size_sd = WITHIN_SD if in_frame_of_camera(solution) else SIZE_SD_LOG
-    sd, theta = _Deviations(size_sd, WITHIN_SD, TILT_SD, TILT_SD), problem.start(source)
+    sd, theta = _Deviations(size_sd, WITHIN_SD, TILT_SD, TILT_SD), problem.start()
+    problem.check(theta, source)
     how: dict[str, Any] = {"jac": problem.jacobian, "loss": "soft_l1", "x_scale": "jac"}
     for _ in range(MOST_ROUNDS):
         solved = least_squares(problem.residuals, theta, args=(sd, size_sd), **how)
         theta = solved.x
         log_size, level = problem.errors(theta)
         sd = _Deviations(*_learnt(log_size, size_sd, WITHIN_SD), *_learnt(level, TILT_SD, TILT_SD))
+    problem.check(theta, source)
     sd_theta = np.sqrt(np.diag(np.linalg.pinv(solved.jac.T @ solved.jac)))
     up, height, f, size = problem.unpacked(theta)
     placed = _world_camera(problem.camera(f), up, height * metres(bird), problem.places(theta) * metres(bird))
@@ -175,16 +177,14 @@ class _Problem:
         x, y = np.array(self._size_px) / 2 if camera is None else camera.matrix[:2, 2]
         self._centre = float(x), float(y)
         self._sample = _Sample(solution, bird, source)
-        self._pairs = _undistorted(distances, camera)
+        self._pairs = distances
         self._start = self._sample.up(self._usual, self._centre)
         self._basis = np.linalg.svd(self._start[None])[2][1:]
 
-    def start(self, source: object) -> Float[np.ndarray, "parameters"]:
+    def start(self) -> Float[np.ndarray, "parameters"]:
         """Return parameters at which the median bird has the size of the model."""
         log_size, _ = self._sample.values(self._start, 1.0, self._usual, self._centre)
         height = -np.nanmedian(log_size)
-        if not np.isfinite(height):
-            raise InputError(source, "shows no ledge below its birds", "give the camera by --cameras, with its pose")
         return np.array([0, 0, height, 0, 0] if self._given is None else [0, 0, height, 0])
 
     def unpacked(self, theta: np.ndarray) -> tuple[Float[np.ndarray, "3"], float, float, float]:
@@ -209,6 +209,13 @@ class _Problem:
         if self._pairs is not None:
             found.append(_distance_error(self._pairs, up, height * self._unit_m, f, self._centre) / DISTANCE_SD)
         return np.concatenate(found)
+
+    def check(self, theta: np.ndarray, source: object) -> None:
+        """Raise InputError if most birds are not below the camera."""
+        up, _, f, _ = self.unpacked(theta)
+        if self._sample.share_below(up, f, self._centre) < 0.5:
+            remedy = "a camera must look down on the birds; with a calibrated camera, the plane can be `world`"
+            raise InputError(source, "shows birds that are not below the camera", remedy)
 
     def jacobian(self, theta: np.ndarray, *args: Any) -> Float[np.ndarray, "residuals parameters"]:
         """Return the derivatives of the residuals; orientations have the precision of float32, so steps are large."""
@@ -252,11 +259,12 @@ class _Sample:
 
     def __init__(self, solution: Solution, bird: Bird, source: object):
         interval_s = interval_of(solution)
-        slow = speed_lengths(solution, bird, interval_s) < SLOW
-        columns = _blocks(len(solution.frame_index), interval_s)
+        fast = speed_lengths(solution, bird, interval_s) >= SLOW
+        # a short block has a frame more than once
+        columns, self._at = np.unique(_blocks(len(solution.frame_index), interval_s), return_inverse=True)
         self._solution = select_solution(solution, np.arange(len(solution.track_id)), columns)
         contradicted = flags(np.asarray(self._solution.doubts)) == CONTRADICTED
-        self._usable = self._solution.valid & slow[:, columns] & ~contradicted
+        self._usable = self._solution.valid & ~fast[:, columns] & ~contradicted
         if not self._usable.any():
             remedy = "see the report of the result; with a calibrated camera, the plane can be `world`"
             problem = "shows no bird that stands, with a pose that the detections do not contradict"
@@ -296,6 +304,10 @@ class _Sample:
         level = placed.axes[..., 0] @ up
         return self._medians(log_size), self._medians(level)
 
+    def share_below(self, up: np.ndarray, f: float, centre: tuple[float, float]) -> float:
+        """Return the share of the poses whose feet lie below the camera."""
+        return float(np.mean((self._placed(f, centre).feet[self._usable] @ up).min(axis=-1) < 0))
+
     def places(self, up: np.ndarray, height: float, f: float, centre: tuple[float, float]) -> Float[np.ndarray, "N 3"]:
         """Return the mean place of each bird that stands, in the camera frame of the image, model units."""
         log_size, _ = self.values(up, height, f, centre)
@@ -305,7 +317,7 @@ class _Sample:
         return np.nanmean(root[stands], axis=1) * size[:, None]
 
     def _medians(self, values: Float[np.ndarray, "N C"]) -> Float[np.ndarray, "N B"]:
-        blocks = np.where(self._usable, values, np.nan).reshape(len(values), -1, PER_BLOCK)
+        blocks = np.where(self._usable, values, np.nan)[:, self._at].reshape(len(values), -1, PER_BLOCK)
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # blocks without a bird
             return np.nanmedian(blocks, axis=2)
@@ -344,12 +356,6 @@ def _learnt(values: Float[np.ndarray, "N B"], between: float, within: float) -> 
         return float(1.4826 * np.median(np.abs(errors))) if errors.size else 0.0
 
     return max(between, robust(means)), max(within, robust(changes[np.isfinite(changes)]))
-
-
-def _undistorted(distances: Distances | None, camera: Camera | None) -> Distances | None:
-    if distances is None or camera is None:
-        return distances
-    return distances._replace(points_px=camera.undistort(distances.points_px))
 
 
 def _distance_error(

@@ -343,9 +343,10 @@ def _solution(
         return values | _frame_error_bars(result, windows.present[w], crop, bird, camera)
 
     gathered = gather_windows(first, windows, results, arrays, values_of, {})
+    width, height = first.image_size_px[0].tolist()
     return Solution(
         **gathered,
-        **whole_picture(camera, gathered["valid"], first.image_size_px[0].tolist()),
+        **whole_picture(camera, gathered["valid"], (width, height)),
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
     )

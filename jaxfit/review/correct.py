@@ -190,8 +190,11 @@ def read_tracks(result: str | Path, observations: str | Path | None = None) -> T
     folder = Path(result)
     solution, bird = load_solution(folder)
     if solution.has_world:
-        problem = "is a fit of calibrated cameras, whose tracks cannot be corrected or joined"
-        raise InputError(folder, problem, "correct the observations of each camera, or give --match, and fit again")
+        problem = "is in a world, where tracks cannot be corrected or joined"
+        remedy = (
+            "correct a result without a world and run `jaxfit ledge` after it; or correct the observations of each "
+        )
+        raise InputError(folder, problem, remedy + "camera, or give --match, and fit again")
     path = folder / OBSERVATIONS if observations is None else Path(observations)
     if observations is None and not path.is_file():
         problem = f"holds no {OBSERVATIONS}, because `jaxfit fit` does not copy the observations"

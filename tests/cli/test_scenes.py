@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from support.cli_files import rejected
 
@@ -137,16 +138,19 @@ class TruthOfTheScene:
 
     def __init__(self, folder):
         self.truth, self.t = folder / "scene" / "truth.json", -1
+        self.found = {}  # of all frames: a thread segments the next frame while the keypoints of a frame are detected
 
     def __call__(self, frame, instances=None):
         if instances is None:
             self.truth = self.truth if isinstance(self.truth, Observations) else read_coco(self.truth)
             self.t += 1
             masks = {n: self.truth.mask(n, self.t) for n in range(self.truth.num_tracks)}
-            self.found = {n: instance_of(mask, 0.9, "bird") for n, mask in masks.items() if mask is not None}
-            return list(self.found.values())
-        rows = [next(n for n, bird in self.found.items() if bird is instance) for instance in instances]
-        return self.truth.keypoints_px[rows, self.t], self.truth.confidence[rows, self.t]
+            new = {(n, self.t): instance_of(mask, 0.9, "bird") for n, mask in masks.items() if mask is not None}
+            self.found |= new
+            return list(new.values())
+        at = [next(at for at, bird in self.found.items() if bird is instance) for instance in instances]
+        rows, columns = np.array(at, int).reshape(-1, 2).T
+        return self.truth.keypoints_px[rows, columns], self.truth.confidence[rows, columns]
 
 
 @pytest.mark.extended

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.files import read_cameras, write_cameras
+from jaxfit.cli.ledge import _undistorted
 from jaxfit.cli.main import main
-from jaxfit.data.solution import load_solution, save_solution
+from jaxfit.data.solution import load_solution, save_solution, select_solution
 from jaxfit.fitting.contacts import find_contacts
 from jaxfit.fitting.ledge import on_ledge
 from jaxfit.fitting.ledge_plane import Distances, estimate_ledge, plane_of, read_distances
@@ -205,6 +207,45 @@ def test_unusable_distances_are_named(tmp_path, text, message):
     (tmp_path / "d.csv").write_text(text)
     with pytest.raises(InputError, match=message):
         read_distances(tmp_path / "d.csv")
+
+
+@pytest.mark.parametrize("columns", [[0], [0, 1, 2], list(range(0, FRAMES, 7))])
+def test_few_frames_are_enough(seen, camera, columns):
+    few = select_solution(seen, np.arange(7), np.array(columns))
+    ledge = estimate_ledge(few, BIRD, camera)
+    assert abs(ledge.facts["height_m"] - camera.position_world[2]) < 3 * ledge.facts["height_sd_m"]
+    assert on_ledge(few, BIRD, ledge.camera).contact.shape == few.valid.shape
+
+
+def test_unknown_speeds_do_not_exclude_birds(seen, camera):
+    every_second = np.broadcast_to(np.arange(FRAMES) % 2 == 0, seen.valid.shape)
+    gaps = replace(seen, valid=seen.valid & every_second)
+    assert estimate_ledge(gaps, BIRD, camera).facts["birds"] == 7
+
+
+def test_no_track_is_no_bird(seen, camera):
+    nobody = select_solution(seen, np.zeros(0, int), np.arange(FRAMES))
+    assert on_ledge(nobody, BIRD, camera).contact.shape == (0, FRAMES)
+
+
+def test_a_camera_below_its_birds_has_no_ledge(seen):
+    half_turn = Rotation.from_rotvec([np.pi, 0, 0])  # of each bird about its root, so that its feet are nearest
+    orient = (half_turn * Rotation.from_rotvec(seen.global_orient.reshape(-1, 3))).as_rotvec()
+    below = replace(seen, global_orient=orient.reshape(seen.global_orient.shape).astype(np.float32))
+    with pytest.raises(InputError, match="not below the camera"):
+        estimate_ledge(below, BIRD)
+
+
+def test_distances_in_the_picture_of_a_lens(seen, scene, camera):
+    """Ends that were measured in a distorted picture give the same ledge."""
+    ends_m = np.array([[[-0.4, 0.2], [0.4, 0.2]], [[-0.4, 0.2], [-0.4, 0.7]], [[-0.4, 0.7], [0.4, 0.2]]])
+    lens = replace(camera, distortion=np.array([-0.2, 0.02, 0, 0, 0]))
+    in_picture = measured(lens, ends_m)
+    moved = replace(camera, matrix=camera.matrix + np.array([[0, 0, 12], [0, 0, 7], [0, 0, 0]]))
+    straight = _undistorted(in_picture, lens, moved, "distances.csv")
+    np.testing.assert_allclose(straight.points_px, measured(moved, ends_m).points_px, atol=0.05)
+    with pytest.raises(InputError, match="outside the picture"):
+        _undistorted(in_picture._replace(points_px=in_picture.points_px + 5000), lens, moved, "distances.csv")
 
 
 def test_no_ledge_without_birds_that_stand(seen, camera):

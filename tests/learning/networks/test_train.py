@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
 from jaxfit.foundation.errors import InputError  # noqa: E402
-from jaxfit.learning.networks import keypoints, scenes, segmenter  # noqa: E402
+from jaxfit.learning.networks import familiarity, keypoints, scenes, segmenter  # noqa: E402
 from jaxfit.learning.networks.augment import randomise_appearance  # noqa: E402
 from jaxfit.learning.networks.labelled_frames import SPREAD_UNITS, LabelledFrames, birds_with_spread_wings, load_frames  # noqa: E402
 from jaxfit.learning.networks.loop import Schedule  # noqa: E402
@@ -189,7 +189,14 @@ def test_pyramid_strides():
     assert {name: tuple(map_.shape) for name, map_ in maps.items()} == {"a": (1, 2, 16, 24), "b": (1, 1, 16, 24)}
 
 
+@pytest.fixture
+def _few_pictures(monkeypatch):
+    """Training activations of few pictures, because the networks of these tests are not used."""
+    monkeypatch.setattr(familiarity, "MAX_PICTURES", 20)
+
+
 @pytest.mark.extended
+@pytest.mark.usefixtures("_few_pictures")
 def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
     losses = train_network("segmenter", tmp_path / "s.onnx", Simulation(folder, 1), QUICK)
     assert set(losses) == {"foreground", "centre", "offset"}
@@ -204,6 +211,7 @@ def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
 
 
 @pytest.mark.extended
+@pytest.mark.usefixtures("_few_pictures")
 def test_trained_keypoint_network_is_read_back(folder, tmp_path):
     train_network("keypoints", tmp_path / "k.onnx", Simulation(folder, 1), QUICK)
     detector = load_keypoint_detector(tmp_path / "k.onnx")
@@ -213,6 +221,7 @@ def test_trained_keypoint_network_is_read_back(folder, tmp_path):
 
 
 @pytest.mark.extended
+@pytest.mark.usefixtures("_few_pictures")
 def test_a_training_from_a_base_network_begins_with_its_weights(folder, tmp_path):
     still = QUICK._replace(learning_rate=1e-12)
     train_network("keypoints", tmp_path / "k.onnx", Simulation(folder, 1), still, base="builtin")
