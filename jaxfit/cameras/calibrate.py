@@ -186,7 +186,10 @@ def calibrate_lens(views: BoardViews, board: Board, fisheye: bool = False) -> Le
         )
     camera, error_px, sd_px = _solve(views, corners_px, board, fisheye)
     agrees = error_px <= _OUTLIER * np.median(error_px)
-    if LEAST_VIEWS <= agrees.sum() < len(agrees):
+    if agrees.sum() < LEAST_VIEWS:
+        problem = f"has {agrees.sum()} views of the board that agree, fewer than {LEAST_VIEWS}"
+        raise InputError(views.source, problem, "film more places, and move the board slowly")
+    if agrees.sum() < len(agrees):
         corners_px = corners_px[agrees]
         camera, error_px, sd_px = _solve(views, corners_px, board, fisheye)
     rms_px = float(np.sqrt(np.mean(error_px**2)))
@@ -267,6 +270,10 @@ def _relative_pose(
     at = at[:, _different(np.concatenate([_shapes(film)[i] for film, i in zip(films, at, strict=True)], axis=1))]
     first_px, second_px = (film.corners_px[i] for film, i in zip(films, at, strict=True))
     first_px, second_px = _consistent(first_px, second_px, cameras, board)
+    if len(first_px) < LEAST_COMMON_VIEWS:
+        problem = f"has {len(first_px)} different views of the board in common with {films[0].source} that agree"
+        remedy = f"move the board while both cameras see it: {LEAST_COMMON_VIEWS} different views are necessary"
+        raise InputError(films[1].source, problem, remedy)
     points, pixels = _as_lists(first_px, board)
     lenses = [part for camera in cameras for part in (camera.matrix.copy(), camera.distortion.copy())]
     arguments: Any = points, pixels, _as_lists(second_px, board)[1], *lenses, cameras[0].size_px

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from jaxfit.cameras.calibrate import Board, BoardViews, Lens, Pair
+    from jaxfit.cameras.camera import Camera
 
 _MOST_FRAMES = 200
 """Most frames of a film in which the board is searched."""
@@ -107,11 +108,25 @@ def _show_lenses(lenses: Sequence[Lens]) -> None:
     shares = ", ".join(f"{lens.camera.name} {100 * lens.coverage:.0f} %" for lens in lenses)
     show(f"share of the picture that the boards cover: {shares}")
     for lens in lenses:
+        lost = _share_without_rays(lens.camera)
+        if lost > 0:
+            remedy = "try --fisheye, or film the board near the edges"
+            show(f"no lens model in {100 * lost:.0f} % of the picture: {lens.camera.name}; {remedy}")
         if lens.coverage < _LITTLE_COVERAGE:
-            show(f"too little: {lens.camera.name}; film the board also near the edges and corners of the picture")
+            remedy = "film the board also near the edges and corners of the picture"
+            show(f"boards cover too little of the picture: {lens.camera.name}; {remedy}")
         focal_px = lens.camera.matrix[0, 0]
         if lens.focal_sd_px is not None and lens.focal_sd_px[0] > _LARGE_FOCAL_SD * focal_px:
             show(f"uncertain focal length: {lens.camera.name}; film the board tilted by 30 to 45°, in all directions")
+
+
+def _share_without_rays(camera: Camera) -> float:
+    """Return the share of the picture where the distortion of the lens has no inverse."""
+    import numpy as np
+
+    width, height = camera.size_px or (1, 1)
+    grid = np.stack(np.meshgrid(np.linspace(0, width, 33), np.linspace(0, height, 25)), axis=-1)
+    return 1 - float(np.isfinite(camera.undistort(grid)).all(-1).mean())
 
 
 def _show_pairs(lenses: Sequence[Lens], pairs: Sequence[Pair]) -> None:

@@ -133,7 +133,9 @@ def as_filmed(folder: Path, solution: Solution, bird: Bird, name: str | None = N
     if camera is None:
         raise InputError("--camera", f"is {name}, which {path} does not hold", f"choose one of: {', '.join(by_name)}")
     first = camera is cameras[0]
-    if first and in_frame_of_camera(solution):
+    side = max(camera.size_px or largest_image_px(solution))
+    own = np.isclose(solution.focal_px, camera.matrix[0, 0] * CROP_PX / side, rtol=1e-4)  # else poses in crops
+    if first and own and in_frame_of_camera(solution):
         valid = solution.valid & _sees(camera, np.asarray(solution.keypoints_world_m))
         return (solution if (valid == solution.valid).all() else replace(solution, valid=valid)), camera
     seen = in_camera(solution, bird, camera)

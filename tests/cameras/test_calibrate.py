@@ -9,14 +9,16 @@ from jaxfit.cameras.calibrate import (
     MOST_VIEWS,
     Board,
     BoardViews,
+    Lens,
     _coverage,
     calibrate_cameras,
     calibrate_lens,
     find_boards,
     find_corners,
 )
+from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.files import read_camera_file
-from jaxfit.cli.calibrate import _show_pairs
+from jaxfit.cli.calibrate import _show_lenses, _show_pairs
 from jaxfit.cli.main import main
 from jaxfit.foundation.errors import InputError
 from jaxfit.video.writer import VideoWriter
@@ -211,6 +213,33 @@ def test_equal_views_count_once():
     still = views("left", LEFT, WORLD, (LEAST_VIEWS - 1) * poses[:1] + poses[: LEAST_VIEWS - 1])
     with pytest.raises(InputError, match=rf"left\.mp4: has {LEAST_VIEWS - 1} different views of the board"):
         calibrate_lens(still, BOARD)
+
+
+def test_a_pair_needs_different_common_views():
+    """A board that lies still where both cameras see it gives one view in common, however many frames show it."""
+    rig = [(*LEFT, *WORLD), (*RIGHT, *MOVED)]
+    poses = checkerboards.board_poses(np.random.default_rng(0), 21, BOARD[:2], rig, SIZE)
+    still, alone = poses[:1] * 10, poses[1:11]
+    left = views("left", LEFT, WORLD, still + alone, frames=range(20))
+    right = views("right", RIGHT, MOVED, still + alone, frames=[*range(10), *range(30, 40)])
+    with pytest.raises(InputError, match=r"right\.mp4: has \d different views of the board in common with left\.mp4"):
+        calibrate_cameras([left, right], BOARD)
+
+
+def test_wrong_views_leave_too_few():
+    poses = checkerboards.board_poses(np.random.default_rng(0), LEAST_VIEWS, BOARD[:2], [(*LEFT, *WORLD)], SIZE)
+    wrong = views("left", LEFT, WORLD, poses)
+    wrong.corners_px[4] += np.random.default_rng(5).normal(0, 8, wrong.corners_px[4].shape)
+    with pytest.raises(InputError, match=rf"has {LEAST_VIEWS - 1} views of the board that agree"):
+        calibrate_lens(wrong, BOARD)
+
+
+def test_a_lens_model_that_does_not_hold_in_the_whole_picture_is_named(capsys):
+    camera = Camera("wide", LEFT[0], np.array([-0.9, 0.1, 0, 0, 0]), np.eye(3), np.zeros(3), SIZE)
+    _show_lenses([Lens(camera, 20, 0.1, (1.0, 1.0), 0.3)])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "% of the picture: wide; try --fisheye" in printed
+    assert "boards cover too little of the picture: wide" in printed
 
 
 def test_coverage_is_the_share_within_the_corners():
