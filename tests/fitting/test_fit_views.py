@@ -137,7 +137,7 @@ def test_exports_hold_the_world_and_the_true_size(solution, rig, tmp_path):
         first = next(csv.DictReader(file))
     world = [float(first[f"root_{axis}_world_m"]) for axis in "xyz"]
     np.testing.assert_allclose(world, solution.transl_world_m[0, 0], atol=1e-9)
-    with pytest.raises(InputError, match="is a fit of calibrated cameras"):
+    with pytest.raises(InputError, match="is in a world, where tracks cannot be corrected"):
         read_tracks(tmp_path / "result")
 
 
