@@ -162,7 +162,7 @@ def find_corners(picture: UInt8[np.ndarray, "H W 3"], board: Board) -> Float[np.
 def calibrate_lens(views: BoardViews, board: Board, fisheye: bool = False) -> Lens:
     """Calibrate one camera by `cv2.calibrateCameraExtended` or `cv2.fisheye.calibrate`.
 
-    At most `MOST_VIEWS` views are used, those that differ most. Views with an error above three times the median are
+    The `MOST_VIEWS` views that differ most are used. Views with an error above three times the median are
     dropped, and the camera is calibrated again.
 
     Args:

@@ -132,6 +132,10 @@ class Camera:
         """Transform points from the world frame to the camera frame, metres."""
         return np.asarray(points_world) @ self.R_cam_world.T + self.transl_cam
 
+    def to_world(self, points_cam: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
+        """Transform points from the camera frame to the world frame, metres."""
+        return (np.asarray(points_cam) - self.transl_cam) @ self.R_cam_world
+
     def project(self, points_world: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 2"]:
         """Project points of the world, metres, to pixels of the image; NaN for points behind the camera."""
         points_cam = np.asarray(self.to_camera(points_world))

@@ -119,6 +119,24 @@ def in_image(
     )
 
 
+BACKS = 0.1
+"""Weight of the direction of the backs in `upward`, which decides where the lateral axes do not."""
+
+
+def upward(axes: Float[np.ndarray, "M 3 3"]) -> Float[np.ndarray, "3"]:
+    """Return the upward direction that standing birds show.
+
+    The lateral axes of standing birds are level, so the direction n minimises Σ (n · x)² / M − w (n · z̄)² over the
+    lateral axes x of all poses, with the mean direction z̄ of the backs.
+
+    Args:
+        axes: rotation of each pose from the model to a common frame.
+    """
+    x, back = axes[:, :, 0], axes[:, :, 2].mean(axis=0)
+    up = np.linalg.eigh(x.T @ x / len(x) - BACKS * np.outer(back, back))[1][:, 0]
+    return up if up @ back > 0 else -up
+
+
 def _between(first: Float[np.ndarray, "M 3"], second: Float[np.ndarray, "M 3"]) -> Rotation:
     """Return the smallest rotations that turn one direction into another."""
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (first, second))

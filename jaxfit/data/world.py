@@ -52,6 +52,30 @@ def largest_image_px(solution: Solution) -> tuple[int, int]:
     return width, height
 
 
+def world_arrays(
+    camera: Camera,
+    unit_m: float,
+    orientation: Float[np.ndarray, "N T 3"],
+    root: Float[np.ndarray, "N T 3"],
+    keypoints: Float[np.ndarray, "N T K 3"],
+) -> dict[str, np.ndarray]:
+    """Return the arrays `WORLD` of poses in the frame of a camera; NaN without a pose.
+
+    Args:
+        camera: the camera in the world.
+        unit_m: length of a model unit, metres.
+        orientation: axis-angle from the model to the camera, radians.
+        root, keypoints: positions in the camera frame, model units.
+    """
+    orient = Rotation.from_rotvec(np.nan_to_num(orientation).reshape(-1, 3)).as_matrix()
+    R = camera.R_cam_world.T @ orient.reshape(*orientation.shape, 3)
+    return {
+        "R_world_root": np.where(np.isnan(orientation)[..., None], np.nan, R).astype(np.float32),
+        "transl_world_m": camera.to_world(root * unit_m),
+        "keypoints_world_m": camera.to_world(keypoints * unit_m),
+    }
+
+
 def in_frame_of_camera(solution: Solution) -> bool:
     """Whether the birds are in the frame of a camera with a known focal length, not in crops."""
     side, crops = solution.image_size_px.max(axis=-1), solution.crop[solution.valid]

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxfit.data.projection import upward
 from jaxfit.export.gltf import INDICES, VERTICES, GltfBuilder, Motion, add_bird, bird_motion, body_length, weight_error
 from jaxfit.export.result import Exported, describe_tracks, export_folder
 from jaxfit.foundation.extras import __version__
@@ -26,8 +27,6 @@ _MARGIN = 0.5
 """Margin of the ground around the birds, as a share of their spread and of a body length."""
 _FARTHEST = 5.0
 """Birds beyond this multiple of the median distance do not widen the ground: their fits are wrong."""
-_BACKS = 0.1
-"""Weight of the direction of the birds' backs, which decides where the lateral axes do not."""
 
 
 _CAMERA_TO_GLTF = np.diag([1.0, -1.0, -1.0])
@@ -49,24 +48,19 @@ class Ground(NamedTuple):
 def level_ground(exported: Exported, motions: dict[int, Motion]) -> Ground:
     """Estimate the ground from the birds.
 
-    The lateral axes of standing birds are level, so the upward direction n minimises Σ (n · x)² − w (n · z̄)² over the
-    lateral axes x of all poses, with the mean direction z̄ of the birds' backs. The height is the median over the birds
-    of the median height of their lower foot. Both are estimates: the depth of a bird is not measured.
+    The upward direction is that of `upward`. The height is the median over the birds of the median height of their
+    lower foot. Both are estimates: the depth of a bird is not measured.
 
     Args:
         exported: the result.
         motions: position of a track → its motion.
     """
     s = exported.solution
-    lateral, backs = [], []
+    bodies = []
     for n, motion in motions.items():
         turn = Rotation.from_quat(motion.facing)
-        body = turn * Rotation.from_rotvec(s.global_orient[n, motion.at].astype(np.float64))
-        lateral.append(body.apply([1.0, 0, 0]))
-        backs.append(body.apply([0, 0, 1.0]))
-    x, back = np.concatenate(lateral), np.concatenate(backs).mean(0)
-    up = np.linalg.eigh(x.T @ x / len(x) - _BACKS * np.outer(back, back))[1][:, 0]
-    up = up if up @ back > 0 else -up
+        bodies.append((turn * Rotation.from_rotvec(s.global_orient[n, motion.at].astype(np.float64))).as_matrix())
+    up = upward(np.concatenate(bodies))
     forward = np.array([0, 0, 1.0]) if abs(up[2]) < 0.99 else np.array([0, -1.0, 0])
     backward = -(forward - (forward @ up) * up)
     backward /= np.linalg.norm(backward)

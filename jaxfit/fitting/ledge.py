@@ -10,13 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.projection import InImage, in_image
 from jaxfit.data.solution import Solution
-from jaxfit.data.world import largest_image_px, whole_picture
+from jaxfit.data.world import largest_image_px, whole_picture, world_arrays
 from jaxfit.fitting.contacts import SLOW, feet_cam, find_contacts, interval_of, speed_lengths
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
@@ -78,13 +77,7 @@ def _in_world(
     scale, root = factor * placed.size, factor[..., None] * placed.root
     growth = scale / s.scale
     points = factor[..., None, None] * placed.points(s.keypoints_cam.astype(np.float64), s.scale.astype(np.float64))
-
-    def to_world(points_cam: np.ndarray) -> np.ndarray:
-        return (points_cam * unit_m - camera.transl_cam) @ camera.R_cam_world
-
-    keypoints_world_m = to_world(points)
-    orient = Rotation.from_rotvec(np.nan_to_num(placed.orientation).reshape(-1, 3)).as_matrix()
-    R = camera.R_cam_world.T @ orient.reshape(*s.valid.shape, 3, 3)
+    world = world_arrays(camera, unit_m, placed.orientation, root, points)
     turned = {}
     for name in ("keypoints_cam_cov", "keypoints_centred_cov"):
         if (covariance := getattr(s, name)) is not None:
@@ -96,15 +89,13 @@ def _in_world(
     return replace(
         s,
         **turned,
+        **world,
         **whole_picture(lens, s.valid, largest_image_px(s)),
         global_orient=placed.orientation.astype(np.float32),
         transl=(root - scale[..., None] * joint).astype(np.float32),
         scale=scale.astype(np.float32),
         keypoints_cam=points.astype(np.float32),
-        keypoints_px=np.nan_to_num(lens.project(keypoints_world_m)).astype(np.float32),
-        R_world_root=np.where(s.valid[..., None, None], R, np.nan).astype(np.float32),
-        transl_world_m=to_world(root),
-        keypoints_world_m=keypoints_world_m,
+        keypoints_px=np.nan_to_num(lens.project(world["keypoints_world_m"])).astype(np.float32),
         contact=contact.astype(np.float32),
     )
 

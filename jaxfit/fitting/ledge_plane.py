@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
 from jaxfit.data.flags import CONTRADICTED, flags
-from jaxfit.data.projection import in_image
+from jaxfit.data.projection import in_image, upward
 from jaxfit.data.solution import Solution, select_solution
 from jaxfit.data.world import in_frame_of_camera, largest_image_px
 from jaxfit.fitting.contacts import SLOW, feet_cam, interval_of, speed_lengths
@@ -43,8 +43,6 @@ PER_BLOCK, BLOCK_S, MOST_BLOCKS = 5, 1.0, 200
 """Poses of a block, its length in seconds, and the number of blocks that the plane is estimated from."""
 ALONG = 2.0
 """Places of birds that spread this many times as far in one direction as across show the direction of the ledge."""
-BACKS = 0.1
-"""Weight of the direction of the backs, which decides the upward direction where the lateral axes do not."""
 MOST_ROUNDS, STEP = 5, 1e-3
 
 
@@ -281,14 +279,8 @@ class _Sample:
         return self._last[1]
 
     def up(self, f: float, centre: tuple[float, float]) -> Float[np.ndarray, "3"]:
-        """Return the direction that is level for no lateral axis: up, in the camera frame of the image.
-
-        n minimises Σ (n · x)² − w (n · z̄)² over the lateral axes x, with the mean direction z̄ of the backs.
-        """
-        axes = self._placed(f, centre).axes[self._usable]
-        x, back = axes[:, :, 0], axes[:, :, 2].mean(axis=0)
-        up = np.linalg.eigh(x.T @ x / len(x) - BACKS * np.outer(back, back))[1][:, 0]
-        return up if up @ back > 0 else -up
+        """Return the upward direction of the birds in the camera frame of the image."""
+        return upward(self._placed(f, centre).axes[self._usable])
 
     def values(
         self, up: np.ndarray, height: float, f: float, centre: tuple[float, float]

@@ -26,7 +26,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.projection import in_image
 from jaxfit.data.solution import WORLD, Solution
 from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
-from jaxfit.data.world import in_camera, whole_picture
+from jaxfit.data.world import in_camera, whole_picture, world_arrays
 from jaxfit.fitting.collect import FittedWindow, frame_error_bars, gather_windows, pose_shapes
 from jaxfit.fitting.error_bars import error_bar_shapes
 from jaxfit.fitting.fit import check_observations, checked_model, final_results, fit
@@ -404,16 +404,5 @@ def _with_world(solution: Solution, bird: Bird, camera: Camera) -> Solution:
     """Return the solution of one view with the birds in the world: every bird has the size of the model."""
     unit_m = bird.metres_per_unit or 1.0
     placed = in_image(solution, bird, float(camera.matrix[0, 0]), tuple(camera.matrix[:2, 2]))
-    orient = Rotation.from_rotvec(np.nan_to_num(placed.orientation).reshape(-1, 3)).as_matrix()
-    R = camera.R_cam_world.T @ orient.reshape(*placed.orientation.shape[:2], 3, 3)
     keypoints_cam = placed.points(solution.keypoints_cam.astype(np.float64), solution.scale.astype(np.float64))
-
-    def to_world(points_cam: np.ndarray) -> np.ndarray:
-        return (points_cam * unit_m - camera.transl_cam) @ camera.R_cam_world
-
-    return replace(
-        solution,
-        R_world_root=np.where(solution.valid[..., None, None], R, np.nan),
-        transl_world_m=to_world(placed.root),
-        keypoints_world_m=to_world(keypoints_cam),
-    )
+    return replace(solution, **world_arrays(camera, unit_m, placed.orientation, placed.root, keypoints_cam))

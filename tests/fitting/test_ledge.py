@@ -224,8 +224,8 @@ def test_unknown_speeds_do_not_exclude_birds(seen, camera):
 
 
 def test_no_track_is_no_bird(seen, camera):
-    nobody = select_solution(seen, np.zeros(0, int), np.arange(FRAMES))
-    assert on_ledge(nobody, BIRD, camera).contact.shape == (0, FRAMES)
+    no_birds = select_solution(seen, np.zeros(0, int), np.arange(FRAMES))
+    assert on_ledge(no_birds, BIRD, camera).contact.shape == (0, FRAMES)
 
 
 def test_a_camera_below_its_birds_has_no_ledge(seen):
@@ -249,9 +249,9 @@ def test_distances_in_the_picture_of_a_lens(seen, scene, camera):
 
 
 def test_no_ledge_without_birds_that_stand(seen, camera):
-    nobody = replace(seen, valid=np.zeros_like(seen.valid))
+    no_birds = replace(seen, valid=np.zeros_like(seen.valid))
     with pytest.raises(InputError, match="shows no bird that stands"):
-        estimate_ledge(nobody, BIRD, camera)
+        estimate_ledge(no_birds, BIRD, camera)
     with pytest.raises(InputError, match="no unit of length"):
         estimate_ledge(seen, replace(BIRD, metres_per_unit=None), camera)
     upside_down = camera.moved(np.diag([1.0, -1.0, -1.0]), np.zeros(3))

@@ -44,7 +44,7 @@ def rays(matrix, distortion, size_px):
 
 
 def board_poses(rng, count, board, cameras, size_px, depth=(12, 22)):
-    """Return random poses of a board in the world: those that all cameras see, tilted by up to 45 degrees.
+    """Return random poses of a board in the world: all cameras see them, and the tilt is 45 degrees or less.
 
     Args:
         rng: generator of random numbers.

@@ -333,7 +333,7 @@ def test_pictures_are_read_before_scenes_are_filmed(tmp_path, monkeypatch, caplo
 def test_command_after_a_kill(tmp_path):
     """A killed training continues, and the result is that of an uninterrupted training."""
     labels = write_labels(tmp_path / "labels", coco({t: [bird(40 + t // 20, 30)] for t in TIMES}), list(TIMES))
-    few = "from jaxfit.learning.networks import familiarity; familiarity.MAX_PICTURES = 20"  # nobody uses this network
+    few = "from jaxfit.learning.networks import familiarity; familiarity.MAX_PICTURES = 20"  # this network is not used
     run = f"{few}; from jaxfit.cli.main import run; run()"
     options = ["train", "segmenter", "--labels", str(labels), "--scenes", "0", "--steps", "10"]
     command = [sys.executable, "-c", run, *options]
