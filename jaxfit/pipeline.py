@@ -7,9 +7,11 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxfit.behaviour.result import shown_behaviour
 from jaxfit.config.build import plain_config
 from jaxfit.config.fit import FitConfig
 from jaxfit.config.perception import TrackConfig
@@ -214,8 +216,24 @@ def reconstruct(
             summary = _summary(tracking, solution, bird, networks, video, info, clock)
             settings = config_to_yaml(config)
             write_solution(solution, bird, settings, summary, part, learnt_yaml)
-            write_report(part / REPORT, solution, bird, observations, summary, settings, folder, video, force=True)
+            _write_report(part, solution, bird, observations, summary, settings, folder, video, progress)
     return Reconstruction(tracking, solution, summary)
+
+
+def _write_report(
+    part: Path,
+    solution: Solution,
+    bird: Bird,
+    observations: Observations,
+    summary: dict[str, Any],
+    settings: str,
+    folder: Path,
+    video: Path,
+    progress: ProgressTask,
+) -> None:
+    """Write the report, with what the birds do."""
+    report = solution, bird, observations, summary, settings, folder, video
+    write_report(part / REPORT, *report, force=True, describe=partial(shown_behaviour, solution, bird, progress))
 
 
 def _with_segmenter(

@@ -73,6 +73,10 @@ def write_tree():
 
 
 def _summary(source):
+    if source.suffix == ".js":
+        return source.read_text(encoding="utf-8").partition("\n")[0].removeprefix("// ").rstrip(".")
+    if not source.exists():
+        return ""
     text = ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) if source.suffix == ".py" else ""
     return (text or "").partition("\n")[0]
 

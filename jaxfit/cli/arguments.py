@@ -150,6 +150,8 @@ def _track_help(path: str) -> str:
 def add_result_commands(commands: Any) -> None:
     """Add the commands."""
     _report(commands)
+    _describe(commands)
+    _view(commands)
     _export(commands)
     _tracks(commands)
     _join(commands)
@@ -168,6 +170,44 @@ def _report(commands: Any) -> None:
     report.add_argument("--out", type=Path, metavar="HTML", help=text)
     report.add_argument("--overwrite", action="store_true", help="replace an existing file of --out")
     add_force(report)
+
+
+def _describe(commands: Any) -> None:
+    text = "describe what the birds of a result do: angles, wingbeats, distances, bouts of behaviour, time budgets"
+    describe = add_command(commands, "describe", "behaviour.describe", text)
+    describe.add_argument("result", type=Path, metavar="RESULT", help="folder of a result")
+    text = "features of every bird and frame: .csv, .parquet, or .nc for movement; bouts, time budgets and a project "
+    add_out(describe, "PATH", text + "for BORIS stand beside it", overwrite="existing files")
+    text = "rules of the behaviours: a file with `base: behaviour` (default: the shipped rules)"
+    describe.add_argument("--config", default="behaviour", metavar="FILE", help=text)
+    text = "also this feature: the name that a package registers, or module:function"
+    describe.add_argument("--feature", action="append", metavar="NAME", help=text)
+    describe.add_argument("--tracks", metavar="ID,ID", help="only these tracks")
+    describe.add_argument("--frames", metavar="A:B", help="only the frames from A to B; B is left out")
+    describe.add_argument("--fps", type=float, help="frame rate of the footage (default: that of the result)")
+
+
+def _view(commands: Any) -> None:
+    text = "look at a result in the browser: film, birds on their ledge, timeline; correct its tracks"
+    view = add_command(commands, "view", "view.view", text)
+    text = "folder of a result; several results of one film are shown side by side"
+    view.add_argument("results", type=Path, nargs="+", metavar="RESULT", help=text)
+    text = "film of the result (default: the film that the result names, if it is still there)"
+    view.add_argument("--video", type=Path, metavar="VIDEO|DIR", help=text)
+    text = "for a result in a world: the camera of the film, by its name in cameras.toml (default: the first camera)"
+    view.add_argument("--camera", metavar="NAME", help=text)
+    text = "the file that was fitted, for a result of `jaxfit fit`"
+    view.add_argument("--observations", type=Path, metavar="OBS.json", help=text)
+    view.add_argument("--frames", metavar="A:B", help="only the frames from A to B; B is left out")
+    view.add_argument("--fps", type=float, help="frame rate of the footage (default: that of the result)")
+    text = "file of the corrections, which `jaxfit tracks --edits` takes too (default: RESULT.edits beside the result)"
+    view.add_argument("--edits", type=Path, metavar="FILE", help=text)
+    view.add_argument("--port", type=int, metavar="PORT", help="port to listen on (default: a free port)")
+    view.add_argument("--no-browser", action="store_true", help="print the address, and open no browser")
+    text = "write a page that opens without jaxfit: one file of up to 30 MB (.html), or a folder"
+    view.add_argument("--save", type=Path, metavar="PAGE.html|DIR", help=text)
+    view.add_argument("--overwrite", action="store_true", help="replace an earlier page of --save")
+    add_force(view)
 
 
 def _export(commands: Any) -> None:
@@ -216,9 +256,13 @@ def _tracks(commands: Any) -> None:
         ("--cut", "ID@A", "the frames from A on become a new track"),
         ("--join", "ID,ID", "the second track becomes a part of the first track"),
         ("--delete", "ID,ID", "delete tracks"),
+        ("--exclude", "ID@A:B", "remove wrong poses of a track, from frame A to frame B − 1 (or to the end)"),
     ):
         text = f"{what}; may be repeated, corrections happen in their order"
         tracks.add_argument(option, dest="edits", action=_AddEdit, metavar=metavar, help=text)
+    text = "text file of corrections, one a line, such as `swap 3,5@120:200` or `exclude 3@10:20`; lines that begin "
+    text += "with # are ignored; these corrections come before those of the options"
+    tracks.add_argument("--edits", dest="edits_file", type=Path, metavar="FILE", help=text)
     text = "the file that was fitted, for a result of `jaxfit fit`"
     tracks.add_argument("--observations", type=Path, metavar="OBS.json", help=text)
     tracks.add_argument("--out", type=Path, metavar="DIR", help="folder for the corrected result")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
+from jaxfit.behaviour.result import shown_behaviour
 from jaxfit.cli.observations import matching_line, observation_tables
 from jaxfit.cli.tables import counted, evaluation_tables, flag_quality_line, show, track_table
 from jaxfit.config.build import with_values
@@ -74,7 +76,8 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     report = done.solution, bird, observations, done.summary, config_to_yaml(config), result_folder
     measured = [_measured(table) for table in compared]
     measured[-1] = measured[-1]._replace(note=f"{measured[-1].note}; {numbers}")
-    write_report(result_folder / REPORT, *report, scene_folder / FOOTAGE, measured=measured)
+    describe = partial(shown_behaviour, done.solution, bird, terminal)
+    write_report(result_folder / REPORT, *report, scene_folder / FOOTAGE, measured=measured, describe=describe)
     if verbose:
         for output in (track_table(observations, done.solution), *compared, flag_quality_line(result), numbers):
             show(output)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from jaxfit.cli.tables import counted, right_aligned, show, show_facts
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.reading import json_text
+from jaxfit.foundation.reading import json_text, read_text
 from jaxfit.model.files import find_bird, read_provenance, save_bird
 
 
@@ -136,13 +137,22 @@ def list_configs(options: argparse.Namespace) -> None:
 
 
 def show_config(options: argparse.Namespace) -> None:
-    """Print a shipped config with all values, and with their descriptions as comments."""
+    """Print a shipped config, or a file of rules of behaviours, with all values and their descriptions as comments."""
+    from jaxfit.behaviour.rules import BehaviourConfig
     from jaxfit.config.fit import FitConfig
     from jaxfit.config.reconstruct import ReconstructConfig
-    from jaxfit.config.yaml_file import documented_yaml, read_config, shipped_configs
+    from jaxfit.config.yaml_file import documented_yaml, read_config, read_yaml, shipped_configs
     from jaxfit.evaluation.ablation.grid import GridConfig
+    from jaxfit.foundation.limits import CONFIG_BYTES
 
+    kinds = {"reconstruct": ReconstructConfig, "ablation": GridConfig, "behaviour": BehaviourConfig}
+    kind = kinds.get(options.name, FitConfig)
     if options.name not in shipped_configs():
-        raise InputError(options.name, "is not a shipped config", f"give one of {', '.join(shipped_configs())}")
-    kind = {"reconstruct": ReconstructConfig, "ablation": GridConfig}.get(options.name, FitConfig)
+        remedy = f"give one of {', '.join(shipped_configs())}, or a file with rules of behaviours"
+        if not Path(options.name).is_file():
+            raise InputError(options.name, "is not a shipped config", remedy)
+        text = read_text(options.name, CONFIG_BYTES, "a YAML file")
+        if "behaviours" not in read_yaml(text, options.name).values:
+            raise InputError(options.name, "holds no rules of behaviours", remedy)
+        kind = BehaviourConfig
     print(documented_yaml(read_config(kind, options.name)), end="")  # noqa: T201

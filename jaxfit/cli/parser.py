@@ -307,7 +307,7 @@ def _configs(commands: Any) -> None:
     text = "list the configs of fits: what each config is for, and the data on which its values were chosen"
     add_command(actions, "list", "models.list_configs", text)
     show = add_command(actions, "show", "models.show_config", "print all settings of a config with their descriptions")
-    show.add_argument("name", metavar="NAME", help="name of a shipped config: reconstruct, paper, ablation, …")
+    show.add_argument("name", metavar="NAME", help="shipped config (reconstruct, paper, …) or file of behaviour rules")
 
 
 def _bench(commands: Any) -> None:

@@ -10,24 +10,26 @@ import numpy as np
 from jaxfit.cli.tables import counted, right_aligned, show, track_table
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import terminal
-from jaxfit.review.edits import Edit
-
-_TRACKS = {"swap": 2, "cut": 1, "join": 2, "delete": None}
-"""Kind of an edit → number of its tracks; None is any number."""
+from jaxfit.review.edits import EXAMPLES, Edit, parse_edit, read_edits
 
 
 def tracks(options: argparse.Namespace) -> None:
     """List the tracks of a result, or correct the tracks and fit what changes."""
-    if not options.edits:
+    if not options.edits and options.edits_file is None:
         if options.out is not None:
-            raise InputError("tracks", "has --out, but no correction", "give --swap, --cut, --join or --delete")
+            known = ", ".join(f"--{kind}" for kind in EXAMPLES)
+            raise InputError("tracks", "has --out, but no correction", f"give {known} or --edits")
         _list(options)
         return
     if options.out is None:
         raise InputError("tracks", "has corrections, but no folder for the new result", "give --out")
     from jaxfit.review.correct import correct_tracks
 
-    edits = [_edit(kind, text) for kind, text in options.edits]
+    edits = [] if options.edits_file is None else read_edits(options.edits_file)
+    edits += [_edit(kind, text) for kind, text in options.edits or []]
+    if not edits:
+        example = f"swap {EXAMPLES['swap']}"
+        raise InputError(options.edits_file, "holds no correction", f"write one a line, for example {example}")
     done = correct_tracks(
         options.result, options.out, edits, options.observations, options.overwrite, progress=terminal
     )
@@ -75,17 +77,13 @@ def _list(options: argparse.Namespace) -> None:
 
 def _edit(kind: str, text: str) -> Edit:
     """Return the edit of an option such as `--swap 3,5@120:140`."""
-    match = re.fullmatch(r"(\d{1,9}(?:,\d{1,9})*)(?:@(\d{1,9})(?::(\d{1,9}))?)?", text)
-    named, *ends = match.groups() if match else ("", None, None)
-    numbers = tuple(int(part) for part in named.split(",") if part)
-    start, stop = (None if end is None else int(end) for end in ends)
-    wrong = not numbers or (_TRACKS[kind] or len(numbers)) != len(numbers)
-    wrong |= kind == "cut" and (start is None or stop is not None)
-    wrong |= kind in ("join", "delete") and start is not None
-    if wrong:
-        examples = {"swap": "3,5@120", "cut": "4@80", "join": "2,7", "delete": "6"}
-        raise InputError(f"--{kind}", f"cannot be '{text}'", f"write for example --{kind} {examples[kind]}")
-    return Edit(kind, numbers, start, stop)
+    try:
+        return parse_edit(f"{kind} {text}", f"--{kind}")
+    except InputError:
+        remedy = f"write for example --{kind} {EXAMPLES[kind]}"
+        if kind == "exclude":
+            remedy += "; --delete removes all frames of a track"
+        raise InputError(f"--{kind}", f"cannot be '{text}'", remedy) from None
 
 
 def export(options: argparse.Namespace) -> None:
@@ -132,18 +130,24 @@ def frame_range(text: str | None) -> tuple[int | None, int | None]:
     """Return the two ends of `--frames A:B`; an end that is left out is None.
 
     Raises:
-        InputError: the text is not a range of frames.
+        InputError: the text is not a range of frames, or the range is empty.
     """
-    match = re.fullmatch(r"(\d{1,9})?:(\d{1,9})?", text or ":")
+    match = re.fullmatch(r"(\d{1,9})?:(\d{1,9})?", ":" if text is None else text)
     if match is None:
         raise InputError("--frames", f"is '{text}', not a range of frames", "write for example --frames 100:200")
     first, stop = (None if part is None else int(part) for part in match.groups())
+    if first is not None and stop is not None and stop <= first:
+        raise InputError("--frames", f"is '{text}': the range is empty", "B is left out, so give a B above A")
     return first, stop
 
 
 def report(options: argparse.Namespace) -> None:
     """Write the report of a result."""
+    from functools import partial
+
+    from jaxfit.behaviour.result import behaviour_of_result
     from jaxfit.view.report.write import report_of_result
 
-    path = report_of_result(options.result, options.video, options.out, options.overwrite, options.force)
+    describe = partial(behaviour_of_result, progress=terminal)
+    path = report_of_result(options.result, options.video, options.out, options.overwrite, options.force, describe)
     show(f"{path} ({path.stat().st_size / 1e6:.2f} MB): open it in a browser")

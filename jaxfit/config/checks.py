@@ -69,7 +69,8 @@ class ConfigKeyError(InputError):
 
     def within(self, where: str) -> ConfigKeyError:
         """Return the same error with the key's path extended by `where`, the path of the key's own config."""
-        return ConfigKeyError(join_keys(where, self.key), self.key_problem, self.remedy)
+        path = join_keys(where, self.key) if self.key else where
+        return ConfigKeyError(path, self.key_problem, self.remedy)
 
 
 def join_keys(where: str, key: object) -> str:

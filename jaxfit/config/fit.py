@@ -290,7 +290,7 @@ def load_config(source: str | Path) -> FitConfig:
 
 def shipped_fit_configs() -> list[str]:
     """Return the names of the shipped configs of fits."""
-    return [name for name in shipped_configs() if name not in ("ablation", "reconstruct")]
+    return [name for name in shipped_configs() if name not in ("ablation", "behaviour", "reconstruct")]
 
 
 class ShippedConfig(NamedTuple):

@@ -12,9 +12,8 @@ import re
 import textwrap
 import typing
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import reduce
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeAlias
 
@@ -22,7 +21,7 @@ import numpy as np
 import yaml
 
 from jaxfit.config.build import Config, build_config, field_help, plain_config
-from jaxfit.config.checks import ConfigKeyError, first_key, shown
+from jaxfit.config.checks import ConfigKeyError, first_key, join_keys, known_names, shown
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import (
     CONFIG_BASES,
@@ -311,7 +310,8 @@ def read_config(kind: type[Config], source: str | Path) -> Config:
 
     A file may name another file or a shipped config as its `base`. The file's values replace the base's values key by
     key. A field with the metadata `OWN_FILE` takes the name of a file, or a mapping with a `base` of its own; both
-    replace the value in the file's base.
+    replace the value in the file's base. The attribute `whole` of a dataclass names keys whose mapping a file replaces
+    as a whole, and `removable` names the key of a mapping from which the value null removes an entry of the base.
 
     Args:
         kind: the frozen dataclass to read.
@@ -319,13 +319,21 @@ def read_config(kind: type[Config], source: str | Path) -> Config:
 
     Raises:
         InputError: an unreadable file, an unknown key, a value of the wrong type or outside its range; the error names
-            the file that holds the key, which may be a base, and the line.
+            the file that holds the key, which may be a base, and the line. Shipped configs are right by themselves, so
+            the error names the file that changes them.
     """
     layers = _layers(os.fspath(source), kind)
+    whole = getattr(kind, "whole", ())
     try:
-        return build_config(kind, reduce(_merge, (layer.values for layer in layers)))
+        values: dict[str, Any] = {}
+        for layer in layers:
+            below, values = values, _merge(values, layer.values, whole)
+            _remove_entries(values, below, getattr(kind, "removable", ""))
+        return build_config(kind, values)
     except ConfigKeyError as error:
-        origin = _origin(layers, error.key)
+        origin = _origin(layers, error.key, whole)
+        if origin.source in shipped_configs():
+            origin = layers[-1]
         line = line_of(origin.lines, error.key)
         raise InputError(
             origin.source, f"line {line}: {error.problem}" if line else error.problem, error.remedy
@@ -451,11 +459,25 @@ def _resolve(base: str, source: str) -> str:
     return path if exists(path) else base
 
 
-def _origin(layers: list[_Layer], path: str) -> _Layer:
+def _remove_entries(values: dict[str, Any], below: dict[str, Any], key: str) -> None:
+    """Remove the entries with the value null from the mapping at a key; an entry must be in the values below."""
+    entries, known = values.get(key), below.get(key)
+    if not isinstance(entries, dict):
+        return
+    for name in [name for name, value in entries.items() if value is None]:
+        if not isinstance(known, dict) or name not in known:
+            remedy = known_names(name, known or ())
+            raise ConfigKeyError(
+                join_keys(key, name), "is null, which removes it, but the base does not have it", remedy
+            )
+        del entries[name]
+
+
+def _origin(layers: list[_Layer], path: str, whole: Collection[str]) -> _Layer:
     """Return the last file that sets the value at a path, or that adds to the nearest enclosing mapping."""
     merged, found, origin = {}, None, layers[-1]
     for layer in layers:
-        merged, before = _merge(merged, layer.values), found
+        merged, before = _merge(merged, layer.values, whole), found
         found, rest = merged, path.replace("[", ".")
         while isinstance(found, dict) and (split := first_key(found, rest))[0] in found:
             found, rest = found[split[0]], split[1]
@@ -464,10 +486,10 @@ def _origin(layers: list[_Layer], path: str) -> _Layer:
     return origin
 
 
-def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of `below`, replaced key by key by the values of `above`."""
+def _merge(below: dict[str, Any], above: dict[str, Any], whole: Collection[str] = ()) -> dict[str, Any]:
+    """Return the values of `below`, replaced key by key by those of `above`; mappings at `whole` are replaced whole."""
     merged = dict(below)
     for key, value in above.items():
-        both = isinstance(value, dict) and isinstance(merged.get(key), dict)
-        merged[key] = _merge(merged[key], value) if both else value
+        both = isinstance(value, dict) and isinstance(merged.get(key), dict) and key not in whole
+        merged[key] = _merge(merged[key], value, whole) if both else value
     return merged

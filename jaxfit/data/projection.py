@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
@@ -56,7 +56,7 @@ class InImage(NamedTuple):
             scale: `Solution.scale`.
         """
         from_root = points_cam / (scale / self.size)[..., None, None] - self.root_in_crop[:, :, None]
-        return np.einsum("ntij,ntpj->ntpi", self.turn, from_root) + self.root[:, :, None]
+        return from_root @ self.turn.swapaxes(-1, -2) + self.root[:, :, None]
 
 
 def image_focal_px(solution: Solution) -> float:
@@ -163,12 +163,24 @@ class PosedBirds:
         bird: the model of the solution.
         lens: the camera whose frame the poses are in (`data.world.as_filmed`), as it films. None: the camera of the
             crops, without distortion.
+        vertices: positions of the vertices to pose; None poses all.
     """
 
-    def __init__(self, solution: Solution, bird: Bird, lens: Camera | None = None):
+    def __init__(
+        self,
+        solution: Solution,
+        bird: Bird,
+        lens: Camera | None = None,
+        vertices: Int[np.ndarray, "P"] | None = None,
+    ):
         self.solution = solution
         self._lens = None if lens is None else replace(lens, R_cam_world=np.eye(3), transl_cam=np.zeros(3))
-        self._rig = fold_bird(bird)
+        self._rig = rig = fold_bird(bird)
+        if vertices is not None:
+            of_vertices = {
+                name: getattr(rig, name)[..., vertices] for name in ("vertices", "skin_weights", "shape_basis")
+            }
+            self._rig = replace(rig, **of_vertices)
 
     @property
     def faces(self) -> Array:

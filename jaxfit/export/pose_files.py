@@ -21,7 +21,7 @@ import uuid
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -39,6 +39,9 @@ from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.progress import ProgressTask
 from jaxfit.foundation.reading import json_text
 from jaxfit.model.anatomy import skeleton_pairs
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def write_coco_keypoints(exported: Exported, out: Path, progress: ProgressTask) -> list[Path]:
@@ -128,8 +131,25 @@ def write_movement(
     Raises:
         InputError: xarray or h5netcdf is not installed, the frame rate is unknown, or the result is in no world.
     """
+    dataset = movement_dataset(exported, space, dims)
+    with progress("Writing netCDF", None):
+        write_whole(out, netcdf(dataset))
+    return [out], [_READERS[dims]]
+
+
+def movement_dataset(
+    exported: Exported, space: Literal["2d", "3d", "world"], dims: Literal["singular", "plural"] = "singular"
+) -> xarray.Dataset:
+    """Return the data set of `write_movement`, to which further variables can be added.
+
+    Args:
+        exported, space, dims: as for `write_movement`.
+
+    Raises:
+        InputError: as for `write_movement`.
+    """
     for package in ("xarray", "h5netcdf"):
-        require_package(package, "--to movement")
+        require_package(package, "netCDF files")
     import xarray
 
     s, fps = exported.solution, exported.sampling_fps
@@ -150,34 +170,36 @@ def write_movement(
     arrays = {"position": (of_position, position, {"units": unit})}
     if sd is not None:
         arrays["position_sd"] = (of_position, in_time(sd.astype(np.float32)), {"units": unit, "description": SD})
-    with progress("Writing netCDF", None):
-        dataset = xarray.Dataset(
-            {
-                **arrays,
-                "confidence": (("time", keypoint, individual), confidence, {"description": CONFIDENCE}),
-                **_quality(exported, individual, column, len(numbers)),
-            },
-            coords={
-                "time": np.interp(numbers, s.frame_index, exported.times_s),
-                "space": list("xyz"[: position.shape[1]]),
-                keypoint: list(s.keypoint_names),
-                individual: [f"bird_{track}" for track in s.track_id.tolist()],
-                "frame": ("time", numbers),
-            },
-            attrs={
-                "source_software": "jaxfit",
-                "ds_type": "poses",
-                "fps": fps,
-                "time_unit": "seconds",
-                "source_file": str(exported.source),
-                **facts,
-            },
-        )
-        content = io.BytesIO()
-        compressed = {"zlib": True, "complevel": 4}
-        dataset.to_netcdf(content, engine="h5netcdf", encoding={name: compressed for name in (*arrays, "confidence")})
-        write_whole(out, content.getvalue())
-    return [out], [_READERS[dims]]
+    return xarray.Dataset(
+        {
+            **arrays,
+            "confidence": (("time", keypoint, individual), confidence, {"description": CONFIDENCE}),
+            **_quality(exported, individual, column, len(numbers)),
+        },
+        coords={
+            "time": np.interp(numbers, s.frame_index, exported.times_s),
+            "space": list("xyz"[: position.shape[1]]),
+            keypoint: list(s.keypoint_names),
+            individual: [f"bird_{track}" for track in s.track_id.tolist()],
+            "frame": ("time", numbers),
+        },
+        attrs={
+            "source_software": "jaxfit",
+            "ds_type": "poses",
+            "fps": fps,
+            "time_unit": "seconds",
+            "source_file": str(exported.source),
+            **facts,
+        },
+    )
+
+
+def netcdf(dataset: xarray.Dataset) -> bytes:
+    """Return a data set as a netCDF file, with compressed numbers."""
+    content = io.BytesIO()
+    numbers = [name for name, values in dataset.data_vars.items() if values.dtype.kind == "f" and values.ndim > 1]
+    dataset.to_netcdf(content, engine="h5netcdf", encoding={name: {"zlib": True, "complevel": 4} for name in numbers})
+    return content.getvalue()
 
 
 def _positions(exported: Exported, space: str) -> tuple[np.ndarray, np.ndarray | None, str, dict[str, Any]]:

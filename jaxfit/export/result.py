@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -84,6 +84,8 @@ SD = (
 )
 """Definition of the standard deviations of an export."""
 
+FPS_RANGE = 0.001, 100_000
+"""Smallest and largest frame rate that a user can give, frames per second."""
 _OBSERVATIONS, _SUMMARY = "observations.json", "summary.json"
 
 
@@ -109,6 +111,17 @@ class Exported:
     """Time of every frame in seconds: the stored times, or frame number / fps; NaN if unknown."""
     video: Path | None
     """The footage, which may have been moved; None if unknown."""
+
+    def select(self, rows: Int[np.ndarray, "M"], columns: Int[np.ndarray, "L"]) -> Exported:
+        """Return M of the tracks and L of the frames, chosen by their positions."""
+        solution = select_solution(self.solution, rows, columns)
+        return replace(
+            self,
+            solution=solution,
+            observations=None if self.observations is None else self.observations.select(rows, columns),
+            quality={track: self.quality[track] for track in solution.track_id.tolist() if track in self.quality},
+            times_s=self.times_s[columns],
+        )
 
     @property
     def unit(self) -> str:
@@ -245,9 +258,10 @@ def open_result(
             the detections do not belong to the result.
     """
     folder = Path(folder)
-    for name, value in (("--fps", fps), ("--metres-per-unit", metres_per_unit)):
-        if value is not None and not 0 < value < np.inf:
-            raise InputError(name, f"is {value}, not a positive number", "give a number above 0")
+    if fps is not None and not FPS_RANGE[0] <= fps <= FPS_RANGE[1]:
+        raise InputError("--fps", f"is {fps}", f"give a number within {FPS_RANGE[0]} and {FPS_RANGE[1]:,}")
+    if metres_per_unit is not None and not 0 < metres_per_unit < np.inf:
+        raise InputError("--metres-per-unit", f"is {metres_per_unit}, not a positive number", "give a number above 0")
     solution, bird = load_solution(folder)
     if metres_per_unit is not None and solution.has_world:
         remedy = f"remove --metres-per-unit: a model unit of this result is {bird.metres_per_unit:.6g} m"
@@ -255,7 +269,6 @@ def open_result(
     rows = track_positions(solution, tracks, folder)
     columns = frame_positions(solution, frames, folder)
     observations, quality = _detections(folder, solution, bird)
-    chosen = select_solution(solution, rows, columns)
     if video is None:
         video = _stored_video(folder)
         rate = fps or solution.fps
@@ -263,27 +276,33 @@ def open_result(
         video = Path(video)
         footage_fps = _rate_of(video, solution)
         rate = fps or solution.fps or footage_fps
-    return Exported(
+    whole = Exported(
         source=folder,
-        solution=chosen,
+        solution=solution,
         bird=bird,
-        observations=None if observations is None else observations.select(rows, columns),
-        quality={track: quality[track] for track in chosen.track_id.tolist() if track in quality},
+        observations=observations,
+        quality={track: quality[track] for track in solution.track_id.tolist() if track in quality},
         metres_per_unit=metres_per_unit or bird.metres_per_unit,
         focal_px=image_focal_px(solution),
         fps=rate,
-        times_s=_times(chosen, fps, rate),
+        times_s=frame_times(solution, fps, rate),
         video=video,
     )
+    return whole if tracks is None and frames == (None, None) else whole.select(rows, columns)
 
 
-def _times(solution: Solution, given: float | None, rate: float | None) -> Float[np.ndarray, "T"]:
+def stored_times(solution: Solution) -> Float[np.ndarray, "T"] | None:
+    """Return the stored times of the frames, seconds; None if one is unknown or they do not increase."""
+    stored = solution.timestamp_s
+    increasing = stored is not None and np.isfinite(stored).all() and (np.diff(stored) > 0).all()
+    return stored if increasing else None
+
+
+def frame_times(solution: Solution, given: float | None, rate: float | None) -> Float[np.ndarray, "T"]:
     """Return the time of every frame: by the given rate, by the stored times, else by the rate of the footage."""
     numbers = solution.frame_index.astype(np.float64)
-    stored = np.full(len(numbers), np.nan) if solution.timestamp_s is None else solution.timestamp_s
-    known = np.isfinite(stored)
-    increasing = known.all() and (np.diff(stored) > 0).all()
-    if given is None and increasing:
+    stored = stored_times(solution)
+    if given is None and stored is not None:
         return stored
     return numbers / rate if rate else np.full(len(numbers), np.nan)
 

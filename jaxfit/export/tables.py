@@ -1,6 +1,6 @@
 """Tables for R, pandas and spreadsheets, as CSV or Parquet: poses and keypoints, and joint angles.
 
-Both tables have a row for every track and frame. A row without a pose has `fitted` = false and empty values. The last
+Both tables have a row for every track and frame. A row without a pose has `fitted` = FALSE and empty values. The last
 part of the name of a column is its unit: `s`, `px` (image pixels), `m` or `unit` (model units), `rad`. Positions in
 space are those of a bird of the model's size in the camera frame of the image (`jaxfit.data.projection`). Results in a
 world have the true size, and also positions in the world (`world_m`); on a ledge, also `on_ledge`.
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,13 @@ from jaxfit.foundation.reading import json_text
 
 Columns = dict[str, np.ndarray]
 """Name → values of all rows; NaN and None are empty cells."""
+_BLOCK = 5000
+"""Rows that are texts at once."""
 
 
 def write_csv(exported: Exported, out: Path, progress: ProgressTask) -> list[Path]:
     """Write both tables as CSV; returns their paths."""
-    return _write(exported, out, _csv, progress)
+    return _write(exported, out, csv_table, progress)
 
 
 def write_parquet(exported: Exported, out: Path, progress: ProgressTask) -> list[Path]:
@@ -39,8 +41,7 @@ def write_parquet(exported: Exported, out: Path, progress: ProgressTask) -> list
     Raises:
         InputError: PyArrow is not installed.
     """
-    require_package("pyarrow", "--to parquet")
-    return _write(exported, out, _parquet, progress)
+    return _write(exported, out, parquet_table, progress)
 
 
 def angles_path(out: Path) -> Path:
@@ -60,8 +61,8 @@ def _write(
     return list(tables)
 
 
-def _row_columns(exported: Exported) -> Columns:
-    """Return the columns that both tables share: track, frame, time, fitted, status, flag and doubts."""
+def row_columns(exported: Exported) -> Columns:
+    """Return the columns that all tables share: track, frame, time, fitted, status, flag and doubts."""
     s, doubts = exported.solution, np.asarray(exported.solution.doubts)
     N, T = s.valid.shape
     return {
@@ -79,7 +80,7 @@ def _pose_columns(exported: Exported) -> Columns:
     """Return the quality of the track, position, orientation and size of the bird, and its keypoints."""
     s, unit, points = exported.solution, exported.unit, exported.keypoints_3d
     T = len(s.frame_index)
-    columns = _row_columns(exported)
+    columns = row_columns(exported)
     for name in ("coverage", "mean_confidence", "jitter"):
         rows = [exported.quality.get(track) for track in s.track_id.tolist()]
         values = [np.nan if row is None or getattr(row, name) is None else getattr(row, name) for row in rows]
@@ -114,7 +115,7 @@ def _angle_columns(exported: Exported) -> Columns:
     """Return the rotation of every joint except the root relative to its parent, as axis-angles."""
     s = exported.solution
     angles = {name: s.body_pose[:, :, j] for j, name in enumerate(s.joint_names[1:])}
-    columns = _row_columns(exported) | _vectors(exported, angles, "rad")
+    columns = row_columns(exported) | _vectors(exported, angles, "rad")
     if s.body_pose_sd is not None:
         sd = {name: s.body_pose_sd[:, :, j] for j, name in enumerate(s.joint_names[1:])}
         columns |= _vectors(exported, sd, "sd_rad")
@@ -168,11 +169,15 @@ def _facts_of_space(exported: Exported) -> dict[str, str]:
     return facts | ({} if s.contact is None else {"on_ledge": ON_LEDGE})
 
 
-def _csv(columns: Columns, _facts: dict[str, str]) -> bytes:
+def csv_table(columns: Columns, _facts: dict[str, str], _about: Mapping[str, dict[str, str]] | None = None) -> bytes:
+    """Return a table as CSV, as R and pandas read it without options: TRUE and FALSE; NaN is empty, None is NA."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows(zip(*map(_texts, columns.values()), strict=True))
+    rows = len(next(iter(columns.values()), ()))
+    for first in range(0, rows, _BLOCK):
+        block = (_texts(values[first : first + _BLOCK]) for values in columns.values())
+        writer.writerows(zip(*block, strict=True))
     return text.getvalue().encode()
 
 
@@ -181,20 +186,31 @@ def _texts(values: np.ndarray) -> list[Any]:
     if values.dtype.kind == "f":
         return np.where(np.isnan(values), "", values.astype(str)).tolist()
     if values.dtype.kind == "b":
-        return np.where(values, "true", "false").tolist()
-    return values.tolist()
+        return np.where(values, "TRUE", "FALSE").tolist()
+    return ["NA" if value is None else value for value in values.tolist()]
 
 
-def _parquet(columns: Columns, facts: dict[str, str]) -> bytes:
+def parquet_table(columns: Columns, facts: dict[str, str], about: Mapping[str, dict[str, str]] | None = None) -> bytes:
+    """Return a table as Parquet.
+
+    Args:
+        columns: the columns.
+        facts: metadata of the table.
+        about: column → its metadata; None takes the unit from the end of the name.
+
+    Raises:
+        InputError: PyArrow is not installed.
+    """
+    require_package("pyarrow", "Parquet")
     import pyarrow
     import pyarrow.parquet
 
     fields, arrays = [], []
     for name, values in columns.items():
-        array = pyarrow.array(values, from_pandas=True)  # NaN becomes null
+        array = pyarrow.array(values, from_pandas=True)  # NaN and None become null
         unit = name.rpartition("_")[2]
         metadata = {"unit": unit} if unit in ("s", "px", "m", "unit", "rad") else None
-        fields.append(pyarrow.field(name, array.type, metadata=metadata))
+        fields.append(pyarrow.field(name, array.type, metadata=metadata if about is None else about.get(name)))
         arrays.append(array)
     table = pyarrow.Table.from_arrays(arrays, schema=pyarrow.schema(fields, metadata=facts))
     content = io.BytesIO()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxfit.data.projection import PosedBirds
 from jaxfit.data.solution import Solution
@@ -98,18 +100,30 @@ def _smoothed(ratio: Float[np.ndarray, "N T"], change: float) -> Float[np.ndarra
         change: probability of a change of state between two frames.
     """
 
-    def passed(logit: np.ndarray) -> np.ndarray:
-        first = 1 / (1 + np.exp(-np.clip(logit, -50, 50)))
-        mixed = first * (1 - change) + (1 - first) * change
-        return np.log(mixed / (1 - mixed))
+    return np.asarray(_forward_backward(jnp.asarray(ratio.T, jnp.float32), change), np.float64).T
 
-    N, T = ratio.shape
-    forward, backward = np.zeros((N, T)), np.zeros((N, T))
-    for t in range(T):
-        forward[:, t] = ratio[:, t] + (passed(forward[:, t - 1]) if t else 0)
-    for t in range(T - 2, -1, -1):
-        backward[:, t] = passed(ratio[:, t + 1] + backward[:, t + 1])
-    return 1 / (1 + np.exp(-np.clip(forward + backward, -50, 50)))
+
+@jax.jit
+def _forward_backward(ratio: Float[Array, "T N"], change: float) -> Float[Array, "T N"]:
+    """Return `_smoothed` with the frames first."""
+
+    def passed(logit: Array) -> Array:
+        first = jax.nn.sigmoid(logit)
+        # not 1 − mixed, which rounding makes 0
+        mixed, other = first + (1 - 2 * first) * change, (1 - first) + (2 * first - 1) * change
+        return jnp.log(mixed) - jnp.log(other)
+
+    def onward(logit: Array, own: Array) -> tuple[Array, Array]:
+        seen = own + passed(logit)
+        return seen, seen
+
+    def back(logit: Array, own: Array) -> tuple[Array, Array]:
+        return passed(own + logit), logit
+
+    unknown = jnp.zeros(ratio.shape[1])
+    forward = jax.lax.scan(onward, unknown, ratio)[1]
+    backward = jax.lax.scan(back, unknown, ratio, reverse=True)[1]
+    return jax.nn.sigmoid(forward + backward)
 
 
 def interval_of(solution: Solution) -> float:
@@ -147,11 +161,11 @@ def feet_cam(solution: Solution, bird: Bird, n: int | None = None) -> Float[np.n
     named = [j for j, name in enumerate(bird.joint_names) if name in FEET]
     touching = np.asarray(bird.skin_weights)[:, named].sum(axis=1) > 0.5
     chosen = np.flatnonzero(touching if touching.any() else np.ones_like(touching))
-    posed, T = PosedBirds(solution, bird), len(solution.frame_index)
+    posed, T = PosedBirds(solution, bird, vertices=chosen), len(solution.frame_index)
     rows = range(len(solution.track_id)) if n is None else [n]
     found = np.empty((len(rows), T, len(chosen), 3))
     for i, row in enumerate(rows):
         for first in range(0, T, CHUNK):
             start = max(min(first, T - CHUNK), 0)  # slices of equal length share one compiled program
-            found[i, start : start + CHUNK] = posed.vertices_cam_window(row, slice(start, start + CHUNK))[:, chosen]
+            found[i, start : start + CHUNK] = posed.vertices_cam_window(row, slice(start, start + CHUNK))
     return found

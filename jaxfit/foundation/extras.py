@@ -49,6 +49,8 @@ OPTIONAL_PACKAGES = {
     "onnxscript": OptionalPackage("onnxscript", "0.5", "train", "`jaxfit train`"),
     "dask": OptionalPackage("dask", "2026.8", "cluster", "`--workers`, `--scheduler`"),
     "distributed": OptionalPackage("distributed", "2026.8", "cluster", "`--workers`, `--scheduler`"),
+    "starlette": OptionalPackage("starlette", "1.0", "view", "`jaxfit view`"),
+    "uvicorn": OptionalPackage("uvicorn", "0.40", "view", "`jaxfit view`"),
     "trackers": OptionalPackage("trackers", "2.6", "trackers", "trackers other than the paper's tracker"),
 }
 """Name in the package index → package."""

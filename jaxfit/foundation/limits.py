@@ -104,6 +104,10 @@ GRID_RUNS = 10_000
 ABLATION_BYTES = 200_000_000
 """Largest size of a file that describes the runs of an ablation (ablation.json), or their metrics."""
 
+# --- corrections of tracks
+EDITS_BYTES = 1_000_000
+"""Largest file of corrections of tracks (`--edits`). A correction takes about 20 bytes."""
+
 # --- pictures and videos
 IMAGE_PIXELS = 100_000_000
 """Most pixels of a picture or of a frame of a video: 300 MB in memory."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import math
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
-from importlib import metadata
 from typing import Any, TypeVar, overload
 
 from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.plugins import entry_points, import_object
 from jaxfit.objective.curvature import Curvature
 
 ENTRY_POINTS = "jaxfit.terms"
@@ -99,11 +98,11 @@ def find_term(name: str) -> Term:
         return _terms[name]
     if ":" in name:
         path = name
-    elif name in (paths := _paths_of_packages()):
+    elif name in (paths := entry_points(ENTRY_POINTS)):
         path = paths[name]
     else:
         raise KeyError(name)
-    function = _import(name, path)
+    function = import_object(f"term {name!r}", path)
     registered = next((known for known in _terms.values() if known.function is function), None)
     _terms[name] = registered or _term_of(name, function)
     return _terms[name]
@@ -116,27 +115,7 @@ def find_terms(names: Iterable[str]) -> dict[str, Term]:
 
 def known_terms() -> list[str]:
     """Return the names of all terms that are registered or provided by installed packages; paths are not included."""
-    return [name for name in dict.fromkeys([*_terms, *_paths_of_packages()]) if ":" not in name]
-
-
-def _paths_of_packages() -> dict[str, str]:
-    """Return name → path of the terms that installed packages provide."""
-    return {point.name: point.value for point in metadata.entry_points(group=ENTRY_POINTS)}
-
-
-def _import(name: str, path: str) -> Any:
-    """Import the object at `package.module:function`."""
-    module_name, _, attribute = path.partition(":")
-    try:
-        module = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:  # a foreign module may raise any exception, and may end Python
-        problem = f"cannot be imported: {type(error).__name__}: {error}"
-        remedy = "its folder must be in PYTHONPATH, or its package installed"
-        raise InputError(f"term {name!r}", problem, remedy) from error
-    try:
-        return getattr(module, attribute)
-    except (Exception, SystemExit):  # a module can compute its attributes
-        raise InputError(f"term {name!r}", f"{module_name} has no function {attribute!r}", "check the name") from None
+    return [name for name in dict.fromkeys([*_terms, *entry_points(ENTRY_POINTS)]) if ":" not in name]
 
 
 def _term_of(name: str, function: Any, positive: Collection[str] = (), compares_masks: bool = False) -> Term:

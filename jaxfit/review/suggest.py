@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -195,9 +196,9 @@ def _link(source: Path, target: Path) -> None:
 
 _logger = logging.getLogger(__name__)
 
-MIRROR, VARIETY, TEACHER = "mirror image", "variety", "teacher"
+MIRROR, VARIETY, TEACHER, MARKED = "mirror image", "variety", "teacher", "marked by a person"
 """Reasons beside the signals of `frame_signals`: disagreement under flips; a frame unlike the others; disagreement with
-another segmenter."""
+another segmenter; a person."""
 
 
 class SuggestedFrame(NamedTuple):
@@ -314,11 +315,7 @@ def suggest(
             (part / IMAGES / picture_name(video, int(observations.frame_index[t]))).unlink()
         chosen = observations.select(tracks=[] if empty else None, frames=positions)
         write_labels(chosen, video, part, out.resolve())
-        rows = []
-        for number, time_s, birds, reason, score in frames:
-            time = "" if time_s is None else f"{time_s:.3f}"
-            rows.append((number, time, picture_name(video, number), birds, reason, f"{score:.3f}"))
-        write_list(rows, part / MARKER)
+        _write_rows(frames, video, part)
     return Suggestions(frames, chosen)
 
 
@@ -407,3 +404,48 @@ def _choose(
         for i in picks
     ]
     return frames, at[picks].tolist()
+
+
+def suggest_marked(
+    video: Path, out: Path, frames: Sequence[int], result: Path, progress: ProgressTask = silent
+) -> Suggestions:
+    """Write frames that a person has marked for labelling, as `suggest` writes frames that it chooses.
+
+    Args:
+        video: a video, or a folder of frames.
+        out: folder to write, completely or not at all.
+        frames: numbers of the frames, in increasing order.
+        result: a folder of `jaxfit reconstruct` or `jaxfit fit`, or a file of observations of this video.
+        progress: reports every frame.
+
+    Raises:
+        InputError: the video, the result or the folder cannot be used; the result or the video lacks a frame; or the
+            extra `formats` is not installed.
+    """
+    require_extra("formats", "frames to label", "h5py")
+    check_replaceable(out, False, MARKER)
+    observations = read_result(result, video).observations
+    missing = sorted(set(frames) - set(observations.frame_index.tolist()))
+    if missing:
+        raise InputError(result, f"has no frame {missing[0]}", "mark frames of the result")
+    candidates = np.searchsorted(observations.frame_index, frames)
+    with new_folder(out, marker=MARKER) as part:
+        (part / IMAGES).mkdir()
+        examined = _examine(video, observations, candidates, None, part / IMAGES, progress, None)
+        _check_count(len(frames), len(examined.positions), video)
+        chosen, birds = observations.select(frames=candidates), observations.present.sum(0)
+        write_labels(chosen, video, part, out.resolve())
+        marked = [
+            SuggestedFrame(number, examined.times_s[t], int(birds[t]), MARKED, 1.0)
+            for number, t in zip(frames, candidates.tolist(), strict=True)
+        ]
+        _write_rows(marked, video, part)
+    return Suggestions(marked, chosen)
+
+
+def _write_rows(frames: Sequence[SuggestedFrame], video: Path, part: Path) -> None:
+    rows = []
+    for number, time_s, birds, reason, score in frames:
+        time = "" if time_s is None else f"{time_s:.3f}"
+        rows.append((number, time, picture_name(video, number), birds, reason, f"{score:.3f}"))
+    write_list(rows, part / MARKER)

@@ -91,6 +91,14 @@ class Keyframes:
         self.labels.append((self.last.time_s, behaviour))
         _BEHAVIOUR_FUNCTIONS[behaviour](self, until_s, target)
 
+    def begin(self, behaviour: str) -> None:
+        """Say that a behaviour begins only now, and that the bird stood since the label before."""
+        self.labels[-1] = self.labels[-1][0], "stand"
+        if self.last.time_s > self.labels[-1][0]:
+            self.labels.append((self.last.time_s, behaviour))
+        else:
+            self.labels[-1] = self.last.time_s, behaviour
+
 
 def blend(a: Posture | str, b: Posture | str, share: float) -> Posture:
     """Interpolate between two postures: share 0 is a, share 1 is b."""
@@ -117,13 +125,16 @@ def _preen(bird: Keyframes, until_s: float, _target) -> None:
 
 
 def _walk(bird: Keyframes, until_s: float, target) -> None:
+    behaviour = bird.labels[-1][1]
     bird.turn_towards("standing", target)
+    bird.begin(behaviour)
     distance, foot = np.hypot(*np.subtract(target, bird.last.feet)), 0
     while bird.last.time_s < until_s and distance > 0:
         ahead = min(STEP_UNITS, distance) * np.array([-np.sin(bird.last.heading), np.cos(bird.last.heading)])
         step = f"walking_{('left', 'right')[foot]}"
         bird.add(step, STEP_S, feet=tuple(np.add(bird.last.feet, ahead)))
         distance, foot = distance - STEP_UNITS, 1 - foot
+    bird.labels.append((bird.last.time_s, "stand"))
     bird.add("standing", 0.3)
 
 
@@ -134,16 +145,17 @@ def _flap(bird: Keyframes, until_s: float, _target) -> None:
         bird.add("flapping_down", FLAP_S)
     bird.add("wings_half", 0.2)
     bird.add("standing", 0.35)
-    _stand(bird, until_s, None)
+    bird.add_behaviour("stand", until_s)
 
 
 def _jab(bird: Keyframes, until_s: float, target) -> None:
     if target is not None:
         bird.turn_towards("alert", target)
+        bird.begin("jab")
     for _ in range(int(bird.rng.integers(2, 4))):
         bird.add("jab", 0.16)
         bird.add(blend("alert", "jab", 0.3), 0.2)
-    _stand(bird, until_s, None)
+    bird.add_behaviour("stand", until_s)
 
 
 def _approach(bird: Keyframes, until_s: float, target) -> None:
@@ -163,6 +175,7 @@ def _fly_off(bird: Keyframes, until_s: float, _target) -> None:
     """Turn to the edge, leap and fly away from the wall, out of the picture."""
     outward = np.pi + bird.rng.uniform(-0.4, 0.4)
     bird.turn_towards("standing", tuple(np.add(bird.last.feet, [-np.sin(outward), np.cos(outward)])))
+    bird.begin("fly_off")
     bird.add("wings_half", 0.2)
     heading = bird.last.heading
     flight, distance, speed, beat = POSTURES["wings_up"].pitch_rad, 0.0, 20.0, 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -94,6 +94,52 @@ def draw_birds(
         one_camera: whether all birds share one camera, so that their depths are comparable.
     """
     height, width = image.shape[:2]
+    for group in _rendered(birds, faces, (width, height), one_camera):
+        box = image[group.low[1] : group.high[1], group.low[0] : group.high[0]]
+        seen = group.coverage > 0
+        box[seen] = (
+            box[seen] * (1 - style.opacity * group.coverage[seen][:, None])
+            + 255 * style.opacity * group.values[seen]
+            + 0.5
+        ).astype(np.uint8)
+        for i in reversed(range(len(group.birds))):
+            edges = _edges(group, i)
+            cv2.drawContours(box, edges, -1, track_colour(group.birds[i].position), style.line_px, cv2.LINE_AA)
+
+
+def outlines(
+    birds: Sequence[DrawnBird], faces: Int[np.ndarray, "F 3"], size_px: tuple[int, int], one_camera: bool
+) -> dict[int, list[Int[np.ndarray, "_ 2"]]]:
+    """Return the outlines that `draw_birds` draws, to a pixel: position of a track → closed curves, image pixels."""
+    found = {}
+    for group in _rendered(birds, faces, size_px, one_camera, samples=1):
+        for i, bird in enumerate(group.birds):
+            found[bird.position] = [edge[:, 0] + group.low for edge in _edges(group, i)]
+    return found
+
+
+class _Rendered(NamedTuple):
+    """Birds with overlapping boxes in their part of the image, H × W pixels."""
+
+    low: Int[np.ndarray, "2"]
+    """First column and row of the part."""
+    high: Int[np.ndarray, "2"]
+    birds: list[DrawnBird]
+    values: Float[np.ndarray, "H W 3"]
+    """Blue, green, red in [0, 1]."""
+    coverage: Float[np.ndarray, "H W"]
+    owner: Int[np.ndarray, "H W"]
+    """Index of the visible bird in `birds`; −1 without a bird."""
+
+
+def _rendered(
+    birds: Sequence[DrawnBird],
+    faces: Int[np.ndarray, "F 3"],
+    size_px: tuple[int, int],
+    one_camera: bool,
+    samples: int = 2,
+) -> Iterator[_Rendered]:
+    width, height = size_px
     for group in _overlapping(birds, width, height):
         members = sorted((birds[i] for i in group), key=lambda bird: -float(bird.screen[:, 1].max()))
         low = np.clip(np.floor(np.min([b.screen[:, :2].min(0) for b in members], 0)) - 2, 0, None).astype(int)
@@ -107,17 +153,17 @@ def draw_birds(
             np.concatenate(meshes),
             np.concatenate([faces + i * V for i in range(len(members))]),
             np.concatenate([b.colours for b in members]),
-            *(int(side) for side in high - low),
+            int(high[0] - low[0]),
+            int(high[1] - low[1]),
+            samples,
         )
-        box = image[low[1] : high[1], low[0] : high[0]]
-        seen = coverage > 0
-        box[seen] = (
-            box[seen] * (1 - style.opacity * coverage[seen][:, None]) + 255 * style.opacity * values[seen] + 0.5
-        ).astype(np.uint8)
         owner = np.where(face >= 0, face // len(faces), -1)
-        for i in reversed(range(len(members))):
-            edges, _ = cv2.findContours((owner == i).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-            cv2.drawContours(box, edges, -1, track_colour(members[i].position), style.line_px, cv2.LINE_AA)
+        yield _Rendered(low, high, members, values, coverage, owner)
+
+
+def _edges(group: _Rendered, i: int) -> Sequence[np.ndarray]:
+    """Return the outlines of the visible part of a bird, (M, 1, 2) each, in pixels of its group."""
+    return cv2.findContours((group.owner == i).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
 
 
 def _layer(mesh: Float[np.ndarray, "V 3"], rank: int) -> Float[np.ndarray, "V 3"]:

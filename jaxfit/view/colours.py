@@ -1,4 +1,4 @@
-"""The colours of all pictures: tracks and mesh outlines, keypoints, text and paper."""
+"""The colours of all pictures: tracks and mesh outlines, behaviours, keypoints, text and paper."""
 
 from __future__ import annotations
 
@@ -41,6 +41,25 @@ TRACK_COLOURS: tuple[Colour, ...] = (
 dark colours made lighter; people with any colour vision can distinguish them. All contrast with dark and with white
 plumage."""
 
+BEHAVIOUR_COLOURS: tuple[Colour, ...] = (
+    (238, 204, 136),  # light blue
+    (153, 170, 68),  # teal
+    (136, 34, 51),  # indigo
+    (153, 68, 170),  # purple
+    (85, 34, 136),  # wine
+    (119, 204, 221),  # sand
+    (51, 153, 153),  # olive
+    (51, 119, 17),  # green
+    (119, 102, 204),  # rose
+    (212, 207, 200),  # light grey
+)
+"""Colours of behaviours in the order of their config, repeated after the last: Paul Tol's palette *muted* in another
+order, with a light grey that differs from paper. People with any colour vision can distinguish them: the smallest
+difference (CIEDE2000) of two of them, or of one and white, is 10.9, also with simulated protanopia, deuteranopia and
+tritanopia (Machado et al. 2009)."""
+OTHER_BEHAVIOUR: Colour = (155, 145, 133)
+"""A bird that shows no behaviour of the config; drawn as a thin bar."""
+
 PLUMAGE_SHARE = 0.4
 """Weight of the model's colours in the colours of a drawn bird; the rest is the colour of the track."""
 
@@ -48,6 +67,23 @@ PLUMAGE_SHARE = 0.4
 def track_colour(n: int) -> Colour:
     """Return the colour of the track at position `n`."""
     return TRACK_COLOURS[n % len(TRACK_COLOURS)]
+
+
+def behaviour_colour(n: int | None) -> Colour:
+    """Return the colour of the behaviour at position `n` of its config; None is no behaviour of the config."""
+    return OTHER_BEHAVIOUR if n is None else BEHAVIOUR_COLOURS[n % len(BEHAVIOUR_COLOURS)]
+
+
+def css(colour: Colour) -> str:
+    """Return a colour as HTML and SVG name it: `#rrggbb`."""
+    blue, green, red = colour
+    return f"#{red:02x}{green:02x}{blue:02x}"
+
+
+def ink_on(colour: Colour) -> Colour:
+    """Return the colour of text on a colour: dark or white, whichever has more contrast."""
+    linear = (np.array(colour) / 255) ** 2.2
+    return INK if linear @ (0.0722, 0.7152, 0.2126) > 0.18 else (255, 255, 255)
 
 
 def tinted(vertex_colours: Float[np.ndarray, "V 3"], n: int, share: float = PLUMAGE_SHARE) -> Float[np.ndarray, "V 3"]:

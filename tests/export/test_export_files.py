@@ -46,7 +46,7 @@ def test_tables_hold_a_row_for_every_bird_and_frame(folder, made, tmp_path):
     assert [(row["track"], row["frame"]) for row in rows] == [(str(n), str(t)) for n in TRACKS for t in FRAMES]
     assert [row["status"] for row in rows[:: len(FRAMES)]] == ["ok", "partly diverged", "diverged"]
     valid = made.valid
-    assert [row["fitted"] for row in rows] == ["true" if fitted else "false" for fitted in valid.ravel()]
+    assert [row["fitted"] for row in rows] == ["TRUE" if fitted else "FALSE" for fitted in valid.ravel()]
     assert float(rows[3]["time_s"]) == pytest.approx(FRAMES[3] / FPS)
     assert 0 < float(rows[0]["track_mean_confidence"]) < 1
     for k, name in enumerate(made.keypoint_names):
@@ -158,9 +158,9 @@ WRONG = {
     "unknown track": (["--to", "csv", "--tracks", "3,99"], "has no track 99 (its tracks are 3, 7, 8)"),
     "no list of tracks": (["--to", "csv", "--tracks", "3;4"], "--tracks: is '3;4', not a list of track ids"),
     "frames outside": (["--to", "csv", "--frames", "10:99"], "lacks the frames 10:99 (its frames are 10:21)"),
-    "no range": (["--to", "csv", "--frames", "20:10"], "lacks the frames 20:10"),
+    "no range": (["--to", "csv", "--frames", "20:10"], "--frames: is '20:10': the range is empty"),
     "no numbers": (["--to", "csv", "--frames", "a:b"], "--frames: is 'a:b', not a range of frames"),
-    "no rate": (["--to", "csv", "--fps", "0"], "--fps: is 0.0, not a positive number"),
+    "no rate": (["--to", "csv", "--fps", "0"], "--fps: is 0.0 (give a number within 0.001 and 100,000)"),
     "foreign option": (["--to", "csv", "--ground"], "--ground: does not belong to the format csv"),
     "no pose": (["--to", "coco", "--tracks", "8"], "holds no pose in the chosen tracks and frames"),
 }

@@ -137,7 +137,7 @@ def test_by_entry_point(package, monkeypatch):
     def entry_points(*, group):
         return metadata.EntryPoints([offered, clash] if group == "jaxfit.terms" else [])
 
-    monkeypatch.setattr(registry.metadata, "entry_points", entry_points)
+    monkeypatch.setattr(metadata, "entry_points", entry_points)
     assert "cosy" in known_terms()
     assert find_term("cosy").settings == {"power": 2.0}
     assert find_term("velocity").function.__module__ == "jaxfit.objective.temporal"  # jaxfit's own term has priority

@@ -11,7 +11,7 @@ import jaxfit
 from jaxfit.cli.main import main
 from jaxfit.data.solution import LAYOUT
 from jaxfit.foundation.errors import InputError
-from jaxfit.review.correct import correct_tracks
+from jaxfit.review.correct import correct_tracks, refit
 from jaxfit.review.edits import Edit, apply_edits
 
 CELLS = [name for name, (shape, _) in LAYOUT.items() if shape.startswith("N T")]
@@ -31,19 +31,27 @@ CASES = {
     "cut inside a window": ([Edit("cut", (4,), 108)], 3),
     "join what was cut": ([Edit("cut", (2,), 109), Edit("join", (2, 6))], 0),
     "delete": ([Edit("delete", (4,))], 0),
+    "exclude in the middle of a window": ([Edit("exclude", (4,), 108, 110)], 1),
+    "exclude the last window": ([Edit("exclude", (2,), 112)], 1),
+    "exclude a whole window": ([Edit("exclude", (4,), 106, 112)], 2),
+    "exclude all frames": ([Edit("exclude", (4,), 100)], 0),
 }
+FILTERED_BESIDE = ("cut where", "swap the last", "exclude the last", "exclude a whole")
+"""The median filter also changes frames beside these corrections."""
 
 
 @pytest.mark.parametrize(
-    "case", [case if case.startswith("swap the") else pytest.param(case, marks=pytest.mark.extended) for case in CASES]
+    "case",
+    [
+        case if case.startswith(("swap the", "exclude in")) else pytest.param(case, marks=pytest.mark.extended)
+        for case in CASES
+    ],
 )
 def test_only_changed_windows_are_fitted_again(folder, tmp_path, monkeypatch, case):
     edits, fitted = CASES[case]
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     done = correct_tracks(folder, tmp_path / "out", edits)
-    if not case.startswith("cut where") and not case.startswith(
-        "swap the last"
-    ):  # the filter changes frames beside them
+    if not case.startswith(FILTERED_BESIDE):
         assert len(done.fitted) == fitted
     else:
         assert 0 < len(done.fitted) < done.windows
@@ -71,6 +79,7 @@ def test_only_changed_windows_are_fitted_again(folder, tmp_path, monkeypatch, ca
         # the second part begins where a window began that shared frames with an earlier window
         pytest.param(Edit("cut", (4,), 108), None, marks=pytest.mark.extended),
         pytest.param(Edit("swap", (2, 4)), set(), marks=pytest.mark.extended),
+        pytest.param(Edit("exclude", (2,), 115), {(2, 108, 113), (2, 112, 114)}, marks=pytest.mark.extended),
     ],
 )
 def test_windows_that_share_frames_are_fitted_with_their_neighbours(tmp_path, edit, fitted):
@@ -83,6 +92,20 @@ def test_windows_that_share_frames_are_fitted_with_their_neighbours(tmp_path, ed
     expected = jaxfit.fit(apply_edits(observations(), [edit], "observations"), BIRD, shared)
     for name in ("track_id", "status", *CELLS):
         np.testing.assert_array_equal(getattr(read, name), getattr(expected, name), err_msg=name)
+
+
+def test_a_track_whose_remaining_frames_are_not_usable_has_no_window():
+    """Frame 100 of track 4 has two keypoints, too few for a fit; without its other frames, nothing is fitted."""
+    before = observations()
+    confidence = before.confidence.copy()
+    confidence[1, 0, 2:] = 0
+    before = before.with_keypoints(before.keypoints_px, confidence)
+    after = apply_edits(before, [Edit("exclude", (4,), 101)], "x")
+    done = refit(jaxfit.fit(before, BIRD, CONFIG), before, after, BIRD, CONFIG)
+    assert not done.fitted
+    assert done.solution.track_id.tolist() == [2, 4, 5]
+    assert done.solution.valid.sum(1).tolist() == [17, 0, 12]
+    assert done.solution.status[1] == jaxfit.fit(after, BIRD, CONFIG).status[1]
 
 
 def test_edits_move_birds():
@@ -108,6 +131,13 @@ WRONG = {
     "nothing left": (["--delete", "2,4,5"], "has no track left"),
     "no frame": (["--cut", "2"], "--cut: cannot be '2' (write for example --cut 4@80)"),
     "no list": (["--delete", "a/b\n"], "--delete: cannot be 'a/b\\n'"),
+    "exclusion without frames": (
+        ["--exclude", "2"],
+        "--exclude: cannot be '2' (write for example --exclude 3@10:20; --delete removes all frames of a track)",
+    ),
+    "exclusion of two tracks": (["--exclude", "2,4@100"], "--exclude: cannot be '2,4@100'"),
+    "no frame is left": (["--delete", "4,5", "--exclude", "2@:117"], "has no track left"),
+    "no frames": (["--exclude", "2@110:110"], "exclude 2@110:110: there are no such frames"),
 }
 
 

@@ -19,6 +19,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.view.overlay import overlay_pictures
+from jaxfit.view.report.behaviour import Behaviour, behaviour_meanings, behaviour_section, behaviour_style
 from jaxfit.view.report.contents import Report, Step, Track, Warned, counted, next_steps, warnings_of
 from jaxfit.view.report.timeline import Html, duration, element, error_curve, joined, size_curve, swatch, timeline
 
@@ -132,17 +133,32 @@ class Measured(NamedTuple):
     """What the columns mean."""
 
 
-def page(report: Report, pictures: Sequence[Picture], measured: Sequence[Measured] = ()) -> str:
+def page(
+    report: Report,
+    pictures: Sequence[Picture],
+    measured: Sequence[Measured] = (),
+    behaviour: Behaviour | None = None,
+    film: str | None = None,
+) -> str:
     """Return the page.
 
     Args:
         report: the content.
         pictures: frames with drawn birds; may be empty.
         measured: metrics against a known truth; may be empty.
+        behaviour: what the same birds do in the same frames; None writes no section. Photographs, a single frame and a
+            result without a pose have no such section.
+        film: address of the footage relative to the page, for links; None writes no links.
+
+    Raises:
+        ValueError: `behaviour` has other birds or frames.
     """
     warned = warnings_of(report)
     title = f"Birds in {report.title}"
     style = resources.files("jaxfit.view.report").joinpath("style.css").read_text("utf-8")
+    behaviour = _shown_behaviour(report, behaviour)
+    if behaviour is not None:
+        style += behaviour_style(behaviour)
     head = element(
         "head",
         element("meta", charset="utf-8"),
@@ -161,9 +177,10 @@ def page(report: Report, pictures: Sequence[Picture], measured: Sequence[Measure
             _section("Warnings", _warnings(warned)),
             None if report.photographs else _section("Pictures", _strip(report, pictures)),
             _section("Tracks over time", timeline(report)) if report.over_time else None,
+            _behaviour(report, behaviour, film),
             _section("Quality of each track", _table(report)),
             _section("Comparison with the truth", *map(_measured, measured)) if measured else None,
-            _section("What the words mean", _definitions(_meanings(report))),
+            _section("What the words mean", _definitions(_meanings(report, behaviour))),
             _section("How the result was made", _details(report)),
         ),
     )
@@ -172,6 +189,25 @@ def page(report: Report, pictures: Sequence[Picture], measured: Sequence[Measure
 
 def _section(title: str, *content: Html | None) -> Html:
     return element("section", element("h2", title), *content)
+
+
+def _shown_behaviour(report: Report, behaviour: Behaviour | None) -> Behaviour | None:
+    """Return the behaviour, if the result shows what birds do over time."""
+    if behaviour is None or not report.over_time or not report.poses:
+        return None
+    expected = len(report.tracks), len(report.frames)
+    if behaviour.state.shape != expected or not np.array_equal(behaviour.frames, report.frames):
+        came = f"{behaviour.state.shape[0]} birds and {len(behaviour.frames)} frames"
+        raise ValueError(
+            f"behaviour: expected the {expected[0]} birds and {expected[1]} frames of the report, got {came}"
+        )
+    return behaviour
+
+
+def _behaviour(report: Report, behaviour: Behaviour | None, film: str | None) -> Html | None:
+    if behaviour is None:
+        return None
+    return _section("Behaviour", behaviour_section(behaviour, [track.position for track in report.tracks], film))
 
 
 def _footage(report: Report) -> Html:
@@ -316,11 +352,12 @@ def _measured(table: Measured) -> Html:
     return joined(element("div", content, class_="wide"), element("p", table.note, class_="note"))
 
 
-def _meanings(report: Report) -> list[tuple[str, str]]:
+def _meanings(report: Report, behaviour: Behaviour | None) -> list[tuple[str, str]]:
     """Return the definitions of the words on the page."""
     absent = [] if report.over_time else ["Size in the image"]
     absent += [] if report.has_error_bars else ["Error bars"]
-    return [pair for pair in _MEANINGS if pair[0] not in absent]
+    further = [] if behaviour is None else behaviour_meanings(behaviour)
+    return [pair for pair in _MEANINGS if pair[0] not in absent] + further
 
 
 def _definitions(pairs: Sequence[tuple[str, str]]) -> Html:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from html import escape
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from jaxfit.data.flags import CONTRADICTED, UNSURE, WRONG_SHARE
+from jaxfit.data.tracks import frame_step
 from jaxfit.foundation.errors import one_line
-from jaxfit.view.colours import track_colour
+from jaxfit.view.colours import css, track_colour
 from jaxfit.view.report.contents import Report, Track
 
 _WITHOUT_END = ("img", "meta")
@@ -60,13 +62,78 @@ _CURVE_RANGE = 0.3
 """Deviations of the size beyond this share are drawn at the edge."""
 
 
+class Tick(NamedTuple):
+    """One marked frame of an axis."""
+
+    place: float
+    """Place on the axis, 0 to 1."""
+    frame: int
+    time: str | None
+    """Time for people; None if unknown."""
+
+
+class Axis(NamedTuple):
+    """The axis of frames that all rows of a page share; T frames of the result."""
+
+    frames: Int[np.ndarray, "T"]
+    """Numbers of the frames, ascending."""
+    step: int
+    """Distance of the frame numbers."""
+    times_s: Float[np.ndarray, "T"]
+    """Time of every frame; NaN if unknown."""
+
+    @property
+    def at(self) -> Int[np.ndarray, "T"]:
+        """Place of every frame, counted in frames; missing frames have places too."""
+        return (self.frames - self.frames[0]) // self.step
+
+    @property
+    def length(self) -> int:
+        """Number of frames from the first to the last frame, missing frames included."""
+        return int(self.at[-1]) + 1
+
+    @property
+    def per_column(self) -> int:
+        """Frames in one column of a row."""
+        return -(-self.length // _COLUMNS)
+
+    @property
+    def columns(self) -> int:
+        """Columns of a row."""
+        return -(-self.length // self.per_column)
+
+    def ticks(self) -> list[Tick]:
+        """Return about `_TICKS` frames with round numbers."""
+        first, span = int(self.frames[0]), max(self.length - 1, 1) * self.step
+        raw = span / _TICKS
+        power = 10 ** np.floor(np.log10(max(raw, 1)))
+        every = max(int(next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw)), 1)
+        ticks = []
+        for number in range(-(-first // every) * every, first + span + 1, every):
+            place = (number - first) / (self.columns * self.per_column * self.step)
+            if place <= 0.93:  # else the label would leave the page
+                ticks.append(Tick(place, number, self._time(number, every)))
+        return ticks
+
+    def _time(self, number: int, every: int) -> str | None:
+        """Return the time of a frame, with the digits that ticks at every `every`-th frame need."""
+        if not np.isfinite(self.times_s).all():
+            return None
+        seconds = float(np.interp(number, self.frames, self.times_s))
+        distance = every * float(self.times_s[-1] - self.times_s[0]) / max(int(self.frames[-1] - self.frames[0]), 1)
+        return duration(seconds) if distance >= 1 else clock(seconds, 1 if distance >= 0.1 else 2)
+
+
+def axis_of(frames: Int[np.ndarray, "T"], times_s: Float[np.ndarray, "T"]) -> Axis:
+    """Return the axis of the frames of a result."""
+    return Axis(frames, frame_step(frames), times_s)
+
+
 def timeline(report: Report) -> Html:
     """Return the rows of all birds over a common axis of frames."""
-    first, last = int(report.frames[0]), int(report.frames[-1])
-    length = (last - first) // report.step + 1
-    per_column = -(-length // _COLUMNS)
-    at = (report.frames - first) // report.step
-    rows = [_axis(report, first, length), _counts(report, at, length)]
+    axis = axis_of(report.frames, report.times_s)
+    at, length, per_column, first = axis.at, axis.length, axis.per_column, int(report.frames[0])
+    rows = [axis_row(axis), _counts(report, axis)]
     for track in report.tracks:
         states = np.zeros(length, int)
         states[at] = _states(track)
@@ -91,8 +158,7 @@ def timeline(report: Report) -> Html:
 
 def swatch(position: int) -> Html:
     """Return a mark in the colour that the bird has in overlays."""
-    blue, green, red = track_colour(position)
-    return element("i", class_="swatch", style=f"background:rgb({red},{green},{blue})")
+    return element("i", class_="swatch", style=f"background:{css(track_colour(position))}")
 
 
 def size_curve(track: Track) -> Html:
@@ -153,6 +219,16 @@ def duration(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d} h" if hours else f"{minutes}:{rest:02d} min"
 
 
+def clock(seconds: float, digits: int = 2) -> str:
+    """Return a time of the film as `2.40 s`, `3:05.20` or `1:02:03.00`."""
+    minutes, rest = divmod(round(seconds, digits), 60)
+    hours, minutes = divmod(int(minutes), 60)
+    width = digits + 3
+    if hours:
+        return f"{hours}:{minutes:02d}:{rest:0{width}.{digits}f}"
+    return f"{minutes}:{rest:0{width}.{digits}f}" if minutes else f"{rest:.{digits}f} s"
+
+
 def _states(track: Track) -> Int[np.ndarray, "T"]:
     """Return the state of a bird in every frame."""
     level = np.zeros(len(track.valid), int)
@@ -189,13 +265,12 @@ def _bars(states: Int[np.ndarray, "C"], state: int, top: float, height: float) -
     return element("path", class_=f"s{state}", d=bars) if bars else None
 
 
-def _counts(report: Report, at: np.ndarray, length: int) -> Html:
+def _counts(report: Report, axis: Axis) -> Html:
     """Return the row with the number of birds over the frames."""
-    per_column = -(-length // _COLUMNS)
-    counts = np.zeros(length + -length % per_column)
+    counts, at = np.zeros(axis.columns * axis.per_column), axis.at
     for track in report.tracks:
         counts[at] += track.present
-    counts = counts.reshape(-1, per_column).max(1)
+    counts = counts.reshape(-1, axis.per_column).max(1)
     most = int(counts.max(initial=1))
     steps = "".join(f"V{1 - count / most:.3f}h1" for count in counts)
     area = element("path", class_="count", d=f"M0 1{steps}V1z")
@@ -208,19 +283,12 @@ def _stretched(columns: int) -> dict[str, object]:
     return {"viewBox": f"0 0 {columns} 1", "preserveAspectRatio": "none"}
 
 
-def _axis(report: Report, first: int, length: int) -> Html:
+def axis_row(axis: Axis) -> Html:
     """Return the row with the numbers and times of some frames."""
-    span = max(length - 1, 1) * report.step
-    raw = span / _TICKS
-    power = 10 ** np.floor(np.log10(max(raw, 1)))
-    every = max(int(next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw)), 1)
     ticks = []
-    for number in range(-(-first // every) * every, first + span + 1, every):
-        place = (number - first) / (length * report.step)
-        if place > 0.93:  # the label would leave the page
-            continue
-        time = None if report.fps is None else element("small", duration(number / report.fps))
-        ticks.append(element("span", f"{number:,}", time, class_="tick", style=f"left:{100 * place:.2f}%"))
+    for place, frame, time in axis.ticks():
+        small = None if time is None else element("small", time)
+        ticks.append(element("span", f"{frame:,}", small, class_="tick", style=f"left:{100 * place:.2f}%"))
     return element("div", element("span", "frame", class_="label"), element("div", *ticks, class_="axis"), class_="row")
 
 

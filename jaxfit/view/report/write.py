@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -19,6 +22,7 @@ from jaxfit.foundation.files import check_new_file, write_whole
 from jaxfit.foundation.limits import CONFIG_BYTES
 from jaxfit.foundation.reading import json_values, read_file
 from jaxfit.model.bird import Bird
+from jaxfit.view.report.behaviour import Behaviour
 from jaxfit.view.report.contents import gather
 from jaxfit.view.report.page import Measured, page, report_pictures
 
@@ -39,8 +43,9 @@ def write_report(
     video: Path | None,
     force: bool = False,
     measured: Sequence[Measured] = (),
+    describe: Callable[[], Behaviour | None] | None = None,
 ) -> None:
-    """Write the report of a result as one HTML page without links to other files.
+    """Write the report of a result as one HTML page that needs no other file.
 
     Args:
         path: file to write.
@@ -52,6 +57,7 @@ def write_report(
         video: the footage; None writes a report without pictures.
         force: draw also on footage that is not the footage of the result.
         measured: metrics against a known truth.
+        describe: returns what the birds do, whose bouts are links to the footage. None writes no section.
 
     Raises:
         InputError: the footage does not belong to the result, or the file cannot be written.
@@ -61,7 +67,26 @@ def write_report(
     if video is not None and solution.valid.any():
         filmed, lens = as_filmed(folder, solution, bird)
         pictures = report_pictures(filmed, bird, video, observations, force, lens)
-    write_whole(path, page(report, pictures, measured).encode())
+    behaviour = None if describe is None else describe()
+    film = None if video is None else film_address(video, path)
+    write_whole(path, page(report, pictures, measured, behaviour, film).encode())
+
+
+def film_address(film: Path, page: Path) -> str | None:
+    """Return the address of a film as a page links to it: relative to the page, where possible.
+
+    Args:
+        film: the footage. A folder of pictures has no times that a link could name: None.
+        page: the file of the page.
+    """
+    if not film.is_file():
+        return None
+    film = film.absolute()
+    try:
+        relative = os.path.relpath(film, page.absolute().parent)
+    except ValueError:  # another drive of Windows
+        return film.as_uri()
+    return quote(Path(relative).as_posix())
 
 
 def report_of_result(
@@ -70,6 +95,7 @@ def report_of_result(
     out: str | Path | None = None,
     overwrite: bool = False,
     force: bool = False,
+    describe: Callable[[Path], Behaviour | None] | None = None,
 ) -> Path:
     """Write the report of a result folder.
 
@@ -79,6 +105,7 @@ def report_of_result(
         out: file to write; None takes `report.html` in the folder of the result.
         overwrite: replace an existing file. Without `out`, an earlier report of the result is always replaced.
         force: draw also on footage that is not the footage of the result.
+        describe: returns what the birds of a result folder do; None writes no such section.
 
     Returns:
         The written file.
@@ -103,7 +130,9 @@ def report_of_result(
     content = {key: each.value for key, each in content.items()}
     if video is not None and content.get("photographs"):
         raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
-    write_report(path, solution, bird, observations, content, config, folder, _footage(content, video), force)
+    footage = _footage(content, video)
+    own = None if describe is None else partial(describe, folder)
+    write_report(path, solution, bird, observations, content, config, folder, footage, force, describe=own)
     return path
 
 

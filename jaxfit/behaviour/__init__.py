@@ -1,0 +1,1 @@
+"""What birds do: features of every frame, bouts of behaviour, time budgets."""
