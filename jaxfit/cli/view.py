@@ -1,0 +1,73 @@
+"""`view`: film, birds and timeline in a page of the browser."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import webbrowser
+from pathlib import Path
+
+from jaxfit.cli.results import frame_range
+from jaxfit.cli.tables import show
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.extras import require_extra
+from jaxfit.foundation.progress import terminal
+
+
+def view(options: argparse.Namespace) -> None:
+    """Serve the page until Ctrl+C, or save the page."""
+    from jaxfit.data.formats.recognise import read_observations
+    from jaxfit.export.result import open_result
+    from jaxfit.video.reader import probe_video
+    from jaxfit.view.overlay import check_belongs
+    from jaxfit.viewer.saved import save_page
+    from jaxfit.viewer.shown import Shown
+
+    frames, video = frame_range(options.frames), options.video
+    observations = None if options.observations is None else read_observations(options.observations)
+
+    def opened(folder: Path, seen=None) -> Shown:
+        return Shown(folder, open_result(folder, None, frames, options.fps), seen, options.camera)
+
+    results = [opened(folder, observations if n == 0 else None) for n, folder in enumerate(options.results)]
+    if video is None and results[0].exported.video is not None and results[0].exported.video.exists():
+        video = results[0].exported.video
+    if video is None:
+        show("without the film: --video shows it beside the birds")
+    else:
+        for each in results:
+            check_belongs(each.solution, None, video, probe_video(video), options.force)
+    if options.save is not None:
+        saved = save_page(results, video, options.save, options.overwrite, terminal)
+        for what in saved.left_out:
+            show(f"left out: {what}")
+        show(f"{saved.path} ({saved.bytes / 1e6:.2f} MB): open it in a browser")
+        return
+    require_extra("view", "jaxfit view", "starlette", "uvicorn")
+    from jaxfit.viewer.server import Viewer, listening, serve
+    from jaxfit.viewer.session import Session
+
+    session = None
+    if len(results) == 1:
+        edits = options.edits or options.results[0].resolve().with_name(f"{options.results[0].resolve().name}.edits")
+        session = Session(options.results[0], edits, options.observations, video)
+    elif options.edits is not None:
+        raise InputError("--edits", "corrects one result, and several are given", "give one result")
+    sock = listening(options.port)
+    serve(Viewer(results, video, session, opened), sock, _started(not options.no_browser))
+
+
+def _started(open_browser: bool):
+    def started(address: str) -> None:
+        show(f"{address}")
+        show("open this address in a browser of this computer; Ctrl+C ends the viewer")
+        if open_browser and has_display():
+            webbrowser.open(address)
+
+    return started
+
+
+def has_display() -> bool:
+    """Whether this computer can show a browser."""
+    return sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))

@@ -1,0 +1,309 @@
+// The film with outlines, keypoints and error ellipses of all birds.
+// @ts-check
+import { filmAddress } from "viewer/data";
+
+/** @typedef {import("viewer/data").Packed} Packed */
+/** @typedef {import("viewer/data").ResultFacts} ResultFacts */
+
+const MISSING = -32768;
+const CACHE_BYTES = 250e6;
+
+/** The pictures of the film: a video element, or single pictures of the server. */
+export class Film {
+  /** @param {import("viewer/data").FilmFacts} facts @param {(number | null)[]} times_s @param {number[]} frames */
+  constructor(facts, times_s, frames) {
+    this.frames = frames;
+    this.times_s = /** @type {number[]} */ (facts.times_s ?? times_s);
+    this.pictures = facts.pictures;
+    /** @type {HTMLVideoElement | null} */
+    this.video = null;
+    /** @type {CanvasImageSource | null} */
+    this.picture = null;
+    this.problem = "";
+    /** Pictures that were shown last, so that scrubbing to and fro does not wait for the decoder. @type {Map<number, ImageBitmap>} */
+    this.shown = new Map();
+    this.source = this.times_s.every((time) => time !== null) ? facts.source : null;
+  }
+
+  /** Opens the film. Where the browser cannot play it, single pictures take its place. */
+  async open() {
+    if (this.source === null) return;
+    const video = document.createElement("video");
+    video.muted = true;
+    video.preload = "auto";
+    video.playsInline = true;
+    video.src = await filmAddress(this.source);
+    const opened = await new Promise((done) => {
+      video.onloadeddata = () => done(true);
+      video.onerror = () => done(false);
+    });
+    if (opened) this.video = video;
+    else if (!this.pictures) this.problem = "The browser cannot play the film.";
+  }
+
+  /** Middle of the time in which a frame is shown. @param {number} i position of the frame */
+  middle(i) {
+    const next = this.times_s[i + 1] ?? this.times_s[i] + (i > 0 ? this.times_s[i] - this.times_s[i - 1] : 0.04);
+    return (this.times_s[i] + next) / 2;
+  }
+
+  /** Moves the video to a frame. @param {HTMLVideoElement} video @param {number} i position of the frame */
+  async move(video, i) {
+    if (video.readyState >= 2 && Math.abs(video.currentTime - this.middle(i)) < 1e-4) return;
+    await new Promise((done) => {
+      video.onseeked = done;
+      video.currentTime = this.middle(i);
+    });
+  }
+
+  /** Shows a frame; resolves when its picture is there. @param {number} i position of the frame */
+  async seek(i) {
+    const video = this.video, known = this.shown.get(i);
+    if (known) {
+      this.shown.delete(i); // the newest is last
+      this.shown.set(i, known);
+      this.picture = known;
+      return;
+    }
+    if (video) {
+      await this.move(video, i);
+      this.picture = await createImageBitmap(video);
+      this.shown.set(i, this.picture);
+      const most = Math.max(CACHE_BYTES / (4 * video.videoWidth * video.videoHeight), 2);
+      for (const [old, picture] of this.shown) {
+        if (this.shown.size <= most) break;
+        this.shown.delete(old);
+        picture.close();
+      }
+      return;
+    }
+    if (!this.pictures) return;
+    const image = new Image();
+    image.src = `frames/${this.frames[i]}`;
+    try {
+      await image.decode();
+      this.picture = image;
+      this.problem = "";
+    } catch {
+      this.problem = `The film has no picture of frame ${this.frames[i]}.`;
+    }
+  }
+}
+
+/** One canvas with the film and the birds of a result. */
+export class FilmView {
+  /** @param {HTMLElement} parent @param {ResultFacts} facts @param {(track: number, more: boolean) => void} select */
+  constructor(parent, facts, select) {
+    this.facts = facts;
+    this.canvas = document.createElement("canvas");
+    this.message = document.createElement("p");
+    this.message.className = "message";
+    parent.append(this.canvas, this.message);
+    /** @type {Packed | null} */
+    this.outlines = null;
+    this.redraw = () => {};
+    this.t = -1;
+    this.zoom = 1;
+    /** The point of the film in the middle of the canvas. @type {[number, number]} */
+    this.centre = [facts.size_px[0] / 2, facts.size_px[1] / 2];
+    this.watch(select);
+  }
+
+  /** @param {(track: number, more: boolean) => void} select */
+  watch(select) {
+    const { canvas } = this;
+    /** @type {{x: number, y: number, moved: boolean} | null} */
+    let drag = null;
+    canvas.addEventListener("pointerdown", (event) => {
+      drag = { x: event.clientX, y: event.clientY, moved: false };
+      canvas.setPointerCapture(event.pointerId);
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      if (!drag || this.zoom === 1) return;
+      const { scale, ratio } = this.placement();
+      drag.moved ||= Math.hypot(event.clientX - drag.x, event.clientY - drag.y) > 4;
+      if (!drag.moved) return;
+      this.centre = [this.centre[0] - ((event.clientX - drag.x) * ratio) / scale, this.centre[1] - ((event.clientY - drag.y) * ratio) / scale];
+      drag = { x: event.clientX, y: event.clientY, moved: true };
+      this.redraw();
+    });
+    canvas.addEventListener("pointerup", (event) => {
+      const n = drag && !drag.moved ? this.birdAt(event) : -1;
+      drag = null;
+      if (n >= 0) select(this.facts.tracks[n].id, event.shiftKey);
+    });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      const [x, y] = this.inFilm(event), before = this.zoom;
+      this.zoom = Math.min(Math.max(before * Math.exp(-event.deltaY / 400), 1), 20);
+      // the point under the pointer stays
+      const share = 1 - before / this.zoom;
+      this.centre = [this.centre[0] + (x - this.centre[0]) * share, this.centre[1] + (y - this.centre[1]) * share];
+      this.redraw();
+    }, { passive: false });
+    canvas.addEventListener("dblclick", () => {
+      this.zoom = 1;
+      this.redraw();
+    });
+  }
+
+  /** Scale and offset from film pixels to canvas pixels, and canvas pixels per pixel of the page. */
+  placement() {
+    const [width, height] = this.facts.size_px, { canvas } = this;
+    const scale = Math.min(canvas.width / width, canvas.height / height) * this.zoom;
+    if (this.zoom === 1) this.centre = [width / 2, height / 2];
+    const ratio = canvas.width / Math.max(canvas.getBoundingClientRect().width, 1);
+    return { scale, ratio, x: canvas.width / 2 - this.centre[0] * scale, y: canvas.height / 2 - this.centre[1] * scale };
+  }
+
+  /** The point of the film under the pointer. @param {MouseEvent} event */
+  inFilm(event) {
+    const box = this.canvas.getBoundingClientRect(), { scale, ratio, x, y } = this.placement();
+    return [((event.clientX - box.left) * ratio - x) / scale, ((event.clientY - box.top) * ratio - y) / scale];
+  }
+
+  /** Moves the chosen bird to the middle. @param {Packed} poses @param {number} t @param {Set<number>} selected */
+  follow(poses, t, selected) {
+    const n = this.facts.tracks.findIndex((track) => selected.has(track.id));
+    const [, F, K] = poses.shapes.keypoints, { valid, keypoints } = poses.arrays, step = poses.facts.step_px;
+    if (n < 0 || !valid[n * F + t]) return;
+    let [left, top, right, bottom] = [Infinity, Infinity, -Infinity, -Infinity];
+    for (let k = (n * F + t) * K; k < (n * F + t + 1) * K; k++) {
+      left = Math.min(left, keypoints[2 * k] * step);
+      right = Math.max(right, keypoints[2 * k] * step);
+      top = Math.min(top, keypoints[2 * k + 1] * step);
+      bottom = Math.max(bottom, keypoints[2 * k + 1] * step);
+    }
+    if (this.zoom === 1) this.zoom = Math.min(Math.max((0.4 * this.facts.size_px[1]) / Math.max(right - left, bottom - top, 1), 1.01), 20);
+    this.centre = [(left + right) / 2, (top + bottom) / 2];
+  }
+
+  /**
+   * Draws a frame.
+   * @param {CanvasImageSource | null} picture
+   * @param {number} t position of the frame in its parts, −1 if the result lacks the frame
+   * @param {Packed | null} poses
+   * @param {Packed | null} outlines
+   * @param {Set<number>} selected ids of tracks
+   * @param {boolean} points whether keypoints are drawn
+   * @param {boolean} follow whether the chosen bird is in the middle
+   */
+  draw(picture, t, poses, outlines, selected, points, follow) {
+    this.redraw = () => this.draw(picture, t, poses, outlines, selected, points, follow);
+    const box = this.canvas.getBoundingClientRect(), ratio = Math.min(window.devicePixelRatio, 2);
+    const width = Math.max(1, Math.round(box.width * ratio)), height = Math.max(1, Math.round(box.height * ratio));
+    if (this.canvas.width !== width || this.canvas.height !== height) {
+      this.canvas.width = width;
+      this.canvas.height = height;
+    }
+    const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d"));
+    if (follow && poses && t >= 0) this.follow(poses, t, selected);
+    const { scale, x, y } = this.placement(), [w, h] = this.facts.size_px;
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    context.clearRect(0, 0, width, height);
+    if (picture) context.drawImage(picture, x, y, w * scale, h * scale);
+    context.setTransform(scale, 0, 0, scale, x, y);
+    this.outlines = t < 0 ? null : outlines;
+    this.t = t;
+    if (t < 0) return;
+    if (outlines) this.drawOutlines(context, outlines, t, selected, scale);
+    if (poses && points) this.drawPoints(context, poses, t, selected, scale);
+  }
+
+  /** Paths of the birds at the present frame, [position of the track, path]. @param {Packed} outlines @param {number} t */
+  *paths(outlines, t) {
+    const { poses, lengths, points } = outlines.arrays, step = outlines.facts.step_px, count = outlines.facts.frames;
+    let start = 0;
+    for (let i = 0; i < poses.length; start += lengths[i], i++) {
+      if (poses[i] % count !== t) continue;
+      const path = new Path2D();
+      for (let k = start; k < start + lengths[i]; k++) path.lineTo(points[2 * k] * step + 0.5, points[2 * k + 1] * step + 0.5);
+      path.closePath();
+      yield /** @type {[number, Path2D]} */ ([Math.floor(poses[i] / count), path]);
+    }
+  }
+
+  /** @param {CanvasRenderingContext2D} context @param {Packed} outlines @param {number} t @param {Set<number>} selected @param {number} scale */
+  drawOutlines(context, outlines, t, selected, scale) {
+    for (const [n, path] of this.paths(outlines, t)) {
+      const { id, colour } = this.facts.tracks[n];
+      context.strokeStyle = colour;
+      context.lineWidth = (selected.has(id) ? 3.5 : 2) / scale;
+      context.stroke(path);
+      if (selected.has(id)) {
+        context.fillStyle = `${colour}30`;
+        context.fill(path);
+      }
+    }
+  }
+
+  /** @param {CanvasRenderingContext2D} context @param {Packed} poses @param {number} t @param {Set<number>} selected @param {number} scale */
+  drawPoints(context, poses, t, selected, scale) {
+    const { keypoints, detected, regions, valid } = poses.arrays, step = poses.facts.step_px;
+    const [N, F, K] = poses.shapes.keypoints;
+    for (let n = 0; n < N; n++) {
+      if (!valid[n * F + t]) continue;
+      const { id, colour } = this.facts.tracks[n], first = (n * F + t) * K;
+      const at = (/** @type {any} */ array, /** @type {number} */ k) => [array[2 * (first + k)] * step, array[2 * (first + k) + 1] * step];
+      if (regions && selected.has(id)) this.drawRegions(context, poses, first, colour, scale);
+      if (selected.has(id)) {
+        context.strokeStyle = "#ffffffa0";
+        context.lineWidth = 1 / scale;
+        for (const [a, b] of this.facts.skeleton) {
+          context.beginPath();
+          context.moveTo(...pair(at(keypoints, a)));
+          context.lineTo(...pair(at(keypoints, b)));
+          context.stroke();
+        }
+      }
+      const radius = (selected.has(id) ? 2.6 : 1.5) / scale;
+      for (let k = 0; k < K; k++) {
+        if (detected && selected.has(id) && detected[2 * (first + k)] !== MISSING) {
+          context.strokeStyle = "#ffeb3c";
+          context.lineWidth = 1.3 / scale;
+          circle(context, at(detected, k), 2 * radius);
+          context.stroke();
+        }
+        context.fillStyle = "#fff";
+        circle(context, at(keypoints, k), radius);
+        context.fill();
+      }
+    }
+  }
+
+  /** @param {CanvasRenderingContext2D} context @param {Packed} poses @param {number} first @param {string} colour @param {number} scale */
+  drawRegions(context, poses, first, colour, scale) {
+    const { keypoints, regions } = poses.arrays, step = poses.facts.step_px, K = poses.shapes.keypoints[2];
+    context.strokeStyle = colour;
+    context.lineWidth = 1 / scale;
+    for (let k = first; k < first + K; k++) {
+      if (regions[3 * k] === MISSING) continue;
+      const radius = this.facts.region_radius / 64;
+      context.beginPath();
+      context.ellipse(keypoints[2 * k] * step, keypoints[2 * k + 1] * step, regions[3 * k] * radius,
+        regions[3 * k + 1] * radius, (regions[3 * k + 2] * 0.01 * Math.PI) / 180, 0, 2 * Math.PI);
+      context.stroke();
+    }
+  }
+
+  /** Position of the track under the pointer, −1 for none. @param {MouseEvent} event */
+  birdAt(event) {
+    const [px, py] = this.inFilm(event);
+    const context = /** @type {CanvasRenderingContext2D} */ (this.canvas.getContext("2d"));
+    context.setTransform(1, 0, 0, 1, 0, 0);
+    let found = -1;
+    if (this.outlines) {
+      for (const [n, path] of this.paths(this.outlines, this.t)) if (context.isPointInPath(path, px, py)) found = n;
+    }
+    return found;
+  }
+}
+
+/** @param {number[]} point @returns {[number, number]} */
+const pair = (point) => [point[0], point[1]];
+
+/** @param {CanvasRenderingContext2D} context @param {number[]} at @param {number} radius */
+function circle(context, at, radius) {
+  context.beginPath();
+  context.arc(at[0], at[1], radius, 0, 2 * Math.PI);
+}

@@ -1,0 +1,165 @@
+"""A page to send: one HTML file, or a folder, that opens without jaxfit and without a network."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import check_new_file, check_replaceable, new_folder, write_whole
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.viewer.film import PLAYED, write_copy
+from jaxfit.viewer.page import saved_index
+from jaxfit.viewer.shown import Shown
+
+LARGEST_FILE = 30_000_000
+"""Bytes of a page in one file."""
+WIDTHS = 1280, 960, 640, 480
+"""Widths of the copy of the film that are tried until the page is small enough, pixels."""
+CURVES = "confidence", "residual", "body_pitch", "speed", "wing_spread", "neighbour_distance"
+"""Values over time that a saved page holds, where the result has them."""
+INDEX = "index.html"
+
+
+class Saved(NamedTuple):
+    """A written page."""
+
+    path: Path
+    bytes: int
+    left_out: tuple[str, ...]
+    """What the page does not show, for people."""
+
+
+def save_page(
+    results: Sequence[Shown], video: Path | None, out: Path, overwrite: bool = False, progress: ProgressTask = silent
+) -> Saved:
+    """Write a page with everything that it shows.
+
+    A name that ends in `.html` becomes one file of at most `LARGEST_FILE` bytes: the film is made smaller until it
+    fits, and left out if it does not fit at all. Any other name becomes a folder, with the film as it is where browsers
+    play its format.
+
+    Args:
+        results: what the page shows.
+        video: the film; None shows the birds in 3D only.
+        out: the file or the folder.
+        overwrite: replace an earlier page.
+        progress: reports parts.
+
+    Raises:
+        InputError: the poses alone are too large for one file, the film cannot be read, or the page cannot be written.
+    """
+    whole = out.suffix.lower() == ".html"
+    if whole:
+        check_new_file(out, overwrite)
+    else:
+        check_replaceable(out, overwrite, INDEX)
+    return (_save_file if whole else _save_folder)(results, video, out, overwrite, progress)
+
+
+def _save_file(results: Sequence[Shown], video: Path | None, out: Path, _: bool, progress: ProgressTask) -> Saved:
+    left_out: list[str] = [*_ALWAYS]
+    entries = [_element(path, content) for path, content in _arrays(results, left_out, progress)]
+    film, copy = None, None
+    free = LARGEST_FILE - sum(map(len, entries)) - len(saved_index("")) - 2 * len(json.dumps(_facts(results, None, [])))
+    if free < 0:
+        problem = f"would have {(LARGEST_FILE - free) / 1e6:.0f} MB without a film, more than {LARGEST_FILE / 1e6:.0f}"
+        raise InputError(out, problem, "give --frames A:B, or a folder in place of a file")
+    with tempfile.TemporaryDirectory() as folder:
+        for width in WIDTHS if video is not None else ():
+            film = Path(folder) / f"{width}.mp4"
+            times = write_copy(_video(video), results[0].solution.frame_index, film, width, progress)
+            if film.stat().st_size * 4 / 3 < free:
+                text = base64.b64encode(film.read_bytes()).decode()
+                entries.append(f'<script type="text/plain" data-path="film" data-type="video/mp4">{text}</script>')
+                copy = {"source": "film", "times_s": times.tolist(), "pictures": False}
+                if width < results[0].size_px[0]:
+                    left_out.append(f"the film in its full size: it is {width} pixels wide here")
+                break
+        else:
+            if video is not None:
+                left_out.append(f"the film, with which the page would have more than {LARGEST_FILE / 1e6:.0f} MB")
+    facts = json.dumps(_facts(results, copy, left_out)).encode()
+    content = saved_index("\n".join([_element("facts", facts), *entries])).encode()
+    write_whole(out, content)
+    return Saved(out, len(content), tuple(left_out))
+
+
+def _save_folder(
+    results: Sequence[Shown], video: Path | None, out: Path, overwrite: bool, progress: ProgressTask
+) -> Saved:
+    left_out: list[str] = [*_ALWAYS]
+    with new_folder(out, overwrite, marker=INDEX) as part:
+        (part / "data").mkdir()
+        for path, content in _arrays(results, left_out, progress):
+            call = f"jaxfitSaved({json.dumps(path)}, {json.dumps(_packed(content))})\n"
+            write_whole(part / "data" / f"{path.replace('/', '-')}.js", call.encode())
+        copy = None
+        if video is not None:
+            name, times = "film.mp4", None
+            if not video.is_dir() and video.suffix.lower() in PLAYED and np.isfinite(results[0].times_s).all():
+                name = f"film{video.suffix.lower()}"
+                shutil.copyfile(video, part / name)
+            else:
+                frames, width = results[0].solution.frame_index, results[0].size_px[0]
+                times = write_copy(video, frames, part / name, width, progress).tolist()
+            copy = {"source": name, "times_s": times, "pictures": False}
+        facts = _element("facts", json.dumps(_facts(results, copy, left_out)).encode())
+        write_whole(part / INDEX, saved_index(facts).encode())
+    size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
+    return Saved(out / INDEX, size, tuple(left_out))
+
+
+_ALWAYS = ("corrections, which need `jaxfit view`",)
+
+
+def _video(video: Path | None) -> Path:
+    assert video is not None
+    return video
+
+
+def _facts(results: Sequence[Shown], film: dict[str, Any] | None, left_out: Sequence[str]) -> dict[str, Any]:
+    facts = [each.facts() for each in results]
+    for each in facts:
+        each["values"] = [value for value in each["values"] if value["name"] in CURVES]
+    notes = [f"This saved page leaves out: {'; '.join(left_out)}."] if left_out else []
+    return {"results": facts, "film": film, "corrections": None, "notes": notes}
+
+
+def _arrays(results: Sequence[Shown], left_out: list[str], progress: ProgressTask) -> Iterator[tuple[str, bytes]]:
+    """Yield path and content of all arrays that the page reads."""
+    with progress("Saving the page", sum(each.parts for each in results)) as report_progress:
+        for number, result in enumerate(results):
+            readers: dict[str, Callable[[], bytes]] = {"rig": result.rig, "flags": result.flags}
+            known = [each["name"] for each in result.facts()["values"]] if number == 0 else []
+            for name in known:
+                if name in CURVES:
+                    readers[f"values/{name}"] = partial(result.values, name)
+            for name, read in readers.items():
+                try:
+                    yield f"results/{number}/{name}", read()
+                except InputError as error:
+                    left_out.append(f"the curve of {error}")
+            for part in range(result.parts):
+                yield f"results/{number}/poses/{part}", result.part(part)
+                yield f"results/{number}/outlines/{part}", result.outlines(part)
+                report_progress(1, f"part {part + 1}")
+    further = [each["name"].replace("_", " ") for each in results[0].facts()["values"] if each["name"] not in CURVES]
+    left_out.append(f"{len(further)} further curves, which `jaxfit view` shows")
+
+
+def _packed(content: bytes) -> str:
+    return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
+
+
+def _element(path: str, content: bytes) -> str:
+    return f'<script type="text/plain" data-path="{path}">{_packed(content)}</script>'

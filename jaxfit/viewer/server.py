@@ -1,0 +1,276 @@
+"""The server of the page. It answers only this computer, only with the token of its address, and takes no path."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import socket
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.reading import parse_json
+from jaxfit.viewer.film import PLAYED, frame_picture
+from jaxfit.viewer.page import FILES, index, policy
+from jaxfit.viewer.session import Session
+from jaxfit.viewer.shown import Shown
+
+HOST = "127.0.0.1"
+LARGEST_BODY = 1 << 20
+"""Bytes that the page may send at once."""
+BINARY = "application/octet-stream"
+
+
+@dataclass
+class Viewer:
+    """What one page shows: results of one film, and the corrections of the first result."""
+
+    results: list[Shown]
+    video: Path | None
+    session: Session | None
+    open_result: Callable[[Path], Shown]
+    """Opens the new result after corrections."""
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the page needs first."""
+        first = self.results[0].solution.frame_index
+        film = None
+        if self.video is not None:
+            played = not self.video.is_dir() and self.video.suffix.lower() in PLAYED
+            film = {"source": "film" if played else None, "times_s": None, "pictures": True}
+        corrections = None
+        if self.session is not None:
+            corrections = {"edits": [str(edit) for edit in self.session.edits], "file": str(self.session.edits_path)}
+        return {
+            "results": [each.facts() for each in self.results],
+            "film": film,
+            "corrections": corrections,
+            "first_frame": int(first[0]),
+        }
+
+
+def application(viewer: Viewer, port: int) -> ASGIApp:
+    """Return the server of a page as an ASGI application.
+
+    Args:
+        viewer: what the page shows.
+        port: the port that the server listens on, which belongs to the address of the page.
+    """
+
+    async def facts(request: Request) -> Response:
+        return JSONResponse(await run_in_threadpool(viewer.facts))
+
+    async def binary(request: Request) -> Response:
+        result = _result(viewer, request)
+        kind, numbered = request.path_params["kind"], request.path_params.get("number")
+        content = await run_in_threadpool(_content, result, kind, numbered)
+        return Response(content, media_type=BINARY)
+
+    async def film(request: Request) -> Response:
+        if viewer.video is None or viewer.video.is_dir():
+            raise HTTPException(404)
+        return FileResponse(viewer.video)  # answers byte ranges
+
+    async def picture(request: Request) -> Response:
+        if viewer.video is None:
+            raise HTTPException(404)
+        number = request.path_params["number"]
+        return Response(await run_in_threadpool(frame_picture, viewer.video, number), media_type="image/jpeg")
+
+    async def change(request: Request) -> Response:
+        session = viewer.session
+        if session is None:
+            raise InputError("this page", "takes no corrections", "open one result, without --save")
+        sent = parse_json((await _body(request)).decode("utf-8", "replace"), "the page")
+        action = request.path_params["action"]
+        if action == "edits":
+            await run_in_threadpool(session.set_edits, _list_of(sent, "edits", str))
+            return JSONResponse({})
+        if action == "refit":
+            work = session.refit(lambda out: viewer.results.append(viewer.open_result(out)))
+        elif action == "mark":
+            work = session.mark(_list_of(sent, "frames", int))
+        else:
+            raise HTTPException(404)
+        return JSONResponse(work.entries())
+
+    async def work(request: Request) -> Response:
+        known = viewer.session is not None and viewer.session.work is not None
+        return JSONResponse(viewer.session.work.entries() if known else {"done": True, "kind": ""})  # type: ignore[union-attr]
+
+    inside = Starlette(
+        routes=[
+            Route("/", _page),
+            Route("/page/{name}", _page_file),
+            Route("/facts", facts),
+            Route("/results/{result:int}/{kind}", binary),
+            Route("/results/{result:int}/{kind}/{number}", binary),
+            Route("/film", film),
+            Route("/frames/{number:int}", picture),
+            Route("/work", work),
+            Route("/change/{action}", change, methods=["POST"]),
+        ],
+        exception_handlers={InputError: _refused},
+    )
+    return Guard(inside, viewer.token, port)
+
+
+class Guard:
+    """Passes on what the page of this server asks, and rejects all else.
+
+    A request needs the token as the first part of its path. Its `Host` must be this computer, so that a foreign name
+    that leads here (DNS rebinding) fails. An `Origin` or `Sec-Fetch-Site` of another page fails too.
+    """
+
+    def __init__(self, inside: ASGIApp, token: str, port: int):
+        self._inside, self._token = inside, token
+        self._hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http":
+            if scope["type"] == "lifespan":
+                await self._inside(scope, receive, send)
+            return
+        problem = self._problem(scope)
+        if problem is not None:
+            await PlainTextResponse(problem, 403)(scope, receive, send)
+            return
+
+        async def guarded(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message["headers"], *_HEADERS]
+            await send(message)
+
+        prefix = f"/{self._token}"
+        path = scope["path"].removeprefix(prefix)
+        await self._inside({**scope, "path": path, "raw_path": path.encode(), "root_path": ""}, receive, guarded)
+
+    def _problem(self, scope: Scope) -> str | None:
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        if headers.get("host") not in self._hosts:
+            return "jaxfit answers only this computer"
+        if "origin" in headers and headers["origin"] not in {f"http://{host}" for host in self._hosts}:
+            return "jaxfit answers only its own page"
+        if headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
+            return "jaxfit answers only its own page"
+        token = scope["path"].split("/")[1] if scope["path"].startswith("/") else ""
+        if not hmac.compare_digest(token.encode(), self._token.encode()) or scope["path"].count("/") < 2:
+            return "the address has no token, or the token of another run: use the address that jaxfit printed"
+        return None
+
+
+_HEADERS = [
+    (b"cache-control", b"no-store"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"x-frame-options", b"DENY"),
+]
+
+
+async def _page(request: Request) -> Response:
+    return Response(index(), media_type="text/html", headers={"Content-Security-Policy": policy()})
+
+
+async def _page_file(request: Request) -> Response:
+    name = request.path_params["name"]
+    if name not in FILES:
+        raise HTTPException(404)
+    return Response(FILES[name].read_bytes(), media_type=_media_type(name))
+
+
+def _result(viewer: Viewer, request: Request) -> Shown:
+    number = request.path_params["result"]
+    if not number < len(viewer.results):
+        raise HTTPException(404)
+    return viewer.results[number]
+
+
+def _content(result: Shown, kind: str, argument: str | None) -> bytes:
+    """Return arrays of a result: `rig`, `flags`, `poses/3`, `outlines/3`, `values/speed`."""
+    if kind in ("rig", "flags") and argument is None:
+        return result.rig() if kind == "rig" else result.flags()
+    if kind in ("poses", "outlines") and argument is not None and argument.isdecimal() and len(argument) < 9:
+        return result.part(int(argument)) if kind == "poses" else result.outlines(int(argument))
+    names = {each["name"] for each in result.facts()["values"]}
+    if kind == "values" and argument in names:
+        return result.values(argument)
+    raise HTTPException(404)
+
+
+async def _body(request: Request) -> bytes:
+    content = b""
+    async for part in request.stream():
+        content += part
+        if len(content) > LARGEST_BODY:
+            raise HTTPException(413)
+    return content
+
+
+def _list_of(sent: Any, name: str, kind: type) -> list[Any]:
+    values = sent.get(name) if isinstance(sent, dict) else None
+    if not isinstance(values, list) or not all(type(value) is kind for value in values):
+        raise InputError("the page", f"sent no list of {name}", "reload the page")
+    return values
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    return JSONResponse({"problem": str(error)}, 400)
+
+
+def _media_type(name: str) -> str:
+    kinds = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
+    return kinds.get(Path(name).suffix, "text/plain")
+
+
+def listening(port: int | None) -> socket.socket:
+    """Return a socket that listens on a port of this computer only; None takes a free port.
+
+    Raises:
+        InputError: the port is in use, or may not be used.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    if sys.platform != "win32":  # there, the option would share a port that is in use
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        sock.bind((HOST, port or 0))
+        sock.listen()
+    except (OSError, OverflowError) as error:
+        sock.close()
+        problem = f"is {port}, which cannot be used: {getattr(error, 'strerror', None) or error}"
+        raise InputError("--port", problem, "leave --port out, which takes a free port") from error
+    return sock
+
+
+def serve(viewer: Viewer, sock: socket.socket, started: Callable[[str], None]) -> None:
+    """Serve a page until the process is interrupted.
+
+    Args:
+        viewer: what the page shows.
+        sock: where to listen, from `listening`.
+        started: is called with the address of the page when the server answers.
+    """
+    port = sock.getsockname()[1]
+    config = uvicorn.Config(application(viewer, port), log_level="warning", lifespan="off", server_header=False)
+
+    class Server(uvicorn.Server):
+        async def startup(self, sockets: Any = None) -> None:
+            await super().startup(sockets)
+            started(f"http://{HOST}:{port}/{viewer.token}/")
+
+    Server(config).run(sockets=[sock])

