@@ -13,13 +13,14 @@ export JAXFIT_REFERENCE
 # Some machines set this variable. Every process of the tests would then compile all imported modules again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: install test extended lint bench demo notebooks clean
+.PHONY: install test extended portable lint bench demo notebooks clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make install    the package with its compiled kernels, in $(VENV)"
 	@echo "make test       the test suite (under eight minutes on two cores)"
 	@echo "make extended   the slow tests, and those that install packages in environments of their own"
+	@echo "make portable   the kernels with every compiler that is installed, sanitizers and emulators"
 	@echo "make lint       formatting, lint and types"
 	@echo "make bench      benchmarks against the committed baseline"
 	@echo "make demo       simulate a short scene, reconstruct it from its footage, show and export it"
@@ -45,6 +46,10 @@ test: install
 
 extended: install
 	$(UNOPTIMISED) $(PYTEST) -m extended
+	$(BIN)/python tests/support/portable.py
+
+portable: install
+	$(BIN)/python tests/support/portable.py
 
 lint: install
 	$(BIN)/ruff check jaxfit tests notebooks

@@ -16,10 +16,12 @@ struct Faces {
   float x0[kLanes], y0[kLanes];                      // first vertex, in px, and origin of the other quantities
   float tx[3][kLanes], ty[3][kLanes];                // unit tangents of the edges 01, 12, 20
   float shift[3][kLanes], half[3][kLanes];           // minus the middle's place along the tangent; half the length
+  float inverse[3][kLanes];                          // 1 / length
   float height[kLanes];                              // distance of vertex 0 from edge 12
   float reach[3][kLanes];                            // minus (blur radius + half the extent of a block across the edge)
   int32_t left[kLanes], right[kLanes], top[kLanes], bottom[kLanes];  // the blocks around the face, inclusive
   int32_t vertex[3][kLanes];
+  uint32_t near[kLanes];                             // the blocks that a face with one window reaches, as bits: blocks.h
   uint32_t visible;
   uint32_t pad[15];
 };
@@ -50,7 +52,7 @@ size_t workspace(const Mesh& mesh, Blur, int64_t size) {
   return sizeof(float) * (2 * l.vertices + l.products + l.open) + sizeof(Faces) * l.chunks;
 }
 
-INLINE Workspace carve(const Mesh& mesh, int64_t size, void* memory) {
+[[gnu::always_inline]] inline Workspace carve(const Mesh& mesh, int64_t size, void* memory) {
   const Layout l(mesh, size);
   float* p = static_cast<float*>(memory);
   Workspace ws;
@@ -63,7 +65,7 @@ INLINE Workspace carve(const Mesh& mesh, int64_t size, void* memory) {
   return ws;
 }
 
-INLINE void close(const Workspace& ws, int64_t column, int64_t row) {
+[[gnu::always_inline]] inline void close(const Workspace& ws, int64_t column, int64_t row) {
   ws.open[row * ws.row_bytes + column / 8] &= ~(1u << column % 8);
 }
 
@@ -74,7 +76,7 @@ struct Scale {
   float slope;   // -∂(p's exponent) / ∂(scaled distance), the constant factor of the gradient in px
 };
 
-INLINE Scale scale_of(Blur blur, int64_t size) {
+[[gnu::always_inline]] inline Scale scale_of(Blur blur, int64_t size) {
   const float k = __builtin_sqrtf(1.44269504088896340736f / blur.sigma);
   const float radius = blur.radius * k;
   return {k, radius < kNegligible ? radius : kNegligible, static_cast<float>(size), 2.f / (blur.sigma * k)};
@@ -95,7 +97,7 @@ bool load_vertices(const Mesh& mesh, Workspace& ws) {
 
 // Returns the stride of the order of the faces. It puts neighbouring faces far apart, so that every block soon meets a
 // face that covers it.
-INLINE int64_t stride_of(int64_t n) {
+[[gnu::always_inline]] inline int64_t stride_of(int64_t n) {
   int64_t stride = static_cast<int64_t>(static_cast<double>(n) * 0.6180339887498949);
   for (;; ++stride) {
     int64_t a = n, b = stride;
@@ -104,72 +106,59 @@ INLINE int64_t stride_of(int64_t n) {
   }
 }
 
-INLINE Vec clamp(Vec a, float low, float high) { return min(max(a, all(low)), all(high)); }
+// Prepares the faces from `at` on that fill a register; `gathered` holds x and y of their three corners.
+[[gnu::always_inline]] inline void set_up_part(Faces& f, int at, const float gathered[6][kLanes], Scale scale) {
+  const Vec x0 = load(gathered[0] + at), y0 = load(gathered[1] + at);
+  const Vec to_x[2] = {load(gathered[2] + at) - x0, load(gathered[4] + at) - x0};
+  const Vec to_y[2] = {load(gathered[3] + at) - y0, load(gathered[5] + at) - y0};
+  const Vec area = to_x[0] * to_y[1] - to_x[1] * to_y[0];
 
-INLINE void set_up_chunk(Faces& f, const Workspace& ws, Scale scale) {
-  alignas(64) float gathered[6][kLanes];
-  for (int i = 0; i < kLanes; ++i)
-    for (int v = 0; v < 3; ++v) {
-      gathered[2 * v][i] = ws.x[f.vertex[v][i]];
-      gathered[2 * v + 1][i] = ws.y[f.vertex[v][i]];
-    }
-  const Vec x0 = load(gathered[0]), y0 = load(gathered[1]);
-  Vec x1 = load(gathered[2]) - x0, y1 = load(gathered[3]) - y0;
-  Vec x2 = load(gathered[4]) - x0, y2 = load(gathered[5]) - y0;
-  Vec area = x1 * y2 - x2 * y1;
-
-  const Mask turned = all(0.f) > area;
-  const uint32_t swap = bits(turned);
-  for (int i = 0; i < kLanes; ++i)
-    if (swap >> i & 1) {
-      const int32_t v = f.vertex[1][i];
-      f.vertex[1][i] = f.vertex[2][i], f.vertex[2][i] = v;
-    }
-  const Vec x1_old = x1, y1_old = y1;
-  x1 = select(turned, x2, x1), y1 = select(turned, y2, y1);
-  x2 = select(turned, x1_old, x2), y2 = select(turned, y1_old, y2);
-  const Vec px_x[2] = {x1, x2}, px_y[2] = {y1, y2};
+  const Mask turned = greater(all(0.f), area);
+  for (uint32_t todo = bits(turned); todo; todo &= todo - 1) {
+    const int i = at + __builtin_ctz(todo);
+    const int32_t v = f.vertex[1][i];
+    f.vertex[1][i] = f.vertex[2][i];
+    f.vertex[2][i] = v;
+  }
   // The area is exactly 0 where two corners are equal, if the compiler does not fuse these products.
-  const Mask seen = abs(area) > all(kMinArea * 0.25f * scale.size * scale.size);
-  const Vec k = all(scale.k);
-  x1 = x1 * k, y1 = y1 * k, x2 = x2 * k, y2 = y2 * k, area = abs(area) * k * k;
-
-  store(f.x0, x0), store(f.y0, y0);
-  const Vec ax[3] = {all(0.f), x1, x2}, ay[3] = {all(0.f), y1, y2};
+  const Mask seen = greater(abs(area), all(kMinArea * 0.25f * scale.size * scale.size));
+  const Vec k = all(scale.k), zero = all(0.f);
+  const Vec x1 = select(turned, to_x[1], to_x[0]) * k, x2 = select(turned, to_x[0], to_x[1]) * k;
+  const Vec y1 = select(turned, to_y[1], to_y[0]) * k, y2 = select(turned, to_y[0], to_y[1]) * k;
+  const Vec ax[3] = {zero, x1, x2}, ay[3] = {zero, y1, y2};
+  store(f.x0 + at, x0);
+  store(f.y0 + at, y0);
   for (int i = 0; i < 3; ++i) {
     const int j = (i + 1) % 3;
     const Vec ex = ax[j] - ax[i], ey = ay[j] - ay[i];
     const Vec length = max(sqrt(fma(ex, ex, ey * ey)), all(kShortest));
     const Vec inverse = all(1.f) / length;
     const Vec tx = ex * inverse, ty = ey * inverse;
-    store(f.tx[i], tx), store(f.ty[i], ty);
-    store(f.half[i], length * all(0.5f));
-    store(f.shift[i], all(-0.5f) * fma(tx, ax[i] + ax[j], ty * (ay[i] + ay[j])));
-    store(f.reach[i], all(-scale.radius) - (abs(tx) + abs(ty)) * all(1.5f * scale.k));
-    if (i == 1) store(f.height, area * inverse);
+    store(f.tx[i] + at, tx);
+    store(f.ty[i] + at, ty);
+    store(f.half[i] + at, length * all(0.5f));
+    store(f.inverse[i] + at, inverse);
+    store(f.shift[i] + at, all(-0.5f) * fma(tx, ax[i] + ax[j], ty * (ay[i] + ay[j])));
+    store(f.reach[i] + at, all(-scale.radius) - (abs(tx) + abs(ty)) * all(1.5f * scale.k));
+    if (i == 1) store(f.height + at, abs(area) * k * k * inverse);
   }
 
   // The centre of pixel i is at i + 1/2.
-  const Vec margin = all(scale.radius / scale.k);
+  const Vec margin = all(scale.radius / scale.k), last = all(scale.size - 1);
   const Vec shift_low = margin + all(0.5f), shift_high = margin - all(0.5f);
-  const Vec zero = all(0.f);
-  const Vec low_x = x0 + min(zero, min(px_x[0], px_x[1])) - shift_low;
-  const Vec low_y = y0 + min(zero, min(px_y[0], px_y[1])) - shift_low;
-  const Vec high_x = x0 + max(zero, max(px_x[0], px_x[1])) + shift_high;
-  const Vec high_y = y0 + max(zero, max(px_y[0], px_y[1])) + shift_high;
-  const Vec last = all(scale.size - 1);
-  const Mask visible = seen &
-                       (low_x <= last) & (low_y <= last) & (zero <= high_x) & (zero <= high_y);
-  f.visible &= bits(visible);
+  const Vec low_x = x0 + min(zero, min(to_x[0], to_x[1])) - shift_low;
+  const Vec low_y = y0 + min(zero, min(to_y[0], to_y[1])) - shift_low;
+  const Vec high_x = x0 + max(zero, max(to_x[0], to_x[1])) + shift_high;
+  const Vec high_y = y0 + max(zero, max(to_y[0], to_y[1])) + shift_high;
+  const Mask inside = at_most(low_x, last) & at_most(low_y, last) & at_most(zero, high_x) & at_most(zero, high_y);
+  f.visible |= bits(seen & inside) << at;
 
-  alignas(64) float range[4][kLanes];
-  store(range[0], clamp(low_x, 0, scale.size - 1) * all(1.f / kBlock));
-  store(range[1], clamp(high_x, 0, scale.size - 1) * all(1.f / kBlock));
-  store(range[2], clamp(low_y, 0, scale.size - 1) * all(1.f / kBlock));
-  store(range[3], clamp(high_y, 0, scale.size - 1) * all(1.f / kBlock));
-  for (int i = 0; i < kLanes; ++i) {
-    f.left[i] = static_cast<int32_t>(range[0][i]), f.right[i] = static_cast<int32_t>(range[1][i]);
-    f.top[i] = static_cast<int32_t>(range[2][i]), f.bottom[i] = static_cast<int32_t>(range[3][i]);
+  const Vec range[4] = {low_x, high_x, low_y, high_y};
+  int32_t* blocks[4] = {f.left, f.right, f.top, f.bottom};
+  for (int i = 0; i < 4; ++i) {
+    alignas(64) float block[kWidth];
+    store(block, min(max(range[i], zero), last) * all(1.f / kBlock));
+    for (int n = 0; n < kWidth; ++n) blocks[i][at + n] = static_cast<int32_t>(block[n]);
   }
 }
 
@@ -178,15 +167,22 @@ void set_up_faces(const Mesh& mesh, Scale scale, Workspace& ws) {
   int64_t face = 0;
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
     Faces& f = ws.faces[c];
-    const int64_t rest = n - c * kLanes;
-    f.visible = rest >= kLanes ? 0xFFFFu : (1u << rest) - 1;
+    alignas(64) float gathered[6][kLanes];
     for (int i = 0; i < kLanes; ++i) {
-      int64_t id = face;
-      for (int v = 0; v < 3; ++v) f.vertex[v][i] = mesh.faces[3 * id + v];
+      const int64_t id = face;
+      for (int v = 0; v < 3; ++v) {
+        const int32_t vertex = mesh.faces[3 * id + v];
+        f.vertex[v][i] = vertex;
+        gathered[2 * v][i] = ws.x[vertex];
+        gathered[2 * v + 1][i] = ws.y[vertex];
+      }
       face += stride;
       if (face >= n) face -= n;
     }
-    set_up_chunk(f, ws, scale);
+    f.visible = 0;
+    for (int at = 0; at < kLanes; at += kWidth) set_up_part(f, at, gathered, scale);
+    const int64_t rest = n - c * kLanes;
+    if (rest < kLanes) f.visible &= (1u << rest) - 1;
   }
 }
 

@@ -10,15 +10,8 @@
 //
 // The error, coverage minus mask at the known pixels, is filtered as a whole, so that both have the same softness: the
 // silhouette has the area of its mesh, whatever the width of the filter and of the part.
+#include "compiled.h"
 #include "vertex_rows.h"
-
-#if defined(JAXFIT_AVX512)
-#define KERNELS filtered_avx512
-#elif defined(JAXFIT_AVX2)
-#define KERNELS filtered_avx2
-#else
-#define KERNELS filtered_baseline
-#endif
 
 namespace jaxfit {
 namespace {
@@ -54,7 +47,7 @@ struct Workspace {
   bool closed;  // the edges of both sides are the same, and so are the means
 };
 
-INLINE Workspace carve(const Mesh& mesh, Blur blur, int64_t size, void* memory, size_t* bytes = nullptr) {
+[[gnu::always_inline]] inline Workspace carve(const Mesh& mesh, Blur blur, int64_t size, void* memory, size_t* bytes = nullptr) {
   const Filter filter(blur);
   Workspace ws;
   ws.size = size, ws.radius = filter.radius;
@@ -67,8 +60,8 @@ INLINE Workspace carve(const Mesh& mesh, Blur blur, int64_t size, void* memory, 
   ws.front_edges = reinterpret_cast<int16_t*>(p);
   ws.back_edges = ws.front_edges + mesh.edges.count;
   if (bytes) {
-    const char* end = reinterpret_cast<char*>(ws.back_edges + round_up(mesh.edges.count));
-    *bytes = end - static_cast<char*>(memory);
+    const char* end = reinterpret_cast<char*>(ws.back_edges + mesh.edges.count);
+    *bytes = static_cast<size_t>((end - static_cast<char*>(memory) + 63) / 64 * 64);  // floats follow
   } else {
     filter.fill_taps(ws.taps);
   }
@@ -116,7 +109,7 @@ struct Segment {
 // Calls visit(column, row, t0, t1) for each pixel that the segment crosses from the share t0 to t1 of its length. The
 // columns -1 and `size`, and the rows likewise, hold everything outside the image.
 template <typename Visit>
-INLINE void walk(Segment s, int64_t size, Visit visit) {
+[[gnu::always_inline]] inline void walk(Segment s, int64_t size, Visit visit) {
   const float last = static_cast<float>(size), never = 2.f;
   const auto cell = [&](float a, float d) {
     const float low = __builtin_floorf(a < -1 ? -1 : a > last ? last : a);
@@ -143,14 +136,14 @@ INLINE void walk(Segment s, int64_t size, Visit visit) {
   }
 }
 
-INLINE Segment segment_of(const Mesh& mesh, int64_t edge) {
+[[gnu::always_inline]] inline Segment segment_of(const Mesh& mesh, int64_t edge) {
   const float* a = mesh.vertices + 3 * mesh.edges.ends[2 * edge];
   const float* b = mesh.vertices + 3 * mesh.edges.ends[2 * edge + 1];
   const float ax = clamp_far(a[0]), ay = clamp_far(a[1]);
   return {ax, ay, clamp_far(b[0]) - ax, clamp_far(b[1]) - ay};
 }
 
-INLINE float* at(float* plane, const Workspace& ws, int64_t row) { return plane + row * ws.stride + ws.radius; }
+[[gnu::always_inline]] inline float* at(float* plane, const Workspace& ws, int64_t row) { return plane + row * ws.stride + ws.radius; }
 
 // Computes `front` and `back`. Returns false if a coordinate is not finite.
 bool render(const Mesh& mesh, Workspace& ws) {
@@ -179,7 +172,7 @@ bool render(const Mesh& mesh, Workspace& ws) {
   return true;
 }
 
-INLINE float coverage_at(const Workspace& ws, int64_t i) {
+[[gnu::always_inline]] inline float coverage_at(const Workspace& ws, int64_t i) {
   const float front = ws.front[i], back = ws.closed ? front : ws.back[i];
   const float most = front > back ? front : back;
   return most < kCovered ? most : 1;
@@ -191,7 +184,7 @@ void filter(Workspace& ws, float* plane) {
   for (int64_t y = 0; y < size; ++y) {
     float* to = at(ws.other, ws, y);
     const int64_t first = y < ws.radius ? -y : -ws.radius, last = size - 1 - y < ws.radius ? size - 1 - y : ws.radius;
-    for (int64_t x = 0; x < width; x += kLanes) {
+    for (int64_t x = 0; x < width; x += kWidth) {
       Vec sum = all(0.f);
       for (int64_t k = first; k <= last; ++k)
         sum = fma(all(ws.taps[k + ws.radius]), load(at(plane, ws, y + k) + x), sum);
@@ -203,7 +196,7 @@ void filter(Workspace& ws, float* plane) {
     fill(from, ws.radius, 0);
     fill(from + ws.radius + size, ws.stride - ws.radius - size, 0);
     float* to = at(plane, ws, y);
-    for (int64_t x = 0; x < width; x += kLanes) {
+    for (int64_t x = 0; x < width; x += kWidth) {
       Vec sum = all(0.f);
       for (int64_t k = 0; k <= 2 * ws.radius; ++k) sum = fma(all(ws.taps[k]), load(from + x + k), sum);
       store(to + x, sum);
@@ -241,14 +234,14 @@ void add_gradient(const Mesh& mesh, Workspace& ws, const float* plane, float* gr
   clear_far_gradient(mesh, gradient);
 }
 
-INLINE bool known(Target target, int64_t i) { return !target.bytes || target.bytes[i] != kUnknown; }
+[[gnu::always_inline]] inline bool known(Target target, int64_t i) { return !target.bytes || target.bytes[i] != kUnknown; }
 
-INLINE float value_of(Target target, int64_t i) {
+[[gnu::always_inline]] inline float value_of(Target target, int64_t i) {
   return target.bytes ? (target.bytes[i] == kBackground ? 0.f : 1.f) : target.floats[i];
 }
 
 // Clears a plane with its margins.
-INLINE void clear(float* plane, const Workspace& ws) { fill(plane, ws.size * ws.stride, 0); }
+[[gnu::always_inline]] inline void clear(float* plane, const Workspace& ws) { fill(plane, ws.size * ws.stride, 0); }
 
 void silhouette(const Mesh& mesh, Blur blur, int64_t size, void* memory, float* image) {
   Workspace ws = carve(mesh, blur, size, memory);
@@ -326,7 +319,7 @@ struct Rows {
   int64_t count, limit;
 };
 
-INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, const Workspace& ws, void* memory, size_t before,
+[[gnu::always_inline]] inline Rows carve_rows(const Mesh& mesh, const Skin& skin, const Workspace& ws, void* memory, size_t before,
                        size_t* bytes = nullptr) {
   const int64_t size = ws.size, D = skin.parameters;
   Rows rows;
@@ -421,7 +414,7 @@ void filter_rows(const Workspace& ws, int64_t D, Rows& rows) {
         if (column < x - reach || column > x + reach) continue;
         const Vec weight = all(down * overlap(x, column));
         const float* from = rows.values + other * D;
-        for (int64_t d = 0; d < D; d += kLanes) store(to + d, fma(weight, load(from + d), load(to + d)));
+        for (int64_t d = 0; d < D; d += kWidth) store(to + d, fma(weight, load(from + d), load(to + d)));
       }
     }
   }
@@ -439,8 +432,8 @@ void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int6
 
 }  // namespace
 
-extern const Kernels KERNELS;
-const Kernels KERNELS = {
+template <>
+const Kernels Compiled<kIsa>::unbiased = {
     workspace, silhouette, silhouette_gradient, mask_loss, gauss_newton_workspace, silhouette_gauss_newton};
 
 }  // namespace jaxfit

@@ -30,7 +30,7 @@ size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int
   return workspace(mesh, blur, size) + bytes;
 }
 
-INLINE Rows carve_rows(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory) {
+[[gnu::always_inline]] inline Rows carve_rows(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory) {
   const Layout l(mesh, size);
   Rows rows;
   rows.values = reinterpret_cast<float*>(static_cast<char*>(memory) + workspace(mesh, blur, size));
@@ -48,15 +48,17 @@ int64_t set_row_factors(const uint8_t* target, int64_t size, Scale scale, Worksp
   const Vec one = all(1.f), low = all(kBandEdge), high = all(1 - kBandEdge);
   int64_t count = 0;
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
-    const Vec transmitted = one / load(place);
-    const Vec known = load_unequal(target, size, column, row, kUnknown, kBird);
-    const Mask band = (transmitted > low) & (high > transmitted) & (known > all(0.f));
-    if (!bits(band)) {
-      close(ws, column, row);
-      return;
+    const BlockValues known = load_unequal(target, size, column, row, kUnknown, kBird);
+    uint32_t band = 0;
+    for (int at = 0; at < kLanes; at += kWidth) {
+      const Vec transmitted = one / load(place + at);
+      const Mask in_band =
+          greater(transmitted, low) & greater(high, transmitted) & greater(load(known.at + at), all(0.f));
+      store(place + at, keep(in_band, transmitted * all(scale.slope)));
+      band |= bits(in_band) << at;
     }
-    store(place, keep(band, transmitted * all(scale.slope)));
-    count += __builtin_popcount(bits(band));
+    if (!band) close(ws, column, row);
+    count += __builtin_popcount(band);
   });
   return count;
 }
@@ -81,48 +83,50 @@ void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
       if (chosen && rows.count < kMostRows) of_pixel[i] = static_cast<int32_t>(rows.count++), mine |= 1u << i;
     }
     rows.chosen[(place - ws.products) / kLanes] = mine;
-    store(place, load(place) * grown);
+    for (int at = 0; at < kLanes; at += kWidth) store(place + at, load(place + at) * grown);
     if (!mine) close(ws, column, row);
   });
 }
 
-void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, Rows& rows) {
+// Adds the derivatives of the chosen pixels of a block with respect to the vertices of one edge.
+[[gnu::always_inline]] inline void add_edge(const Mesh& mesh, const Skin& skin, const Faces& f, int lane, int edge, uint32_t pixels,
+                                    const float* pull_x, const float* pull_y, const float* along,
+                                    const int32_t* of_pixel, Rows& rows) {
+  if (!pixels) return;
   const int64_t D = skin.parameters;
+  const float* a = vertex_rows(mesh, skin, f.vertex[edge][lane], rows.of_vertex);
+  const float* b = vertex_rows(mesh, skin, f.vertex[(edge + 1) % 3][lane], rows.of_vertex);
+  for (; pixels; pixels &= pixels - 1) {
+    const int i = __builtin_ctz(pixels);
+    const float to_a = 0.5f - along[i], to_b = 0.5f + along[i];
+    add_vertices(a, b, to_a * pull_x[i], to_a * pull_y[i], to_b * pull_x[i], to_b * pull_y[i], D,
+                 rows.values + of_pixel[i] * D);
+  }
+}
+
+void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, Rows& rows) {
   const Vec outside = all(scale.radius * scale.radius);
-  for (int64_t i = 0; i < rows.count * D; ++i) rows.values[i] = 0;
+  fill(rows.values, rows.count * skin.parameters, 0);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
-    const Faces& f = ws.faces[c];
+    Faces& f = ws.faces[c];
     for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
       const int lane = __builtin_ctz(todo);
-      for_each_block(f, lane, scale, ws,
-                     [&](const Distances& at, const Nearest& n, float* place, int64_t, int64_t)
-                         __attribute__((always_inline)) {
-        const int32_t* of_pixel = rows.of_pixel + (place - ws.products);
-        const uint32_t chosen = rows.chosen[(place - ws.products) / kLanes];
-        const Mask in = outside > n.d;
-        if (!(bits(in) & chosen)) return;
-        const Vec pull = flip_sign(load(place) * reciprocal(all(1.f) + exp2(n.d)), n.d);
-        Mask of_edge[3];
-        divide_pixels(n, in, of_edge);
-        for (int i = 0; i < 3; ++i) {
-          uint32_t pixels = bits(of_edge[i]) & chosen;
+      for_each_block<Reached::kKnown>(f, lane, scale, ws, [&](const Face& face, const Block& block)
+                                      __attribute__((always_inline)) {
+        const int64_t place = block.place - ws.products;
+        for (int at = 0; at < kLanes; at += kWidth) {
+          const Nearest n = nearest_edge(face, block, at);
+          uint32_t pixels = bits(greater(outside, n.d)) & rows.chosen[place / kLanes] >> at;
           if (!pixels) continue;
-          const Vec tx = all(f.tx[i][lane]), ty = all(f.ty[i][lane]);
-          alignas(64) float pull_x[kLanes], pull_y[kLanes], place_along[kLanes];
-          store(pull_x, pull * fms(tx, n.beyond[i], ty * at.across[i]));
-          store(pull_y, pull * fma(ty, n.beyond[i], tx * at.across[i]));
-          store(place_along, n.clamped[i] * all(0.5f / f.half[i][lane]));
-          const float* a = nullptr;
-          const float* b = nullptr;
-          for (; pixels; pixels &= pixels - 1) {
-            const int k = __builtin_ctz(pixels);
-            if (!a) {
-              a = vertex_rows(mesh, skin, f.vertex[i][lane], rows.of_vertex);
-              b = vertex_rows(mesh, skin, f.vertex[(i + 1) % 3][lane], rows.of_vertex);
-            }
-            const float to_a = 0.5f - place_along[k], to_b = 0.5f + place_along[k];
-            add_vertices(a, b, to_a * pull_x[k], to_a * pull_y[k], to_b * pull_x[k], to_b * pull_y[k], D,
-                         rows.values + of_pixel[k] * D);
+          const Vec pull = flip_sign(load(block.place + at) * reciprocal(all(1.f) + exp2(n.d)), n.d);
+          for (int i = 0; i < 3; ++i) {
+            const uint32_t own = i < 2 ? pixels & bits(at_most(n.square[i], n.smallest)) : pixels;
+            pixels &= ~own;
+            alignas(64) float pull_x[kWidth], pull_y[kWidth], along[kWidth];
+            store(pull_x, pull * fms(face.tx[i], n.beyond[i], face.ty[i] * n.across[i]));
+            store(pull_y, pull * fma(face.ty[i], n.beyond[i], face.tx[i] * n.across[i]));
+            store(along, n.clamped[i] * all(f.inverse[i][lane]));
+            add_edge(mesh, skin, f, lane, i, own, pull_x, pull_y, along, rows.of_pixel + place + at, rows);
           }
         }
       });

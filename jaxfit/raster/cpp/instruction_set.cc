@@ -3,19 +3,9 @@
 #include <atomic>
 #include <stdexcept>
 
-namespace jaxfit {
+#include "compiled.h"
 
-extern const Kernels kernels_baseline;
-extern const Kernels filtered_baseline;
-extern const Renderer renderer_baseline;
-#ifdef JAXFIT_X86
-extern const Kernels kernels_avx2;
-extern const Kernels filtered_avx2;
-extern const Renderer renderer_avx2;
-extern const Kernels kernels_avx512;
-extern const Kernels filtered_avx512;
-extern const Renderer renderer_avx512;
-#endif
+namespace jaxfit {
 
 namespace {
 
@@ -25,17 +15,23 @@ struct Choice {
   const Renderer* renderer;
 };
 
+template <Isa isa>
+Choice choice(const char* name) {
+  using Own = Compiled<isa>;
+  return {name, {&Own::soft_rasterizer, &Own::unbiased}, &Own::renderer};
+}
+
 std::vector<Choice> choices() {
   std::vector<Choice> available;
-#ifdef JAXFIT_X86
+#if defined(JAXFIT_X86)
   __builtin_cpu_init();
   const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
   if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
       __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-    available.push_back({"avx512", {&kernels_avx512, &filtered_avx512}, &renderer_avx512});
-  if (avx2) available.push_back({"avx2", {&kernels_avx2, &filtered_avx2}, &renderer_avx2});
+    available.push_back(choice<Isa::kAvx512>("avx512"));
+  if (avx2) available.push_back(choice<Isa::kAvx2>("avx2"));
 #endif
-  available.push_back({"baseline", {&kernels_baseline, &filtered_baseline}, &renderer_baseline});
+  available.push_back(choice<Isa::kBaseline>("baseline"));
   return available;
 }
 

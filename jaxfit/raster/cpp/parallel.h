@@ -5,7 +5,6 @@
 #include <atomic>
 #include <condition_variable>
 #include <cstdint>
-#include <cstdlib>
 #include <exception>
 #include <memory>
 #include <mutex>
@@ -17,18 +16,17 @@ namespace jaxfit {
 // Returns at least `bytes` of 64-byte aligned scratch memory. Each thread keeps its memory from call to call, because
 // the first use of fresh pages takes as long as a small image.
 inline void* scratch(size_t bytes) {
+  constexpr std::align_val_t kAlignment{64};
   struct Free {
-    void operator()(void* p) const { std::free(p); }
+    void operator()(void* p) const { ::operator delete(p, kAlignment); }
   };
   thread_local std::unique_ptr<void, Free> memory;
   thread_local size_t held = 0;
   if (held < bytes) {
     memory.reset();
     held = 0;
-    const size_t rounded = (bytes + 63) / 64 * 64;
-    memory.reset(std::aligned_alloc(64, rounded));
-    if (!memory) throw std::bad_alloc();
-    held = rounded;
+    memory.reset(::operator new(bytes, kAlignment));
+    held = bytes;
   }
   return memory.get();
 }

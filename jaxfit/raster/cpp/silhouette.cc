@@ -1,4 +1,4 @@
-// The soft silhouette. This file is compiled once for each instruction set (JAXFIT_AVX512, JAXFIT_AVX2, neither).
+// The soft silhouette. This file is compiled once for each instruction set.
 //
 // For a pixel and a face, d is the squared distance to the nearest edge segment, negative inside, and
 // silhouette = 1 - Π (1 - p) with p = sigmoid(-d / s). With e = exp(-d / s) this equals 1 - 1 / Π (1 + e), which needs
@@ -8,115 +8,120 @@
 // blocks around the face, are evaluated to find the blocks that the face can reach. The pixels of these blocks are then
 // evaluated. A block is closed when all its products exceed kSaturated: later faces skip the block, and the block has
 // no gradient, because d silhouette / d d = -Π (1 - p) · p / s vanishes there.
+#include "compiled.h"
 #include "gauss_newton.h"
 #include "products.h"
-
-#if defined(JAXFIT_AVX512)
-#define KERNELS kernels_avx512
-#elif defined(JAXFIT_AVX2)
-#define KERNELS kernels_avx2
-#else
-#define KERNELS kernels_baseline
-#endif
 
 namespace jaxfit {
 namespace {
 
-// Adds the gradient of every open block. For each pixel `products` holds the factor of p · (pixel - nearest point).
+// Adds the gradient of every open block. For each pixel `products` holds the factor of p · (pixel - nearest point). The
+// nearest point lies on an edge between two vertices, which share the force.
 void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
-  const Vec outside = all(scale.radius * scale.radius);
+  const Vec outside = all(scale.radius * scale.radius), zero = all(0.f), one = all(1.f);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
-    const Faces& f = ws.faces[c];
+    Faces& f = ws.faces[c];
     for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
       const int lane = __builtin_ctz(todo);
-      // For each edge the sums of four quantities over the pixels: the pull across and along the edge, and both
-      // multiplied by the position along the edge where the pull acts.
-      Vec sums[12];
-      for (int i = 0; i < 12; ++i) sums[i] = all(0.f);
+      const Vec inverse[3] = {all(f.inverse[0][lane]), all(f.inverse[1][lane]), all(f.inverse[2][lane])};
+      Vec x[3] = {zero, zero, zero}, y[3] = {zero, zero, zero};  // on vertices 0 and 1, and on the whole face
       bool any = false;
-      for_each_block(f, lane, scale, ws,
-                     [&](const Distances& at, const Nearest& n, float* place, int64_t, int64_t)
-                         __attribute__((always_inline)) {
+      for_each_block<Reached::kKnown>(f, lane, scale, ws, [&](const Face& face, const Block& block)
+                                      __attribute__((always_inline)) {
         any = true;
-        const Mask in = outside > n.d;
-        const Vec p = reciprocal(all(1.f) + exp2(n.d));
-        const Vec pull = flip_sign(load(place) * p, n.d);
-        Mask of_edge[3];
-        divide_pixels(n, in, of_edge);
-        for (int i = 0; i < 3; ++i) {
-          const Vec g = keep(of_edge[i], pull), gt = g * n.clamped[i];
-          sums[4 * i + 0] = fma(g, at.across[i], sums[4 * i + 0]);
-          sums[4 * i + 1] = fma(g, n.beyond[i], sums[4 * i + 1]);
-          sums[4 * i + 2] = fma(gt, at.across[i], sums[4 * i + 2]);
-          sums[4 * i + 3] = fma(gt, n.beyond[i], sums[4 * i + 3]);
+        for (int at = 0; at < kLanes; at += kWidth) {
+          const Nearest n = nearest_edge(face, block, at);
+          const Vec p = keep(greater(outside, n.d), reciprocal(one + exp2(n.d)));
+          const Vec pull = flip_sign(load(block.place + at) * p, n.d);
+          const Vec across = pull * pick(n, n.across[0], n.across[1], n.across[2]);
+          const Vec beyond = pull * pick(n, n.beyond[0], n.beyond[1], n.beyond[2]);
+          const Vec tx = pick(n, face.tx[0], face.tx[1], face.tx[2]);
+          const Vec ty = pick(n, face.ty[0], face.ty[1], face.ty[2]);
+          const Vec force_x = fms(tx, beyond, ty * across), force_y = fma(ty, beyond, tx * across);
+          const Vec along = pick(n, n.clamped[0] * inverse[0], n.clamped[1] * inverse[1], n.clamped[2] * inverse[2]);
+          const Vec to_end = all(0.5f) + along, to_start = all(0.5f) - along;
+          const Vec share0 = pick(n, to_start, zero, to_end), share1 = pick(n, to_end, to_start, zero);
+          x[0] = fma(share0, force_x, x[0]);
+          y[0] = fma(share0, force_y, y[0]);
+          x[1] = fma(share1, force_x, x[1]);
+          y[1] = fma(share1, force_y, y[1]);
+          x[2] = x[2] + force_x;
+          y[2] = y[2] + force_y;
         }
       });
       if (!any) continue;
-      alignas(64) float total[16];
-      reduce12(sums, total);
+      float on_x[3] = {sum(x[0]), sum(x[1]), sum(x[2])}, on_y[3] = {sum(y[0]), sum(y[1]), sum(y[2])};
+      on_x[2] -= on_x[0] + on_x[1];
+      on_y[2] -= on_y[0] + on_y[1];
       for (int i = 0; i < 3; ++i) {
-        const float tx = f.tx[i][lane], ty = f.ty[i][lane], inverse = 0.5f / f.half[i][lane];
-        const float* s = total + 4 * i;
-        const float fx = 0.5f * (tx * s[1] - ty * s[0]), fy = 0.5f * (ty * s[1] + tx * s[0]);
-        const float mx = inverse * (tx * s[3] - ty * s[2]), my = inverse * (ty * s[3] + tx * s[2]);
-        float* a = gradient + 3 * f.vertex[i][lane];
-        float* b = gradient + 3 * f.vertex[(i + 1) % 3][lane];
-        a[0] += fx - mx, a[1] += fy - my;
-        b[0] += fx + mx, b[1] += fy + my;
+        gradient[3 * f.vertex[i][lane]] += on_x[i];
+        gradient[3 * f.vertex[i][lane] + 1] += on_y[i];
       }
     }
   }
 }
 
 // Returns a 4×4 block of a row-major image, with `fill` outside the image.
-INLINE Vec load_block(const float* image, int64_t size, int64_t column, int64_t row, float fill) {
+[[gnu::always_inline]] inline BlockValues load_block(const float* image, int64_t size, int64_t column, int64_t row, float fill) {
   const int64_t x0 = column * kBlock, y0 = row * kBlock;
-  alignas(64) float values[kLanes];
+  BlockValues values;
   for (int i = 0; i < kLanes; ++i) {
     const int64_t x = x0 + i % kBlock, y = y0 + i / kBlock;
-    values[i] = x < size && y < size ? image[y * size + x] : fill;
+    values.at[i] = x < size && y < size ? image[y * size + x] : fill;
   }
-  return load(values);
+  return values;
 }
 
-// Returns silhouette - target, 0 at unknown pixels. Outside the image the target is the bird.
-INLINE Vec error_of(Vec silhouette, const float* target, int64_t size, int64_t column, int64_t row) {
-  return silhouette - load_block(target, size, column, row, 1.f);
+// The target of a block, and 0 at unknown pixels, else 1. Outside the image the target is the bird.
+struct BlockTarget {
+  BlockValues value, known;
+};
+
+[[gnu::always_inline]] inline BlockTarget load_target(const float* target, int64_t size, int64_t column, int64_t row) {
+  BlockTarget block{load_block(target, size, column, row, 1), {}};
+  fill(block.known.at, kLanes, 1);
+  return block;
 }
 
-INLINE Vec error_of(Vec silhouette, const uint8_t* target, int64_t size, int64_t column, int64_t row) {
-  const Vec known = load_unequal(target, size, column, row, kUnknown, kBird);
-  return known * (silhouette - load_unequal(target, size, column, row, kBackground, kBird));
+[[gnu::always_inline]] inline BlockTarget load_target(const uint8_t* target, int64_t size, int64_t column, int64_t row) {
+  return {load_unequal(target, size, column, row, kBackground, kBird),
+          load_unequal(target, size, column, row, kUnknown, kBird)};
 }
 
-// Replaces the products by the factors of the gradient, given d loss / d silhouette. Closes blocks without gradient.
-INLINE void set_factor(Vec cotangent, Vec transmitted, Scale scale, const Workspace& ws, float* place, int64_t column,
-                       int64_t row) {
+// Replaces products by the factors of the gradient, given d loss / d silhouette. Returns whether one is not negligible.
+[[gnu::always_inline]] inline bool set_factor(Vec cotangent, Vec transmitted, Scale scale, float* place) {
   const Vec factor = cotangent * transmitted;
   store(place, factor * all(scale.slope));
-  if (!bits(abs(factor) > all(1.f / kSaturated))) close(ws, column, row);
+  return bits(greater(abs(factor), all(1.f / kSaturated)));
 }
 
 template <LossKind kind, typename Pixel>
 float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, bool with_gradient) {
   double total = 0;
   Vec part = all(0.f);
-  const Vec one = all(1.f);
+  const Vec zero = all(0.f), half = all(0.5f), one = all(1.f);
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
-    const Vec transmitted = one / load(place);
-    const Vec error = error_of(one - transmitted, target, size, column, row);
-    const Vec magnitude = abs(error);
-    Vec slope;
-    if (kind == LossKind::kL1) {
-      part = part + magnitude;
-      slope = flip_sign(keep(magnitude > all(0.f), one), error);
-    } else {
-      const Vec square = all(0.5f) * error * error;
-      part = part + select(magnitude > one, magnitude - all(0.5f), square);
-      slope = max(min(error, one), all(-1.f));
+    const BlockTarget block = load_target(target, size, column, row);
+    bool open = false;
+    for (int at = 0; at < kLanes; at += kWidth) {
+      const Vec transmitted = one / load(place + at);
+      const Vec error = load(block.known.at + at) * (one - transmitted - load(block.value.at + at));
+      const Vec magnitude = abs(error);
+      Vec slope;
+      if (kind == LossKind::kL1) {
+        part = part + magnitude;
+        slope = flip_sign(keep(greater(magnitude, zero), one), error);
+      } else {
+        part = part + select(greater(magnitude, one), magnitude - half, half * error * error);
+        slope = clamp_to(error, one);
+      }
+      if (with_gradient) open |= set_factor(slope, transmitted, scale, place + at);
     }
-    if (column % 16 == 15) total += sum(part), part = all(0.f);
-    if (with_gradient) set_factor(slope, transmitted, scale, ws, place, column, row);
+    if (column % 16 == 15) {
+      total += sum(part);
+      part = zero;
+    }
+    if (with_gradient && !open) close(ws, column, row);
   });
   return static_cast<float>(total + sum(part));
 }
@@ -132,11 +137,11 @@ void silhouette(const Mesh& mesh, Blur blur, int64_t size, void* memory, float* 
   const Scale scale = scale_of(blur, size);
   if (!render(mesh, size, scale, ws)) return fill(image, size * size, __builtin_nanf(""));
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
-    alignas(64) float value[kLanes];
-    store(value, all(1.f) - all(1.f) / load(place));
+    BlockValues value;
+    for (int at = 0; at < kLanes; at += kWidth) store(value.at + at, all(1.f) - all(1.f) / load(place + at));
     for (int i = 0; i < kLanes; ++i) {
       const int64_t x = column * kBlock + i % kBlock, y = row * kBlock + i / kBlock;
-      if (x < size && y < size) image[y * size + x] = value[i];
+      if (x < size && y < size) image[y * size + x] = value.at[i];
     }
   });
 }
@@ -148,8 +153,11 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
   if (!render(mesh, size, scale, ws))
     return set_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
-    const Vec transmitted = all(1.f) / load(place);
-    set_factor(load_block(cotangent, size, column, row, 0.f), transmitted, scale, ws, place, column, row);
+    const BlockValues slope = load_block(cotangent, size, column, row, 0);
+    bool open = false;
+    for (int at = 0; at < kLanes; at += kWidth)
+      open |= set_factor(load(slope.at + at), all(1.f) / load(place + at), scale, place + at);
+    if (!open) close(ws, column, row);
   });
   finish_gradient(mesh, scale, ws, gradient);
 }
@@ -175,8 +183,8 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
 
 }  // namespace
 
-extern const Kernels KERNELS;
-const Kernels KERNELS = {
+template <>
+const Kernels Compiled<kIsa>::soft_rasterizer = {
     workspace, silhouette, silhouette_gradient, mask_loss, gauss_newton_workspace, silhouette_gauss_newton};
 
 }  // namespace jaxfit

@@ -104,9 +104,9 @@ void clear_tile(const Strip& s, int64_t tile) {
   }
 }
 
-inline __attribute__((always_inline)) Doubles all(double a) { return Doubles{a, a, a, a, a, a, a, a}; }
+[[gnu::always_inline]] inline Doubles all(double a) { return Doubles{a, a, a, a, a, a, a, a}; }
 
-inline __attribute__((always_inline)) Doubles select(Longs which, Doubles a, Doubles b) {
+[[gnu::always_inline]] inline Doubles select(Longs which, Doubles a, Doubles b) {
   return (Doubles)((which & (Longs)a) | (~which & (Longs)b));
 }
 
@@ -161,7 +161,7 @@ Strip rasterise(const Mesh& mesh, Frame frame, Rows rows, void* memory) {
 }
 
 // Computes perspective-correct weights of the corners at a sample that the face covers. Returns 1/depth.
-inline __attribute__((always_inline)) double weigh(const Face& f, double x, double y, double weights[3]) {
+[[gnu::always_inline]] inline double weigh(const Face& f, double x, double y, double weights[3]) {
   double dx[3], dy[3];
   for (int i = 0; i < 3; ++i) dx[i] = f.x[i] - x, dy[i] = (f.y[i] - y) * f.turn;
   for (int i = 0; i < 3; ++i) {

@@ -13,7 +13,7 @@ struct VertexRows {
 };
 
 // Returns d vertex / d parameters in px: D derivatives of x, then D of y. Computes them where they are not ready.
-INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, const VertexRows& rows) {
+[[gnu::always_inline]] inline const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, const VertexRows& rows) {
   const int64_t D = skin.parameters, P = skin.transforming;
   float* out = rows.values + 2 * v * D;
   if (rows.ready[v]) return out;
@@ -22,7 +22,7 @@ INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, c
   const float* rest = skin.rest + 3 * v;
   const float zoom = skin.focal / at[2];
   const float by_depth[2] = {(skin.centre - at[0]) / at[2], (skin.centre - at[1]) / at[2]};
-  for (int64_t d = 0; d < D; d += kLanes) {
+  for (int64_t d = 0; d < D; d += kWidth) {
     Vec x[3] = {all(0.f), all(0.f), all(0.f)};  // d position / d parameters, camera frame
     for (int64_t m = 0; d < P && m < skin.per_vertex; ++m) {
       const float w = skin.weight[v * skin.per_vertex + m];
@@ -38,10 +38,10 @@ INLINE const float* vertex_rows(const Mesh& mesh, const Skin& skin, int64_t v, c
 }
 
 // row += ax · (x of a) + ay · (y of a) + bx · (x of b) + by · (y of b), with the rows a and b of two vertices.
-INLINE void add_vertices(const float* a, const float* b, float ax, float ay, float bx, float by, int64_t D,
+[[gnu::always_inline]] inline void add_vertices(const float* a, const float* b, float ax, float ay, float bx, float by, int64_t D,
                          float* row) {
   const Vec wax = all(ax), way = all(ay), wbx = all(bx), wby = all(by);
-  for (int64_t d = 0; d < D; d += kLanes) {
+  for (int64_t d = 0; d < D; d += kWidth) {
     Vec sum = load(row + d);
     sum = fma(wax, load(a + d), fma(way, load(a + D + d), sum));
     sum = fma(wbx, load(b + d), fma(wby, load(b + D + d), sum));
@@ -52,7 +52,7 @@ INLINE void add_vertices(const float* a, const float* b, float ax, float ay, flo
 // block = leftᵀ · right, which is symmetric, four lines of the block at a time.
 void multiply_rows(const float* left, const float* right, int64_t count, int64_t D, float* block) {
   for (int64_t i = 0; i < D; i += 4)
-    for (int64_t d = i / kLanes * kLanes; d < D; d += kLanes) {
+    for (int64_t d = i / kWidth * kWidth; d < D; d += kWidth) {
       Vec sums[4] = {all(0.f), all(0.f), all(0.f), all(0.f)};
       for (int64_t r = 0; r < count; ++r) {
         const Vec own = load(right + r * D + d);

@@ -8,13 +8,13 @@
 namespace jaxfit {
 namespace {
 
-INLINE int64_t round_up(int64_t n) { return (n + kLanes - 1) / kLanes * kLanes; }
+[[gnu::always_inline]] inline int64_t round_up(int64_t n) { return (n + kLanes - 1) / kLanes * kLanes; }
 
 void fill(float* p, int64_t n, float value) {
   for (int64_t i = 0; i < n; ++i) p[i] = value;
 }
 
-INLINE float clamp_far(float a) { return a < -kFarAway ? -kFarAway : a > kFarAway ? kFarAway : a; }
+[[gnu::always_inline]] inline float clamp_far(float a) { return a < -kFarAway ? -kFarAway : a > kFarAway ? kFarAway : a; }
 
 // Sets x and y of the gradient to a value, and the depth to 0.
 void set_gradient(float* gradient, int64_t vertices, float value) {

@@ -1,20 +1,13 @@
-// The z-buffer. This file is compiled once for each instruction set (JAXFIT_AVX512, JAXFIT_AVX2, neither).
+// The z-buffer. This file is compiled once for each instruction set.
 //
 // The code repeats the operations of jaxfit/raster/zbuffer_reference.py in double precision, so that both find the same
 // face at every sample. This requires -ffp-contract=off. First, every face writes its nearness (1/depth) and its number
 // to the samples where it is the nearest face so far. Then the weights of the nearest face are computed again at every
 // sample. Only tiles of columns that a face reaches are cleared and read, so the time depends on the covered area.
 // Masks need no depths: coverage.h draws them.
+#include "compiled.h"
 #include "coverage.h"
 #include "strip.h"
-
-#if defined(JAXFIT_AVX512)
-#define RENDERER renderer_avx512
-#elif defined(JAXFIT_AVX2)
-#define RENDERER renderer_avx2
-#else
-#define RENDERER renderer_baseline
-#endif
 
 namespace jaxfit {
 namespace {
@@ -198,7 +191,7 @@ void draw(const Mesh& mesh, Frame frame, Rows rows, void* memory, const float* c
 
 }  // namespace
 
-extern const Renderer RENDERER;
-const Renderer RENDERER = {workspace, fragments, mask, overlap, interpolate, draw};
+template <>
+const Renderer Compiled<kIsa>::renderer = {workspace, fragments, mask, overlap, interpolate, draw};
 
 }  // namespace jaxfit
