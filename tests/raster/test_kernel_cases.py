@@ -14,6 +14,7 @@ KERNELS = Path(__file__).resolve().parents[2] / "jaxfit" / "raster" / "cpp"
 COMPILER = shlex.split(os.environ.get("CXX", "c++"))
 
 
+@pytest.mark.extended
 def test_stored_cases_are_those_of_the_reference():
     stored, expected = read_cases(STORED.read_text(encoding="utf-8")), cases()
     assert len(stored) == len(expected)

@@ -24,7 +24,7 @@ def _bumpy(seed: int, size: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     points = np.asarray(ball.vertices) * rng.uniform(0.5, 1.3, (len(ball.vertices), 1))
     screen = points * [0.3 * size, 0.22 * size, 0.5] + [0.52 * size, 0.47 * size, 4]
-    return screen.astype(np.float32), np.asarray(ball.faces, np.int32)
+    return screen.round(3).astype(np.float32), np.asarray(ball.faces, np.int32)
 
 
 def _sheet(size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -54,13 +54,13 @@ def _case(mesh, size: int, blur: reference.Blur, seed: int) -> dict[str, np.ndar
     target = np.zeros((size, size), np.uint8)
     target[size // 4 : 3 * size // 4, size // 3 : 4 * size // 5] = 1
     target[: size // 5, size // 2 :] = 2
-    cotangent = rng.normal(size=(size, size)).astype(np.float32)
+    cotangent = rng.normal(size=(size, size)).round(1).astype(np.float32)
     skin = reference.Skin(
-        jnp.asarray(rng.normal(size=vertices.shape), jnp.float32),
+        jnp.asarray(rng.normal(size=vertices.shape).round(1), jnp.float32),
         jnp.asarray(rng.integers(0, JOINTS, (len(vertices), PER_VERTEX)), jnp.int32),
-        jnp.asarray(rng.dirichlet(np.ones(PER_VERTEX), len(vertices)), jnp.float32),
-        jnp.asarray(rng.normal(scale=0.1, size=(JOINTS, 3, 4, PARAMETERS)), jnp.float32),
-        jnp.asarray(rng.normal(scale=0.1, size=(len(vertices), 3, SHAPES)), jnp.float32),
+        jnp.asarray(rng.dirichlet(np.ones(PER_VERTEX), len(vertices)).round(2), jnp.float32),
+        jnp.asarray(rng.normal(scale=0.1, size=(JOINTS, 3, 4, PARAMETERS)).round(2), jnp.float32),
+        jnp.asarray(rng.normal(scale=0.1, size=(len(vertices), 3, SHAPES)).round(2), jnp.float32),
     )
     one = jnp.float32(1)
     arrays = {
@@ -101,7 +101,7 @@ def text_of(stored: list[dict[str, np.ndarray]]) -> str:
     for number, arrays in enumerate(stored):
         lines.append(f"case {number}")
         for name, values in arrays.items():
-            lines.append(f"{name} {values.size} " + " ".join(f"{np.float32(value):.9g}" for value in values))
+            lines.append(f"{name} {values.size} " + " ".join(f"{np.float32(value):.7g}" for value in values))
     return "\n".join(lines) + "\n"
 
 

@@ -49,7 +49,7 @@ TARGETS = (
     ),
     Target(
         "MinGW-w64 for Windows",
-        "x86_64-w64-mingw32-g++",
+        "x86_64-w64-mingw32-g++-posix",
         "-static",
         "wine",
         ("-DCMAKE_SYSTEM_NAME=Windows", "-DCMAKE_SYSTEM_PROCESSOR=AMD64"),

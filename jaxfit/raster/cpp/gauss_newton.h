@@ -89,9 +89,9 @@ void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
 }
 
 // Adds the derivatives of the chosen pixels of a block with respect to the vertices of one edge.
-[[gnu::always_inline]] inline void add_edge(const Mesh& mesh, const Skin& skin, const Faces& f, int lane, int edge, uint32_t pixels,
-                                    const float* pull_x, const float* pull_y, const float* along,
-                                    const int32_t* of_pixel, Rows& rows) {
+[[gnu::always_inline]] inline void add_edge(const Mesh& mesh, const Skin& skin, const Faces& f, int lane, int edge,
+                                            uint32_t pixels, const float* pull_x, const float* pull_y,
+                                            const float* along, const int32_t* of_pixel, Rows& rows) {
   if (!pixels) return;
   const int64_t D = skin.parameters;
   const float* a = vertex_rows(mesh, skin, f.vertex[edge][lane], rows.of_vertex);

@@ -62,7 +62,8 @@ void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
 }
 
 // Returns a 4×4 block of a row-major image, with `fill` outside the image.
-[[gnu::always_inline]] inline BlockValues load_block(const float* image, int64_t size, int64_t column, int64_t row, float fill) {
+[[gnu::always_inline]] inline BlockValues load_block(const float* image, int64_t size, int64_t column, int64_t row,
+                                                     float fill) {
   const int64_t x0 = column * kBlock, y0 = row * kBlock;
   BlockValues values;
   for (int i = 0; i < kLanes; ++i) {
@@ -77,13 +78,15 @@ struct BlockTarget {
   BlockValues value, known;
 };
 
-[[gnu::always_inline]] inline BlockTarget load_target(const float* target, int64_t size, int64_t column, int64_t row) {
+[[gnu::always_inline]] inline BlockTarget load_target(const float* target, int64_t size, int64_t column,
+                                                      int64_t row) {
   BlockTarget block{load_block(target, size, column, row, 1), {}};
   fill(block.known.at, kLanes, 1);
   return block;
 }
 
-[[gnu::always_inline]] inline BlockTarget load_target(const uint8_t* target, int64_t size, int64_t column, int64_t row) {
+[[gnu::always_inline]] inline BlockTarget load_target(const uint8_t* target, int64_t size, int64_t column,
+                                                      int64_t row) {
   return {load_unequal(target, size, column, row, kBackground, kBird),
           load_unequal(target, size, column, row, kUnknown, kBird)};
 }

@@ -108,7 +108,8 @@ typedef int32_t Ints __attribute__((vector_size(16)));
 
 constexpr int kWidth = sizeof(Vec) / sizeof(float);
 
-[[gnu::always_inline]] inline Vec all(float a) { return a - Vec{}; }  // unlike Vec{} + a, it needs no addition: -0 - 0 is -0
+// Unlike Vec{} + a, this needs no addition, because a - 0 is a also for a = -0.
+[[gnu::always_inline]] inline Vec all(float a) { return a - Vec{}; }
 
 [[gnu::always_inline]] inline Vec load(const float* p) {
   Vec a;
@@ -168,7 +169,9 @@ typedef Ints Mask;  // all bits of a lane are set, or none
 [[gnu::always_inline]] inline Vec flip_sign(Vec a, Vec s) { return (Vec)((Ints)a ^ ((Ints)s & INT32_MIN)); }
 
 // product · (1 + e) where m, at most kFull. Without the limit, the infinite product of another lane would become NaN.
-[[gnu::always_inline]] inline Vec grow(Vec product, Vec e, Mask m) { return min(fma(product, keep(m, e), product), all(kFull)); }
+[[gnu::always_inline]] inline Vec grow(Vec product, Vec e, Mask m) {
+  return min(fma(product, keep(m, e), product), all(kFull));
+}
 
 [[gnu::always_inline]] inline float sum(Vec a) {
   typedef float Quad __attribute__((vector_size(16)));
