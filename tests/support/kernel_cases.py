@@ -1,6 +1,7 @@
 """The stored cases of the kernels: meshes, masks, and what the reference implementations compute for them.
 
-`python tests/support/kernel_cases.py` writes tests/raster/kernel_cases.txt again. tests/raster/kernel_cases.cc reads it.
+`python tests/support/kernel_cases.py` writes tests/raster/kernel_cases.txt again.
+tests/raster/kernel_cases.cc reads this file.
 """
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# ruff: noqa: T201  (the table is the output)
 """Compile the kernels with every compiler that is here, and run their test program: `make portable`.
 
 The table has a line for each compiler and check. A compiler that is not installed is skipped, and the line says what to
