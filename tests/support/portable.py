@@ -7,6 +7,7 @@ install. Programs for other processors and systems run in an emulator where ther
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -52,7 +53,7 @@ TARGETS = (
         "MinGW-w64 for Windows",
         "x86_64-w64-mingw32-g++-posix",
         "-static",
-        "wine",
+        "wine64",
         ("-DCMAKE_SYSTEM_NAME=Windows", "-DCMAKE_SYSTEM_PROCESSOR=AMD64"),
     ),
 )
@@ -76,10 +77,11 @@ def check(target: Target) -> list[tuple[str, str, str]]:
         if ran.returncode:
             print(ran.stdout, ran.stderr, sep="\n", file=sys.stderr)
             return [("", "compile", "FAILED")]
-    if target.runner and shutil.which(target.runner) is None:
+    runner = shutil.which(target.runner, path=f"{os.environ['PATH']}:/usr/lib/wine") if target.runner else ""
+    if runner is None:
         return [("", "compile", "ok"), ("", "run", f"skipped: {target.runner} is not installed")]
     (program,) = (path for path in folder.iterdir() if path.name in ("kernel_cases", "kernel_cases.exe"))
-    ran = subprocess.run([*filter(None, [target.runner]), str(program), str(CASES)], capture_output=True, text=True)
+    ran = subprocess.run([*filter(None, [runner]), str(program), str(CASES)], capture_output=True, text=True)
     lines = [line.split() for line in ran.stdout.splitlines()]
     isas = list(dict.fromkeys(line[0] for line in lines))
     result = [("", "compile", "ok")]
