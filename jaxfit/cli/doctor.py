@@ -80,15 +80,18 @@ def _processor() -> Iterator[Finding]:
 def _kernels() -> Iterator[Finding]:
     from importlib.util import find_spec
 
-    from jaxfit.raster.kernels import ISA_VARIABLE, available_isas, current_isa
+    from jaxfit.raster.kernels import ISA_VARIABLE, available_isas, current_isa, isa_problem, lacks_avx2
 
     if os.environ.get(ISA_VARIABLE) == "none":
         yield Finding("kernels", f"switched off by {ISA_VARIABLE}=none", f"unset {ISA_VARIABLE}")
     elif find_spec("jaxfit.raster._kernels") is None:
         remedy = "install GCC or Clang, and reinstall jaxfit: fits are hundreds of times slower without kernels"
         yield Finding("kernels", "not built", remedy)
+    elif (problem := isa_problem()) is not None:
+        yield Finding("kernels", f"environment variable {ISA_VARIABLE}: {problem[0]}", problem[1])
     else:
-        yield Finding("kernels", f"{current_isa()} (this processor supports: {', '.join(available_isas())})")
+        state = f"{current_isa()} (this processor supports: {', '.join(available_isas())})"
+        yield Finding("kernels", state + "; slow, because this processor lacks AVX2" * lacks_avx2())
 
 
 def _ffmpeg() -> Iterator[Finding]:

@@ -68,6 +68,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         use_cache()
         module, command = options.run.split(".")
+        if command != "doctor":  # which reports the variable
+            _check_isa()
         # imported here, so that help and wrong arguments do not wait for the imports of commands
         getattr(import_module(f"jaxfit.cli.{module}"), command)(options)
     except InputError as error:
@@ -124,6 +126,17 @@ def _prepare_streams(verbose: bool) -> None:
     os.dup2(discarded, descriptor)
     os.close(discarded)
     sys.stderr = own
+
+
+def _check_isa() -> None:
+    """Reject a wrong `JAXFIT_KERNEL_ISA` at once: a reconstruction uses kernels only after minutes of tracking."""
+    if not os.environ.get("JAXFIT_KERNEL_ISA"):
+        return  # without the imports
+    from jaxfit.raster.kernels import ISA_VARIABLE, isa_problem
+
+    problem = isa_problem()
+    if problem is not None:
+        raise InputError(f"environment variable {ISA_VARIABLE}", *problem)
 
 
 def _rejected(error: InputError) -> int:

@@ -237,8 +237,11 @@ def _run(function: Callable[[Any, Any], Any], shared: Any, task: Any, versions: 
 
 def _versions() -> dict[str, str]:
     """Return the versions that must agree between the processes."""
-    from jaxfit.raster.kernels import kernels_available
+    from jaxfit.raster.kernels import ISA_VARIABLE, isa_problem, kernels_available
 
+    problem = isa_problem()
+    if problem is not None:
+        raise InputError(f"environment variable {ISA_VARIABLE}", *problem)
     return library_versions(_CHECKED) | {"compiled kernels": "yes" if kernels_available() else "no"}
 
 

@@ -94,7 +94,7 @@ def load_bird(path: Path | str) -> Bird:
 
     def int32(array: np.ndarray) -> np.ndarray:
         # without this, an index beyond int32 would wrap round to an index that may be valid
-        return np.where((array < 2**31) & (array >= 0), array, -1).astype(np.int32)
+        return np.where((array < 2**31) & (array >= 0), array.astype(np.int32), np.int32(-1))
 
     # a number too large for float32 becomes infinite, and check_bird reports its field
     with np.errstate(over="ignore"):

@@ -4,7 +4,7 @@ Load the compiled kernels and register them with XLA; no other module does this.
 has no kernels. A warning says so once, and the reference implementations run in place of the kernels. Kernels that
 exist but do not load are an error. The environment variable `JAXFIT_KERNEL_ISA` chooses the instruction set of the
 process: avx512, avx2 or baseline. The default is the best instruction set of the processor. The value none switches the
-kernels off.
+kernels off. Another value, or an instruction set that the processor lacks, is an error.
 """
 
 import functools
@@ -12,6 +12,7 @@ import importlib
 import importlib.util
 import logging
 import os
+import platform
 from types import ModuleType
 
 import jax
@@ -22,6 +23,8 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from jaxfit.raster.silhouette_reference import EDGES, KINDS, Blur, Skin
 
 ISA_VARIABLE = "JAXFIT_KERNEL_ISA"
+_ISAS = ("avx512", "avx2", "baseline")
+"""All instruction sets for which kernels are built. Every processor has the last."""
 _MODULE = "jaxfit.raster._kernels"
 _logger = logging.getLogger(__name__)
 
@@ -39,11 +42,33 @@ def _kernels() -> ModuleType | None:
             slower,
         )
         return None
+    problem = isa_problem()
+    if problem is not None:
+        raise ValueError(f"environment variable {ISA_VARIABLE}: {problem[0]} ({problem[1]})")
     kernels = importlib.import_module(_MODULE)
     kernels.choose_isa(os.environ.get(ISA_VARIABLE) or "auto")
+    if _lack_avx2(kernels.available_isas()):
+        _logger.warning("This processor lacks AVX2, so silhouettes and renderings take several times as long.")
     for name, handler in kernels.handlers().items():
         jax.ffi.register_ffi_target(name, handler, platform="cpu")
     return kernels
+
+
+def isa_problem() -> tuple[str, str] | None:
+    """Why the kernels cannot use the value of the environment variable, and the remedy. None if they can."""
+    name = os.environ.get(ISA_VARIABLE) or "auto"
+    if name in ("auto", "none") or importlib.util.find_spec(_MODULE) is None:
+        return None
+    available = importlib.import_module(_MODULE).available_isas()
+    if name in available:
+        return None
+    problem = f"this processor lacks {name}" if name in _ISAS else f"'{name}' is not an instruction set of the kernels"
+    return problem, f"unset the variable, or set it to {', '.join(['auto', *available])} or none"
+
+
+def _lack_avx2(available: list[str] | tuple[str, ...]) -> bool:
+    """Whether these are the instruction sets of an x86 processor without AVX2. Other processors never have AVX2."""
+    return platform.machine().lower() in ("x86_64", "amd64") and "avx2" not in available
 
 
 def require_kernels() -> ModuleType:
@@ -73,6 +98,11 @@ def current_isa() -> str | None:
     """The instruction set in use. None without kernels."""
     kernels = _kernels()
     return kernels.current_isa() if kernels else None
+
+
+def lacks_avx2() -> bool:
+    """Whether the kernels are slow because this x86 processor lacks AVX2. False without kernels."""
+    return kernels_available() and _lack_avx2(available_isas())
 
 
 def choose_isa(name: str) -> None:

@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxfit.cli import doctor
+from jaxfit.cli.main import main
 from jaxfit.raster import kernels as native
 from jaxfit.raster import silhouette as raster
 
@@ -69,13 +71,52 @@ def test_the_environment_chooses_the_instruction_set(monkeypatch):
     native._kernels.cache_clear()
     monkeypatch.setenv(native.ISA_VARIABLE, "baseline")
     assert native.current_isa() == "baseline"
-    native._kernels.cache_clear()
-    monkeypatch.setenv(native.ISA_VARIABLE, "abacus")
-    with pytest.raises(ValueError, match="'abacus' is not available"):
-        native.current_isa()
     monkeypatch.delenv(native.ISA_VARIABLE)
     native._kernels.cache_clear()
     assert native.current_isa() == ISAS[0]
+
+
+@pytest.fixture
+def old_processor(tmp_path, monkeypatch):
+    """Kernels on an x86 processor without AVX2, in place of the compiled kernels."""
+    module = "available_isas = lambda: ['baseline']\ncurrent_isa = lambda: 'baseline'\n"
+    module += "choose_isa = lambda name: None\nhandlers = dict\n"
+    (tmp_path / "jaxfit_kernels_without_avx2.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(native, "_MODULE", "jaxfit_kernels_without_avx2")
+    monkeypatch.setattr(native.platform, "machine", lambda: "x86_64")
+    native._kernels.cache_clear()
+    yield
+    native._kernels.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ("avx2", "this processor lacks avx2"),
+        ("abacus", "'abacus' is not an instruction set of the kernels"),
+        ("BASELINE", "'BASELINE' is not an instruction set of the kernels"),
+    ],
+)
+def test_an_instruction_set_that_the_variable_cannot_have(value, problem, old_processor, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv(native.ISA_VARIABLE, value)
+    remedy = "unset the variable, or set it to auto, baseline or none"
+    with pytest.raises(ValueError, match=f"{native.ISA_VARIABLE}: {problem}"):
+        native.current_isa()
+    assert main(["reconstruct", "no.mp4", "--out", str(tmp_path / "result")]) == 2  # before the work begins
+    message = f"jaxfit: environment variable JAXFIT_KERNEL_ISA: {problem} ({remedy})\n"
+    assert capsys.readouterr().err.endswith(message)
+    (finding,) = doctor._checked(doctor._kernels)
+    assert (finding.state, finding.remedy) == (f"environment variable JAXFIT_KERNEL_ISA: {problem}", remedy)
+
+
+def test_a_processor_without_avx2(old_processor, monkeypatch, caplog):
+    with caplog.at_level(logging.WARNING, logger="jaxfit"):
+        assert [native.lacks_avx2() for _ in range(2)] == [True, True]
+    assert [record.message.count("lacks AVX2") for record in caplog.records] == [1]
+    assert "lacks AVX2" in doctor._checked(doctor._kernels)[0].state
+    monkeypatch.setattr(native.platform, "machine", lambda: "aarch64")
+    assert not native.lacks_avx2()
 
 
 @pytest.mark.skipif(not os.environ.get("JAXFIT_REQUIRE_KERNELS"), reason="JAXFIT_REQUIRE_KERNELS is not set")
