@@ -13,7 +13,7 @@ export JAXFIT_REFERENCE
 # Some machines set this variable. Every process of the tests would then compile all imported modules again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: install test extended portable lint bench demo notebooks clean
+.PHONY: install test extended portable lint bench demo notebooks wheel clean
 .DEFAULT_GOAL := help
 
 help:
@@ -25,6 +25,7 @@ help:
 	@echo "make bench      benchmarks against the committed baseline"
 	@echo "make demo       simulate a short scene, reconstruct it from its footage, show and export it"
 	@echo "make notebooks  run the notebooks and store their output (16 minutes)"
+	@echo "make wheel      the source distribution and a tried wheel, in dist (ZIG=1: compiled by Zig, for older Linux)"
 	@echo "make clean      remove the environment and everything built"
 
 install: $(VENV)/installed
@@ -52,8 +53,8 @@ portable: install
 	$(BIN)/python tests/support/portable.py
 
 lint: install
-	$(BIN)/ruff check jaxfit tests notebooks
-	$(BIN)/ruff format --check jaxfit tests notebooks
+	$(BIN)/ruff check jaxfit tests notebooks .ci
+	$(BIN)/ruff format --check jaxfit tests notebooks .ci
 	$(BIN)/pyright jaxfit
 
 bench: install
@@ -65,5 +66,8 @@ demo: install
 notebooks: install
 	$(BIN)/python tests/support/notebook_runs.py
 
+wheel:
+	$(PYTHON) .ci/wheel.py $(if $(ZIG),--zig)
+
 clean:
-	rm -rf $(VENV) build demo .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache .hypothesis

@@ -101,7 +101,7 @@ def _ffmpeg() -> Iterator[Finding]:
 
     codecs = ".".join(map(str, av.library_versions["libavcodec"]))
     yield Finding("FFmpeg", f"PyAV {av.__version__} with libavcodec {codecs}")
-    remedy = 'run pip install --upgrade --force-reinstall "av>=18"'
+    remedy = 'run pip install --upgrade --force-reinstall "av>=18,<19"'
     decoders = [name for name in _DECODERS if _has_codec(name, "r")]
     lacking = [name for name in _DECODERS if name not in decoders]
     state = f"{', '.join(decoders)}" + (f"; without {', '.join(lacking)}" if lacking else "")

@@ -36,8 +36,8 @@ class OptionalPackage(NamedTuple):
 
 
 OPTIONAL_PACKAGES = {
-    "h5py": OptionalPackage("h5py", "3.12", "formats", "files of DeepLabCut (.h5) and SLEAP, `jaxfit suggest`"),
-    "xarray": OptionalPackage("xarray", "2024.10", "formats", "`jaxfit export --to movement`"),
+    "h5py": OptionalPackage("h5py", "3.14", "formats", "files of DeepLabCut (.h5) and SLEAP, `jaxfit suggest`"),
+    "xarray": OptionalPackage("xarray", "2025.8", "formats", "`jaxfit export --to movement`"),
     "h5netcdf": OptionalPackage("h5netcdf", "1.4", "formats", "`jaxfit export --to movement`"),
     "pyarrow": OptionalPackage("pyarrow", "18", "formats", "`jaxfit export --to parquet`"),
     "pynwb": OptionalPackage("pynwb", "4.2", "formats", "`jaxfit export --to nwb`"),

@@ -48,7 +48,7 @@ def _kernels() -> ModuleType | None:
     kernels = importlib.import_module(_MODULE)
     kernels.choose_isa(os.environ.get(ISA_VARIABLE) or "auto")
     if _lack_avx2(kernels.available_isas()):
-        _logger.warning("This processor lacks AVX2, so silhouettes and renderings take several times as long.")
+        _logger.warning("This processor lacks AVX2, so silhouettes and renderings take two to three times as long.")
     for name, handler in kernels.handlers().items():
         jax.ffi.register_ffi_target(name, handler, platform="cpu")
     return kernels

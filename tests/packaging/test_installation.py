@@ -83,15 +83,25 @@ def kernels_in(wheel):
 
 
 @pytest.fixture(scope="module")
-def wheel(build_python, tmp_path_factory):
-    """A wheel of the source distribution."""
-    folder = tmp_path_factory.mktemp("wheel")
+def sdist(build_python, tmp_path_factory):
+    """The folder of an unpacked source distribution."""
+    folder = tmp_path_factory.mktemp("sdist")
     code = f"import os; os.chdir({str(ROOT)!r}); from scikit_build_core.build import build_sdist"
     run(build_python, "-c", f"{code}; build_sdist({str(folder)!r})")
     (archive,) = folder.glob("jaxfit_birds-*.tar.gz")
     with tarfile.open(archive) as file:
         file.extractall(folder, filter="data")
-    return build_wheel(build_python, archive.with_name(archive.name.removesuffix(".tar.gz")))[0]
+    return archive.with_name(archive.name.removesuffix(".tar.gz"))
+
+
+@pytest.fixture(scope="module")
+def wheel(build_python, sdist):
+    """A wheel of the source distribution."""
+    return build_wheel(build_python, sdist)[0]
+
+
+def test_a_source_distribution_holds_what_a_build_reads(sdist):
+    assert {path.name for path in sdist.iterdir()} - {"dist"} == {*SOURCES, "CHANGELOG.md", "PKG-INFO"}
 
 
 def test_a_wheel_holds_kernels_configs_and_all_files_of_the_package(wheel):
