@@ -1,5 +1,9 @@
 #include "instruction_set.h"
 
+#if defined(JAXFIT_X86)
+#include <cpuid.h>
+#endif
+
 #include <atomic>
 #include <stdexcept>
 
@@ -21,15 +25,33 @@ Choice choice(const char* name) {
   return {name, {&Own::soft_rasterizer, &Own::unbiased}, &Own::renderer};
 }
 
+#if defined(JAXFIT_X86)
+
+struct Features {
+  bool avx2, avx512;
+};
+
+// Asks the processor, because __builtin_cpu_supports finds no instruction set in programs that Zig compiles.
+Features features() {
+  constexpr unsigned first = bit_OSXSAVE | bit_AVX | bit_FMA;
+  constexpr unsigned avx512 = bit_AVX512F | bit_AVX512BW | bit_AVX512DQ | bit_AVX512VL;
+  unsigned a, b, c, d;
+  if (!__get_cpuid(1, &a, &b, &c, &d) || (c & first) != first) return {};
+  unsigned saved, rest;  // the registers that the operating system saves: bits 1, 2 for AVX; 5, 6, 7 for AVX-512
+  __asm__("xgetbv" : "=a"(saved), "=d"(rest) : "c"(0));
+  if ((saved & 0x06) != 0x06 || !__get_cpuid_count(7, 0, &a, &b, &c, &d)) return {};
+  const bool avx2 = (b & bit_AVX2) != 0;
+  return {avx2, avx2 && (b & avx512) == avx512 && (saved & 0xe6) == 0xe6};
+}
+
+#endif
+
 std::vector<Choice> choices() {
   std::vector<Choice> available;
 #if defined(JAXFIT_X86)
-  __builtin_cpu_init();
-  const bool avx2 = __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
-  if (avx2 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-      __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl"))
-    available.push_back(choice<Isa::kAvx512>("avx512"));
-  if (avx2) available.push_back(choice<Isa::kAvx2>("avx2"));
+  const Features found = features();
+  if (found.avx512) available.push_back(choice<Isa::kAvx512>("avx512"));
+  if (found.avx2) available.push_back(choice<Isa::kAvx2>("avx2"));
 #endif
   available.push_back(choice<Isa::kBaseline>("baseline"));
   return available;
