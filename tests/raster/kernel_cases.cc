@@ -49,7 +49,8 @@ std::vector<Case> read_cases(const char* path) {
   std::vector<Case> cases;
   std::string name;
   size_t count = 0;
-  while (file >> name >> count) {
+  bool complete = true;
+  while (complete && file >> name >> count) {
     if (name == "case") {
       cases.emplace_back();
       continue;
@@ -60,10 +61,10 @@ std::vector<Case> read_cases(const char* path) {
       file >> text;
       value = std::strtof(text.c_str(), nullptr);
     }
-    if (!file || cases.empty()) break;
-    cases.back().arrays[name] = std::move(values);
+    complete = !file.fail() && !cases.empty();
+    if (complete) cases.back().arrays[name] = std::move(values);
   }
-  if (cases.empty() || !file.eof()) {
+  if (!complete || cases.empty() || !file.eof()) {
     std::cerr << path << ": is not a complete file of cases\n";
     std::exit(2);
   }
