@@ -115,25 +115,32 @@ struct Block {
   }
 }
 
-// Fills the positions of the centres of a window's blocks. Returns the bits of the blocks that the face reaches.
-[[gnu::always_inline]] inline uint32_t set_centres(const Face& face, const Faces& f, int lane, Window w, Scale scale,
-                                                   Positions& centre) {
-  const float reach = scale.radius + 2.1213204f * scale.k;  // 1.5·√2 px from a block's centre to its corner pixels
+// Fills the positions of the centres of a window's blocks.
+[[gnu::always_inline]] inline void set_centres(const Face& face, const Faces& f, int lane, Window w, Scale scale,
+                                               Positions& centre) {
   const Vec x0 = all(((static_cast<float>(w.column) + 0.5f) * kBlock - f.x0[lane]) * scale.k);
   const Vec y0 = all(((static_cast<float>(w.row) + 0.5f) * kBlock - f.y0[lane]) * scale.k);
-  uint32_t near = 0;
   for (int at = 0; at < kLanes; at += kWidth) {
     const Vec x = fma(load(kWindows.column[w.width] + at), all(kBlock * scale.k), x0);
     const Vec y = fma(load(kWindows.row[w.width] + at), all(kBlock * scale.k), y0);
+    for (int i = 0; i < 3; ++i) {
+      const Vec across = fms(face.tx[i], y, face.ty[i] * x);
+      store(centre.across[i] + at, i == 1 ? across + all(f.height[lane]) : across);
+      store(centre.along[i] + at, fma(face.tx[i], x, fma(face.ty[i], y, all(f.shift[i][lane]))));
+    }
+  }
+}
+
+// Returns the bits of the blocks of a window that the face reaches.
+[[gnu::always_inline]] inline uint32_t blocks_in_reach(const Face& face, const Faces& f, int lane, Scale scale,
+                                                       const Positions& centre) {
+  const float reach = scale.radius + 2.1213204f * scale.k;  // 1.5·√2 px from a block's centre to its corner pixels
+  uint32_t near = 0;
+  for (int at = 0; at < kLanes; at += kWidth) {
     Vec across[3], along[3];
     for (int i = 0; i < 3; ++i) {
-      across[i] = fms(face.tx[i], y, face.ty[i] * x);
-      along[i] = fma(face.tx[i], x, fma(face.ty[i], y, all(f.shift[i][lane])));
-    }
-    across[1] = across[1] + all(f.height[lane]);
-    for (int i = 0; i < 3; ++i) {
-      store(centre.across[i] + at, across[i]);
-      store(centre.along[i] + at, along[i]);
+      across[i] = load(centre.across[i] + at);
+      along[i] = load(centre.along[i] + at);
     }
     const Mask in_reach = greater(all(reach * reach), nearest_edge(face, across, along).d) &
                           greater(across[0], all(f.reach[0][lane])) & greater(across[1], all(f.reach[1][lane])) &
@@ -164,7 +171,8 @@ template <Reached reached, typename Visit>
       if (!todo) continue;
       const Face face = repeat(f, lane);
       Positions centre, to_pixel;
-      todo &= set_centres(face, f, lane, window, scale, centre);
+      set_centres(face, f, lane, window, scale, centre);
+      if (!known) todo &= blocks_in_reach(face, f, lane, scale, centre);
       if (one_window && !known) f.near[lane] = todo;
       set_pixels(face, scale, to_pixel);
       for (; todo; todo &= todo - 1) {

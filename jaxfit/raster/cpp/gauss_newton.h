@@ -92,7 +92,6 @@ void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
 [[gnu::always_inline]] inline void add_edge(const Mesh& mesh, const Skin& skin, const Faces& f, int lane, int edge,
                                             uint32_t pixels, const float* pull_x, const float* pull_y,
                                             const float* along, const int32_t* of_pixel, Rows& rows) {
-  if (!pixels) return;
   const int64_t D = skin.parameters;
   const float* a = vertex_rows(mesh, skin, f.vertex[edge][lane], rows.of_vertex);
   const float* b = vertex_rows(mesh, skin, f.vertex[(edge + 1) % 3][lane], rows.of_vertex);
@@ -121,6 +120,7 @@ void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, R
           const Vec pull = flip_sign(load(block.place + at) * reciprocal(all(1.f) + exp2(n.d)), n.d);
           for (int i = 0; i < 3; ++i) {
             const uint32_t own = i < 2 ? pixels & bits(at_most(n.square[i], n.smallest)) : pixels;
+            if (!own) continue;
             pixels &= ~own;
             alignas(64) float pull_x[kWidth], pull_y[kWidth], along[kWidth];
             store(pull_x, pull * fms(face.tx[i], n.beyond[i], face.ty[i] * n.across[i]));

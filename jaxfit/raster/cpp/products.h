@@ -56,8 +56,8 @@ struct BlockValues {
 };
 
 // Returns 1 where a byte of a 4×4 block is not `value`, else 0. The bytes outside the image are `fill`.
-[[gnu::always_inline]] inline BlockValues load_unequal(const uint8_t* image, int64_t size, int64_t column, int64_t row, uint8_t value,
-                                               uint8_t fill) {
+[[gnu::always_inline]] inline BlockValues load_unequal(const uint8_t* image, int64_t size, int64_t column, int64_t row,
+                                                       uint8_t value, uint8_t fill) {
   typedef float Quad __attribute__((vector_size(16)));
   typedef int32_t IntQuad __attribute__((vector_size(16)));
   const IntQuad own_byte = {0xFF, 0xFF00, 0xFF0000, INT32_MIN >> 7};

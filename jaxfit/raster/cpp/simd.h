@@ -17,7 +17,7 @@
 namespace jaxfit {
 namespace {
 
-constexpr int kLanes = 16;       // pixels of a block, and faces that are prepared together
+constexpr int kLanes = 16;      // pixels of a block, and faces that are prepared together
 constexpr float kFull = 1e30f;  // the limit of products
 
 // Defined for each instruction set:
@@ -62,7 +62,6 @@ typedef int32_t Ints __attribute__((vector_size(32)));
 [[gnu::always_inline]] inline Vec fma(Vec a, Vec b, Vec c) { return _mm256_fmadd_ps(a, b, c); }
 [[gnu::always_inline]] inline Vec fms(Vec a, Vec b, Vec c) { return _mm256_fmsub_ps(a, b, c); }
 [[gnu::always_inline]] inline uint32_t bits(Ints m) { return static_cast<uint32_t>(_mm256_movemask_ps((Vec)m)); }
-[[gnu::always_inline]] inline Vec select(Ints m, Vec a, Vec b) { return _mm256_blendv_ps(b, a, (Vec)m); }
 
 #elif defined(__SSE2__)
 
@@ -75,9 +74,6 @@ typedef int32_t Ints __attribute__((vector_size(16)));
 [[gnu::always_inline]] inline Vec fma(Vec a, Vec b, Vec c) { return a * b + c; }
 [[gnu::always_inline]] inline Vec fms(Vec a, Vec b, Vec c) { return a * b - c; }
 [[gnu::always_inline]] inline uint32_t bits(Ints m) { return static_cast<uint32_t>(_mm_movemask_ps((Vec)m)); }
-[[gnu::always_inline]] inline Vec select(Ints m, Vec a, Vec b) {
-  return (Vec)((m & (Ints)a) | (~m & (Ints)b));
-}
 
 #else  // NEON on ARM; elsewhere what the compiler makes of vectors of four floats
 
@@ -89,9 +85,6 @@ typedef int32_t Ints __attribute__((vector_size(16)));
 [[gnu::always_inline]] inline uint32_t bits(Ints m) {
   const Ints own = m & Ints{1, 2, 4, 8};
   return static_cast<uint32_t>((own[0] | own[1]) | (own[2] | own[3]));
-}
-[[gnu::always_inline]] inline Vec select(Ints m, Vec a, Vec b) {
-  return (Vec)((m & (Ints)a) | (~m & (Ints)b));
 }
 #if defined(__ARM_NEON) && defined(__aarch64__)
 [[gnu::always_inline]] inline Vec sqrt(Vec a) { return vsqrtq_f32(a); }
@@ -153,6 +146,11 @@ typedef Ints Mask;  // all bits of a lane are set, or none
 [[gnu::always_inline]] inline Mask greater(Vec a, Vec b) { return (Ints)(a > b); }
 [[gnu::always_inline]] inline Mask at_most(Vec a, Vec b) { return (Ints)(a <= b); }
 [[gnu::always_inline]] inline Vec keep(Mask m, Vec a) { return (Vec)(m & (Ints)a); }
+#if defined(__AVX2__)
+[[gnu::always_inline]] inline Vec select(Mask m, Vec a, Vec b) { return _mm256_blendv_ps(b, a, (Vec)m); }
+#else
+[[gnu::always_inline]] inline Vec select(Mask m, Vec a, Vec b) { return (Vec)((m & (Ints)a) | (~m & (Ints)b)); }
+#endif
 [[gnu::always_inline]] inline Vec clamp_to(Vec a, Vec limit) { return max(min(a, limit), -limit); }
 [[gnu::always_inline]] inline Vec reciprocal(Vec a) { return 1.f / a; }
 [[gnu::always_inline]] inline Vec exp2(Vec a) {
