@@ -20,6 +20,11 @@ PLAYED = (".mp4", ".m4v", ".webm", ".mov")
 JPEG_QUALITY = 85
 
 
+def is_played(video: Path) -> bool:
+    """Whether browsers may play a film as it is; a folder of images is no film."""
+    return not video.is_dir() and video.suffix.lower() in PLAYED
+
+
 def frame_picture(video: Path, number: int, max_width: int = 1920) -> bytes:
     """Return one frame as JPEG.
 

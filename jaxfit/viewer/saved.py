@@ -17,7 +17,7 @@ import numpy as np
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file, check_replaceable, new_folder, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
-from jaxfit.viewer.film import PLAYED, write_copy
+from jaxfit.viewer.film import is_played, write_copy
 from jaxfit.viewer.page import saved_index
 from jaxfit.viewer.shown import Shown
 
@@ -58,40 +58,46 @@ def save_page(
     Raises:
         InputError: the poses alone are too large for one file, the film cannot be read, or the page cannot be written.
     """
-    whole = out.suffix.lower() == ".html"
-    if whole:
+    if out.suffix.lower() == ".html":
         check_new_file(out, overwrite)
-    else:
-        check_replaceable(out, overwrite, INDEX)
-    return (_save_file if whole else _save_folder)(results, video, out, overwrite, progress)
+        return _save_file(results, video, out, progress)
+    check_replaceable(out, overwrite, INDEX)
+    return _save_folder(results, video, out, overwrite, progress)
 
 
-def _save_file(results: Sequence[Shown], video: Path | None, out: Path, _: bool, progress: ProgressTask) -> Saved:
+def _save_file(results: Sequence[Shown], video: Path | None, out: Path, progress: ProgressTask) -> Saved:
     left_out: list[str] = [*_ALWAYS]
     entries = [_element(path, content) for path, content in _arrays(results, left_out, progress)]
-    film, copy = None, None
     free = LARGEST_FILE - sum(map(len, entries)) - len(saved_index("")) - 2 * len(json.dumps(_facts(results, None, [])))
     if free < 0:
         problem = f"would have {(LARGEST_FILE - free) / 1e6:.0f} MB without a film, more than {LARGEST_FILE / 1e6:.0f}"
         raise InputError(out, problem, "give --frames A:B, or a folder in place of a file")
-    with tempfile.TemporaryDirectory() as folder:
-        for width in WIDTHS if video is not None else ():
-            film = Path(folder) / f"{width}.mp4"
-            times = write_copy(_video(video), results[0].solution.frame_index, film, width, progress)
-            if film.stat().st_size * 4 / 3 < free:
-                text = base64.b64encode(film.read_bytes()).decode()
-                entries.append(f'<script type="text/plain" data-path="film" data-type="video/mp4">{text}</script>')
-                copy = {"source": "film", "times_s": times.tolist(), "pictures": False}
-                if width < results[0].size_px[0]:
-                    left_out.append(f"the film in its full size: it is {width} pixels wide here")
-                break
-        else:
-            if video is not None:
-                left_out.append(f"the film, with which the page would have more than {LARGEST_FILE / 1e6:.0f} MB")
+    copy = None
+    if video is not None:
+        film, copy, without = _film_that_fits(results[0], video, free, progress)
+        entries += film
+        left_out += without
     facts = json.dumps(_facts(results, copy, left_out)).encode()
     content = saved_index("\n".join([_element("facts", facts), *entries])).encode()
     write_whole(out, content)
     return Saved(out, len(content), tuple(left_out))
+
+
+def _film_that_fits(
+    result: Shown, video: Path, free: int, progress: ProgressTask
+) -> tuple[list[str], dict[str, Any] | None, list[str]]:
+    """Return the largest copy of a film that has at most `free` bytes as an element, its facts, and what it lacks."""
+    with tempfile.TemporaryDirectory() as folder:
+        for width in WIDTHS:
+            film = Path(folder) / f"{width}.mp4"
+            times = write_copy(video, result.solution.frame_index, film, width, progress)
+            if film.stat().st_size * 4 / 3 < free:
+                text = base64.b64encode(film.read_bytes()).decode()
+                element = f'<script type="text/plain" data-path="film" data-type="video/mp4">{text}</script>'
+                smaller = width < result.size_px[0]
+                lacks = [f"the film in its full size: it is {width} pixels wide here"] if smaller else []
+                return [element], {"source": "film", "times_s": times.tolist(), "pictures": False}, lacks
+    return [], None, [f"the film, with which the page would have more than {LARGEST_FILE / 1e6:.0f} MB"]
 
 
 def _save_folder(
@@ -106,7 +112,7 @@ def _save_folder(
         copy = None
         if video is not None:
             name, times = "film.mp4", None
-            if not video.is_dir() and video.suffix.lower() in PLAYED and np.isfinite(results[0].times_s).all():
+            if is_played(video) and np.isfinite(results[0].times_s).all():
                 name = f"film{video.suffix.lower()}"
                 shutil.copyfile(video, part / name)
             else:
@@ -122,11 +128,6 @@ def _save_folder(
 _ALWAYS = ("corrections, which need `jaxfit view`",)
 
 
-def _video(video: Path | None) -> Path:
-    assert video is not None
-    return video
-
-
 def _facts(results: Sequence[Shown], film: dict[str, Any] | None, left_out: Sequence[str]) -> dict[str, Any]:
     facts = [each.facts() for each in results]
     for each in facts:
@@ -140,10 +141,9 @@ def _arrays(results: Sequence[Shown], left_out: list[str], progress: ProgressTas
     with progress("Saving the page", sum(each.parts for each in results)) as report_progress:
         for number, result in enumerate(results):
             readers: dict[str, Callable[[], bytes]] = {"rig": result.rig, "flags": result.flags}
-            known = [each["name"] for each in result.facts()["values"]] if number == 0 else []
-            for name in known:
-                if name in CURVES:
-                    readers[f"values/{name}"] = partial(result.values, name)
+            if number == 0:  # the page shows the curves of the first result only
+                names = [each["name"] for each in result.kinds_of_values]
+                readers |= {f"values/{name}": partial(result.values, name) for name in names if name in CURVES}
             for name, read in readers.items():
                 try:
                     yield f"results/{number}/{name}", read()
@@ -153,8 +153,8 @@ def _arrays(results: Sequence[Shown], left_out: list[str], progress: ProgressTas
                 yield f"results/{number}/poses/{part}", result.part(part)
                 yield f"results/{number}/outlines/{part}", result.outlines(part)
                 report_progress(1, f"part {part + 1}")
-    further = [each["name"].replace("_", " ") for each in results[0].facts()["values"] if each["name"] not in CURVES]
-    left_out.append(f"{len(further)} further curves, which `jaxfit view` shows")
+    further = sum(each["name"] not in CURVES for each in results[0].kinds_of_values)
+    left_out.append(f"{further} further curves, which `jaxfit view` shows")
 
 
 def _packed(content: bytes) -> str:

@@ -22,7 +22,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import parse_json
-from jaxfit.viewer.film import PLAYED, frame_picture
+from jaxfit.viewer.film import frame_picture, is_played
 from jaxfit.viewer.page import FILES, index, policy
 from jaxfit.viewer.session import Session
 from jaxfit.viewer.shown import Shown
@@ -46,11 +46,9 @@ class Viewer:
 
     def facts(self) -> dict[str, Any]:
         """Return what the page needs first."""
-        first = self.results[0].solution.frame_index
         film = None
         if self.video is not None:
-            played = not self.video.is_dir() and self.video.suffix.lower() in PLAYED
-            film = {"source": "film" if played else None, "times_s": None, "pictures": True}
+            film = {"source": "film" if is_played(self.video) else None, "times_s": None, "pictures": True}
         corrections = None
         if self.session is not None:
             corrections = {"edits": [str(edit) for edit in self.session.edits], "file": str(self.session.edits_path)}
@@ -58,7 +56,6 @@ class Viewer:
             "results": [each.facts() for each in self.results],
             "film": film,
             "corrections": corrections,
-            "first_frame": int(first[0]),
         }
 
 
@@ -108,8 +105,8 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         return JSONResponse(work.entries())
 
     async def work(request: Request) -> Response:
-        known = viewer.session is not None and viewer.session.work is not None
-        return JSONResponse(viewer.session.work.entries() if known else {"done": True, "kind": ""})  # type: ignore[union-attr]
+        running = None if viewer.session is None else viewer.session.work
+        return JSONResponse({"done": True, "kind": ""} if running is None else running.entries())
 
     inside = Starlette(
         routes=[
@@ -207,8 +204,7 @@ def _content(result: Shown, kind: str, argument: str | None) -> bytes:
         return result.rig() if kind == "rig" else result.flags()
     if kind in ("poses", "outlines") and argument is not None and argument.isdecimal() and len(argument) < 9:
         return result.part(int(argument)) if kind == "poses" else result.outlines(int(argument))
-    names = {each["name"] for each in result.facts()["values"]}
-    if kind == "values" and argument in names:
+    if kind == "values" and argument in [each["name"] for each in result.kinds_of_values]:
         return result.values(argument)
     raise HTTPException(404)
 

@@ -99,7 +99,7 @@ class Shown:
 
     def facts(self) -> dict[str, Any]:
         """Return what the page needs first: tracks, times, names."""
-        s, seen = self.solution, self.observations is not None
+        s = self.solution
         times = [None if np.isnan(time) else round(float(time), 6) for time in self.times_s]
         return {
             "name": "/".join(self.folder.resolve().parts[-2:]),
@@ -114,13 +114,16 @@ class Shown:
             "skeleton": [list(pair) for pair in skeleton_pairs(s.keypoint_names)],
             "keypoints": list(s.keypoint_names),
             "flags": list(FLAGS),
-            "values": self._names_of_values(seen),
+            "values": self.kinds_of_values,
             "region_radius": float(np.sqrt(REGION_95)),
-            "detected": seen,
+            "detected": self.observations is not None,
         }
 
-    def _names_of_values(self, seen: bool) -> list[dict[str, str]]:
-        own = [{"name": name, "title": title, "unit": unit} for name, (title, unit) in OWN_VALUES.items() if seen]
+    @property
+    def kinds_of_values(self) -> list[dict[str, str]]:
+        """Name, title and unit of the values over time that the page offers."""
+        own_values = OWN_VALUES if self.observations is not None else {}
+        own = [{"name": name, "title": title, "unit": unit} for name, (title, unit) in own_values.items()]
         unit = "m" if self.solution.has_world and self.bird.metres_per_unit else "bl"
         return own + [
             {"name": each.name, "title": each.name.replace("_", " ").capitalize(), "unit": each.shown_unit(unit)}
