@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.stats import bootstrap
 
-from jaxfit.behaviour.describe import Description
+from jaxfit.behaviour.describe import Description, circular_mean
 from jaxfit.behaviour.rules import OTHER, BehaviourConfig, BehaviourRule, Range
 from jaxfit.view.report.behaviour import NO_POSE
 
@@ -259,7 +259,7 @@ def _mean(values: np.ndarray, circular: bool) -> float:
     known = values[np.isfinite(values)].astype(np.float64)
     if not len(known):
         return float("nan")
-    return float(np.degrees(np.angle(np.exp(1j * np.radians(known)).mean())) if circular else known.mean())
+    return float(circular_mean(known) if circular else known.mean())
 
 
 def time_budget(ethogram: Ethogram, track_id: Int[np.ndarray, "N"]) -> list[Budget]:

@@ -105,6 +105,11 @@ def describe(
     return Description(flock, tuple(present), values, sd, missing, flock.solution.track_id)
 
 
+def circular_mean(directions_deg: Float[np.ndarray, "M *A"]) -> Float[np.ndarray, "*A"]:
+    """Return the circular mean over the first axis, −180 to 180 degrees."""
+    return np.degrees(np.angle(np.exp(1j * np.radians(directions_deg)).mean(axis=0)))
+
+
 def by_reason(missing: Mapping[str, str]) -> dict[str, list[str]]:
     """Return reason → the names that are missing for it."""
     reasons: dict[str, list[str]] = {}
@@ -181,7 +186,7 @@ def _deviations(flock: Flock, features: Sequence[Feature], first: int, last: int
         values = np.stack(drawn[each.name])
         if each.circular:
             with np.errstate(all="ignore"):
-                middle = np.degrees(np.angle(np.exp(1j * np.radians(values)).mean(axis=0)))
+                middle = circular_mean(values)
             values = (values - middle + 180) % 360 - 180
         found[each.name] = np.where(known, values.std(axis=0, ddof=1), np.nan)
     return found

@@ -77,16 +77,17 @@ def check(target: Target) -> list[tuple[str, str, str]]:
         if ran.returncode:
             print(ran.stdout, ran.stderr, sep="\n", file=sys.stderr)
             return [("", "compile", "FAILED")]
+    compiled = ("", "compile", "ok")
     runner = shutil.which(target.runner, path=f"{os.environ['PATH']}:/usr/lib/wine") if target.runner else ""
     if runner is None:
-        return [("", "compile", "ok"), ("", "run", f"skipped: {target.runner} is not installed")]
+        return [compiled, ("", "run", f"skipped: {target.runner} is not installed")]
     (program,) = (path for path in folder.iterdir() if path.name in ("kernel_cases", "kernel_cases.exe"))
     ran = subprocess.run([*filter(None, [runner]), str(program), str(CASES)], capture_output=True, text=True)
     if "unexpected memory mapping" in ran.stderr:  # GCC 12's thread sanitizer, where Linux spreads addresses widely
-        return [("", "compile", "ok"), ("", "run", "skipped: this sanitizer does not start on this system")]
+        return [compiled, ("", "run", "skipped: this sanitizer does not start on this system")]
     lines = [line.split() for line in ran.stdout.splitlines()]
     isas = list(dict.fromkeys(line[0] for line in lines))
-    result = [("", "compile", "ok")]
+    result = [compiled]
     for isa in isas:
         own = [line for line in lines if line[0] == isa]
         errors = {name: float(error) for _, name, error, _ in own if error != "-"}
