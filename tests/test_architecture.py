@@ -1,6 +1,6 @@
-"""The layout of the code: docs/architecture.md is true, and the rules that it states hold.
+"""The layout of the code: docs/developers/architecture.md and modules.md are true, and the rules hold that they state.
 
-After a module is added, renamed or removed, `python tests/test_architecture.py` rewrites the tree of the document. The
+After a module is added, renamed or removed, `python tests/test_architecture.py` rewrites the tree of modules.md. The
 tree keeps the descriptions; a new module gets the first line of its docstring, to be shortened by hand, without a
 full stop.
 """
@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENT = ROOT / "docs" / "architecture.md"
+TEXT = ROOT / "docs" / "developers" / "architecture.md"
+DOCUMENT = TEXT.with_name("modules.md")
 PACKAGE = ROOT / "jaxfit"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 MOST_LINES, MOST_FUNCTION_LINES, MOST_ROOT_MODULES, MOST_FLOORS = 500, 60, 2, 100
@@ -116,12 +117,12 @@ def test_the_tree_of_the_document_is_the_tree_of_the_package():
         if path not in documented:
             wrong.append((line, f"add {path} after this line"))
         line = documented[path].line if path in documented else line
-    messages = [f"docs/architecture.md:{line}: {what}" for line, what in sorted(wrong)]
+    messages = [f"docs/developers/modules.md:{line}: {what}" for line, what in sorted(wrong)]
     assert not wrong, "\n".join([*messages, "or run: python tests/test_architecture.py"])
 
 
-def test_paths_in_the_text_of_the_document_exist():
-    text = TREE.sub("", DOCUMENT.read_text(encoding="utf-8"))
+def test_paths_in_the_text_of_the_documents_exist():
+    text = TEXT.read_text(encoding="utf-8") + TREE.sub("", DOCUMENT.read_text(encoding="utf-8"))
     named = re.findall(r"`([\w*./]+(?:/|\.py|\.cc|\.yaml))`", text)
     assert not [path for path in named if not any(list(folder.glob(path)) for folder in (PACKAGE, ROOT))]
 
@@ -129,7 +130,7 @@ def test_paths_in_the_text_of_the_document_exist():
 def test_the_document_names_the_floor_of_every_package():
     present = {path.split("/")[0].removesuffix(".py") for path in paths_on_disk()} - {"__init__", "__init__.pyi"}
     lacking, removed = present - floors().keys(), floors().keys() - present
-    assert not lacking | removed, f'docs/architecture.md, "Floors": add {lacking or "none"}, remove {removed or "none"}'
+    assert not lacking | removed, f'modules.md, "Floors": add {lacking or "none"}, remove {removed or "none"}'
 
 
 def test_modules_import_from_lower_floors_only():

@@ -18,7 +18,7 @@ from jaxfit.objective.residuals import residual_sum
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 MODEL_CARD = ROOT / "jaxfit" / "perception" / "networks" / "README.md"
-DOCUMENTS = [README, MODEL_CARD, *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [README, MODEL_CARD, *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 documents = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 
@@ -80,7 +80,7 @@ def test_python_examples_import_what_exists(path):
 
 
 def test_the_example_of_residuals_is_a_term(monkeypatch):
-    text = (ROOT / "docs" / "terms.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "developers" / "term.md").read_text(encoding="utf-8")
     (example,) = [block for _, block in BLOCK.findall(text) if "Residuals(" in block]
     names = {"__name__": "residuals_example"}
     monkeypatch.setattr(registry, "_terms", dict(registry._terms))
@@ -96,7 +96,7 @@ def test_the_example_of_residuals_is_a_term(monkeypatch):
 
 
 def test_configs_are_valid(tmp_path):
-    text = (ROOT / "docs" / "configs.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "guide" / "configs.md").read_text(encoding="utf-8")
     configs = [block for language, block in BLOCK.findall(text) if language == "yaml" and block.startswith("base:")]
     assert configs
     for config in configs:

@@ -1,4 +1,4 @@
-"""docs/limits.md lists all limits of `jaxfit.foundation.limits`; `python tests/test_limits_document.py` rewrites it."""
+"""docs/reference/limits.md lists all limits of `jaxfit.foundation.limits`; this file, run as a script, rewrites it."""
 
 import ast
 import re
@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCE, DOCUMENT = ROOT / "jaxfit" / "foundation" / "limits.py", ROOT / "docs" / "limits.md"
+SOURCE, DOCUMENT = ROOT / "jaxfit" / "foundation" / "limits.py", ROOT / "docs" / "reference" / "limits.md"
 START = "<!-- the tables below are written from jaxfit/foundation/limits.py -->\n"
 
 

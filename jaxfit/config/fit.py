@@ -140,7 +140,7 @@ class StageConfig:
     """Optimised parameters: global_orient, body_pose, transl, scale, bone_length, betas."""
     solver: Literal["adam", "levenberg_marquardt"] = "adam"
     """`adam`: for all terms. `levenberg_marquardt`: needs 10 to 30 steps instead of hundreds; all terms of the library,
-    and terms of others that return residuals (docs/terms.md)."""
+    and terms of others that return residuals (docs/developers/term.md)."""
     learning_rate: float = 0.01
     """Adam's step size, in each parameter's own unit."""
     step_scale: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
@@ -216,11 +216,11 @@ class FitConfig:
     initialise: InitialiseConfig = InitialiseConfig()
     error_bars: bool = False
     """Whether the result has error bars: standard deviations of the pose and covariances of the keypoints
-    (docs/files.md). They assume that the terms of the last stage are negative log-likelihoods."""
+    (docs/reference/result_folder.md). They assume that the terms of the last stage are negative log-likelihoods."""
     learn_weights: tuple[str, ...] = ()
-    """What is learnt from the data before the fit (docs/configs.md): the scale of `keypoint_likelihood`, the weight of
-    `mask_smooth_l1`, and `keypoint_offsets`. The values of the config are then the initial values, and weak prior
-    knowledge. The result holds the learnt values in `learnt.yaml`."""
+    """What is learnt from the data before the fit (docs/method/learnt_weights.md): the scale of `keypoint_likelihood`,
+    the weight of `mask_smooth_l1`, and `keypoint_offsets`. The values of the config are then the initial values, and
+    weak prior knowledge. The result holds the learnt values in `learnt.yaml`."""
     keypoint_offsets: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     """Keypoint → [x, y, z]: offset of the keypoint in the observations from the keypoint of the model, in the rest
     pose: sideways, towards the bill, upwards; model units. The keypoints of the result have these offsets, too."""

@@ -154,7 +154,7 @@ class Solution:
     """(N, T) int8: sum of 2^i over the doubts i of `jaxfit.data.flags.DOUBTS` about the pose; 0: no doubt; −1: no pose,
     or not judged. None means −1 everywhere."""
 
-    # error bars (`fitting/error_bars.py`): None without, NaN where a window has none; docs/files.md
+    # error bars (`fitting/error_bars.py`): None without, NaN where a window has none; docs/reference/result_folder.md
     global_orient_sd: np.ndarray | None = None
     """(N, T, 3) float32: radians, about the axes of the root of the bird."""
     body_pose_sd: np.ndarray | None = None

@@ -1,6 +1,6 @@
 """Limits on input: what jaxfit rejects before it takes memory or time that a damaged file could demand.
 
-Each limit is far above real input. docs/limits.md lists all of them.
+Each limit is far above real input. docs/reference/limits.md lists all of them.
 """
 
 # --- messages

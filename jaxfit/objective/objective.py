@@ -86,7 +86,7 @@ def _checked_residuals(name: str, value: Any) -> list[Residuals]:
     if _is_residuals(value):
         return as_list(value)
     problem = "returns a number, but the solver levenberg_marquardt and error bars need its residuals"
-    remedy = "return Residuals (docs/terms.md), or use the solver adam without error_bars"
+    remedy = "return Residuals (docs/developers/term.md), or use the solver adam without error_bars"
     raise InputError(f"term {name!r}", problem, remedy)
 
 

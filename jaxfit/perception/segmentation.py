@@ -335,7 +335,7 @@ def _load(
         raise InputError(model.path, problem, f"add a network for the masks: {model.path.name}+u2netp.onnx")
     if kind != "auto":
         raise _unknown_layout(model, f"{kind}: {candidates[kind].layout}")
-    raise _unknown_layout(model, f"{', '.join(_NETWORKS)}; docs/usage.md lists their outputs")
+    raise _unknown_layout(model, f"{', '.join(_NETWORKS)}; docs/guide/networks.md lists their outputs")
 
 
 def _unknown_layout(model: OnnxModel, supported: str) -> InputError:

@@ -256,7 +256,7 @@ def suggest(
     `choose` takes frames that are uncertain and differ from the frames chosen before. Without any bird, the frames are
     chosen by variety alone. With a teacher, only the disagreement of its masks counts (`segmenter_disagreement`).
 
-    The video is read once, or twice without `result`. docs/files.md describes the folder.
+    The video is read once, or twice without `result`. docs/reference/suggested_frames.md describes the folder.
 
     Args:
         video: a video, or a folder of frames.

@@ -26,7 +26,7 @@ from jaxfit.behaviour.describe import describe
 from jaxfit.behaviour.registry import own_features
 from jaxfit.model.murre.postures import POSTURES
 
-DRAWING = Path(__file__).resolve().parents[2] / "docs" / "behaviour.svg"
+DRAWING = Path(__file__).resolve().parents[2] / "docs" / "media" / "behaviour.svg"
 
 
 def values_of(solution, fps=25.0, bird=BIRD, **how):

@@ -235,7 +235,11 @@ def test_unusable_inputs_of_track_and_reconstruct(name, inputs, tmp_path, monkey
     expect("notes.txt", "ONNX", more=["--segmenter", inputs / "notes.txt"])
     strange = write_constant(tmp_path / "strange.onnx", (1, 3, 8, 8), {"logits": np.zeros(9)})
     expect(
-        "strange.onnx: has an unknown layout", "logits (1, 9)", "yolo", "docs/usage.md", more=["--segmenter", strange]
+        "strange.onnx: has an unknown layout",
+        "logits (1, 9)",
+        "yolo",
+        "docs/guide/networks.md",
+        more=["--segmenter", strange],
     )
     layout = {"output0": np.zeros((116, 84)), "output1": np.zeros((32, 16, 16))}
     coco = write_constant(tmp_path / "coco.onnx", (1, 3, 64, 64), layout)

@@ -1,4 +1,4 @@
-"""docs/configs.md lists the configs of fits as their files describe them, and so does `jaxfit config list`.
+"""docs/guide/configs.md lists the configs of fits as their files describe them, and so does `jaxfit config list`.
 
 `python tests/config/test_config_list.py` rewrites the table of the document.
 """
@@ -9,7 +9,7 @@ from jaxfit.cli.main import main
 from jaxfit.config.fit import GROUPS, describe_fit_configs, shipped_fit_configs
 from jaxfit.config.yaml_file import shipped_comment
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "configs.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "guide" / "configs.md"
 START = "<!-- the table below is written from the first comments of configs/*.yaml -->\n"
 END = "<!-- end of the table -->\n"
 

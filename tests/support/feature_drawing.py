@@ -1,7 +1,7 @@
 """Draw what the features of behaviour measure, on murres.
 
-`PYTHONPATH=tests .venv/bin/python -m support.feature_drawing` writes `docs/behaviour.svg`. The angles and lengths in
-the drawing are those that `describe` returns for the drawn birds.
+`PYTHONPATH=tests .venv/bin/python -m support.feature_drawing` writes `docs/media/behaviour.svg`. The angles and
+lengths in the drawing are those that `describe` returns for the drawn birds.
 """
 
 import sys
@@ -19,7 +19,7 @@ from jaxfit.model.murre.postures import POSTURES
 from jaxfit.raster.zbuffer import zbuffer
 from support.described import BIRD, STANDING, bent, flock, mesh_by_hand, points_by_hand, result, turned
 
-FILE = Path(__file__).resolve().parents[2] / "docs" / "behaviour.svg"
+FILE = Path(__file__).resolve().parents[2] / "docs" / "media" / "behaviour.svg"
 WIDTH, HEIGHT = 1000, 920
 INK, FAINT, PALE, DARK, EDGE = "#222222", "#6f6f6f", "#f3efe8", "#c3cad3", "#7d858f"
 BLUE, ORANGE, GREEN, PURPLE, RED, TEAL = "#1f5fa8", "#b85c00", "#2f7d32", "#7a3ea1", "#b3202a", "#00767a"
