@@ -13,13 +13,14 @@ export JAXFIT_REFERENCE
 # Some machines set this variable. Every process of the tests would then compile all imported modules again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: install test extended portable lint bench demo notebooks wheel clean
+.PHONY: install test extended docs portable lint bench demo notebooks wheel clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make install    the package with its compiled kernels, in $(VENV)"
 	@echo "make test       the test suite (under eight minutes on two cores)"
-	@echo "make extended   the slow tests, and those that install packages in environments of their own"
+	@echo "make extended   the slow tests, those that install packages in environments of their own, and the site"
+	@echo "make docs       the documents as a site: open site/index.html, no network is needed"
 	@echo "make portable   the kernels with every compiler that is installed, sanitizers and emulators"
 	@echo "make lint       formatting, lint and types"
 	@echo "make bench      benchmarks against the committed baseline"
@@ -45,9 +46,13 @@ $(VENV)/installed: pyproject.toml $(wildcard jaxfit/raster/cpp/*)
 test: install
 	$(UNOPTIMISED) XLA_FLAGS="$$XLA_FLAGS $(QUICK_COMPILATION)" $(PYTEST)
 
-extended: install
+extended: install docs
 	$(UNOPTIMISED) $(PYTEST) -m extended
 	$(BIN)/python tests/support/portable.py
+
+# The theme prints a notice about its own future otherwise.
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 portable: install
 	$(BIN)/python tests/support/portable.py
@@ -70,4 +75,4 @@ wheel:
 	$(PYTHON) .ci/wheel.py $(if $(ZIG),--zig)
 
 clean:
-	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist demo site .pytest_cache .ruff_cache .hypothesis
