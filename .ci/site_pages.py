@@ -66,6 +66,15 @@ SUBJECTS = {
     "pipeline": "Reconstruction",
 }
 """Package → heading of its messages."""
+BOOSTS = {
+    "index.md": 2,
+    "guide": 2,
+    "reference/metrics.md": 3,
+    "reference/api.md": 0.5,
+    "results": 0.5,
+    "developers": 0.3,
+}
+"""Page or folder → factor on its rank in the search: instructions come before measurements."""
 
 
 def _cell(text: object) -> str:
@@ -273,6 +282,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     A link to a file that is no page, such as a module, becomes its text.
     """
     uri = page.file.src_uri
+    page.meta["search"] = {"boost": BOOSTS.get(uri, BOOSTS.get(posixpath.dirname(uri), 1))}
     sources = {page: source for source, page in OUTSIDE.items()}
     folder = posixpath.dirname(sources.get(uri, f"docs/{uri}"))
 

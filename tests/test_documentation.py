@@ -20,6 +20,9 @@ README = ROOT / "README.md"
 MODEL_CARD = ROOT / "jaxfit" / "perception" / "networks" / "README.md"
 DOCUMENTS = [README, MODEL_CARD, *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+EVERYWHERE = sorted(
+    {*DOCUMENTS, *ROOT.glob("*.md"), *(ROOT / ".github").rglob("*.md"), *(ROOT / "tests").rglob("*.md")}
+)
 documents = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 
 
@@ -42,7 +45,7 @@ def commands(text):
     return [shlex.split(match[1], comments=True)[1:] for match in found if match]
 
 
-@documents
+@pytest.mark.parametrize("path", EVERYWHERE, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_links_lead_to_files_and_headings(path):
     links = re.findall(r"\]\(([^)\s]+)\)", path.read_text(encoding="utf-8"))
     broken = []
