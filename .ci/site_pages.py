@@ -37,6 +37,7 @@ OUTSIDE = {
 }
 """Documents outside docs/ that are pages of the site, too."""
 MARKER = re.compile(r"^<!-- generated: (\w+) -->$", re.MULTILINE)
+NAMED = re.compile(r"docs/([\w/]+)\.md(#[\w-]+)?")
 LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
 CONFIGS = {
     "A fit": (FitConfig, "fit"),
@@ -81,6 +82,7 @@ def _cell(text: object) -> str:
     """Return a text as a cell of a table. Code between backticks stays as it is, except for the bars."""
     parts = " ".join(str(text).split()).replace("|", "\\|").split("`")
     parts[::2] = [re.sub(r"([*_<\[])", r"\\\1", part) for part in parts[::2]]
+    parts[::2] = [NAMED.sub(r"[\1](../\1.md\2)", part) for part in parts[::2]]
     return "`".join(parts)
 
 
@@ -122,10 +124,13 @@ def _type_text(hint: Any) -> str:
     if origin in (types.UnionType, typing.Union):
         return " or ".join(map(_type_text, arguments))
     if origin is tuple:
-        return f"list of {_type_text(arguments[0])}"
+        inner = _type_text(arguments[0])
+        return f"list of {inner}{'s' if inner in ('mapping', 'number') else ''}"
     if origin is Mapping:
         return f"mapping to {_type_text(arguments[1])}"
-    names = {str: "text", int: "whole number", float: "number", bool: "true or false", Any: "number or mapping"}
+    if dataclasses.is_dataclass(hint):
+        return "mapping"
+    names = {str: "text", int: "whole number", float: "number", bool: "true or false", Any: "any value"}
     return names.get(hint, getattr(hint, "__name__", str(hint)))
 
 
@@ -162,7 +167,7 @@ def _default_text(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return f"`{ {None: 'null', True: 'true', False: 'false'}[value] }`"
     if isinstance(value, Mapping | tuple):
-        return f"`{list(value) or '[]'}`" if isinstance(value, tuple) else "`{}`"
+        return f"`[{', '.join(map(str, value))}]`" if isinstance(value, tuple) else "`{}`"
     return f"`{value}`"
 
 
