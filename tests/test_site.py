@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
+from support.term_drawings import METHOD, TERMS
 
 import jaxfit
 from jaxfit.cli.parser import build_parser
@@ -129,12 +130,33 @@ def test_every_equation_converts(site):
         assert "\\" not in html  # a command of LaTeX that was not understood
 
 
+def navigation(entries):
+    """Return the pages of a part of the navigation."""
+    if isinstance(entries, str):
+        return [entries]
+    parts = entries.values() if isinstance(entries, dict) else entries
+    return [page for part in parts for page in navigation(part)]
+
+
+def test_the_navigation_has_every_page_once(site):
+    listed = navigation(yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"])
+    present = [path.relative_to(DOCUMENTS).as_posix() for path in PAGES]
+    assert sorted(listed) == sorted([*present, *site.OUTSIDE.values()])
+
+
+def test_every_drawing_has_its_function():
+    for folder, drawings in (("terms", TERMS), ("method", METHOD)):
+        drawn = {drawing.__name__ for drawing in drawings}
+        present = {path.stem for path in (DOCUMENTS / "media" / folder).glob("*.svg")}
+        assert present - {"pipeline"} == drawn, "run support.term_drawings"
+    assert {drawing.__name__ for drawing in TERMS} == set(known_terms())
+
+
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(DOCUMENTS).as_posix())
-def test_pages_are_short_and_in_the_navigation(path, site):
+def test_pages_are_short(path, site):
     text = path.read_text(encoding="utf-8")
     assert len(text.splitlines()) <= MOST_LINES
     assert text.startswith("# ")
-    assert path.relative_to(DOCUMENTS).as_posix() in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     assert set(site.MARKER.findall(text)) <= site.GENERATED.keys()
 
 
