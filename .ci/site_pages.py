@@ -248,7 +248,7 @@ def messages() -> str:
         folder = PACKAGE / package
         files = sorted(folder.rglob("*.py")) if folder.is_dir() else [folder.with_suffix(".py")]
         rows = dict.fromkeys(row for path in files for row in error_messages(path))
-        rows = [(problem, remedy) for problem, remedy in rows if re.search(r"\w{3}", problem)]
+        rows = [(problem, remedy) for problem, remedy in rows if len(re.findall("[a-z]{2,}", problem)) > 2]
         lines += [f"## {title}", "", "| message | remedy |", "| --- | --- |"]
         lines += [
             f"| {_cell(problem)} | {_cell(remedy if re.search(r'[a-z]{3}', remedy) else '')} |"
