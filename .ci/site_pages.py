@@ -160,7 +160,8 @@ def config_keys(kind: Any, where: str = "") -> Iterator[tuple[str, str, str, str
             shown = "" if plain else _default_text(default)
             yield path, _type_text(hints[field.name]), shown, texts.get(field.name, "")
         for between, part in inner:
-            yield from config_keys(part, path + between)
+            if part is not FitConfig:  # its keys have a table of their own
+                yield from config_keys(part, path + between)
 
 
 def _default_text(value: Any) -> str:
