@@ -44,7 +44,7 @@ def doctor(_options: argparse.Namespace) -> None:
         table.add_row(*finding)
     show(table)
     missing = sum(bool(finding.remedy) for finding in findings)
-    show("nothing is missing" if not missing else f"{counted(missing, 'part')} can be added or repaired")
+    show("nothing is missing" if not missing else f"{counted(missing, 'part')} missing: see the column of remedies")
 
 
 def _checked(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
