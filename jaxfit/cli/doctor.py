@@ -44,7 +44,8 @@ def doctor(_options: argparse.Namespace) -> None:
         table.add_row(*finding)
     show(table)
     missing = sum(bool(finding.remedy) for finding in findings)
-    show("nothing is missing" if not missing else f"{counted(missing, 'part')} missing: see the column of remedies")
+    parts = f"{counted(missing, 'part')} missing or in need of repair: the last column says what to do"
+    show(parts if missing else "nothing is missing")
 
 
 def _checked(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
