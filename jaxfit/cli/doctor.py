@@ -44,8 +44,8 @@ def doctor(_options: argparse.Namespace) -> None:
         table.add_row(*finding)
     show(table)
     missing = sum(bool(finding.remedy) for finding in findings)
-    parts = f"{counted(missing, 'part')} missing or in need of repair: the last column says what to do"
-    show(parts if missing else "nothing is missing")
+    text = "the last column says what to do; packages are needed only for the commands that it names"
+    show(f"{counted(missing, 'part')} missing or in need of repair: {text}" if missing else "nothing is missing")
 
 
 def _checked(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
