@@ -1,4 +1,4 @@
-"""The documents: links lead to files, commands parse, configs and Python examples are valid, the README is short."""
+"""The documents: links lead to files, commands parse and are complete, examples are valid, the README is short."""
 
 import argparse
 import ast
@@ -18,11 +18,9 @@ from jaxfit.objective.residuals import residual_sum
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
 MODEL_CARD = ROOT / "jaxfit" / "perception" / "networks" / "README.md"
-DOCUMENTS = [README, MODEL_CARD, *sorted((ROOT / "docs").rglob("*.md"))]
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), MODEL_CARD, *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.DOTALL | re.MULTILINE)
-EVERYWHERE = sorted(
-    {*DOCUMENTS, *ROOT.glob("*.md"), *(ROOT / ".github").rglob("*.md"), *(ROOT / "tests").rglob("*.md")}
-)
+EVERYWHERE = [*DOCUMENTS, *sorted((ROOT / ".github").rglob("*.md"))]
 documents = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
 
 
@@ -108,14 +106,14 @@ def test_configs_are_valid(tmp_path):
         load(tmp_path / "mine.yaml")
 
 
-def test_every_command_stands_in_the_readme(capsys):
+def test_every_command_stands_in_a_document(capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
     known = re.findall(r"^    (\w+) ", capsys.readouterr().out, re.MULTILINE)
     assert len(known) > 5
-    text = README.read_text(encoding="utf-8")
+    text = "".join(path.read_text(encoding="utf-8") for path in DOCUMENTS)
     assert not [name for name in known if f"jaxfit {name}" not in text]
 
 
 def test_the_readme_is_short():
-    assert len(README.read_text(encoding="utf-8").splitlines()) <= 150
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 100

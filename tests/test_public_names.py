@@ -1,6 +1,8 @@
 """The public names exist, also for type checkers, and each name is imported at its first use."""
 
 import ast
+import pydoc
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -21,6 +23,16 @@ def test_every_public_name_comes_from_its_module():
         assert getattr(jaxfit, name) is getattr(import_module(module), name)
     with pytest.raises(AttributeError, match="reconstrcut"):
         jaxfit.reconstrcut  # noqa: B018
+
+
+def test_help_is_a_map_of_the_public_names():
+    text = pydoc.render_doc(jaxfit, renderer=pydoc.plaintext)
+    assert len(text.splitlines()) < 120
+    assert set(jaxfit.__all__) <= set(re.findall(r"\w+", text))
+    assert "Args:" in pydoc.render_doc(jaxfit.fit)
+    names: dict = {}
+    exec("from jaxfit import *", names)
+    assert names.keys() >= {*jaxfit.__all__}
 
 
 @pytest.mark.parametrize(

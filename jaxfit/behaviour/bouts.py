@@ -54,7 +54,7 @@ class Ethogram:
     """Behaviour that the result cannot show → why."""
 
     def select(self, rows: Int[np.ndarray, "M"], columns: Int[np.ndarray, "L"], description: Description) -> Ethogram:
-        """Return what M of the birds do in L of the frames; bouts that reach beyond these frames are cut to them.
+        """Return the behaviour of M birds in L frames. Bouts are cut at the ends of these frames.
 
         Args:
             rows: positions of the birds.

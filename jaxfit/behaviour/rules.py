@@ -105,7 +105,7 @@ def _check_conditions(key: str, conditions: Mapping[str, str]) -> None:
 
 @dataclass(frozen=True)
 class BehaviourConfig:
-    """The behaviours that are told apart. A frame with several of them has the first."""
+    """The behaviours that jaxfit distinguishes. A frame in which several apply has the first of them."""
 
     shipped: ClassVar[str] = "behaviour"
     whole: ClassVar[tuple[str, ...]] = ("begins", "lasts")

@@ -120,7 +120,7 @@ def show_matches(read: ReadViews) -> None:
     show(table)
     doubtful = [str(b + 1) for b in range(read.matches.birds) if read.matches.undecided[b] > 0]
     if doubtful:
-        show(f"not decided everywhere: bird {', '.join(doubtful)}; look at them, and decide by --match if necessary")
+        show(f"uncertain in some frames: bird {', '.join(doubtful)}; look, and decide by --match if necessary")
 
 
 def check_calibration(options: argparse.Namespace) -> None:

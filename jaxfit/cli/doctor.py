@@ -44,7 +44,8 @@ def doctor(_options: argparse.Namespace) -> None:
         table.add_row(*finding)
     show(table)
     missing = sum(bool(finding.remedy) for finding in findings)
-    show("nothing is missing" if not missing else f"{counted(missing, 'part')} can be added or repaired")
+    text = "the last column says what to do; packages are needed only for the commands that it names"
+    show(f"{counted(missing, 'part')} missing or in need of repair: {text}" if missing else "nothing is missing")
 
 
 def _checked(check: Callable[[], Iterator[Finding]]) -> list[Finding]:

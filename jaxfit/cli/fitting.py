@@ -217,7 +217,7 @@ def evaluate(options: argparse.Namespace) -> None:
     true_names = truth.observations.keypoint_names
     if not true_names:
         remedy = f"compare the detections that were fitted: jaxfit evaluate OBS.json --truth {options.truth}"
-        raise InputError(options.truth, "holds masks without keypoints, which a result is matched by", remedy)
+        raise InputError(options.truth, "has masks but no keypoints, by which poses are compared", remedy)
     if set(true_names) != set(bird.keypoint_names):
         names = keypoint_map(true_names, options.truth, bird.keypoint_names, options.names, quiet=options.json)
         truth = replace(truth, observations=map_keypoints(truth.observations, names, bird.keypoint_names))

@@ -120,7 +120,7 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     if result.chosen == "trained":
         show(f"{options.network} trained in {minutes:.1f} min, {result.best_step} steps → {options.out}")
     else:
-        show(f"{options.network} compared in {minutes:.1f} min, without trained weights → {options.out}")
+        show(f"{options.network} not changed by the training ({minutes:.1f} min) → {options.out}")
     if result.doubt:
         suggest = f"jaxfit suggest {options.video} --segmenter {options.out} --teacher {teacher}"
         text = "%s: the network may be wrong: %s; label some frames and train on them: %s"

@@ -223,7 +223,7 @@ def facts(noise: DetectionNoise) -> dict[str, str]:
     share = f" ({swapped / sides:.1%})" if sides else ""
     found["exchanged left and right keypoints"] = f"{swapped} of {sides} pairs{share}"
     if noise.unmoved_share > 0.01:
-        text = f"{noise.unmoved_share:.0%}: correct pre-filled labels, or the scales are too small"
+        text = f"{noise.unmoved_share:.0%}: pre-filled and not corrected? Then the scales are too small"
         found["labels exactly on the detection"] = text
     return found
 

@@ -276,7 +276,7 @@ def timeline(exported: Exported) -> tuple[Float[np.ndarray, "L"], np.ndarray]:
 
 
 def weight_error(exported: Exported) -> float:
-    """Return the largest error of a vertex that comes of at most four weights, as a share of the body length.
+    """Return the largest error of a vertex if it has at most four weights, as a share of the body length.
 
     The error is taken over ten fitted frames of every bird; 0 where no vertex has more than four weights.
     """

@@ -75,7 +75,7 @@ def constant_deviation(
     weight: float,
     present: Bool[np.ndarray, "T"],
 ) -> Float[np.ndarray, "T P P"]:
-    """Return V·Vᵀ of each frame: what a pose that deviates from the prior in the whole window adds.
+    """Return V·Vᵀ of each frame: the covariance that a deviation from the prior in the whole window adds.
 
     Args:
         window: the posterior.

@@ -83,7 +83,7 @@ def other_jaxfit() -> str | None:
 
 def install_command(extra: str, upgrade: bool = False) -> str:
     """Return the text that says how to install an extra. The package index does not have this package."""
-    return f'pip install {"--upgrade " * upgrade}".[{extra}]" in the checkout of jaxfit'
+    return f'pip install {"--upgrade " * upgrade}".[{extra}]" in the checkout of jaxfit, or "NAME.whl[{extra}]"'
 
 
 def require_extra(extra: str, source: str, *names: str) -> None:

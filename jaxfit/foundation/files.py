@@ -288,7 +288,7 @@ class Temporary(NamedTuple):
 
 @contextmanager
 def temporary(target: Path) -> Iterator[Temporary]:
-    """Yield temporary names in the folder of a target; remove at the end what exists under these names.
+    """Yield temporary names in the folder of a target, and remove the files that still have these names at the end.
 
     Removes first what killed processes have left in the folder.
 

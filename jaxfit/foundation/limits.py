@@ -1,4 +1,4 @@
-"""Limits on input: what jaxfit rejects before it takes memory or time that a damaged file could demand.
+"""Limits on input: jaxfit rejects larger input before it uses memory or time.
 
 Each limit is far above real input. docs/reference/limits.md lists all of them.
 """

@@ -118,7 +118,7 @@ def run_tracking(
     cluster: Cluster | None = None,
     on_frame: Callable[[ObservationsFrom], object] | None = None,
 ) -> TrackingResult:
-    """Track a video as `track_video` does, and return short tracks, damaged frames and durations too.
+    """Track a video as `track_video` does, and also return trust, skipped tracks, damaged frames and durations.
 
     Args:
         source, config, segmenter, keypoints, tracker, progress: as for `track_video`.

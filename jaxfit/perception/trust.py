@@ -16,18 +16,17 @@ REMEDY = (
 )
 """What to do when trust is low."""
 
-# The limits were set on 15 simulated clips (seeds 700 to 714, random cameras of `jaxfit.learning.networks.scenes`,
-# 960×640, 12 or 20 consecutive frames at 12 frames/s) and on a clip from the side (seed 790, 8° below the horizontal).
-# In 13 good clips, 78 to 95 % of the keypoints are right; in the two other clips, 79 and 81 %; in the clip from the
-# side, 50 %. The limits of distances, short
-# tracks and the number of birds were set with earlier networks, and hold for the present networks.
+# The limits lie beyond the values of 13 good clips out of 15 simulated ones (seeds 700 to 714, random cameras of
+# `jaxfit.learning.networks.scenes`, 960×640, 12 or 20 consecutive frames at 12 frames/s), in which 78 to 95 % of the
+# keypoints are right. The two other clips have 79 and 81 %, a clip from the side (seed 790, 8° below the horizontal)
+# has 50 %. The values for distances, short tracks and the number of birds are those of earlier networks.
 MAX_FRAME_DISTANCE = 1.0
 """Largest median distance of the frames: 99 % of the training inputs are nearer. The clips have 0.27 to 0.58."""
 MAX_BIRD_DISTANCE = 1.0
 """Largest median distance of the birds: 99 % of the training inputs are nearer. The clips have 0.48 to 0.76."""
 MIN_SCORE = 0.75
-"""Least median score. The present segmenter gives scores that are lower by 0.02 to 0.05: 12 clips with and without
-spread wings (seeds 700 to 711) have 0.80 to 0.95, a short clip of four birds 0.79."""
+"""Least median score. 12 clips with and without spread wings (seeds 700 to 711) have 0.80 to 0.95, a short clip of four
+birds 0.79."""
 MIN_CONFIDENCE = 0.75
 """Least median confidence of a bird. The good clips have 0.80 to 0.95, the others 0.65 and 0.72, the clip from the side
 0.72."""
@@ -70,7 +69,7 @@ class FootageSignals(NamedTuple):
 
 
 class Trust(NamedTuple):
-    """The judgement of a video."""
+    """Whether the networks work on a video as they work on simulated footage, and why not."""
 
     level: str
     """`high` or `low`."""
@@ -155,6 +154,7 @@ class _Rule(NamedTuple):
     limit: float
     is_upper: bool
     text: str
+    limit_format: str = ".2g"
 
     def is_broken(self, signals: FootageSignals) -> bool:
         value = getattr(signals, self.signal)
@@ -162,7 +162,8 @@ class _Rule(NamedTuple):
 
     def reason(self, signals: FootageSignals) -> str:
         bound = "at most" if self.is_upper else "at least"
-        return self.text.format(**signals._asdict()) + f" ({bound} {self.limit:.2g} on simulated footage)"
+        limit = f"{bound} {self.limit:{self.limit_format}} on simulated footage"
+        return f"{self.text.format(**signals._asdict())} ({limit})"
 
 
 _RULES = (
@@ -183,19 +184,22 @@ _RULES = (
         "contradicted_share",
         MAX_CONTRADICTED_SHARE,
         True,
-        "keypoints lie outside the masks in a share of {contradicted_share:.2f} of the birds",
+        "{contradicted_share:.0%} of the birds have keypoints outside their masks",
+        ".0%",
     ),
     _Rule("confidence", MIN_CONFIDENCE, False, "the confidences of the keypoints are low: median {confidence:.2f}"),
     _Rule(
         "short_share",
         MAX_SHORT_SHARE,
         True,
-        "{short_tracks} of {tracks} tracks are too short: they hold a share of {short_share:.2f} of the detections",
+        "{short_tracks} of {tracks} tracks are too short, and hold {short_share:.0%} of the detections",
+        ".0%",
     ),
     _Rule(
         "count_change",
         MAX_COUNT_CHANGE,
         True,
-        "the number of birds changes from frame to frame by a share of {count_change:.2f}",
+        "the number of birds changes by {count_change:.0%} from frame to frame",
+        ".0%",
     ),
 )

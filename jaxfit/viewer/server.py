@@ -126,7 +126,7 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
 
 
 class Guard:
-    """Passes on what the page of this server asks, and rejects all else.
+    """Passes on the requests of this server's own page, and rejects all others.
 
     A request needs the token as the first part of its path. Its `Host` must be this computer, so that a foreign name
     that leads here (DNS rebinding) fails. An `Origin` or `Sec-Fetch-Site` of another page fails too.

@@ -301,7 +301,7 @@ def test_unusable_results_of_evaluate(fitted, inputs, tmp_path, capsys):
     rejected(capsys, ["evaluate", str(fitted), "--truth", str(tmp_path / "no.json")], "no.json")
     (tmp_path / "masks").mkdir()
     cv2.imwrite(str(tmp_path / "masks" / "0.png"), np.ones((9, 9), np.uint8))
-    rejected(capsys, ["evaluate", str(fitted), "--truth", str(tmp_path / "masks")], "masks without keypoints")
+    rejected(capsys, ["evaluate", str(fitted), "--truth", str(tmp_path / "masks")], "masks but no keypoints")
     content = json.loads((inputs / "birds.json").read_text())
     for annotation in content["annotations"]:
         annotation["track_id"] += 100

@@ -167,7 +167,7 @@ def spoilt(**changes):
         (array(third=np.inf * (flags() + 1)), "third numbers of inf"),
         (array(xy=0 * positions()), "holds no keypoint with a position"),
         (spoilt(x=((3, 1, 2, 0), np.inf)), "infinite"),
-        (spoilt(x=((3, 1, 2, 0), np.nan)), "one number NaN and the other finite"),
+        (spoilt(x=((3, 1, 2, 0), np.nan)), "only one of the two coordinates"),
         (array(xy=positions() - [0, 20]), r"has positions of 1 to 64 and -19 to 19, neither pixels of .* 64×40"),
         (array(xy=10 * positions()), r"neither pixels of the images of 64×40 nor fractions"),
     ],

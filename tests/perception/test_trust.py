@@ -71,7 +71,7 @@ def test_every_signal_has_a_limit(signal, limit, beyond):
     judged = judge(GOOD._replace(**{signal: limit + 0.02 * beyond}))
     assert judged.level == "low"
     (reason,) = judged.reasons
-    assert f"{limit:.2g}" in reason
+    assert f" {limit:.0%} " in reason or f" {limit:.2g} " in reason
     sentence = judged.sentence()
     assert sentence.startswith(f"trust is low: {reason};")
     for remedy in ("--segmenter", "jaxfit suggest", "crop"):

@@ -171,7 +171,7 @@ def _known(
         raise InputError(source, "holds infinite positions", _REMEDY)
     missing = np.isnan(position)
     if (missing.any(-1) != missing.all(-1)).any():
-        raise InputError(source, "holds positions with one number NaN and the other finite", _REMEDY)
+        raise InputError(source, "holds positions with only one of the two coordinates (the other is NaN)", _REMEDY)
     absent = missing.any(-1) | (position == 0).all(-1)
     known = np.asarray(~absent & (confidence > 0))
     if not known.any():

@@ -151,7 +151,7 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
         InputError: a key is unknown, or a value is invalid.
     """
     if base.learn_weights:
-        _logger.warning("%s: the runs learn no weights, because runs vary weights", source)
+        _logger.warning("%s: the runs learn no weights, because an ablation sets the weights itself", source)
         base = replace(base, learn_weights=())
     kept: dict[Hashable, tuple[FitConfig, Mapping[str, Any]]] = {}
     repeated = []

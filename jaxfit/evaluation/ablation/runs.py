@@ -90,7 +90,7 @@ def fit_batches(
         InputError: as `fit_runs`; a config learns its weights.
     """
     if any(run.config.learn_weights for run in runs):
-        raise InputError("config", "`learn_weights` names terms, but an ablation varies weights", LEARN_REMEDY)
+        raise InputError("config", "`learn_weights` would change the weights that an ablation sets", LEARN_REMEDY)
     for batch in plan_batches(observations, bird, runs, source):
         if not all(r in stored for r in batch):
             began = time.perf_counter()

@@ -45,7 +45,7 @@ MIN_OUTCOMES = 200
 
 
 class Outcomes(NamedTuple):
-    """M detections: what the network said, and whether the detection is right."""
+    """Raw values of a network for M detections, and whether each detection is right."""
 
     values: Float[np.ndarray, "M"]
     """Raw values of the network."""
