@@ -17,7 +17,8 @@ from jaxfit.fitting.posterior import (
     multiply,
     window_posteriors,
 )
-from jaxfit.fitting.solve import problem_window, stage_program
+from jaxfit.fitting.problem import problem_window
+from jaxfit.fitting.solve import stage_program
 from jaxfit.objective.curvature import frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature
 from jaxfit.objective.registry import Term, find_terms

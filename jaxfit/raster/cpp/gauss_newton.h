@@ -17,15 +17,16 @@ constexpr float kBandEdge = 0.01f;  // the band holds the pixels whose silhouett
 
 struct Rows {
   float* values;        // (kMostRows, D)
+  float* factor;        // (kMostRows): the factor of p · (pixel - nearest point) in d silhouette
   int32_t* of_pixel;    // for each chosen pixel of each block the index of its row
   VertexRows of_vertex;
   uint16_t* chosen;     // for each block the pixels that have a row, as bits
   int64_t count;
 };
 
-size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size) {
+size_t block_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size) {
   const Layout l(mesh, size);
-  const int64_t floats = kMostRows * skin.parameters + l.products + 2 * mesh.num_vertices * skin.parameters;
+  const int64_t floats = kMostRows * (skin.parameters + 1) + l.products + 2 * mesh.num_vertices * skin.parameters;
   const int64_t bytes = sizeof(float) * floats + sizeof(uint16_t) * l.blocks * l.blocks + mesh.num_vertices;
   return workspace(mesh, blur, size) + bytes;
 }
@@ -34,7 +35,8 @@ size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int
   const Layout l(mesh, size);
   Rows rows;
   rows.values = reinterpret_cast<float*>(static_cast<char*>(memory) + workspace(mesh, blur, size));
-  rows.of_vertex.values = rows.values + kMostRows * skin.parameters;
+  rows.factor = rows.values + kMostRows * skin.parameters;
+  rows.of_vertex.values = rows.factor + kMostRows;
   rows.of_pixel = reinterpret_cast<int32_t*>(rows.of_vertex.values + 2 * mesh.num_vertices * skin.parameters);
   rows.chosen = reinterpret_cast<uint16_t*>(rows.of_pixel + l.products);
   rows.of_vertex.ready = reinterpret_cast<uint8_t*>(rows.chosen + l.blocks * l.blocks);
@@ -43,49 +45,50 @@ size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int
   return rows;
 }
 
-// Replaces the products by the factors of p · (pixel - nearest point) in d silhouette. Returns the pixels in the band.
-int64_t set_row_factors(const uint8_t* target, int64_t size, Scale scale, Workspace& ws) {
+// Finds the known pixels in the band, as bits of each block in `chosen`. Returns their number.
+int64_t find_band(const uint8_t* target, int64_t size, const Workspace& ws, Rows& rows) {
   const Vec one = all(1.f), low = all(kBandEdge), high = all(1 - kBandEdge);
   int64_t count = 0;
-  for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
-    const BlockValues known = load_unequal(target, size, column, row, kUnknown, kBird);
+  for_each_place(ws, [&](const float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     uint32_t band = 0;
     for (int at = 0; at < kLanes; at += kWidth) {
       const Vec transmitted = one / load(place + at);
-      const Mask in_band =
-          greater(transmitted, low) & greater(high, transmitted) & greater(load(known.at + at), all(0.f));
-      store(place + at, keep(in_band, transmitted * all(scale.slope)));
-      band |= bits(in_band) << at;
+      band |= bits(greater(transmitted, low) & greater(high, transmitted)) << at;
     }
-    if (!band) close(ws, column, row);
+    if (band) {
+      const BlockValues known = load_unequal(target, size, column, row, kUnknown, kBird);
+      for (int at = 0; at < kLanes; at += kWidth)
+        band &= ~(bits(at_most(load(known.at + at), all(0.f))) << at);
+    }
+    rows.chosen[(place - ws.products) / kLanes] = static_cast<uint16_t>(band);
     count += __builtin_popcount(band);
   });
   return count;
 }
 
 // Gives rows to the pixels of the band: to all, or to a part whose factors grow by √(band / part).
-void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
+void choose_rows(const uint8_t* target, int64_t size, Scale scale, const Workspace& ws, Rows& rows) {
+  const int64_t band = find_band(target, size, ws, rows);
   const bool every = band <= kMostRows;
   // fewer than kMostRows, because the number of chosen pixels varies
   const double part = every ? 1 : 0.95 * kMostRows / static_cast<double>(band);
   const uint32_t threshold = static_cast<uint32_t>(part * 4294967295.0);
-  const Vec grown = all(every ? 1.f : __builtin_sqrtf(static_cast<float>(1 / part)));
+  const float factor = scale.slope * (every ? 1.f : __builtin_sqrtf(static_cast<float>(1 / part)));
   uint32_t number = 0;
-  for_each_place(ws, [&](float* place, int64_t column, int64_t row) {
-    int32_t* of_pixel = rows.of_pixel + (place - ws.products);
-    if (!(ws.open[row * ws.row_bytes + column / 8] >> column % 8 & 1)) return;
-    uint16_t mine = 0;
-    for (int i = 0; i < kLanes; ++i) {
-      if (place[i] == 0) continue;
+  for (int64_t block = 0; block < ws.blocks * ws.blocks; ++block) {
+    uint32_t mine = 0;
+    for (uint32_t todo = rows.chosen[block]; todo; todo &= todo - 1) {
+      const int i = __builtin_ctz(todo);
       // steps of the golden ratio spread the chosen pixels evenly along the band
       const bool chosen = every || number * 2654435769u < threshold;
       ++number;
-      if (chosen && rows.count < kMostRows) of_pixel[i] = static_cast<int32_t>(rows.count++), mine |= 1u << i;
+      if (!chosen || rows.count == kMostRows) continue;
+      rows.factor[rows.count] = factor / ws.products[block * kLanes + i];
+      rows.of_pixel[block * kLanes + i] = static_cast<int32_t>(rows.count++);
+      mine |= 1u << i;
     }
-    rows.chosen[(place - ws.products) / kLanes] = mine;
-    for (int at = 0; at < kLanes; at += kWidth) store(place + at, load(place + at) * grown);
-    if (!mine) close(ws, column, row);
-  });
+    rows.chosen[block] = static_cast<uint16_t>(mine);
+  }
 }
 
 // Adds the derivatives of the chosen pixels of a block with respect to the vertices of one edge.
@@ -97,14 +100,18 @@ void choose_rows(int64_t band, Workspace& ws, Rows& rows) {
   const float* b = vertex_rows(mesh, skin, f.vertex[(edge + 1) % 3][lane], rows.of_vertex);
   for (; pixels; pixels &= pixels - 1) {
     const int i = __builtin_ctz(pixels);
+    const float factor = rows.factor[of_pixel[i]], x = factor * pull_x[i], y = factor * pull_y[i];
     const float to_a = 0.5f - along[i], to_b = 0.5f + along[i];
-    add_vertices(a, b, to_a * pull_x[i], to_a * pull_y[i], to_b * pull_x[i], to_b * pull_y[i], D,
-                 rows.values + of_pixel[i] * D);
+    add_vertices(a, b, to_a * x, to_a * y, to_b * x, to_b * y, D, rows.values + of_pixel[i] * D);
   }
 }
 
+// Fills the rows. Closes the blocks without a chosen pixel; the blocks with one must be open.
 void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, Rows& rows) {
   const Vec outside = all(scale.radius * scale.radius);
+  for_each_place(ws, [&](const float* place, int64_t column, int64_t row) {
+    if (!rows.chosen[(place - ws.products) / kLanes]) close(ws, column, row);
+  });
   fill(rows.values, rows.count * skin.parameters, 0);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
     Faces& f = ws.faces[c];
@@ -114,10 +121,12 @@ void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, R
                                       __attribute__((always_inline)) {
         const int64_t place = block.place - ws.products;
         for (int at = 0; at < kLanes; at += kWidth) {
+          const uint32_t chosen = rows.chosen[place / kLanes] >> at & ((1u << kWidth) - 1);
+          if (!chosen) continue;
           const Nearest n = nearest_edge(face, block, at);
-          uint32_t pixels = bits(greater(outside, n.d)) & rows.chosen[place / kLanes] >> at;
+          uint32_t pixels = bits(greater(outside, n.d)) & chosen;
           if (!pixels) continue;
-          const Vec pull = flip_sign(load(block.place + at) * reciprocal(all(1.f) + exp2(n.d)), n.d);
+          const Vec pull = flip_sign(reciprocal(all(1.f) + exp2(n.d)), n.d);
           for (int i = 0; i < 3; ++i) {
             const uint32_t own = i < 2 ? pixels & bits(at_most(n.square[i], n.smallest)) : pixels;
             if (!own) continue;
@@ -132,17 +141,6 @@ void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, R
       });
     }
   }
-}
-
-void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory,
-                             const uint8_t* target, float* block) {
-  Workspace ws = carve(mesh, size, memory);
-  const Scale scale = scale_of(blur, size);
-  if (!render(mesh, size, scale, ws)) return fill(block, skin.parameters * skin.parameters, __builtin_nanf(""));
-  Rows rows = carve_rows(mesh, skin, blur, size, memory);
-  choose_rows(set_row_factors(target, size, scale, ws), ws, rows);
-  fill_rows(mesh, skin, scale, ws, rows);
-  multiply_rows(rows.values, rows.values, rows.count, skin.parameters, block);
 }
 
 }  // namespace

@@ -166,13 +166,19 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
 }
 
 void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target target, LossKind kind, float* loss,
-               float* gradient) {
+               float* gradient, const Skin* skin, float* block) {
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
   if (!render(mesh, size, scale, ws)) {
     *loss = __builtin_nanf("");
     if (gradient) set_gradient(gradient, mesh.num_vertices, *loss);
+    if (block) fill(block, skin->parameters * skin->parameters, *loss);
     return;
+  }
+  Rows rows;
+  if (block) {  // before the loss, which overwrites the products
+    rows = carve_rows(mesh, *skin, blur, size, memory);
+    choose_rows(target.bytes, size, scale, ws, rows);
   }
   const bool l1 = kind == LossKind::kL1, with = gradient != nullptr;
   if (target.bytes)
@@ -182,12 +188,16 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
     *loss = l1 ? compare<LossKind::kL1>(target.floats, size, scale, ws, with)
                : compare<LossKind::kSmoothL1>(target.floats, size, scale, ws, with);
   if (gradient) finish_gradient(mesh, scale, ws, gradient);
+  if (!block) return;
+  // The blocks of the band are open: their error is at least kBandEdge, so their gradient is not negligible.
+  fill_rows(mesh, *skin, scale, ws, rows);
+  multiply_rows(rows.values, rows.values, rows.count, skin->parameters, block);
 }
 
 }  // namespace
 
 template <>
 const Kernels Compiled<kIsa>::soft_rasterizer = {
-    workspace, silhouette, silhouette_gradient, mask_loss, gauss_newton_workspace, silhouette_gauss_newton};
+    workspace, silhouette, silhouette_gradient, mask_loss, block_workspace};
 
 }  // namespace jaxfit
