@@ -3,7 +3,8 @@
 // The block is Jᵀ·J with one row of J = d silhouette / d parameters for each pixel of the band in which the silhouette
 // is neither 0 nor 1, and the mask is not unknown. Of a band with more than kMostRows pixels, an evenly spread part
 // enters with a larger weight. A row is the sum over the faces near the pixel: d silhouette / d vertex, times
-// d vertex / d parameters. The second factor is computed once for each vertex that some row needs.
+// d vertex / d parameters. The pass over the faces that adds the gradient adds the rows too, because both need the nearest
+// points. The second factor is computed once for each vertex that some row needs.
 #pragma once
 
 #include "products.h"
@@ -67,7 +68,7 @@ int64_t find_band(const uint8_t* target, int64_t size, const Workspace& ws, Rows
 }
 
 // Gives rows to the pixels of the band: to all, or to a part whose factors grow by √(band / part).
-void choose_rows(const uint8_t* target, int64_t size, Scale scale, const Workspace& ws, Rows& rows) {
+void choose_rows(const uint8_t* target, int64_t size, int64_t D, Scale scale, const Workspace& ws, Rows& rows) {
   const int64_t band = find_band(target, size, ws, rows);
   const bool every = band <= kMostRows;
   // fewer than kMostRows, because the number of chosen pixels varies
@@ -89,57 +90,27 @@ void choose_rows(const uint8_t* target, int64_t size, Scale scale, const Workspa
     }
     rows.chosen[block] = static_cast<uint16_t>(mine);
   }
+  fill(rows.values, rows.count * D, 0);
 }
 
-// Adds the derivatives of the chosen pixels of a block with respect to the vertices of one edge.
-[[gnu::always_inline]] inline void add_edge(const Mesh& mesh, const Skin& skin, const Faces& f, int lane, int edge,
-                                            uint32_t pixels, const float* pull_x, const float* pull_y,
-                                            const float* along, const int32_t* of_pixel, Rows& rows) {
+// The pull of some pixels on the corners of a face: for each pixel p · (pixel - nearest point), with the sign of d, and the
+// shares of the corners 0 and 1. The third corner has the rest; the shares of corners that the nearest edge lacks are 0.
+struct Pull {
+  alignas(64) float x[kWidth], y[kWidth], share0[kWidth], share1[kWidth];
+};
+
+// Adds d silhouette / d parameters, through one face, to the rows of the chosen pixels.
+[[gnu::always_inline]] inline void add_to_rows(const Mesh& mesh, const Skin& skin, const Faces& f, int lane, uint32_t pixels,
+                                               const Pull& pull, const int32_t* of_pixel, const Rows& rows) {
   const int64_t D = skin.parameters;
-  const float* a = vertex_rows(mesh, skin, f.vertex[edge][lane], rows.of_vertex);
-  const float* b = vertex_rows(mesh, skin, f.vertex[(edge + 1) % 3][lane], rows.of_vertex);
   for (; pixels; pixels &= pixels - 1) {
     const int i = __builtin_ctz(pixels);
-    const float factor = rows.factor[of_pixel[i]], x = factor * pull_x[i], y = factor * pull_y[i];
-    const float to_a = 0.5f - along[i], to_b = 0.5f + along[i];
-    add_vertices(a, b, to_a * x, to_a * y, to_b * x, to_b * y, D, rows.values + of_pixel[i] * D);
-  }
-}
-
-// Fills the rows. Closes the blocks without a chosen pixel; the blocks with one must be open.
-void fill_rows(const Mesh& mesh, const Skin& skin, Scale scale, Workspace& ws, Rows& rows) {
-  const Vec outside = all(scale.radius * scale.radius);
-  for_each_place(ws, [&](const float* place, int64_t column, int64_t row) {
-    if (!rows.chosen[(place - ws.products) / kLanes]) close(ws, column, row);
-  });
-  fill(rows.values, rows.count * skin.parameters, 0);
-  for (int64_t c = 0; c < ws.num_chunks; ++c) {
-    Faces& f = ws.faces[c];
-    for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
-      const int lane = __builtin_ctz(todo);
-      for_each_block<Reached::kKnown>(f, lane, scale, ws, [&](const Face& face, const Block& block)
-                                      __attribute__((always_inline)) {
-        const int64_t place = block.place - ws.products;
-        for (int at = 0; at < kLanes; at += kWidth) {
-          const uint32_t chosen = rows.chosen[place / kLanes] >> at & ((1u << kWidth) - 1);
-          if (!chosen) continue;
-          const Nearest n = nearest_edge(face, block, at);
-          uint32_t pixels = bits(greater(outside, n.d)) & chosen;
-          if (!pixels) continue;
-          const Vec pull = flip_sign(reciprocal(all(1.f) + exp2(n.d)), n.d);
-          for (int i = 0; i < 3; ++i) {
-            const uint32_t own = i < 2 ? pixels & bits(at_most(n.square[i], n.smallest)) : pixels;
-            if (!own) continue;
-            pixels &= ~own;
-            alignas(64) float pull_x[kWidth], pull_y[kWidth], along[kWidth];
-            store(pull_x, pull * fms(face.tx[i], n.beyond[i], face.ty[i] * n.across[i]));
-            store(pull_y, pull * fma(face.ty[i], n.beyond[i], face.tx[i] * n.across[i]));
-            store(along, n.clamped[i] * all(f.inverse[i][lane]));
-            add_edge(mesh, skin, f, lane, i, own, pull_x, pull_y, along, rows.of_pixel + place + at, rows);
-          }
-        }
-      });
-    }
+    const float share[3] = {pull.share0[i], pull.share1[i], 1 - pull.share0[i] - pull.share1[i]};
+    const int first = share[0] == 0 ? 1 : 0, second = share[0] == 0 || share[1] == 0 ? 2 : 1;
+    const float factor = rows.factor[of_pixel[i]], x = factor * pull.x[i], y = factor * pull.y[i];
+    add_vertices(vertex_rows(mesh, skin, f.vertex[first][lane], rows.of_vertex),
+                 vertex_rows(mesh, skin, f.vertex[second][lane], rows.of_vertex), share[first] * x, share[first] * y,
+                 share[second] * x, share[second] * y, D, rows.values + of_pixel[i] * D);
   }
 }
 
