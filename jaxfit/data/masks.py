@@ -39,12 +39,9 @@ def decode_mask(rle: Mapping[str, Any], columns: tuple[int, int] | None = None) 
     height, width = rle["size"]
     left, right = np.clip(columns, 0, width).tolist()
     mask = np.zeros((width, height), bool)  # run lengths go column by column; untouched rows take no memory
-    runs = np.clip(foreground_runs([rle]).pixels, left * height, right * height) - left * height
-    start, end = runs[runs[:, 0] < runs[:, 1]].T
-    change = np.zeros((right - left) * height + 1, np.int8)
-    change[start] += 1
-    change[end] -= 1
-    np.cumsum(change[:-1], dtype=np.int8, out=mask[left:right].reshape(-1).view(np.int8))
+    pixels = mask.reshape(-1)
+    for start, end in np.clip(foreground_runs([rle]).pixels, left * height, right * height).tolist():
+        pixels[start:end] = True
     return mask.T
 
 

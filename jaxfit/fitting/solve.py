@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -128,13 +129,11 @@ def advance(
     program, problems, steps = fixed
     count = steps + jnp.where(state.started, 0, program.solver.preparing_steps)
 
-    def one(problem: Problem, pose: Pose, solver: Any) -> tuple[Pose, Any]:
-        def step(_, at: tuple[Pose, Any]) -> tuple[Pose, Any]:
-            return program.solver.step(program, problem, *at)
+    def step(_, at: tuple[Pose, Any]) -> tuple[Pose, Any]:
+        return jax.vmap(functools.partial(program.solver.step, program))(problems, *at)
 
-        return jax.lax.fori_loop(0, count, step, (pose, solver))
-
-    pose, solver = jax.vmap(one)(problems, state.pose, state.solver)
+    # the loop outside: to batch a loop, JAX traces its body a second time
+    pose, solver = jax.lax.fori_loop(0, count, step, (state.pose, state.solver))
     return StageState(pose, solver, jnp.bool_(True)), *jax.vmap(program.solver.outcome)(solver)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, cast
 
 import jax.numpy as jnp
@@ -80,18 +81,16 @@ def evaluate_curvature(
         InputError: a term has no blocks and does not return residuals; the error names the term.
     """
 
-    def residuals_of(window: PosedWindow) -> list[Residuals]:
-        found = []
-        for name, values in settings.items():
-            if terms[name].with_blocks is None:
-                parts = _checked_residuals(name, terms[name].function(window, **_without_weight(values)))
-                found += [part._replace(weight=jnp.asarray(values["weight"]) * part.weight) for part in parts]
-        return found
+    def residuals_of(name: str, window: PosedWindow) -> list[Residuals]:
+        values = settings[name]
+        parts = _checked_residuals(name, terms[name].function(window, **_without_weight(values)))
+        return [part._replace(weight=jnp.asarray(values["weight"]) * part.weight) for part in parts]
 
     if blocks is None:
         with_blocks = {name: values for name, values in settings.items() if terms[name].with_blocks is not None}
         blocks = sum_with_blocks(window, terms, with_blocks)[1]
-    curvatures = [residual_curvature(window, residuals_of, second_order)]
+    of_residuals = [partial(residuals_of, name) for name in settings if terms[name].with_blocks is None]
+    curvatures = [residual_curvature(window, of_residuals, second_order)]
     if blocks is not None:
         curvatures.append(block_curvature(blocks))
     return weighted_curvature([jnp.ones(())] * len(curvatures), curvatures)

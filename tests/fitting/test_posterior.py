@@ -168,5 +168,5 @@ def test_second_order_curvature_of_student_t_is_its_fisher_information():
     kernel = student_t(dof, size)
     own = Residuals(r, kernel=kernel, jacobian=lambda: [jnp.broadcast_to(jnp.eye(size)[:, :1], (count, size, 1))])
     for second_order, expected in ((True, (dof + size) / (dof + size + 2)), (False, 1.0)):
-        H = residual_curvature(Line(), lambda _: own, second_order)  # pyright: ignore[reportArgumentType]
+        H = residual_curvature(Line(), [lambda _: own], second_order)  # pyright: ignore[reportArgumentType]
         assert float(H.diagonal.mean()) == pytest.approx(expected, rel=0.02)
