@@ -52,13 +52,13 @@ def sum_with_blocks(
     """Return `weighted_sum`, and Σ λ · blocks of the terms with blocks (None without such a term), in one pass."""
     blocks = [name for name in settings if terms[name].with_blocks is not None]
     total = weighted_sum(window, terms, {name: values for name, values in settings.items() if name not in blocks})
-    parts = []
+    summed = None
     for name in blocks:
         weight = jnp.asarray(settings[name]["weight"])
         value, block = cast(Any, terms[name].with_blocks)(window, **_without_weight(settings[name]))
         total += weight * _checked_scalar(name, value)
-        parts.append(weight * block)
-    return total, sum(parts) if parts else None
+        summed = weight * block if summed is None else summed + weight * block
+    return total, summed
 
 
 def evaluate_curvature(

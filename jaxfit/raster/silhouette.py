@@ -157,7 +157,8 @@ def mask_loss_and_block(
         raise ValueError(f"target: expected bool or uint8, got {target.dtype}")
     switch, skin = jax.lax.stop_gradient((weight, skin))
     settings = tuple(float(x) for x in camera_px), kind, blur, _choose(backend)
-    loss, block = _mask_loss_and_block(vertices, faces, target.astype(jnp.uint8), switch, skin, *settings)
+    found: Any = _mask_loss_and_block(vertices, faces, target.astype(jnp.uint8), switch, skin, *settings)
+    loss, block = found
     return (weight * loss).astype(vertices_screen.dtype), switch * jax.lax.stop_gradient(block)
 
 
