@@ -19,16 +19,16 @@ Source: Iglewicz and Hoaglin 1993, *How to detect and handle outliers* (modified
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int8
 
 from jaxfit.data.mask_comparison import compare_masks
-from jaxfit.data.masks import box_of_mask, decode_mask
+from jaxfit.data.masks import box_of_rle, decode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.foundation.progress import ProgressTask, silent
@@ -116,22 +116,22 @@ def contradict_masks(
             sure_px = observations.keypoints_px[n, t, observations.confidence[n, t] >= LEAST_CONFIDENCE]
             limit_px = WRONG_SHARE * float(observations.box_px[n, t, 2:].max())
             if len(sure_px):
-                outside = _distances_px(sure_px, decode_mask(observations.masks[n, t]), limit_px) > limit_px
+                outside = _distances_px(sure_px, observations.masks[n, t], limit_px) > limit_px
                 contradicts[n, t] = outside.mean() > OUTSIDE_SHARE
             report_progress(1, "")
     return contradicts
 
 
 def _distances_px(
-    points_px: Float[np.ndarray, "M 2"], mask: Bool[np.ndarray, "H W"], reach_px: float
+    points_px: Float[np.ndarray, "M 2"], rle: Mapping[str, Any], reach_px: float
 ) -> Float[np.ndarray, "M"]:
     """Return the distance of points to a mask in pixels; larger distances than `reach_px` are not exact."""
-    box = box_of_mask(mask)
+    box = box_of_rle(rle)
     if box is None:
         return np.zeros(len(points_px))  # an empty mask says nothing
     margin = int(reach_px) + 2
     x0, y0, width, height = box
-    inside = mask[y0 : y0 + height, x0 : x0 + width]
+    inside = decode_mask(rle, (x0, x0 + width))[y0 : y0 + height, x0 : x0 + width]
     background = np.pad(~inside, margin, constant_values=True).astype(np.uint8)
     distance = cv2.distanceTransform(background, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     at = np.floor(points_px).astype(int) - (x0 - margin, y0 - margin)

@@ -12,6 +12,8 @@ from typing import Any, cast
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxfit.data.formats.rle import foreground_runs
+
 
 def box_of_mask(mask: np.ndarray) -> tuple[int, int, int, int] | None:
     """Return the tight box of an (H, W) mask: x, y of the first pixel, width, height; None for an empty mask."""
@@ -22,11 +24,33 @@ def box_of_mask(mask: np.ndarray) -> tuple[int, int, int, int] | None:
     return x0, y0, int(columns[-1]) + 1 - x0, int(rows[-1]) + 1 - y0
 
 
-def decode_mask(rle: Mapping[str, Any]) -> np.ndarray:
-    """Return the mask of run lengths: (H, W) bool."""
+def decode_mask(rle: Mapping[str, Any], columns: tuple[int, int] | None = None) -> np.ndarray:
+    """Return the mask of run lengths: (H, W) bool.
+
+    Args:
+        rle: run lengths in the format of ``Observations.masks``, which are valid.
+        columns: the first column, and the column after the last, that are decoded; the others are background. A bird
+            covers a small part of a large image, and the time is that of the part. None decodes the whole mask.
+    """
     from pycocotools import mask as coco_mask
 
-    return coco_mask.decode(cast(Any, rle)).view(bool)
+    if columns is None:
+        return coco_mask.decode(cast(Any, rle)).view(bool)
+    height, width = rle["size"]
+    left, right = np.clip(columns, 0, width).tolist()
+    mask = np.zeros((width, height), bool)  # run lengths go column by column; untouched rows take no memory
+    pixels = mask.reshape(-1)
+    for start, end in np.clip(foreground_runs([rle]).pixels, left * height, right * height).tolist():
+        pixels[start:end] = True
+    return mask.T
+
+
+def box_of_rle(rle: Mapping[str, Any]) -> tuple[int, int, int, int] | None:
+    """Return `box_of_mask` of run lengths, without decoding them."""
+    from pycocotools import mask as coco_mask
+
+    x0, y0, width, height = (int(value) for value in coco_mask.toBbox(cast(Any, rle)))
+    return (x0, y0, width, height) if width and height else None
 
 
 def encode_mask(mask: Any) -> dict[str, Any]:

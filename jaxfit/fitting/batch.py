@@ -25,11 +25,9 @@ from jaxfit.config.fit import FitConfig, StageConfig
 from jaxfit.fitting.diagnose import name_failures
 from jaxfit.fitting.error_bars import ErrorBars, window_error_bars
 from jaxfit.fitting.posterior import with_shared
+from jaxfit.fitting.problem import Hyperparameters, Problem, Program
 from jaxfit.fitting.solve import (
     FitModel,
-    Hyperparameters,
-    Problem,
-    Program,
     Report,
     StageState,
     advance,
@@ -252,9 +250,10 @@ def _run_stage(
     states = [begin(program, tile.problems, take_tile(carried, tile.rows)) for tile in tiles]
     states, rejected = _take_steps(program, tiles, states, stage, report_progress)
     count = len(rows.failure)
-    state, rejected = join_tiles(states, count), join_tiles(rejected, count)
+    poses, solvers, _ = zip(*states, strict=True)
+    pose, solver, rejected = (join_tiles(each, count) for each in (poses, solvers, rejected))
     step = np.where(rejected > 0, stage.steps + 1 - rejected, 0)  # all steps after the first failure are rejected
-    return _name_failures(program, tiles, rows._replace(pose=state.pose, solver=state.solver), step, stage)
+    return _name_failures(program, tiles, rows._replace(pose=pose, solver=solver), step, stage)
 
 
 def _take_steps(

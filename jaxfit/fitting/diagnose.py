@@ -12,15 +12,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from jaxfit.config.fit import FitConfig
-from jaxfit.fitting.solve import (
-    FitModel,
-    Problem,
-    Program,
-    needs_mask,
-    problem_window,
-    stage_hyperparameters,
-    stage_program,
-)
+from jaxfit.fitting.problem import Problem, Program, problem_window
+from jaxfit.fitting.solve import FitModel, needs_mask, stage_hyperparameters, stage_program
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.kinematics import Pose, rest_pose
 from jaxfit.objective.objective import evaluate_curvature, weighted_sum

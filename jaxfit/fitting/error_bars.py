@@ -37,6 +37,7 @@ from scipy.stats import f as f_distribution
 
 from jaxfit.data.solution import ERROR_BARS
 from jaxfit.fitting.posterior import WindowPosterior, window_posteriors
+from jaxfit.fitting.problem import Problem, Program
 from jaxfit.fitting.sandwich import (
     constant_deviation,
     data_blocks,
@@ -45,7 +46,6 @@ from jaxfit.fitting.sandwich import (
     spread,
     time_factor,
 )
-from jaxfit.fitting.solve import Problem, Program
 from jaxfit.model.kinematics import (
     Pose,
     window_keypoint_derivatives,

@@ -47,10 +47,7 @@ from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
 from jaxfit.fitting.evidence import KEYPOINTS, MASK, Evidence, measure
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.keypoint_offsets import first_offsets, learn_offsets
-from jaxfit.fitting.solve import (
-    FitModel,
-    fit_model,
-)
+from jaxfit.fitting.solve import FitModel, fit_model
 from jaxfit.fitting.tasks import FitShared, FitTask, Run, gather_batch
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.progress import ProgressTask, silent

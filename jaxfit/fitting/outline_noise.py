@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter
 
-from jaxfit.fitting.solve import Program
+from jaxfit.fitting.problem import Program
 from jaxfit.raster.silhouette_reference import UNKNOWN
 
 MASKS_PER_WINDOW = 25

@@ -35,7 +35,8 @@ from jaxtyping import Array, Float
 from scipy.linalg import cho_solve, get_lapack_funcs
 
 from jaxfit.config.fit import StageConfig
-from jaxfit.fitting.solve import Problem, Program, problem_window, shared_parameters
+from jaxfit.fitting.problem import Problem, Program, problem_window
+from jaxfit.fitting.solve import shared_parameters
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.curvature import frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature

@@ -1,8 +1,9 @@
-"""Problems, solvers (Adam, Levenberg-Marquardt), and the compiled program of a stage."""
+"""The solver Adam, and the compiled programs of a stage: begin, take steps, report."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -12,89 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import optimistix as optx
-from jax.scipy.sparse.linalg import cg
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxfit.config.fit import FitConfig, InitialiseConfig, StageConfig
+from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
+from jaxfit.fitting.problem import Hyperparameters, Problem, Program, Solver, problem_loss, problem_window
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX, CropCamera
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, move_keypoints
-from jaxfit.objective.curvature import SHARED_PARAMETERS, Rows, add_rows, frame_rows, shared_columns
-from jaxfit.objective.objective import evaluate_curvature, evaluate_terms, weighted_sum
-from jaxfit.objective.posed_window import PosedWindow, Priors, Raster, Targets, priors_of
-from jaxfit.objective.registry import Term, find_terms
+from jaxfit.objective.curvature import (
+    SHARED_PARAMETERS,
+)
+from jaxfit.objective.objective import evaluate_terms
+from jaxfit.objective.posed_window import Priors, Raster, priors_of
+from jaxfit.objective.registry import find_terms
 from jaxfit.raster.silhouette_reference import Blur
-
-
-class Program(NamedTuple):
-    """The data that all problems of a stage share. `rig` and `priors` are traced; the other fields are static."""
-
-    rig: Rig
-    priors: Priors
-    camera: CropCamera
-    raster: Raster
-    terms: Mapping[str, Term]
-    """The stage's active terms, by name."""
-    solver: Solver
-    shared: tuple[str, ...] = ()
-    """The parameters of `curvature.SHARED_PARAMETERS` that a solver with curvature optimises, in that order."""
-
-
-class Hyperparameters(NamedTuple):
-    """The values that may differ between the problems of a batch. All values are traced. A batch adds an axis B."""
-
-    settings: dict[str, dict[str, Float[Array | np.ndarray, "*B"]]]
-    """Weight and settings of the active terms."""
-    step_size: Pose
-    """Adam's step size for every parameter, in shapes that broadcast against the pose. 0 fixes a parameter, for every
-    solver."""
-    keypoints_on: Float[Array | np.ndarray, "*B K"]
-    """1 for the keypoints that the stage uses, else 0."""
-
-
-class Problem(NamedTuple):
-    """The data of one problem, without the optimised pose. A batch adds a leading axis B to every array."""
-
-    hyperparameters: Hyperparameters
-    anchor: Pose
-    """The pose at the beginning of the stage."""
-    targets: Targets
-
-
-class Solver(NamedTuple):
-    """A method that improves the pose of one problem. All three functions are pure.
-
-    A batch maps the functions over its problems.
-    """
-
-    init: Callable[[Program, Problem, Any], Any]
-    """Return the state before the first step, at the anchor. The third argument is the state after the previous stage,
-    whose moments the solver continues. None: the solver starts without moments."""
-    step: Callable[[Program, Problem, Pose, Any], tuple[Pose, Any]]
-    """Take one step. Return the next pose and state."""
-    outcome: Callable[[Any], tuple[Float[Array, ""], Int[Array, ""]]]
-    """Return, from a state, the last loss that the solver computed, and the number of steps of this stage that were
-    rejected because the loss or its gradient was not finite. After the first rejected step, the pose is constant."""
-
-
-def problem_window(program: Program, problem: Problem, pose: Pose) -> PosedWindow:
-    """Return the posed window that the terms evaluate."""
-    targets = problem.targets
-    on = problem.hyperparameters.keypoints_on
-    if targets.views is not None:  # the keypoints of the model, once for each view
-        on = jnp.tile(on, targets.confidence.shape[-1] // on.shape[-1])
-    active = targets.confidence * on
-    targets = eqx.tree_at(lambda t: t.confidence, targets, active)
-    rig, priors, camera, raster = program.rig, program.priors, program.camera, program.raster
-    return PosedWindow(pose, problem.anchor, targets, rig, priors, camera, raster, program.shared)
-
-
-def problem_loss(program: Program, problem: Problem, pose: Pose) -> Float[Array, ""]:
-    """Return the objective. The gradient of fixed parameters is 0, so their moments stay 0."""
-    optimised = jax.tree.map(
-        lambda x, step: jnp.where(step > 0, x, jax.lax.stop_gradient(x)), pose, problem.hyperparameters.step_size
-    )
-    return weighted_sum(problem_window(program, problem, optimised), program.terms, problem.hyperparameters.settings)
 
 
 class _AdamState(NamedTuple):
@@ -152,128 +85,14 @@ def _adam_outcome(state: _AdamState) -> tuple[Float[Array, ""], Int[Array, ""]]:
 ADAM = Solver(_adam_init, _adam_step, _adam_outcome)
 
 
-CG_STEPS, CG_TOLERANCE = 100, 0.01
-"""Largest number of conjugate-gradient steps within one step, and the relative residual at which they end. The
-first steps need few of them. A tolerance far below 1e-6 makes single precision underflow to 0/0."""
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-5, 1e8
-"""The damping μ of the first step, and the bounds of μ."""
-DAMPING_DECREASE, DAMPING_INCREASE = 0.2, 5.0
-"""Factors on the damping after a step that lowered the loss, and after a step that did not lower the loss."""
-
-MOST_RELAXATION, MOMENTUM, PESSIMISTIC = 1.5, 0.4, 0.9
-"""Where the true curvature along the last step was less than `PESSIMISTIC` times that of H, the next step is longer by
-at most the factor `MOST_RELAXATION`, and continues the last step by the share `MOMENTUM`."""
-
-
-class _LevenbergState(NamedTuple):
-    loss: Float[Array, ""]
-    gradient: Rows
-    damping: Float[Array, ""]
-    change: Rows
-    """The last step; 0 if the last step was not taken."""
-    curvature_ratio: Float[Array, ""]
-    """Curvature of the objective along the last step, over the curvature of H; 1 if the last step was not taken."""
-    rejected: Int[Array, ""]
-    """Number of steps from a pose whose loss or gradient is not finite."""
-
-
-def _levenberg_init(program: Program, problem: Problem, carried: Any) -> _LevenbergState:
-    assert carried is None  # `FitConfig` checks this: only Adam has moments
-    loss, gradient = _loss_and_gradient(program, problem, problem.anchor)
-    return _LevenbergState(
-        loss=loss,
-        gradient=gradient,
-        damping=jnp.float32(FIRST_DAMPING),
-        change=jnp.zeros_like(gradient),
-        curvature_ratio=jnp.float32(1.0),
-        rejected=jnp.int32(0),
-    )
-
-
-def _levenberg_step(
-    program: Program, problem: Problem, pose: Pose, state: _LevenbergState
-) -> tuple[Pose, _LevenbergState]:
-    """Return x + c with c = ω·d + β·c_last and (H + μ·diag H)·d = −g if this lowers the objective, else x.
-
-    The damping μ decreases after a step that lowered the objective, and increases otherwise. H is the curvature of
-    the terms' quadratic bounds: JᵀJ within a frame, and one band between frames. Conjugate gradients need only products
-    with H, so that the matrix itself is not computed.
-
-    H is too large where it bounds an unsquared norm or leaves out second derivatives. The ratio κ of the true curvature
-    along the last step to that of H measures this. For κ ≥ 0.9, ω = 1 and β = 0: a plain step. Else ω = 1/κ, at most
-    1.5, and β = 0.4.
-
-    Source: Marquardt 1963, An algorithm for least-squares estimation of nonlinear parameters; Polyak 1964, Some methods
-    of speeding up the convergence of iteration methods (momentum).
-    """
-    window = problem_window(program, problem, pose)
-    curvature = evaluate_curvature(window, program.terms, problem.hyperparameters.settings)
-    step_size = jax.tree.map(lambda x, size: jnp.broadcast_to(size, x.shape), pose, problem.hyperparameters.step_size)
-    optimised = frame_rows(step_size, program.shared) > 0
-    is_shared = shared_columns(pose, program.shared)
-
-    def allowed(rows: Rows) -> Rows:
-        """Set the change of fixed parameters to 0, and the change of shared parameters to its mean."""
-        rows = jnp.where(optimised, rows, 0.0)
-        return jnp.where(is_shared, rows.mean(axis=0), rows)
-
-    gradient = allowed(state.gradient)
-    diagonal = allowed(curvature.diagonal)
-    # a parameter without curvature has no gradient and does not change
-    diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
-    newton, _ = cg(
-        lambda d: allowed(curvature.product(d)) + state.damping * diagonal * d,
-        -gradient,
-        M=lambda d: d / diagonal,
-        tol=CG_TOLERANCE,
-        maxiter=CG_STEPS,
-    )
-    pessimistic = state.curvature_ratio < PESSIMISTIC
-    relaxation = 1 / jnp.maximum(state.curvature_ratio, 1 / MOST_RELAXATION)
-    change = jnp.where(pessimistic, relaxation * newton + MOMENTUM * state.change, newton)
-    new_pose = add_rows(pose, change, program.shared)
-    loss, new_gradient = _loss_and_gradient(program, problem, new_pose)
-    not_finite = ~(jnp.isfinite(state.loss) & jnp.isfinite(state.gradient).all())
-    lower = ~not_finite & (loss < state.loss) & jnp.isfinite(new_gradient).all()
-    bend = jnp.vdot(change, curvature.product(change))
-    ratio = 2 * (loss - state.loss - jnp.vdot(gradient, change)) / jnp.where(bend > 0, bend, 1.0)
-
-    def choose(new: Any, old: Any) -> Any:
-        return jax.tree.map(lambda a, b: jnp.where(lower, a, b), new, old)
-
-    factor = jnp.where(lower, DAMPING_DECREASE, DAMPING_INCREASE)
-    return choose(new_pose, pose), _LevenbergState(
-        loss=choose(loss, state.loss),
-        gradient=choose(new_gradient, state.gradient),
-        damping=jnp.clip(state.damping * factor, LEAST_DAMPING, MOST_DAMPING),
-        change=choose(change, jnp.zeros_like(change)),
-        curvature_ratio=choose(ratio, jnp.float32(1.0)),
-        rejected=state.rejected + not_finite,
-    )
-
-
-def _loss_and_gradient(program: Program, problem: Problem, pose: Pose) -> tuple[Float[Array, ""], Rows]:
-    """Return the objective and its gradient, one row per frame."""
-
-    def loss(change: Rows) -> Float[Array, ""]:
-        return problem_loss(program, problem, add_rows(pose, change, program.shared))
-
-    return jax.value_and_grad(loss)(jnp.zeros_like(frame_rows(pose, program.shared)))
-
-
-def _levenberg_outcome(state: _LevenbergState) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    return state.loss, state.rejected
-
-
-LEVENBERG_MARQUARDT = Solver(_levenberg_init, _levenberg_step, _levenberg_outcome)
-
-
 class StageState(NamedTuple):
     """The current poses and solver states of a batch of B problems in one stage."""
 
     pose: Pose
     solver: Any
     """The state of the solver, with leading axis B."""
+    started: Bool[Array, ""]
+    """Whether the preparing steps of the solver were taken."""
 
 
 @eqx.filter_jit
@@ -291,14 +110,14 @@ def begin(program: Program, problems: Problem, carried: Any) -> StageState:
 
     solver = jax.vmap(one)(problems, carried)
     # `advance` reuses the memory of its state, so the state must not share memory with the anchor
-    return StageState(*jax.tree.map(jnp.copy, (problems.anchor, solver)))
+    return StageState(*jax.tree.map(jnp.copy, (problems.anchor, solver)), started=jnp.bool_(False))
 
 
 @eqx.filter_jit(donate="all-except-first")
 def advance(
     fixed: tuple[Program, Problem, Int[Array, ""]], state: StageState
 ) -> tuple[StageState, Float[Array, "B"], Int[Array, "B"]]:
-    """Take some steps.
+    """Take some steps, after the preparing steps of the solver where the state has not started.
 
     Args:
         fixed: the program, the problems (B, …) and the number of steps (traced).
@@ -308,15 +127,14 @@ def advance(
         The new state, and `Solver.outcome` of each problem: loss (B,) and rejected steps (B,).
     """
     program, problems, steps = fixed
+    count = steps + jnp.where(state.started, 0, program.solver.preparing_steps)
 
-    def one(problem: Problem, state: StageState) -> StageState:
-        def step(_, state: StageState) -> StageState:
-            return StageState(*program.solver.step(program, problem, *state))
+    def step(_, at: tuple[Pose, Any]) -> tuple[Pose, Any]:
+        return jax.vmap(functools.partial(program.solver.step, program))(problems, *at)
 
-        return jax.lax.fori_loop(0, steps, step, state)
-
-    state = jax.vmap(one)(problems, state)
-    return state, *jax.vmap(program.solver.outcome)(state.solver)
+    # the loop outside: to batch a loop, JAX traces its body a second time
+    pose, solver = jax.lax.fori_loop(0, count, step, (state.pose, state.solver))
+    return StageState(pose, solver, jnp.bool_(True)), *jax.vmap(program.solver.outcome)(solver)
 
 
 class Report(NamedTuple):

@@ -430,11 +430,12 @@ def _cut_masks(
 ) -> None:
     """Write the crops of the masks of one window in one view to `cuts`."""
     for t in np.flatnonzero(has_mask).tolist():
-        full = decode_mask(cast(Any, masks.own[t]))
+        columns = int(crop[t, 0]), int(crop[t, 0] + crop[t, 2])
+        full = decode_mask(cast(Any, masks.own[t]), columns)
         cuts[t] = cut_mask(full, crop[t], cuts.shape[-1])
         others = masks.others[t]
         if others is not False:
-            others = None if others is None else decode_mask(others)
+            others = None if others is None else decode_mask(others, columns)
             mark_unknown(cuts[t], others, cast(Any, full.shape), crop[t])
 
 

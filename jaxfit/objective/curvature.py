@@ -28,6 +28,11 @@ A change of a parameter that all frames share is the mean of its rows. Its gradi
 """
 
 
+FrameBlocks = Float[Array, "T D D"]
+"""A curvature without products of different frames: one positive semi-definite block per frame, in the columns of
+`frame_rows`."""
+
+
 class Curvature(NamedTuple):
     """A positive semi-definite H on rows of frames."""
 
@@ -36,6 +41,11 @@ class Curvature(NamedTuple):
     these parameters."""
     diagonal: Rows
     """Diagonal of H. For a shared parameter, only the mean over the rows counts."""
+
+
+def block_curvature(blocks: FrameBlocks) -> Curvature:
+    """Return the curvature of blocks."""
+    return Curvature(lambda d: jnp.einsum("tij,tj->ti", blocks, d), jnp.diagonal(blocks, axis1=-2, axis2=-1))
 
 
 def weighted_curvature(weights: Sequence[Float[Array, ""]], curvatures: Sequence[Curvature]) -> Curvature:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from functools import partial
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.objective.curvature import Curvature, weighted_curvature
+from jaxfit.objective.curvature import Curvature, FrameBlocks, block_curvature, weighted_curvature
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import Term
 from jaxfit.objective.residuals import Residuals, as_list, residual_curvature, residual_sum
@@ -45,36 +46,54 @@ def weighted_sum(window: PosedWindow, terms: Mapping[str, Term], settings: Setti
     return sum((jnp.asarray(settings[name]["weight"]) * value for name, value in values.items()), start=jnp.zeros(()))
 
 
+def sum_with_blocks(
+    window: PosedWindow, terms: Mapping[str, Term], settings: Settings
+) -> tuple[Float[Array, ""], FrameBlocks | None]:
+    """Return `weighted_sum`, and Σ λ · blocks of the terms with blocks (None without such a term), in one pass."""
+    blocks = [name for name in settings if terms[name].with_blocks is not None]
+    total = weighted_sum(window, terms, {name: values for name, values in settings.items() if name not in blocks})
+    summed = None
+    for name in blocks:
+        weight = jnp.asarray(settings[name]["weight"])
+        value, block = cast(Any, terms[name].with_blocks)(window, **_without_weight(settings[name]))
+        total += weight * _checked_scalar(name, value)
+        summed = weight * block if summed is None else summed + weight * block
+    return total, summed
+
+
 def evaluate_curvature(
-    window: PosedWindow, terms: Mapping[str, Term], settings: Settings, second_order: bool = False
+    window: PosedWindow,
+    terms: Mapping[str, Term],
+    settings: Settings,
+    second_order: bool = False,
+    blocks: FrameBlocks | None = None,
 ) -> Curvature:
-    """Return Σ λ · H_term over the active terms, from their own curvature or from their residuals.
+    """Return Σ λ · H_term over the active terms, from their blocks or from their residuals.
 
     Args:
         window: one bird in one window.
         terms, settings: as for `evaluate_terms`.
         second_order: whether H includes the second derivatives of robust kernels, as `residual_curvature` describes.
-            A term with its own curvature does not distinguish.
+            Blocks do not distinguish.
+        blocks: the second result of `sum_with_blocks` at this window; None computes it.
 
     Raises:
-        InputError: a term has no curvature and does not return residuals; the error names the term.
+        InputError: a term has no blocks and does not return residuals; the error names the term.
     """
 
-    def residuals_of(window: PosedWindow) -> list[Residuals]:
-        found = []
-        for name, values in settings.items():
-            if terms[name].curvature is None:
-                parts = _checked_residuals(name, terms[name].function(window, **_without_weight(values)))
-                found += [part._replace(weight=jnp.asarray(values["weight"]) * part.weight) for part in parts]
-        return found
+    def residuals_of(name: str, window: PosedWindow) -> list[Residuals]:
+        values = settings[name]
+        parts = _checked_residuals(name, terms[name].function(window, **_without_weight(values)))
+        return [part._replace(weight=jnp.asarray(values["weight"]) * part.weight) for part in parts]
 
-    weights, curvatures = [jnp.ones(())], [residual_curvature(window, residuals_of, second_order)]
-    for name, values in settings.items():
-        curvature = terms[name].curvature
-        if curvature is not None:
-            weights.append(jnp.asarray(values["weight"]))
-            curvatures.append(curvature(window, **_without_weight(values)))
-    return weighted_curvature(weights, curvatures)
+    if blocks is None:
+        with_blocks = {name: values for name, values in settings.items() if terms[name].with_blocks is not None}
+        blocks = sum_with_blocks(window, terms, with_blocks)[1]
+    of_residuals = [partial(residuals_of, name) for name in settings if terms[name].with_blocks is None]
+    curvatures = [residual_curvature(window, of_residuals, second_order)]
+    if blocks is not None:
+        curvatures.append(block_curvature(blocks))
+    return weighted_curvature([jnp.ones(())] * len(curvatures), curvatures)
 
 
 def _without_weight(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -302,12 +302,13 @@ class PosedWindow:
     @cached_property
     def skin(self) -> Skin:
         """Derivatives of the vertices with respect to a row of `curvature.frame_rows`, in factors. Only `slope`
-        (I, J, 3, 4, D) and `shape_slope` (I, V, 3, S) have a leading axis of images."""
-        rest = shaped_vertices(self._rig, self.pose)
-        slope = window_transform_derivatives(self._rig, self._transforms, self.pose, "bone_length" in self.shared)
+        (I, J, 3, 4, D) and `shape_slope` (I, V, 3, S) have a leading axis of images. They are constants for JAX."""
+        pose, transforms = jax.lax.stop_gradient((self.pose, self._transforms))
+        rest = shaped_vertices(self._rig, pose)
+        slope = window_transform_derivatives(self._rig, transforms, pose, "bone_length" in self.shared)
         shape_slope = jnp.zeros((*self.vertices_screen.shape, 0))
         if "betas" in self.shared:
-            shape_slope = window_shape_derivatives(self._rig, self._transforms, self.pose)
+            shape_slope = window_shape_derivatives(self._rig, transforms, pose)
         views = self.targets.views
         if views is not None:
             slope = jnp.einsum("tvab,tjbcd->tvjacd", views.linear, slope).reshape(-1, *slope.shape[1:])

@@ -8,9 +8,11 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar, overload
 
+from jaxtyping import Array
+
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.plugins import entry_points, import_object
-from jaxfit.objective.curvature import Curvature
+from jaxfit.objective.curvature import FrameBlocks
 
 ENTRY_POINTS = "jaxfit.terms"
 """The entry-point group with which an installed package provides terms."""
@@ -33,8 +35,8 @@ class Term:
     """Settings that must be above 0; the other settings may be 0."""
     compares_masks: bool
     """Whether the term uses masks: only stages with such a term receive masks."""
-    curvature: Callable[..., Curvature] | None = None
-    """The curvature, a function of the same arguments; Levenberg-Marquardt requires a curvature."""
+    with_blocks: Callable[..., tuple[Array, FrameBlocks]] | None = None
+    """The value and the Gauss-Newton blocks, a function of the same arguments, of a term that returns no residuals."""
 
 
 _terms: dict[str, Term] = {}
@@ -49,9 +51,9 @@ def term(
     name: str | None = None,
     positive: Collection[str] = (),
     compares_masks: bool = False,
-    curvature: Callable[..., Curvature] | None = None,
+    with_blocks: Callable[..., tuple[Array, FrameBlocks]] | None = None,
 ) -> Callable[[Function], Function]: ...
-def term(function=None, /, *, name=None, positive=(), compares_masks=False, curvature=None):
+def term(function=None, /, *, name=None, positive=(), compares_masks=False, with_blocks=None):
     """Register a term of the objective: a pure function of the window, with the settings as keyword arguments.
 
     After `@term def stillness(window, *, beta=1.0): …`, the configs of this session can use the term `stillness`. The
@@ -63,8 +65,9 @@ def term(function=None, /, *, name=None, positive=(), compares_masks=False, curv
         name: name of the term in configs (default: the name of the function).
         positive: settings that must be above 0.
         compares_masks: whether the function uses `window.targets.mask`, which is empty in stages without such a term.
-        curvature: takes the arguments of `function` and returns a `jaxfit.objective.curvature.Curvature`; stages with
-            the solver `levenberg_marquardt` require a curvature.
+        with_blocks: for a function that cannot return residuals, such as a term of the silhouette: takes the same
+            arguments, and returns the value and the Gauss-Newton blocks of the frames,
+            `jaxfit.objective.curvature.FrameBlocks`. The solver `levenberg_marquardt` needs residuals or blocks.
 
     Raises:
         InputError: the function does not have the form of a term, or a term of another module has this name. A module
@@ -77,7 +80,7 @@ def term(function=None, /, *, name=None, positive=(), compares_masks=False, curv
         if existing is not None and existing.function.__module__ != function.__module__:
             problem = f"is already the name of a term of {existing.function.__module__}"
             raise InputError(f"term {new.name!r}", problem, "choose another name")
-        _terms[new.name] = replace(new, curvature=curvature)
+        _terms[new.name] = replace(new, with_blocks=with_blocks)
         return function
 
     return register if function is None else register(function)
@@ -86,8 +89,8 @@ def term(function=None, /, *, name=None, positive=(), compares_masks=False, curv
 def find_term(name: str) -> Term:
     """Return a term by its registered name, by an entry point of the group `jaxfit.terms`, or by its path.
 
-    The path is `package.module:function`. Such a function needs the decorator only if the term uses masks, has a
-    curvature, or has settings that must be above 0.
+    The path is `package.module:function`. Such a function needs the decorator only if the term uses masks, has
+    blocks, or has settings that must be above 0.
 
     Raises:
         KeyError: no term has this name.

@@ -96,7 +96,7 @@ def residual_sum(residuals: Residuals | Sequence[Residuals]) -> Scalar:
 
 def residual_curvature(
     window: PosedWindow,
-    residuals_of: Callable[[PosedWindow], Residuals | Sequence[Residuals]],
+    terms: Sequence[Callable[[PosedWindow], Residuals | Sequence[Residuals]]],
     second_order: bool = False,
 ) -> Curvature:
     """Return H = Jᵀ·diag(2w·ρ′)·J of the residuals of a window.
@@ -111,28 +111,34 @@ def residual_curvature(
 
     Args:
         window: one bird in one window.
-        residuals_of: returns the residuals of a window.
+        terms: each returns residuals of a window.
         second_order: whether H includes the second derivative ρ″ of the kernels.
 
     Source: Holland and Welsch 1977, Robust regression using iteratively reweighted least-squares; Hutchinson 1990, A
     stochastic estimator of the trace of the influence matrix (random signs).
     """
-    current = as_list(residuals_of(window))
-    factors = []
-    for each in current:
+
+    def factor_of(each: Residuals) -> Float[Array, "..."]:
         slope = _mean_slope(each) if second_order else each.kernel.slope(_squared(each))
-        factor = 2 * each.weight * slope
-        factors.append(jnp.broadcast_to(jax.lax.stop_gradient(factor)[..., None], each.values.shape))
-    by_formula = [i for i, each in enumerate(current) if each.jacobian is not None]
-    by_jax = [i for i in range(len(current)) if i not in by_formula]
-    curvatures = [_from_jacobian(current[i], factors[i]) for i in by_formula]
+        factor = jax.lax.stop_gradient(2 * each.weight * slope)
+        return jnp.broadcast_to(factor[..., None], each.values.shape)
+
+    curvatures, by_jax, factors = [], [], []
+    for function in terms:
+        parts = as_list(function(window))
+        curvatures += [_from_jacobian(part, factor_of(part)) for part in parts if part.jacobian is not None]
+        others = [i for i, part in enumerate(parts) if part.jacobian is None]
+        if others:
+            by_jax.append((function, others))
+            factors += [factor_of(parts[i]) for i in others]
     if by_jax:
 
         def values_at(d: Rows) -> list[Float[Array, "..."]]:
-            moved = as_list(residuals_of(window.moved(d)))
-            return [jnp.asarray(moved[i].values) for i in by_jax]
+            moved = window.moved(d)
+            parts = [(as_list(function(moved)), others) for function, others in by_jax]
+            return [jnp.asarray(own[i].values) for own, others in parts for i in others]
 
-        curvatures.append(_from_jax(window, values_at, [factors[i] for i in by_jax]))
+        curvatures.append(_from_jax(window, values_at, factors))
     return weighted_curvature([jnp.ones(())] * len(curvatures), curvatures)
 
 

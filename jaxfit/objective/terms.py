@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxfit.objective.curvature import Curvature, Rows
+from jaxfit.objective.curvature import FrameBlocks
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import term
 from jaxfit.objective.residuals import NORM, Residuals, Scalar, geman_mcclure
 from jaxfit.objective.temporal import complete_runs
-from jaxfit.raster.silhouette import Kind, mask_loss, silhouette_gauss_newton
+from jaxfit.raster.silhouette import Kind, mask_loss, mask_loss_and_block
 
 
 @term(positive=["sigma_px"])
@@ -33,32 +33,37 @@ def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Residu
     )
 
 
-def _mask_curvature(window: PosedWindow) -> Curvature:
-    """Return H = JᵀJ with J the derivative of the silhouette: the Gauss-Newton matrix of Σ ½e².
+def _mask_and_blocks(window: PosedWindow, kind: Kind) -> tuple[Scalar, FrameBlocks]:
+    """Return the mask term and H = JᵀJ with J the derivative of the silhouette: the Gauss-Newton matrix of Σ ½e².
 
     The L1 norm has the same H. Its quadratic bound is ½ Σ e²/n with n = |e| ≤ 1, so H is smaller than the curvature of
     the bound. With the bound, the solver needs about twice as many steps.
     """
     ratio = window.raster.size_px / window.camera.size_px
     camera_px = window.camera.focal_px * ratio, window.camera.centre_px * ratio
-    raster = {"blur": window.raster.blur, "backend": window.raster.backend}
+    raster = {"kind": kind, "blur": window.raster.blur, "backend": window.raster.backend}
 
     def frame(vertices_screen, target, weight, slope, shape_slope):
         skin = window.skin._replace(slope=slope, shape_slope=shape_slope)
-        return silhouette_gauss_newton(vertices_screen, window.faces, target, weight, skin, camera_px, **raster)
+        return mask_loss_and_block(vertices_screen, window.faces, target, weight, skin, camera_px, **raster)
 
     skin = window.skin.slope, window.skin.shape_slope
-    blocks = jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window), *skin)
+    values, blocks = jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window), *skin)
     if window.targets.views is not None:
         blocks = blocks.reshape(len(window.present), -1, *blocks.shape[1:]).sum(axis=1)
-
-    def product(d: Rows) -> Rows:
-        return jnp.einsum("tij,tj->ti", blocks, d)
-
-    return Curvature(product, jnp.diagonal(blocks, axis1=-2, axis2=-1))
+    return jnp.sum(values), blocks
 
 
-@term(compares_masks=True, curvature=_mask_curvature)
+def _mask(window: PosedWindow, kind: Kind) -> Scalar:
+    raster = {"blur": window.raster.blur, "backend": window.raster.backend}
+
+    def frame(vertices_screen, target, weight):
+        return mask_loss(vertices_screen, window.faces, target, weight, kind=kind, **raster)
+
+    return jnp.sum(jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window)))
+
+
+@term(compares_masks=True, with_blocks=lambda window: _mask_and_blocks(window, "l1"))
 def mask(window: PosedWindow) -> Scalar:
     """Compare silhouette and mask by the L1 norm: E_msk = Σ_t Σ_pixels |soft silhouette − mask|.
 
@@ -69,7 +74,7 @@ def mask(window: PosedWindow) -> Scalar:
     return _mask(window, "l1")
 
 
-@term(compares_masks=True, curvature=_mask_curvature)
+@term(compares_masks=True, with_blocks=lambda window: _mask_and_blocks(window, "smooth_l1"))
 def mask_smooth_l1(window: PosedWindow) -> Scalar:
     """Compare silhouette and mask by smooth-L1, as AVES does: Σ_t Σ_pixels ½e², e = soft silhouette − mask.
 
@@ -78,15 +83,6 @@ def mask_smooth_l1(window: PosedWindow) -> Scalar:
     Source: Wang et al. 2021, section 4.
     """
     return _mask(window, "smooth_l1")
-
-
-def _mask(window: PosedWindow, kind: Kind) -> Scalar:
-    raster = {"blur": window.raster.blur, "backend": window.raster.backend}
-
-    def frame(vertices_screen, target, weight):
-        return mask_loss(vertices_screen, window.faces, target, weight, kind=kind, **raster)
-
-    return jnp.sum(jax.vmap(frame)(window.vertices_screen, window.mask, _mask_weight(window)))
 
 
 def _mask_weight(window: PosedWindow) -> Float[Array, "I"]:

@@ -174,25 +174,28 @@ def mask_loss_and_gradient(
     return _call("jaxfit_mask_loss_and_gradient", results, *operands, blur=blur, kind=np.int32(KINDS.index(kind)))
 
 
-def silhouette_gauss_newton(
+def mask_loss_gradient_and_block(
     vertices: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
     target: UInt8[Array, "size size"],
     weight: Float[Array, ""],
     skin: Skin,
     camera_px: tuple[float, float],
+    kind: str,
     blur: Blur,
-) -> Float[Array, "D D"]:
-    """Return the unweighted Gauss-Newton block. A weight of 0 gives a block of 0 and skips the rendering."""
+) -> tuple[Float[Array, ""], Float[Array, "V 3"], Float[Array, "D D"]]:
+    """Return `mask_loss_and_gradient` and the unweighted Gauss-Newton block, which is 0 for a weight of 0."""
     slope, shape_slope = _padded(skin.slope), _padded(skin.shape_slope)
-    size_of_block = slope.shape[-1] + shape_slope.shape[-1]
-    block = jax.ShapeDtypeStruct((size_of_block, size_of_block), jnp.float32)
+    padded = slope.shape[-1] + shape_slope.shape[-1]
+    shapes = ((), vertices.shape, (padded, padded))
+    results = tuple(jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes)
     operands = (vertices, faces, target, weight, skin.rest, skin.joint, skin.weight, slope, shape_slope)
     focal, centre = (np.float32(x) for x in camera_px)
-    result = _call("jaxfit_silhouette_gauss_newton", block, *operands, blur=blur, focal=focal, centre=centre)
-    parameters, shapes = skin.slope.shape[-1], skin.shape_slope.shape[-1]
-    kept = np.r_[:parameters, slope.shape[-1] : slope.shape[-1] + shapes]
-    return result[kept][:, kept] if shapes else result[:parameters, :parameters]
+    settings = {"kind": np.int32(KINDS.index(kind)), "focal": focal, "centre": centre}
+    loss, gradient, block = _call("jaxfit_mask_loss_gradient_and_block", results, *operands, blur=blur, **settings)
+    parameters, own_shapes = skin.slope.shape[-1], skin.shape_slope.shape[-1]
+    kept = np.r_[:parameters, slope.shape[-1] : slope.shape[-1] + own_shapes]
+    return loss, gradient, block[kept][:, kept] if own_shapes else block[:parameters, :parameters]
 
 
 def _padded(derivatives: Float[Array, "... P"]) -> Float[Array, "... M"]:

@@ -108,21 +108,13 @@ def mask_loss(
 
     Source: Hägerlind et al., "Temporally-consistent 3D Reconstruction of Seabirds" (2024), the term E_msk.
     """
-    _check_mesh(vertices_screen, faces)
-    target = _check_target(target)
-    if kind not in silhouette_reference.KINDS:
-        raise ValueError(f"kind: expected one of {silhouette_reference.KINDS}, got {kind!r}")
-    if jnp.shape(weight) != ():
-        raise ValueError(f"weight: expected a scalar, got shape {jnp.shape(weight)}")
-    blur = Blur.for_size(target.shape[0]) if blur is None else blur
-    vertices, faces = _as_operands(vertices_screen, faces)
-    weight = jnp.asarray(weight, jnp.float32)
+    vertices, faces, target, weight, blur = _loss_operands(vertices_screen, faces, target, weight, kind, blur)
     switch = jax.lax.stop_gradient(weight)
     loss: Any = _mask_loss(vertices, faces, target, switch, kind, blur, _choose(backend))
     return (weight * loss).astype(vertices_screen.dtype)
 
 
-def silhouette_gauss_newton(
+def mask_loss_and_block(
     vertices_screen: Float[Array, "V 3"],
     faces: Int[Array, "F 3"],
     target: Bool[Array, "size size"] | UInt8[Array, "size size"],
@@ -130,48 +122,56 @@ def silhouette_gauss_newton(
     skin: Skin,
     camera_px: tuple[float, float],
     *,
+    kind: Kind = "l1",
     blur: Blur | None = None,
     backend: Backend = "auto",
-) -> Float[Array, "D D"]:
-    """Return the Gauss-Newton block of the soft silhouette for the D parameters of a skinned mesh.
+) -> tuple[Float[Array, ""], Float[Array, "D D"]]:
+    """Return `mask_loss`, and the Gauss-Newton block of the soft silhouette for the D parameters of a skinned mesh.
 
     H = w · Σ j·jᵀ over the known pixels with 0.01 < S < 0.99, where S is `silhouette` and j = dS / d parameters. H is
     the curvature of ½ Σ (S − target)², and the solver uses H for both mask losses. The kernels sum over at most 256
     pixels. Of more pixels they take an evenly spread part, and scale the sum.
 
     With the edge `unbiased`, j is the derivative of the filtered difference of `mask_loss`, and the sum is over all
-    pixels; the kernels take at most 16 · size pixels of the outline. H has no gradient.
+    pixels; the kernels take at most 16 · size pixels of the outline.
+
+    One pass of the kernel computes loss, gradient and H. H has no gradient.
 
     Args:
-        vertices_screen, faces, blur, backend: as for `silhouette`. The depth is that of the camera frame of
-            `skin`, in the unit of its rest vertices.
-        target: the mask, as for `mask_loss`; only its size and its unknown pixels matter.
-        weight: w. An image of weight 0 is not rendered, and its H is 0.
+        vertices_screen, faces, weight, kind, blur, backend: as for `mask_loss`. The depth is that of the camera frame
+            of `skin`, in the unit of its rest vertices.
+        target: the mask, as for `mask_loss`.
         skin: rest vertices, skinning weights and derivatives of the joint transforms.
         camera_px: focal length and centre of the image in pixels of the silhouette, for the pinhole camera
             pixel = focal · (x, y) / z + centre.
 
     Returns:
-        H, positive semi-definite, px² per unit of each of two parameters.
+        The loss, an area in px², and H, positive semi-definite, px² per unit of each of two parameters.
 
     Raises:
         ValueError: the shape, type or value of an argument is not as described.
         RuntimeError: backend="native" without kernels.
     """
-    _check_mesh(vertices_screen, faces)
-    target = _check_target(target)
+    vertices, faces, target, weight, blur = _loss_operands(vertices_screen, faces, target, weight, kind, blur)
     if jnp.issubdtype(target.dtype, jnp.floating):
         raise ValueError(f"target: expected bool or uint8, got {target.dtype}")
+    switch, skin = jax.lax.stop_gradient((weight, skin))
+    settings = tuple(float(x) for x in camera_px), kind, blur, _choose(backend)
+    found: Any = _mask_loss_and_block(vertices, faces, target.astype(jnp.uint8), switch, skin, *settings)
+    loss, block = found
+    return (weight * loss).astype(vertices_screen.dtype), switch * jax.lax.stop_gradient(block)
+
+
+def _loss_operands(vertices, faces, target, weight, kind, blur):
+    """Return checked vertices, faces, target, weight and blur of a loss."""
+    _check_mesh(vertices, faces)
+    target = _check_target(target)
+    if kind not in silhouette_reference.KINDS:
+        raise ValueError(f"kind: expected one of {silhouette_reference.KINDS}, got {kind!r}")
+    if jnp.shape(weight) != ():
+        raise ValueError(f"weight: expected a scalar, got shape {jnp.shape(weight)}")
     blur = Blur.for_size(target.shape[0]) if blur is None else blur
-    vertices, faces = _as_operands(vertices_screen, faces)
-    weight = jnp.asarray(weight, jnp.float32)
-    block: Any = _dispatch(
-        _choose(backend),
-        lambda v, f, t, w, s: kernels.silhouette_gauss_newton(v, f, t, w, s, camera_px, blur),
-        lambda v, f, t, w, s: silhouette_reference.silhouette_gauss_newton(v, f, t, w, s, camera_px, blur),
-        *jax.lax.stop_gradient((vertices, faces, target.astype(jnp.uint8), weight, skin)),
-    )
-    return weight * block
+    return *_as_operands(vertices, faces), target, jnp.asarray(weight, jnp.float32), blur
 
 
 def _check_size(size) -> None:
@@ -214,8 +214,11 @@ def _choose(backend: str) -> str:
 
 
 def _dispatch(backend: str, native_function, reference_function, *operands):
-    """Call one of two functions. For "auto", the program of a platform contains only the function for that platform."""
-    if backend == "native":
+    """Call one of two functions. For "auto", the program of a platform contains only the function for that platform.
+
+    Where the CPU is the only platform, the reference is not traced: tracing takes as long as the rest of an objective.
+    """
+    if backend == "native" or (backend == "auto" and jax.default_backend() == "cpu"):
         return native_function(*operands)
     if backend == "reference":
         return reference_function(*operands)
@@ -280,3 +283,33 @@ def _mask_loss_backward(kind, blur, backend, gradient, cotangent):
 
 
 _mask_loss.defvjp(_mask_loss_forward, _mask_loss_backward)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(5, 6, 7, 8))
+def _mask_loss_and_block(vertices, faces, target, weight, skin, camera_px, kind, blur, backend) -> Any:
+    return _mask_loss_and_block_forward(vertices, faces, target, weight, skin, camera_px, kind, blur, backend)[0]
+
+
+def _mask_loss_and_block_forward(vertices, faces, target, weight, skin, camera_px, kind, blur, backend):
+    def reference(v, f, t, w, s):
+        loss, gradient = jax.value_and_grad(silhouette_reference.mask_loss)(v, f, t, w, kind, blur)
+        return loss, gradient, silhouette_reference.silhouette_gauss_newton(v, f, t, w, s, camera_px, blur)
+
+    loss, gradient, block = _dispatch(
+        backend,
+        lambda v, f, t, w, s: kernels.mask_loss_gradient_and_block(v, f, t, w, s, camera_px, kind, blur),
+        reference,
+        vertices,
+        faces,
+        target,
+        weight,
+        skin,
+    )
+    return (loss, block), gradient
+
+
+def _mask_loss_and_block_backward(camera_px, kind, blur, backend, gradient, cotangents):
+    return cotangents[0] * gradient, None, None, None, None
+
+
+_mask_loss_and_block.defvjp(_mask_loss_and_block_forward, _mask_loss_and_block_backward)

@@ -18,7 +18,8 @@ from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.initial_poses import load_initial_poses
-from jaxfit.fitting.solve import Problem, fit_model, report, stage_hyperparameters, stage_program
+from jaxfit.fitting.problem import Problem
+from jaxfit.fitting.solve import fit_model, report, stage_hyperparameters, stage_program
 from jaxfit.fitting.windows import cut_windows, load_targets
 from jaxfit.foundation.errors import InputError
 from jaxfit.learning.priors import learn_prior

@@ -11,15 +11,15 @@ from support.stages import BIRD, CONFIG, FIRST, MODEL, B, T, case, problems, pro
 from jaxfit.config.fit import load_config
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.solve import (
+from jaxfit.fitting.levenberg_marquardt import (
     DAMPING_DECREASE,
     DAMPING_INCREASE,
     FIRST_DAMPING,
     LEVENBERG_MARQUARDT,
     MOMENTUM,
     MOST_RELAXATION,
-    problem_window,
 )
+from jaxfit.fitting.problem import problem_window
 from jaxfit.foundation.errors import InputError
 from jaxfit.objective import registry
 from jaxfit.objective.curvature import add_rows, frame_rows, shared_columns
@@ -69,10 +69,10 @@ def take_steps(stage, problem, count=1, **changes):
     """Return the first state (with `changes`), and pose and state after each step with an accurate equation."""
     init, step = solver_of(stage)
     batch = jax.tree.map(lambda x: jnp.asarray(x)[None], problem)
-    first = init(batch)._replace(**{name: value[None] for name, value in changes.items()})
-    states = [(batch.anchor, first)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("jaxfit.fitting.solve.CG_TOLERANCE", 1e-6)
+        patch.setattr("jaxfit.fitting.levenberg_marquardt.CG_TOLERANCE", 1e-6)
+        pose, first = step(batch, batch.anchor, init(batch))  # evaluates the anchor
+        states = [(pose, first._replace(**{name: value[None] for name, value in changes.items()}))]
         for _ in range(count):
             states.append(step(batch, *states[-1]))
     (_, before), *after = jax.tree.map(lambda x: x[0], states)

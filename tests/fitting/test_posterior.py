@@ -17,7 +17,8 @@ from jaxfit.fitting.posterior import (
     multiply,
     window_posteriors,
 )
-from jaxfit.fitting.solve import problem_window, stage_program
+from jaxfit.fitting.problem import problem_window
+from jaxfit.fitting.solve import stage_program
 from jaxfit.objective.curvature import frame_rows, shared_columns
 from jaxfit.objective.objective import evaluate_curvature
 from jaxfit.objective.registry import Term, find_terms
@@ -167,5 +168,5 @@ def test_second_order_curvature_of_student_t_is_its_fisher_information():
     kernel = student_t(dof, size)
     own = Residuals(r, kernel=kernel, jacobian=lambda: [jnp.broadcast_to(jnp.eye(size)[:, :1], (count, size, 1))])
     for second_order, expected in ((True, (dof + size) / (dof + size + 2)), (False, 1.0)):
-        H = residual_curvature(Line(), lambda _: own, second_order)  # pyright: ignore[reportArgumentType]
+        H = residual_curvature(Line(), [lambda _: own], second_order)  # pyright: ignore[reportArgumentType]
         assert float(H.diagonal.mean()) == pytest.approx(expected, rel=0.02)

@@ -94,14 +94,6 @@ Results compute(const Case& own) {
   auto& pull = results["pull"];
   pull.resize(vertices.size());
   kernels.silhouette_gradient(mesh, blur, size, memory, own.floats("cotangent").data(), pull.data());
-  for (const LossKind kind : {LossKind::kL1, LossKind::kSmoothL1}) {
-    const std::string name = kind == LossKind::kL1 ? "l1" : "smooth_l1";
-    auto& loss = results[name];
-    auto& gradient = results[name + "_gradient"];
-    loss.resize(1);
-    gradient.resize(vertices.size());
-    kernels.mask_loss(mesh, blur, size, memory, {target.data(), nullptr}, kind, loss.data(), gradient.data());
-  }
 
   const auto joint = own.as<int32_t>("joint");
   const int64_t parameters = static_cast<int64_t>(own.number("parameters"));
@@ -117,8 +109,16 @@ Results compute(const Case& own) {
                           own.number("centre")};
   auto& block = results["block"];
   block.resize(static_cast<size_t>(parameters * parameters));
-  memory = jaxfit::scratch(kernels.gauss_newton_workspace(mesh, skin, blur, size));
-  kernels.silhouette_gauss_newton(mesh, skin, blur, size, memory, target.data(), block.data());
+  memory = jaxfit::scratch(kernels.block_workspace(mesh, skin, blur, size));
+  for (const LossKind kind : {LossKind::kL1, LossKind::kSmoothL1}) {
+    const std::string name = kind == LossKind::kL1 ? "l1" : "smooth_l1";
+    auto& loss = results[name];
+    auto& gradient = results[name + "_gradient"];
+    loss.resize(1);
+    gradient.resize(vertices.size());
+    kernels.mask_loss(mesh, blur, size, memory, {target.data(), nullptr}, kind, loss.data(), gradient.data(), &skin,
+                      block.data());
+  }
 
   const jaxfit::Renderer& renderer = jaxfit::current_renderer();
   const jaxfit::Frame frame{size, size, 1};

@@ -72,7 +72,7 @@ def block(row, backend, weight=1.0, vertices=None, faces=RIG.faces, blur=BLUR, s
 def compiled_block(vertices, faces, target, weight, skin, backend, blur):
     ratio = target.shape[0] / CropCamera().size_px
     camera_px = CropCamera().focal_px * ratio, CropCamera().centre_px * ratio
-    return raster.silhouette_gauss_newton(vertices, faces, target, weight, skin, camera_px, blur=blur, backend=backend)
+    return raster.mask_loss_and_block(vertices, faces, target, weight, skin, camera_px, blur=blur, backend=backend)[1]
 
 
 @functools.partial(jax.jit, static_argnames="blur")

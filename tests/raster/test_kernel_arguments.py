@@ -93,7 +93,12 @@ HANDLERS = {
     "jaxfit_silhouette_gradient": (("vertices", "faces", "cotangent"), ("gradient",)),
     "jaxfit_mask_loss": (("vertices", "faces", "target", "weight"), ("loss",)),
     "jaxfit_mask_loss_and_gradient": (("vertices", "faces", "target", "weight"), ("loss", "gradient")),
+    "jaxfit_mask_loss_gradient_and_block": (
+        ("vertices", "faces", "mask", "weight", "rest", "joint", "skin_weight", "slope", "shape"),
+        ("loss", "gradient", "block"),
+    ),
 }
+OPERAND_TYPES = {"faces": jnp.int32, "joint": jnp.int32, "mask": jnp.uint8}
 SHAPES = {
     "vertices": (B, V, 3),
     "faces": (1, 1, 3),
@@ -103,18 +108,26 @@ SHAPES = {
     "image": (B, H, H),
     "gradient": (B, V, 3),
     "loss": (B,),
+    "mask": (1, H, H),
+    "rest": (1, V, 3),
+    "joint": (1, V, 2),
+    "skin_weight": (1, V, 2),
+    "slope": (B, 2, 3, 4, 16),
+    "shape": (B, V, 3, 0),
+    "block": (B, 16, 16),
 }
 
 
 def call_handler(handler, **changed):
     """Calls one of XLA's handlers with arrays of zeros, of which some have another shape."""
     attributes = {"sigma": 1.0, "radius": 2.0, "edge": 0} | ({"kind": 0} if "loss" in handler else {})
+    attributes |= {"focal": 9.0, "centre": 3.0} if "block" in handler else {}
     attributes |= {name: changed.pop(name) for name in list(changed) if name in attributes}
     shapes = SHAPES | changed
     operands, results = HANDLERS[handler]
     types = [jax.ShapeDtypeStruct(shapes[name], jnp.float32) for name in results]
     call = jax.ffi.ffi_call(handler, types if len(types) > 1 else types[0])
-    arrays = [jnp.zeros(shapes[name], jnp.int32 if name == "faces" else jnp.float32) for name in operands]
+    arrays = [jnp.zeros(shapes[name], OPERAND_TYPES.get(name, jnp.float32)) for name in operands]
     settings = {name: np.int32(v) if name in ("kind", "edge") else np.float32(v) for name, v in attributes.items()}
     return jax.block_until_ready(call(*arrays, **settings))
 
@@ -144,6 +157,10 @@ def test_the_handlers_accept_shapes_that_fit():
         ("jaxfit_mask_loss_and_gradient", {"gradient": (B, 1, 3)}, FITTING_GRADIENT + r"\(2, 1, 3\)"),
         ("jaxfit_mask_loss_and_gradient", {"gradient": (1, V, 3)}, FITTING_GRADIENT + r"\(1, 3, 3\)"),
         ("jaxfit_mask_loss_and_gradient", {"kind": -1}, "kind: expected 0 or 1, got -1"),
+        ("jaxfit_mask_loss_gradient_and_block", {"block": (B, 16, 32)}, r"block: .*\(2, 32, 32\), got \(2, 16, 32\)"),
+        ("jaxfit_mask_loss_gradient_and_block", {"block": (B, 8, 8)}, "block: expected a multiple of 16 parameters"),
+        ("jaxfit_mask_loss_gradient_and_block", {"rest": (B, 1, 3)}, r"rest: .*\(3, 3\), got \(2, 1, 3\)"),
+        ("jaxfit_mask_loss_gradient_and_block", {"slope": (B, 0, 3, 4, 16)}, r"joint: an index is not in \[0, 0\)"),
     ],
 )
 def test_the_handlers_reject_shapes_that_do_not_fit(handler, changed, message):

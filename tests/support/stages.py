@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfit.config.fit import FitConfig, StageConfig
-from jaxfit.fitting.solve import FitModel, Problem, advance, begin, stage_hyperparameters, stage_program
+from jaxfit.fitting.problem import Problem
+from jaxfit.fitting.solve import FitModel, advance, begin, stage_hyperparameters, stage_program
 from jaxfit.model.camera import CropCamera, project
 from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
 from jaxfit.objective.objective import weighted_sum
@@ -87,7 +88,7 @@ def solve(stages, start, targets, chunks=(STEPS,)):
         state = begin(*own, solver if stage.carry_moments else None)
         for steps in chunks:
             state, loss, rejected = advance((*own, jnp.int32(steps)), state)
-        pose, solver = state
+        pose, solver = state.pose, state.solver
     return jax.tree.map(np.asarray, (pose, loss, rejected))
 
 

@@ -22,18 +22,15 @@ from jaxfit.data.solution import Solution
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.evaluation.metrics import pa_mpjpe
 from jaxfit.fitting.fit import check_observations, fit, windows_of
+from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
+from jaxfit.fitting.problem import Problem, Program, Solver, problem_loss
 from jaxfit.fitting.solve import (
     ADAM,
-    LEVENBERG_MARQUARDT,
-    Problem,
-    Program,
     Report,
-    Solver,
     advance,
     begin,
     fit_model,
     needs_mask,
-    problem_loss,
     report,
     stage_hyperparameters,
     stage_program,

@@ -72,34 +72,74 @@ ffi::Error silhouette_gradient(ffi::ThreadPool pool, Floats vertices, Indices fa
   return ffi::Error::Success();
 }
 
-// If `gradient` is null, only the loss is computed.
-ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const Indices& faces,
-                         const ffi::AnyBuffer& target, const Floats& weight, ffi::Result<Floats>& loss,
-                         ffi::Result<Floats>* gradient, float sigma, float radius, int32_t edge_number,
-                         int32_t kind_number) {
-  const Batch batch(loss->dimensions(), 0);
-  const Blur blur = checked_blur(sigma, radius);
-  const Edge edge = checked_edge(edge_number);
-  const LossKind kind = checked_kind(kind_number);
-  const Meshes meshes(vertices, faces, batch, edge == Edge::kUnbiased);
-  if (gradient) check_result("gradient", (*gradient)->dimensions(), batch, {meshes.num_vertices, 3});
+// The skins of a batch. `slope` is (J, 3, 4, P) and `shape` is (V, 3, S), with P and S multiples of 16 and D = P + S.
+struct Skins {
+  Skin first;  // with the pointers of the first item
+  Operand rest_at, joint_at, weight_at, slope_at, shape_at;
+
+  Skins(const Batch& batch, int64_t num_vertices, int64_t parameters, const Floats& rest, const Indices& joint,
+        const Floats& weight, const Floats& slope, const Floats& shape, float focal, float centre) {
+    const int64_t shapes = shape.dimensions().size() ? shape.dimensions()[shape.dimensions().size() - 1] : 0;
+    const int64_t transforming = parameters - shapes;
+    if (transforming < 1 || transforming % 16 || shapes % 16)
+      throw std::invalid_argument("block: expected a multiple of 16 parameters, got " + std::to_string(transforming) +
+                                  " and " + std::to_string(shapes));
+    rest_at = bind("rest", rest.dimensions(), batch, {num_vertices, 3});
+    joint_at = bind("joint", joint.dimensions(), batch, {num_vertices, kAny});
+    const int64_t joints = num_vertices ? joint_at.item / num_vertices : 0;
+    weight_at = bind("skin_weight", weight.dimensions(), batch, {num_vertices, joints});
+    slope_at = bind("slope", slope.dimensions(), batch, {kAny, 3, 4, transforming});
+    shape_at = bind("shape", shape.dimensions(), batch, {num_vertices, 3, shapes});
+    check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, slope_at.item / (12 * transforming));
+    first = {rest.typed_data(),  joint.typed_data(), weight.typed_data(), slope.typed_data(), shape.typed_data(), joints,
+             transforming, parameters, focal, centre};
+  }
+
+  Skin of(const Batch& batch, int64_t image) const {
+    Skin skin = first;
+    skin.rest += rest_at.offset(batch, image);
+    skin.joint += joint_at.offset(batch, image);
+    skin.weight += weight_at.offset(batch, image);
+    skin.slope += slope_at.offset(batch, image);
+    skin.shape += shape_at.offset(batch, image);
+    return skin;
+  }
+};
+
+// How a loss is computed: the checked attributes of its handlers.
+struct Loss {
+  Blur blur;
+  Edge edge;
+  LossKind kind;
+
+  Loss(float sigma, float radius, int32_t edge, int32_t kind)
+      : blur(checked_blur(sigma, radius)), edge(checked_edge(edge)), kind(checked_kind(kind)) {}
+};
+
+// Without `gradients`, only the losses are computed; with `skins` and `blocks`, the Gauss-Newton blocks too.
+ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Batch& batch, const Meshes& meshes, const ffi::AnyBuffer& target,
+                         const Floats& weight, Loss how, float* losses, float* gradients = nullptr,
+                         const Skins* skins = nullptr, float* blocks = nullptr) {
   const int64_t size = size_of("target", target.dimensions());
   const Operand target_at = bind("target", target.dimensions(), batch, {size, size});
   const Operand weight_at = bind("weight", weight.dimensions(), batch, {});
   const auto type = target.element_type();
   const bool bytes = type == ffi::U8 || type == ffi::PRED;
   if (!bytes && type != ffi::F32) throw std::invalid_argument("target: expected bool, uint8 or float32");
+  if (!bytes && blocks) throw std::invalid_argument("target: expected bool or uint8");
   const auto* pixels = static_cast<const char*>(target.untyped_data());
-  const Kernels& kernels = current_kernels(edge);
+  const Kernels& kernels = current_kernels(how.edge);
   const float* weights = weight.typed_data();
-  float* out = loss->typed_data();
-  float* slopes = gradient ? (*gradient)->typed_data() : nullptr;
   for_each_task(pool, batch.count, [=, &batch, &meshes, &target_at, &weight_at, &kernels](int64_t i) {
     const Mesh mesh = meshes.of(batch, i);
-    float* slope = slopes ? slopes + i * 3 * mesh.num_vertices : nullptr;
+    const Skin skin = skins ? skins->of(batch, i) : Skin{};
+    const int64_t slopes = 3 * mesh.num_vertices, products = skin.parameters * skin.parameters;
+    float* gradient = gradients ? gradients + i * slopes : nullptr;
+    float* block = blocks ? blocks + i * products : nullptr;
     if (weights[weight_at.offset(batch, i)] == 0) {  // a missing frame: nothing is rendered
-      out[i] = 0;
-      if (slope) std::fill(slope, slope + 3 * mesh.num_vertices, 0.f);
+      losses[i] = 0;
+      if (gradient) std::fill(gradient, gradient + slopes, 0.f);
+      if (block) std::fill(block, block + products, 0.f);
       return;
     }
     const int64_t at = target_at.offset(batch, i);
@@ -108,72 +148,45 @@ ffi::Error run_mask_loss(ffi::ThreadPool& pool, const Floats& vertices, const In
       image.bytes = reinterpret_cast<const uint8_t*>(pixels) + at;
     else
       image.floats = reinterpret_cast<const float*>(pixels) + at;
-    kernels.mask_loss(mesh, blur, size, scratch(kernels.workspace(mesh, blur, size)), image, kind, out + i, slope);
+    void* memory = scratch(block ? kernels.block_workspace(mesh, skin, how.blur, size)
+                                 : kernels.workspace(mesh, how.blur, size));
+    kernels.mask_loss(mesh, how.blur, size, memory, image, how.kind, losses + i, gradient, &skin, block);
   });
   return ffi::Error::Success();
 }
 
 ffi::Error mask_loss(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target, Floats weight,
                      ffi::Result<Floats> loss, float sigma, float radius, int32_t edge, int32_t kind) {
-  return run_mask_loss(pool, vertices, faces, target, weight, loss, nullptr, sigma, radius, edge, kind);
+  const Loss how(sigma, radius, edge, kind);
+  const Batch batch(loss->dimensions(), 0);
+  const Meshes meshes(vertices, faces, batch, how.edge == Edge::kUnbiased);
+  return run_mask_loss(pool, batch, meshes, target, weight, how, loss->typed_data());
 }
 
 ffi::Error mask_loss_and_gradient(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target,
                                   Floats weight, ffi::Result<Floats> loss, ffi::Result<Floats> gradient, float sigma,
                                   float radius, int32_t edge, int32_t kind) {
-  return run_mask_loss(pool, vertices, faces, target, weight, loss, &gradient, sigma, radius, edge, kind);
+  const Loss how(sigma, radius, edge, kind);
+  const Batch batch(loss->dimensions(), 0);
+  const Meshes meshes(vertices, faces, batch, how.edge == Edge::kUnbiased);
+  check_result("gradient", gradient->dimensions(), batch, {meshes.num_vertices, 3});
+  return run_mask_loss(pool, batch, meshes, target, weight, how, loss->typed_data(), gradient->typed_data());
 }
 
-// `slope` is (J, 3, 4, P) and `shape` is (V, 3, S), with P and S multiples of 16 and D = P + S.
-ffi::Error silhouette_gauss_newton(ffi::ThreadPool pool, Floats vertices, Indices faces, Bytes target, Floats weight,
-                                   Floats rest, Indices joint, Floats skin_weight, Floats slope, Floats shape,
-                                   ffi::Result<Floats> block, float sigma, float radius, int32_t edge_number,
-                                   float focal, float centre) {
-  const Batch batch(block->dimensions(), 2);
-  const Blur blur = checked_blur(sigma, radius);
-  const Edge edge = checked_edge(edge_number);
-  const Meshes meshes(vertices, faces, batch, edge == Edge::kUnbiased);
-  const int64_t parameters = block->dimensions()[block->dimensions().size() - 1];
-  const int64_t shapes = shape.dimensions().size() ? shape.dimensions()[shape.dimensions().size() - 1] : 0;
-  const int64_t transforming = parameters - shapes;
-  if (transforming < 1 || transforming % 16 || shapes % 16)
-    throw std::invalid_argument("block: expected a multiple of 16 parameters, got " + std::to_string(transforming) +
-                                " and " + std::to_string(shapes));
+ffi::Error mask_loss_gradient_and_block(ffi::ThreadPool pool, Floats vertices, Indices faces, ffi::AnyBuffer target,
+                                        Floats weight, Floats rest, Indices joint, Floats skin_weight, Floats slope,
+                                        Floats shape, ffi::Result<Floats> loss, ffi::Result<Floats> gradient,
+                                        ffi::Result<Floats> block, float sigma, float radius, int32_t edge,
+                                        int32_t kind, float focal, float centre) {
+  const Loss how(sigma, radius, edge, kind);
+  const Batch batch(loss->dimensions(), 0);
+  const Meshes meshes(vertices, faces, batch, how.edge == Edge::kUnbiased);
+  check_result("gradient", gradient->dimensions(), batch, {meshes.num_vertices, 3});
+  const int64_t parameters = block->dimensions().size() ? block->dimensions()[block->dimensions().size() - 1] : 0;
   check_result("block", block->dimensions(), batch, {parameters, parameters});
-  const int64_t size = size_of("target", target.dimensions());
-  const Operand target_at = bind("target", target.dimensions(), batch, {size, size});
-  const Operand weight_at = bind("weight", weight.dimensions(), batch, {});
-  const Operand rest_at = bind("rest", rest.dimensions(), batch, {meshes.num_vertices, 3});
-  const Operand joint_at = bind("joint", joint.dimensions(), batch, {meshes.num_vertices, kAny});
-  const int64_t joints = meshes.num_vertices ? joint_at.item / meshes.num_vertices : 0;
-  const Operand skin_at = bind("skin_weight", skin_weight.dimensions(), batch, {meshes.num_vertices, joints});
-  const Operand slope_at = bind("slope", slope.dimensions(), batch, {kAny, 3, 4, transforming});
-  const Operand shape_at = bind("shape", shape.dimensions(), batch, {meshes.num_vertices, 3, shapes});
-  check_indices("joint", joint.typed_data(), joint_at.items * joint_at.item, slope_at.item / (12 * transforming));
-  const Kernels& kernels = current_kernels(edge);
-  float* out = block->typed_data();
-  for_each_task(pool, batch.count, [&](int64_t i) {
-    float* own = out + i * parameters * parameters;
-    if (weight.typed_data()[weight_at.offset(batch, i)] == 0) {  // a missing frame: nothing is rendered
-      std::fill(own, own + parameters * parameters, 0.f);
-      return;
-    }
-    const Skin skin{rest.typed_data() + rest_at.offset(batch, i),
-                    joint.typed_data() + joint_at.offset(batch, i),
-                    skin_weight.typed_data() + skin_at.offset(batch, i),
-                    slope.typed_data() + slope_at.offset(batch, i),
-                    shape.typed_data() + shape_at.offset(batch, i),
-                    joints,
-                    transforming,
-                    parameters,
-                    focal,
-                    centre};
-    const Mesh mesh = meshes.of(batch, i);
-    void* memory = scratch(kernels.gauss_newton_workspace(mesh, skin, blur, size));
-    const uint8_t* pixels = target.typed_data() + target_at.offset(batch, i);
-    kernels.silhouette_gauss_newton(mesh, skin, blur, size, memory, pixels, own);
-  });
-  return ffi::Error::Success();
+  const Skins skins(batch, meshes.num_vertices, parameters, rest, joint, skin_weight, slope, shape, focal, centre);
+  return run_mask_loss(pool, batch, meshes, target, weight, how, loss->typed_data(), gradient->typed_data(), &skins,
+                       block->typed_data());
 }
 
 auto with_mesh() { return ffi::Ffi::Bind().Ctx<ffi::ThreadPool>().Arg<Floats>().Arg<Indices>(); }
@@ -238,23 +251,24 @@ XLA_FFI_Error* mask_loss_and_gradient_handler(XLA_FFI_CallFrame* frame) {
   });
 }
 
-XLA_FFI_Error* silhouette_gauss_newton_handler(XLA_FFI_CallFrame* frame) {
+XLA_FFI_Error* mask_loss_gradient_and_block_handler(XLA_FFI_CallFrame* frame) {
   return call_guarded(frame->api, [frame] {
-    static const auto* handler = with_mesh()
-                                     .Arg<Bytes>()
-                                     .Arg<Floats>()
+    static const auto* handler = with_mesh_and_target()
                                      .Arg<Floats>()
                                      .Arg<Indices>()
                                      .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Arg<Floats>()
                                      .Ret<Floats>()
+                                     .Ret<Floats>()
+                                     .Ret<Floats>()
                                      .Attr<float>("sigma")
                                      .Attr<float>("radius")
                                      .Attr<int32_t>("edge")
+                                     .Attr<int32_t>("kind")
                                      .Attr<float>("focal")
                                      .Attr<float>("centre")
-                                     .To(silhouette_gauss_newton)
+                                     .To(mask_loss_gradient_and_block)
                                      .release();
     return handler->Call(frame);
   });

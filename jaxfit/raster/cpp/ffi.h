@@ -9,6 +9,6 @@ XLA_FFI_Error* silhouette_handler(XLA_FFI_CallFrame* frame);
 XLA_FFI_Error* silhouette_gradient_handler(XLA_FFI_CallFrame* frame);
 XLA_FFI_Error* mask_loss_handler(XLA_FFI_CallFrame* frame);
 XLA_FFI_Error* mask_loss_and_gradient_handler(XLA_FFI_CallFrame* frame);
-XLA_FFI_Error* silhouette_gauss_newton_handler(XLA_FFI_CallFrame* frame);
+XLA_FFI_Error* mask_loss_gradient_and_block_handler(XLA_FFI_CallFrame* frame);
 
 }  // namespace jaxfit

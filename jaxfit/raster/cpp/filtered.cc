@@ -266,48 +266,6 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
   add_gradient(mesh, ws, ws.error, gradient);
 }
 
-void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target target, LossKind kind, float* loss,
-               float* gradient) {
-  Workspace ws = carve(mesh, blur, size, memory);
-  if (!render(mesh, ws)) {
-    *loss = __builtin_nanf("");
-    if (gradient) set_gradient(gradient, mesh.num_vertices, *loss);
-    return;
-  }
-  clear(ws.error, ws);
-  for (int64_t y = 0; y < size; ++y)
-    for (int64_t x = 0; x < size; ++x) {
-      const int64_t i = y * size + x;
-      if (!known(target, i)) continue;
-      at(ws.error, ws, y)[x] = coverage_at(ws, y * ws.stride + ws.radius + x) - value_of(target, i);
-    }
-  filter(ws, ws.error);
-  double total = 0;
-  for (int64_t y = 0; y < size; ++y) {
-    float* error = at(ws.error, ws, y);
-    float of_row = 0;
-    for (int64_t x = 0; x < size; ++x) {
-      const float e = error[x], magnitude = __builtin_fabsf(e);
-      if (kind == LossKind::kL1) {
-        of_row += magnitude;
-        error[x] = e > 0 ? 1.f : e < 0 ? -1.f : 0.f;
-      } else {
-        of_row += magnitude > 1 ? magnitude - 0.5f : 0.5f * e * e;
-        error[x] = e > 1 ? 1.f : e < -1 ? -1.f : e;
-      }
-    }
-    total += of_row;
-  }
-  *loss = static_cast<float>(total);
-  if (!gradient) return;
-  filter(ws, ws.error);
-  for (int64_t y = 0; y < size; ++y)
-    for (int64_t x = 0; x < size; ++x)
-      if (!known(target, y * size + x)) at(ws.error, ws, y)[x] = 0;
-  set_gradient(gradient, mesh.num_vertices, 0);
-  add_gradient(mesh, ws, ws.error, gradient);
-}
-
 // Rows d coverage / d parameters of the pixels at the outline, in the order of the pixels.
 struct Rows {
   float *values, *filtered;  // (limit, D); `filtered` has the rows of FᵀF · values, with the filter F
@@ -339,7 +297,7 @@ struct Rows {
   return rows;
 }
 
-size_t gauss_newton_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size) {
+size_t block_workspace(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size) {
   size_t before, bytes;
   const Workspace ws = carve(mesh, blur, size, nullptr, &before);
   carve_rows(mesh, skin, ws, nullptr, before, &bytes);
@@ -420,20 +378,59 @@ void filter_rows(const Workspace& ws, int64_t D, Rows& rows) {
   }
 }
 
-void silhouette_gauss_newton(const Mesh& mesh, const Skin& skin, Blur blur, int64_t size, void* memory,
-                             const uint8_t* target, float* block) {
+void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target target, LossKind kind, float* loss,
+               float* gradient, const Skin* skin, float* block) {
   Workspace ws = carve(mesh, blur, size, memory);
-  if (!render(mesh, ws)) return fill(block, skin.parameters * skin.parameters, __builtin_nanf(""));
-  Rows rows = carve_rows(mesh, skin, ws, memory, workspace(mesh, blur, size));
-  fill_rows(mesh, skin, ws, target, rows);
-  filter_rows(ws, skin.parameters, rows);
-  multiply_rows(rows.values, rows.filtered, rows.count, skin.parameters, block);
+  if (!render(mesh, ws)) {
+    *loss = __builtin_nanf("");
+    if (gradient) set_gradient(gradient, mesh.num_vertices, *loss);
+    if (block) fill(block, skin->parameters * skin->parameters, *loss);
+    return;
+  }
+  if (block) {  // before the gradient, which overwrites the means
+    Rows rows = carve_rows(mesh, *skin, ws, memory, workspace(mesh, blur, size));
+    fill_rows(mesh, *skin, ws, target.bytes, rows);
+    filter_rows(ws, skin->parameters, rows);
+    multiply_rows(rows.values, rows.filtered, rows.count, skin->parameters, block);
+  }
+  clear(ws.error, ws);
+  for (int64_t y = 0; y < size; ++y)
+    for (int64_t x = 0; x < size; ++x) {
+      const int64_t i = y * size + x;
+      if (!known(target, i)) continue;
+      at(ws.error, ws, y)[x] = coverage_at(ws, y * ws.stride + ws.radius + x) - value_of(target, i);
+    }
+  filter(ws, ws.error);
+  double total = 0;
+  for (int64_t y = 0; y < size; ++y) {
+    float* error = at(ws.error, ws, y);
+    float of_row = 0;
+    for (int64_t x = 0; x < size; ++x) {
+      const float e = error[x], magnitude = __builtin_fabsf(e);
+      if (kind == LossKind::kL1) {
+        of_row += magnitude;
+        error[x] = e > 0 ? 1.f : e < 0 ? -1.f : 0.f;
+      } else {
+        of_row += magnitude > 1 ? magnitude - 0.5f : 0.5f * e * e;
+        error[x] = e > 1 ? 1.f : e < -1 ? -1.f : e;
+      }
+    }
+    total += of_row;
+  }
+  *loss = static_cast<float>(total);
+  if (!gradient) return;
+  filter(ws, ws.error);
+  for (int64_t y = 0; y < size; ++y)
+    for (int64_t x = 0; x < size; ++x)
+      if (!known(target, y * size + x)) at(ws.error, ws, y)[x] = 0;
+  set_gradient(gradient, mesh.num_vertices, 0);
+  add_gradient(mesh, ws, ws.error, gradient);
 }
 
 }  // namespace
 
 template <>
 const Kernels Compiled<kIsa>::unbiased = {
-    workspace, silhouette, silhouette_gradient, mask_loss, gauss_newton_workspace, silhouette_gauss_newton};
+    workspace, silhouette, silhouette_gradient, mask_loss, block_workspace};
 
 }  // namespace jaxfit

@@ -19,7 +19,7 @@ NB_MODULE(_kernels, m) {
     add("jaxfit_silhouette_gradient", jaxfit::silhouette_gradient_handler);
     add("jaxfit_mask_loss", jaxfit::mask_loss_handler);
     add("jaxfit_mask_loss_and_gradient", jaxfit::mask_loss_and_gradient_handler);
-    add("jaxfit_silhouette_gauss_newton", jaxfit::silhouette_gauss_newton_handler);
+    add("jaxfit_mask_loss_gradient_and_block", jaxfit::mask_loss_gradient_and_block_handler);
     return handlers;
   });
   jaxfit::add_renderer(m);

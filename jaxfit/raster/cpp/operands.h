@@ -19,7 +19,6 @@ namespace ffi = xla::ffi;
 using Dimensions = ffi::AnyBuffer::Dimensions;
 using Floats = ffi::Buffer<ffi::F32>;
 using Indices = ffi::Buffer<ffi::S32>;
-using Bytes = ffi::Buffer<ffi::U8>;
 
 // The dimensions of the batch: the leading dimensions of a result whose items have `item_rank` dimensions.
 struct Batch {

@@ -16,8 +16,10 @@ namespace jaxfit {
 namespace {
 
 // Adds the gradient of every open block. For each pixel `products` holds the factor of p · (pixel - nearest point). The
-// nearest point lies on an edge between two vertices, which share the force.
-void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
+// nearest point lies on an edge between two vertices, which share the force. With a skin, it fills `rows` as well.
+template <bool with_rows>
+void accumulate_gradient(const Mesh& mesh, const Skin* skin, Scale scale, Workspace& ws, const Rows* rows,
+                         float* gradient) {
   const Vec outside = all(scale.radius * scale.radius), zero = all(0.f), one = all(1.f);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
     Faces& f = ws.faces[c];
@@ -29,24 +31,36 @@ void accumulate_gradient(Scale scale, Workspace& ws, float* gradient) {
       for_each_block<Reached::kKnown>(f, lane, scale, ws, [&](const Face& face, const Block& block)
                                       __attribute__((always_inline)) {
         any = true;
+        const int64_t place = block.place - ws.products;
+        const uint32_t chosen = with_rows ? rows->chosen[place / kLanes] : 0;
         for (int at = 0; at < kLanes; at += kWidth) {
           const Nearest n = nearest_edge(face, block, at);
           const Vec p = keep(greater(outside, n.d), reciprocal(one + exp2(n.d)));
-          const Vec pull = flip_sign(load(block.place + at) * p, n.d);
+          const Vec pull = flip_sign(p, n.d);
           const Vec across = pull * pick(n, n.across[0], n.across[1], n.across[2]);
           const Vec beyond = pull * pick(n, n.beyond[0], n.beyond[1], n.beyond[2]);
           const Vec tx = pick(n, face.tx[0], face.tx[1], face.tx[2]);
           const Vec ty = pick(n, face.ty[0], face.ty[1], face.ty[2]);
-          const Vec force_x = fms(tx, beyond, ty * across), force_y = fma(ty, beyond, tx * across);
+          const Vec pull_x = fms(tx, beyond, ty * across), pull_y = fma(ty, beyond, tx * across);
           const Vec along = pick(n, n.clamped[0] * inverse[0], n.clamped[1] * inverse[1], n.clamped[2] * inverse[2]);
           const Vec to_end = all(0.5f) + along, to_start = all(0.5f) - along;
           const Vec share0 = pick(n, to_start, zero, to_end), share1 = pick(n, to_end, to_start, zero);
+          const Vec factor = load(block.place + at);
+          const Vec force_x = factor * pull_x, force_y = factor * pull_y;
           x[0] = fma(share0, force_x, x[0]);
           y[0] = fma(share0, force_y, y[0]);
           x[1] = fma(share1, force_x, x[1]);
           y[1] = fma(share1, force_y, y[1]);
           x[2] = x[2] + force_x;
           y[2] = y[2] + force_y;
+          const uint32_t own = chosen >> at & ((1u << kWidth) - 1);
+          if (!with_rows || !own) continue;
+          Pull stored;
+          store(stored.x, pull_x);
+          store(stored.y, pull_y);
+          store(stored.share0, share0);
+          store(stored.share1, share1);
+          add_to_rows(mesh, *skin, f, lane, own & bits(greater(outside, n.d)), stored, rows->of_pixel + place + at, *rows);
         }
       });
       if (!any) continue;
@@ -129,9 +143,13 @@ float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, boo
   return static_cast<float>(total + sum(part));
 }
 
-void finish_gradient(const Mesh& mesh, Scale scale, Workspace& ws, float* gradient) {
+void finish_gradient(const Mesh& mesh, Scale scale, Workspace& ws, float* gradient, const Skin* skin = nullptr,
+                     const Rows* rows = nullptr) {
   set_gradient(gradient, mesh.num_vertices, 0);
-  accumulate_gradient(scale, ws, gradient);
+  if (rows)
+    accumulate_gradient<true>(mesh, skin, scale, ws, rows, gradient);
+  else
+    accumulate_gradient<false>(mesh, skin, scale, ws, rows, gradient);
   clear_far_gradient(mesh, gradient);
 }
 
@@ -166,13 +184,19 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
 }
 
 void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target target, LossKind kind, float* loss,
-               float* gradient) {
+               float* gradient, const Skin* skin, float* block) {
   Workspace ws = carve(mesh, size, memory);
   const Scale scale = scale_of(blur, size);
   if (!render(mesh, size, scale, ws)) {
     *loss = __builtin_nanf("");
     if (gradient) set_gradient(gradient, mesh.num_vertices, *loss);
+    if (block) fill(block, skin->parameters * skin->parameters, *loss);
     return;
+  }
+  Rows rows;
+  if (block) {  // before the loss, which overwrites the products
+    rows = carve_rows(mesh, *skin, blur, size, memory);
+    choose_rows(target.bytes, size, skin->parameters, scale, ws, rows);
   }
   const bool l1 = kind == LossKind::kL1, with = gradient != nullptr;
   if (target.bytes)
@@ -181,13 +205,15 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
   else
     *loss = l1 ? compare<LossKind::kL1>(target.floats, size, scale, ws, with)
                : compare<LossKind::kSmoothL1>(target.floats, size, scale, ws, with);
-  if (gradient) finish_gradient(mesh, scale, ws, gradient);
+  // The blocks of the band are open: their error is at least kBandEdge, so their gradient is not negligible.
+  if (gradient) finish_gradient(mesh, scale, ws, gradient, skin, block ? &rows : nullptr);
+  if (block) multiply_rows(rows.values, rows.values, rows.count, skin->parameters, block);
 }
 
 }  // namespace
 
 template <>
 const Kernels Compiled<kIsa>::soft_rasterizer = {
-    workspace, silhouette, silhouette_gradient, mask_loss, gauss_newton_workspace, silhouette_gauss_newton};
+    workspace, silhouette, silhouette_gradient, mask_loss, block_workspace};
 
 }  // namespace jaxfit

@@ -48,14 +48,12 @@ struct Kernels {
   void (*silhouette)(const Mesh&, Blur, int64_t size, void* memory, float* image);
   void (*silhouette_gradient)(const Mesh&, Blur, int64_t size, void* memory, const float* cotangent,
                               float* gradient);
-  // If `gradient` is null, only the loss is computed.
-  void (*mask_loss)(const Mesh&, Blur, int64_t size, void* memory, Target, LossKind, float* loss,
-                    float* gradient);
-  size_t (*gauss_newton_workspace)(const Mesh&, const Skin&, Blur, int64_t size);
-  // Computes the block Jᵀ·J (D, D) with J = d silhouette / d parameters, without the unknown pixels of the mask `target`.
-  // The depths of the mesh are in the camera frame.
-  void (*silhouette_gauss_newton)(const Mesh&, const Skin&, Blur, int64_t size, void* memory, const uint8_t* target,
-                                  float* block);
+  // Without `gradient`, only the loss is computed. With `block`, which needs `gradient`, a target of bytes and depths in
+  // the camera frame, also the Gauss-Newton block Jᵀ·J (D, D) with J = d silhouette / d parameters of `skin`, without the
+  // unknown pixels; `memory` then has the size that block_workspace returns.
+  void (*mask_loss)(const Mesh&, Blur, int64_t size, void* memory, Target, LossKind, float* loss, float* gradient,
+                    const Skin* skin, float* block);
+  size_t (*block_workspace)(const Mesh&, const Skin&, Blur, int64_t size);
 };
 
 }  // namespace jaxfit
