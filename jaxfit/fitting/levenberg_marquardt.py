@@ -1,4 +1,4 @@
-"""The solver Levenberg-Marquardt: damped Gauss-Newton steps on all frames of a window at once."""
+"""The solver Levenberg-Marquardt: damped Gauss-Newton steps of a whole window."""
 
 from __future__ import annotations
 

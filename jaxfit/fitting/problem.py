@@ -1,4 +1,4 @@
-"""The problem of a stage: its program, its data, its objective, and what a solver is."""
+"""The problem of a stage: program, data, objective; what a solver is."""
 
 from __future__ import annotations
 
