@@ -46,11 +46,13 @@ def decode_mask(rle: Mapping[str, Any], columns: tuple[int, int] | None = None) 
 
 
 def box_of_rle(rle: Mapping[str, Any]) -> tuple[int, int, int, int] | None:
-    """Return `box_of_mask` of run lengths, without decoding them."""
+    """Return `box_of_mask` of run lengths, without decoding them. Runs without pixels may make the box larger."""
     from pycocotools import mask as coco_mask
 
+    if not coco_mask.area(cast(Any, rle)):
+        return None
     x0, y0, width, height = (int(value) for value in coco_mask.toBbox(cast(Any, rle)))
-    return (x0, y0, width, height) if width and height else None
+    return x0, y0, width, height
 
 
 def encode_mask(mask: Any) -> dict[str, Any]:

@@ -130,7 +130,7 @@ class _Rows(NamedTuple):
 
     pose: Pose
     solver: Any
-    """The solver's state after the previous stage; None before the first stage."""
+    """The solver's state after the previous stage; None if the next stage does not continue its moments."""
     failure: np.ndarray
     """(R·H,) text as in `Fitted`."""
     ambiguity_deg: Float[np.ndarray, "RH T"]
@@ -168,7 +168,8 @@ def fit_batch(model: FitModel, configs: Sequence[FitConfig], batch: Batch, repor
         hyperparameters = [stage_hyperparameters(c, c.stages[i], model.bird.keypoint_names) for c in configs]
         rows, config_of_row, targets_row = _split_rows(rows, batch, hyperparameters)
         tiles = _stage_tiles(rows, hyperparameters, config_of_row, batch.targets, targets_row, needs_mask(stage))
-        rows = _run_stage(program, tiles, rows, stage, report_progress)
+        carries = i < last and configs[0].stages[i + 1].carry_moments
+        rows = _run_stage(program, tiles, rows, stage, carries, report_progress)
         if i < last and not (stage.keep_best and rows.hypotheses > 1):
             continue
         reports = [report(program, tile.problems, take_tile(rows.pose, tile.rows)) for tile in tiles]
@@ -243,15 +244,20 @@ def _stage_tiles(
 
 
 def _run_stage(
-    program: Program, tiles: Sequence[_Tile], rows: _Rows, stage: StageConfig, report_progress: ReportProgress
+    program: Program,
+    tiles: Sequence[_Tile],
+    rows: _Rows,
+    stage: StageConfig,
+    carries: bool,
+    report_progress: ReportProgress,
 ) -> _Rows:
-    """Take all steps of a stage, and name the failures."""
+    """Take all steps of a stage, and name the failures. `carries`: the next stage continues the moments."""
     carried = rows.solver if stage.carry_moments else None
     states = [begin(program, tile.problems, take_tile(carried, tile.rows)) for tile in tiles]
     states, rejected = _take_steps(program, tiles, states, stage, report_progress)
     count = len(rows.failure)
-    poses, solvers, _ = zip(*states, strict=True)
-    pose, solver, rejected = (join_tiles(each, count) for each in (poses, solvers, rejected))
+    pose, rejected = join_tiles([state.pose for state in states], count), join_tiles(rejected, count)
+    solver = join_tiles([state.solver for state in states], count) if carries else None
     step = np.where(rejected > 0, stage.steps + 1 - rejected, 0)  # all steps after the first failure are rejected
     return _name_failures(program, tiles, rows._replace(pose=pose, solver=solver), step, stage)
 

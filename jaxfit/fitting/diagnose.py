@@ -16,7 +16,7 @@ from jaxfit.fitting.problem import Problem, Program, problem_window
 from jaxfit.fitting.solve import FitModel, needs_mask, stage_hyperparameters, stage_program
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.kinematics import Pose, rest_pose
-from jaxfit.objective.objective import evaluate_curvature, weighted_sum
+from jaxfit.objective.objective import evaluate_curvature, sum_with_blocks, weighted_sum
 from jaxfit.objective.posed_window import Targets
 from jaxfit.objective.registry import Term
 
@@ -57,6 +57,7 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
             _trace(term, jax.grad(_share_of(program, name)), pose, problem)
             if stage.solver == "levenberg_marquardt" or (config.error_bars and stage is config.stages[-1]):
                 _trace(term, _curvature_of(program, name), pose, problem)
+                _trace(term, jax.grad(_share_with_blocks_of(program, name)), pose, problem)
 
 
 def _trace(term: Term, function: Callable[..., object], *arguments: object) -> None:
@@ -133,6 +134,16 @@ def _share_of(program: Program, name: str) -> Callable[[Pose, Problem], Array]:
     def share(pose: Pose, problem: Problem) -> Array:
         settings = {name: problem.hyperparameters.settings[name]}
         return weighted_sum(problem_window(program, problem, pose), program.terms, settings)
+
+    return share
+
+
+def _share_with_blocks_of(program: Program, name: str) -> Callable[[Pose, Problem], Array]:
+    """Return `_share_of` as Levenberg-Marquardt evaluates the term: together with its blocks, if it has blocks."""
+
+    def share(pose: Pose, problem: Problem) -> Array:
+        settings = {name: problem.hyperparameters.settings[name]}
+        return sum_with_blocks(problem_window(program, problem, pose), program.terms, settings)[0]
 
     return share
 

@@ -106,7 +106,7 @@ def _levenberg_step(
     new_pose = add_rows(pose, change, program.shared)
     loss, new_gradient, blocks = _evaluate(program, problem, new_pose)
     not_finite = ~(jnp.isfinite(state.loss) & jnp.isfinite(state.gradient).all())
-    lower = ~not_finite & (loss < state.loss) & jnp.isfinite(new_gradient).all()
+    lower = state.prepared & ~not_finite & (loss < state.loss) & jnp.isfinite(new_gradient).all()
     bend = jnp.vdot(change, curvature.product(change))
     ratio = 2 * (loss - state.loss - jnp.vdot(gradient, change)) / jnp.where(bend > 0, bend, 1.0)
 

@@ -60,8 +60,8 @@ class Solver(NamedTuple):
     """
 
     init: Callable[[Program, Problem, Any], Any]
-    """Return the state before the first step, at the anchor. The third argument is the state after the previous stage,
-    whose moments the solver continues. None: the solver starts without moments."""
+    """Return the state before the first call of `step`, at the anchor. The third argument is the state after the
+    previous stage, whose moments the solver continues. None: the solver starts without moments."""
     step: Callable[[Program, Problem, Pose, Any], tuple[Pose, Any]]
     """Take one step. Return the next pose and state."""
     outcome: Callable[[Any], tuple[Float[Array, ""], Int[Array, ""]]]

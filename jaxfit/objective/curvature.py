@@ -48,15 +48,13 @@ def block_curvature(blocks: FrameBlocks) -> Curvature:
     return Curvature(lambda d: jnp.einsum("tij,tj->ti", blocks, d), jnp.diagonal(blocks, axis1=-2, axis2=-1))
 
 
-def weighted_curvature(weights: Sequence[Float[Array, ""]], curvatures: Sequence[Curvature]) -> Curvature:
-    """Return Σ λ · H of some curvatures."""
+def sum_of_curvatures(curvatures: Sequence[Curvature]) -> Curvature:
+    """Return Σ H of some curvatures."""
 
     def product(d: Rows) -> Rows:
-        products = (w * H.product(d) for w, H in zip(weights, curvatures, strict=True))
-        return sum(products, start=jnp.zeros_like(d))
+        return sum((H.product(d) for H in curvatures), start=jnp.zeros_like(d))
 
-    diagonal = sum((w * H.diagonal for w, H in zip(weights, curvatures, strict=True)), start=jnp.zeros(()))
-    return Curvature(product, diagonal)
+    return Curvature(product, sum((H.diagonal for H in curvatures), start=jnp.zeros(())))
 
 
 def frame_rows(pose: Pose, shared: Sequence[str] = ()) -> Rows:

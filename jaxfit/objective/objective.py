@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.objective.curvature import Curvature, FrameBlocks, block_curvature, weighted_curvature
+from jaxfit.objective.curvature import Curvature, FrameBlocks, block_curvature, frame_rows, sum_of_curvatures
 from jaxfit.objective.posed_window import PosedWindow
 from jaxfit.objective.registry import Term
 from jaxfit.objective.residuals import Residuals, as_list, residual_curvature, residual_sum
@@ -49,14 +49,22 @@ def weighted_sum(window: PosedWindow, terms: Mapping[str, Term], settings: Setti
 def sum_with_blocks(
     window: PosedWindow, terms: Mapping[str, Term], settings: Settings
 ) -> tuple[Float[Array, ""], FrameBlocks | None]:
-    """Return `weighted_sum`, and Σ λ · blocks of the terms with blocks (None without such a term), in one pass."""
+    """Return `weighted_sum`, and Σ λ · blocks of the terms with blocks (None without such a term), in one pass.
+
+    Raises:
+        InputError: a term does not return one real number, or blocks of another shape; the error names the term.
+    """
     blocks = [name for name in settings if terms[name].with_blocks is not None]
     total = weighted_sum(window, terms, {name: values for name, values in settings.items() if name not in blocks})
-    summed = None
+    summed, (frames, columns) = None, frame_rows(window.pose, window.shared).shape
+    shape = (frames, columns, columns)
     for name in blocks:
         weight = jnp.asarray(settings[name]["weight"])
         value, block = cast(Any, terms[name].with_blocks)(window, **_without_weight(settings[name]))
         total += weight * _checked_scalar(name, value)
+        if jnp.shape(block) != shape:
+            problem = f"`with_blocks` returned blocks of shape {jnp.shape(block)}, not {shape}"
+            raise InputError(f"term {name!r}", problem, "return one block for each frame, in the columns of frame_rows")
         summed = weight * block if summed is None else summed + weight * block
     return total, summed
 
@@ -93,7 +101,7 @@ def evaluate_curvature(
     curvatures = [residual_curvature(window, of_residuals, second_order)]
     if blocks is not None:
         curvatures.append(block_curvature(blocks))
-    return weighted_curvature([jnp.ones(())] * len(curvatures), curvatures)
+    return sum_of_curvatures(curvatures)
 
 
 def _without_weight(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,7 +112,9 @@ def _checked_residuals(name: str, value: Any) -> list[Residuals]:
     """Return the residuals of a term after a check that the term returns residuals."""
     if _is_residuals(value):
         return as_list(value)
-    problem = "returns a number, but the solver levenberg_marquardt and error bars need its residuals"
+    problem = (
+        "returns a number, but the solver levenberg_marquardt and error bars need its residuals (or `with_blocks`)"
+    )
     remedy = "return Residuals (docs/developers/term.md), or use the solver adam without error_bars"
     raise InputError(f"term {name!r}", problem, remedy)
 

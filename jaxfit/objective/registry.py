@@ -122,7 +122,7 @@ def known_terms() -> list[str]:
 
 
 def _term_of(name: str, function: Any, positive: Collection[str] = (), compares_masks: bool = False) -> Term:
-    """Return the term of a function, without a curvature.
+    """Return the term of a function, without blocks.
 
     Raises:
         InputError: the function does not have the form of a term.

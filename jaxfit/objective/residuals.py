@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxfit.objective.curvature import Curvature, Rows, frame_rows, shared_columns, weighted_curvature
+from jaxfit.objective.curvature import Curvature, Rows, frame_rows, shared_columns, sum_of_curvatures
 from jaxfit.objective.posed_window import PosedWindow
 
 Scalar = Float[Array, ""]
@@ -139,7 +139,7 @@ def residual_curvature(
             return [jnp.asarray(own[i].values) for own, others in parts for i in others]
 
         curvatures.append(_from_jax(window, values_at, factors))
-    return weighted_curvature([jnp.ones(())] * len(curvatures), curvatures)
+    return sum_of_curvatures(curvatures)
 
 
 def _from_jacobian(residuals: Residuals, factor: Float[Array, "..."]) -> Curvature:

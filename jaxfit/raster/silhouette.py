@@ -140,7 +140,7 @@ def mask_loss_and_block(
     Args:
         vertices_screen, faces, weight, kind, blur, backend: as for `mask_loss`. The depth is that of the camera frame
             of `skin`, in the unit of its rest vertices.
-        target: the mask, as for `mask_loss`.
+        target: the mask, of bool or uint8, as for `mask_loss`.
         skin: rest vertices, skinning weights and derivatives of the joint transforms.
         camera_px: focal length and centre of the image in pixels of the silhouette, for the pinhole camera
             pixel = focal · (x, y) / z + centre.
@@ -216,7 +216,8 @@ def _choose(backend: str) -> str:
 def _dispatch(backend: str, native_function, reference_function, *operands):
     """Call one of two functions. For "auto", the program of a platform contains only the function for that platform.
 
-    Where the CPU is the only platform, the reference is not traced: tracing takes as long as the rest of an objective.
+    Where JAX runs on the CPU unless told otherwise, the program contains the kernels only: tracing the reference takes
+    as long as the rest of an objective. Such a program cannot be compiled for other platforms.
     """
     if backend == "native" or (backend == "auto" and jax.default_backend() == "cpu"):
         return native_function(*operands)

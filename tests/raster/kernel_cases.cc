@@ -109,15 +109,18 @@ Results compute(const Case& own) {
                           own.number("centre")};
   auto& block = results["block"];
   block.resize(static_cast<size_t>(parameters * parameters));
-  memory = jaxfit::scratch(kernels.block_workspace(mesh, skin, blur, size));
   for (const LossKind kind : {LossKind::kL1, LossKind::kSmoothL1}) {
     const std::string name = kind == LossKind::kL1 ? "l1" : "smooth_l1";
     auto& loss = results[name];
     auto& gradient = results[name + "_gradient"];
     loss.resize(1);
     gradient.resize(vertices.size());
-    kernels.mask_loss(mesh, blur, size, memory, {target.data(), nullptr}, kind, loss.data(), gradient.data(), &skin,
-                      block.data());
+    // both ways: the loss and the gradient alone, and with the block
+    const bool alone = kind == LossKind::kL1;
+    memory = jaxfit::scratch(alone ? kernels.workspace(mesh, blur, size)
+                                   : kernels.block_workspace(mesh, skin, blur, size));
+    kernels.mask_loss(mesh, blur, size, memory, {target.data(), nullptr}, kind, loss.data(), gradient.data(),
+                      alone ? nullptr : &skin, alone ? nullptr : block.data());
   }
 
   const jaxfit::Renderer& renderer = jaxfit::current_renderer();

@@ -139,6 +139,32 @@ def test_unknown_pixels_have_no_curvature(backend, blur):
     np.testing.assert_array_equal(block(row, backend, target=target == 1, blur=blur), block(row, backend, blur=blur))
 
 
+@pytest.mark.parametrize("blur", [BLUR, UNBIASED], ids=["soft_rasterizer", "unbiased"])
+@pytest.mark.parametrize("kind", ["l1", "smooth_l1"])
+def test_loss_and_gradient_are_those_of_the_mask_loss(backend, kind, blur):
+    rows, weights, target = (
+        jnp.stack([row_of(seed=n) for n in range(3)]),
+        jnp.asarray([1.0, 0.0, 2.0]),
+        random_target(SIZE),
+    )
+    camera_px = CropCamera().focal_px * SIZE / CropCamera().size_px, SIZE / 2
+    settings = {"kind": kind, "blur": blur, "backend": backend}
+
+    def with_block(vertices, weight, row):
+        return raster.mask_loss_and_block(vertices, RIG.faces, target, weight, skin_of(row), camera_px, **settings)[0]
+
+    def alone(vertices, weight, _):
+        return raster.mask_loss(vertices, RIG.faces, target, weight, **settings)
+
+    vertices = jax.vmap(on_screen)(rows)
+    found, expected = (
+        jax.jit(jax.vmap(jax.value_and_grad(loss, argnums=(0, 1))))(vertices, weights, rows)
+        for loss in (with_block, alone)
+    )
+    for own, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(own, other, atol=1e-6 * float(np.abs(other).max()))
+
+
 def test_a_bird_outside_the_image_has_no_curvature(backend):
     assert not np.any(block(row_of((60.0, 0.0, 180.0)), backend))
 

@@ -241,6 +241,15 @@ def test_only_the_cpu_program_holds_the_call(platform, monkeypatch):
 
 
 @needs_kernels
+def test_the_gradient_of_a_mean_is_not_negligible():
+    """The kernels leave out blocks whose gradient is small beside the greatest one, not those of a small loss."""
+    vertices, faces = random_mesh(0)  # of the same size as other tests, which compiled its program
+    pulls = [image_and_pull(vertices, faces, jnp.full((64, 64), c), 64, None, "native")[1] for c in (1.0, 2.0**-30)]
+    assert np.any(pulls[0])
+    np.testing.assert_allclose(pulls[1] * 2.0**30, pulls[0], rtol=1e-6)
+
+
+@needs_kernels
 def test_without_differentiation_only_the_loss_is_computed():
     vertices, faces = random_mesh(0, faces=4)
 

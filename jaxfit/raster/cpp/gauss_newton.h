@@ -67,7 +67,8 @@ int64_t find_band(const uint8_t* target, int64_t size, const Workspace& ws, Rows
   return count;
 }
 
-// Gives rows to the pixels of the band: to all, or to a part whose factors grow by √(band / part).
+// Gives rows to the pixels of the band: to all, or to a part whose factors grow by √(band / part). Reads the products, so
+// it comes before the loss. Clears the rows.
 void choose_rows(const uint8_t* target, int64_t size, int64_t D, Scale scale, const Workspace& ws, Rows& rows) {
   const int64_t band = find_band(target, size, ws, rows);
   const bool every = band <= kMostRows;
@@ -93,8 +94,8 @@ void choose_rows(const uint8_t* target, int64_t size, int64_t D, Scale scale, co
   fill(rows.values, rows.count * D, 0);
 }
 
-// The pull of some pixels on the corners of a face: for each pixel p · (pixel - nearest point), with the sign of d, and the
-// shares of the corners 0 and 1. The third corner has the rest; the shares of corners that the nearest edge lacks are 0.
+// The pull of some pixels on the corners of a face: for each pixel p · (pixel - nearest point), with the sign of d, and
+// the shares of the corners 0 and 1. The third corner has the rest. Corners that the nearest edge lacks have the share 0.
 struct Pull {
   alignas(64) float x[kWidth], y[kWidth], share0[kWidth], share1[kWidth];
 };
@@ -105,6 +106,7 @@ struct Pull {
   const int64_t D = skin.parameters;
   for (; pixels; pixels &= pixels - 1) {
     const int i = __builtin_ctz(pixels);
+    // The two corners of the nearest edge. If the nearest point is a corner, the other one has the share 0.
     const float share[3] = {pull.share0[i], pull.share1[i], 1 - pull.share0[i] - pull.share1[i]};
     const int first = share[0] == 0 ? 1 : 0, second = share[0] == 0 || share[1] == 0 ? 2 : 1;
     const float factor = rows.factor[of_pixel[i]], x = factor * pull.x[i], y = factor * pull.y[i];

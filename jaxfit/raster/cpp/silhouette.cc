@@ -16,7 +16,8 @@ namespace jaxfit {
 namespace {
 
 // Adds the gradient of every open block. For each pixel `products` holds the factor of p · (pixel - nearest point). The
-// nearest point lies on an edge between two vertices, which share the force. With a skin, it fills `rows` as well.
+// nearest point lies on an edge between two vertices, which share the force. With rows, the pull of each chosen pixel is
+// added to its row as well, with the factor of the row: the derivative of the silhouette in place of that of the loss.
 template <bool with_rows>
 void accumulate_gradient(const Mesh& mesh, const Skin* skin, Scale scale, Workspace& ws, const Rows* rows,
                          float* gradient) {
@@ -41,8 +42,10 @@ void accumulate_gradient(const Mesh& mesh, const Skin* skin, Scale scale, Worksp
           const Vec beyond = pull * pick(n, n.beyond[0], n.beyond[1], n.beyond[2]);
           const Vec tx = pick(n, face.tx[0], face.tx[1], face.tx[2]);
           const Vec ty = pick(n, face.ty[0], face.ty[1], face.ty[2]);
+          // With the normal n = (-ty, tx), which points inside, pixel - nearest point = beyond · t + across · n.
           const Vec pull_x = fms(tx, beyond, ty * across), pull_y = fma(ty, beyond, tx * across);
           const Vec along = pick(n, n.clamped[0] * inverse[0], n.clamped[1] * inverse[1], n.clamped[2] * inverse[2]);
+          // `along` is in [-1/2, 1/2]. Edge 12 does not touch vertex 0, and edge 20 does not touch vertex 1.
           const Vec to_end = all(0.5f) + along, to_start = all(0.5f) - along;
           const Vec share0 = pick(n, to_start, zero, to_end), share1 = pick(n, to_end, to_start, zero);
           const Vec factor = load(block.place + at);
@@ -60,12 +63,13 @@ void accumulate_gradient(const Mesh& mesh, const Skin* skin, Scale scale, Worksp
           store(stored.y, pull_y);
           store(stored.share0, share0);
           store(stored.share1, share1);
-          add_to_rows(mesh, *skin, f, lane, own & bits(greater(outside, n.d)), stored, rows->of_pixel + place + at, *rows);
+          const uint32_t reached = own & bits(greater(outside, n.d));
+          add_to_rows(mesh, *skin, f, lane, reached, stored, rows->of_pixel + place + at, *rows);
         }
       });
       if (!any) continue;
       float on_x[3] = {sum(x[0]), sum(x[1]), sum(x[2])}, on_y[3] = {sum(y[0]), sum(y[1]), sum(y[2])};
-      on_x[2] -= on_x[0] + on_x[1];
+      on_x[2] -= on_x[0] + on_x[1];  // vertex 2 has the rest of the force
       on_y[2] -= on_y[0] + on_y[1];
       for (int i = 0; i < 3; ++i) {
         gradient[3 * f.vertex[i][lane]] += on_x[i];
@@ -105,13 +109,16 @@ struct BlockTarget {
           load_unequal(target, size, column, row, kUnknown, kBird)};
 }
 
-// Replaces products by the factors of the gradient, given d loss / d silhouette. Returns whether one is not negligible.
-[[gnu::always_inline]] inline bool set_factor(Vec cotangent, Vec transmitted, Scale scale, float* place) {
+// Replaces products by the factors of the gradient, given d loss / d silhouette. Returns whether one is above
+// `negligible`.
+[[gnu::always_inline]] inline bool set_factor(Vec cotangent, Vec transmitted, Scale scale, float negligible,
+                                              float* place) {
   const Vec factor = cotangent * transmitted;
   store(place, factor * all(scale.slope));
-  return bits(greater(abs(factor), all(1.f / kSaturated)));
+  return bits(greater(abs(factor), all(negligible)));
 }
 
+// Returns the loss. With a gradient, replaces the products by its factors and closes the blocks without any.
 template <LossKind kind, typename Pixel>
 float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, bool with_gradient) {
   double total = 0;
@@ -132,9 +139,9 @@ float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, boo
         part = part + select(greater(magnitude, one), magnitude - half, half * error * error);
         slope = clamp_to(error, one);
       }
-      if (with_gradient) open |= set_factor(slope, transmitted, scale, place + at);
+      if (with_gradient) open |= set_factor(slope, transmitted, scale, 1 / kSaturated, place + at);
     }
-    if (column % 16 == 15) {
+    if (column % 16 == 15) {  // few enough floats for their precision
       total += sum(part);
       part = zero;
     }
@@ -173,11 +180,13 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
   const Scale scale = scale_of(blur, size);
   if (!render(mesh, size, scale, ws))
     return set_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
+  float greatest = 0;
+  for (int64_t i = 0; i < size * size; ++i) greatest = __builtin_fmaxf(greatest, __builtin_fabsf(cotangent[i]));
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     const BlockValues slope = load_block(cotangent, size, column, row, 0);
     bool open = false;
     for (int at = 0; at < kLanes; at += kWidth)
-      open |= set_factor(load(slope.at + at), all(1.f) / load(place + at), scale, place + at);
+      open |= set_factor(load(slope.at + at), all(1.f) / load(place + at), scale, greatest / kSaturated, place + at);
     if (!open) close(ws, column, row);
   });
   finish_gradient(mesh, scale, ws, gradient);
