@@ -141,14 +141,14 @@ def test_unknown_pixels_have_no_curvature(backend, blur):
 
 @pytest.mark.parametrize("blur", [BLUR, UNBIASED], ids=["soft_rasterizer", "unbiased"])
 @pytest.mark.parametrize("kind", ["l1", "smooth_l1"])
-def test_loss_and_gradient_are_those_of_the_mask_loss(backend, kind, blur):
+def test_loss_and_gradient_are_those_of_the_mask_loss(native, kind, blur):
     rows, weights, target = (
         jnp.stack([row_of(seed=n) for n in range(3)]),
         jnp.asarray([1.0, 0.0, 2.0]),
         random_target(SIZE),
     )
     camera_px = CropCamera().focal_px * SIZE / CropCamera().size_px, SIZE / 2
-    settings = {"kind": kind, "blur": blur, "backend": backend}
+    settings = {"kind": kind, "blur": blur, "backend": native}
 
     def with_block(vertices, weight, row):
         return raster.mask_loss_and_block(vertices, RIG.faces, target, weight, skin_of(row), camera_px, **settings)[0]
