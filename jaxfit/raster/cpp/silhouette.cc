@@ -182,11 +182,12 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
     return set_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
   float greatest = 0;
   for (int64_t i = 0; i < size * size; ++i) greatest = __builtin_fmaxf(greatest, __builtin_fabsf(cotangent[i]));
+  const float negligible = __builtin_fminf(greatest, 1) / kSaturated;
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
     const BlockValues slope = load_block(cotangent, size, column, row, 0);
     bool open = false;
     for (int at = 0; at < kLanes; at += kWidth)
-      open |= set_factor(load(slope.at + at), all(1.f) / load(place + at), scale, greatest / kSaturated, place + at);
+      open |= set_factor(load(slope.at + at), all(1.f) / load(place + at), scale, negligible, place + at);
     if (!open) close(ws, column, row);
   });
   finish_gradient(mesh, scale, ws, gradient);
