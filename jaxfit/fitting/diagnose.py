@@ -57,7 +57,8 @@ def check_terms(config: FitConfig, model: FitModel) -> None:
             _trace(term, jax.grad(_share_of(program, name)), pose, problem)
             if stage.solver == "levenberg_marquardt" or (config.error_bars and stage is config.stages[-1]):
                 _trace(term, _curvature_of(program, name), pose, problem)
-                _trace(term, jax.grad(_share_with_blocks_of(program, name)), pose, problem)
+                if term.with_blocks is not None:
+                    _trace(term, jax.grad(_share_of(program, name, with_blocks=True)), pose, problem)
 
 
 def _trace(term: Term, function: Callable[..., object], *arguments: object) -> None:
@@ -128,22 +129,16 @@ def _not_finite(
     return jax.vmap(one)(problems, pose)
 
 
-def _share_of(program: Program, name: str) -> Callable[[Pose, Problem], Array]:
-    """Return the weighted value of one term as a function of pose and problem."""
+def _share_of(program: Program, name: str, with_blocks: bool = False) -> Callable[[Pose, Problem], Array]:
+    """Return the weighted value of one term as a function of pose and problem.
+
+    `with_blocks`: as Levenberg-Marquardt evaluates the term, together with its blocks.
+    """
 
     def share(pose: Pose, problem: Problem) -> Array:
         settings = {name: problem.hyperparameters.settings[name]}
-        return weighted_sum(problem_window(program, problem, pose), program.terms, settings)
-
-    return share
-
-
-def _share_with_blocks_of(program: Program, name: str) -> Callable[[Pose, Problem], Array]:
-    """Return `_share_of` as Levenberg-Marquardt evaluates the term: together with its blocks, if it has blocks."""
-
-    def share(pose: Pose, problem: Problem) -> Array:
-        settings = {name: problem.hyperparameters.settings[name]}
-        return sum_with_blocks(problem_window(program, problem, pose), program.terms, settings)[0]
+        arguments = problem_window(program, problem, pose), program.terms, settings
+        return sum_with_blocks(*arguments)[0] if with_blocks else weighted_sum(*arguments)
 
     return share
 

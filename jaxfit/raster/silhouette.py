@@ -216,8 +216,8 @@ def _choose(backend: str) -> str:
 def _dispatch(backend: str, native_function, reference_function, *operands):
     """Call one of two functions. For "auto", the program of a platform contains only the function for that platform.
 
-    Where JAX runs on the CPU unless told otherwise, the program contains the kernels only: tracing the reference takes
-    as long as the rest of an objective. Such a program cannot be compiled for other platforms.
+    If the CPU is the default platform of JAX, the program contains the kernels only, because tracing the reference
+    takes long. Such a program cannot be compiled for other platforms.
     """
     if backend == "native" or (backend == "auto" and jax.default_backend() == "cpu"):
         return native_function(*operands)

@@ -212,6 +212,18 @@ def test_a_term_without_residuals_is_rejected_before_the_fit(monkeypatch):
     check_terms(dataclasses.replace(CONFIG, stages=(dataclasses.replace(stage, solver="adam"),)), MODEL)
 
 
+def test_blocks_of_another_shape_are_rejected_before_the_fit(monkeypatch):
+    monkeypatch.setattr(registry, "_terms", dict(registry._terms))
+
+    def with_blocks(window):
+        return jnp.sum(window.pose.transl), jnp.zeros((len(window.present), 3, 3))
+
+    registry.term(name="place", with_blocks=with_blocks)(lambda window: jnp.sum(window.pose.transl))
+    stage = dataclasses.replace(NEWTON, terms=("keypoints", "place"))
+    with pytest.raises(InputError, match=r"'place': `with_blocks` returned blocks of shape"):
+        check_terms(dataclasses.replace(CONFIG, stages=(stage,)), MODEL)
+
+
 @pytest.mark.extended
 def test_bones_and_shape_are_optimised_like_by_adam():
     start, targets = case()

@@ -1,7 +1,7 @@
 """Draw what the features of behaviour measure, on murres.
 
-`PYTHONPATH=tests .venv/bin/python -m support.feature_drawing` writes `docs/media/behaviour.svg`. The angles and
-lengths in the drawing are those that `describe` returns for the drawn birds.
+`PYTHONPATH=tests .venv/bin/python -m support.feature_drawing` writes `docs/media/behaviour.svg`. The drawing
+shows the angles and lengths that `describe` returns for the drawn birds.
 """
 
 import sys

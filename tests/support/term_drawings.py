@@ -40,13 +40,18 @@ def _cost(kernel: RobustKernel, residual):
     return np.asarray(kernel.value(np.asarray(residual, np.float32) ** 2))
 
 
+def _compared(axes, value, cost, name, other, other_name):
+    """Plot the cost of a term, and another cost as a dashed line."""
+    axes.plot(value, cost, label=name)
+    axes.plot(value, other, "--", label=other_name, color=LINE)
+    axes.legend(frameon=False)
+
+
 def keypoints():
     figure, axes = _axes("error, pixels of a 256-pixel crop", "cost")
     error = np.linspace(-200, 200, 121)
-    axes.plot(error, _cost(geman_mcclure(50.0), error), label="σ = 50")
-    axes.plot(error, np.minimum(error**2, 3000), "--", label="square", color=LINE)
+    _compared(axes, error, _cost(geman_mcclure(50.0), error), "σ = 50", np.minimum(error**2, 3000), "square")
     axes.set_ylim(0, 3000)
-    axes.legend(frameon=False)
     return figure
 
 
@@ -84,9 +89,7 @@ def mask():
 def mask_smooth_l1():
     figure, axes = _axes("silhouette − mask, one pixel", "cost")
     difference = np.linspace(-1, 1, 101)
-    axes.plot(difference, difference**2 / 2, label="mask_smooth_l1")
-    axes.plot(difference, abs(difference), "--", label="mask", color=LINE)
-    axes.legend(frameon=False)
+    _compared(axes, difference, difference**2 / 2, "mask_smooth_l1", abs(difference), "mask")
     return figure
 
 
@@ -131,10 +134,8 @@ def size_prior():
 def shape_norm():
     figure, axes = _axes("shape coefficient β", "cost")
     value = np.linspace(-3, 3, 61)
-    axes.plot(value, abs(value), label="shape_norm")
-    axes.plot(value, value**2, "--", label="shape_prior", color=LINE)
+    _compared(axes, value, abs(value), "shape_norm", value**2, "shape_prior")
     axes.set_ylim(0, 5)
-    axes.legend(frameon=False)
     return figure
 
 
