@@ -100,8 +100,8 @@ def wheel(build_python, sdist):
     return build_wheel(build_python, sdist)[0]
 
 
-def test_a_source_distribution_holds_what_a_build_reads(sdist):
-    assert {path.name for path in sdist.iterdir()} - {"dist"} == {*SOURCES, "CHANGELOG.md", "PKG-INFO"}
+def test_a_source_distribution_holds_what_builds_and_readers_need(sdist):
+    assert {path.name for path in sdist.iterdir()} - {"dist"} == {*SOURCES, "CHANGELOG.md", "CITATION.cff", "PKG-INFO"}
 
 
 def test_a_wheel_holds_kernels_configs_and_all_files_of_the_package(wheel):
