@@ -70,7 +70,7 @@ def join_tiles(tiles: Sequence[Any], count: int) -> Any:
 
 def take_tile(tree: Any, rows: Int[np.ndarray, "G"]) -> Any:
     """Return some rows of a pytree of arrays as JAX arrays; −1 is the last row."""
-    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[rows]), tree)
+    return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[rows], tree))
 
 
 _logger = logging.getLogger(__name__)
@@ -237,8 +237,7 @@ def _stage_tiles(
         # without masks, the problems that fill up the last tile render no silhouettes
         real = (tile >= 0).reshape(-1, *(1,) * (own.has_mask.ndim - 1))
         own = replace(own, has_mask=own.has_mask & real)
-        repeated = [hyperparameters[c] for c in config[tile]]
-        settings = jax.tree.map(lambda *x: jnp.asarray(np.stack(x)), *repeated)
+        settings = jax.device_put(jax.tree.map(lambda *x: np.stack(x), *(hyperparameters[c] for c in config[tile])))
         tiles.append(_Tile(Problem(settings, take_tile(rows.pose, tile), own), tile))
     return tiles
 

@@ -33,7 +33,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from scipy.stats import f as f_distribution
 
 from jaxfit.data.solution import ERROR_BARS
 from jaxfit.fitting.posterior import WindowPosterior, window_posteriors
@@ -300,8 +299,8 @@ class _Noise(NamedTuple):
 
     @property
     def expected(self) -> float:
-        """Median of the squared residual in units of `variance`."""
-        return 2 * math.log(2) if math.isinf(self.dof) else 2 * float(f_distribution.median(2, self.dof))
+        """Median of the squared residual in units of `variance`: twice the median of the F distribution of 2 and ν."""
+        return 2 * math.log(2) if math.isinf(self.dof) else self.dof * math.expm1(2 * math.log(2) / self.dof)
 
     def precision(self, error_px: Float[np.ndarray, "T K 2"]) -> Float[np.ndarray, "T K"]:
         """Return the curvature of the term for x and y of a keypoint, at some errors (`residual_curvature`)."""

@@ -158,8 +158,8 @@ def _orientations(
 def search_initial_poses(
     bird: Bird,
     rig: Rig,
-    keypoints_px: Float[Array, "W T K 2"],
-    confidence: Float[Array, "W T K"],
+    keypoints_px: Float[Array | np.ndarray, "W T K 2"],
+    confidence: Float[Array | np.ndarray, "W T K"],
     config: InitialiseConfig,
     camera: CropCamera,
     common_size: bool,
@@ -185,7 +185,7 @@ def search_initial_poses(
         _search_tile(bird, rig, *take_tile((keypoints_px, confidence), rows), config, camera, common_size)
         for rows in tile_rows(count, tile_size(frames))
     ]
-    return jax.tree.map(jnp.asarray, join_tiles(found, count))
+    return jax.device_put(join_tiles(found, count))
 
 
 @partial(jax.jit, static_argnames=("config", "camera", "common_size"))

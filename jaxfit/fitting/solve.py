@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxfit.config.fit import FitConfig, InitialiseConfig, StageConfig
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program, Solver, problem_loss, problem_window
+from jaxfit.fitting.stored_programs import StoredProgram
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX, CropCamera
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, move_keypoints
@@ -113,7 +114,7 @@ def begin(program: Program, problems: Problem, carried: Any) -> StageState:
     return StageState(*jax.tree.map(jnp.copy, (problems.anchor, solver)), started=jnp.bool_(False))
 
 
-@eqx.filter_jit(donate="all-except-first")
+@functools.partial(StoredProgram, structure=lambda fixed, state: (state, 0, 0))
 def advance(
     fixed: tuple[Program, Problem, Int[Array, ""]], state: StageState
 ) -> tuple[StageState, Float[Array, "B"], Int[Array, "B"]]:

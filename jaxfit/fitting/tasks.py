@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
@@ -102,8 +101,8 @@ def initial_poses_of(windows: Windows, config: FitConfig, model: FitModel) -> Po
     return search_initial_poses(
         model.bird,
         model.rig,
-        jnp.asarray(windows.keypoints_px),
-        jnp.asarray(windows.confidence),
+        windows.keypoints_px,
+        windows.confidence,
         config.initialise,
         model.camera,
         config.common_size,
@@ -134,7 +133,7 @@ def gather_batch(shared: FitShared, task: FitTask) -> Batch:
     poses, pose_row = _prepare_rows(task, _pose_key, partial(_initial_poses, shared))
     return Batch(
         targets=jax.tree.map(lambda *x: np.concatenate(x), *targets),
-        initial_pose=jax.tree.map(lambda *x: jnp.concatenate(x), *poses),
+        initial_pose=jax.tree.map(lambda *x: np.concatenate(x), *poses),
         config=np.array([r for r, _ in task.problems]),
         targets_row=targets_row,
         pose_row=pose_row,

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from jaxfit.foundation.array_files import load_npz
@@ -106,7 +106,7 @@ def load_bird(path: Path | str) -> Bird:
     arrays.setdefault("vertex_colours", neutral_colours(len(content["vertices"])))
     arrays.setdefault("joint_limits", unlimited_joints(max(len(content["parents"]) - 1, 0)))
     bird = Bird(
-        **{field: jnp.asarray(array) for field, array in arrays.items()},
+        **jax.device_put(arrays),
         parents=tuple(int(parent) for parent in content["parents"]),
         joint_names=tuple(map(str, content["joint_names"])),
         keypoint_names=tuple(map(str, content["keypoint_names"])),

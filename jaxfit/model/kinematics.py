@@ -93,21 +93,24 @@ def fold_bird(bird: Bird) -> Rig:
     basis = np.asarray(bird.shape_basis, np.float64)
     homogeneous = np.concatenate([np.asarray(bird.vertices, np.float64), np.ones((len(weights), 1))], axis=1)
 
+    def put(values, dtype=np.float32):  # unlike jnp.asarray, this compiles no program for each shape
+        return jax.device_put(np.asarray(values, dtype))
+
     def on_keypoints(points):  # Σ_v keypoint_weights · skin_weights · point
-        return jnp.asarray(np.einsum("kv,vj,...vc->...kjc", to_keypoints, weights, points, optimize=True), jnp.float32)
+        return put(np.einsum("kv,vj,...vc->...kjc", to_keypoints, weights, points, optimize=True))
 
     most = max(int((weights != 0).sum(axis=1).max(initial=0)), 1)
     vertex_joints = np.argsort(weights == 0, axis=1, kind="stable")[:, :most]  # the joints with a weight first
     return Rig(
-        joints=jnp.asarray(bird.joints, jnp.float32),
+        joints=put(bird.joints),
         keypoint_map=on_keypoints(homogeneous),
         keypoint_shape_map=on_keypoints(basis),
-        vertices=jnp.asarray(bird.vertices, jnp.float32).T,
-        skin_weights=jnp.asarray(weights.T, jnp.float32),
-        vertex_joints=jnp.asarray(vertex_joints, jnp.int32),
-        vertex_weights=jnp.asarray(np.take_along_axis(weights, vertex_joints, axis=1), jnp.float32),
-        shape_basis=jnp.asarray(basis.transpose(0, 2, 1), jnp.float32),
-        faces=jnp.asarray(bird.faces, jnp.int32),
+        vertices=put(np.asarray(bird.vertices).T),
+        skin_weights=put(weights.T),
+        vertex_joints=put(vertex_joints, np.int32),
+        vertex_weights=put(np.take_along_axis(weights, vertex_joints, axis=1)),
+        shape_basis=put(basis.transpose(0, 2, 1)),
+        faces=put(bird.faces, np.int32),
         parents=bird.parents,
         joint_names=bird.joint_names,
         keypoint_names=bird.keypoint_names,

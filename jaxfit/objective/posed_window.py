@@ -103,7 +103,7 @@ def priors_of(bird: Bird) -> Priors:
 
     def whitener(covariance):
         cholesky = np.linalg.cholesky(np.asarray(covariance, np.float64))
-        return jnp.asarray(np.linalg.inv(cholesky), jnp.float32)
+        return jax.device_put(np.linalg.inv(cholesky).astype(np.float32))
 
     return Priors(
         bird.pose_mean,

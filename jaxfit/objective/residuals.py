@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int8
 
 from jaxfit.objective.curvature import Curvature, Rows, frame_rows, shared_columns, sum_of_curvatures
 from jaxfit.objective.posed_window import PosedWindow
@@ -168,12 +168,12 @@ def _from_jax(window: PosedWindow, values_at: Callable[[Rows], list], factors: l
     def product(d: Rows) -> Rows:
         return backward([factor * change for factor, change in zip(factors, forward(d), strict=True)])[0]
 
-    def probe(key: Array) -> Rows:
-        keys = jax.random.split(key, len(factors))
-        signs = [jax.random.rademacher(k, factor.shape, jnp.float32) for k, factor in zip(keys, factors, strict=True)]
+    def probe(signs: list[Int8[np.ndarray, "..."]]) -> Rows:
         return backward([jnp.sqrt(factor) * sign for factor, sign in zip(factors, signs, strict=True)])[0] ** 2
 
-    diagonal = jax.vmap(probe)(jax.random.split(jax.random.key(0), PROBES)).mean(axis=0)
+    random = np.random.default_rng(0)  # not of JAX, whose generator would be compiled into the program
+    signs = [random.choice(np.array([-1, 1], np.int8), (PROBES, *factor.shape)) for factor in factors]
+    diagonal = jax.vmap(probe)(signs).mean(axis=0)
     # the gradient of a shared parameter is divided between the rows, so its square is too small
     rows = jnp.where(shared_columns(window.pose, window.shared), len(zero), 1)
     return Curvature(product, rows * diagonal)

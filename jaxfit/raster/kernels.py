@@ -88,6 +88,12 @@ def kernels_available() -> bool:
     return _kernels() is not None
 
 
+def ffi_targets() -> tuple[str, ...]:
+    """The names of the kernels in compiled programs. Empty without kernels."""
+    kernels = _kernels()
+    return tuple(kernels.handlers()) if kernels else ()
+
+
 def available_isas() -> tuple[str, ...]:
     """The instruction sets that the kernels can use on this processor, best first. Empty without kernels."""
     kernels = _kernels()

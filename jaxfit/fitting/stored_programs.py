@@ -1,0 +1,136 @@
+"""Traced programs in JAX's cache folder, so that the next process does not trace the same Python code again.
+
+JAX stores compiled programs under keys that it computes from the traced programs. So every process traces the objective
+of every stage, which takes seconds, before it finds the compiled program. Here the traced program (StableHLO by
+`jax.export`) is stored, too. Its key holds everything that decides the trace: the source of the package, the versions
+of the libraries that trace it, and the arguments except for the numbers in their arrays. Programs with terms from
+outside of the package are not stored, because nobody knows what else decides their trace.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.metadata
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import FunctionType
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.export
+
+from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.files import write_whole
+from jaxfit.objective.registry import Term
+from jaxfit.raster.kernels import ffi_targets
+from jaxfit.raster.silhouette_reference import Blur
+
+PACKAGE = Path(__file__).resolve().parents[1]
+LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "optax")
+"""The libraries whose code becomes part of a trace."""
+SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_threefry_partitionable")
+"""The settings of JAX that decide a trace."""
+CHECKSUM = hashlib.sha256
+
+
+class StoredProgram:
+    """A compiled function (fixed, state) → result whose trace is stored. It reuses the memory of `state`.
+
+    Without a local cache folder, with a device other than CPUs, and for arguments that have no key, it is compiled by
+    `eqx.filter_jit` as usual.
+    """
+
+    def __init__(self, function: Callable[[Any, Any], Any], structure: Callable[[Any, Any], Any]):
+        """Compile a function.
+
+        Args:
+            function: a pure function (fixed, state) → pytree of arrays.
+            structure: returns from the same arguments a pytree with the structure of the result, with any leaves.
+        """
+        self._function = function
+        self._structure = structure
+        self._compiled = eqx.filter_jit(function, donate="all-except-first")
+        self._loaded: dict[str, Callable[..., list]] = {}
+        functools.update_wrapper(self, function)
+
+    def __call__(self, fixed: Any, state: Any) -> Any:
+        arguments, others = eqx.partition((fixed, state), eqx.is_array)
+        key = _key(self._function, arguments, others)
+        if key is None:
+            return self._compiled(fixed, state)
+        if key not in self._loaded:
+            self._loaded[key] = self._load(key, arguments, others)
+        # results of an exported program are bound to a device; unbound arguments would be compiled once more
+        bound = jax.device_put(arguments, jax.local_devices()[0])
+        result = self._loaded[key](*map(jax.tree.leaves, bound))
+        return jax.tree.unflatten(jax.tree.structure(self._structure(fixed, state)), result)
+
+    def _load(self, key: str, arguments: Any, others: Any) -> Callable[..., list]:
+        """Return the stored program as a compiled function of two lists of arrays; store it first where it is not."""
+        path = Path(jax.config.jax_compilation_cache_dir) / "traced" / key
+        program = _read(path)
+        if program is None:
+            leaves = [jax.tree.leaves(part) for part in arguments]
+            structures = [jax.tree.structure(part) for part in arguments]
+
+            def of_leaves(*leaves: list) -> list:
+                arrays = tuple(map(jax.tree.unflatten, structures, leaves))
+                return jax.tree.leaves(self._function(*eqx.combine(arrays, others)))
+
+            allowed = [jax.export.DisabledSafetyCheck.custom_call(name) for name in ffi_targets()]
+            program = jax.export.export(jax.jit(of_leaves), disabled_checks=allowed)(*leaves)
+            content = bytes(program.serialize())
+            with suppress(InputError, OSError):  # a full or protected disk: the next process traces again
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(path, CHECKSUM(content).digest() + content)
+        call = functools.update_wrapper(lambda *leaves: program.call(*leaves), self._function)
+        return jax.jit(call, donate_argnums=1)
+
+
+def _read(path: Path) -> jax.export.Exported | None:
+    """Return a stored program; None if there is no whole file."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    size = CHECKSUM().digest_size
+    whole = CHECKSUM(content[size:]).digest() == content[:size]
+    return jax.export.deserialize(bytearray(content[size:])) if whole else None
+
+
+def _key(function: Callable, arguments: Any, others: Any) -> str | None:
+    """Return the name of the file of a program; None if its trace is not stored."""
+    folder = jax.config.jax_compilation_cache_dir
+    if not folder or "://" in folder or jax.default_backend() != "cpu":
+        return None
+    described = [_described(leaf) for leaf in (function, *jax.tree.leaves(others))]
+    if None in described:
+        return None
+    arrays = [(x.shape, x.dtype.name, x.weak_type) for x in jax.tree.leaves(arguments)]
+    structures = jax.tree.structure(arguments), jax.tree.structure(others)
+    settings = [getattr(jax.config, name) for name in SETTINGS]
+    whole = _source(), settings, ffi_targets(), described, arrays, structures
+    return CHECKSUM(repr(whole).encode()).hexdigest()
+
+
+def _described(leaf: Any) -> str | None:
+    """Return a text that determines a leaf that is no array; None for an unknown kind of leaf."""
+    if isinstance(leaf, Term):
+        parts = [_described(each) for each in (leaf.function, leaf.with_blocks)]
+        return None if None in parts else repr(parts)
+    if isinstance(leaf, FunctionType):  # the key holds the source of the package, so the line determines the function
+        ours = leaf.__module__.startswith("jaxfit.") and leaf.__closure__ is None
+        return f"{leaf.__module__} {leaf.__qualname__} {leaf.__code__.co_firstlineno}" if ours else None
+    return repr(leaf) if isinstance(leaf, str | int | float | Blur | None) else None
+
+
+@functools.cache
+def _source() -> str:
+    """Return the checksum of the source of the package and of the versions of the libraries."""
+    checksum = CHECKSUM(repr([importlib.metadata.version(name) for name in LIBRARIES]).encode())
+    for path in sorted(PACKAGE.rglob("*.py")):
+        checksum.update(path.read_bytes())
+    return checksum.hexdigest()
