@@ -6,11 +6,13 @@
 import argparse
 import dataclasses
 import importlib.util
+import itertools
 import re
 import sys
 import tomllib
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 import yaml
@@ -28,6 +30,8 @@ PAGES = sorted(DOCUMENTS.rglob("*.md"))
 RESULTS = sorted((DOCUMENTS / "results").glob("*.md"))
 MOST_LINES = 400
 MEASURED = re.compile(r"^\*Measured with (\d+\.\d+\.\d+):\*")
+HISTORY = re.compile("cannot be repeated|no longer shipped|by an earlier|with an earlier|an earlier program")
+"""Words of a line of `MEASURED` whose tables show an earlier state on purpose."""
 FENCE = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
 
 
@@ -184,25 +188,85 @@ def test_the_site_needs_no_network():
     assert all((DOCUMENTS / script).exists() for script in plain["extra"]["polyfills"])
 
 
-def tables(path):
-    """Return heading, first row and version (or None) of every table of a page of results."""
-    heading, version, lines = "", None, FENCE.sub("", path.read_text(encoding="utf-8")).splitlines()
-    for line, following in zip(lines, [*lines[1:], ""], strict=True):
+class Measured(NamedTuple):
+    """A table of a page of results."""
+
+    heading: str
+    first_row: str
+    version: tuple[int, ...] | None
+    """None without a line of `MEASURED`."""
+    history: bool
+
+
+def tables(text):
+    """Return every table of a page of results."""
+    heading, version, history = "", None, False
+    lines = FENCE.sub("", text).splitlines()
+    for i, line in enumerate(lines):
         if line.startswith("#"):
             level = len(line) - len(line.lstrip("#"))
-            heading, version = line, version if level > 2 else None
+            heading, version, history = line, version if level > 2 else None, history and level > 2
         elif match := MEASURED.match(line):
-            version = match[1]
-        elif line.startswith("|") and following.startswith("| --"):
-            yield heading, line, version
+            version = tuple(map(int, match[1].split(".")))
+            history = bool(HISTORY.search(" ".join(itertools.takewhile(str.strip, lines[i:]))))
+        elif line.startswith("|") and lines[i + 1 : i + 2] and lines[i + 1].startswith("| --"):
+            yield Measured(heading, line, version, history)
+
+
+def is_stale(table, present):
+    """Return whether a table was measured more than one minor release ago."""
+    return not table.history and (table.version[0], table.version[1] + 1) < present[:2]
 
 
 @pytest.mark.parametrize("path", RESULTS, ids=lambda path: path.stem)
-def test_every_table_of_results_says_its_version(path):
+def test_every_table_of_results_says_its_version_and_none_is_stale(path):
     present = tuple(map(int, own_version().split(".")))
-    for heading, row, version in tables(path):
-        assert version, f"{path.name}, {heading}: add `*Measured with VERSION:* command` before {row}"
-        assert tuple(map(int, version.split("."))) <= present
+    for table in tables(path.read_text(encoding="utf-8")):
+        where = f"{path.name}, {table.heading}, {table.first_row}"
+        assert table.version, f"{where}: add `*Measured with VERSION:* command`"
+        assert table.version <= present, where
+        assert not is_stale(table, present), f"{where}: measure again by its command, or say why it cannot be repeated"
+
+
+def test_stale_tables_are_found():
+    text = """# Page
+
+*Measured with 0.1.0:* `command`.
+
+| a |
+| -- |
+
+## Old
+
+*Measured with 0.1.0:* `command` of a model
+that is no longer shipped.
+
+Text:
+
+| b |
+| -- |
+
+### Older
+
+| c |
+| -- |
+
+## None
+
+```
+| no table |
+| -- |
+```
+
+| d |
+| -- |
+"""
+    a, b, c, d = tables(text)
+    assert (a.version, a.history, b.history, c.history, d.version) == ((0, 1, 0), False, True, True, None)
+    assert [c.heading, d.first_row] == ["### Older", "| d |"]
+    assert [is_stale(a, (0, minor, 0)) for minor in (1, 2, 3)] == [False, False, True]
+    assert is_stale(a, (1, 0, 0))
+    assert not is_stale(b, (0, 3, 0))
 
 
 def own_version():
@@ -212,6 +276,6 @@ def own_version():
 
 if __name__ == "__main__":
     for page in RESULTS:
-        for where, first, measured in tables(page):
-            if measured != own_version():
-                sys.stdout.write(f"{page.name}, {where}: {measured}: {first}\n")
+        for table in tables(page.read_text(encoding="utf-8")):
+            if table.version != tuple(map(int, own_version().split("."))):
+                sys.stdout.write(f"{page.name}, {table.heading}: {table.version}: {table.first_row}\n")

@@ -33,6 +33,7 @@ LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "optax")
 """The libraries whose code becomes part of a trace."""
 SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_threefry_partitionable")
 """The settings of JAX that decide a trace."""
+FOLDER = "jax_compilation_cache_dir"
 CHECKSUM = hashlib.sha256
 
 
@@ -70,7 +71,7 @@ class StoredProgram:
 
     def _load(self, key: str, arguments: Any, others: Any) -> Callable[..., list]:
         """Return the stored program as a compiled function of two lists of arrays; store it first where it is not."""
-        path = Path(jax.config.jax_compilation_cache_dir) / "traced" / key
+        path = Path(getattr(jax.config, FOLDER)) / "traced" / key
         program = _read(path)
         if program is None:
             leaves = [jax.tree.leaves(part) for part in arguments]
@@ -103,7 +104,7 @@ def _read(path: Path) -> jax.export.Exported | None:
 
 def _key(function: Callable, arguments: Any, others: Any) -> str | None:
     """Return the name of the file of a program; None if its trace is not stored."""
-    folder = jax.config.jax_compilation_cache_dir
+    folder = getattr(jax.config, FOLDER)
     if not folder or "://" in folder or jax.default_backend() != "cpu":
         return None
     described = [_described(leaf) for leaf in (function, *jax.tree.leaves(others))]

@@ -93,7 +93,7 @@ def fold_bird(bird: Bird) -> Rig:
     basis = np.asarray(bird.shape_basis, np.float64)
     homogeneous = np.concatenate([np.asarray(bird.vertices, np.float64), np.ones((len(weights), 1))], axis=1)
 
-    def put(values, dtype=np.float32):  # unlike jnp.asarray, this compiles no program for each shape
+    def put(values, dtype: type = np.float32):  # unlike jnp.asarray, this compiles no program for each shape
         return jax.device_put(np.asarray(values, dtype))
 
     def on_keypoints(points):  # Σ_v keypoint_weights · skin_weights · point
