@@ -5,8 +5,8 @@ BIN := $(VENV)/bin
 EXTRAS ?= dev
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 # The tests compile thousands of small programs, which takes longer than running them. So most tests do not optimise their
-# programs. The fixture `optimised` makes exceptions, with the flags in `make test`, and as for users in the extended tests
-# of fits. The last step of .ci/run compiles as for users, too.
+# programs; the fixture `optimised` makes exceptions. The test of the first hour, and the last step of .ci/run, compile as
+# for users.
 UNOPTIMISED := JAX_DISABLE_MOST_OPTIMIZATIONS=1
 QUICK_COMPILATION := --xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false
 export JAXFIT_REFERENCE
@@ -47,7 +47,7 @@ test: install
 	$(UNOPTIMISED) XLA_FLAGS="$$XLA_FLAGS $(QUICK_COMPILATION)" $(PYTEST)
 
 extended: install docs
-	$(UNOPTIMISED) $(PYTEST) -m extended
+	$(UNOPTIMISED) XLA_FLAGS="$$XLA_FLAGS $(QUICK_COMPILATION)" $(PYTEST) -m extended
 	$(BIN)/python tests/support/portable.py
 
 # The theme prints a notice about its own future otherwise.

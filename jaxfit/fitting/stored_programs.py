@@ -31,7 +31,7 @@ from jaxfit.raster.silhouette_reference import Blur
 PACKAGE = Path(__file__).resolve().parents[1]
 LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "optax")
 """The libraries whose code becomes part of a trace."""
-SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion", "jax_threefry_partitionable")
+SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion")
 """The settings of JAX that decide a trace."""
 FOLDER = "jax_compilation_cache_dir"
 CHECKSUM = hashlib.sha256

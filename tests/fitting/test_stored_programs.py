@@ -13,12 +13,8 @@ import jaxfit
 from jaxfit.fitting import stored_programs
 from jaxfit.fitting.solve import advance, begin
 from jaxfit.fitting.stored_programs import StoredProgram
+from jaxfit.objective import registry
 from jaxfit.objective.residuals import Residuals
-
-
-@jaxfit.term
-def term_of_a_user(window) -> Residuals:
-    return Residuals(window.pose.body_pose)
 
 
 @pytest.fixture
@@ -146,7 +142,12 @@ def test_a_damaged_file_is_replaced(folder, traced, damage):
     assert stored_programs._read(file) is not None
 
 
-def test_terms_of_users_are_not_stored(folder, traced):
+def test_terms_of_users_are_not_stored(folder, traced, monkeypatch):
+    def term_of_a_user(window) -> Residuals:
+        return Residuals(window.pose.body_pose)
+
+    monkeypatch.setattr(registry, "_terms", dict(registry._terms))
+    jaxfit.term(term_of_a_user)
     stage = dataclasses.replace(FIRST, terms=(*FIRST.terms, "term_of_a_user"))
     settings = dataclasses.replace(CONFIG, terms={**CONFIG.terms, "term_of_a_user": 1.0})
     state, *_ = take_steps(*arguments(stage, config=settings))
