@@ -1,4 +1,4 @@
-"""Traced programs in JAX's cache folder, so that the next process does not trace the same Python code again.
+"""Traced programs in JAX's cache folder, so that later processes do not trace them again.
 
 JAX stores compiled programs under keys that it computes from the traced programs. So every process traces the objective
 of every stage, which takes seconds, before it finds the compiled program. Here the traced program (StableHLO by
