@@ -156,7 +156,7 @@ class TruthOfTheScene:
 @pytest.mark.extended
 def test_the_demo_writes_the_files_that_it_names(tmp_path, monkeypatch, capsys):
     (tmp_path / "quick.yaml").write_text(
-        "base: reconstruct\ntrack: {min_track_frames: 2}\nfit:\n  base: paper\n  stages:\n"
+        "base: reconstruct\ntrack: {min_track_frames: 2}\nfit:\n  base: paper\n  window: 5\n  stages:\n"
         "    - {name: only, steps: 200, terms: [keypoints, pose_prior], step_scale: {transl: [1, 1, 0]}}\n"
     )
 

@@ -185,7 +185,8 @@ def bench_solvers(
         observations: the birds of the fit.
         bird: the model.
         stage_name: `keypoints` or `mask`.
-        limit: largest number of steps of a solver. None: the number in `SCHEDULES`.
+        limit: largest number of steps of a solver, also of Adam before the mask stage. None: the number in
+            `SCHEDULES`.
         repeats: number of runs of each solver.
         progress: shows the progress of all runs.
 
@@ -210,7 +211,8 @@ def bench_solvers(
 
     program, problems = problems_of(config.stages[0], jax.tree.map(lambda x: x[:, 0], initial_pose))
     if stage_name == "mask":
-        state, _, _ = advance((program, problems, jnp.int32(config.stages[0].steps)), begin(program, problems, None))
+        before = min(config.stages[0].steps, limit or config.stages[0].steps)
+        state, _, _ = advance((program, problems, jnp.int32(before)), begin(program, problems, None))
         program, problems = problems_of(config.stages[1], state.pose)
     result: dict[str, Any] = {"stage": stage_name, "birds": len(np.unique(windows.track)), "windows": count}
     step_counts = {name: min(steps, limit or steps) for name, (_, steps, _) in schedules.items()}
