@@ -32,6 +32,8 @@ class Finding(NamedTuple):
     state: str
     remedy: str = ""
     """What to do; empty where nothing is missing."""
+    optional: bool = False
+    """Whether only some commands need this part."""
 
 
 def doctor(_options: argparse.Namespace) -> None:
@@ -41,11 +43,17 @@ def doctor(_options: argparse.Namespace) -> None:
     for column in ("part", "state", "remedy"):
         table.add_column(column, overflow="fold")
     for finding in findings:
-        table.add_row(*finding)
+        table.add_row(finding.part, finding.state, finding.remedy)
     show(table)
-    missing = sum(bool(finding.remedy) for finding in findings)
-    text = "the last column says what to do; packages are needed only for the commands that it names"
-    show(f"{counted(missing, 'part')} missing or in need of repair: {text}" if missing else "nothing is missing")
+    missing = [finding for finding in findings if finding.remedy]
+    faults, packages = (sum(finding.optional == optional for finding in missing) for optional in (False, True))
+    if faults:
+        show(f"{counted(faults, 'part')} missing or in need of repair: the last column says what to do")
+    else:
+        show("everything that jaxfit requires works")
+    if packages:
+        are = "optional package is" if packages == 1 else "optional packages are"
+        show(f"{packages} {are} not installed, or too old: only the commands in the last column need them")
 
 
 def _checked(check: Callable[[], Iterator[Finding]]) -> list[Finding]:
@@ -163,7 +171,7 @@ def _optional_packages() -> Iterator[Finding]:
         if problem:
             state = "missing" if "lacks" in problem else f"too old: version {metadata.version(name)}"
             remedy = f"for {package.use}: {install_command(package.extra, upgrade=True)}"
-            yield Finding(name, state, remedy)
+            yield Finding(name, state, remedy, optional=True)
         else:
             yield Finding(name, f"{metadata.version(name)}, for {package.use}")
 

@@ -233,7 +233,7 @@ def evaluate(options: argparse.Namespace) -> None:
         matched = {"matched_by": matching.by, "follows": matching.follows}
         print(json_text(result.to_dict() | matched))  # noqa: T201
         return
-    for table in evaluation_tables(result):
+    for table in evaluation_tables(result, matching.follows if matching.by == "overlap" else None):
         show(table)
     for table in breakdown_tables(result, options.by) if options.by else []:
         show(table)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -84,16 +84,24 @@ def _calibration_cells(row: CalibrationRow) -> list[str]:
     return [str(row.count), *inside, f"{row.sd:.3g}", f"{row.error:.3g}", f"{row.nll:.2f}", f"{row.nll_constant:.2f}"]
 
 
-def evaluation_tables(result: Evaluation) -> list[Table]:
-    """Return the table of metrics in 2D, and the table of metrics in 3D if there are any; one row per track."""
+def evaluation_tables(result: Evaluation, follows: Mapping[int, int] | None = None) -> list[Table]:
+    """Return the table of metrics in 2D, and the table of metrics in 3D if there are any; one row per track.
+
+    Args:
+        result: the metrics, by the ids of the truth.
+        follows: track of the result → bird of the truth, where they have different ids.
+    """
     from jaxfit.evaluation.evaluate import COLUMNS
 
     def frames(row: dict[str, float]) -> str:
         return f"{row['frames']:.0f}"
 
-    tables = [right_aligned("track", "frames", *COLUMNS)]
-    for track, row in result.tracks.items():
-        tables[0].add_row(str(track), frames(row), *_cells_2d(row, COLUMNS))
+    first = "track → bird" if follows else "track"
+    labels = {bird: f"{track} → {bird}" for track, bird in sorted((follows or {}).items()) if bird in result.tracks}
+    rows = {labels.get(bird, str(bird)): result.tracks[bird] for bird in {**labels, **result.tracks}}
+    tables = [right_aligned(first, "frames", *COLUMNS)]
+    for track, row in rows.items():
+        tables[0].add_row(track, frames(row), *_cells_2d(row, COLUMNS))
     tables[0].add_section()
     tables[0].add_row("all", str(result.frames), *_cells_2d(result.overall, COLUMNS))
     for name, bounds in _bounds(result):
@@ -104,9 +112,9 @@ def evaluation_tables(result: Evaluation) -> list[Table]:
         f"keypoint metrics use all annotated keypoints, also hidden keypoints; {_INTERVAL}"
     )
     if result.points_3d:
-        table_3d = right_aligned("track", *_COLUMNS_3D.values())
-        for track, row in result.tracks.items():
-            table_3d.add_row(str(track), *_cells_3d(row))
+        table_3d = right_aligned(first, *_COLUMNS_3D.values())
+        for track, row in rows.items():
+            table_3d.add_row(track, *_cells_3d(row))
         table_3d.add_section()
         table_3d.add_row("all", *_cells_3d(result.overall))
         for name, bounds in _bounds(result):

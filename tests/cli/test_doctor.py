@@ -35,3 +35,18 @@ def test_a_broken_library_is_a_finding():
         yield
 
     assert doctor._checked(_broken_part)[0].state == "fails: OSError: libav.so: cannot open"
+
+
+def test_optional_packages_are_no_faults(capsys, monkeypatch):
+    packages = [doctor.Finding("pynwb", "missing", "install it", optional=True)]
+    monkeypatch.setattr(doctor, "_CHECKS", (lambda: iter([doctor.Finding("kernels", "avx2"), *packages]),))
+    assert main(["doctor"]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [
+        "everything that jaxfit requires works",
+        "1 optional package is not installed, or too old: only the commands in the last column need them",
+    ]
+    monkeypatch.setattr(doctor, "_CHECKS", (lambda: iter([doctor.Finding("kernels", "none", "compile them")]),))
+    assert main(["doctor"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == (
+        "1 part missing or in need of repair: the last column says what to do"
+    )

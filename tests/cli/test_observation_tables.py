@@ -1,12 +1,16 @@
 """`jaxfit evaluate` of observations, and its line about matched tracks."""
 
 import json
+from types import SimpleNamespace
+from typing import Any
 
 from support.rectangles import birds, steady
 
 from jaxfit.cli import main as cli
 from jaxfit.cli.observations import matching_line
+from jaxfit.cli.tables import evaluation_tables
 from jaxfit.data.formats.coco import write_coco
+from jaxfit.evaluation.evaluate import COLUMNS
 from jaxfit.evaluation.truth import Matching
 
 LEFT, RIGHT = (0, 0, 30, 20), (60, 0, 30, 20)
@@ -56,3 +60,21 @@ def test_the_line_of_matched_tracks():
     line = matching_line(Matching("overlap", {3: 1, 8: 2}, [4, 5], [6]))
     assert "3 → 1, 8 → 2; tracks that follow no bird: 4, 5; birds that no track follows: 6" in line
     assert matching_line(Matching("overlap", {}, [], [])).endswith(": none")
+
+
+def test_rows_of_matched_tracks_have_both_numbers_in_the_order_of_the_tracks():
+    metrics = dict.fromkeys((*COLUMNS, "frames"), 1.0)
+    result: Any = SimpleNamespace(
+        tracks={bird: metrics for bird in (1, 2, 7)},
+        overall=metrics,
+        frames=3,
+        points_3d="",
+        sums=SimpleNamespace(birds=()),
+    )
+    for follows, title, labels in (
+        ({8: 1, 3: 2, 4: 6}, "track → bird", ["3 → 2", "8 → 1", "7", "all"]),
+        (None, "track", ["1", "2", "7", "all"]),
+    ):
+        (table,) = evaluation_tables(result, follows)
+        assert table.columns[0].header == title
+        assert list(table.columns[0].cells) == labels

@@ -376,7 +376,7 @@ def _export(report: Report, result: str) -> list[Step]:
     """Return the step of the export; poses of low trust are no data for statistics."""
     if not report.poses or report.trust == "low":
         return []
-    command = f"jaxfit export {result} --to csv --out birds.csv"
+    command = f"jaxfit export {result} --to csv --out positions.csv"
     return [Step("Export positions and angles for your statistics.", command)]
 
 

@@ -277,7 +277,7 @@ def _warnings(warned: Sequence[Warned]) -> Html:
     for each in warned:
         listed = element("ul", *(element("li", text) for text in each.details)) if each.details else None
         if len(each.details) > 3:
-            listed = element("details", element("summary", f"Show {len(each.details)}"), listed)
+            listed = element("details", element("summary", f"Show all {len(each.details)} lines"), listed)
         items.append(element("li", element("b", each.title), element("p", each.text), listed))
     return element("ul", *items, class_="warnings")
 
