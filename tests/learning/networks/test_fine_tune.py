@@ -333,7 +333,11 @@ def test_pictures_are_read_before_scenes_are_filmed(tmp_path, monkeypatch, caplo
 def test_command_after_a_kill(tmp_path):
     """A killed training continues, and the result is that of an uninterrupted training."""
     labels = write_labels(tmp_path / "labels", coco({t: [bird(40 + t // 20, 30)] for t in TIMES}), list(TIMES))
-    few = "from jaxfit.learning.networks import familiarity; familiarity.MAX_PICTURES = 20"  # this network is not used
+    # this network is not used, so it sees few pictures
+    few = (
+        "from jaxfit.learning.networks import familiarity, fine_tune; familiarity.MAX_PICTURES = 20; "
+        "usual = fine_tune.default_schedule; fine_tune.default_schedule = lambda *x: usual(*x)._replace(batch=1)"
+    )
     run = f"{few}; from jaxfit.cli.main import run; run()"
     options = ["train", "segmenter", "--labels", str(labels), "--scenes", "0", "--steps", "10"]
     command = [sys.executable, "-c", run, *options]
