@@ -33,6 +33,8 @@ LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "optax")
 """The libraries whose code becomes part of a trace."""
 SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion")
 """The settings of JAX that decide a trace."""
+MOST_LOADED = 32
+"""Most compiled programs that one function keeps in a process."""
 FOLDER = "jax_compilation_cache_dir"
 CHECKSUM = hashlib.sha256
 
@@ -62,33 +64,37 @@ class StoredProgram:
         key = _key(self._function, arguments, others)
         if key is None:
             return self._compiled(fixed, state)
+        leaves = [jax.tree.leaves(part) for part in arguments]
         if key not in self._loaded:
-            self._loaded[key] = self._load(key, arguments, others)
-        # results of an exported program are bound to a device; unbound arguments would be compiled once more
-        bound = jax.device_put(arguments, jax.local_devices()[0])
-        result = self._loaded[key](*map(jax.tree.leaves, bound))
+            if len(self._loaded) == MOST_LOADED:
+                self._loaded.pop(next(iter(self._loaded)))
+            program = self._traced(key, arguments, others)
+            call = functools.update_wrapper(lambda *leaves: program.call(*leaves), self._function)
+            # a jitted function would be compiled once more for its own results, which are bound to a device
+            self._loaded[key] = jax.jit(call, donate_argnums=1).lower(*leaves).compile()
+        result = self._loaded[key](*leaves)
         return jax.tree.unflatten(jax.tree.structure(self._structure(fixed, state)), result)
 
-    def _load(self, key: str, arguments: Any, others: Any) -> Callable[..., list]:
-        """Return the stored program as a compiled function of two lists of arrays; store it first where it is not."""
+    def _traced(self, key: str, arguments: Any, others: Any) -> jax.export.Exported:
+        """Return the stored program, a function of two lists of arrays. Trace and store it first where it is not."""
         path = Path(getattr(jax.config, FOLDER)) / "traced" / key
-        program = _read(path)
-        if program is None:
-            leaves = [jax.tree.leaves(part) for part in arguments]
-            structures = [jax.tree.structure(part) for part in arguments]
+        stored = _read(path)
+        if stored is not None:
+            return stored
+        structures = [jax.tree.structure(part) for part in arguments]
 
-            def of_leaves(*leaves: list) -> list:
-                arrays = tuple(map(jax.tree.unflatten, structures, leaves))
-                return jax.tree.leaves(self._function(*eqx.combine(arrays, others)))
+        def of_leaves(*leaves: list) -> list:
+            arrays = tuple(map(jax.tree.unflatten, structures, leaves))
+            return jax.tree.leaves(self._function(*eqx.combine(arrays, others)))
 
-            allowed = [jax.export.DisabledSafetyCheck.custom_call(name) for name in ffi_targets()]
-            program = jax.export.export(jax.jit(of_leaves), disabled_checks=allowed)(*leaves)
-            content = bytes(program.serialize())
-            with suppress(InputError, OSError):  # a full or protected disk: the next process traces again
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_whole(path, CHECKSUM(content).digest() + content)
-        call = functools.update_wrapper(lambda *leaves: program.call(*leaves), self._function)
-        return jax.jit(call, donate_argnums=1)
+        allowed = [jax.export.DisabledSafetyCheck.custom_call(name) for name in ffi_targets()]
+        export = jax.export.export(jax.jit(of_leaves), disabled_checks=allowed)
+        program = export(*(jax.tree.leaves(part) for part in arguments))
+        content = bytes(program.serialize())
+        with suppress(InputError, OSError):  # a full or protected disk: the next process traces again
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, CHECKSUM(content).digest() + content)
+        return program
 
 
 def _read(path: Path) -> jax.export.Exported | None:
@@ -113,6 +119,7 @@ def _key(function: Callable, arguments: Any, others: Any) -> str | None:
     arrays = [(x.shape, x.dtype.name, x.weak_type) for x in jax.tree.leaves(arguments)]
     structures = jax.tree.structure(arguments), jax.tree.structure(others)
     settings = [getattr(jax.config, name) for name in SETTINGS]
+    settings.append(jax.config.read("jax_disable_most_optimizations"))  # it decides the compilation
     whole = _source(), settings, ffi_targets(), described, arrays, structures
     return CHECKSUM(repr(whole).encode()).hexdigest()
 

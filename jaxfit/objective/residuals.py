@@ -168,7 +168,7 @@ def _from_jax(window: PosedWindow, values_at: Callable[[Rows], list], factors: l
     def product(d: Rows) -> Rows:
         return backward([factor * change for factor, change in zip(factors, forward(d), strict=True)])[0]
 
-    def probe(signs: list[Int8[Array, "..."]]) -> Rows:
+    def probe(signs: Sequence[Int8[Array | np.ndarray, "..."]]) -> Rows:
         return backward([jnp.sqrt(factor) * sign for factor, sign in zip(factors, signs, strict=True)])[0] ** 2
 
     random = np.random.default_rng(0)  # not of JAX, whose generator would be compiled into the program

@@ -13,6 +13,7 @@ from jaxfit.config.fit import load_config
 from jaxfit.fitting import batch, tasks
 from jaxfit.fitting import fit as fit_module
 from jaxfit.fitting.fit import fit, fit_runs
+from jaxfit.fitting.solve import advance
 from jaxfit.model.camera import CropCamera
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
@@ -53,8 +54,8 @@ def assert_equal(a, b):
 
 
 @pytest.mark.extended
-def test_a_sweep_compiles_once(observed, caplog):
-    jax.clear_caches()  # other tests fit batches of these shapes
+def test_a_sweep_compiles_once(observed, caplog, monkeypatch):
+    monkeypatch.setattr(advance, "_loaded", {})  # other tests fit batches of these shapes
     with caplog.at_level(logging.WARNING), jax.log_compiles():
         values = [(1, 2), (5, 6), (7, 8)]
         for a, b in values:
