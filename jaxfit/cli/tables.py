@@ -89,17 +89,16 @@ def evaluation_tables(result: Evaluation, follows: Mapping[int, int] | None = No
 
     Args:
         result: the metrics, by the ids of the truth.
-        follows: track of the result → bird of the truth, where they have different ids.
+        follows: track of the result → bird of the truth, where they have different ids; rows then name both.
     """
     from jaxfit.evaluation.evaluate import COLUMNS
 
     def frames(row: dict[str, float]) -> str:
         return f"{row['frames']:.0f}"
 
-    first = "track → bird" if follows else "track"
     labels = {bird: f"{track} → {bird}" for track, bird in sorted((follows or {}).items()) if bird in result.tracks}
     rows = {labels.get(bird, str(bird)): result.tracks[bird] for bird in {**labels, **result.tracks}}
-    tables = [right_aligned(first, "frames", *COLUMNS)]
+    tables = [right_aligned("track", "frames", *COLUMNS)]
     for track, row in rows.items():
         tables[0].add_row(track, frames(row), *_cells_2d(row, COLUMNS))
     tables[0].add_section()
@@ -112,7 +111,7 @@ def evaluation_tables(result: Evaluation, follows: Mapping[int, int] | None = No
         f"keypoint metrics use all annotated keypoints, also hidden keypoints; {_INTERVAL}"
     )
     if result.points_3d:
-        table_3d = right_aligned(first, *_COLUMNS_3D.values())
+        table_3d = right_aligned("track", *_COLUMNS_3D.values())
         for track, row in rows.items():
             table_3d.add_row(track, *_cells_3d(row))
         table_3d.add_section()
