@@ -72,10 +72,8 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     export_result(result_folder, "glb", folder / ANIMATION, overwrite=True, progress=terminal)
     metrics = {"detection": observed.detection, "tracking": observed.tracking, **result.overall}
     write_whole(folder / METRICS, json_text(metrics).encode())
-    compared, numbers = (
-        [*observation_tables(observed), *evaluation_tables(result, matching.follows)],
-        matching_line(matching),
-    )
+    compared = [*observation_tables(observed), *evaluation_tables(result, matching.follows)]
+    numbers = matching_line(matching)
     report = done.solution, bird, observations, done.summary, config_to_yaml(config), result_folder
     measured = [_measured(table) for table in compared]
     measured[-1] = measured[-1]._replace(note=f"{measured[-1].note}; {numbers}")

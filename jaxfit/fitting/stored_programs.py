@@ -4,7 +4,7 @@ JAX stores compiled programs under keys that it computes from the traced program
 of every stage, which takes seconds, before it finds the compiled program. Here the traced program (StableHLO by
 `jax.export`) is stored, too. Its key holds everything that decides the trace: the source of the package, the versions
 of the libraries that trace it, and the arguments except for the numbers in their arrays. Programs with terms from
-outside of the package are not stored, because nobody knows what else decides their trace.
+outside of the package are not stored, because their traces may depend on other files.
 """
 
 from __future__ import annotations
@@ -68,28 +68,26 @@ class StoredProgram:
         if key not in self._loaded:
             if len(self._loaded) == MOST_LOADED:
                 self._loaded.pop(next(iter(self._loaded)))
-            program = self._traced(key, arguments, others)
+            program = self._traced(key, leaves, [*map(jax.tree.structure, arguments)], others)
             call = functools.update_wrapper(lambda *leaves: program.call(*leaves), self._function)
             # a jitted function would be compiled once more for its own results, which are bound to a device
             self._loaded[key] = jax.jit(call, donate_argnums=1).lower(*leaves).compile()
         result = self._loaded[key](*leaves)
         return jax.tree.unflatten(jax.tree.structure(self._structure(fixed, state)), result)
 
-    def _traced(self, key: str, arguments: Any, others: Any) -> jax.export.Exported:
+    def _traced(self, key: str, leaves: list, structures: list, others: Any) -> jax.export.Exported:
         """Return the stored program, a function of two lists of arrays. Trace and store it first where it is not."""
         path = Path(getattr(jax.config, FOLDER)) / "traced" / key
         stored = _read(path)
         if stored is not None:
             return stored
-        structures = [jax.tree.structure(part) for part in arguments]
 
         def of_leaves(*leaves: list) -> list:
             arrays = tuple(map(jax.tree.unflatten, structures, leaves))
             return jax.tree.leaves(self._function(*eqx.combine(arrays, others)))
 
         allowed = [jax.export.DisabledSafetyCheck.custom_call(name) for name in ffi_targets()]
-        export = jax.export.export(jax.jit(of_leaves), disabled_checks=allowed)
-        program = export(*(jax.tree.leaves(part) for part in arguments))
+        program = jax.export.export(jax.jit(of_leaves), disabled_checks=allowed)(*leaves)
         content = bytes(program.serialize())
         with suppress(InputError, OSError):  # a full or protected disk: the next process traces again
             path.parent.mkdir(parents=True, exist_ok=True)
