@@ -110,8 +110,10 @@ def begin(program: Program, problems: Problem, carried: Any) -> StageState:
         return program.solver.init(program, problem, carried)
 
     solver = jax.vmap(one)(problems, carried)
-    # `advance` reuses the memory of its state, so the state must not share memory with the anchor
-    return StageState(*jax.tree.map(jnp.copy, (problems.anchor, solver)), started=jnp.bool_(False))
+    # `advance` reuses the memory of its state, so the state must not share memory with the anchor. Its results are not
+    # weakly typed. A weakly typed first state, as of Adam's counter, would compile the same program once more.
+    copies = jax.tree.map(lambda x: jnp.array(x, x.dtype), (problems.anchor, solver))
+    return StageState(*copies, started=jnp.bool_(False))
 
 
 @functools.partial(StoredProgram, structure=lambda fixed, state: (state, 0, 0))
