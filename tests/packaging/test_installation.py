@@ -175,7 +175,7 @@ def test_for_another_processor_the_package_installs_without_kernels(build_python
     [("int broken(", "error: expected"), ('#include "no_such_header.h"', "no_such_header.h: No such file")],
 )
 def test_a_compile_error_fails_the_installation(build_python, source, line, message):
-    file = source / "jaxfit" / "raster" / "cpp" / "instruction_set.cc"
+    file = source / "jaxfit" / "raster" / "cpp" / "mesh.h"  # in all files, so the first compilation fails
     file.write_text(file.read_text() + f"\n{line}\n")
     _, output = build_wheel(build_python, source, fails=True)
     assert message in output

@@ -92,9 +92,10 @@ class KeypointMaps(nn.Module):
     def forward(self, pictures: Tensor) -> Tensor:
         """Compute maps (B, K, h, w) within 0 and 1 from pictures (B, 3, H, W)."""
         logits = self.network(pictures)["logits"]
-        B, K, h, w = logits.shape
-        flat = functional.pad(logits.reshape(B, K, h * w), (0, 1))  # the last class is `absent`
-        maps = torch.softmax(flat, dim=-1)[..., :-1].reshape(B, K, h, w)
+        # a softmax over the cells and the class `absent`, whose logit is 0
+        highest = logits.amax((2, 3), keepdim=True).clamp(min=0)
+        share = torch.exp(logits - highest)
+        maps = share / (share.sum((2, 3), keepdim=True) + torch.exp(-highest))
         return functional.conv2d(maps, self.window, padding=4, groups=self.keypoints)
 
 

@@ -50,14 +50,14 @@ def export_onnx(
     """Write a network to an ONNX file, with weights in 16 bits: the file is half as large, with equivalent results.
 
     Args:
-        network: a module in evaluation mode that maps one tensor to tensors.
+        network: a module in evaluation mode that maps one tensor to tensors, without operations that depend on the
+            lengths of the variable axes. The exporter needs five times as long if it has to derive these lengths.
         example: an input.
         variable_axes: axis → name of the input's axes of variable length.
         outputs: names of the outputs, in their order.
         metadata: metadata of the file, which describes input and output.
         path: an `.onnx` file; an existing file is replaced.
     """
-    shapes = {axis: torch.export.Dim.DYNAMIC for axis in variable_axes}
     with _quiet_exporter():
         program = torch.onnx.export(
             network,
@@ -65,7 +65,6 @@ def export_onnx(
             input_names=["pictures"],
             output_names=list(outputs),
             opset_version=OPSET,
-            dynamic_shapes=(shapes,),
             dynamo=True,
             verbose=False,
         )
@@ -74,6 +73,10 @@ def export_onnx(
     _convert_weights(model)
     for axis, name in variable_axes.items():
         model.graph.input[0].type.tensor_type.shape.dim[axis].dim_param = name
+    for output in model.graph.output:
+        output.type.tensor_type.ClearField("shape")  # that of the example
+    del model.graph.value_info[:]
+    model = onnx.shape_inference.infer_shapes(model)
     del model.metadata_props[:]
     for key, value in metadata.items():
         model.metadata_props.add(key=key, value=value)
