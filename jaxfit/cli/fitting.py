@@ -23,6 +23,7 @@ from jaxfit.cli.tables import (
     flag_quality_line,
     right_aligned,
     show,
+    wrong_poses_line,
 )
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import terminal
@@ -233,13 +234,14 @@ def evaluate(options: argparse.Namespace) -> None:
         matched = {"matched_by": matching.by, "follows": matching.follows}
         print(json_text(result.to_dict() | matched))  # noqa: T201
         return
-    for table in evaluation_tables(result, matching.follows if matching.by == "overlap" else None):
+    follows = matching.follows if matching.by == "overlap" else None
+    for table in evaluation_tables(result, follows):
         show(table)
     for table in breakdown_tables(result, options.by) if options.by else []:
         show(table)
     if matching.by == "overlap":
         show(matching_line(matching))
-    if line := flag_quality_line(result):
+    for line in filter(None, (wrong_poses_line(result, follows), flag_quality_line(result))):
         show(line)
     if result.missing:
         show(f"not counted: {counted(result.missing, 'annotated bird')} without a pose in this result")

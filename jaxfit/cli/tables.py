@@ -136,6 +136,20 @@ def flag_quality_line(result: Evaluation) -> str:
     return f"flagged: {subject}, and {counted(flagged - found, 'other pose')}"
 
 
+def wrong_poses_line(result: Evaluation, follows: Mapping[int, int] | None = None) -> str:
+    """Return a line with the worst frame of the five worst tracks, by the ids of the result; empty if no pose is wrong.
+
+    `follows` is as for `evaluation_tables`.
+    """
+    own = {bird: track for track, bird in (follows or {}).items()}
+    poses = [
+        f"track {own.get(bird, bird)} frame {row['frame']:.0f} ({100 * row['error']:.1f} % of the length; "
+        f"{counted(round(row['count']), 'wrong pose')})"
+        for bird, row in result.wrong.items()
+    ]
+    return f"worst frames: {', '.join(poses[:5])}" if poses else ""
+
+
 def breakdown_tables(result: Evaluation, by: Literal["behaviour", "keypoint"]) -> list[Table]:
     """Return tables of metrics with one row per behaviour or per keypoint."""
     from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_KEYPOINT

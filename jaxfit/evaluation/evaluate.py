@@ -64,6 +64,9 @@ class Evaluation:
     """Number of poses with a 3D error that are `wrong` (a joint wrong by more than `WRONG_SHARE` of the body length),
     `flagged` (`unsure` or `contradicted`), and both (`found`). Empty without true poses, or if the result has no
     flags."""
+    wrong: dict[int, dict[str, float]] = field(default_factory=dict)
+    """Track id → the number of its wrong poses (see `flags`) as `count`, and the `frame` and the `error` (share of the
+    body length) of the worst; the worst track first. Tracks without a wrong pose are left out."""
     sums: BirdSums = field(default_factory=lambda: BirdSums((), {}, {}))
     """Sums per bird, from which `paired_ratio` compares results of the same birds."""
 
@@ -95,6 +98,7 @@ class Evaluation:
             behaviours=rows("behaviours"),
             keypoints=rows("keypoints"),
             flags=content.get("flags", {}),
+            wrong={int(track): row for track, row in content.get("wrong", {}).items()},
             sums=BirdSums(
                 tuple(sums["birds"]),
                 {metric: tuple(values) for metric, values in sums["numerators"].items()},
@@ -208,6 +212,7 @@ def evaluate(
         behaviours=_metrics_of_behaviours(behaviour, errors, measured, either),
         keypoints=_metrics_of_keypoints(bird.keypoint_names, errors, keypoints, masks.true_side_px),
         flags={} if spatial is None else _flag_quality(solution, errors["mpjpe/length"]),
+        wrong={} if spatial is None else _wrong_poses(solution, errors["mpjpe/length"]),
         sums=sums,
     )
 
@@ -221,6 +226,18 @@ def _flag_quality(solution: Solution, error: Float[np.ndarray, "N T J"]) -> dict
     wrong = np.nanmax(error[measured], axis=-1) > WRONG_SHARE
     flagged = found[measured] != OK
     return {"wrong": float(wrong.sum()), "flagged": float(flagged.sum()), "found": float((wrong & flagged).sum())}
+
+
+def _wrong_poses(solution: Solution, error: Float[np.ndarray, "N T J"]) -> dict[int, dict[str, float]]:
+    """Return `Evaluation.wrong`; `error` as for `_flag_quality`."""
+    largest = np.where(np.isfinite(error), error, 0).max(-1)
+    rows = {}
+    for n in np.argsort(-largest.max(1), kind="stable").tolist():
+        t = int(largest[n].argmax())
+        if largest[n, t] > WRONG_SHARE:
+            values = (largest[n] > WRONG_SHARE).sum(), solution.frame_index[t], largest[n, t]
+            rows[int(solution.track_id[n])] = dict(zip(("count", "frame", "error"), map(float, values), strict=True))
+    return rows
 
 
 def _metrics_of_behaviours(

@@ -8,7 +8,7 @@ from support.rectangles import birds, steady
 
 from jaxfit.cli import main as cli
 from jaxfit.cli.observations import matching_line
-from jaxfit.cli.tables import evaluation_tables
+from jaxfit.cli.tables import evaluation_tables, wrong_poses_line
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.evaluation.evaluate import COLUMNS
 from jaxfit.evaluation.truth import Matching
@@ -74,3 +74,14 @@ def test_rows_of_matched_tracks_have_both_numbers_in_the_order_of_the_tracks():
     for follows, labels in (({8: 1, 3: 2, 4: 6}, ["3 → 2", "8 → 1", "7", "all"]), (None, ["1", "2", "7", "all"])):
         (table,) = evaluation_tables(result, follows)
         assert list(table.columns[0].cells) == labels
+
+
+def test_the_line_of_the_worst_frames():
+    """The line names the tracks of the result, and the five worst of seven."""
+    rows = {bird: {"count": 2.0 - bird % 2, "frame": 50.0 + bird, "error": 0.5 / bird} for bird in range(1, 8)}
+    result: Any = SimpleNamespace(wrong=rows)
+    line = wrong_poses_line(result, {9: 2})
+    assert line.startswith("worst frames: track 1 frame 51 (50.0 % of the length; 1 wrong pose), track 9 frame 52 (")
+    assert line.endswith("track 5 frame 55 (10.0 % of the length; 1 wrong pose)")
+    result.wrong = {}
+    assert wrong_poses_line(result) == ""

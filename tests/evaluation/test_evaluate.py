@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, sides, solution, truth
 
+from jaxfit.data.flags import WRONG_SHARE
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.projection import PosedBirds
 from jaxfit.evaluation.evaluate import COLUMNS, evaluate
@@ -206,5 +207,11 @@ def test_wrong_poses_are_counted_with_their_flags():
     exact = Truth(truth(), solution())
     result = evaluate(solution(body_pose=body_pose, doubts=doubts), BIRD, exact)
     assert result.flags == {"wrong": 2, "flagged": 2, "found": 1}
-    assert evaluate(solution(body_pose=body_pose), BIRD, exact).flags == {}
+    without_flags = evaluate(solution(body_pose=body_pose), BIRD, exact)
+    assert without_flags.flags == {}
+    (row,) = without_flags.wrong.values()
+    assert without_flags.wrong == result.wrong == {5: {"count": 2, "frame": row["frame"], "error": row["error"]}}
+    assert row["frame"] in (11, 12)
+    assert row["error"] > WRONG_SHARE
+    assert evaluate(solution(), BIRD, exact).wrong == evaluate(solution(body_pose=body_pose), BIRD, truth()).wrong == {}
     assert evaluate(solution(doubts=doubts), BIRD, truth()).flags == {}
