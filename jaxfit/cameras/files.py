@@ -119,7 +119,7 @@ def write_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
 
 def _reader(path: Path) -> Callable[[Path], Parsed]:
     """Return the function that reads a file, from the first bytes of the file and from its name."""
-    with open_file(path, "a file of cameras") as file:
+    with open_file(path, "a file of cameras", "check the path; `jaxfit cameras calibrate` writes cameras") as file:
         start = file.read(4096)
     if not start.strip():
         raise InputError(path, "is empty", _FORMATS)

@@ -17,7 +17,7 @@ from jaxfit.foundation.array_files import load_npz, validate_arrays
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder, write_whole
 from jaxfit.foundation.limits import IMAGE_SIDE_PX
-from jaxfit.foundation.reading import check_folder, json_text
+from jaxfit.foundation.reading import check_folder, check_readable, json_text
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.kinematics import Pose
@@ -34,6 +34,7 @@ STATUSES = ("ok", "partly diverged", "diverged", "no usable frame")
 
 RESULT = "poses.npz"
 """File that marks a result folder."""
+_WRITTEN_BY = "check the path; `jaxfit fit` and `jaxfit reconstruct` write results"
 _CONFIG, _SUMMARY, _MODEL = "config.yaml", "summary.json", "model.npz"
 _LEARNT = "learnt.yaml"
 
@@ -410,8 +411,8 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         InputError: the folder does not exist; a file is missing, damaged or of another version; or the shapes of the
             arrays do not agree.
     """
-    folder = check_folder(folder, "a folder of results")
-    path = folder / RESULT
+    folder = check_folder(folder, "a folder of results", _WRITTEN_BY)
+    path = check_readable(folder / RESULT, "an .npz file", _WRITTEN_BY)
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
     optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | LEDGE).items()}

@@ -78,7 +78,7 @@ def read_truth(
     if not (path / TRUTH).is_file():
         if any(file.suffix.lower() in IMAGE_SUFFIXES for file in path.iterdir()):
             return Truth(mask_observations(path), source=path)
-        remedy = "give a file of annotations, a folder of masks, or the folder of a simulated scene"
+        remedy = "give a file of annotations, a folder of masks, or the folder of a scene that `jaxfit simulate` wrote"
         raise InputError(path, f"is a folder without {TRUTH} and without pictures of masks", remedy)
     if not (path / TRUE_POSES).is_dir():
         remedy = f"give {path / TRUTH} to compare in the image alone"

@@ -19,9 +19,10 @@ import numpy as np
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import JSON_LEVELS, JSON_VALUES
 
+_CHECK_PATH = "check the path"
 # Errors of the operating system for a read: the problem, and the action that the user can take.
 _PROBLEMS = {
-    errno.ENOENT: ("does not exist", "check the path"),
+    errno.ENOENT: ("does not exist", ""),  # the remedy is an argument
     errno.ENOTDIR: ("does not exist: a part of its path is a file", "check the path"),
     errno.ELOOP: ("is a symbolic link that leads back to itself", "check the links of its path"),
     errno.ENAMETOOLONG: ("has a name that is too long for this system", "check the path"),
@@ -30,12 +31,13 @@ _PROBLEMS = {
 }
 
 
-def check_readable(path: str | Path, kind: str = "a file") -> Path:
+def check_readable(path: str | Path, kind: str = "a file", absent: str = _CHECK_PATH) -> Path:
     """Check that a path is a regular file that can be read; call this function before a library opens the path.
 
     Args:
         path: the file.
         kind: the expected kind of file with its article, such as ``an .npz file``, for the message.
+        absent: the remedy where the path does not exist, such as the command that writes the file.
 
     Returns:
         The path.
@@ -44,27 +46,27 @@ def check_readable(path: str | Path, kind: str = "a file") -> Path:
         InputError: the path does not exist, is not a regular file (a folder, a device, a pipe), is a cyclic symbolic
             link, has a name that is too long or that no file can have, or cannot be read.
     """
-    with open_file(path, kind):
+    with open_file(path, kind, absent):
         return Path(path)
 
 
-def check_folder(path: str | Path, kind: str = "a folder") -> Path:
+def check_folder(path: str | Path, kind: str = "a folder", absent: str = _CHECK_PATH) -> Path:
     """Check that a path is a folder; arguments, result and errors as `check_readable`."""
     path = Path(path)
-    with _read_errors(path):
+    with _read_errors(path, absent):
         if not stat.S_ISDIR(path.stat().st_mode):
             raise InputError(path, f"is a file, not {kind}", "check the path")
     return path
 
 
 @contextmanager
-def open_file(path: str | Path, kind: str = "a file") -> Iterator[BinaryIO]:
+def open_file(path: str | Path, kind: str = "a file", absent: str = _CHECK_PATH) -> Iterator[BinaryIO]:
     """Open a regular file for reading bytes, as a context manager; arguments and errors as `check_readable`.
 
     An error of the operating system in the body, such as a damaged disk, is an InputError too.
     """
     path = Path(path)
-    with _read_errors(path):
+    with _read_errors(path, absent):
         _require_file(path, path.stat().st_mode, kind)  # before the open, because devices may react to it
         # without O_NONBLOCK, opening a pipe that replaces the file now would wait for a writer
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
@@ -115,7 +117,7 @@ def _require_file(path: Path, mode: int, kind: str) -> None:
 
 
 @contextmanager
-def _read_errors(path: Path) -> Iterator[None]:
+def _read_errors(path: Path, absent: str) -> Iterator[None]:
     """Convert errors of the operating system in the body to an InputError that names `path`."""
     try:
         valid = b"\0" not in os.fsencode(path)
@@ -128,7 +130,7 @@ def _read_errors(path: Path) -> Iterator[None]:
     except OSError as error:
         unknown = f"cannot be read: {error.strerror or error}", "check the disk or the path"
         problem, remedy = _PROBLEMS.get(error.errno or 0, unknown)
-        raise InputError(path, problem, remedy) from error
+        raise InputError(path, problem, remedy or absent) from error
 
 
 def read_json_file(path: str | Path, most_bytes: int) -> Any:

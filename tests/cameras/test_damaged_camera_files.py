@@ -220,7 +220,7 @@ def test_a_zero_quaternion_and_a_missing_file_of_colmap_are_refused(tmp_path):
 
 
 def test_folders_without_a_clear_file_of_cameras_are_refused(tmp_path):
-    refused(tmp_path / "none", "does not exist")
+    refused(tmp_path / "none", "does not exist .*`jaxfit cameras calibrate` writes cameras")
     refused(tmp_path, "holds no file of cameras")
     (tmp_path / "a.toml").write_text(ANIPOSE)
     (tmp_path / "b.toml").write_text(ANIPOSE)

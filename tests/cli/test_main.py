@@ -296,7 +296,7 @@ cli.run()
 
 def test_unusable_results_of_evaluate(fitted, inputs, tmp_path, capsys):
     truth = str(inputs / "birds.json")
-    rejected(capsys, ["evaluate", str(tmp_path / "absent"), "--truth", truth], "absent")
+    rejected(capsys, ["evaluate", str(tmp_path / "absent"), "--truth", truth], "absent", "`jaxfit fit`")
     rejected(capsys, ["evaluate", str(inputs), "--truth", truth], "poses.npz")
     rejected(capsys, ["evaluate", str(fitted), "--truth", str(tmp_path / "no.json")], "no.json")
     (tmp_path / "masks").mkdir()

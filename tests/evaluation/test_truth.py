@@ -88,10 +88,10 @@ def test_a_fit_is_no_truth(scene):
 def test_folders_without_truth(scene, tmp_path_factory):
     with pytest.raises(InputError, match=r"a folder without truth\.json and without pictures of masks \(give a file"):
         read_truth(tmp_path_factory.mktemp("empty"))
-    with pytest.raises(InputError, match="absent"):
+    with pytest.raises(InputError, match=r"absent: does not exist .*`jaxfit track` and `jaxfit import` write"):
         read_truth(scene / "absent")
     (scene / "truth" / "poses.npz").unlink()
-    with pytest.raises(InputError, match=r"poses\.npz: does not exist"):
+    with pytest.raises(InputError, match=r"poses\.npz: does not exist \(.*`jaxfit fit` and `jaxfit reconstruct` write"):
         read_truth(scene)
     (scene / "truth").rename(scene / "elsewhere")
     with pytest.raises(InputError, match=r"holds no true poses .*give .*truth\.json to compare in the image alone"):

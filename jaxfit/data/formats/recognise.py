@@ -17,6 +17,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import open_file
 
+_WRITTEN_BY = "check the path; `jaxfit track` and `jaxfit import` write observations"
 _FORMATS = (
     "give COCO or Label Studio json, DeepLabCut or Lightning Pose .csv, DeepLabCut .h5, SLEAP .slp or .analysis.h5"
 )
@@ -47,7 +48,7 @@ def read_observations(
             the extra `formats` is needed and not installed.
     """
     path, video = Path(path), None if video is None else Path(video)
-    with open_file(path, "a file of observations") as file:
+    with open_file(path, "a file of observations", _WRITTEN_BY) as file:
         start = file.read(4096)
     if start.startswith(HDF5_SIGNATURE):
         return table_observations(_read_hdf5(path, video), path, video, size_px)
