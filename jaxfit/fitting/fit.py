@@ -263,7 +263,7 @@ def check_observations(observations: Observations, bird: Bird, source: object) -
         InputError: no bird, or other keypoints than the model's.
     """
     if not observations.num_tracks:
-        raise InputError(source, "holds no bird", "use other footage, or another network")
+        raise InputError(source, "holds no bird", "look whether birds are visible; if so, use another network")
     return check_keypoints(observations, bird.keypoint_names, source)
 
 

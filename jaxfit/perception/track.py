@@ -257,7 +257,10 @@ def _no_bird(source: str | Path, config: TrackConfig, frame_count: int, has_own_
     if not has_own_segmenter:
         best = _highest_score(source, config)
         problem += f"; the highest score is {best:.2f}" if best else f"; no score reaches {RETRY_MIN_SCORE}"
-    remedy = "label frames (jaxfit suggest), use another --segmenter or --classes, lower --min-score, or set --tile-px"
+    remedy = (
+        "look whether birds are visible in the film; if so, label frames (jaxfit suggest), use another --segmenter or "
+        "--classes, lower --min-score, or set --tile-px"
+    )
     return InputError(source, problem, remedy)
 
 

@@ -102,7 +102,7 @@ def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
     assert main(command(inputs, "track", out)) == 0
     (message,) = caplog.messages
     assert "no bird was detected in 12 frames" in message
-    assert "label frames (jaxfit suggest)" in message
+    assert "look whether birds are visible in the film; if so, label frames (jaxfit suggest)" in message
     assert "--min-score" in message
     content = json.loads(out.read_text())
     assert (len(content["images"]), content["annotations"]) == (FRAMES, [])
