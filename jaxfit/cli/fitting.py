@@ -241,12 +241,23 @@ def evaluate(options: argparse.Namespace) -> None:
         show(table)
     if matching.by == "overlap":
         show(matching_line(matching))
-    for line in filter(None, (wrong_poses_line(result, follows), flag_quality_line(result))):
+    for line in filter(None, (_missing_space(options), wrong_poses_line(result, follows), flag_quality_line(result))):
         show(line)
     if result.missing:
         show(f"not counted: {counted(result.missing, 'annotated bird')} without a pose in this result")
     if result.unmatched:
         show(f"not counted: {counted(result.unmatched, 'pose')} of tracks or frames that the truth lacks")
+
+
+def _missing_space(options: argparse.Namespace) -> str:
+    """Return why the annotations of a simulated scene give no metrics in space; empty text for other truths."""
+    from jaxfit.data.formats import TRUE_POSES, TRUTH
+
+    if options.truth.name != TRUTH:
+        return ""
+    poses = options.truth.with_name(TRUE_POSES)
+    why = f"the true poses are in {poses}: give --truth {poses.parent}" if poses.is_dir() else f"there is no {poses}"
+    return f"no metrics in space: {why}"
 
 
 def _calibration(options: argparse.Namespace, solution: Solution, truth: Truth) -> None:

@@ -39,6 +39,10 @@ def test_a_scene_evaluated_against_its_own_truth(scene, capsys):
         assert heading in tables
     assert [line.split()[1] for line in tables.splitlines() if " from " in line or " to " in line][:2] == ["from", "to"]
     assert "stand" not in tables
+    assert "no metrics in space" not in tables
+    assert main(["evaluate", str(scene / "truth"), "--truth", str(scene / "truth.json")]) == 0
+    line = f"no metrics in space: the true poses are in {scene / 'truth'}: give --truth {scene}\n"
+    assert line in capsys.readouterr().out
     assert result["intervals"]["me_p"] == [0, 0]
     assert sum(row["frames"] for row in result["behaviours"].values()) == result["frames"]
 
