@@ -55,10 +55,10 @@ class EscapedTable(Table):
 
 
 def right_aligned(*columns: str, **options: Any) -> Table:
-    """Return an empty table with right-aligned columns."""
+    """Return an empty table with right-aligned columns; in a narrow output, long cells take several lines."""
     table = EscapedTable(**options)
     for column in columns:
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", overflow="fold")
     return table
 
 
@@ -67,9 +67,8 @@ def calibration_tables(result: Calibration) -> list[Table]:
     tables = []
     for name, group in result.groups.items():
         coverage = [f"{100 * float(level):.0f} %" for level in group.overall.coverage]
-        table = right_aligned(
-            name, "errors", *coverage, "sd", "error", "NLL", "constant", title=f"{name} ({group.unit})"
-        )
+        columns = ("errors", *coverage, "sd", "error", "NLL", "constant")
+        table = right_aligned("", *columns, title=f"{name} ({group.unit})", padding=(0, 0, 0, 1))
         table.columns[0].justify = "left"
         for part, row in group.parts.items():
             table.add_row(part, *_calibration_cells(row))
@@ -111,7 +110,7 @@ def evaluation_tables(result: Evaluation, follows: Mapping[int, int] | None = No
         f"keypoint metrics use all annotated keypoints, also hidden keypoints; {_INTERVAL}"
     )
     if result.points_3d:
-        table_3d = right_aligned("track", *_COLUMNS_3D.values())
+        table_3d = right_aligned("track", *_COLUMNS_3D.values(), padding=(0, 0, 0, 1))
         for track, row in rows.items():
             table_3d.add_row(track, *_cells_3d(row))
         table_3d.add_section()

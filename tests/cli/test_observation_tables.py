@@ -8,7 +8,7 @@ from support.rectangles import birds, steady
 
 from jaxfit.cli import main as cli
 from jaxfit.cli.observations import matching_line
-from jaxfit.cli.tables import evaluation_tables, wrong_poses_line
+from jaxfit.cli.tables import evaluation_tables, right_aligned, show, wrong_poses_line
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.evaluation.evaluate import COLUMNS
 from jaxfit.evaluation.truth import Matching
@@ -85,3 +85,14 @@ def test_the_line_of_the_worst_frames():
     assert line.endswith("track 5 frame 55 (10.0 % of the length; 1 wrong pose)")
     result.wrong = {}
     assert wrong_poses_line(result) == ""
+
+
+def test_no_value_is_lost_in_a_narrow_output(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    table = right_aligned("keypoint", *COLUMNS)
+    table.add_row("left_wing_elbow", *["0.1234"] * len(COLUMNS))
+    show(table)
+    printed = capsys.readouterr().out
+    assert "…" not in printed
+    lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in printed.splitlines() if "│" in line]
+    assert ["".join(parts) for parts in zip(*lines, strict=True)] == ["left_wing_elbow", *["0.1234"] * len(COLUMNS)]
