@@ -256,8 +256,9 @@ def _missing_space(options: argparse.Namespace) -> str:
     if options.truth.name != TRUTH:
         return ""
     poses = options.truth.with_name(TRUE_POSES)
-    why = f"the true poses are in {poses}: give --truth {poses.parent}" if poses.is_dir() else f"there is no {poses}"
-    return f"no metrics in space: {why}"
+    if not poses.is_dir():
+        return f"no metrics in space: there is no folder {TRUE_POSES} with the true poses beside {options.truth}"
+    return f"no metrics in space: the true poses are in {poses}: give --truth {poses.parent}"
 
 
 def _calibration(options: argparse.Namespace, solution: Solution, truth: Truth) -> None:

@@ -27,7 +27,7 @@ def scene(tmp_path_factory):
     return folder
 
 
-def test_a_scene_evaluated_against_its_own_truth(scene, capsys):
+def test_a_scene_evaluated_against_its_own_truth(scene, tmp_path, capsys):
     assert main(["evaluate", str(scene / "truth"), "--truth", str(scene), "--json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["me_p"] == 0
@@ -43,6 +43,9 @@ def test_a_scene_evaluated_against_its_own_truth(scene, capsys):
     assert main(["evaluate", str(scene / "truth"), "--truth", str(scene / "truth.json")]) == 0
     line = f"no metrics in space: the true poses are in {scene / 'truth'}: give --truth {scene}\n"
     assert line in capsys.readouterr().out
+    (tmp_path / "truth.json").write_bytes((scene / "truth.json").read_bytes())
+    assert main(["evaluate", str(scene / "truth"), "--truth", str(tmp_path / "truth.json")]) == 0
+    assert "there is no folder truth with the true poses beside" in capsys.readouterr().out
     assert result["intervals"]["me_p"] == [0, 0]
     assert sum(row["frames"] for row in result["behaviours"].values()) == result["frames"]
 
