@@ -81,7 +81,7 @@ void choose_rows(const uint8_t* target, int64_t size, int64_t D, Scale scale, co
     uint32_t mine = 0;
     for (uint32_t todo = rows.chosen[block]; todo; todo &= todo - 1) {
       const int i = __builtin_ctz(todo);
-      // steps of the golden ratio spread the chosen pixels evenly along the band
+      // steps of the golden ratio spread the chosen pixels evenly over the band, in the order of the blocks
       const bool chosen = every || number * 2654435769u < threshold;
       ++number;
       if (!chosen || rows.count == kMostRows) continue;

@@ -8,7 +8,7 @@ namespace {
 
 // Multiplies the factors of all faces into `products` and closes the blocks that saturate.
 void accumulate_products(Scale scale, Workspace& ws) {
-  const Vec outside = all(-scale.radius * scale.radius), saturated = all(kSaturated);
+  const Vec at_radius = all(-scale.radius * scale.radius), saturated = all(kSaturated);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
     Faces& f = ws.faces[c];
     for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
@@ -20,7 +20,7 @@ void accumulate_products(Scale scale, Workspace& ws) {
         for (int i = 0; i < kLanes / kWidth; ++i) minus_d[i] = nearest_edge(face, block, i * kWidth).minus_d;
         for (int i = 0; i < kLanes / kWidth; ++i) {
           float* place = block.place + i * kWidth;
-          const Vec product = grow(load(place), exp2(minus_d[i]), greater(minus_d[i], outside));
+          const Vec product = grow(load(place), exp2(minus_d[i]), greater(minus_d[i], at_radius));
           store(place, product);
           open |= bits(at_most(product, saturated));
         }

@@ -4,10 +4,15 @@
 // silhouette = 1 - Π (1 - p) with p = sigmoid(-d / s). With e = exp(-d / s) this equals 1 - 1 / Π (1 + e), which needs
 // no division per face. All lengths are scaled by k = √(log2(e) / s), so that e = 2^(-d).
 //
-// The image is divided into blocks of 4×4 pixels. For each face, sixteen block *centres* at a time, a window of the
-// blocks around the face, are evaluated to find the blocks that the face can reach. The pixels of these blocks are then
-// evaluated. A block is closed when all its products exceed kSaturated: later faces skip the block, and the block has
-// no gradient, because d silhouette / d d = -Π (1 - p) · p / s vanishes there.
+// The image is divided into blocks of 4×4 pixels. A face changes only pixels that are inside it, or nearer than the blur
+// radius. To find their blocks, the distances of the block *centres* around the face are computed, sixteen at a time (a
+// window); then those of the pixels of these blocks.
+//
+// There are two passes over the faces. The first multiplies the factors (1 + e) of all faces into `products`. From the
+// products come the loss, and for each pixel the factor of the gradient, which replaces the product. The second pass adds
+// the gradient of all faces. A block is closed, so that later faces skip it, in the first pass when all its products
+// exceed kSaturated, because d silhouette / d d = -Π (1 - p) · p / s vanishes there; and before the second pass where no
+// pixel has a gradient.
 #include "compiled.h"
 #include "gauss_newton.h"
 #include "products.h"
@@ -21,7 +26,7 @@ namespace {
 template <bool with_rows>
 void accumulate_gradient(const Mesh& mesh, const Skin* skin, Scale scale, Workspace& ws, const Rows* rows,
                          float* gradient) {
-  const Vec outside = all(scale.radius * scale.radius), zero = all(0.f), one = all(1.f);
+  const Vec radius_squared = all(scale.radius * scale.radius), zero = all(0.f), one = all(1.f);
   for (int64_t c = 0; c < ws.num_chunks; ++c) {
     Faces& f = ws.faces[c];
     for (uint32_t todo = f.visible; todo; todo &= todo - 1) {
@@ -32,22 +37,24 @@ void accumulate_gradient(const Mesh& mesh, const Skin* skin, Scale scale, Worksp
       for_each_block<Reached::kKnown>(f, lane, scale, ws, [&](const Face& face, const Block& block)
                                       __attribute__((always_inline)) {
         any = true;
-        const int64_t place = block.place - ws.products;
-        const uint32_t chosen = with_rows ? rows->chosen[place / kLanes] : 0;
+        const int64_t first_pixel = block.place - ws.products;
+        const uint32_t chosen = with_rows ? rows->chosen[first_pixel / kLanes] : 0;
         for (int at = 0; at < kLanes; at += kWidth) {
           const Nearest n = nearest_edge(face, block, at);
-          const Vec p = keep(greater(outside, n.d), reciprocal(one + exp2(n.d)));
+          const Vec p = keep(greater(radius_squared, n.d), reciprocal(one + exp2(n.d)));
+          // Outside, the silhouette rises if the edge moves towards the pixel; inside, if it moves away.
           const Vec pull = flip_sign(p, n.d);
           const Vec across = pull * pick(n, n.across[0], n.across[1], n.across[2]);
           const Vec beyond = pull * pick(n, n.beyond[0], n.beyond[1], n.beyond[2]);
           const Vec tx = pick(n, face.tx[0], face.tx[1], face.tx[2]);
           const Vec ty = pick(n, face.ty[0], face.ty[1], face.ty[2]);
-          // With the normal n = (-ty, tx), which points inside, pixel - nearest point = beyond · t + across · n.
+          // With the normal m = (-ty, tx), which points inside, pixel - nearest point = beyond · t + across · m.
           const Vec pull_x = fms(tx, beyond, ty * across), pull_y = fma(ty, beyond, tx * across);
           const Vec along = pick(n, n.clamped[0] * inverse[0], n.clamped[1] * inverse[1], n.clamped[2] * inverse[2]);
-          // `along` is in [-1/2, 1/2]. Edge 12 does not touch vertex 0, and edge 20 does not touch vertex 1.
-          const Vec to_end = all(0.5f) + along, to_start = all(0.5f) - along;
-          const Vec share0 = pick(n, to_start, zero, to_end), share1 = pick(n, to_end, to_start, zero);
+          // `along` is in [-1/2, 1/2] from the start to the end of the edge. Edge 12 does not touch vertex 0, and edge 20
+          // does not touch vertex 1.
+          const Vec of_end = all(0.5f) + along, of_start = all(0.5f) - along;
+          const Vec share0 = pick(n, of_start, zero, of_end), share1 = pick(n, of_end, of_start, zero);
           const Vec factor = load(block.place + at);
           const Vec force_x = factor * pull_x, force_y = factor * pull_y;
           x[0] = fma(share0, force_x, x[0]);
@@ -63,8 +70,8 @@ void accumulate_gradient(const Mesh& mesh, const Skin* skin, Scale scale, Worksp
           store(stored.y, pull_y);
           store(stored.share0, share0);
           store(stored.share1, share1);
-          const uint32_t reached = own & bits(greater(outside, n.d));
-          add_to_rows(mesh, *skin, f, lane, reached, stored, rows->of_pixel + place + at, *rows);
+          const uint32_t reached = own & bits(greater(radius_squared, n.d));
+          add_to_rows(mesh, *skin, f, lane, reached, stored, rows->of_pixel + first_pixel + at, *rows);
         }
       });
       if (!any) continue;
@@ -91,7 +98,8 @@ void accumulate_gradient(const Mesh& mesh, const Skin* skin, Scale scale, Worksp
   return values;
 }
 
-// The target of a block, and 0 at unknown pixels, else 1. Outside the image the target is the bird.
+// The target of a block, and 0 at unknown pixels, else 1. Outside the image the target is the bird: the products there
+// are kFull, so the error is 0.
 struct BlockTarget {
   BlockValues value, known;
 };
@@ -110,7 +118,7 @@ struct BlockTarget {
 }
 
 // Replaces products by the factors of the gradient, given d loss / d silhouette. Returns whether one is above
-// `negligible`.
+// `negligible` before it is multiplied by the constant `scale.slope`.
 [[gnu::always_inline]] inline bool set_factor(Vec cotangent, Vec transmitted, Scale scale, float negligible,
                                               float* place) {
   const Vec factor = cotangent * transmitted;
@@ -131,17 +139,17 @@ float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, boo
       const Vec transmitted = one / load(place + at);
       const Vec error = load(block.known.at + at) * (one - transmitted - load(block.value.at + at));
       const Vec magnitude = abs(error);
-      Vec slope;
+      Vec cotangent;  // d loss / d silhouette
       if (kind == LossKind::kL1) {
         part = part + magnitude;
-        slope = flip_sign(keep(greater(magnitude, zero), one), error);
+        cotangent = flip_sign(keep(greater(magnitude, zero), one), error);
       } else {
         part = part + select(greater(magnitude, one), magnitude - half, half * error * error);
-        slope = clamp_to(error, one);
+        cotangent = clamp_to(error, one);
       }
-      if (with_gradient) open |= set_factor(slope, transmitted, scale, 1 / kSaturated, place + at);
+      if (with_gradient) open |= set_factor(cotangent, transmitted, scale, 1 / kSaturated, place + at);
     }
-    if (column % 16 == 15) {  // few enough floats for their precision
+    if (column % 16 == 15) {  // a float is precise enough for the sum of so few numbers
       total += sum(part);
       part = zero;
     }
@@ -150,8 +158,9 @@ float compare(const Pixel* target, int64_t size, Scale scale, Workspace& ws, boo
   return static_cast<float>(total + sum(part));
 }
 
-void finish_gradient(const Mesh& mesh, Scale scale, Workspace& ws, float* gradient, const Skin* skin = nullptr,
-                     const Rows* rows = nullptr) {
+// The second pass over the faces, from the factors of the pixels.
+void gradient_from_factors(const Mesh& mesh, Scale scale, Workspace& ws, float* gradient, const Skin* skin = nullptr,
+                           const Rows* rows = nullptr) {
   set_gradient(gradient, mesh.num_vertices, 0);
   if (rows)
     accumulate_gradient<true>(mesh, skin, scale, ws, rows, gradient);
@@ -182,15 +191,16 @@ void silhouette_gradient(const Mesh& mesh, Blur blur, int64_t size, void* memory
     return set_gradient(gradient, mesh.num_vertices, __builtin_nanf(""));
   float greatest = 0;
   for (int64_t i = 0; i < size * size; ++i) greatest = __builtin_fmaxf(greatest, __builtin_fabsf(cotangent[i]));
+  // relative to the greatest number, where all are small
   const float negligible = __builtin_fminf(greatest, 1) / kSaturated;
   for_each_place(ws, [&](float* place, int64_t column, int64_t row) __attribute__((always_inline)) {
-    const BlockValues slope = load_block(cotangent, size, column, row, 0);
+    const BlockValues cotangents = load_block(cotangent, size, column, row, 0);
     bool open = false;
     for (int at = 0; at < kLanes; at += kWidth)
-      open |= set_factor(load(slope.at + at), all(1.f) / load(place + at), scale, negligible, place + at);
+      open |= set_factor(load(cotangents.at + at), all(1.f) / load(place + at), scale, negligible, place + at);
     if (!open) close(ws, column, row);
   });
-  finish_gradient(mesh, scale, ws, gradient);
+  gradient_from_factors(mesh, scale, ws, gradient);
 }
 
 void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target target, LossKind kind, float* loss,
@@ -208,15 +218,16 @@ void mask_loss(const Mesh& mesh, Blur blur, int64_t size, void* memory, Target t
     rows = carve_rows(mesh, *skin, blur, size, memory);
     choose_rows(target.bytes, size, skin->parameters, scale, ws, rows);
   }
-  const bool l1 = kind == LossKind::kL1, with = gradient != nullptr;
+  const bool l1 = kind == LossKind::kL1, with_gradient = gradient != nullptr;
   if (target.bytes)
-    *loss = l1 ? compare<LossKind::kL1>(target.bytes, size, scale, ws, with)
-               : compare<LossKind::kSmoothL1>(target.bytes, size, scale, ws, with);
+    *loss = l1 ? compare<LossKind::kL1>(target.bytes, size, scale, ws, with_gradient)
+               : compare<LossKind::kSmoothL1>(target.bytes, size, scale, ws, with_gradient);
   else
-    *loss = l1 ? compare<LossKind::kL1>(target.floats, size, scale, ws, with)
-               : compare<LossKind::kSmoothL1>(target.floats, size, scale, ws, with);
-  // The blocks of the band are open: their error is at least kBandEdge, so their gradient is not negligible.
-  if (gradient) finish_gradient(mesh, scale, ws, gradient, skin, block ? &rows : nullptr);
+    *loss = l1 ? compare<LossKind::kL1>(target.floats, size, scale, ws, with_gradient)
+               : compare<LossKind::kSmoothL1>(target.floats, size, scale, ws, with_gradient);
+  // The blocks of the band are open: both the error and 1 - silhouette are at least kBandEdge there, so their product,
+  // the factor, is not negligible.
+  if (gradient) gradient_from_factors(mesh, scale, ws, gradient, skin, block ? &rows : nullptr);
   if (block) multiply_rows(rows.values, rows.values, rows.count, skin->parameters, block);
 }
 

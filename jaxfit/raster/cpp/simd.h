@@ -34,7 +34,7 @@ constexpr float kFull = 1e30f;  // the limit of products
 //   bits(m)              one bit for each lane
 //   clamp_to(a, limit)   a clamped to [-limit, limit]
 //   reciprocal(a)        1 / a, with a relative error of at most 2^-28
-//   exp2(a)              2^a for a ≤ 60, with a relative error of 2.6e-6
+//   exp2(a)              2^a with a relative error of 2.6e-6; for a > 60 at least 2^60
 
 // Coefficients of a polynomial for 2^a on [-1/2, 1/2].
 constexpr float kPower[5] = {0.9999992847442627f, 0.6931217908859253f, 0.240247443318367f, 0.05591785907745361f,
