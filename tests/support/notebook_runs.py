@@ -47,7 +47,7 @@ def execute(notebook: NotebookNode, folder: Path, allow_errors: bool = False) ->
     client = NotebookClient(
         notebook,
         kernel_name="python3",
-        timeout=900,
+        timeout=3600,  # a training takes half an hour on a slow machine
         startup_timeout=300,
         record_timing=False,
         allow_errors=allow_errors,
