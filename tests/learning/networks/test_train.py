@@ -212,15 +212,22 @@ def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
 
 @pytest.mark.extended
 @pytest.mark.usefixtures("_few_pictures")
-def test_trained_keypoint_network_is_read_back_and_began_with_its_base(folder, tmp_path):
+def test_trained_keypoint_network_is_read_back(folder, tmp_path):
+    train_network("keypoints", tmp_path / "k.onnx", Simulation(folder, 1), QUICK)
+    detector = load_keypoint_detector(tmp_path / "k.onnx")
+    assert detector.keypoint_names == MURRE_KEYPOINTS
+    assert (tmp_path / "k.onnx").stat().st_size < 4.8e6
+    assert OnnxModel(tmp_path / "k.onnx").metadata["background"] == "visible"
+
+
+@pytest.mark.extended
+@pytest.mark.usefixtures("_few_pictures")
+def test_a_training_from_a_base_network_begins_with_its_weights(folder, tmp_path):
     still = QUICK._replace(learning_rate=1e-12)
     train_network("keypoints", tmp_path / "k.onnx", Simulation(folder, 1), still, base="builtin")
     picture = np.random.default_rng(0).uniform(0, 1, (1, 3, 192, 192)).astype(np.float32)
     trained, builtin = (OnnxModel(path)(picture)["heatmaps"] for path in (tmp_path / "k.onnx", BUILTIN_PATH))
     np.testing.assert_allclose(trained, builtin, atol=2e-3)
-    assert load_keypoint_detector(tmp_path / "k.onnx").keypoint_names == MURRE_KEYPOINTS
-    assert (tmp_path / "k.onnx").stat().st_size < 4.8e6
-    assert OnnxModel(tmp_path / "k.onnx").metadata["background"] == "visible"
 
 
 def test_frames_of_an_earlier_version_are_rejected(frames, tmp_path):
