@@ -25,7 +25,7 @@ help:
 	@echo "make lint       formatting, lint and types"
 	@echo "make bench      benchmarks against the committed baseline"
 	@echo "make demo       simulate a short scene, reconstruct it from its footage, show and export it"
-	@echo "make notebooks  run the notebooks and store their output (16 minutes)"
+	@echo "make notebooks  run the notebooks and store their output (half an hour)"
 	@echo "make wheel      the source distribution and a tried wheel, in dist (ZIG=1: compiled by Zig, for older Linux)"
 	@echo "make clean      remove the environment and everything built"
 
