@@ -55,6 +55,10 @@ class ReadViews(NamedTuple):
     tracks: tuple[Observations, ...]
     """The tracks of the cameras before they were matched."""
     matches: BirdMatches
+    offset_frames: list[float] | None
+    """The offsets that were given, see `on_common_frames`."""
+    step_frames: list[float]
+    """Frames of each camera between two frames of the first, see `own_steps`."""
 
 
 def read_views(options: argparse.Namespace, bird: Bird) -> ReadViews:
@@ -69,7 +73,7 @@ def read_views(options: argparse.Namespace, bird: Bird) -> ReadViews:
     """
     from jaxfit.cameras.files import read_camera_file
     from jaxfit.data.view_matching import BirdMatches, match_birds, matches_of_file
-    from jaxfit.data.views import Views, assign_cameras, birds_in_rows, on_common_frames, straightened
+    from jaxfit.data.views import Views, assign_cameras, birds_in_rows, on_common_frames, own_steps, straightened
 
     file = read_camera_file(options.cameras, options.unit)
     own = [
@@ -79,7 +83,8 @@ def read_views(options: argparse.Namespace, bird: Bird) -> ReadViews:
     lenses = assign_cameras(file.cameras, own, options.observations)
     pairs = [straightened(camera, each, terminal) for camera, each in zip(lenses, own, strict=True)]
     cameras = tuple(camera for camera, _ in pairs)
-    tracks = on_common_frames([each for _, each in pairs], _offsets(options.offsets, len(pairs)))
+    offsets, steps = _offsets(options.offsets, len(pairs)), own_steps([each for _, each in pairs])
+    tracks = on_common_frames([each for _, each in pairs], offsets)
     if options.match is not None:
         matches = matches_of_file(options.match, lenses, tracks)
     elif len(tracks) == 1:
@@ -90,7 +95,7 @@ def read_views(options: argparse.Namespace, bird: Bird) -> ReadViews:
         matches = match_birds(cameras, tracks)
     ids = tracks[0].track_id.tolist() if len(tracks) == 1 and options.match is None else range(1, matches.birds + 1)
     rows = tuple(birds_in_rows(each, of, list(ids)) for each, of in zip(tracks, matches.bird, strict=True))
-    return ReadViews(Views(cameras, lenses, rows), tracks, matches)
+    return ReadViews(Views(cameras, lenses, rows), tracks, matches, offsets, steps)
 
 
 def _offsets(text: str | None, count: int) -> list[float] | None:
@@ -130,7 +135,7 @@ def check_calibration(options: argparse.Namespace) -> None:
     if len(options.observations) < 2:
         raise InputError("cameras check", "needs two cameras", "give the observations of at least two cameras")
     read = read_views(options, find_bird(options.model))
-    result = check_cameras(read.views, read.tracks, read.matches)
+    result = check_cameras(*read)
     show_matches(read)
     table = right_aligned("camera", "error px", "% of box", "agree %")
     for name, (error_px, relative, agree) in result.by_camera.items():

@@ -46,8 +46,8 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.cameras.files import write_cameras
     from jaxfit.config.fit import load_config
     from jaxfit.config.yaml_file import config_to_yaml
-    from jaxfit.data.solution import RESULT, write_solution
-    from jaxfit.data.world import CAMERAS
+    from jaxfit.data.result_folder import CAMERAS, POSES
+    from jaxfit.data.solution import write_solution
     from jaxfit.fitting.collect import summarise
     from jaxfit.fitting.fit import fit, learn_weights
     from jaxfit.fitting.initial_poses import load_initial_poses
@@ -56,7 +56,7 @@ def fit(options: argparse.Namespace) -> None:
     from jaxfit.foundation.workers import open_cluster
 
     start = time.perf_counter()
-    check_replaceable(options.out, options.overwrite, RESULT)  # before the long work
+    check_replaceable(options.out, options.overwrite, POSES)  # before the long work
     config, bird = load_config(options.config), find_bird(options.model)
     check_ledge_options(options, bird)
     if options.ledge is not None:
@@ -86,7 +86,7 @@ def fit(options: argparse.Namespace) -> None:
         summary["ledge"] = placed.facts
     if observations.photographs:
         summary["photographs"] = observations.photographs
-    with new_folder(options.out, options.overwrite, marker=RESULT) as part:
+    with new_folder(options.out, options.overwrite, marker=POSES) as part:
         write_solution(solution, bird, config_to_yaml(config), summary, part, learnt and learnt.to_yaml())
         if placed is not None:
             write_cameras(placed.cameras, part / CAMERAS)
@@ -131,8 +131,8 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     from jaxfit.cameras.files import write_cameras
     from jaxfit.cli.cameras import read_views, show_matches
     from jaxfit.config.yaml_file import config_to_yaml
-    from jaxfit.data.solution import RESULT, write_solution
-    from jaxfit.data.world import CAMERAS
+    from jaxfit.data.result_folder import CAMERAS, POSES
+    from jaxfit.data.solution import write_solution
     from jaxfit.fitting.collect import summarise
     from jaxfit.fitting.ledge_plane import plane_of
     from jaxfit.fitting.views import fit_views
@@ -141,7 +141,8 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
 
     if options.init is not None:
         raise InputError("--init", "is given with --cameras", "leave out --init: the cameras give the initial poses")
-    views, tracks, matches = read = read_views(options, bird)
+    read = read_views(options, bird)
+    views, tracks, matches = read.views, read.tracks, read.matches
     show_matches(read)
     if options.ledge == WORLD:
         plane_of(views.lenses[0], options.cameras)  # before the long work
@@ -163,7 +164,7 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
         }
         for b in range(matches.birds)
     }
-    with new_folder(options.out, options.overwrite, marker=RESULT) as part:
+    with new_folder(options.out, options.overwrite, marker=POSES) as part:
         write_solution(solution, bird, config_to_yaml(config), summary, part)
         write_cameras(lenses, part / CAMERAS)
     _show_fit(solution)

@@ -53,16 +53,28 @@ class CameraCheck(NamedTuple):
     """What is wrong, in sentences; empty if nothing was found."""
 
 
-def check_cameras(views: Views, unmatched: Sequence[Observations], matches: BirdMatches) -> CameraCheck:
+def check_cameras(
+    views: Views,
+    unmatched: Sequence[Observations],
+    matches: BirdMatches,
+    offset_frames: Sequence[float] | None = None,
+    step_frames: Sequence[float] | None = None,
+) -> CameraCheck:
     """Check cameras.
 
     Args:
         views: cameras and birds, as for a fit.
         unmatched: the tracks of the cameras before they were matched, in the frames of the first camera.
         matches: the matches of the tracks.
+        offset_frames: the offsets with which the cameras were brought to common frames. None: 0.
+        step_frames: for each camera, the number of its frames between two common frames (`own_steps`). None: 1.
     """
     cameras = views.cameras
-    findings = _order(cameras, unmatched) or (_offsets(views) if matches.birds else [])
+    findings = _order(cameras, unmatched) or (
+        _offsets(views, offset_frames or [0.0] * len(cameras), step_frames or [1.0] * len(cameras))
+        if matches.birds
+        else []
+    )
     tables = _errors(views) if matches.birds else ({}, {})
     if not findings and matches.birds and len(cameras) > 2:
         findings = _moved(views)
@@ -107,7 +119,7 @@ def _order(cameras: Sequence[Camera], observations: Sequence[Observations]) -> l
     return [f"{text} (error {now:.2f} → {scores[best]:.3f} of the birds' size)"]
 
 
-def _offsets(views: Views) -> list[str]:
+def _offsets(views: Views, given: Sequence[float], steps: Sequence[float]) -> list[str]:
     """Try offsets in time of one camera, with the keypoints that move fastest: birds at rest show no offset."""
     px, confidence, side = stacked_keypoints(views.observations)
     T = px.shape[2]
@@ -145,11 +157,12 @@ def _offsets(views: Views) -> list[str]:
     if not found:
         return []
     _, v, best, scores = min(found, key=lambda each: each[0])
+    count = len(views.cameras)
     # an offset of the first camera is one of all others
-    others = len(views.cameras) - 1
-    numbers = [0, *[-best] * others] if v == 0 else [best if w == v else 0 for w in range(others + 1)]
-    option = ",".join(map(str, numbers))
-    text = f"camera {views.cameras[v].name} is {abs(best)} frames {'late' if best > 0 else 'early'}: --offsets {option}"
+    moved = [0, *[-best] * (count - 1)] if v == 0 else [best if w == v else 0 for w in range(count)]
+    option = ",".join(f"{each + move * step:.6g}" for each, move, step in zip(given, moved, steps, strict=True))
+    text = f"camera {views.cameras[v].name} is {abs(best) * steps[v]:.6g} frames {'late' if best > 0 else 'early'}"
+    text += f": --offsets {option}"
     return [f"{text} (error of moving keypoints {scores[0]:.3f} → {scores[best]:.3f} of the birds' size)"]
 
 

@@ -134,8 +134,7 @@ def straightened(
     x0, y0, w, h = np.moveaxis(observations.box_px.astype(np.float64), -1, 0)
     corners = np.stack([np.stack([x0 + i * w, y0 + j * h], -1) for i in (0, 0.5, 1) for j in (0, 0.5, 1)], axis=-2)
     corners = camera.undistort(corners) - low
-    with np.errstate(all="ignore"):
-        first, last = np.nanmin(corners, axis=-2), np.nanmax(corners, axis=-2)
+    first, last = np.fmin.reduce(corners, axis=-2), np.fmax.reduce(corners, axis=-2)
     boxes = np.where(observations.present[..., None], np.concatenate([first, last - first], axis=-1), 0)
     boxes = np.nan_to_num(boxes)
     masks: dict[tuple[int, int], Mapping[str, Any]] = {}
@@ -204,6 +203,13 @@ def on_common_frames(
             raise InputError("observations", problem, "check the frame numbers, the rates and the offsets")
         moved.append(own if own is first and not offset else _at_frames(own, at, first))
     return tuple(moved)
+
+
+def own_steps(observations: Sequence[Observations]) -> list[float]:
+    """Return the number of frames of each camera between two frames of the first camera."""
+    first = observations[0]
+    numbers = [_own_numbers(first, own) for own in observations]
+    return [float(np.median(np.diff(each))) if len(each) > 1 else 1.0 for each in numbers]
 
 
 def _own_numbers(first: Observations, own: Observations) -> Float[np.ndarray, "T"]:

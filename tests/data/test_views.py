@@ -9,7 +9,7 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.data.masks import decode_mask
 from jaxfit.data.view_check import check_cameras
 from jaxfit.data.view_matching import match_birds, matches_of_file
-from jaxfit.data.views import Views, assign_cameras, birds_in_rows, on_common_frames, straightened
+from jaxfit.data.views import Views, assign_cameras, birds_in_rows, on_common_frames, own_steps, straightened
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import load_murre
 from jaxfit.simulation.rig import stage_rig
@@ -194,7 +194,7 @@ def checked(lenses, observations, offsets=None):
     pairs = [straightened(camera, replace(own, masks={})) for camera, own in zip(lenses, observations, strict=True)]
     tracks = on_common_frames([own for _, own in pairs], offsets)
     views, matches = matched([camera for camera, _ in pairs], lenses, tracks)
-    return check_cameras(views, tracks, matches)
+    return check_cameras(views, tracks, matches, offsets, own_steps([own for _, own in pairs]))
 
 
 def test_right_cameras_pass_the_check(rig):
@@ -224,3 +224,7 @@ def test_an_offset_in_time_is_named():
     (finding,) = checked(rig.cameras, [exact[0], late, exact[2]]).findings
     assert "camera cam1 is 3 frames early: --offsets 0,-3,0" in finding
     assert checked(rig.cameras, [exact[0], late, exact[2]], [0, -3, 0]).findings == []
+    # every second frame was read, and a part of the offset was given
+    thinned = [replace(own, frame_index=2 * own.frame_index) for own in (exact[0], late, exact[2])]
+    (finding,) = checked(rig.cameras, thinned, [0, -2, 0]).findings
+    assert "camera cam1 is 4 frames early: --offsets 0,-6,0" in finding
