@@ -7,12 +7,12 @@ import gzip
 import json
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Int
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file, check_replaceable, new_folder, write_whole
@@ -66,36 +66,37 @@ def save_page(
 
 
 def _save_file(results: Sequence[Shown], video: Path | None, out: Path, progress: ProgressTask) -> Saved:
-    left_out: list[str] = [*_ALWAYS]
-    entries = [_element(path, content) for path, content in _arrays(results, left_out, progress)]
-    free = LARGEST_FILE - sum(map(len, entries)) - len(saved_index("")) - 2 * len(json.dumps(_facts(results, None, [])))
+    curves, left_out = _curves(results[0])
+    entries = [_element(path, content) for path, content in _arrays(results, curves, progress)]
+    free = LARGEST_FILE - sum(map(len, entries)) - len(saved_index(""))
+    free -= 2 * len(json.dumps(_facts(results, curves, None, [])))
     if free < 0:
         problem = f"would have {(LARGEST_FILE - free) / 1e6:.0f} MB without a film, more than {LARGEST_FILE / 1e6:.0f}"
         raise InputError(out, problem, "give --frames A:B, or a folder in place of a file")
     copy = None
     if video is not None:
-        film, copy, without = _film_that_fits(results[0], video, free, progress)
+        film, copy, without = _film_that_fits(results, video, free, progress)
         entries += film
         left_out += without
-    facts = json.dumps(_facts(results, copy, left_out)).encode()
+    facts = json.dumps(_facts(results, curves, copy, left_out)).encode()
     content = saved_index("\n".join([_element("facts", facts), *entries])).encode()
     write_whole(out, content)
     return Saved(out, len(content), tuple(left_out))
 
 
 def _film_that_fits(
-    result: Shown, video: Path, free: int, progress: ProgressTask
+    results: Sequence[Shown], video: Path, free: int, progress: ProgressTask
 ) -> tuple[list[str], dict[str, Any] | None, list[str]]:
     """Return the largest copy of a film that has at most `free` bytes as an element, its facts, and what it lacks."""
+    full = results[0].size_px[0]
     with tempfile.TemporaryDirectory() as folder:
-        for width in WIDTHS:
+        for width in (min(full, WIDTHS[0]), *(each for each in WIDTHS[1:] if each < full)):
             film = Path(folder) / f"{width}.mp4"
-            times = write_copy(video, result.solution.frame_index, film, width, progress)
+            times = write_copy(video, _frames(results), film, width, progress)
             if film.stat().st_size * 4 / 3 < free:
                 text = base64.b64encode(film.read_bytes()).decode()
                 element = f'<script type="text/plain" data-path="film" data-type="video/mp4">{text}</script>'
-                smaller = width < result.size_px[0]
-                lacks = [f"the film in its full size: it is {width} pixels wide here"] if smaller else []
+                lacks = [f"the film in its full size: it is {width} pixels wide here"] if width < full else []
                 return [element], {"source": "film", "times_s": times.tolist(), "pictures": False}, lacks
     return [], None, [f"the film, with which the page would have more than {LARGEST_FILE / 1e6:.0f} MB"]
 
@@ -103,58 +104,69 @@ def _film_that_fits(
 def _save_folder(
     results: Sequence[Shown], video: Path | None, out: Path, overwrite: bool, progress: ProgressTask
 ) -> Saved:
-    left_out: list[str] = [*_ALWAYS]
+    curves, left_out = _curves(results[0])
     with new_folder(out, overwrite, marker=INDEX) as part:
         (part / "data").mkdir()
-        for path, content in _arrays(results, left_out, progress):
+        for path, content in _arrays(results, curves, progress):
             call = f"jaxfitSaved({json.dumps(path)}, {json.dumps(_packed(content))})\n"
             write_whole(part / "data" / f"{path.replace('/', '-')}.js", call.encode())
         copy = None
         if video is not None:
             name, times = "film.mp4", None
-            if is_played(video) and np.isfinite(results[0].times_s).all():
+            if is_played(video) and all(np.isfinite(each.times_s).all() for each in results):
                 name = f"film{video.suffix.lower()}"
                 shutil.copyfile(video, part / name)
             else:
-                frames, width = results[0].solution.frame_index, results[0].size_px[0]
-                times = write_copy(video, frames, part / name, width, progress).tolist()
+                times = write_copy(video, _frames(results), part / name, results[0].size_px[0], progress).tolist()
             copy = {"source": name, "times_s": times, "pictures": False}
-        facts = _element("facts", json.dumps(_facts(results, copy, left_out)).encode())
+        facts = _element("facts", json.dumps(_facts(results, curves, copy, left_out)).encode())
         write_whole(part / INDEX, saved_index(facts).encode())
     size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
     return Saved(out / INDEX, size, tuple(left_out))
 
 
-_ALWAYS = ("corrections, which need `jaxfit view`",)
+def _frames(results: Sequence[Shown]) -> Int[np.ndarray, "T"]:
+    """Return the frames of the page: those of all results."""
+    return np.unique(np.concatenate([each.solution.frame_index for each in results]))
 
 
-def _facts(results: Sequence[Shown], film: dict[str, Any] | None, left_out: Sequence[str]) -> dict[str, Any]:
+def _curves(result: Shown) -> tuple[dict[str, bytes], list[str]]:
+    """Return the curves that a page holds, and what it leaves out, for people."""
+    names = [each["name"] for each in result.kinds_of_values]
+    curves, left_out = {}, ["corrections, which need `jaxfit view`"]
+    for name in CURVES:
+        if name in names:
+            try:
+                curves[name] = result.values(name)
+            except InputError as error:
+                left_out.append(f"the curve of {error}")
+    left_out.append(f"{sum(name not in CURVES for name in names)} further curves, which `jaxfit view` shows")
+    return curves, left_out
+
+
+def _facts(
+    results: Sequence[Shown], curves: Mapping[str, bytes], film: dict[str, Any] | None, left_out: Sequence[str]
+) -> dict[str, Any]:
     facts = [each.facts() for each in results]
     for each in facts:
-        each["values"] = [value for value in each["values"] if value["name"] in CURVES]
+        each["values"] = [value for value in each["values"] if value["name"] in curves]
     notes = [f"This saved page leaves out: {'; '.join(left_out)}."] if left_out else []
     return {"results": facts, "film": film, "corrections": None, "notes": notes}
 
 
-def _arrays(results: Sequence[Shown], left_out: list[str], progress: ProgressTask) -> Iterator[tuple[str, bytes]]:
-    """Yield path and content of all arrays that the page reads."""
+def _arrays(
+    results: Sequence[Shown], curves: Mapping[str, bytes], progress: ProgressTask
+) -> Iterator[tuple[str, bytes]]:
+    """Yield path and content of all arrays that the page reads. It shows the curves of the first result only."""
+    yield from ((f"results/0/values/{name}", content) for name, content in curves.items())
     with progress("Saving the page", sum(each.parts for each in results)) as report_progress:
         for number, result in enumerate(results):
-            readers: dict[str, Callable[[], bytes]] = {"rig": result.rig, "flags": result.flags}
-            if number == 0:  # the page shows the curves of the first result only
-                names = [each["name"] for each in result.kinds_of_values]
-                readers |= {f"values/{name}": partial(result.values, name) for name in names if name in CURVES}
-            for name, read in readers.items():
-                try:
-                    yield f"results/{number}/{name}", read()
-                except InputError as error:
-                    left_out.append(f"the curve of {error}")
+            yield f"results/{number}/rig", result.rig()
+            yield f"results/{number}/flags", result.flags()
             for part in range(result.parts):
                 yield f"results/{number}/poses/{part}", result.part(part)
                 yield f"results/{number}/outlines/{part}", result.outlines(part)
                 report_progress(1, f"part {part + 1}")
-    further = sum(each["name"] not in CURVES for each in results[0].kinds_of_values)
-    left_out.append(f"{further} further curves, which `jaxfit view` shows")
 
 
 def _packed(content: bytes) -> str:

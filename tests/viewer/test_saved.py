@@ -10,9 +10,11 @@ from support.cli_files import rejected
 from support.viewed import shown, write_result
 
 from jaxfit.cli.main import main
+from jaxfit.export.result import open_result
 from jaxfit.foundation.errors import InputError
 from jaxfit.viewer import saved
 from jaxfit.viewer.saved import save_page
+from jaxfit.viewer.shown import Shown
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +70,28 @@ def test_a_folder_holds_the_film_as_it_is(result, tmp_path):
     assert len(facts["results"]) == 2
 
 
+def test_the_film_covers_the_frames_of_all_results(result, tmp_path):
+    seen, video = result
+    count, first = len(seen.solution.frame_index), int(seen.solution.frame_index[0])
+    later = Shown(seen.folder, open_result(seen.folder, None, (first + 2, None)))
+    done = save_page([later, seen], video, tmp_path / "page.html")
+    facts = json.loads(opened(elements(done.path.read_text(encoding="utf-8"))["facts"]))
+    assert len(facts["film"]["times_s"]) == count
+
+
+def test_curves_that_are_not_defined_are_not_offered(result, tmp_path):
+    seen, _ = result
+    alone = Shown(seen.folder, open_result(seen.folder, [seen.solution.track_id.tolist()[0]]))
+    with pytest.raises(InputError):
+        alone.values("neighbour_distance")
+    done = save_page([alone], None, tmp_path / "page.html")
+    held = elements(done.path.read_text(encoding="utf-8"))
+    offered = [value["name"] for value in json.loads(opened(held["facts"]))["results"][0]["values"]]
+    assert "neighbour_distance" not in offered
+    assert {f"results/0/values/{name}" for name in offered} == {path for path in held if "/values/" in path}
+    assert any("neighbour" in what for what in done.left_out), done.left_out
+
+
 def test_a_page_that_is_too_large_loses_the_film_and_then_fails(result, tmp_path, monkeypatch):
     seen, video = result
     without = save_page([seen], None, tmp_path / "without.html").bytes
@@ -80,8 +104,10 @@ def test_a_page_that_is_too_large_loses_the_film_and_then_fails(result, tmp_path
         return frames / 10
 
     monkeypatch.setattr(saved, "write_copy", write_large)
+    full = seen.size_px[0]
+    monkeypatch.setattr(saved, "WIDTHS", (full + 2, full + 1, full - 1, full - 2))
     done = save_page([seen], video, tmp_path / "page.html")
-    assert widths == sorted(widths, reverse=True) == list(saved.WIDTHS)
+    assert widths == [full, full - 1, full - 2]
     assert any(what.startswith("the film") for what in done.left_out)
     facts = json.loads(opened(elements(done.path.read_text(encoding="utf-8"))["facts"]))
     assert facts["film"] is None

@@ -114,7 +114,6 @@ export function arrays(result, name) {
   for (const old of packed.keys()) {
     if (packed.size <= PARTS_KEPT) break;
     if (!old.endsWith("rig") && !old.endsWith("flags")) packed.delete(old);
-    else break;
   }
   return found;
 }

@@ -69,13 +69,13 @@ export class LedgeView {
     // the axis up has to be set before the controls are made
     this.orbit.up.set(0, level ? 0 : -1, level ? 1 : 0);
     const eye = new THREE.Vector3(x, y, z), size = Math.max(new THREE.Vector3(...high).distanceTo(new THREE.Vector3(...low)), 3 * length);
-    const towards = eye.sub(middle);
+    const towards = eye.clone().sub(middle);
     if (level) towards.z = Math.max(towards.z, 0.35 * Math.hypot(towards.x, towards.y));
     this.orbit.position.copy(middle).addScaledVector(towards.normalize(), 1.5 * size + 2 * length);
     this.orbit.near = 0.02 * length;
     this.orbit.far = 200 * size;
     this.film.near = this.orbit.near;
-    this.film.far = this.orbit.far + eye.length();
+    this.film.far = this.orbit.far + eye.distanceTo(middle);
     this.controls = new OrbitControls(this.orbit, this.renderer?.domElement);
     this.controls.target.copy(middle);
     this.controls.update();
