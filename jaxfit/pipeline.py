@@ -19,6 +19,7 @@ from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_rec
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.result_folder import OBSERVATIONS, OVERLAY, POSES
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.tracks import track_quality
 from jaxfit.fitting.collect import summarise
@@ -103,8 +104,6 @@ def _content_hash(files: Sequence[Path], report_bytes: Callable[[int], object] =
         digest.update(f"{file.name!a} ".encode() + one.digest())
     return digest.hexdigest()
 
-
-OBSERVATIONS, OVERLAY, MARKER = "observations.json", "overlay.mp4", "poses.npz"
 
 _logger = logging.getLogger(__name__)
 
@@ -209,7 +208,7 @@ def reconstruct(
         with clock("fit"):
             config, learnt_yaml = _learn_weights(config, observations, bird, video, progress)
             solution = fit(observations, bird, config.fit, None, fit_progress, video, windows, cluster)
-        with new_folder(folder, overwrite, marker=MARKER) as part:
+        with new_folder(folder, overwrite, marker=POSES) as part:
             write_coco(observations, part / OBSERVATIONS, tracking.info())
             with clock("overlay"):
                 _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
@@ -260,7 +259,7 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
     check_outputs([folder / OVERLAY], video, overwrite=True)
     if is_inside(video, folder):
         raise InputError(folder, "holds the video, which the result would replace", "choose another --out")
-    check_replaceable(folder, overwrite, MARKER)
+    check_replaceable(folder, overwrite, POSES)
 
 
 def _check_tracking(tracking: TrackingResult, stored: Parts | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,9 +19,9 @@ from jaxfit.behaviour.tables import boris_project, bout_columns, budget_columns,
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.files import read_cameras
 from jaxfit.data.flags import CONTRADICTED, flags
-from jaxfit.data.formats.fields import read_json
+from jaxfit.data.result_folder import CAMERAS, read_summary
 from jaxfit.data.solution import Solution
-from jaxfit.data.world import CAMERAS, as_filmed
+from jaxfit.data.world import as_filmed
 from jaxfit.export.result import Exported, frame_times, open_result, stored_times
 from jaxfit.export.tables import csv_table
 from jaxfit.foundation.extras import require_package
@@ -145,7 +145,7 @@ def describe_result(
         features=features,
         cameras=len(read_cameras(path)) if solution.has_world and path.is_file() else 0,
         camera=camera,
-        photographs=bool(_summary(folder).get("photographs")),
+        photographs=bool(read_summary(folder).get("photographs")),
         source=folder,
         progress=progress,
     )
@@ -164,21 +164,15 @@ def behaviour_of_result(folder: Path, progress: ProgressTask = silent) -> Behavi
         InputError: the folder holds no result, or its files do not belong together.
     """
     exported = open_result(folder)
-    if _summary(folder).get("photographs") or not exported.solution.valid.any():
+    if read_summary(folder).get("photographs") or not exported.solution.valid.any():
         return None
     return describe_result(folder, exported, progress=progress).shown
-
-
-def _summary(folder: Path) -> dict[str, Any]:
-    path = folder / "summary.json"
-    summary = read_json(path).value if path.is_file() else {}
-    return summary if isinstance(summary, dict) else {}
 
 
 def _notes_of_quality(folder: Path, solution: Solution) -> tuple[str, ...]:
     """Return sentences about why the features may be wrong: low trust, poses that the detections contradict."""
     notes, flag = [], flags(np.asarray(solution.doubts))[solution.valid]
-    if _summary(folder).get("trust") == "low":
+    if read_summary(folder).get("trust") == "low":
         notes.append("trust in the tracking is low, so what follows may be wrong: see the report of the result")
     share = float((flag == CONTRADICTED).mean()) if flag.size else 0.0
     if share:

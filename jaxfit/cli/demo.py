@@ -17,6 +17,7 @@ from jaxfit.config.build import with_values
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats import FOOTAGE, MARKER
+from jaxfit.data.result_folder import OVERLAY, POSES
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.evaluation.tracking import ObservationsEvaluation, evaluate_observations
 from jaxfit.evaluation.truth import Matching, Truth, match_tracks
@@ -27,7 +28,7 @@ from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text
 from jaxfit.model.files import find_bird, load_murre
 from jaxfit.perception.trust import Trust
-from jaxfit.pipeline import OVERLAY, reconstruct
+from jaxfit.pipeline import reconstruct
 from jaxfit.simulation.scene import simulate
 from jaxfit.view.report.page import Measured
 from jaxfit.view.report.write import REPORT, write_report
@@ -59,7 +60,7 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     scene_folder, result_folder = folder / "scene", folder / "result"
     _check_folder(folder)
     check_replaceable(scene_folder, True, MARKER)
-    check_replaceable(result_folder, True, "poses.npz")
+    check_replaceable(result_folder, True, POSES)
     bird, config = load_murre(), with_values(load_reconstruct_config(), {"track.segmenter.file": "builtin"})
     show(f"simulating {BIRDS} murres on a ledge over {FRAMES} frames, then reconstructing them from the footage alone")
     scene = simulate(bird, scene_folder, BIRDS, FRAMES, SIZE, seed=SEED, overwrite=True, progress=terminal)

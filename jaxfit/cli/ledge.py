@@ -170,12 +170,12 @@ def ledge(options: argparse.Namespace) -> None:
     """Place the birds of a result on the ledge that they stand on, and write a new result."""
     from jaxfit.cameras.files import write_cameras
     from jaxfit.config.reconstruct import ReconstructConfig
-    from jaxfit.data.solution import RESULT, load_solution, write_solution
-    from jaxfit.data.world import CAMERAS
+    from jaxfit.data.result_folder import CAMERAS, LEARNT, OBSERVATIONS, POSES, read_summary
+    from jaxfit.data.solution import load_solution, write_solution
     from jaxfit.foundation.files import check_replaceable, new_folder
-    from jaxfit.review.correct import read_config, read_summary
+    from jaxfit.review.correct import read_config
 
-    check_replaceable(options.out, options.overwrite, RESULT)
+    check_replaceable(options.out, options.overwrite, POSES)
     if options.out.resolve() == options.result.resolve():
         raise InputError(options.out, "is the result itself, which stays as it is", "choose another --out")
     solution, bird = load_solution(options.result)
@@ -192,8 +192,8 @@ def ledge(options: argparse.Namespace) -> None:
     views = _one_camera(options, solution)
     done = place(options, solution, bird, views, options.result)
     summary["ledge"] = done.facts
-    with new_folder(options.out, options.overwrite, marker=RESULT) as part:
-        for name in _KEPT_FILES:
+    with new_folder(options.out, options.overwrite, marker=POSES) as part:
+        for name in (OBSERVATIONS, LEARNT):
             if (options.result / name).is_file():
                 shutil.copyfile(options.result / name, part / name)
         write_solution(done.solution, bird, config_text, summary, part)
@@ -205,10 +205,6 @@ def ledge(options: argparse.Namespace) -> None:
         show("fit again with --ledge, which uses `edge: unbiased`, or give measured distances")
     show_world(done.solution)
     show(f"{counted(len(solution.track_id), 'bird')} on the ledge → {options.out}")
-
-
-_KEPT_FILES = ("observations.json", "learnt.yaml")
-"""Files of the earlier result that stay as they are."""
 
 
 def _one_camera(options: argparse.Namespace, solution: Solution) -> Views | None:

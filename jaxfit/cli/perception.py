@@ -51,8 +51,9 @@ def track(options: argparse.Namespace) -> None:
 
 def reconstruct(options: argparse.Namespace) -> None:
     """Track the birds of a video, fit their poses and draw them."""
+    from jaxfit.data.result_folder import OBSERVATIONS, OVERLAY, POSES, SUMMARY
     from jaxfit.foundation.workers import open_cluster
-    from jaxfit.pipeline import OBSERVATIONS, OVERLAY, NoTrackError, reconstruct
+    from jaxfit.pipeline import NoTrackError, reconstruct
     from jaxfit.view.report.write import REPORT
 
     start = time.perf_counter()
@@ -76,8 +77,8 @@ def reconstruct(options: argparse.Namespace) -> None:
         (OVERLAY, "the posed birds on the footage"),
         (OVERLAY.replace(".mp4", ".png"), "a contact sheet, with a legend"),
         (OBSERVATIONS, "the tracked keypoints and masks"),
-        ("poses.npz", "the poses"),
-        ("summary.json", "metrics, timings and versions"),
+        (POSES, "the poses"),
+        (SUMMARY, "metrics, timings and versions"),
     ):
         if (options.out / name).is_file():
             show(f"  {options.out / name}: {text}")

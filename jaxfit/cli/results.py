@@ -58,7 +58,8 @@ def join(options: argparse.Namespace) -> None:
 
 
 def _list(options: argparse.Namespace) -> None:
-    from jaxfit.data.formats.coco import read_coco
+    from jaxfit.data.formats.recognise import read_observations
+    from jaxfit.data.result_folder import OBSERVATIONS
     from jaxfit.data.solution import load_solution
 
     solution, _ = load_solution(options.result)
@@ -70,9 +71,9 @@ def _list(options: argparse.Namespace) -> None:
         ends = [str(solution.frame_index[at[i]]) if len(at) else "–" for i in (0, -1)]
         table.add_row(str(track), str(len(at)), *ends, str(gaps), str(solution.status[n]))
     show(table)
-    path = options.result / "observations.json" if options.observations is None else options.observations
-    if path.is_file():
-        show(track_table(read_coco(path)))
+    path = options.observations or options.result / OBSERVATIONS
+    if options.observations is not None or path.is_file():
+        show(track_table(read_observations(path)))
 
 
 def _edit(kind: str, text: str) -> Edit:

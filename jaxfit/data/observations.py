@@ -31,6 +31,10 @@ _LAYOUT = {
     "keypoint_names": ("K", np.str_),
     "timestamp_s": ("T", np.float64),
 }
+CELLS = tuple(name for name, (shape, _) in _LAYOUT.items() if shape.startswith("N T"))
+"""Arrays with a value for every track and frame."""
+MAPPINGS = ("masks", "amodal_masks", "own_images")
+"""Values of some tracks and frames, by their positions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +235,7 @@ class Observations:
             if "T" in shape:
                 array = array.take(columns, axis=shape.split().index("T"))
             picked[name] = array
-        mappings = {name: moved(getattr(self, name)) for name in ("masks", "amodal_masks", "own_images")}
+        mappings = {name: moved(getattr(self, name)) for name in MAPPINGS}
         return replace(self, **picked, **mappings)
 
     def with_keypoints(self, keypoints_px: Any, confidence: Any) -> Observations:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxfit.data.footage import FootageIdentity, footage_of
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import check_times
+from jaxfit.data.result_folder import CONFIG, LEARNT, MODEL, POSES, SUMMARY
 from jaxfit.foundation.array_files import load_npz, validate_arrays
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder, write_whole
@@ -32,11 +33,7 @@ _OLDEST_VERSION = 2
 STATUSES = ("ok", "partly diverged", "diverged", "no usable frame")
 """The words of `Solution.status`."""
 
-RESULT = "poses.npz"
-"""File that marks a result folder."""
 _WRITTEN_BY = "check the path; `jaxfit fit` and `jaxfit reconstruct` write results"
-_CONFIG, _SUMMARY, _MODEL = "config.yaml", "summary.json", "model.npz"
-_LEARNT = "learnt.yaml"
 
 _CAMERA = {"focal_px": ("", np.float64), "crop_px": ("", np.int64)}
 _TIMES = {"timestamp_s": ("T", np.float64), "fps": ("", np.float64)}
@@ -369,7 +366,7 @@ def save_solution(
         InputError: the folder holds results already or something else, or cannot be written.
         TypeError: ``summary`` holds a value that JSON cannot represent.
     """
-    with new_folder(folder, overwrite, marker=RESULT) as part:
+    with new_folder(folder, overwrite, marker=POSES) as part:
         write_solution(solution, bird, config_yaml, summary, part, learnt_yaml)
 
 
@@ -393,12 +390,12 @@ def write_solution(
     arrays["timestamp_s"] = solution.timestamp_s
     arrays["fps"] = np.asarray(np.nan if solution.fps is None else solution.fps, np.float64)
     arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
-    write_whole(folder / RESULT, lambda file: np.savez_compressed(file, **arrays))
-    write_whole(folder / _CONFIG, config_yaml.encode())
+    write_whole(folder / POSES, lambda file: np.savez_compressed(file, **arrays))
+    write_whole(folder / CONFIG, config_yaml.encode())
     if learnt_yaml is not None:
-        write_whole(folder / _LEARNT, learnt_yaml.encode())
-    write_whole(folder / _SUMMARY, summary_json.encode())
-    save_bird(bird, folder / _MODEL)
+        write_whole(folder / LEARNT, learnt_yaml.encode())
+    write_whole(folder / SUMMARY, summary_json.encode())
+    save_bird(bird, folder / MODEL)
 
 
 def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
@@ -412,7 +409,7 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
             arrays do not agree.
     """
     folder = check_folder(folder, "a folder of results", _WRITTEN_BY)
-    path = check_readable(folder / RESULT, "an .npz file", _WRITTEN_BY)
+    path = check_readable(folder / POSES, "an .npz file", _WRITTEN_BY)
     shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
     shapes |= {"loss": "N L", "loss_terms": "L"}
     optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | LEDGE).items()}
@@ -427,15 +424,15 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         fps = validate_arrays({"fps": arrays.pop("fps", np.nan)}, {"fps": _TIMES["fps"]})["fps"].item()
         losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
         fps = None if math.isnan(fps) else fps
-        solution = Solution(**arrays, loss=losses, fps=fps, footage=_footage(folder / _SUMMARY))
+        solution = Solution(**arrays, loss=losses, fps=fps, footage=_footage(folder / SUMMARY))
     except ValueError as error:
         raise InputError(path, str(error), "run the fit again") from error
-    bird = load_bird(folder / _MODEL)
+    bird = load_bird(folder / MODEL)
     if (bird.joint_names, bird.keypoint_names) != (solution.joint_names, solution.keypoint_names):
-        raise InputError(folder / _MODEL, f"is not the model of {RESULT}", "run the fit again")
+        raise InputError(folder / MODEL, f"is not the model of {POSES}", "run the fit again")
     if bird.num_shapes != solution.betas.shape[2]:
-        problem = f"has {bird.num_shapes} shape coefficients, but {RESULT} has {solution.betas.shape[2]}"
-        raise InputError(folder / _MODEL, problem, "run the fit again")
+        problem = f"has {bird.num_shapes} shape coefficients, but {POSES} has {solution.betas.shape[2]}"
+        raise InputError(folder / MODEL, problem, "run the fit again")
     return solution, bird
 
 

@@ -16,13 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.files import read_cameras
+from jaxfit.data.result_folder import CAMERAS
 from jaxfit.data.solution import ERROR_BARS, Solution
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX
 
-CAMERAS = "cameras.toml"
-"""File of the cameras in the folder of a result."""
 _AGREES_PX = 1.0
 """Largest error of a pixel whose distortion is removed again; a larger error: the lens model does not hold there."""
 

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.projection import InImage, image_focal_px, in_image
+from jaxfit.data.result_folder import OBSERVATIONS, named_footage, read_summary
 from jaxfit.data.solution import Solution, load_solution, select_solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
 from jaxfit.foundation.errors import InputError
@@ -86,7 +86,6 @@ SD = (
 
 FPS_RANGE = 0.001, 100_000
 """Smallest and largest frame rate that a user can give, frames per second."""
-_OBSERVATIONS, _SUMMARY = "observations.json", "summary.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +269,7 @@ def open_result(
     columns = frame_positions(solution, frames, folder)
     observations, quality = _detections(folder, solution, bird)
     if video is None:
-        video = _stored_video(folder)
+        video = named_footage(read_summary(folder))
         rate = fps or solution.fps
     else:
         video = Path(video)
@@ -309,7 +308,7 @@ def frame_times(solution: Solution, given: float | None, rate: float | None) -> 
 
 def _detections(folder: Path, solution: Solution, bird: Bird) -> tuple[Observations | None, dict[int, TrackQuality]]:
     """Return the detections of a result, with the tracks and frames of the solution, and the quality of the tracks."""
-    path = folder / _OBSERVATIONS
+    path = folder / OBSERVATIONS
     if not path.is_file():
         return None, {}
     read = check_keypoints(read_coco(path), bird.keypoint_names, path)
@@ -322,17 +321,6 @@ def _detections(folder: Path, solution: Solution, bird: Bird) -> tuple[Observati
         raise InputError(path, problem, "remove it, or run the reconstruction again")
     order = np.array([row[track] for track in tracks], int)
     return read.select(order, np.array([column[number] for number in frames], int)), quality
-
-
-def _stored_video(folder: Path) -> Path | None:
-    """Return the footage that a summary names; a relative path begins in the folder where the command ran."""
-    path = folder / _SUMMARY
-    if not path.is_file():
-        return None
-    summary = read_json(path)
-    named = summary.value.get("video") if isinstance(summary.value, dict) else None
-    file = named.get("file") if isinstance(named, dict) else None
-    return Path(file) if isinstance(file, str) and file and "\0" not in file else None
 
 
 def _rate_of(video: Path, solution: Solution) -> float | None:

@@ -14,9 +14,9 @@ from jaxfit.config.fit import FitConfig, load_config
 from jaxfit.config.reconstruct import ReconstructConfig, load_reconstruct_config
 from jaxfit.data.flags import with_doubts
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.result_folder import CONFIG, OBSERVATIONS, POSES, read_summary
 from jaxfit.data.solution import Solution, load_solution, write_solution
 from jaxfit.data.tracks import track_quality
 from jaxfit.fitting.collect import summarise, track_status
@@ -163,9 +163,9 @@ def _ends(observations: Observations, windows: Windows, w: int) -> tuple[int, in
     return int(observations.frame_index[at[0]]), int(observations.frame_index[at[-1]])
 
 
-OBSERVATIONS, CONFIG, MARKER = "observations.json", "config.yaml", "poses.npz"
-_SUMMARY = "summary.json"
-_KEPT = ("video", "trust", "trust_reasons", "networks", "segmenter", "segmenter_reason")
+DETECTION = ("video", "networks", "segmenter", "segmenter_reason")
+"""Entries of the summary about the video and the networks."""
+_KEPT = (*DETECTION, "trust", "trust_reasons", "trust_signals", "joined")
 """Entries of the summary that corrections do not change."""
 
 
@@ -234,7 +234,7 @@ def correct_tracks(
     folder, out, start = Path(result), Path(out), time.perf_counter()
     if out.resolve() == folder.resolve():
         raise InputError(out, "is the result itself, which corrections keep", "choose another --out")
-    check_replaceable(out, overwrite, MARKER)
+    check_replaceable(out, overwrite, POSES)
     tracks = read_tracks(folder, observations)
     corrected = apply_edits(tracks.observations, edits, folder)
     config, config_text = read_config(folder)
@@ -245,7 +245,7 @@ def correct_tracks(
     summary |= {key: value for key, value in earlier.items() if key in _KEPT}
     summary["quality"] = {row.track_id: row._asdict() for row in track_quality(corrected)}
     summary["corrections"] = [*earlier.get("corrections", []), *map(str, edits)]
-    with new_folder(out, overwrite, marker=MARKER) as part:
+    with new_folder(out, overwrite, marker=POSES) as part:
         write_coco(corrected, part / OBSERVATIONS)
         write_solution(done.solution, tracks.bird, config_text, summary, part)
     return done
@@ -257,10 +257,3 @@ def read_config(folder: Path) -> tuple[FitConfig | ReconstructConfig, str]:
     text = read_file(path, CONFIG_BYTES, "a config").decode("utf-8", "replace")
     is_reconstruction = any(line.startswith("fit:") for line in text.splitlines())
     return (load_reconstruct_config(path) if is_reconstruction else load_config(path)), text
-
-
-def read_summary(folder: Path) -> dict[str, Any]:
-    """Return the content of `summary.json` of a result; empty if the file is absent."""
-    path = folder / _SUMMARY
-    value = read_json(path).value if path.is_file() else {}
-    return value if isinstance(value, dict) else {}

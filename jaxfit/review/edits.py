@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import CELLS, MAPPINGS, Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import EDITS_BYTES
 from jaxfit.foundation.reading import read_text
@@ -21,8 +21,6 @@ _TRACKS = {"swap": 2, "cut": 1, "join": 2, "delete": None, "exclude": 1}
 """Kind of an edit → number of its tracks; None is any number."""
 _FORM = re.compile(r"([a-z]+) ([0-9]{1,18}(?:,[0-9]{1,18})*)(?:@(?=[0-9:])([0-9]{1,18})?(?::([0-9]{1,18}))?)?")
 """Kind, tracks, first frame and end of the frames."""
-_CELLS = ("present", "keypoints_px", "confidence", "occluded", "score", "box_px")
-_MAPPINGS = ("masks", "amodal_masks", "own_images")
 
 
 class Edit(NamedTuple):
@@ -166,7 +164,7 @@ def _frames(observations: Observations, edit: Edit, source: object) -> np.ndarra
 def _moved(observations: Observations, target: dict[int, int], frames: np.ndarray) -> Observations:
     """Return observations in which some rows have moved to other rows in some frames; what they leave is empty."""
     arrays: dict[str, Any] = {}
-    for name in _CELLS:
+    for name in CELLS:
         old = np.asarray(getattr(observations, name))
         new = old.copy()
         for row in target:
@@ -174,7 +172,7 @@ def _moved(observations: Observations, target: dict[int, int], frames: np.ndarra
         for row, other in target.items():
             new[other, frames] = old[row, frames]
         arrays[name] = new
-    for name in _MAPPINGS:
+    for name in MAPPINGS:
         mapping = getattr(observations, name)
         arrays[name] = {(target.get(n, n) if frames[t] else n, t): value for (n, t), value in mapping.items()}
     return replace(observations, **arrays)
@@ -183,10 +181,10 @@ def _moved(observations: Observations, target: dict[int, int], frames: np.ndarra
 def _excluded(observations: Observations, row: int, frames: np.ndarray) -> Observations:
     """Return observations in which one row is empty in some frames."""
     arrays: dict[str, Any] = {}
-    for name in _CELLS:
+    for name in CELLS:
         arrays[name] = np.array(getattr(observations, name))
         arrays[name][row, frames] = 0
-    for name in _MAPPINGS:
+    for name in MAPPINGS:
         mapping = getattr(observations, name)
         arrays[name] = {(n, t): mapping[n, t] for n, t in mapping if n != row or not frames[t]}
     return replace(observations, **arrays)
@@ -195,7 +193,7 @@ def _excluded(observations: Observations, row: int, frames: np.ndarray) -> Obser
 def _with_empty_track(observations: Observations) -> Observations:
     """Return the observations with one more track, whose number is the next after the largest number."""
     arrays: dict[str, Any] = {}
-    for name in _CELLS:
+    for name in CELLS:
         values = np.asarray(getattr(observations, name))
         arrays[name] = np.concatenate([values, np.zeros_like(values[:1])])
     number = int(observations.track_id.max()) + 1

@@ -25,7 +25,8 @@ from jaxfit.config.build import plain_config, with_values
 from jaxfit.config.perception import TrackerConfig
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import CELLS, MAPPINGS, Observations
+from jaxfit.data.result_folder import OBSERVATIONS, POSES, read_summary
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.tracks import frame_step, track_quality
 from jaxfit.fitting.collect import summarise
@@ -34,11 +35,9 @@ from jaxfit.foundation.files import check_replaceable, new_folder
 from jaxfit.foundation.progress import Clock
 from jaxfit.foundation.unfinished import differences
 from jaxfit.model.bird import model_hash
-from jaxfit.review.correct import MARKER, OBSERVATIONS, Tracks, read_config, read_summary, read_tracks
+from jaxfit.review.correct import DETECTION, Tracks, read_config, read_tracks
 
-_CELLS = ("present", "keypoints_px", "confidence", "occluded", "score", "box_px")
 _FRAMES = ("frame_index", "image_size_px", "file_name", "timestamp_s")
-_MAPPINGS = ("masks", "amodal_masks", "own_images")
 _TIMES = ("frame_index", "timestamp_s")
 
 
@@ -54,8 +53,8 @@ def concatenate_observations(
     """
     frames = np.cumsum([0, *(part.num_frames for part in parts)])
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _FRAMES}
-    arrays |= {name: _cells(name, parts, rows, len(track_id)) for name in _CELLS}
-    for name in _MAPPINGS:
+    arrays |= {name: _cells(name, parts, rows, len(track_id)) for name in CELLS}
+    for name in MAPPINGS:
         arrays[name] = {
             (int(row[n]), int(first) + t): value
             for part, row, first in zip(parts, rows, frames, strict=False)
@@ -283,7 +282,7 @@ def join_results(
         raise InputError(out, "is one of the results, which joining keeps", "choose another --out")
     if bridge is not None and bridge < 0:
         raise InputError("--bridge", f"is {bridge}", "give a number of frames, 0 or more")
-    check_replaceable(out, overwrite, MARKER)
+    check_replaceable(out, overwrite, POSES)
     with clock("read"):
         parts = sorted((_read(folder) for folder in folders), key=lambda part: int(part.frames[0]))
     for earlier, later in pairwise(parts):
@@ -297,11 +296,14 @@ def join_results(
     bird, first = parts[0].tracks.bird, parts[0].summary
     trust = _trust(parts)
     summary: dict[str, Any] = summarise(solution, bird, clock.seconds)
-    summary |= {key: first[key] for key in ("video", "networks") if key in first} | trust
+    summary |= {key: first[key] for key in DETECTION if key in first} | trust
     summary["quality"] = {row.track_id: row._asdict() for row in track_quality(observations)}
+    corrections = [edit for part in parts for edit in part.summary.get("corrections", [])]
+    if corrections:
+        summary["corrections"] = corrections
     summary["joined"] = [row._asdict() for row in table]
     info = {key: "; ".join(value) if isinstance(value, list) else value for key, value in trust.items()}
-    with new_folder(out, overwrite, marker=MARKER) as part:
+    with new_folder(out, overwrite, marker=POSES) as part:
         write_coco(observations, part / OBSERVATIONS, info)
         write_solution(solution, bird, config_to_yaml(_config(parts)), summary, part)
     return solution, table
@@ -388,7 +390,7 @@ def _follow(
     track_id = np.zeros(0, np.int64)
     joined = None  # the observations of the parts so far
     for part in parts:
-        own = part.tracks.observations
+        own = replace(part.tracks.observations, masks={}, amodal_masks={})  # boxes are enough
         links = {} if joined is None else {link.after: link for link in link_tracks(joined, own, most_missing)}
         row = np.zeros(own.num_tracks, np.int64)
         for n, track in enumerate(own.track_id.tolist()):

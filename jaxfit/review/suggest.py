@@ -26,6 +26,7 @@ from jaxfit.data.formats.write_deeplabcut import write_deeplabcut_labels
 from jaxfit.data.formats.write_sleap import write_sleap_project
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import projected_observations
+from jaxfit.data.result_folder import OBSERVATIONS
 from jaxfit.data.solution import Solution, load_solution
 from jaxfit.foundation.errors import InputError, one_line
 from jaxfit.foundation.extras import require_extra
@@ -47,8 +48,6 @@ from jaxfit.review.signals import (
 from jaxfit.video.reader import probe_video, read_frames
 from jaxfit.view.drawing import write_png
 from jaxfit.view.overlay import is_inside
-
-_OBSERVATIONS = "observations.json"
 
 
 class Result(NamedTuple):
@@ -75,8 +74,8 @@ def read_result(path: Path, video: Path) -> Result:
     solution = None
     if path.is_dir():
         solution, _ = load_solution(path)
-        if (path / _OBSERVATIONS).is_file():
-            observations = read_observations(path / _OBSERVATIONS, video)
+        if (path / OBSERVATIONS).is_file():
+            observations = read_observations(path / OBSERVATIONS, video)
         else:
             observations, solution = projected_observations(solution), None
             check_video(observations, path, video)

@@ -66,11 +66,7 @@ def cut_tiles(
     """Cut the tiles of birds out of the image of their frame, for `contact_sheet`; black beyond the edges."""
     tiles = {}
     for n, t in pairs:
-        x0, y0, size = _window(posed, n, t)
-        zoom = TILE_PX / size
-        # pixel centres are halves in jaxfit and whole numbers in OpenCV
-        place = np.array([[zoom, 0, (0.5 - x0) * zoom - 0.5], [0, zoom, (0.5 - y0) * zoom - 0.5]])
-        tiles[n, t] = cv2.warpAffine(picture, place, (TILE_PX, TILE_PX), flags=cv2.INTER_LINEAR)
+        tiles[n, t] = _cut(picture, _window(posed, n, t), cv2.INTER_LINEAR)
     return tiles
 
 
@@ -168,6 +164,15 @@ def _window(posed: PosedBirds, n: int, t: int) -> Float[np.ndarray, "3"]:
     return crop if crop[2] < 1.4 * size else np.array([*((low + high - size) / 2), size], np.float32)
 
 
+def _cut(picture: np.ndarray, window: np.ndarray, interpolation: int) -> np.ndarray:
+    """Cut a window out of a picture, as a tile."""
+    x0, y0, size = window
+    zoom = TILE_PX / size
+    # pixel centres are halves in jaxfit and whole numbers in OpenCV
+    place = np.array([[zoom, 0, (0.5 - x0) * zoom - 0.5], [0, zoom, (0.5 - y0) * zoom - 0.5]])
+    return cv2.warpAffine(picture, place, (TILE_PX, TILE_PX), flags=interpolation)
+
+
 def _to_tile(points_px: np.ndarray, window: np.ndarray) -> np.ndarray:
     return (points_px - window[:2]) * (TILE_PX / window[2])
 
@@ -177,10 +182,7 @@ def _observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footag
     tile = np.full((TILE_PX, TILE_PX, 3), PAPER, np.uint8) if footage is None else footage.copy()
     mask = detected.mask(n, t) if footage is None else None
     if mask is not None:
-        zoom = TILE_PX / window[2]
-        place = np.array([[zoom, 0, -window[0] * zoom], [0, zoom, -window[1] * zoom]])
-        seen = cv2.warpAffine(mask.astype(np.uint8), place, (TILE_PX, TILE_PX), flags=cv2.INTER_NEAREST)
-        tile[seen > 0] = SEEN
+        tile[_cut(mask.astype(np.uint8), window, cv2.INTER_NEAREST) > 0] = SEEN
     screen = posed.vertices_screen(n, t)
     screen = np.column_stack([_to_tile(screen[:, :2], window), screen[:, 2]])
     covered = hard_mask(screen, posed.faces, TILE_PX, TILE_PX).astype(np.uint8)

@@ -18,8 +18,9 @@ from jaxfit.cameras.files import read_cameras
 from jaxfit.data.flags import FLAGS, flags, keypoint_distances
 from jaxfit.data.observations import Observations
 from jaxfit.data.projection import PosedBirds, image_focal_px, in_image
+from jaxfit.data.result_folder import CAMERAS
 from jaxfit.data.solution import select_solution
-from jaxfit.data.world import CAMERAS, as_filmed
+from jaxfit.data.world import as_filmed
 from jaxfit.export.gltf import four_weights
 from jaxfit.export.result import Exported
 from jaxfit.foundation.errors import InputError

@@ -203,6 +203,11 @@ def test_absent_files(folder, tmp_path, capsys, name, message):
     assert message in capsys.readouterr().err
 
 
+def test_a_list_of_tracks_needs_the_observations_that_are_named(folder, tmp_path, capsys):
+    assert main(["tracks", str(folder), "--observations", str(tmp_path / "absent.json")]) == 2
+    assert "absent.json" in capsys.readouterr().err
+
+
 def test_a_file_needs_a_folder_for_the_result(folder, tmp_path, capsys):
     path = tmp_path / "edits.txt"
     path.write_text("delete 5\n")

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.files import write_cameras
+from jaxfit.data.result_folder import CAMERAS
 from jaxfit.data.solution import save_solution
-from jaxfit.data.world import CAMERAS
 from jaxfit.model.files import load_murre
 
 BIRD, FRAMES = load_murre(), 2

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jaxfit.data.observations import Observations
+from jaxfit.data.result_folder import SUMMARY
 from jaxfit.data.solution import load_solution
 from jaxfit.evaluation.ablation.grid import ClaimConfig, Run, hashable
 from jaxfit.evaluation.ablation.runs import run_folder
@@ -97,7 +98,7 @@ def read_metrics(folder: Path) -> tuple[Evaluation, float, int]:
     """
     path, remedy = folder / _EVALUATION, "remove this folder; then the same command fits the run again"
     content = read_json_file(path, ABLATION_BYTES)
-    summary = read_json_file(folder / "summary.json", ABLATION_BYTES)
+    summary = read_json_file(folder / SUMMARY, ABLATION_BYTES)
     try:
         evaluation = Evaluation.from_dict(content)
         seconds, runs_at_once = summary["seconds"]["fit"], summary["runs_at_once"]

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from jaxfit.data.flags import CONTRADICTED, FLAGS, UNSURE, expected_error, flagged_ranges, flags
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.observations import Observations
+from jaxfit.data.result_folder import SUMMARY
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
 from jaxfit.model.bird import Bird
@@ -152,7 +153,7 @@ def gather(
     Raises:
         InputError: an entry of the summary has another type than jaxfit writes.
     """
-    field = Field(folder / "summary.json", "", summary)
+    field = Field(folder / SUMMARY, "", summary)
     video = field["video"] if field.has("video") else None
     named = video["file"].text() if video is not None and video.has("file") else None
     sizes = solution.image_size_px[solution.valid]

@@ -13,8 +13,8 @@ from urllib.parse import quote
 import numpy as np
 
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.result_folder import CONFIG, OBSERVATIONS, named_footage, read_summary
 from jaxfit.data.solution import Solution, load_solution
 from jaxfit.data.world import as_filmed
 from jaxfit.foundation.errors import InputError
@@ -27,7 +27,6 @@ from jaxfit.view.report.contents import gather
 from jaxfit.view.report.page import Measured, page, report_pictures
 
 REPORT = "report.html"
-_OBSERVATIONS, _SUMMARY, _CONFIG = "observations.json", "summary.json", "config.yaml"
 
 _logger = logging.getLogger(__name__)
 
@@ -118,16 +117,14 @@ def report_of_result(
     path = folder / REPORT if out is None else Path(out)
     check_new_file(path, overwrite or out is None)
     solution, bird = load_solution(folder)
-    summary = read_json(folder / _SUMMARY) if (folder / _SUMMARY).is_file() else None
-    config = read_file(folder / _CONFIG, CONFIG_BYTES, "a config").decode("utf-8", "replace")
+    content = read_summary(folder)
+    config = read_file(folder / CONFIG, CONFIG_BYTES, "a config").decode("utf-8", "replace")
     observations = None
-    if (folder / _OBSERVATIONS).is_file():
-        observations = check_keypoints(read_coco(folder / _OBSERVATIONS), bird.keypoint_names, folder / _OBSERVATIONS)
+    if (folder / OBSERVATIONS).is_file():
+        observations = check_keypoints(read_coco(folder / OBSERVATIONS), bird.keypoint_names, folder / OBSERVATIONS)
         if not np.array_equal(observations.frame_index, solution.frame_index):
             problem = "has other frames than poses.npz, so it belongs to another result"
-            raise InputError(folder / _OBSERVATIONS, problem, "remove it, or run the reconstruction again")
-    content = {} if summary is None else dict(summary.entries())
-    content = {key: each.value for key, each in content.items()}
+            raise InputError(folder / OBSERVATIONS, problem, "remove it, or run the reconstruction again")
     if video is not None and content.get("photographs"):
         raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
     footage = _footage(content, video)
@@ -140,11 +137,8 @@ def _footage(summary: Mapping[str, Any], given: str | Path | None) -> Path | Non
     """Return the footage that is given, or else the footage that the summary names and that still exists."""
     if given is not None:
         return Path(given)
-    video = summary.get("video")
-    named = video.get("file") if isinstance(video, dict) else None
-    if not isinstance(named, str) or "\0" in named:
-        return None
-    if Path(named).exists():
-        return Path(named)
+    named = named_footage(summary)
+    if named is None or named.exists():
+        return named
     _logger.warning("%s: the footage is not there, so the report has no pictures; give --video", named)
     return None
