@@ -18,7 +18,8 @@ from jaxfit.config.perception import TrackConfig
 from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats.coco import write_coco
-from jaxfit.data.observations import Observations, check_keypoints
+from jaxfit.data.keypoint_names import NameMap, map_keypoints, names_in_model
+from jaxfit.data.observations import Observations
 from jaxfit.data.result_folder import OBSERVATIONS, OVERLAY, POSES
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.tracks import track_quality
@@ -38,7 +39,6 @@ from jaxfit.perception.detections import check_segmenter, network_files, open_ke
 from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segmenter
 from jaxfit.perception.track import ObservationsFrom, TrackingResult, run_tracking
-from jaxfit.perception.tracking import TrackRecorder
 from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import VideoInfo, probe_video
 from jaxfit.view.overlay import check_outputs, is_inside, overlay
@@ -124,6 +124,8 @@ class Reconstruction(NamedTuple):
     """Poses."""
     summary: dict[str, Any]
     """Content of `summary.json`: metrics, timings, versions."""
+    names: NameMap
+    """The keypoints of the network → those of the model, by the words of their names."""
 
 
 def reconstruct(
@@ -163,7 +165,7 @@ def reconstruct(
         The result. A failed fit of one bird appears in the bird's status and does not affect other birds.
 
     Raises:
-        InputError: no video; an unusable network or tracker; keypoints that differ from the model's; a folder that
+        InputError: no video; an unusable network or tracker; a network without keypoints of the model; a folder that
             cannot be written, holds the video or holds other files; a video without birds (`NoTrackError`); unfinished
             work of another video, config, model or version; another process that works on the same result; a cluster
             that ends.
@@ -179,8 +181,8 @@ def reconstruct(
         config, choice = (config, None) if replaced["segmenter"] else _with_segmenter(config, video, progress)
         own_networks = {kind: files for kind, files in network_files(config.track).items() if not replaced[kind]}
         networks = file_hashes(own_networks)
-        empty = TrackRecorder(keypoints.keypoint_names).observations()
-        check_keypoints(empty, bird.keypoint_names, config.track.keypoints.file)
+        names = names_in_model(keypoints.keypoint_names, bird.keypoint_names, config.track.keypoints.file)
+        in_model = partial(map_keypoints, names=names, model_names=bird.keypoint_names)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
             stored, workers = None, None
@@ -198,13 +200,13 @@ def reconstruct(
 
                 def on_frame(observations_from: ObservationsFrom) -> None:
                     with clock("fit"):
-                        provisional_fit(observations_from)
+                        provisional_fit(lambda first: in_model(observations_from(first)))
 
                 more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
                 tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
                 tracking = tracking._replace(choice=choice)
         _check_tracking(tracking, stored)
-        observations = tracking.observations
+        observations = in_model(tracking.observations)
         with clock("fit"):
             config, learnt_yaml = _learn_weights(config, observations, bird, video, progress)
             solution = fit(observations, bird, config.fit, None, fit_progress, video, windows, cluster)
@@ -212,11 +214,11 @@ def reconstruct(
             write_coco(observations, part / OBSERVATIONS, tracking.info())
             with clock("overlay"):
                 _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
-            summary = _summary(tracking, solution, bird, networks, video, info, clock)
+            summary = _summary(tracking, solution, bird, names, networks, video, info, clock)
             settings = config_to_yaml(config)
             write_solution(solution, bird, settings, summary, part, learnt_yaml)
             _write_report(part, solution, bird, observations, summary, settings, folder, video, progress)
-    return Reconstruction(tracking, solution, summary)
+    return Reconstruction(tracking, solution, summary, names)
 
 
 def _write_report(
@@ -324,6 +326,7 @@ def _summary(
     tracking: TrackingResult,
     solution: Solution,
     bird: Bird,
+    names: NameMap,
     networks: dict[str, dict[str, str]],
     video: Path,
     info: VideoInfo,
@@ -344,4 +347,5 @@ def _summary(
         "trust_signals": tracking.trust.signals._asdict(),
         "seconds_of_tracking": {part: round(value, 3) for part, value in tracking.seconds.items()},
         "networks": networks,
+        **({"keypoint_names": names.mapped} if names.changes_names else {}),
     }

@@ -70,7 +70,8 @@ def keypoint_map(
         problem = f"has no keypoint of the model by name: it has {', '.join(own)}"
         raise InputError(path, problem, "map the names by --names MAP.yaml")
     if names.changes_names and not quiet:
-        _show_names(names, path, proposed=map_file is None)
+        how = "mapped by --names" if map_file is not None else "mapped by their words; --names MAP.yaml changes the map"
+        show_names(names, path.name, how)
     return names
 
 
@@ -88,10 +89,10 @@ def image_size(options: argparse.Namespace) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _show_names(names: NameMap, path: Path, proposed: bool) -> None:
-    """Print the map of the names as a table, or only the unused keypoints if no name changes."""
+def show_names(names: NameMap, source: str, how: str) -> None:
+    """Print the map of the names of a source as a table, or only the unused keypoints if no name changes."""
     if all(old == new for old, new in names.mapped.items()):
-        show(f"keypoints of {path.name} that are not used: {', '.join(names.unmapped)}")
+        show(f"keypoints of {source} that are not used: {', '.join(names.unmapped)}")
         return
     table = EscapedTable()
     table.add_column("in the file")
@@ -100,8 +101,7 @@ def _show_names(names: NameMap, path: Path, proposed: bool) -> None:
         table.add_row(old, new)
     for old in names.unmapped:
         table.add_row(old, "– (not used)")
-    origin = "mapped by their words; --names MAP.yaml changes the map" if proposed else "mapped by --names"
-    show(f"keypoints of {path.name}, {origin}:")
+    show(f"keypoints of {source}, {how}:")
     show(table)
     if names.missing:
         show(f"keypoints of the model that the file lacks: {', '.join(names.missing)}")

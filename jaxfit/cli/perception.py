@@ -7,8 +7,10 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from jaxfit.cli.observations import show_names
 from jaxfit.cli.tables import counted, flag_line, right_aligned, show, track_table
 from jaxfit.foundation.progress import terminal
 from jaxfit.model.files import find_bird
@@ -66,6 +68,9 @@ def reconstruct(options: argparse.Namespace) -> None:
         except NoTrackError as error:
             _show_failure(error.tracking, config.track.min_track_frames)
             raise
+    if done.names.changes_names:
+        how = "mapped by their words; `jaxfit track` and `jaxfit fit --names MAP.yaml` use another map"
+        show_names(done.names, Path(config.track.keypoints.file).name, how)
     _show_trust(done.tracking, done.tracking.trust.sentence())
     show(flag_line(done.solution))
     show(track_table(done.tracking.observations, done.solution))

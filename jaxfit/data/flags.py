@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float, Int, Int8
 
 from jaxfit.data.mask_comparison import compare_masks
 from jaxfit.data.masks import box_of_rle, decode_mask
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.solution import Solution
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.bird import Bird, rest_length
@@ -57,7 +57,8 @@ WRONG_SHARE = 0.1
 """A pose whose keypoints are wrong by more than this share of the length of the bird counts as wrong."""
 LEAST_IOU = 0.5
 LEAST_CONFIDENCE = 0.5
-"""Mean confidence of all keypoints of a bird, below which they are doubtful; missing keypoints count as 0."""
+"""Mean confidence of all keypoints of a bird, below which they are doubtful; missing keypoints count as 0, except those
+that are missing everywhere."""
 OUTSIDE_SHARE = 0.1
 """Keypoints and mask contradict each other if more than this share of the keypoints lies outside the mask by more than
 `WRONG_SHARE` of the longer side of the box. Masks often lack one or two of 20 keypoints: bill and feet are thin."""
@@ -181,7 +182,7 @@ def with_doubts_of_views(
         is_outlier(1 - overlap) | (overlap < LEAST_IOU),
         np.asarray(solution.ambiguity_deg) > 0,
         expected_error(solution, bird) > WRONG_SHARE,
-        confidence.mean(-1) < LEAST_CONFIDENCE,
+        mean_confidence(confidence) < LEAST_CONFIDENCE,
         outside > 0.5,
     )
     doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))

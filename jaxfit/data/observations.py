@@ -33,6 +33,8 @@ _LAYOUT = {
 }
 CELLS = tuple(name for name, (shape, _) in _LAYOUT.items() if shape.startswith("N T"))
 """Arrays with a value for every track and frame."""
+LEAST_KEYPOINTS = 3
+"""Fewer keypoints do not determine the orientation of a bird."""
 MAPPINGS = ("masks", "amodal_masks", "own_images")
 """Values of some tracks and frames, by their positions."""
 
@@ -197,17 +199,9 @@ class Observations:
         own = self.own_images.get((n, t))
         return own[0] if own else str(self.file_name[t])
 
-    def usable(self, min_keypoints: int = 3, min_confidence: float = 0.0) -> np.ndarray:
-        """Return where a bird has enough keypoints for a fit.
-
-        Args:
-            min_keypoints: fewest confident keypoints; fewer than three do not determine the orientation.
-            min_confidence: keypoints with a greater confidence are confident.
-
-        Returns:
-            (N, T) bool: present and with at least ``min_keypoints`` confident keypoints.
-        """
-        return self.present & ((self.confidence > min_confidence).sum(-1) >= min_keypoints)
+    def usable(self, min_keypoints: int = LEAST_KEYPOINTS) -> np.ndarray:
+        """Return where a bird has enough keypoints for a fit, (N, T) bool: it is present with ``min_keypoints``."""
+        return self.present & ((self.confidence > 0).sum(-1) >= min_keypoints)
 
     def select(self, tracks: Any = None, frames: Any = None) -> Observations:
         """Return the observations of some tracks and frames.
@@ -301,6 +295,12 @@ def check_keypoints(observations: Observations, names: Sequence[str], source: ob
         problem = f"keypoints {' and '.join(parts)}"
         raise InputError(source, problem, "rename the keypoints as in the model, or choose another model")
     return reorder_keypoints(observations, names)
+
+
+def mean_confidence(confidence: Float[np.ndarray, "*B K"]) -> Float[np.ndarray, "*B"]:
+    """Return the mean over the keypoints, except those without a confidence anywhere, which the network lacks."""
+    known = confidence.any(axis=tuple(range(confidence.ndim - 1)))
+    return confidence[..., known].mean(-1) if known.any() else np.zeros(confidence.shape[:-1], confidence.dtype)
 
 
 _KEPT = 1024

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import FRAME_DIGITS, FRAMES_PER_S, SECONDS_PER_FRAME
 
@@ -140,7 +140,8 @@ class TrackQuality(NamedTuple):
     coverage: float
     """Fraction of the frames from the first to the last with a detection; frames missing in the file count too."""
     mean_confidence: float
-    """Mean confidence of all keypoints over the frames with a detection; a missing keypoint counts as 0."""
+    """Mean confidence of all keypoints over the frames with a detection; a missing keypoint counts as 0, unless no bird
+    has it."""
     jitter: float | None
     """Median of |p(t−1) − 2 p(t) + p(t+1)| / (longer side of the box at t), where the position p of a keypoint has a
     confidence of at least ½ in three consecutive frames; None without three such frames. White noise of standard
@@ -158,7 +159,7 @@ def track_quality(observations: Observations) -> list[TrackQuality]:
     """
     numbers = observations.frame_index
     step = frame_step(numbers)
-    jitter = second_differences(observations)
+    confidence, jitter = mean_confidence(observations.confidence), second_differences(observations)
     qualities = []
     for n in range(observations.num_tracks):
         at = np.flatnonzero(observations.present[n])
@@ -174,7 +175,7 @@ def track_quality(observations: Observations) -> list[TrackQuality]:
                 frames=len(at),
                 gaps=int((np.diff(numbers[at]) > step).sum()),
                 coverage=len(at) / ((last - first) // step + 1),
-                mean_confidence=float(observations.confidence[n, at].mean()) if observations.num_keypoints else 0.0,
+                mean_confidence=float(confidence[n, at].mean()),
                 jitter=float(np.median(own)) if len(own) else None,
             )
         )

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from jaxfit.data.flags import LARGEST_SHARE, keypoint_distances
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import frame_step, second_differences
 from jaxfit.model.anatomy import mirror_pairs
@@ -44,7 +44,7 @@ def frame_signals(observations: Observations, solution: Solution | None = None) 
     """
     present = observations.present
     signals = {
-        "low confidence": mean_over_birds(1 - observations.confidence.mean(-1), present),
+        "low confidence": mean_over_birds(1 - mean_confidence(observations.confidence), present),
         "low bird score": mean_over_birds(1 - cast(np.ndarray, observations.score), present),
         "jitter": mean_over_birds(_jitter(observations), present),
         "missing birds": _missing_birds(observations),

@@ -16,7 +16,7 @@ from jaxfit.behaviour.describe import describe
 from jaxfit.behaviour.registry import find_feature, own_features
 from jaxfit.cameras.files import read_cameras
 from jaxfit.data.flags import FLAGS, flags, keypoint_distances
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.projection import PosedBirds, image_focal_px, in_image
 from jaxfit.data.result_folder import CAMERAS
 from jaxfit.data.solution import select_solution
@@ -276,7 +276,7 @@ class Shown:
         rows = np.intersect1d(seen.track_id, s.track_id, return_indices=True)[1:]
         columns = np.intersect1d(seen.frame_index, s.frame_index, return_indices=True)[1:]
         if name == "confidence":
-            found_here = np.where(seen.present, seen.confidence.mean(-1), np.nan)
+            found_here = np.where(seen.present, mean_confidence(seen.confidence), np.nan)
         else:
             found_here = keypoint_distances(seen, s)
         values[np.ix_(rows[1], columns[1])] = found_here[np.ix_(rows[0], columns[0])]

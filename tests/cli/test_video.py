@@ -206,11 +206,52 @@ def test_the_footage_is_not_replaced(inputs, capsys):
     assert (inputs / "frames" / "0.png").is_file()
 
 
+class NamedKeypoints(TrueKeypoints):
+    """The true keypoints under other names."""
+
+    keypoint_names = (
+        "Beak",
+        "eyeL",
+        "R_eye",
+        "crown",
+        "nape",
+        "back",
+        "chest",
+        "tail",
+        "wingL",
+        "wingR",
+        "knee",
+        "spot",
+    )
+
+
 @pytest.mark.usefixtures("networks")
-def test_keypoints_of_another_model(inputs, tmp_path, capsys):
-    wrong = command(inputs, "reconstruct", tmp_path / "result")[:-2]  # the murre, not the toy
-    rejected(capsys, wrong, "keypoints lack", "another model")
+def test_keypoints_of_another_model(inputs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(NamedKeypoints, "keypoint_names", tuple("abcdefghijkl"))
+    monkeypatch.setattr(pipeline, "open_keypoint_detector", lambda _: NamedKeypoints(FOOTAGE))
+    rejected(capsys, command(inputs, "reconstruct", tmp_path / "result"), "keypoints lack bill_tip", "another model")
     assert not (tmp_path / "result").exists()
+
+
+@pytest.mark.usefixtures("networks")
+def test_keypoints_with_names_of_their_own(inputs, tmp_path, monkeypatch, capsys):
+    """A network that `jaxfit train` trained on labels of DeepLabCut has the names of the labels."""
+    for module in (track, pipeline):
+        monkeypatch.setattr(module, "open_keypoint_detector", lambda _: NamedKeypoints(FOOTAGE))
+    out = tmp_path / "result"
+    assert main(command(inputs, "reconstruct", out, "--stop", "4")) == 0
+    said = capsys.readouterr().out
+    assert "Beak" in said
+    assert "jaxfit fit --names" in said
+    found = read_coco(out / "observations.json")
+    assert found.keypoint_names == BIRD.keypoint_names
+    columns = (found.keypoints_px[:, 0, 0, 0] // SIDE).astype(int)
+    np.testing.assert_allclose(found.keypoints_px[:, 0, :10], FOOTAGE.keypoints_px[0, columns, :10], atol=0.01)
+    assert (found.confidence[:, :, :10] > 0).all()
+    assert not found.confidence[:, :, 10:].any()  # the feet: the network knows a knee and a spot instead
+    assert json.loads((out / "summary.json").read_text())["keypoint_names"]["wingL"] == "left_wingtip"
+    solution, _ = load_solution(out)
+    assert solution.valid.all()
 
 
 @pytest.mark.parametrize("name", ["track", "reconstruct"])

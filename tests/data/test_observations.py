@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxfit.data.masks import encode_mask
-from jaxfit.data.observations import Observations, check_keypoints, reorder_keypoints
+from jaxfit.data.observations import Observations, check_keypoints, mean_confidence, reorder_keypoints
 from jaxfit.foundation.errors import InputError
 
 MASK = np.zeros((6, 8), bool)
@@ -124,7 +124,12 @@ def test_masks():
 def test_usable():
     np.testing.assert_array_equal(make().usable(), [[True, False, False], [False, True, True]])
     np.testing.assert_array_equal(make().usable(min_keypoints=2), [[True, True, False], [False, True, True]])
-    np.testing.assert_array_equal(make().usable(2, 0.3), [[True, True, False], [False, True, False]])
+
+
+def test_keypoints_that_no_bird_has_do_not_count():
+    confidence = np.array([[[0.5, 0, 1.0], [0, 0, 0.5]], [[0, 0, 0], [1.0, 0, 1.0]]], np.float32)
+    np.testing.assert_array_equal(mean_confidence(confidence), [[0.75, 0.25], [0, 1]])
+    np.testing.assert_array_equal(mean_confidence(np.zeros((2, 3, 0), np.float32)), np.zeros((2, 3)))
 
 
 def test_select_moves_everything_along():

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from jaxfit.data.flags import CONTRADICTED, FLAGS, UNSURE, expected_error, flagged_ranges, flags
 from jaxfit.data.formats.fields import Field
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.result_folder import SUMMARY
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
@@ -203,6 +203,7 @@ def _tracks(
     problems: Mapping[str, tuple[str, ...]],
     expected: Float[np.ndarray, "N T"],
 ) -> list[Track]:
+    means = mean_confidence(observations.confidence) if observations and observations.num_keypoints else None
     quality = {} if observations is None else {row.track_id: row for row in track_quality(observations)}
     rows = {} if observations is None else {track: n for n, track in enumerate(observations.track_id.tolist())}
     size = _image_size(solution)
@@ -213,7 +214,7 @@ def _tracks(
         valid, present, confidence = solution.valid[n], solution.valid[n], None
         if observations is not None and track_id in rows:
             present = observations.present[rows[track_id]]
-            confidence = observations.confidence[rows[track_id]].mean(-1) if observations.num_keypoints else None
+            confidence = None if means is None else means[rows[track_id]]
         median = np.median(size[n, valid]) if valid.any() else 1.0
         poses, at = int(valid.sum()), solution.frame_index[present]
         tracks.append(
