@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from jaxfit.behaviour.result import shown_behaviour
-from jaxfit.cli.observations import matching_line, observation_tables
+from jaxfit.cli.observations import matching_line, observation_tables, parsed_size
 from jaxfit.cli.tables import counted, evaluation_tables, flag_quality_line, show, track_table
 from jaxfit.config.build import with_values
 from jaxfit.config.reconstruct import load_reconstruct_config
@@ -146,7 +146,7 @@ def simulate_scene(options: argparse.Namespace) -> None:
     from jaxfit.simulation.rig import simulate_rig
 
     start = time.perf_counter()
-    size = _size(options.size)
+    size = parsed_size(options.size)
     numbers = {name: getattr(options, name) for name in ("birds", "frames", "fps", "seed", "codec", "overwrite")}
     if options.cameras is None:
         if options.distortion:
@@ -181,11 +181,3 @@ def demo(options: argparse.Namespace) -> None:
     """Run the demo."""
 
     run_demo(options.out, options.verbose)
-
-
-def _size(text: str) -> tuple[int, int]:
-    """Return width and height in pixels from a text such as `2592x1520`."""
-    sides = text.lower().replace("×", "x").split("x")
-    if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
-        raise InputError("--size", f"{text!r} is not a picture size", "give width and height as in 2592x1520")
-    return int(sides[0]), int(sides[1])

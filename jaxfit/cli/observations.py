@@ -76,16 +76,19 @@ def keypoint_map(
 
 
 def image_size(options: argparse.Namespace) -> tuple[int, int] | None:
-    """Return width and height of the option `size`, such as `640x480`; None without the option.
+    """Return width and height of the option `size`, see `parsed_size`; None without the option."""
+    return None if options.size is None else parsed_size(options.size)
+
+
+def parsed_size(text: str) -> tuple[int, int]:
+    """Return width and height in pixels from the text of `--size`, such as `640x480`.
 
     Raises:
-        InputError: the option is not two positive whole numbers.
+        InputError: the text is not two positive whole numbers.
     """
-    if options.size is None:
-        return None
-    width, _, height = options.size.lower().partition("x")
+    width, _, height = text.lower().replace("×", "x").partition("x")
     if not all(side.isascii() and side.isdecimal() and 1 <= len(side) <= 5 and int(side) for side in (width, height)):
-        raise InputError("--size", f"is {options.size}", "give width and height in pixels, such as 640x480")
+        raise InputError("--size", f"is {text}", "give width and height in pixels, such as 640x480")
     return int(width), int(height)
 
 

@@ -25,6 +25,7 @@ from jaxfit.data.projection import PosedBirds
 from jaxfit.data.tracks import frame_step
 from jaxfit.export.result import Exported, describe_tracks
 from jaxfit.model.bird import Bird
+from jaxfit.raster.zbuffer import vertex_normals
 
 _COMPONENT = {"f4": 5126, "u1": 5121, "u2": 5123, "u4": 5125}
 _ELEMENT = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
@@ -90,6 +91,8 @@ class GltfBuilder:
         return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
+ANY_NORMAL = np.array([0, 0, 1], np.float32)
+"""Normal of a vertex without faces, which must have one."""
 FOUR = 4
 """Largest number of joints that move one vertex in glTF."""
 
@@ -207,6 +210,7 @@ def _add_mesh(builder: GltfBuilder, bird: Bird, motion: Motion, name: str) -> in
     if not _morphs(motion):
         vertices = vertices + np.tensordot(motion.betas[0], basis, axes=1)
     faces = np.asarray(bird.faces)
+    normals = vertex_normals(vertices, faces)
     joints, weights = four_weights(bird)
     short = weights.astype(np.float32)
     short[:, 0] = 1 - short[:, 1:].sum(axis=1, dtype=np.float32)  # the sum is 1 after rounding, too
@@ -214,7 +218,7 @@ def _add_mesh(builder: GltfBuilder, bird: Bird, motion: Motion, name: str) -> in
     linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
     attributes = {
         "POSITION": builder.add_array(vertices.astype(np.float32), VERTICES, bounds=True),
-        "NORMAL": builder.add_array(_normals(vertices, faces), VERTICES),
+        "NORMAL": builder.add_array(np.where(normals.any(axis=-1, keepdims=True), normals, ANY_NORMAL), VERTICES),
         "COLOR_0": builder.add_array(linear.astype(np.float32), VERTICES),
         "JOINTS_0": builder.add_array(joints.astype(np.uint8), VERTICES),
         "WEIGHTS_0": builder.add_array(short, VERTICES),
@@ -304,17 +308,6 @@ def body_length(bird: Bird) -> float:
 
 def _morphs(motion: Motion) -> bool:
     return bool(np.ptp(motion.betas, axis=0).any())
-
-
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return unit normals of the vertices: means over their faces, weighted by area."""
-    corners = vertices[faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    sums = np.zeros(vertices.shape)
-    for i in range(3):
-        np.add.at(sums, faces[:, i], normal)
-    length = np.linalg.norm(sums, axis=1, keepdims=True)
-    return np.where(length > 0, sums / np.where(length > 0, length, 1), [0, 0, 1.0]).astype(np.float32)
 
 
 def _plumage(builder: GltfBuilder) -> int:

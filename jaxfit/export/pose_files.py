@@ -78,10 +78,8 @@ def write_dlc_keypoints(exported: Exported, out: Path, progress: ProgressTask) -
     """Write predictions of DeepLabCut for several animals, as `.h5` or `.csv`.
 
     Raises:
-        InputError: h5py is not installed, the name has another suffix, or no pose is chosen.
+        InputError: h5py is not installed, or no pose is chosen.
     """
-    if out.suffix not in (".h5", ".csv"):
-        raise InputError(out, "must end with .h5 or .csv for DeepLabCut", "choose another --out")
     if out.suffix == ".h5":
         require_package("h5py", "--to dlc")
     exported.require_poses()

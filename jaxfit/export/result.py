@@ -362,7 +362,7 @@ def export_folder(
 
 
 def describe_tracks(exported: Exported) -> dict[str, dict[str, Any]]:
-    """Return the status, the number of poses, the failures and the quality of every track, for JSON."""
+    """Return the status, the number of poses and the quality of every track, for JSON."""
     s = exported.solution
     tracks = {}
     for n, track in enumerate(s.track_id.tolist()):

@@ -6,9 +6,9 @@ its training inputs and a matrix W (`jaxfit.learning.networks.familiarity`). The
 is ‖W (a − μ)‖. W whitens the activations of the training, and its scale is such that 99 % of the training inputs have a
 distance below 1.
 
-Calibration of confidences: from a network's raw value to the probability that the detection is right. A network that
-`jaxfit train` wrote holds a curve in its metadata (`jaxfit.learning.networks.calibration` fits the curve): points
-`value:probability`, separated by commas, with linear interpolation between the points. The values increase and the
+Calibration of confidences: from a network's raw value to the probability that the detection is right. The metadata of a
+network, such as the built-in keypoint network, may hold a curve (`jaxfit.learning.networks.calibration` fits it):
+points `value:probability`, separated by commas, with linear interpolation between them. The values increase and the
 probabilities do not decrease. Without a curve, the confidence is the network's own value.
 """
 

@@ -136,7 +136,7 @@ allows it. coco.json can be corrected by a program of your own, too.
 
 
 def picture_name(video: Path, number: int) -> str:
-    """Return the file name of the picture of a frame, from which `picture_names.frame_numbers` reads the number."""
+    """Return the file name of the picture of a frame, from which `frame_numbers` reads the number."""
     return f"{_stem(video)}_{number:06d}.png"
 
 
