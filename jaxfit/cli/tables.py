@@ -200,7 +200,8 @@ def flag_line(solution: Solution) -> str:
 
 def track_table(observations: Observations, solution: Solution | None = None) -> Table:
     """Return a table with the quality of every track, and with the status of its fit if there is a solution."""
-    table = right_aligned("track", "frames", "coverage", "confidence", "jitter")
+    padding = (0, 1) if solution is None else (0, 0, 0, 1)  # 80 characters hold all columns
+    table = right_aligned("track", "frames", "coverage", "confidence", "jitter", padding=padding)
     table.caption = (
         "coverage: fraction of the frames between the first and the last detection that have a detection; confidence: "
         "mean over all keypoints; jitter: median second difference of keypoints divided by the longer side of the box"
@@ -209,7 +210,7 @@ def track_table(observations: Observations, solution: Solution | None = None) ->
     if solution is not None:
         fitted = fit_cells(solution)
         for name in FIT_COLUMNS:
-            table.add_column(name)
+            table.add_column(name, justify="left" if name == "status" else "right", overflow="fold")
     for row in track_quality(observations):
         jitter = "–" if row.jitter is None else f"{row.jitter:.4f}"
         cells = [str(row.track_id), str(row.frames), f"{row.coverage:.2f}", f"{row.mean_confidence:.2f}", jitter]
