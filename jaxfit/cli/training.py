@@ -71,7 +71,7 @@ def train(options: argparse.Namespace) -> None:
 def _train_on_simulation(options: argparse.Namespace) -> None:
     scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
     # before the imports, which take seconds
-    check_numbers(False, options.steps, scenes, varied=options.varied, wings=options.wings)
+    check_numbers(False, options.steps, scenes, options.seed, varied=options.varied, wings=options.wings)
     from jaxfit.learning.networks.train import Simulation, default_schedule, train_network
 
     start = time.perf_counter()
@@ -88,7 +88,9 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
 
 def _train_on_labels(options: argparse.Namespace) -> None:
     scenes = LABEL_SCENES if options.scenes is None else options.scenes
-    check_numbers(True, options.steps, scenes, holdout=options.holdout)  # before the imports, which take seconds
+    check_numbers(
+        True, options.steps, scenes, options.seed, holdout=options.holdout
+    )  # before the imports, which take seconds
     from jaxfit.learning.networks.filming import missing_scenes
     from jaxfit.learning.networks.fine_tune import LABELLED_SHARE, Settings, default_schedule, fine_tune
     from jaxfit.learning.networks.label_data import LabelFiles

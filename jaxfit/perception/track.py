@@ -85,7 +85,7 @@ def track_video(
 ) -> Observations:
     """Detect and track every bird of a video, and detect its keypoints.
 
-    Memory grows with the number of detections, not with the length of the video.
+    Memory grows with the number of frames and of tracks, also short ones: track hours of footage in ranges.
 
     Args:
         source: a video, or a folder of frames.

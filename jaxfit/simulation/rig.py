@@ -75,6 +75,8 @@ def stage_rig(
         cameras = tuple(view.camera(f"cam{i}", unit_m) for i, view in enumerate(views))
     else:
         views = [viewpoint_of(camera, unit_m) for camera in cameras]
+        for view in views:
+            check_scene(birds, frames, (view.width, view.height), fps, seed)
     flock = simulate_flock(bird, birds, frames, fps, LEDGE_DEPTH, views[0], seed)
     scenes = []
     for i, (camera, view) in enumerate(zip(cameras, views, strict=True)):

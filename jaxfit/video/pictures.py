@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import IMAGE_PIXELS, IMAGE_SIDE_PX, PICTURE_BYTES, PICTURE_SCANS
@@ -30,7 +30,10 @@ def image_files(folder: Path) -> list[Path]:
     """
     check_folder(folder)
     try:
-        files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
+        # macOS writes files such as ._img0.png beside the pictures, which are no pictures
+        files = [
+            file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+        ]
     except OSError as error:
         raise InputError(folder, f"cannot be read: {error.strerror}", "change its permissions") from error
     if not files:
@@ -38,8 +41,12 @@ def image_files(folder: Path) -> list[Path]:
     return sorted(files, key=lambda file: [(int(n or 0), text) for n, text in _NUMBERS.findall(file.name)])
 
 
-def read_picture(file: Path, grey: bool = False) -> UInt8[np.ndarray, "H W *channels"] | None:
+def read_picture(
+    file: Path, grey: bool = False
+) -> UInt8[np.ndarray, "H W *channels"] | UInt16[np.ndarray, "H W"] | None:
     """Return a picture in the channel order blue, green, red, or as grey values, turned upright by its EXIF data.
+
+    Grey values of 16 bits stay as they are, because in pictures of masks they are the numbers of birds.
 
     Returns None for a file that is not a picture of a type in `IMAGE_SUFFIXES`, is damaged, or is too large.
     """
@@ -50,8 +57,13 @@ def read_picture(file: Path, grey: bool = False) -> UInt8[np.ndarray, "H W *chan
     size = picture_size(content)
     if size is None or min(size) < 1 or is_too_large(*size):
         return None
+    encoded = np.frombuffer(content, np.uint8)
     try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+        if not grey:
+            return cv2.imdecode(encoded, cv2.IMREAD_COLOR)
+        picture = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        is_whole = picture is None or picture.dtype in (np.uint8, np.uint16)
+        return picture if is_whole else cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE)
     except cv2.error:
         return None
 

@@ -145,7 +145,13 @@ class VideoWriter:
             interpolation=EXACT,
         )
         picture.pts, picture.time_base = self.frames, 1 / self.fps
-        self._container.mux(self._stream.encode(picture))
+        try:
+            packets = self._stream.encode(picture)
+        except av.error.ArgumentError as error:
+            what = f"{self.codec}, {width}×{height} at {float(self.fps):g} frames/s"
+            problem = f"cannot be encoded as {what}: {error.strerror}"
+            raise InputError(self.path, problem, "choose another codec, a smaller picture or a lower rate") from None
+        self._container.mux(packets)
         self.frames += 1
 
     def __exit__(self, *error: Any) -> bool | None:

@@ -81,5 +81,7 @@ def test_cameras_that_cannot_be_simulated_are_refused():
     wide = np.diag([1.1, 1, 1]) @ camera.matrix
     with pytest.raises(InputError, match="pixels that are not square"):
         stage_rig(BIRD, [Camera(**fields | {"matrix": wide, "size_px": (480, 280)})], **SMALL)
+    with pytest.raises(InputError, match=r"size: is 481x280 \(give width and height"):
+        stage_rig(BIRD, [Camera(**fields | {"size_px": (481, 280)})], **SMALL)
     with pytest.raises(InputError, match="give 1 to 32 cameras"):
         stage_rig(BIRD, 33, **SMALL)

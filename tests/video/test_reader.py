@@ -218,6 +218,12 @@ def test_images_that_cannot_be_read(tmp_path, warnings_so_far):
         read_frames(tmp_path)
 
 
+def test_files_that_macos_writes_beside_pictures_are_no_frames(tmp_path):
+    cv2.imwrite(str(tmp_path / "img0.png"), np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "._img0.png").write_bytes(b"Mac OS X")
+    assert [file.name for file in image_files(tmp_path)] == ["img0.png"]
+
+
 def test_files_that_are_not_videos(tmp_path):
     with pytest.raises(InputError, match=r"absent\.mp4: does not exist"):
         read_frames(tmp_path / "absent.mp4")

@@ -211,16 +211,17 @@ def masks_of_picture(picture: np.ndarray, file: Path, several_birds: bool) -> li
     """Return the masks of a picture of masks: one for every grey value except 0.
 
     Args:
-        picture: (H, W) grey values.
+        picture: (H, W) grey values of 8 or 16 bits.
         file: the file of the picture.
         several_birds: whether a picture with one value holds one mask for every connected region.
 
     Raises:
         InputError: the picture holds too many connected regions.
     """
-    values = np.flatnonzero(np.bincount(picture.reshape(-1), minlength=256)[1:]) + 1
+    values = np.flatnonzero(np.bincount(picture.reshape(-1), minlength=1)[1:]) + 1
     if len(values) > _MOST_VALUES or file.suffix.lower() in (".jpg", ".jpeg", ".webp"):
-        picture, values = np.where(picture >= 128, 255, 0).astype(np.uint8), np.array([255])
+        half = 2**15 if picture.dtype == np.uint16 else 2**7
+        picture, values = np.where(picture >= half, 255, 0).astype(np.uint8), np.array([255])
     if len(values) == 1 and several_birds:
         count, regions = cv2.connectedComponents((picture == values[0]).astype(np.uint8))
         if count - 1 > MASKS_PER_PICTURE:

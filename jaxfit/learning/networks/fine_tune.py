@@ -341,7 +341,7 @@ def _check(network: str, path: Path, settings: Settings) -> None:
     if path.suffix != ".onnx":
         raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
     steps = None if settings.schedule is None else settings.schedule.steps
-    check_numbers(True, steps, settings.scenes, holdout=settings.holdout)
+    check_numbers(True, steps, settings.scenes, settings.seed, holdout=settings.holdout)
     check_writable(path)  # before the training, not after it
 
 

@@ -407,4 +407,12 @@ def fingerprint(data: FineTuningData, simulated: Filming | None, base: Path, set
     for pictures, owner in zip(data.frames.pictures, data.frames.owner, strict=True):
         content.update(np.ascontiguousarray(pictures).tobytes())
         content.update(np.ascontiguousarray(owner).tobytes())
+    for picture in (*data.pictures, *data.tracked):  # also those that only the measurements or the second training see
+        labels = picture.labels
+        unknown = labels.unknown and dict(labels.unknown)
+        content.update(repr((labels.name, labels.frame, labels.size_px, unknown)).encode())
+        for bird in labels.birds:
+            for array in (bird.box_px, bird.keypoints_px, bird.visibility):
+                content.update(np.ascontiguousarray(array).tobytes())
+            content.update(repr(bird.mask and dict(bird.mask)).encode())
     return content.hexdigest()

@@ -319,8 +319,12 @@ def _file_of(picture: LabelledPicture, folder: Path | None, listed: Sequence[Pat
         listed: the pictures of the folder, in their order.
     """
     name = picture.name.replace("\\", "/")
-    source = picture.source if picture.source.is_dir() else picture.source.parent
-    roots = [folder] if folder is not None else [source, source / "images", *source.absolute().parents[: _LEVELS - 1]]
+    if picture.source.is_dir():  # of masks, which have the names of the pictures
+        beside = [picture.source / "images", *picture.source.absolute().parents[:_LEVELS]]
+    else:
+        source = picture.source.parent
+        beside = [source, source / "images", *source.absolute().parents[: _LEVELS - 1]]
+    roots = [folder] if folder is not None else beside
     for root in roots:
         for candidate in (root / name, root / Path(name).name):
             if os.path.isfile(candidate):  # noqa: PTH113  (False for names that no file can have)

@@ -410,6 +410,7 @@ def continue_training(
     with progress(name, schedule.steps) as report_progress:
         report_progress(state.step, _note(state))
         if _is_finished(state, schedule):
+            model.cpu().eval()
             return state
         recent: list[float] = []
         drawn = batches(sources, schedule.batch, seed, state.step, schedule.steps)

@@ -11,13 +11,14 @@ _LEAST_STEPS = 20
 _MOST_SCENES = 900
 
 
-def check_numbers(has_labels: bool, steps: int | None, scenes: int, **shares: float) -> None:
+def check_numbers(has_labels: bool, steps: int | None, scenes: int, seed: int, **shares: float) -> None:
     """Check the numbers of a training.
 
     Args:
         has_labels: whether a person or a teacher made labels.
         steps: number of steps; None for the default.
         scenes: number of simulated scenes.
+        seed: seed of the samples.
         shares: `holdout`, `varied` or `wings`.
 
     Raises:
@@ -29,6 +30,8 @@ def check_numbers(has_labels: bool, steps: int | None, scenes: int, **shares: fl
     least = 0 if has_labels else 1
     if not least <= scenes <= _MOST_SCENES:
         raise InputError("train: scenes", f"is {scenes}", f"give {least} to {_MOST_SCENES}")
+    if seed < 0:
+        raise InputError("train: seed", f"is {seed}", "give a whole number from 0")
     for name, share in shares.items():
         most = 0.5 if name == "holdout" else 1
         if not 0 <= share <= most:

@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import torch
 
+from jaxfit.data.formats.fields import read_json
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import own_version
-from jaxfit.foundation.files import check_writable
+from jaxfit.foundation.files import check_writable, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.learning.networks import keypoints, segmenter
 from jaxfit.learning.networks.familiarity import store_training_activations
@@ -96,7 +97,7 @@ def train_network(
         raise InputError("train: encoder", "is given for a keypoint network", "train a segmenter, or leave it out")
     if encoder is not None and base is not None:
         raise InputError("train: encoder", "is given with a base network", "give one of the two")
-    check_numbers(False, schedule.steps, simulation.scenes, varied=simulation.varied, wings=simulation.wings)
+    check_numbers(False, schedule.steps, simulation.scenes, seed, varied=simulation.varied, wings=simulation.wings)
     if Path(path).suffix != ".onnx":
         raise InputError(path, "is not the name of an ONNX file", "give a name with the suffix .onnx")
     check_writable(path)  # before the training, not after it
@@ -146,12 +147,24 @@ def _segmenter_with_encoder(encoder: str | Path | None) -> FeaturePyramid:
     return network
 
 
+_SHARES = "shares.json"
+"""The shares of `Simulation` with which the frames of a folder were filmed."""
+
+
 def _load_or_film(simulation: Simulation, progress: ProgressTask) -> LabelledFrames:
     """Load the frames, or simulate the frames if the folder does not exist."""
     folder, scenes, varied, wings = simulation
+    shares = {"varied": varied, "wings": wings}
     if not folder.exists():
-        return film_scenes(folder, range(scenes), progress=progress, varied=varied, wings=wings)
-    frames = load_frames(folder)
+        frames = film_scenes(folder, range(scenes), progress=progress, **shares)
+        write_whole(folder / _SHARES, json.dumps(shares).encode())
+        return frames
+    frames, path = load_frames(folder), folder / _SHARES
+    stored = read_json(path).value if path.is_file() else {"varied": 0.0, "wings": 0.0}
+    if stored != shares:
+        raise InputError(
+            folder, f"holds scenes of {stored}, not of {shares}", "give another folder, or remove this one"
+        )
     if len(frames.pictures) != scenes * FRAMES_PER_SCENE:
         existing = len(frames.pictures) // FRAMES_PER_SCENE
         remedy = "give another folder or the same number of scenes"

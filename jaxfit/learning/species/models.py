@@ -17,7 +17,7 @@ from scipy import sparse
 from jaxfit.foundation.array_files import load_npz, npz_names
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
-from jaxfit.learning.species.species import absolute_bones, body_length, rest_surface
+from jaxfit.learning.species.species import absolute_bones, body_length, rest_points, rest_surface
 from jaxfit.learning.species.surface import Closest, Similarity, closest_points, fit_similarity, search_samples
 from jaxfit.model.bird import MAX_INFLUENCES, Bird, neutral_colours
 from jaxfit.model.kinematics import Pose, fold_bird, joint_transforms, posed_vertices
@@ -204,11 +204,9 @@ def compare_birds(first: Bird, second: Bird) -> Comparison:
 
 def _by_names(first: Bird, second: Bird) -> Similarity:
     """Return the similarity from the second model to the first by common keypoints, or by common joints."""
-    for names, points in (("keypoint_names", "keypoints"), ("joint_names", "joints")):
-        place = [
-            dict(zip(getattr(b, names), np.asarray(getattr(b, points), np.float64), strict=True))
-            for b in (first, second)
-        ]
+    points = [rest_points(bird) for bird in (first, second)]
+    for kind in ("keypoints", "joints"):
+        place = [own[kind] for own in points]
         common = [name for name in place[0] if name in place[1]]
         if len(common) >= LEAST_COMMON:
             to_first = [np.stack([places[name] for name in common]) for places in place]

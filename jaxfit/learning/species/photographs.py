@@ -71,11 +71,11 @@ def read_photographs(
     config = _keypoint_config()
     parts: list[dict[str, Any]] = []
     remarks: list[str] = []
-    for source, given in sources:
+    for file, (source, given) in enumerate(sources):
         checked = check_keypoints(given, bird.keypoint_names, source)
         observations = _few_frames(checked, config.min_keypoints, frames_per_track)
         solution = fit(observations, bird, config, progress=progress, source=source)
-        parts += _images(observations, solution, source)
+        parts += _images(observations, solution, source, file)
         images, fitted = int(checked.present.sum()), int(solution.valid.sum())
         usable, chosen = (int(each.usable(config.min_keypoints).sum()) for each in (checked, observations))
         remarks += _remarks(source, images, usable, chosen, fitted, frames_per_track)
@@ -130,8 +130,8 @@ def _few_frames(observations: Observations, min_keypoints: int, most: int) -> Ob
     return observations.with_keypoints(observations.keypoints_px, confidence)
 
 
-def _images(observations: Observations, solution: Solution, source: object) -> list[dict[str, Any]]:
-    """Return the images with a valid pose."""
+def _images(observations: Observations, solution: Solution, source: object, file: int) -> list[dict[str, Any]]:
+    """Return the images with a valid pose; `file` is the position of the source, whose name others may have too."""
     images = []
     row = {int(track): n for n, track in enumerate(observations.track_id)}
     for m, t in zip(*np.nonzero(solution.valid), strict=True):
@@ -142,7 +142,7 @@ def _images(observations: Observations, solution: Solution, source: object) -> l
         images.append(
             {
                 "name": f"{source}: {observations.image_file(n, int(t)) or solution.frame_index[t]}, track {track}",
-                "individual": (str(source), track),
+                "individual": (file, track),
                 "keypoints_px": np.asarray(image_to_crop(observations.keypoints_px[n, t], crop), np.float32),
                 "confidence": np.asarray(observations.confidence[n, t]),
                 "mask": mask,

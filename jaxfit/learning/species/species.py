@@ -78,6 +78,20 @@ def rest_surface(bird: Bird) -> Float[np.ndarray, "V 3"]:
     return np.asarray(posed_vertices(rig, joint_transforms(rig, pose), pose), np.float64)
 
 
+def rest_points(bird: Bird) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
+    """Return the keypoints and the joints of `rest_surface` by name, model units."""
+    rig, pose = fold_bird(bird), rest_pose(bird)
+    pose = replace(pose, body_pose=jnp.zeros_like(pose.body_pose))
+    A = np.asarray(joint_transforms(rig, pose), np.float64)
+    joints = np.asarray(rig.joints, np.float64)
+    posed = np.einsum("jdc,jc->jd", A[..., :3], joints) + A[..., 3]
+    keypoints = np.asarray(posed_keypoints(rig, jnp.asarray(A), pose), np.float64)
+    return {
+        "keypoints": dict(zip(bird.keypoint_names, keypoints, strict=True)),
+        "joints": dict(zip(bird.joint_names, posed, strict=True)),
+    }
+
+
 def mean_keypoints(bird: Bird) -> Float[np.ndarray, "K 3"]:
     """Return the keypoints of the mean pose of the prior, in the model's frame, model units."""
     rig, pose = fold_bird(bird), rest_pose(bird)

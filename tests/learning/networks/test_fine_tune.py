@@ -297,6 +297,7 @@ def test_wrong_numbers_are_rejected_before_the_imports(tmp_path, capsys, monkeyp
         ([*labels, "--scenes", "-1"], "scenes: is -1 (give 0 to 900)"),
         (["--steps", "19"], "steps: is 19 (give 20 or more)"),
         (["--scenes", "0"], "scenes: is 0 (give 1 to 900)"),
+        (["--seed", "-1"], "seed: is -1 (give a whole number from 0)"),
         (["--wings", "2"], "wings: is 2.0 (give a share of 0 to 1)"),
     ):
         assert main(["train", "keypoints", *options, "--out", str(tmp_path / "mine.onnx")]) == 2

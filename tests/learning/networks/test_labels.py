@@ -76,17 +76,22 @@ def test_labels_of_which_only_some_have_a_track_are_an_error(tmp_path):
         read_labels([file], [], needs_keypoints=False)
 
 
-def test_folder_of_masks(tmp_path):
+@pytest.mark.parametrize("numbers", [(1, 2), (300, 310)])  # of 8 and of 16 bits
+def test_folder_of_masks(tmp_path, numbers):
     masks, images = tmp_path / "masks", tmp_path / "images"
     write_labels(images, coco({t: [bird()] for t in TIMES}), list(TIMES))
     masks.mkdir()
     for t in TIMES:
-        mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)
-        mask[30:60, 40:70], mask[70:90, 100:130] = 1, 2
+        mask = np.zeros((SIZE[1], SIZE[0]), np.uint8 if max(numbers) < 256 else np.uint16)
+        mask[30:60, 40:70], mask[70:90, 100:130] = numbers
         cv2.imwrite(str(masks / f"frame_{t:04d}.png"), mask)
     data = prepare_data("segmenter", LabelFiles((masks,), (images,)), 0.25, None, tmp_path / "training")
     assert not data.left_out
     assert [(data.frames.owner[0] == n).sum() for n in (1, 2)] == [900, 600]
+    for t in TIMES:
+        (images / f"frame_{t:04d}.png").rename(tmp_path / f"frame_{t:04d}.png")
+    beside = prepare_data("segmenter", LabelFiles((masks,)), 0.25, None, tmp_path / "again")
+    assert all((a.pixels() == b.pixels()).all() for a, b in zip(data.pictures, beside.pictures, strict=True))
     with pytest.raises(InputError, match="folder of masks, without keypoints"):
         read_labels([masks], [], needs_keypoints=True)
 

@@ -34,6 +34,14 @@ def test_equal_models_of_other_size_differ_in_size_only():
     assert max(comparison.of_first.max(), comparison.of_second.max()) < 1e-6
 
 
+def test_models_of_other_meshes_are_aligned_by_the_points_of_their_mean_bones():
+    other = changed(MURRE, bone=1.2)
+    turned = replace(other, faces=jnp.asarray(np.asarray(other.faces)[::-1]))  # the same mesh
+    equal, named = (compare_birds(MURRE, bird) for bird in (other, turned))
+    assert named.size == pytest.approx(equal.size, rel=0.01)
+    assert named.of_first.mean() < 1.3 * equal.of_first.mean()
+
+
 def test_the_command_prints_a_longer_bone_and_draws_both(tmp_path, capsys):
     save_bird(changed(MURRE, bone=1.2), tmp_path / "b.npz")
     assert main(["model", "compare", "murre", str(tmp_path / "b.npz"), "--out", str(tmp_path / "c.png")]) == 0
