@@ -107,6 +107,9 @@ def _offsets(text: str | None, count: int) -> list[float] | None:
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
         raise InputError("--offsets", f"is {text}", f"give {count} numbers with commas, one for each camera, in frames")
+    if numbers[0]:
+        problem = f"is {text}, but the frames of a result are those of the first camera"
+        raise InputError("--offsets", problem, "begin with 0, and give the frame of each other camera at its frame 0")
     return numbers
 
 

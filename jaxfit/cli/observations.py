@@ -210,7 +210,7 @@ def import_observations(options: argparse.Namespace) -> None:
     bird = find_bird(options.model)
     observations, names = observations_for(options.file, bird.keypoint_names, options)
     if options.masks is not None:
-        observations = add_masks(observations, options.masks, terminal)
+        observations = add_masks(observations, options.masks, terminal, options.video)
     write_coco(observations, options.out, {"description": f"imported from {options.file.name}"})
     show(track_table(observations))
     total = int(observations.present.sum())

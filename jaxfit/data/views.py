@@ -14,7 +14,7 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import Triangulated, triangulate_robustly
 from jaxfit.data.masks import decode_mask, encode_patch
 from jaxfit.data.observations import Observations
-from jaxfit.data.tracks import positions_in
+from jaxfit.data.tracks import frame_step
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 
@@ -227,12 +227,15 @@ def _own_numbers(first: Observations, own: Observations) -> Float[np.ndarray, "T
 
 def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observations) -> Observations:
     """Return observations at fractional frame numbers, as frames of the first camera."""
-    whole = np.abs(at - np.round(at)) < WHOLE_FRAME
-    before = np.where(whole, np.round(at), np.floor(at)).astype(np.int64)
-    after = np.where(whole, before, before + 1)
-    i, j = positions_in(before, own.frame_index), positions_in(after, own.frame_index)
-    known, share = (i >= 0) & (j >= 0), np.where(whole, 0, at - before).astype(np.float32)
-    i, j = np.maximum(i, 0), np.maximum(j, 0)
+    numbers, last = own.frame_index, own.num_frames - 1
+    i = np.searchsorted(numbers, at + WHOLE_FRAME, side="right") - 1  # the stored frame before, or the frame itself
+    whole = np.abs(at - numbers[np.maximum(i, 0)]) < WHOLE_FRAME
+    j = np.where(whole, i, i + 1)
+    inside = (i >= 0) & (j <= last)
+    i, j = np.clip(i, 0, last), np.clip(j, 0, last)
+    gap = numbers[j] - numbers[i]
+    known = inside & (gap <= frame_step(numbers))
+    share = np.where(whole | (gap == 0), 0, (at - numbers[i]) / np.maximum(gap, 1)).astype(np.float32)
 
     def mixed(values: np.ndarray) -> np.ndarray:
         w = share.reshape(1, -1, *(1,) * (values.ndim - 2))
@@ -280,6 +283,8 @@ def birds_in_rows(observations: Observations, bird: Int[np.ndarray, "N T"], bird
     known, at, frames = row >= 0, np.maximum(row, 0), np.arange(T)
 
     def taken(values: np.ndarray) -> np.ndarray:
+        if not observations.num_tracks:
+            return np.zeros((B, T, *values.shape[2:]), values.dtype)
         picked = values[at, frames]
         return np.where(known.reshape(*known.shape, *(1,) * (picked.ndim - 2)), picked, 0)
 

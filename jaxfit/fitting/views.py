@@ -129,7 +129,8 @@ def fit_views(
     origin_m = np.nanmedian(found.points_world.reshape(-1, 3), axis=0)
     points = (found.points_world - origin_m) / unit_m
     initial = initial_poses(bird, points, _weights(keypoints, found), source)
-    windows = view_windows(views.cameras, prepared, config, origin_m, unit_m, points)
+    has_pose = np.asarray(np.isfinite(initial.global_orient).all(-1))
+    windows = view_windows(views.cameras, prepared, config, origin_m, unit_m, points, has_pose, source)
     model = checked_model(prepared[0], bird, [config], initial, source)
     run, shared = Run(config, windows), FitShared(model, initial)
     problems = [(0, w) for w in range(len(windows))]
@@ -248,8 +249,14 @@ def view_windows(
     origin_m: Float[np.ndarray, "3"],
     unit_m: float,
     points: Float[np.ndarray, "N T K 3"],
+    has_pose: Bool[np.ndarray, "N T"],
+    source: object,
 ) -> Windows:
-    """Cut the observations of all views into common windows."""
+    """Cut the observations of all views into common windows. Windows without an initial pose are left out.
+
+    Raises:
+        InputError: no window is left.
+    """
     each = replace(config, min_keypoints=1)  # two keypoints of a view count, if the other views see more
     confidence = np.stack([own.confidence for own in prepared])
     together = replace(
@@ -259,6 +266,12 @@ def view_windows(
         masks={},
     )
     starts = window_starts(together, config, first_frames(together, config))
+    frame = windows_at(prepared[0], each, starts).frame
+    posed = has_pose & together.usable(config.min_keypoints)
+    starts = starts[((frame >= 0) & posed[starts[:, :1], np.maximum(frame, 0)]).any(axis=1)]
+    if not len(starts):
+        problem = f"have no bird with {config.min_keypoints} keypoints in two cameras"
+        raise InputError(source, problem, "see `jaxfit cameras check`, or lower `min_keypoints` in the config")
     views = [windows_at(own, each, starts) for own in prepared]
     first = views[0]
     usable = together.usable(config.min_keypoints)

@@ -211,9 +211,9 @@ LEFTOVER_DAYS = 7
 """Age at which jaxfit removes the temporary files of a killed process of another computer on a shared disk."""
 
 # --- files of other tracking programs
-TABLE_VALUES = 2**25
-"""Most entries of N birds × T frames × K keypoints in one file: an hour of 15 birds with 25 keypoints at 25 frames per
-second."""
+TABLE_VALUES = 2**26
+"""Most entries of N birds × T frames × K keypoints in one file, which take 0.9 GB: nearly two hours of 15 birds with 25
+keypoints at 25 frames per second."""
 TABLE_BIRDS = 5_000
 """Most birds in one file."""
 TABLE_PICTURES = 200_000

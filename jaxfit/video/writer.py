@@ -12,6 +12,7 @@ from typing import Any
 
 import av
 import numpy as np
+from av.error import ArgumentError
 from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
@@ -147,7 +148,7 @@ class VideoWriter:
         picture.pts, picture.time_base = self.frames, 1 / self.fps
         try:
             packets = self._stream.encode(picture)
-        except av.error.ArgumentError as error:
+        except ArgumentError as error:
             what = f"{self.codec}, {width}×{height} at {float(self.fps):g} frames/s"
             problem = f"cannot be encoded as {what}: {error.strerror}"
             raise InputError(self.path, problem, "choose another codec, a smaller picture or a lower rate") from None

@@ -66,6 +66,12 @@ def test_tracks_of_cvat(tmp_path):
     np.testing.assert_array_equal(read_observations(tmp_path / "again.json").keypoints_px, observed.keypoints_px)
 
 
+def test_masks_of_birds_without_a_labelled_keypoint_are_kept(tmp_path):
+    polygon = {"segmentation": [[9, 4, 21, 4, 21, 8]], "keypoints": [0] * 9, "num_keypoints": 0}
+    path = saved(tmp_path, cvat(["frame_000012.PNG"], [(1, polygon | {"attributes": {"track_id": 3}})]))
+    assert read_observations(path).masks.keys() == {(0, 0)}
+
+
 def test_pictures_of_label_studio(tmp_path):
     """The prefix of uploads is no part of the name; one bird per picture is one track; a keypoint has a box."""
     observed = read_observations(saved(tmp_path, label_studio(["0a1b2c3d-img_7.png", "99990000-img_5.png"])))

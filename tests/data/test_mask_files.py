@@ -2,6 +2,7 @@
 
 import json
 from contextlib import contextmanager
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -50,6 +51,33 @@ def test_pictures(tmp_path, birds, left, right, suffix):
     (tmp_path / "masks.json").write_text(json.dumps(content))
     again = add_masks(birds, tmp_path / "masks.json")
     assert again.masks == masked.masks
+
+
+def test_masks_with_the_names_of_the_pictures_belong_to_them(tmp_path, birds):
+    """In a folder, frame 0 is the first picture, here frame_0001.png."""
+    video, folder = tmp_path / "frames", tmp_path / "masks"
+    video.mkdir()
+    folder.mkdir()
+    for t in range(T):
+        cv2.imwrite(str(video / f"frame_{t + 1:04d}.png"), halves(0, 0))
+        cv2.imwrite(str(folder / f"frame_{t + 1:04d}.png"), halves(7, 3 if t else 0))
+    masked = add_masks(birds, folder, video=video)
+    assert masked.masks.keys() == {(n, t) for n in range(2) for t in range(T)} - {(1, 0)}
+    names = np.array([f"frame_{t + 1:04d}.png" for t in range(T)])
+    write_coco(replace(masked, file_name=names, frame_index=np.arange(1, T + 1)), tmp_path / "masks.json")
+    assert add_masks(birds, tmp_path / "masks.json", video=video).masks.keys() == masked.masks.keys()
+
+
+def test_masks_without_numbers_of_their_own_are_in_order(tmp_path, birds):
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    later = replace(birds, frame_index=1 + 4 * np.arange(T))
+    for t in range(T):
+        cv2.imwrite(str(folder / f"img{1 + 4 * t:04d}_mask0.png"), halves(7, 3))
+    assert add_masks(later, folder).masks.keys() == {(n, t) for n in range(2) for t in range(T)}
+    (folder / "img0001_mask0.png").unlink()
+    with pytest.raises(InputError, match="without frame numbers of their own"):
+        add_masks(later, folder)
 
 
 def test_masks_that_cover_no_bird_are_not_used(tmp_path, birds):

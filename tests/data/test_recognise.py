@@ -39,6 +39,12 @@ def test_size_of_a_video_beside_the_file(tmp_path):
         with pytest.raises(InputError, match=r"stores no image size.* \(give --video VIDEO, or --size"):
             read_observations(path)
     film(tmp_path / "clip.mp4")
+    other = write_csv(tmp_path / "clip10DLC_net.csv")  # of another film than clip1.mp4
+    film(tmp_path / "clip1.mp4")
+    with pytest.raises(InputError, match="stores no image size"):
+        read_observations(other)
+    (tmp_path / "clip1.mp4").unlink()
+    other.unlink()
     for path in paths:
         assert read_observations(path).image_size_px[0].tolist() == [120, 100]
         assert read_observations(path).file_name[1] == "clip.mp4#1"

@@ -58,6 +58,16 @@ def test_labels_replace_predictions(tmp_path):
     np.testing.assert_allclose(observed.keypoints_px[:, :, 1:, 0], XY[:, :, 1:, 0] + 1, atol=1e-5)
 
 
+def test_frames_of_a_package_name_its_videos_by_their_data_sets(tmp_path):
+    parts = project()
+    parts["frames"]["video"] = 3
+    parts["videos_json"] = [
+        json.dumps({"backend": {"filename": ".", "dataset": f"video{i}/video", "shape": [9, 100 + i, 120, 3]}})
+        for i in (0, 3)
+    ]
+    assert read_observations(write_project(tmp_path / "a.pkg.slp", parts)).image_size_px[0].tolist() == [120, 103]
+
+
 def test_birds_without_a_track(tmp_path, caplog):
     """One bird per frame is one track; otherwise every bird is a track of its own."""
     parts = project()

@@ -158,6 +158,13 @@ def test_rows_of_birds_hold_the_best_of_their_tracks(straight):
     assert len([cell for cell in rows.masks if cell[0] == 1]) == len([cell for cell in own.masks if cell[0] == 2])
 
 
+def test_a_camera_that_tracks_no_bird_has_empty_rows(straight):
+    own = straight[0][1]
+    rows = birds_in_rows(own.select(tracks=[]), np.zeros((0, own.num_frames), int), [1, 2])
+    assert rows.present.shape == (2, own.num_frames)
+    assert not rows.present.any()
+
+
 def test_offsets_and_rates_in_time(straight):
     own = straight[0][1]
     shifted = replace(own.select(frames=np.arange(3, 40)), frame_index=np.arange(37))
@@ -170,6 +177,13 @@ def test_offsets_and_rates_in_time(straight):
     seen = half.confidence[:, :-1] > 0
     assert seen.mean() > 0.5
     np.testing.assert_allclose(half.keypoints_px[:, :-1][seen], expected[seen], atol=1e-3)
+    # every fifth frame is stored: the neighbours are five frames apart
+    thin = own.select(frames=np.arange(0, own.num_frames, 5))
+    between = on_common_frames([thin, thin], [0, 2])[1]
+    expected = 0.6 * thin.keypoints_px[:, :-1] + 0.4 * thin.keypoints_px[:, 1:]
+    seen = between.confidence[:, :-1] > 0
+    assert seen.mean() > 0.5
+    np.testing.assert_allclose(between.keypoints_px[:, :-1][seen], expected[seen], atol=1e-3)
     fast = replace(own, fps=50.0, timestamp_s=own.frame_index / 50.0)
     twice = on_common_frames([own, fast])[1]
     np.testing.assert_array_equal(twice.present[:, :20], own.present[:, :40:2])

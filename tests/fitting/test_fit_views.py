@@ -110,6 +110,23 @@ def test_views_that_miss_things_cost_nothing(rig, truth_m):
     assert error_mm(found, truth_m) < 12
 
 
+def test_a_bird_that_one_camera_sees_has_no_pose(rig):
+    first, second = (scene.truth for scene in rig.scenes[:2])
+    present = second.present.copy()
+    present[1] = False
+    confidence = np.where(present[..., None], second.confidence, 0)
+    second = replace(
+        second, present=present, confidence=confidence, masks={}, amodal_masks={}, occluded=None, score=None
+    )
+    quick = replace(CONFIG, stages=(replace(CONFIG.stages[0], steps=2),), error_bars=False)
+    found = fit_views(views_of(rig, (0, 1), [first, second]), BIRD, quick)
+    assert found.valid[0].all()
+    assert not found.valid[1].any()
+    assert found.status.tolist() == ["ok", "no usable frame"]
+    with pytest.raises(InputError, match="have no bird with 21 keypoints in two cameras"):
+        fit_views(views_of(rig, (0, 1), [first, second]), BIRD, replace(quick, min_keypoints=21))
+
+
 def test_one_view_is_the_fit_of_one_camera(rig, truth_m):
     views = views_of(rig, (1,), [rig.scenes[1].truth])
     keypoints_only = replace(CONFIG, stages=CONFIG.stages[:1])
@@ -205,6 +222,8 @@ def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
     assert main([*command[:2], "--out", str(tmp_path / "x"), "--offsets", "1"]) == 2
     assert main([*command, "--cameras", str(tmp_path / "rig.toml"), "--overwrite", "--offsets", "1,2"]) == 2
     assert "give 3 numbers" in capsys.readouterr().err
+    assert main([*command, "--cameras", str(tmp_path / "rig.toml"), "--overwrite", "--offsets", "1,0,0"]) == 2
+    assert "begin with 0" in capsys.readouterr().err
     check = ["cameras", "check", str(tmp_path / "rig.toml"), *files]
     assert main(check) == 0
     assert "the cameras agree" in capsys.readouterr().out

@@ -311,9 +311,9 @@ def _is_table(value: Any) -> bool:
 
 
 def _is_outside(annotation: dict[str, Any]) -> bool:
-    """Return whether an annotation holds keypoints, but none of them is in the picture."""
+    """Return whether an annotation holds keypoints, but neither a mask nor a keypoint that is in the picture."""
     keypoints = annotation.get("keypoints")
-    if not isinstance(keypoints, list) or "num_keypoints" not in annotation:
+    if not isinstance(keypoints, list) or "num_keypoints" not in annotation or annotation.get("segmentation"):
         return False
     return not any(isinstance(v, int | float) and v > 0 for v in keypoints[2::3])
 

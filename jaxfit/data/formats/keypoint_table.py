@@ -54,8 +54,7 @@ def check_table_size(source: Path, birds: int, frames: int, keypoints: int) -> N
     """Raise InputError if a file has no keypoints, or more birds, frames and keypoints than memory should hold."""
     if not (birds and keypoints):
         raise InputError(source, f"holds no {'keypoints' if birds else 'birds'}", "choose another file")
-    too_many = max(birds / TABLE_BIRDS, keypoints / birds * frames * keypoints / TABLE_VALUES) > 1
-    if too_many:
+    if birds > TABLE_BIRDS or birds * frames * keypoints > TABLE_VALUES:
         problem = f"holds {birds:,} birds × {frames:,} frames × {keypoints:,} keypoints, too many for one table"
         raise InputError(source, problem, "split the file")
 

@@ -40,7 +40,9 @@ _NUMBER = re.compile(rf"\d{{1,{FRAME_DIGITS}}}", re.ASCII)
 _Masks = Callable[[int, int], Sequence[np.ndarray]]
 
 
-def add_masks(observations: Observations, source: Path, progress: ProgressTask = silent) -> Observations:
+def add_masks(
+    observations: Observations, source: Path, progress: ProgressTask = silent, video: Path | None = None
+) -> Observations:
     """Return the observations with masks from a folder of pictures or from a COCO file.
 
     The pictures belong to the images of the same name, or else to the frames of the numbers in their names, or else to
@@ -52,11 +54,15 @@ def add_masks(observations: Observations, source: Path, progress: ProgressTask =
         observations: birds with keypoints.
         source: the folder or the COCO file.
         progress: shows progress, and how many birds have a mask.
+        video: the video or folder of the images. In a folder, frames are numbered by the positions of the pictures, and
+            masks with the names of the pictures belong to them, whatever the numbers in the names.
 
     Raises:
-        InputError: the source cannot be read, holds no mask for any image, or holds a mask of another size.
+        InputError: the source cannot be read, holds no mask for any image or a mask of another size, or its pictures
+            belong to no frames by name, number or order.
     """
-    masks_of = _folder_masks(observations, source) if source.is_dir() else _coco_masks(observations, source)
+    names = _image_names(observations, video)
+    masks_of = (_folder_masks if source.is_dir() else _coco_masks)(observations, source, names)
     masks = dict(observations.masks)
     given = labelled = 0
     images = list(_images(observations))
@@ -156,11 +162,23 @@ def _assigned(
             yield birds[i], masks[j]
 
 
-def _coco_masks(observations: Observations, source: Path) -> _Masks:
+def _image_names(observations: Observations, video: Path | None) -> dict[tuple[int, int], str]:
+    """Return bird and frame → name of the image, for one bird of every image."""
+    listed = image_files(video) if video is not None and video.is_dir() and not observations.own_images else []
+    names = {}
+    for n, t, _ in _images(observations):
+        number = int(observations.frame_index[t])
+        file = listed[number].name if 0 <= number < len(listed) else observations.image_file(n, t)
+        names[n, t] = Path(file.replace("\\", "/")).name
+    return names
+
+
+def _coco_masks(observations: Observations, source: Path, names: dict[tuple[int, int], str]) -> _Masks:
     """Return a function of bird and frame that returns the masks of the image in a COCO file."""
     root = complete_export(read_json(source))
     images = read_images(root["images"])
-    photographs = bool(observations.own_images)
+    shared = {Path(image.file_name).name for image in images.values()} & set(names.values())
+    by_name = bool(observations.own_images) or (bool(shared) and len(set(names.values())) == len(names))
     found: dict[Any, list[dict[str, Any]]] = {}
     for annotation in root["annotations"]:
         image = images.get(annotation["image_id"].identifier())
@@ -169,29 +187,30 @@ def _coco_masks(observations: Observations, source: Path) -> _Masks:
             continue
         rle = read_segmentation(annotation["segmentation"], image.height, image.width)
         if rle is not None:
-            found.setdefault(Path(image.file_name).name if photographs else image.frame_index, []).append(rle)
+            found.setdefault(Path(image.file_name).name if by_name else image.frame_index, []).append(rle)
 
     def masks_of(n: int, t: int) -> list[np.ndarray]:
-        key = Path(observations.image_file(n, t)).name if photographs else int(observations.frame_index[t])
+        key = names[n, t] if by_name else int(observations.frame_index[t])
         return [decode_mask(rle) for rle in found.get(key, ())]
 
     return masks_of
 
 
-def _folder_masks(observations: Observations, source: Path) -> _Masks:
+def _folder_masks(observations: Observations, source: Path, names: dict[tuple[int, int], str]) -> _Masks:
     """Return a function of bird and frame that returns the masks of a picture of a folder."""
     files = image_files(source)
     by_stem = {file.stem: file for file in files}
     numbers = [_NUMBER.findall(file.stem) for file in files]
     last = [int(found[-1]) for found in numbers if found]
     unique = len(last) == len(files) == len(set(last))
-    by_number = dict(zip(last if unique else range(len(files)), files, strict=True))
-    stems = {Path(observations.image_file(n, t)).stem for n, t, _ in _images(observations)}
-    named = bool(stems & by_stem.keys())
+    named = any(Path(name).stem in by_stem for name in names.values())
+    if not (named or unique or len(files) == observations.num_frames):
+        problem = f"has {len(files)} pictures without frame numbers of their own, for {observations.num_frames} frames"
+        raise InputError(source, problem, "name the pictures by frame numbers or as the images")
+    by_number = dict(zip(last if unique else observations.frame_index.tolist(), files, strict=True))
 
     def masks_of(n: int, t: int) -> list[np.ndarray]:
-        stem = Path(observations.image_file(n, t)).stem
-        file = by_stem.get(stem) if named else by_number.get(int(observations.frame_index[t]))
+        file = by_stem.get(Path(names[n, t]).stem) if named else by_number.get(int(observations.frame_index[t]))
         if file is None:
             return []
         return masks_of_picture(_read_mask_picture(file), file, int(observations.present[:, t].sum()) > 1)

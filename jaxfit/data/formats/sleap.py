@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -141,8 +142,10 @@ def _video(root: Hdf5Group, index: int, entry: Field) -> Video:
     if size is None and "width_" in backend and "height_" in backend:
         size = backend["width_"].value, backend["height_"].value
     dataset = backend["dataset"].value if "dataset" in backend else None
-    if size is None and isinstance(dataset, str) and file is None:
-        size = _embedded_size(root, dataset)
+    if isinstance(dataset, str) and file is None:
+        size = size or _embedded_size(root, dataset)
+        number = re.fullmatch(r"video(\d{1,9})/video", dataset)  # the frames of a package name its videos by it
+        index = int(number[1]) if number else index
     if size is None or not all(type(side) is int and side > 0 for side in size):
         return Video(index, file, None, pictures)
     return Video(index, file, size, pictures)

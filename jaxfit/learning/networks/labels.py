@@ -100,7 +100,7 @@ def read_labels(
         else:
             observations = _observations(file, images[i] if images else None, needs_keypoints)
             if masks is not None:
-                observations = add_masks(observations, masks, progress)
+                observations = add_masks(observations, masks, progress, images[i] if images else None)
             found, own_names = list(_pictures(observations, file)), observations.keypoint_names
         if not needs_keypoints:
             found, own_names = [_with_centres(picture) for picture in found], (CENTRE,)

@@ -156,7 +156,7 @@ def _load_or_film(simulation: Simulation, progress: ProgressTask) -> LabelledFra
     folder, scenes, varied, wings = simulation
     shares = {"varied": varied, "wings": wings}
     if not folder.exists():
-        frames = film_scenes(folder, range(scenes), progress=progress, **shares)
+        frames = film_scenes(folder, range(scenes), progress=progress, varied=varied, wings=wings)
         write_whole(folder / _SHARES, json.dumps(shares).encode())
         return frames
     frames, path = load_frames(folder), folder / _SHARES
