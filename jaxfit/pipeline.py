@@ -204,9 +204,9 @@ def reconstruct(
 
                 more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
                 tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
-                tracking = tracking._replace(choice=choice)
+                tracking = tracking._replace(choice=choice, observations=in_model(tracking.observations))
         _check_tracking(tracking, stored)
-        observations = in_model(tracking.observations)
+        observations = tracking.observations
         with clock("fit"):
             config, learnt_yaml = _learn_weights(config, observations, bird, video, progress)
             solution = fit(observations, bird, config.fit, None, fit_progress, video, windows, cluster)

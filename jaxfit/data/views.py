@@ -14,7 +14,6 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import Triangulated, triangulate_robustly
 from jaxfit.data.masks import decode_mask, encode_patch
 from jaxfit.data.observations import Observations
-from jaxfit.data.tracks import frame_step
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 
@@ -24,6 +23,8 @@ MOST_ERROR = 0.1
 """Largest error of a keypoint that agrees with other views, relative to the longer side of the box of the bird."""
 WHOLE_FRAME = 0.02
 """Times that differ by less, in frames, are one frame."""
+LONGEST_GAP_S = 0.25
+"""Keypoints are interpolated between stored frames at most this far apart, seconds; at unknown rates, 25 frames/s."""
 
 
 class Views(NamedTuple):
@@ -234,7 +235,7 @@ def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observation
     inside = (i >= 0) & (j <= last)
     i, j = np.clip(i, 0, last), np.clip(j, 0, last)
     gap = numbers[j] - numbers[i]
-    known = inside & (gap <= frame_step(numbers))
+    known = inside & (gap <= max(1, LONGEST_GAP_S * (own.fps or 25)))
     share = np.where(whole | (gap == 0), 0, (at - numbers[i]) / np.maximum(gap, 1)).astype(np.float32)
 
     def mixed(values: np.ndarray) -> np.ndarray:

@@ -163,7 +163,7 @@ def _ends(observations: Observations, windows: Windows, w: int) -> tuple[int, in
     return int(observations.frame_index[at[0]]), int(observations.frame_index[at[-1]])
 
 
-DETECTION = ("video", "networks", "segmenter", "segmenter_reason")
+DETECTION = ("video", "networks", "segmenter", "segmenter_reason", "keypoint_names")
 """Entries of the summary about the video and the networks."""
 _KEPT = (*DETECTION, "trust", "trust_reasons", "trust_signals", "joined")
 """Entries of the summary that corrections do not change."""

@@ -64,8 +64,16 @@ def test_masks_with_the_names_of_the_pictures_belong_to_them(tmp_path, birds):
     masked = add_masks(birds, folder, video=video)
     assert masked.masks.keys() == {(n, t) for n in range(2) for t in range(T)} - {(1, 0)}
     names = np.array([f"frame_{t + 1:04d}.png" for t in range(T)])
-    write_coco(replace(masked, file_name=names, frame_index=np.arange(1, T + 1)), tmp_path / "masks.json")
-    assert add_masks(birds, tmp_path / "masks.json", video=video).masks.keys() == masked.masks.keys()
+    numbered = replace(masked, file_name=names, frame_index=np.arange(1, T + 1))
+    for suffix in ("png", "jpg"):  # COCO masks of other pictures with these names
+        changed = replace(numbered, file_name=np.array([name.replace("png", suffix) for name in names]))
+        write_coco(changed, tmp_path / "masks.json")
+        assert add_masks(birds, tmp_path / "masks.json", video=video).masks.keys() == masked.masks.keys()
+    # labels that name the pictures keep their numbers, whatever the positions in the folder
+    again = add_masks(replace(numbered, masks={}), folder, video=video)
+    assert again.masks.keys() == masked.masks.keys()
+    cv2.imwrite(str(folder / "other.png"), halves(7, 3))
+    assert add_masks(birds, folder, video=video).masks.keys() == masked.masks.keys()
 
 
 def test_masks_without_numbers_of_their_own_are_in_order(tmp_path, birds):

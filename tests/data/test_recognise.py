@@ -43,7 +43,9 @@ def test_size_of_a_video_beside_the_file(tmp_path):
     film(tmp_path / "clip1.mp4")
     with pytest.raises(InputError, match="stores no image size"):
         read_observations(other)
-    (tmp_path / "clip1.mp4").unlink()
+    (tmp_path / "clip1.mp4").rename(tmp_path / "clip10DLC_net.csv.mp4")
+    assert read_observations(other).image_size_px[0].tolist() == [120, 100]
+    (tmp_path / "clip10DLC_net.csv.mp4").unlink()
     other.unlink()
     for path in paths:
         assert read_observations(path).image_size_px[0].tolist() == [120, 100]

@@ -58,14 +58,17 @@ def test_labels_replace_predictions(tmp_path):
     np.testing.assert_allclose(observed.keypoints_px[:, :, 1:, 0], XY[:, :, 1:, 0] + 1, atol=1e-5)
 
 
-def test_frames_of_a_package_name_its_videos_by_their_data_sets(tmp_path):
+@pytest.mark.parametrize(
+    ("numbers", "named", "height"), [((0, 3), 3, 103), ((3,), 0, 103), ((3,), 3, 103), ((0, 3), 0, 100)]
+)
+def test_frames_of_a_package_name_its_videos_by_number_or_position(tmp_path, numbers, named, height):
     parts = project()
-    parts["frames"]["video"] = 3
+    parts["frames"]["video"] = named
     parts["videos_json"] = [
         json.dumps({"backend": {"filename": ".", "dataset": f"video{i}/video", "shape": [9, 100 + i, 120, 3]}})
-        for i in (0, 3)
+        for i in numbers
     ]
-    assert read_observations(write_project(tmp_path / "a.pkg.slp", parts)).image_size_px[0].tolist() == [120, 103]
+    assert read_observations(write_project(tmp_path / "a.pkg.slp", parts)).image_size_px[0].tolist() == [120, height]
 
 
 def test_birds_without_a_track(tmp_path, caplog):

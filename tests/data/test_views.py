@@ -184,6 +184,8 @@ def test_offsets_and_rates_in_time(straight):
     seen = between.confidence[:, :-1] > 0
     assert seen.mean() > 0.5
     np.testing.assert_allclose(between.keypoints_px[:, :-1][seen], expected[seen], atol=1e-3)
+    apart = own.select(frames=[0, own.num_frames - 1])  # nothing is known of the frames between
+    assert on_common_frames([own, apart])[1].present.any(0).nonzero()[0].tolist() == [0, own.num_frames - 1]
     fast = replace(own, fps=50.0, timestamp_s=own.frame_index / 50.0)
     twice = on_common_frames([own, fast])[1]
     np.testing.assert_array_equal(twice.present[:, :20], own.present[:, :40:2])

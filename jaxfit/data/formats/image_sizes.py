@@ -143,7 +143,7 @@ def _video_beside(source: Path, stored: str | None) -> Path | None:
         for file in source.absolute().parent.iterdir()
         if file.suffix.lower() in _VIDEO_SUFFIXES
         and source.name.startswith(file.stem)
-        and not source.name[len(file.stem)].isdecimal()  # clip10.csv is not of clip1.mp4
+        and not source.name[len(file.stem) :][:1].isdecimal()  # clip10.csv is not of clip1.mp4
         and _is_file(file)
     ]
     return max(videos, key=lambda file: len(file.stem), default=None)

@@ -165,11 +165,10 @@ def _assigned(
 def _image_names(observations: Observations, video: Path | None) -> dict[tuple[int, int], str]:
     """Return bird and frame → name of the image, for one bird of every image."""
     listed = image_files(video) if video is not None and video.is_dir() and not observations.own_images else []
-    names = {}
+    known, names = {file.name for file in listed}, {}
     for n, t, _ in _images(observations):
-        number = int(observations.frame_index[t])
-        file = listed[number].name if 0 <= number < len(listed) else observations.image_file(n, t)
-        names[n, t] = Path(file.replace("\\", "/")).name
+        own, number = Path(observations.image_file(n, t).replace("\\", "/")).name, int(observations.frame_index[t])
+        names[n, t] = own if own in known or not 0 <= number < len(listed) else listed[number].name
     return names
 
 
@@ -177,8 +176,9 @@ def _coco_masks(observations: Observations, source: Path, names: dict[tuple[int,
     """Return a function of bird and frame that returns the masks of the image in a COCO file."""
     root = complete_export(read_json(source))
     images = read_images(root["images"])
-    shared = {Path(image.file_name).name for image in images.values()} & set(names.values())
-    by_name = bool(observations.own_images) or (bool(shared) and len(set(names.values())) == len(names))
+    stems = {at: Path(name).stem for at, name in names.items()}
+    shared = {Path(image.file_name).stem for image in images.values()} & set(stems.values())
+    by_name = bool(observations.own_images) or (bool(shared) and len(set(stems.values())) == len(stems))
     found: dict[Any, list[dict[str, Any]]] = {}
     for annotation in root["annotations"]:
         image = images.get(annotation["image_id"].identifier())
@@ -187,10 +187,10 @@ def _coco_masks(observations: Observations, source: Path, names: dict[tuple[int,
             continue
         rle = read_segmentation(annotation["segmentation"], image.height, image.width)
         if rle is not None:
-            found.setdefault(Path(image.file_name).name if by_name else image.frame_index, []).append(rle)
+            found.setdefault(Path(image.file_name).stem if by_name else image.frame_index, []).append(rle)
 
     def masks_of(n: int, t: int) -> list[np.ndarray]:
-        key = names[n, t] if by_name else int(observations.frame_index[t])
+        key = stems[n, t] if by_name else int(observations.frame_index[t])
         return [decode_mask(rle) for rle in found.get(key, ())]
 
     return masks_of
@@ -200,14 +200,14 @@ def _folder_masks(observations: Observations, source: Path, names: dict[tuple[in
     """Return a function of bird and frame that returns the masks of a picture of a folder."""
     files = image_files(source)
     by_stem = {file.stem: file for file in files}
-    numbers = [_NUMBER.findall(file.stem) for file in files]
-    last = [int(found[-1]) for found in numbers if found]
+    last = [int(found[-1]) for found in (_NUMBER.findall(file.stem) for file in files) if found]
     unique = len(last) == len(files) == len(set(last))
     named = any(Path(name).stem in by_stem for name in names.values())
     if not (named or unique or len(files) == observations.num_frames):
         problem = f"has {len(files)} pictures without frame numbers of their own, for {observations.num_frames} frames"
         raise InputError(source, problem, "name the pictures by frame numbers or as the images")
-    by_number = dict(zip(last if unique else observations.frame_index.tolist(), files, strict=True))
+    numbers = last if unique else observations.frame_index.tolist()
+    by_number = {} if named else dict(zip(numbers, files, strict=True))
 
     def masks_of(n: int, t: int) -> list[np.ndarray]:
         file = by_stem.get(Path(names[n, t]).stem) if named else by_number.get(int(observations.frame_index[t]))

@@ -44,6 +44,9 @@ class Video(NamedTuple):
     """A video of a project."""
 
     index: int
+    """Position in the list of videos."""
+    number: int
+    """Number in the name of the data set of a package, else `index`."""
     file: str | None
     """Path as SLEAP stores it; None for pictures inside the project file."""
     size_px: tuple[int, int] | None
@@ -142,13 +145,14 @@ def _video(root: Hdf5Group, index: int, entry: Field) -> Video:
     if size is None and "width_" in backend and "height_" in backend:
         size = backend["width_"].value, backend["height_"].value
     dataset = backend["dataset"].value if "dataset" in backend else None
+    number = index
     if isinstance(dataset, str) and file is None:
         size = size or _embedded_size(root, dataset)
-        number = re.fullmatch(r"video(\d{1,9})/video", dataset)  # the frames of a package name its videos by it
-        index = int(number[1]) if number else index
+        found = re.fullmatch(r"video(\d{1,9})/video", dataset)
+        number = int(found[1]) if found else index
     if size is None or not all(type(side) is int and side > 0 for side in size):
-        return Video(index, file, None, pictures)
-    return Video(index, file, size, pictures)
+        return Video(index, number, file, None, pictures)
+    return Video(index, number, file, size, pictures)
 
 
 def _pictures(entry: Field) -> tuple[str, ...] | None:
@@ -206,7 +210,9 @@ def read_sleap_project(root: Hdf5Group, path: Path, video: Path | None = None) -
     instances = _integers(root, "instances", _INSTANCES)
     instances["score"] = root.columns("instances", {"score": "iuf"})["score"].astype(np.float64)
     instances["frame"] = _frame_of_instance(root, frames, len(instances["track"]))
-    chosen = _choose_video(frames, instances["frame"], read_videos(root), path, video)
+    videos = read_videos(root)
+    frames["video"] = _positions(frames["video"], videos)
+    chosen = _choose_video(frames, instances["frame"], videos, path, video)
     rows = np.flatnonzero(frames["video"] == chosen.index)
     position = np.full(len(frames["video"]) + 1, -1)  # the last entry serves instances without a frame
     position[rows] = np.arange(len(rows))
@@ -277,6 +283,14 @@ def _frame_of_instance(root: Hdf5Group, frames: dict[str, np.ndarray], count: in
     for row in np.flatnonzero(last > first).tolist():
         frame[first[row] : last[row]] = row
     return frame
+
+
+def _positions(ids: np.ndarray, videos: Sequence[Video]) -> np.ndarray:
+    """Return the positions of the videos of frames, which packages may name by the numbers of their data sets."""
+    position, named = {each.number: each.index for each in videos}, np.unique(ids).tolist()
+    if named == list(range(len(videos))) or not position.keys() >= set(named):
+        return ids  # they are positions
+    return np.array([position[number] for number in ids.tolist()], ids.dtype)
 
 
 def _choose_video(
