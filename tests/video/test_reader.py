@@ -10,6 +10,7 @@ from support.films import COUNT, SIZE, encode, frames, number_in, numbered, over
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.video import packets as packet_reading
+from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import Frame, VideoInfo, probe_video, read_frames
 
 KINDS = {
