@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -21,6 +22,8 @@ MOST_CANVAS = 2.0
 """Longest side of the picture without distortion, as a multiple of that of the image."""
 MOST_ERROR = 0.1
 """Largest error of a keypoint that agrees with other views, relative to the longer side of the box of the bird."""
+_logger = logging.getLogger(__name__)
+
 WHOLE_FRAME = 0.02
 """Times that differ by less, in frames, are one frame."""
 LONGEST_GAP_S = 0.25
@@ -197,12 +200,11 @@ def on_common_frames(
         raise InputError("observations", "of the first camera hold no frame", "give cameras that see birds")
     moved = []
     for v, (own, offset) in enumerate(zip(observations, offsets, strict=True)):
-        at = _own_numbers(first, own) + offset
-        low, high = own.frame_index.min(initial=0), own.frame_index.max(initial=-1)
-        if not ((low <= at) & (at <= high)).any():
+        at = _own_numbers(first, own) + offset if own.num_frames else np.zeros(0)
+        if not ((own.frame_index[:1] <= at) & (at <= own.frame_index[-1:])).any():
             problem = f"of camera {v + 1} have no time in common with those of the first camera"
             raise InputError("observations", problem, "check the frame numbers, the rates and the offsets")
-        moved.append(own if own is first and not offset else _at_frames(own, at, first))
+        moved.append(own if own is first and not offset else _at_frames(own, at, first, v + 1))
     return tuple(moved)
 
 
@@ -226,7 +228,7 @@ def _own_numbers(first: Observations, own: Observations) -> Float[np.ndarray, "T
     return numbers * own.fps / first.fps
 
 
-def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observations) -> Observations:
+def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observations, number: int) -> Observations:
     """Return observations at fractional frame numbers, as frames of the first camera."""
     numbers, last = own.frame_index, own.num_frames - 1
     i = np.searchsorted(numbers, at + WHOLE_FRAME, side="right") - 1  # the stored frame before, or the frame itself
@@ -236,6 +238,10 @@ def _at_frames(own: Observations, at: Float[np.ndarray, "T"], first: Observation
     i, j = np.clip(i, 0, last), np.clip(j, 0, last)
     gap = numbers[j] - numbers[i]
     known = inside & (gap <= max(1, LONGEST_GAP_S * (own.fps or 25)))
+    lost = int((inside & ~known).sum())
+    if lost:
+        text = "camera %d lacks %d of %d frames: its own are more than %g s apart (track it with a smaller --step)"
+        _logger.warning(text, number, lost, len(at), LONGEST_GAP_S)
     share = np.where(whole | (gap == 0), 0, (at - numbers[i]) / np.maximum(gap, 1)).astype(np.float32)
 
     def mixed(values: np.ndarray) -> np.ndarray:

@@ -299,7 +299,7 @@ def join_results(
     summary |= {key: first[key] for key in DETECTION if key in first} | trust
     summary["quality"] = {row.track_id: row._asdict() for row in track_quality(observations)}
     # with the part, because the numbers are those of the tracks of the part
-    corrections = [f"{part.folder.name}: {edit}" for part in parts for edit in part.summary.get("corrections", [])]
+    corrections = [f"{part.folder}: {edit}" for part in parts for edit in part.summary.get("corrections", [])]
     if corrections:
         summary["corrections"] = corrections
     summary["joined"] = [row._asdict() for row in table]

@@ -69,9 +69,14 @@ def test_masks_with_the_names_of_the_pictures_belong_to_them(tmp_path, birds):
         changed = replace(numbered, file_name=np.array([name.replace("png", suffix) for name in names]))
         write_coco(changed, tmp_path / "masks.json")
         assert add_masks(birds, tmp_path / "masks.json", video=video).masks.keys() == masked.masks.keys()
-    # labels that name the pictures keep their numbers, whatever the positions in the folder
-    again = add_masks(replace(numbered, masks={}), folder, video=video)
-    assert again.masks.keys() == masked.masks.keys()
+    # labels that name the pictures keep their numbers, whatever the positions in the folder, also of another type
+    for suffix in ("png", "jpg"):
+        named = replace(numbered, masks={}, file_name=np.array([name.replace("png", suffix) for name in names]))
+        assert add_masks(named, folder, video=video).masks.keys() == masked.masks.keys()
+    # frames of a video have its name and their number
+    frames = replace(numbered, file_name=np.array([f"film.mp4#{t}" for t in range(T)]))
+    write_coco(frames, tmp_path / "masks.json")
+    assert add_masks(replace(frames, masks={}), tmp_path / "masks.json").masks == masked.masks
     cv2.imwrite(str(folder / "other.png"), halves(7, 3))
     assert add_masks(birds, folder, video=video).masks.keys() == masked.masks.keys()
 

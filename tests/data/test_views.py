@@ -165,7 +165,7 @@ def test_a_camera_that_tracks_no_bird_has_empty_rows(straight):
     assert not rows.present.any()
 
 
-def test_offsets_and_rates_in_time(straight):
+def test_offsets_and_rates_in_time(straight, caplog):
     own = straight[0][1]
     shifted = replace(own.select(frames=np.arange(3, 40)), frame_index=np.arange(37))
     first, moved = on_common_frames([own, shifted], [0, -3])
@@ -186,6 +186,9 @@ def test_offsets_and_rates_in_time(straight):
     np.testing.assert_allclose(between.keypoints_px[:, :-1][seen], expected[seen], atol=1e-3)
     apart = own.select(frames=[0, own.num_frames - 1])  # nothing is known of the frames between
     assert on_common_frames([own, apart])[1].present.any(0).nonzero()[0].tolist() == [0, own.num_frames - 1]
+    assert f"camera 2 lacks {own.num_frames - 2} of {own.num_frames} frames" in caplog.text
+    with pytest.raises(InputError, match="of camera 2 have no time in common"):
+        on_common_frames([own, replace(own, frame_index=own.frame_index + 1000)])
     fast = replace(own, fps=50.0, timestamp_s=own.frame_index / 50.0)
     twice = on_common_frames([own, fast])[1]
     np.testing.assert_array_equal(twice.present[:, :20], own.present[:, :40:2])

@@ -133,7 +133,8 @@ def test_tracks_continue_and_everything_is_copied(parts, capsys):
     assert set(observed.masks) == {(n, t) for n in range(3) for t in range(60) if n < 2 or t >= 30}
     summary = json.loads((parts / "out" / "summary.json").read_text())
     assert (summary["trust"], summary["trust_reasons"]) == ("low", ["dark"])
-    assert (summary["segmenter"], summary["corrections"]) == ("builtin", ["a: swap 3,5@4:9"])
+    assert summary["segmenter"] == "builtin"
+    assert summary["corrections"] == [f"{parts / 'a'}: swap 3,5@4:9"]
     assert summary["failures"] == {"6": ["frames 30 to 35: not finite"]}
     became = {(row["folder"][-1], row["track"]): row for row in summary["joined"]}
     assert {key: row["joined"] for key, row in became.items()} == {

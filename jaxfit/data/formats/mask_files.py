@@ -26,7 +26,7 @@ from jaxfit.data.tracks import frame_numbers
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import FRAME_DIGITS, MASKS_PER_PICTURE
 from jaxfit.foundation.progress import ProgressTask, silent
-from jaxfit.video.pictures import image_files, read_picture
+from jaxfit.video.pictures import IMAGE_SUFFIXES, image_files, read_picture
 
 _COVERED = 0.3
 """Least fraction of a bird's keypoints that its mask covers, weighted by confidence; another bird may hide the rest."""
@@ -165,20 +165,27 @@ def _assigned(
 def _image_names(observations: Observations, video: Path | None) -> dict[tuple[int, int], str]:
     """Return bird and frame → name of the image, for one bird of every image."""
     listed = image_files(video) if video is not None and video.is_dir() and not observations.own_images else []
-    known, names = {file.name for file in listed}, {}
+    known, names = {_stem(file.name) for file in listed}, {}
     for n, t, _ in _images(observations):
         own, number = Path(observations.image_file(n, t).replace("\\", "/")).name, int(observations.frame_index[t])
-        names[n, t] = own if own in known or not 0 <= number < len(listed) else listed[number].name
+        names[n, t] = own if _stem(own) in known or not 0 <= number < len(listed) else listed[number].name
     return names
+
+
+def _stem(name: str) -> str:
+    """Return the name of a picture without its suffix; `film.mp4#12`, which names a frame of a video, stays."""
+    return Path(name).stem if Path(name).suffix.lower() in IMAGE_SUFFIXES else name
 
 
 def _coco_masks(observations: Observations, source: Path, names: dict[tuple[int, int], str]) -> _Masks:
     """Return a function of bird and frame that returns the masks of the image in a COCO file."""
     root = complete_export(read_json(source))
     images = read_images(root["images"])
-    stems = {at: Path(name).stem for at, name in names.items()}
-    shared = {Path(image.file_name).stem for image in images.values()} & set(stems.values())
-    by_name = bool(observations.own_images) or (bool(shared) and len(set(stems.values())) == len(stems))
+    pictures = {Path(image.file_name).name for image in images.values()}
+    key_of = str if pictures & set(names.values()) else _stem  # pictures of masks may be of another type
+    keys = {at: key_of(name) for at, name in names.items()}
+    shared = {key_of(name) for name in pictures} & set(keys.values())
+    by_name = bool(observations.own_images) or (bool(shared) and len(set(keys.values())) == len(keys))
     found: dict[Any, list[dict[str, Any]]] = {}
     for annotation in root["annotations"]:
         image = images.get(annotation["image_id"].identifier())
@@ -187,10 +194,11 @@ def _coco_masks(observations: Observations, source: Path, names: dict[tuple[int,
             continue
         rle = read_segmentation(annotation["segmentation"], image.height, image.width)
         if rle is not None:
-            found.setdefault(Path(image.file_name).stem if by_name else image.frame_index, []).append(rle)
+            key = key_of(Path(image.file_name).name) if by_name else image.frame_index
+            found.setdefault(key, []).append(rle)
 
     def masks_of(n: int, t: int) -> list[np.ndarray]:
-        key = stems[n, t] if by_name else int(observations.frame_index[t])
+        key = keys[n, t] if by_name else int(observations.frame_index[t])
         return [decode_mask(rle) for rle in found.get(key, ())]
 
     return masks_of
@@ -202,7 +210,7 @@ def _folder_masks(observations: Observations, source: Path, names: dict[tuple[in
     by_stem = {file.stem: file for file in files}
     last = [int(found[-1]) for found in (_NUMBER.findall(file.stem) for file in files) if found]
     unique = len(last) == len(files) == len(set(last))
-    named = any(Path(name).stem in by_stem for name in names.values())
+    named = any(_stem(name) in by_stem for name in names.values())
     if not (named or unique or len(files) == observations.num_frames):
         problem = f"has {len(files)} pictures without frame numbers of their own, for {observations.num_frames} frames"
         raise InputError(source, problem, "name the pictures by frame numbers or as the images")
@@ -210,7 +218,7 @@ def _folder_masks(observations: Observations, source: Path, names: dict[tuple[in
     by_number = {} if named else dict(zip(numbers, files, strict=True))
 
     def masks_of(n: int, t: int) -> list[np.ndarray]:
-        file = by_stem.get(Path(names[n, t]).stem) if named else by_number.get(int(observations.frame_index[t]))
+        file = by_stem.get(_stem(names[n, t])) if named else by_number.get(int(observations.frame_index[t]))
         if file is None:
             return []
         return masks_of_picture(_read_mask_picture(file), file, int(observations.present[:, t].sum()) > 1)

@@ -145,11 +145,10 @@ def _video(root: Hdf5Group, index: int, entry: Field) -> Video:
     if size is None and "width_" in backend and "height_" in backend:
         size = backend["width_"].value, backend["height_"].value
     dataset = backend["dataset"].value if "dataset" in backend else None
-    number = index
-    if isinstance(dataset, str) and file is None:
-        size = size or _embedded_size(root, dataset)
-        found = re.fullmatch(r"video(\d{1,9})/video", dataset)
-        number = int(found[1]) if found else index
+    found = re.fullmatch(r"video(\d{1,9})/video", dataset) if isinstance(dataset, str) else None
+    number = int(found[1]) if found else index
+    if size is None and isinstance(dataset, str) and file is None:
+        size = _embedded_size(root, dataset)
     if size is None or not all(type(side) is int and side > 0 for side in size):
         return Video(index, number, file, None, pictures)
     return Video(index, number, file, size, pictures)
