@@ -312,10 +312,15 @@ def temporary(target: Path) -> Iterator[Temporary]:
     try:
         yield names
     finally:
-        _own_parts.discard(names.part)
-        _finish(stem, names)
-        if descriptor is not None:
-            os.close(descriptor)
+        try:
+            _finish(stem, names)
+        except KeyboardInterrupt:  # in the middle of the removal
+            _finish(stem, names)
+            raise
+        finally:
+            _own_parts.discard(names.part)
+            if descriptor is not None:
+                os.close(descriptor)
 
 
 def remove_leftovers(folder: Path) -> None:

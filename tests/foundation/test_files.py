@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxfit.foundation import files
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file, check_replaceable, check_writable, new_folder, write_whole
 
@@ -121,6 +122,22 @@ def test_other_errors_are_not_converted_and_leave_no_files(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         fill(tmp_path / "a" / "out", interrupted)
     assert names(tmp_path) == []
+
+
+def test_an_interrupt_of_the_removal_leaves_no_files(tmp_path, monkeypatch):
+    remove, calls = files._remove, []
+
+    def interrupted(path):
+        remove(path)
+        calls.append(path)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(files, "_remove", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "a.txt", b"a")
+    assert calls
+    assert [path.name for path in tmp_path.iterdir()] in (["a.txt"], [])
 
 
 def test_a_folder_appears_after_the_body(tmp_path):
