@@ -138,7 +138,7 @@ def check_calibration(options: argparse.Namespace) -> None:
     if len(options.observations) < 2:
         raise InputError("cameras check", "needs two cameras", "give the observations of at least two cameras")
     read = read_views(options, find_bird(options.model))
-    result = check_cameras(*read)
+    result = check_cameras(read.views, read.tracks, read.matches, read.offset_frames, read.step_frames)
     show_matches(read)
     table = right_aligned("camera", "error px", "% of box", "agree %")
     for name, (error_px, relative, agree) in result.by_camera.items():

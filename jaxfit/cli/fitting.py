@@ -25,6 +25,7 @@ from jaxfit.cli.tables import (
     show,
     wrong_poses_line,
 )
+from jaxfit.data.observations import LEAST_KEYPOINTS
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text
@@ -36,9 +37,6 @@ if TYPE_CHECKING:
     from jaxfit.data.solution import Solution
     from jaxfit.evaluation.truth import Truth
     from jaxfit.model.bird import Bird
-
-LEAST_KEYPOINTS = 3
-"""Fewer keypoints do not determine the orientation of a bird."""
 
 
 def fit(options: argparse.Namespace) -> None:

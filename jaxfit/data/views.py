@@ -22,12 +22,12 @@ MOST_CANVAS = 2.0
 """Longest side of the picture without distortion, as a multiple of that of the image."""
 MOST_ERROR = 0.1
 """Largest error of a keypoint that agrees with other views, relative to the longer side of the box of the bird."""
-_logger = logging.getLogger(__name__)
-
 WHOLE_FRAME = 0.02
 """Times that differ by less, in frames, are one frame."""
 LONGEST_GAP_S = 0.25
 """Keypoints are interpolated between stored frames at most this far apart, seconds; at unknown rates, 25 frames/s."""
+
+_logger = logging.getLogger(__name__)
 
 
 class Views(NamedTuple):

@@ -38,6 +38,7 @@ from jaxfit.fitting.windows import (
     Windows,
     first_frames,
     prepare_observations,
+    window_frames,
     window_starts,
     windows_at,
 )
@@ -266,7 +267,7 @@ def view_windows(
         masks={},
     )
     starts = window_starts(together, config, first_frames(together, config))
-    frame = windows_at(prepared[0], each, starts).frame
+    frame = window_frames(together, config, starts)
     posed = has_pose & together.usable(config.min_keypoints)
     starts = starts[((frame >= 0) & posed[starts[:, :1], np.maximum(frame, 0)]).any(axis=1)]
     if not len(starts):

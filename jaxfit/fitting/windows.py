@@ -322,17 +322,24 @@ def window_starts(prepared: Observations, config: FitConfig, first_frame: Mappin
     return np.array(starts, int).reshape(-1, 3)
 
 
-def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray, "W 3"]) -> Windows:
-    """Return the windows at some places, as `window_starts` returns them."""
-    line, usable = _timeline(prepared), prepared.usable(config.min_keypoints)
-    needed = len(starts) * config.window * (80 + 60 * prepared.num_keypoints)
-    what = f"the arrays of {len(starts):,} windows of {config.window:,} frames"
-    check_memory("observations", what, needed, "lower `window` in the config", max(TABLE_GB, config.memory_gb))
-    track = starts[:, 0]
+def window_frames(prepared: Observations, config: FitConfig, starts: Int[np.ndarray, "W 3"]) -> Int[np.ndarray, "W T"]:
+    """Return the positions of the frames of windows, −1 where a window has no frame."""
+    line = _timeline(prepared)
     frame = np.full((len(starts), config.window), -1)
     for w, (_, first, last) in enumerate(starts.tolist()):
         piece = line[first : min(first + config.window, last + 1)]
         frame[w, : len(piece)] = piece
+    return frame
+
+
+def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray, "W 3"]) -> Windows:
+    """Return the windows at some places, as `window_starts` returns them."""
+    usable = prepared.usable(config.min_keypoints)
+    needed = len(starts) * config.window * (80 + 60 * prepared.num_keypoints)
+    what = f"the arrays of {len(starts):,} windows of {config.window:,} frames"
+    check_memory("observations", what, needed, "lower `window` in the config", max(TABLE_GB, config.memory_gb))
+    track = starts[:, 0]
+    frame = window_frames(prepared, config, starts)
     rows, columns = track[:, None], np.maximum(frame, 0)
     present = (frame >= 0) & usable[rows, columns]
     crop = crop_squares(prepared, track, frame, present, config.crop)

@@ -407,7 +407,7 @@ def fingerprint(data: FineTuningData, simulated: Filming | None, base: Path, set
     for pictures, owner in zip(data.frames.pictures, data.frames.owner, strict=True):
         content.update(np.ascontiguousarray(pictures).tobytes())
         content.update(np.ascontiguousarray(owner).tobytes())
-    for picture in (*data.pictures, *data.tracked):  # also those that only the measurements or the second training see
+    for picture in (*data.pictures, *data.tracked):  # the measurements and the second training use all labels
         labels = picture.labels
         unknown = labels.unknown and dict(labels.unknown)
         content.update(repr((labels.name, labels.frame, labels.size_px, unknown)).encode())

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 from scipy import sparse
 from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
@@ -22,7 +22,7 @@ from scipy.spatial import KDTree
 from jaxfit.foundation.extras import own_version
 from jaxfit.foundation.limits import NPZ_TEXT_CHARACTERS
 from jaxfit.model.bird import Bird, model_hash
-from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints, posed_vertices, rest_pose
+from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_keypoints, posed_vertices, rest_pose
 
 BONE_SD = 0.05
 """Standard deviation by which the mean length of any bone may differ between species, besides the prior of the model.
@@ -73,23 +73,26 @@ def absolute_bones(bird: Bird, bone_length: Any = None) -> Float[np.ndarray, "bo
 
 def rest_surface(bird: Bird) -> Float[np.ndarray, "V 3"]:
     """Return the vertices of the rest pose with the mean bone lengths of the prior, model units."""
-    rig, pose = fold_bird(bird), rest_pose(bird)
-    pose = replace(pose, body_pose=jnp.zeros_like(pose.body_pose))
-    return np.asarray(posed_vertices(rig, joint_transforms(rig, pose), pose), np.float64)
+    rig, pose, A = _straight(bird)
+    return np.asarray(posed_vertices(rig, A, pose), np.float64)
 
 
 def rest_points(bird: Bird) -> dict[str, dict[str, Float[np.ndarray, "3"]]]:
     """Return the keypoints and the joints of `rest_surface` by name, model units."""
-    rig, pose = fold_bird(bird), rest_pose(bird)
-    pose = replace(pose, body_pose=jnp.zeros_like(pose.body_pose))
-    A = np.asarray(joint_transforms(rig, pose), np.float64)
-    joints = np.asarray(rig.joints, np.float64)
-    posed = np.einsum("jdc,jc->jd", A[..., :3], joints) + A[..., 3]
-    keypoints = np.asarray(posed_keypoints(rig, jnp.asarray(A), pose), np.float64)
+    rig, pose, A = _straight(bird)
+    joints = np.asarray(jnp.einsum("jdc,jc->jd", A[..., :3], rig.joints) + A[..., 3], np.float64)
+    keypoints = np.asarray(posed_keypoints(rig, A, pose), np.float64)
     return {
         "keypoints": dict(zip(bird.keypoint_names, keypoints, strict=True)),
-        "joints": dict(zip(bird.joint_names, posed, strict=True)),
+        "joints": dict(zip(bird.joint_names, joints, strict=True)),
     }
+
+
+def _straight(bird: Bird) -> tuple[Rig, Pose, Float[Array, "J 3 4"]]:
+    """Return the rig, the rest pose with straight joints and the mean bone lengths of the prior, and its transforms."""
+    rig, pose = fold_bird(bird), rest_pose(bird)
+    pose = replace(pose, body_pose=jnp.zeros_like(pose.body_pose))
+    return rig, pose, joint_transforms(rig, pose)
 
 
 def mean_keypoints(bird: Bird) -> Float[np.ndarray, "K 3"]:
