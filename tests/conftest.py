@@ -20,7 +20,7 @@ from support.cli_files import write_inputs
 
 DEFAULT_REFERENCE = Path(__file__).resolve().parents[1] / ".." / "shared"
 
-MOST_MAPS = 8000
+MAX_MAPS = 8000
 """Linux allows 65530 memory maps per process by default. With 20,000 maps, a process of the tests takes 4 GB."""
 
 ACCEPTED_SKIPS = (
@@ -71,7 +71,7 @@ def _few_memory_maps():
     """Free the compiled programs after a module if the process has many memory maps, whose number is limited."""
     yield
     maps = Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") > MOST_MAPS:
+    if not maps.exists() or maps.read_bytes().count(b"\n") > MAX_MAPS:
         jax.clear_caches()
 
 

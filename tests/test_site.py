@@ -28,7 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = ROOT / "docs"
 PAGES = sorted(DOCUMENTS.rglob("*.md"))
 RESULTS = sorted((DOCUMENTS / "results").glob("*.md"))
-MOST_LINES = 400
+MAX_LINES = 400
 MEASURED = re.compile(r"^\*Measured with (\d+\.\d+\.\d+):\*")
 HISTORY = re.compile("cannot be repeated|no longer shipped|by an earlier|with an earlier|an earlier program")
 """Words of a line of `MEASURED` whose tables show an earlier state on purpose."""
@@ -159,7 +159,7 @@ def test_every_drawing_has_its_function():
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: path.relative_to(DOCUMENTS).as_posix())
 def test_pages_are_short(path, site):
     text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= MOST_LINES
+    assert len(text.splitlines()) <= MAX_LINES
     assert text.startswith("# ")
     assert set(site.MARKER.findall(text)) <= site.GENERATED.keys()
 

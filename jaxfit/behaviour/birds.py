@@ -22,7 +22,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird, rest_length
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_joints, posed_keypoints
 
-MOST_TILT_SD_DEG = 15.0
+MAX_TILT_SD_DEG = 15.0
 """Standard deviation of an estimated vertical above which the vertical is unknown, degrees.
 
 Postures on a ledge differ by some 15° of pitch: a vertical that is wrong by more takes one posture for another.
@@ -314,7 +314,7 @@ def flock_of(
 
     A result on a ledge has this world. Of other results, the ledge is estimated (`fitting.ledge_plane`): in metres with
     calibrated cameras, else in lengths of the model, because one camera alone measures no size. A vertical that is
-    less certain than `MOST_TILT_SD_DEG` counts as unknown.
+    less certain than `MAX_TILT_SD_DEG` counts as unknown.
 
     Args:
         solution: the poses; those in a world, in the frame of `camera` (`data.world.as_filmed`).
@@ -332,11 +332,11 @@ def flock_of(
             found = estimate_ledge(s, model, None if camera is None else camera.pinhole(), source=source)
             count, tilt_sd = found.facts["birds"], found.facts["tilt_sd_deg"]
             birds = "1 bird" if count == 1 else f"{count} birds"
-            if tilt_sd <= MOST_TILT_SD_DEG:
+            if tilt_sd <= MAX_TILT_SD_DEG:
                 s = on_ledge(s, model, found.camera, known_sizes=cameras > 1)
                 notes.append(f"the vertical is estimated from {birds} (± {tilt_sd:.1f}°)")
             else:
-                limit = f"at most {MOST_TILT_SD_DEG:.0f}° is needed"
+                limit = f"at most {MAX_TILT_SD_DEG:.0f}° is needed"
                 problem = f"estimated from {birds}, its error is ± {tilt_sd:.0f}°, and {limit}"
                 notes.append(f"the ledge and the vertical are unknown: {problem}")
         except InputError as error:

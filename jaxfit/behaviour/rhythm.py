@@ -39,7 +39,7 @@ class Rhythm(NamedTuple):
 def rhythm_of(
     signal: Float[np.ndarray, "N T"],
     time_s: Float[np.ndarray, "T"],
-    least_amplitude: float,
+    min_amplitude: float,
     step_s: Float[np.ndarray, "T"] | None = None,
     interval_s: float | None = None,
     first: int = 0,
@@ -49,14 +49,14 @@ def rhythm_of(
     A window with a Hann taper is fitted by a constant and one sinusoid of each frequency (the generalised Lomb-Scargle
     periodogram), so that gaps and uneven frames are allowed. The frequency with the largest share of the variance
     counts, if this share is at least `SHARE` and larger than that of noise (`FALSE_ALARM`), and if the amplitude is at
-    least `least_amplitude`. Frequencies of less than `CYCLES` per window, or within a quarter of a cycle per window of
+    least `min_amplitude`. Frequencies of less than `CYCLES` per window, or within a quarter of a cycle per window of
     half the frame rate, cannot be measured. Faster movements look like slower movements: a frequency f above half the
     frame rate appears as fps − f.
 
     Args:
         signal: values, NaN where unknown.
         time_s: time of each frame.
-        least_amplitude: smallest amplitude, in the unit of the signal.
+        min_amplitude: smallest amplitude, in the unit of the signal.
         step_s: usual time between frames around each frame; None: as `usual_steps` of `time_s`.
         interval_s: usual time between frames of the whole video; None takes the median of `time_s`.
         first: number of the first frame, so that the windows of parts of a video are those of the whole video.
@@ -72,7 +72,7 @@ def rhythm_of(
             hops = slice(max(t, 0), t + hop)
             for window_s in WINDOWS_S:
                 step = float(step_s[hops.start])
-                measured = _in_window(values, time_s, t, hops, window_s, step, least_amplitude)
+                measured = _in_window(values, time_s, t, hops, window_s, step, min_amplitude)
                 if measured is not None:
                     for array, value in zip(found, measured, strict=True):
                         array[n, hops] = np.where(np.isfinite(values[hops]), value, np.nan)
@@ -87,7 +87,7 @@ def _in_window(
     hops: slice,
     window_s: float,
     interval_s: float,
-    least_amplitude: float,
+    min_amplitude: float,
 ) -> tuple[float, float, np.ndarray] | None:
     """Return frequency, amplitude and phases of the rhythm in a window around frame t; None without a rhythm."""
     highest = 0.5 / interval_s - 0.25 / window_s
@@ -103,11 +103,11 @@ def _in_window(
     # at the ends of a track, the window lies beside the frame
     start = int(np.clip(t - half, near[0], max(near[-1] - 2 * half, near[0])))
     at = near[(near >= start) & (near <= start + 2 * half)]
-    if len(at) < least or np.ptp(values[at]) < 2 * least_amplitude:
+    if len(at) < least or np.ptp(values[at]) < 2 * min_amplitude:
         return None
     frequency = np.arange(LOWEST_HZ, highest, STEP / window_s)
     measured = _sinusoid(time_s[at], values[at], frequency, time_s[hops], window_s)
-    return None if measured is None or measured[1] < least_amplitude else measured
+    return None if measured is None or measured[1] < min_amplitude else measured
 
 
 def _sinusoid(

@@ -14,9 +14,9 @@ from jaxfit.behaviour.rhythm import Rhythm, rhythm_of
 TIPS = ("left_wingtip", "right_wingtip")
 ARMS = ("left_shoulder", "left_elbow", "left_wrist", "right_shoulder", "right_elbow", "right_wrist")
 FEET = ("left_foot", "right_foot")
-LEAST_BEAT_DEG = 5.0
+MIN_BEAT_DEG = 5.0
 """Smallest amplitude of a wingbeat, degrees: larger than the noise of fitted poses."""
-LEAST_STRIDE = 0.03
+MIN_STRIDE = 0.03
 """Smallest amplitude of the distance between the feet in a stride, body lengths."""
 
 
@@ -46,7 +46,7 @@ def _timing(birds: Birds) -> tuple[Float[np.ndarray, "T"], float, int]:
 
 def wingbeat(birds: Birds) -> Rhythm:
     """Return the rhythm of the wing elevation."""
-    return rhythm_of(birds.once(wing_elevation), birds.time_s, LEAST_BEAT_DEG, *_timing(birds))
+    return rhythm_of(birds.once(wing_elevation), birds.time_s, MIN_BEAT_DEG, *_timing(birds))
 
 
 @feature(unit="Hz", keypoints=TIPS, joints=ARMS, needs=("time",))
@@ -79,7 +79,7 @@ def stride(birds: Birds) -> Rhythm:
     forward = unit_vector(birds.forward * [1, 1, 0]) if birds.level else birds.forward
     ahead = np.sum(apart * forward, axis=-1) / birds.body_length
     on_ledge = ~(birds.contact < 0.5)
-    return rhythm_of(np.where(on_ledge, ahead, np.nan), birds.time_s, LEAST_STRIDE, *_timing(birds))
+    return rhythm_of(np.where(on_ledge, ahead, np.nan), birds.time_s, MIN_STRIDE, *_timing(birds))
 
 
 @feature(unit="Hz", keypoints=FEET, needs=("time",))

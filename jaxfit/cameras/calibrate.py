@@ -18,11 +18,11 @@ from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.formats.values import WHOLE_PIXELS
 from jaxfit.foundation.errors import InputError
 
-LEAST_VIEWS = 8
+MIN_VIEWS = 8
 """Fewest different views of the board for the calibration of a camera."""
-MOST_VIEWS = 60
+MAX_VIEWS = 60
 """Most views of the board that a calibration uses; more views take longer and change little."""
-LEAST_COMMON_VIEWS = 3
+MIN_COMMON_VIEWS = 3
 """Fewest frames in which two cameras see the board, for their relative pose."""
 
 _SEARCH_SIDE_PX = 1280
@@ -162,7 +162,7 @@ def find_corners(picture: UInt8[np.ndarray, "H W 3"], board: Board) -> Float[np.
 def calibrate_lens(views: BoardViews, board: Board, fisheye: bool = False) -> Lens:
     """Calibrate one camera by `cv2.calibrateCameraExtended` or `cv2.fisheye.calibrate`.
 
-    The `MOST_VIEWS` views that differ most are used. Views with an error above three times the median are
+    The `MAX_VIEWS` views that differ most are used. Views with an error above three times the median are
     dropped, and the camera is calibrated again.
 
     Args:
@@ -174,20 +174,20 @@ def calibrate_lens(views: BoardViews, board: Board, fisheye: bool = False) -> Le
         The lens. The camera is the world.
 
     Raises:
-        InputError: there are fewer than `LEAST_VIEWS` different views, or OpenCV finds no camera for the views.
+        InputError: there are fewer than `MIN_VIEWS` different views, or OpenCV finds no camera for the views.
 
     Source: Zhang 2000, *A flexible new technique for camera calibration*.
     """
     corners_px = views.corners_px[_different(_shapes(views))]
-    if len(corners_px) < LEAST_VIEWS:
-        problem = f"has {len(corners_px)} different views of the board, fewer than {LEAST_VIEWS}"
+    if len(corners_px) < MIN_VIEWS:
+        problem = f"has {len(corners_px)} different views of the board, fewer than {MIN_VIEWS}"
         raise InputError(
             views.source, problem, "film the board in many places of the picture, tilted in all directions"
         )
     camera, error_px, sd_px = _solve(views, corners_px, board, fisheye)
     agrees = error_px <= _OUTLIER * np.median(error_px)
-    if agrees.sum() < LEAST_VIEWS:
-        problem = f"has {agrees.sum()} views of the board that agree, fewer than {LEAST_VIEWS}"
+    if agrees.sum() < MIN_VIEWS:
+        problem = f"has {agrees.sum()} views of the board that agree, fewer than {MIN_VIEWS}"
         raise InputError(views.source, problem, "film more places, and move the board slowly")
     if agrees.sum() < len(agrees):
         corners_px = corners_px[agrees]
@@ -233,7 +233,7 @@ def calibrate_cameras(
         The cameras in the order of the films, and the pairs.
 
     Raises:
-        InputError: as `calibrate_lens`; or a camera has fewer than `LEAST_COMMON_VIEWS` views in common with the
+        InputError: as `calibrate_lens`; or a camera has fewer than `MIN_COMMON_VIEWS` views in common with the
             others.
     """
     lenses = [calibrate_lens(film, board, fisheye) for film in films]
@@ -242,10 +242,10 @@ def calibrate_cameras(
         left = [i for i in range(len(films)) if i not in placed]
         a, b = max(((a, b) for a in placed for b in left), key=lambda ab: _common(films[ab[0]], films[ab[1]]).shape[1])
         count = _common(films[a], films[b]).shape[1]
-        if count < LEAST_COMMON_VIEWS:
+        if count < MIN_COMMON_VIEWS:
             problem = f"has {count} views of the board at the same time as another camera, fewer than "
             remedy = "show the board to two cameras at a time; the films must start together"
-            raise InputError(films[b].source, f"{problem}{LEAST_COMMON_VIEWS}", remedy)
+            raise InputError(films[b].source, f"{problem}{MIN_COMMON_VIEWS}", remedy)
         first, second = lenses[a].camera, lenses[b].camera
         try:
             R, t, pair = _relative_pose((films[a], films[b]), (first, second), board)
@@ -270,9 +270,9 @@ def _relative_pose(
     at = at[:, _different(np.concatenate([_shapes(film)[i] for film, i in zip(films, at, strict=True)], axis=1))]
     first_px, second_px = (film.corners_px[i] for film, i in zip(films, at, strict=True))
     first_px, second_px = _consistent(first_px, second_px, cameras, board)
-    if len(first_px) < LEAST_COMMON_VIEWS:
+    if len(first_px) < MIN_COMMON_VIEWS:
         problem = f"has {len(first_px)} different views of the board in common with {films[0].source} that agree"
-        remedy = f"move the board while both cameras see it: {LEAST_COMMON_VIEWS} different views are necessary"
+        remedy = f"move the board while both cameras see it: {MIN_COMMON_VIEWS} different views are necessary"
         raise InputError(films[1].source, problem, remedy)
     points, pixels = _as_lists(first_px, board)
     lenses = [part for camera in cameras for part in (camera.matrix.copy(), camera.distortion.copy())]
@@ -333,9 +333,9 @@ def _shapes(views: BoardViews) -> Float[np.ndarray, "F N*2"]:
 
 
 def _different(shapes: Float[np.ndarray, "F D"]) -> list[int]:
-    """Return the places of at most `MOST_VIEWS` views, each as far as possible from the others."""
+    """Return the places of at most `MAX_VIEWS` views, each as far as possible from the others."""
     chosen, distance = [0], np.full(len(shapes), np.inf)
-    while len(chosen) < MOST_VIEWS:
+    while len(chosen) < MAX_VIEWS:
         distance = np.minimum(distance, np.linalg.norm(shapes - shapes[chosen[-1]], axis=1))
         farthest = int(distance.argmax())
         if distance[farthest] < _DIFFERENT:

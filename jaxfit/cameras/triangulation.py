@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from jaxfit.cameras.camera import Camera
 
-LEAST_ANGLE_DEG = 1.0
+MIN_ANGLE_DEG = 1.0
 """Rays that meet at a smaller angle do not determine a point."""
 
 
@@ -122,7 +122,7 @@ def _wide(cameras: Sequence[Camera], pair: tuple[int, int], points: np.ndarray) 
     a, b = (points - cameras[v].position_world for v in pair)
     with np.errstate(invalid="ignore"):
         cosine = np.einsum("...c,...c->...", a, b) / (np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1))
-        return np.abs(cosine) < np.cos(np.radians(LEAST_ANGLE_DEG))
+        return np.abs(cosine) < np.cos(np.radians(MIN_ANGLE_DEG))
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> Float[np.ndarray, "3 3"]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jaxfit.cameras.calibrate import Board, BoardViews, Lens, Pair
     from jaxfit.cameras.camera import Camera
 
-_MOST_FRAMES = 200
+_MAX_FRAMES = 200
 """Most frames of a film in which the board is searched."""
 _BOARD_CORNERS = range(3, 101)
 _LITTLE_COVERAGE = 0.5
@@ -69,7 +69,7 @@ def _find_boards(films: Sequence[Path], board: Board) -> list[BoardViews]:
             problem = f'would be a second camera with the name "{name}", after {films[names.index(name)]}'
             raise InputError(films[i], problem, "give each film its own name")
     counts = [_frame_count(film) for film in films]
-    step = math.ceil(max(counts) / _MOST_FRAMES)
+    step = math.ceil(max(counts) / _MAX_FRAMES)
     found = []
     for name, film, count in zip(names, films, counts, strict=True):
         with terminal(f"search for the board: {name}", math.ceil(count / step)) as report_progress:

@@ -25,7 +25,7 @@ from jaxfit.cli.tables import (
     show,
     wrong_poses_line,
 )
-from jaxfit.data.observations import LEAST_KEYPOINTS
+from jaxfit.data.observations import MIN_KEYPOINTS
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text
@@ -186,8 +186,8 @@ def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namesp
     count = len(names.mapped)
     if count >= config.min_keypoints:
         return config
-    if count < LEAST_KEYPOINTS:
-        problem = f"has {count} keypoints of the model by name; a fit needs {LEAST_KEYPOINTS}"
+    if count < MIN_KEYPOINTS:
+        problem = f"has {count} keypoints of the model by name; a fit needs {MIN_KEYPOINTS}"
         raise InputError(options.observations, problem, "map more names by --names MAP.yaml")
     show(f"min_keypoints is {count} instead of {config.min_keypoints}, because the file has {count} keypoints")
     return replace(config, min_keypoints=count)

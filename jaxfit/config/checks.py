@@ -11,7 +11,7 @@ from typing import Any
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import CONFIG_NUMBER
 
-_MOST_NAMES = 8
+_MAX_NAMES = 8
 
 
 class _Shown(reprlib.Repr):
@@ -52,8 +52,8 @@ def known_names(name: object, names: Iterable[object]) -> str:
     if not listed:
         return ""
     close = difflib.get_close_matches(str(name)[:100], listed, n=1)
-    more = f", … ({len(listed) - _MOST_NAMES} more)" if len(listed) > _MOST_NAMES else ""
-    text = f"known: {', '.join(listed[:_MOST_NAMES])}{more}"
+    more = f", … ({len(listed) - _MAX_NAMES} more)" if len(listed) > _MAX_NAMES else ""
+    text = f"known: {', '.join(listed[:_MAX_NAMES])}{more}"
     return f"did you mean {close[0]}? {text}" if close else text
 
 

@@ -55,15 +55,15 @@ DOUBTS = (
 """The doubts; doubt i has the value 2^i in `Solution.doubts`."""
 WRONG_SHARE = 0.1
 """A pose whose keypoints are wrong by more than this share of the length of the bird counts as wrong."""
-LEAST_IOU = 0.5
-LEAST_CONFIDENCE = 0.5
+MIN_IOU = 0.5
+MIN_CONFIDENCE = 0.5
 """Mean confidence of all keypoints of a bird, below which they are doubtful; missing keypoints count as 0, except those
 that are missing everywhere."""
 OUTSIDE_SHARE = 0.1
 """Keypoints and mask contradict each other if more than this share of the keypoints lies outside the mask by more than
 `WRONG_SHARE` of the longer side of the box. Masks often lack one or two of 20 keypoints: bill and feet are thin."""
 OUTLIER_Z = 3.5
-LEAST_POSES = 20
+MIN_POSES = 20
 """Fewer poses have no outliers."""
 LARGEST_SHARE = 0.5
 """Upper bound of distances as shares of the longer side of the box; farther keypoints are wrong all the same."""
@@ -103,7 +103,7 @@ def contradict_masks(
 ) -> Bool[np.ndarray, "N T"]:
     """Return where the keypoints of a bird contradict its mask (`OUTSIDE_SHARE`).
 
-    Keypoints with a confidence below `LEAST_CONFIDENCE` do not count.
+    Keypoints with a confidence below `MIN_CONFIDENCE` do not count.
 
     Args:
         observations: N tracks over T frames.
@@ -114,7 +114,7 @@ def contradict_masks(
     compared = [(n, t) for n, t in cells.tolist() if (n, t) in observations.masks]
     with progress("Comparing keypoints with masks", len(compared)) as report_progress:
         for n, t in compared:
-            sure_px = observations.keypoints_px[n, t, observations.confidence[n, t] >= LEAST_CONFIDENCE]
+            sure_px = observations.keypoints_px[n, t, observations.confidence[n, t] >= MIN_CONFIDENCE]
             limit_px = WRONG_SHARE * float(observations.box_px[n, t, 2:].max())
             if len(sure_px):
                 outside = _distances_px(sure_px, observations.masks[n, t], limit_px) > limit_px
@@ -179,10 +179,10 @@ def with_doubts_of_views(
     confidence = np.sort(np.stack([own.confidence for own in compared]), axis=0)[-2:][0]
     doubtful = (
         is_outlier(far) | (far > WRONG_SHARE),
-        is_outlier(1 - overlap) | (overlap < LEAST_IOU),
+        is_outlier(1 - overlap) | (overlap < MIN_IOU),
         np.asarray(solution.ambiguity_deg) > 0,
         expected_error(solution, bird) > WRONG_SHARE,
-        mean_confidence(confidence) < LEAST_CONFIDENCE,
+        mean_confidence(confidence) < MIN_CONFIDENCE,
         outside > 0.5,
     )
     doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
@@ -232,10 +232,10 @@ def is_outlier(values: Float[np.ndarray, "N T"]) -> Bool[np.ndarray, "N T"]:
     """Return where values are outliers above the median of all values; NaN is no outlier.
 
     The modified z-score of a value x is 0.6745·(x − m)/MAD, with the median m and the median absolute deviation MAD.
-    Values of equal rounding are no outliers, and fewer than `LEAST_POSES` values have none.
+    Values of equal rounding are no outliers, and fewer than `MIN_POSES` values have none.
     """
     known = values[np.isfinite(values)]
-    if len(known) < LEAST_POSES:
+    if len(known) < MIN_POSES:
         return np.zeros(values.shape, bool)
     median = np.median(known)
     deviation = np.median(np.abs(known - median))

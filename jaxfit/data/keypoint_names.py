@@ -13,7 +13,7 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
-from jaxfit.data.observations import LEAST_KEYPOINTS, Observations
+from jaxfit.data.observations import MIN_KEYPOINTS, Observations
 from jaxfit.foundation.errors import InputError
 
 _SYNONYMS = {
@@ -121,11 +121,11 @@ def names_in_model(names: Sequence[str], model_names: Sequence[str], source: obj
     """Return the proposed map of the keypoints of a network.
 
     Raises:
-        InputError: fewer than `LEAST_KEYPOINTS` keypoints are keypoints of the model.
+        InputError: fewer than `MIN_KEYPOINTS` keypoints are keypoints of the model.
     """
     found = propose_names(names, model_names)
-    if len(found.mapped) < LEAST_KEYPOINTS:
-        problem = f"keypoints lack {', '.join(found.missing)}: fewer than {LEAST_KEYPOINTS} are keypoints of the model"
+    if len(found.mapped) < MIN_KEYPOINTS:
+        problem = f"keypoints lack {', '.join(found.missing)}: fewer than {MIN_KEYPOINTS} are keypoints of the model"
         raise InputError(source, problem, "rename the keypoints as in the model, or choose another model")
     return found
 

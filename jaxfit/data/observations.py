@@ -33,7 +33,7 @@ _LAYOUT = {
 }
 CELLS = tuple(name for name, (shape, _) in _LAYOUT.items() if shape.startswith("N T"))
 """Arrays with a value for every track and frame."""
-LEAST_KEYPOINTS = 3
+MIN_KEYPOINTS = 3
 """Fewer keypoints do not determine the orientation of a bird."""
 MAPPINGS = ("masks", "amodal_masks", "own_images")
 """Values of some tracks and frames, by their positions."""
@@ -199,7 +199,7 @@ class Observations:
         own = self.own_images.get((n, t))
         return own[0] if own else str(self.file_name[t])
 
-    def usable(self, min_keypoints: int = LEAST_KEYPOINTS) -> np.ndarray:
+    def usable(self, min_keypoints: int = MIN_KEYPOINTS) -> np.ndarray:
         """Return where a bird has enough keypoints for a fit, (N, T) bool: it is present with ``min_keypoints``."""
         return self.present & ((self.confidence > 0).sum(-1) >= min_keypoints)
 

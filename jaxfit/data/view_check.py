@@ -24,21 +24,21 @@ from jaxfit.cameras.triangulation import (
 )
 from jaxfit.data.observations import Observations
 from jaxfit.data.view_matching import BirdMatches, pair_costs
-from jaxfit.data.views import MOST_ERROR, ViewKeypoints, Views, stacked_keypoints
+from jaxfit.data.views import MAX_ERROR, ViewKeypoints, Views, stacked_keypoints
 
 UNMATCHED = 0.5
 """Cost of a bird without a partner in another camera, relative to the side of its box."""
 CLEARLY_BETTER = 0.6
 """A change explains an inconsistency if it lowers the cost below this share."""
-MOST_OFFSET = 10
+MAX_OFFSET = 10
 """Largest offset in time that is tried, frames."""
-MOST_PERMUTED = 5
+MAX_PERMUTED = 5
 """Up to this number of cameras, all orders are tried; with more cameras, all exchanges of two."""
 SAMPLED_FRAMES = 60
 SPEED_FRAMES, FASTEST = 2, 0.9
 """The speed of a keypoint is measured over this many frames before and after; the quantile of the speeds above which a
 keypoint counts for offsets in time."""
-LEAST_POINTS = 60
+MIN_POINTS = 60
 """Keypoints of a camera that are needed to estimate its pose."""
 
 
@@ -102,7 +102,7 @@ def consistency(cameras: Sequence[Camera], observations: Sequence[Observations])
 def _order(cameras: Sequence[Camera], observations: Sequence[Observations]) -> list[str]:
     """Try other orders of the cameras."""
     now, count = consistency(cameras, observations), len(cameras)
-    if count <= MOST_PERMUTED:
+    if count <= MAX_PERMUTED:
         orders = list(permutations(range(count)))[1:]
     else:
         orders = []
@@ -112,7 +112,7 @@ def _order(cameras: Sequence[Camera], observations: Sequence[Observations]) -> l
             orders.append(tuple(order))
     scores = {order: consistency([cameras[v] for v in order], observations) for order in orders}
     best = min(scores, key=scores.__getitem__)
-    if scores[best] > min(CLEARLY_BETTER * now, MOST_ERROR):
+    if scores[best] > min(CLEARLY_BETTER * now, MAX_ERROR):
         return []
     names = ", ".join(cameras[v].name for v in best)
     text = f"the order of the cameras is wrong: the files fit the cameras {names}, in this order"
@@ -123,7 +123,7 @@ def _offsets(views: Views, given: Sequence[float], steps: Sequence[float]) -> li
     """Try offsets in time of one camera, with the keypoints that move fastest: birds at rest show no offset."""
     px, confidence, side = stacked_keypoints(views.observations)
     T = px.shape[2]
-    most = min(MOST_OFFSET, T // 4)
+    most = min(MAX_OFFSET, T // 4)
     if most <= SPEED_FRAMES:
         return []
     frames, found = np.arange(most, T - most), []
@@ -142,7 +142,7 @@ def _offsets(views: Views, given: Sequence[float], steps: Sequence[float]) -> li
                 continue
             F = fundamental_matrix(other, camera)
             known = speed[w][:, frames] > 0
-            if known.sum() < LEAST_POINTS:
+            if known.sum() < MIN_POINTS:
                 continue
             moving = known & (speed[w][:, frames] >= np.quantile(speed[w][:, frames][known], FASTEST))
             for offset, own in errors.items():
@@ -186,12 +186,12 @@ def _errors(views: Views) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]
 
 
 def _mean_error(cameras: Sequence[Camera], keypoints: ViewKeypoints) -> float:
-    """Return the mean error of all keypoints, relative to the side of the box; at most `MOST_ERROR` each.
+    """Return the mean error of all keypoints, relative to the side of the box; at most `MAX_ERROR` each.
 
     A wrong pose of one camera can explain the keypoints of this camera, but not those of the others.
     """
     relative, seen = keypoints.triangulated(cameras).error_px / keypoints.side_px, keypoints.confidence > 0
-    error = np.where(np.isfinite(relative), np.minimum(relative, MOST_ERROR), MOST_ERROR)
+    error = np.where(np.isfinite(relative), np.minimum(relative, MAX_ERROR), MAX_ERROR)
     return float(error[seen & (seen.sum(axis=0) > 1)].mean())
 
 
@@ -202,13 +202,13 @@ def _moved(views: Views) -> list[str]:
         others = [w for w in range(len(views.cameras)) if w != v]
         rest = keypoints.of_views(others).triangulated([views.cameras[w] for w in others])
         known = np.isfinite(rest.points_world).all(-1) & (keypoints.confidence[v] > 0)
-        if known.sum() < LEAST_POINTS:
+        if known.sum() < MIN_POINTS:
             continue
         points, shown = rest.points_world[known], keypoints.px[v][known]
         before = float(np.median(reprojection_error_px([camera], points, shown[None])))
         centre = points.mean(axis=0)
         rvec, tvec = cv2.Rodrigues(camera.R_cam_world)[0], camera.transl_cam + camera.R_cam_world @ centre
-        tolerance = 2 * float(np.median(keypoints.side_px[v][known])) * MOST_ERROR
+        tolerance = 2 * float(np.median(keypoints.side_px[v][known])) * MAX_ERROR
         solved, rvec, tvec, _ = cv2.solvePnPRansac(
             points - centre, shown, camera.matrix, None, rvec.copy(), tvec.copy()[:, None], True, 300, tolerance
         )

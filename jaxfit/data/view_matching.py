@@ -24,14 +24,14 @@ from scipy.optimize import linear_sum_assignment
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.triangulation import epipolar_error_px, fundamental_matrix
 from jaxfit.data.observations import Observations
-from jaxfit.data.views import MOST_ERROR
+from jaxfit.data.views import MAX_ERROR
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import CAMERA_BYTES
 from jaxfit.foundation.reading import read_text
 
 BLOCK_FRAMES = 5
 """Frames of a block: a track that changes to another bird costs at most this many frames of one camera."""
-LEAST_PAIRS = 12
+MIN_PAIRS = 12
 """Two tracks with fewer common keypoints, counted over the frames of a block, are not compared."""
 CLEAR_RATIO = 1.5
 """A match is undecided if another track of the same camera has an error less than this times larger."""
@@ -129,7 +129,7 @@ def pair_costs(
         frames: positions of the frames that count.
 
     Returns:
-        Errors relative to the side of the boxes; NaN for tracks with fewer than `LEAST_PAIRS` common keypoints.
+        Errors relative to the side of the boxes; NaN for tracks with fewer than `MIN_PAIRS` common keypoints.
     """
     one, two = observations
     F = fundamental_matrix(*cameras)
@@ -137,7 +137,7 @@ def pair_costs(
     for n in np.flatnonzero(one.present[:, frames].any(1)).tolist():
         for m in np.flatnonzero(two.present[:, frames].any(1)).tolist():
             both = (one.confidence[n, frames] > 0) & (two.confidence[m, frames] > 0)
-            if both.sum() < LEAST_PAIRS:
+            if both.sum() < MIN_PAIRS:
                 continue
             shown = (own.keypoints_px[k, frames][both].astype(np.float64) for own, k in ((one, n), (two, m)))
             sides = [own.box_px[k, frames][:, 2:].max(-1) for own, k in ((one, n), (two, m))]
@@ -178,7 +178,7 @@ def _groups(block: _Block, observations: Sequence[Observations], frames: np.ndar
         prices[a, b] = price(groups[a], groups[b])
     while len(groups) > 1:
         a, b = map(int, np.unravel_index(np.argmin(prices), prices.shape))
-        if prices[a, b] > MOST_ERROR:
+        if prices[a, b] > MAX_ERROR:
             break
         groups[a] += groups.pop(b)
         prices = np.delete(np.delete(prices, b, axis=0), b, axis=1)

@@ -18,9 +18,9 @@ from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 
-MOST_CANVAS = 2.0
+MAX_CANVAS = 2.0
 """Longest side of the picture without distortion, as a multiple of that of the image."""
-MOST_ERROR = 0.1
+MAX_ERROR = 0.1
 """Largest error of a keypoint that agrees with other views, relative to the longer side of the box of the bird."""
 WHOLE_FRAME = 0.02
 """Times that differ by less, in frames, are one frame."""
@@ -51,8 +51,8 @@ class ViewKeypoints(NamedTuple):
     """Longer side of the box of the bird, at least 1."""
 
     def triangulated(self, cameras: Sequence[Camera]) -> Triangulated:
-        """Triangulate; a pixel agrees if its error is at most `MOST_ERROR` of the side of the box."""
-        return triangulate_robustly(cameras, self.px, self.confidence, MOST_ERROR * self.side_px)
+        """Triangulate; a pixel agrees if its error is at most `MAX_ERROR` of the side of the box."""
+        return triangulate_robustly(cameras, self.px, self.confidence, MAX_ERROR * self.side_px)
 
     def of_views(self, views: Sequence[int]) -> ViewKeypoints:
         """Return the keypoints of some views."""
@@ -111,7 +111,7 @@ def straightened(
 ) -> tuple[Camera, Observations]:
     """Return a camera without distortion, and the observations in its pixels.
 
-    The picture of the new camera holds the whole image, at most `MOST_CANVAS` times its size. Keypoints that the lens
+    The picture of the new camera holds the whole image, at most `MAX_CANVAS` times its size. Keypoints that the lens
     model cannot show are missing. Masks are resampled, with half a pixel as the threshold.
     """
     if camera.is_pinhole:
@@ -122,7 +122,7 @@ def straightened(
     border = np.concatenate([np.stack(edge, axis=1) for edge in edges])
     straight = camera.undistort(border)
     straight = straight[np.isfinite(straight).all(-1)]
-    margin = (MOST_CANVAS - 1) / 2 * np.array([width, height])
+    margin = (MAX_CANVAS - 1) / 2 * np.array([width, height])
     low = np.floor(np.maximum(straight.min(axis=0, initial=0), -margin)).astype(int)
     high = np.ceil(np.minimum(straight.max(axis=0, initial=0), margin + np.array([width, height]))).astype(int)
     matrix = camera.matrix.copy()

@@ -17,12 +17,12 @@ from scipy.optimize import linear_sum_assignment
 from jaxfit.data.masks import box_iou, box_of_keypoints
 from jaxfit.data.observations import Observations
 from jaxfit.evaluation import metrics
-from jaxfit.evaluation.truth import LEAST_KEYPOINTS, Truth
+from jaxfit.evaluation.truth import MIN_KEYPOINTS, Truth
 from jaxfit.foundation.errors import InputError
 
 MATCH_IOU = 0.5
 """Least IoU at which a detected bird matches a true bird."""
-LEAST_VISIBLE = 0.05
+MIN_VISIBLE = 0.05
 """Ground-truth birds with a smaller visible fraction of the usual area of their track are ignored."""
 LARGEST_ROUNDING_PX = 1.0
 """Largest difference between the box of a bird's keypoints and the box in a file of labels."""
@@ -54,7 +54,7 @@ def overlap(detected: Observations, truth: Truth | Observations) -> Overlap:
     """Compare the detected birds of a video with the true birds.
 
     The regions are visible masks where both files have masks, else boxes. In a truth with masks, a bird is ignored
-    where its visible mask is smaller than ``LEAST_VISIBLE`` times the median area of the whole masks of its track (of
+    where its visible mask is smaller than ``MIN_VISIBLE`` times the median area of the whole masks of its track (of
     the visible masks where no whole masks are known), or where the mask is missing: hidden birds, slivers at the edge
     of the image, crowds. A detected bird that matches no counted bird is excused where at least ``MATCH_IOU`` of its
     area lies on an ignored bird. The region of an ignored bird is its visible mask, or its box where there is no mask
@@ -108,19 +108,19 @@ def comparable_boxes(detected: Observations, truth: Truth) -> tuple[Observations
 
     Labels of keypoint programs have the box of the visible keypoints, which is smaller than the box of the mask of the
     detected bird. Such a labelled bird gets the box of its labelled keypoints that the detections name, at least
-    ``LEAST_KEYPOINTS``. A detected bird gets the box of the same keypoints of the labelled bird that it agrees with
+    ``MIN_KEYPOINTS``. A detected bird gets the box of the same keypoints of the labelled bird that it agrees with
     best. All other boxes stay, and so do boxes that a person drew.
     """
     seen = truth.observations
     names = [name for name in seen.keypoint_names if name in detected.keypoint_names]
-    if seen.masks or len(names) < LEAST_KEYPOINTS:
+    if seen.masks or len(names) < MIN_KEYPOINTS:
         return detected, truth
     _, at, own_at = np.intersect1d(seen.frame_index, detected.frame_index, return_indices=True)
     k, own_k = ([each.keypoint_names.index(name) for name in names] for each in (seen, detected))
     labelled = seen.confidence > 0
     known = labelled[:, :, k]
     is_own = np.isclose(seen.box_px, box_of_keypoints(seen.keypoints_px, labelled), atol=LARGEST_ROUNDING_PX).all(-1)
-    is_own &= known.sum(-1) >= LEAST_KEYPOINTS
+    is_own &= known.sum(-1) >= MIN_KEYPOINTS
     if not is_own.any():
         return detected, truth
     box_px = np.where(is_own[..., None], box_of_keypoints(seen.keypoints_px[:, :, k], known), seen.box_px)
@@ -162,7 +162,7 @@ def ignored_region(truth: Observations, m: int, t: int, masks: bool) -> dict[str
 
 
 def _hidden(truth: Observations) -> Bool[np.ndarray, "M T"]:
-    """Return where the visible fraction of a bird is below ``LEAST_VISIBLE``, also where the bird is not annotated."""
+    """Return where the visible fraction of a bird is below ``MIN_VISIBLE``, also where the bird is not annotated."""
     if not truth.masks:
         return np.zeros(truth.present.shape, bool)
     visible, whole = np.zeros(truth.present.shape), np.zeros(truth.present.shape)
@@ -171,7 +171,7 @@ def _hidden(truth: Observations) -> Bool[np.ndarray, "M T"]:
     for at, rle in truth.amodal_masks.items():
         whole[at] = coco_mask.area(cast(Any, rle))
     usual = [np.median(areas[areas > 0]) if areas.any() else np.inf for areas in whole]
-    return visible < LEAST_VISIBLE * np.array(usual)[:, None]
+    return visible < MIN_VISIBLE * np.array(usual)[:, None]
 
 
 def _iou(own: list, others: list, of_own: bool = False) -> Float[np.ndarray, "D G"]:

@@ -32,9 +32,9 @@ BASE = "map"
 """The shipped config whose settings are estimated."""
 LAGS = (1, 4)
 """Numbers of frames of the correlations in time."""
-LEAST_KEYPOINTS = 50
+MIN_KEYPOINTS = 50
 """Fewest keypoints that are both detected and labelled."""
-LEAST_CONFIDENCE_RANGE = 0.01
+MIN_CONFIDENCE_RANGE = 0.01
 """Smallest difference of two confidences that differ."""
 RESAMPLES = 200
 """Number of resamples of the bootstrap over birds."""
@@ -136,10 +136,10 @@ def _checked(error_px: np.ndarray, confidence: np.ndarray, labels: object, sourc
     Raises:
         InputError: too few keypoints, one confidence for all keypoints, or mostly labels that are copies.
     """
-    if len(error_px) < LEAST_KEYPOINTS:
-        problem = f"labels {len(error_px)} of the detected keypoints; the estimate needs {LEAST_KEYPOINTS}"
+    if len(error_px) < MIN_KEYPOINTS:
+        problem = f"labels {len(error_px)} of the detected keypoints; the estimate needs {MIN_KEYPOINTS}"
         raise InputError(labels, problem, "label more frames")
-    if np.ptp(confidence) < LEAST_CONFIDENCE_RANGE:
+    if np.ptp(confidence) < MIN_CONFIDENCE_RANGE:
         problem = f"has the confidence {confidence.mean():.2g} at all labelled keypoints; the estimate needs several"
         raise InputError(source, problem, "give detections with confidences, in COCO as keypoint_scores")
     unmoved = float((np.abs(error_px).max(-1) < 1e-3).mean())

@@ -135,7 +135,7 @@ def _null_to_nan(row: Mapping[Any, float | None]) -> dict[Any, float]:
 _logger = logging.getLogger(__name__)
 
 _REMEDY = "give the annotations of the same video"
-_LEAST_MEDIAN_IOU = 0.05
+_MIN_MEDIAN_IOU = 0.05
 """Results with a smaller median IoU probably belong to another video: even a bad fit overlaps more."""
 
 
@@ -322,7 +322,7 @@ def _check_sizes(
 
 def _warn_of_small_overlap(iou: np.ndarray, source: object) -> None:
     overlaps = iou[np.isfinite(iou)]
-    if overlaps.size and np.median(overlaps) < _LEAST_MEDIAN_IOU:
+    if overlaps.size and np.median(overlaps) < _MIN_MEDIAN_IOU:
         _logger.warning(
             "the birds of the result hardly overlap the birds of %s (median IoU %.2f); check the video of the truth",
             source,

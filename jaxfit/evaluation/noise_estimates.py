@@ -107,9 +107,9 @@ def _crops(detected: Observations, config: FitConfig) -> Float[np.ndarray, "N T 
     return crops
 
 
-LEAST_SD_PX, MOST_SD_PX = 0.1, 128.0
+MIN_SD_PX, MAX_SD_PX = 0.1, 128.0
 """Limits of the scales, in crop pixels."""
-LEAST_DOF, MOST_DOF = 1.0, 30.0
+MIN_DOF, MAX_DOF = 1.0, 30.0
 """Limits of the degrees of freedom; above 30 the density hardly differs from a normal density."""
 PRIOR_SD = 2.0
 """Standard deviation of the weak prior on the logarithm of every parameter, about the values of the config."""
@@ -117,7 +117,7 @@ OUTLIER_SCALES = 4.0
 """An error of more than this number of scales is an outlier."""
 EXCHANGE_RATIO = 2.0
 """A pair is exchanged if the RMS error of the exchanged assignment is smaller by more than this factor."""
-LEAST_CORRELATION_PAIRS = 30
+MIN_CORRELATION_PAIRS = 30
 """Fewest pairs of errors for a correlation."""
 
 
@@ -157,7 +157,7 @@ def fit_student_t(
     """
     squared = (error_px**2).sum(-1)
     weight = np.ones(len(squared)) if weight is None else weight
-    limits = np.array([(LEAST_SD_PX, MOST_SD_PX)] * 2 + [(LEAST_DOF, MOST_DOF)])
+    limits = np.array([(MIN_SD_PX, MAX_SD_PX)] * 2 + [(MIN_DOF, MAX_DOF)])
     centre, first = (np.log(np.clip(values, *limits.T)) for values in (prior, start or prior))
 
     def loss(logs: np.ndarray) -> tuple[float, np.ndarray]:
@@ -214,7 +214,7 @@ def frame_correlation(pairs: LabelledPairs, scaled: Float[np.ndarray, "P K 2"], 
         lag: difference of the frame numbers.
 
     Returns:
-        Σ e(t)·e(t + lag) / √(Σ ‖e(t)‖² Σ ‖e(t + lag)‖²), or None for fewer than `LEAST_CORRELATION_PAIRS` errors.
+        Σ e(t)·e(t + lag) / √(Σ ‖e(t)‖² Σ ‖e(t + lag)‖²), or None for fewer than `MIN_CORRELATION_PAIRS` errors.
     """
     place = {(bird, frame): p for p, (bird, frame) in enumerate(zip(*_keys(pairs), strict=True))}
     both = [(p, place[bird, frame + lag]) for (bird, frame), p in place.items() if (bird, frame + lag) in place]
@@ -223,7 +223,7 @@ def frame_correlation(pairs: LabelledPairs, scaled: Float[np.ndarray, "P K 2"], 
     inside = np.linalg.norm(scaled, axis=-1) <= OUTLIER_SCALES  # False for NaN
     first, second = np.array(both).T
     kept = inside[first] & inside[second]
-    if kept.sum() < LEAST_CORRELATION_PAIRS:
+    if kept.sum() < MIN_CORRELATION_PAIRS:
         return None
     a, b = scaled[first][kept], scaled[second][kept]
     return float((a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum()))
@@ -252,7 +252,7 @@ NEAR_UNKNOWN_PX = 1.0
 """The outline does not count this close to unknown pixels and to the border of the crop, in crop pixels."""
 LAGS = 128
 """Largest distance along the outline for the correlation, in crop pixels."""
-LEAST_DEVIATION_PX = 0.05
+MIN_DEVIATION_PX = 0.05
 """Smallest deviation, in crop pixels: about the error of outlines of whole pixels."""
 
 
@@ -370,7 +370,7 @@ def outline_noise(errors: list[OutlineErrors]) -> OutlineNoise:
     covariance = sum(each.products for each in errors) / np.maximum(sum(each.counts for each in errors), 1)
     return OutlineNoise(
         offset_px=mean,
-        deviation_px=max(float(np.abs(samples - mean).mean()), LEAST_DEVIATION_PX),
+        deviation_px=max(float(np.abs(samples - mean).mean()), MIN_DEVIATION_PX),
         length_px=_decay_length(covariance),
         whole_px=float(np.std([each.samples_px.mean() for each in errors])),
     )

@@ -112,9 +112,9 @@ def read_behaviours(path: str | Path) -> dict[int, list[tuple[int, str]]] | None
     return behaviours
 
 
-LEAST_IOU = 0.5
+MIN_IOU = 0.5
 """A track and a bird agree in a frame where the boxes of their keypoints have at least this IoU."""
-LEAST_KEYPOINTS = 3
+MIN_KEYPOINTS = 3
 """Fewest annotated keypoints of a box."""
 
 
@@ -194,7 +194,7 @@ def match_tracks(
 def match_by_overlap(solution: Solution, truth: Truth | Observations) -> dict[int, int]:
     """Match tracks and birds one-to-one, such that they agree in the greatest total number of frames.
 
-    A track and a bird agree in a frame where the boxes around their keypoints have an IoU of at least ``LEAST_IOU``.
+    A track and a bird agree in a frame where the boxes around their keypoints have an IoU of at least ``MIN_IOU``.
     Both boxes enclose the keypoints that are annotated in this frame, at least three. A track can follow a bird only
     if the two agree in at least half of the frames that have both.
 
@@ -215,13 +215,13 @@ def match_by_overlap(solution: Solution, truth: Truth | Observations) -> dict[in
         raise InputError(truth.source, "holds photographs, in which no bird can be followed", remedy)
     _, at_truth, at_own = np.intersect1d(seen.frame_index, solution.frame_index, return_indices=True)
     annotated = seen.confidence[:, at_truth] > 0
-    has_box = annotated.sum(-1) >= LEAST_KEYPOINTS
+    has_box = annotated.sum(-1) >= MIN_KEYPOINTS
     boxes_px = box_of_keypoints(seen.keypoints_px[:, at_truth], annotated)
     agree = np.zeros((len(solution.track_id), seen.num_tracks), int)
     for n, keypoints in enumerate(solution.keypoints_px[:, at_own]):
         both = has_box & solution.valid[n, at_own]
         own_boxes_px = box_of_keypoints(np.broadcast_to(keypoints, (*annotated.shape, 2)), annotated)
-        overlapping = (both & (box_iou(own_boxes_px, boxes_px) >= LEAST_IOU)).sum(1)
+        overlapping = (both & (box_iou(own_boxes_px, boxes_px) >= MIN_IOU)).sum(1)
         agree[n] = np.where(2 * overlapping >= both.sum(1), overlapping, 0)
     pairs = zip(*linear_sum_assignment(agree, maximize=True), strict=True)
     return {int(solution.track_id[n]): int(seen.track_id[m]) for n, m in pairs if agree[n, m]}

@@ -44,13 +44,13 @@ from jaxfit.objective.posed_window import Targets
 
 FRAMES_PER_TILE = 16
 """Frames in a tile of short windows. Larger tiles are not faster, and a single short window fills its tile up."""
-LEAST_PROBLEMS_PER_TILE = 2
+MIN_PROBLEMS_PER_TILE = 2
 """A tile of a single long window is slow: the compiler then computes the joint transforms several times."""
 
 
 def tile_size(frames: int) -> int:
     """Return the number of problems in a tile, for windows of `frames` frames."""
-    return max(FRAMES_PER_TILE // frames, LEAST_PROBLEMS_PER_TILE)
+    return max(FRAMES_PER_TILE // frames, MIN_PROBLEMS_PER_TILE)
 
 
 def tile_rows(count: int, size: int) -> list[Int[np.ndarray, "G"]]:
@@ -77,7 +77,7 @@ _logger = logging.getLogger(__name__)
 
 LIKELIHOOD_RATIO = 20.0
 """A hypothesis is reported if the best hypothesis is less than this many times as likely."""
-LEAST_ANGLE_DEG = 45.0
+MIN_ANGLE_DEG = 45.0
 """Hypotheses are one pose where their orientations differ by a smaller angle, and everywhere if the median does."""
 SECONDS_PER_CALL = 1.0
 """Target duration of some steps of all tiles. After these steps, progress is reported."""
@@ -335,12 +335,12 @@ def _compare_hypotheses(
     own, of_best = (Rotation.from_rotvec(each) for each in pairs)
     angle_deg = np.rad2deg((own.inv() * of_best).magnitude()).reshape(orient.shape[:2])
     angle_deg = np.where(np.repeat(present, rows.hypotheses, axis=0), angle_deg, np.nan)
-    is_other_pose = np.nanmedian(angle_deg, axis=1).reshape(total.shape) > LEAST_ANGLE_DEG
+    is_other_pose = np.nanmedian(angle_deg, axis=1).reshape(total.shape) > MIN_ANGLE_DEG
     others = np.where(is_other_pose, total, np.inf)
     second = np.argmin(others, axis=1)
     with np.errstate(invalid="ignore"):  # no finite hypothesis
         is_near = others.min(axis=1) - total.min(axis=1) < np.log(LIKELIHOOD_RATIO)
     ambiguity_deg = rows.ambiguity_deg.copy()
     of_second = angle_deg[(best - of_row + second)[is_near]]
-    ambiguity_deg[best[is_near]] = np.where(of_second > LEAST_ANGLE_DEG, of_second, 0)
+    ambiguity_deg[best[is_near]] = np.where(of_second > MIN_ANGLE_DEG, of_second, 0)
     return rows._replace(ambiguity_deg=ambiguity_deg), best

@@ -13,7 +13,7 @@ from jaxfit.foundation.limits import CROP_IMAGE_SIDES, IMAGE_SIDE_PX
 from jaxfit.model.camera import CROP_PX
 from jaxfit.raster.silhouette_reference import UNKNOWN
 
-LEAST_SIZE_PX = 16.0
+MIN_SIZE_PX = 16.0
 """Smallest side of a crop, in image pixels."""
 MARGIN_PX = 3.0
 """Pixels this close to another bird's mask are unknown, in pixels of a 256-pixel crop: masks are ragged, and the edge
@@ -38,7 +38,7 @@ def crop_squares(
     for w, n in enumerate(track.tolist()):
         image_px = sizes_px[n, frame[w, present[w]]]
         if not len(image_px):  # a camera that does not see the bird of the window
-            crop[w] = 0, 0, LEAST_SIZE_PX
+            crop[w] = 0, 0, MIN_SIZE_PX
         elif config.mode == "image":
             crop[w] = _whole_image(image_px)
         else:
@@ -76,7 +76,7 @@ def _around_the_bird(
         first = np.where(confident, points, np.inf).min(axis=1)
         corners[without_box] = np.concatenate([first, np.where(confident, points, -np.inf).max(axis=1)], axis=1)
     longest = (corners[:, 2:] - corners[:, :2]).max()
-    size = max(min(np.ceil(longest * (1 + 2 * config.padding)), largest_px), LEAST_SIZE_PX)
+    size = max(min(np.ceil(longest * (1 + 2 * config.padding)), largest_px), MIN_SIZE_PX)
     centre = (corners[:, :2] + corners[:, 2:]) / 2
     if len(at) < len(frame):
         centre = centre[np.abs(np.arange(len(frame))[:, None] - np.flatnonzero(present)).argmin(1)]

@@ -55,11 +55,11 @@ from jaxfit.model.kinematics import (
 from jaxfit.model.rotation import right_jacobian
 from jaxfit.objective.likelihood import keypoint_sd_px
 
-LEAST_RESIDUALS = 10
+MIN_RESIDUALS = 10
 """Number of detected keypoints that a misfit factor needs: the median of as many squared residuals lies within a factor
 of 2 of the true median in 9 of 10 cases. A photograph has about 15."""
-MOST_MISFIT = 100.0
-MOST_LEVERAGE = 0.9
+MAX_MISFIT = 100.0
+MAX_LEVERAGE = 0.9
 
 
 class ErrorBars(NamedTuple):
@@ -355,8 +355,8 @@ def _covariance(
 def _misfit(noise: _Noise, error_px: np.ndarray, counted: np.ndarray, px_cov: np.ndarray) -> float:
     """Return the misfit factor of a window, see the head of this module; 1 for windows with few detected keypoints."""
     leverage = np.einsum("tkii->tk", px_cov) / (2 * noise.gaussian * noise.variance)
-    squared = (error_px**2).sum(-1) / (noise.variance * (1 - np.minimum(leverage, MOST_LEVERAGE)))
+    squared = (error_px**2).sum(-1) / (noise.variance * (1 - np.minimum(leverage, MAX_LEVERAGE)))
     squared = squared[counted & np.isfinite(squared)]
-    if len(squared) < LEAST_RESIDUALS:
+    if len(squared) < MIN_RESIDUALS:
         return 1.0
-    return float(np.clip(np.median(squared) / noise.expected, 1, MOST_MISFIT))
+    return float(np.clip(np.median(squared) / noise.expected, 1, MAX_MISFIT))

@@ -28,9 +28,9 @@ from jaxfit.objective.residuals import as_list
 from jaxfit.raster.silhouette import silhouette
 
 KEYPOINTS, MASK = "keypoint_likelihood", "mask_smooth_l1"
-LEAST_MEAN_WEIGHT = 0.1
+MIN_MEAN_WEIGHT = 0.1
 """Least mean weight of the keypoint errors that an update uses."""
-LEAST_SHARE = 0.5
+MIN_SHARE = 0.5
 """Least part of the N errors that the fit must leave. tr(Σ·H), the part that the fit takes up, is an approximation by
 the curvature. Where it is larger, its error decides about the value, and the value of the config stays."""
 
@@ -107,7 +107,7 @@ def measure(
 
 def _evidence(total: float, taken: float, energy: float) -> Evidence:
     count = total - taken
-    return Evidence(count, energy) if count >= LEAST_SHARE * total else Evidence(0.0, 0.0)
+    return Evidence(count, energy) if count >= MIN_SHARE * total else Evidence(0.0, 0.0)
 
 
 def expanded(evidence: Evidence, dof: float) -> Evidence:
@@ -125,7 +125,7 @@ def expanded(evidence: Evidence, dof: float) -> Evidence:
     if evidence.count == 0:
         return evidence
     mean_weight = 1 + 2 / dof * (1 - evidence.energy / evidence.count)
-    return evidence._replace(energy=evidence.energy / max(mean_weight, LEAST_MEAN_WEIGHT))
+    return evidence._replace(energy=evidence.energy / max(mean_weight, MIN_MEAN_WEIGHT))
 
 
 def mask_evidence(

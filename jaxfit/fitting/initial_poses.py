@@ -36,9 +36,9 @@ from jaxfit.model.rotation import matrix_to_axis_angle, unwrap_axis_angle, view_
 SIGMA_PX = 30.0
 """Scale of the robust matching cost, in pixels of a 256-pixel crop. On a bird of 200 pixels, the keypoints of the mean
 pose are about this far from the keypoints of the true pose."""
-LEAST_SEPARATION_RAD = np.pi / 4
+MIN_SEPARATION_RAD = np.pi / 4
 """In every frame, the orientations of two hypotheses differ by more than this angle."""
-LEAST_SPAN = 0.1
+MIN_SPAN = 0.1
 """The initial scale is at least such that the keypoints of the resting bird span this share of the crop."""
 EXCLUDED_COST = 1e9
 """Cost of a candidate that is too close to an earlier hypothesis, in squared pixels of a 256-pixel crop."""
@@ -151,7 +151,7 @@ def _orientations(
         orientations.append(candidates[chosen])
         scales.append(match.scale_px[nearest, chosen])
         trace = jnp.einsum("tij,cij->tc", candidates[chosen], candidates)
-        exclusion = jnp.where((trace - 1) / 2 > np.cos(LEAST_SEPARATION_RAD), EXCLUDED_COST, exclusion)
+        exclusion = jnp.where((trace - 1) / 2 > np.cos(MIN_SEPARATION_RAD), EXCLUDED_COST, exclusion)
     return jnp.stack(orientations), jnp.stack(scales)
 
 
@@ -204,10 +204,10 @@ def _search_tile(
     model_keypoints, root = posed_keypoints(rig, joint_transforms(rig, rest), rest), rig.joints[0]
     candidates = jnp.asarray(candidate_orientations(config), jnp.float32)
     # no orientation matches wrong keypoints well, so their scale is almost 0 and the depth would be extreme
-    least_scale_px = LEAST_SPAN * camera.size_px / jnp.ptp(model_keypoints, axis=0).max()
+    min_scale_px = MIN_SPAN * camera.size_px / jnp.ptp(model_keypoints, axis=0).max()
 
     def initial_pose(R, scale_px, keypoints_px, confidence) -> tuple[Array, Array, Array]:
-        window_scale_px = jnp.maximum(jnp.median(scale_px), least_scale_px)
+        window_scale_px = jnp.maximum(jnp.median(scale_px), min_scale_px)
         depth = camera.focal_px / window_scale_px
         scale = jnp.ones(1) if common_size else jnp.clip(scale_px / window_scale_px, 0.5, 2.0)
         # the bird rotates about its root joint, as in `joint_transforms`

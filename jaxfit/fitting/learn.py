@@ -15,7 +15,7 @@ A round computes γ and Σ w‖e‖² at the poses of a sample of windows, sets 
 Errors of the outline are not independent from pixel to pixel: `fitting/outline_noise.py` counts them.
 
 Hyperpriors: the values of the config count as `PRIOR_COUNT` observations, and limit the result to a factor of
-`MOST_FACTOR`. The weight of the mask does not fall below its value in the config: the errors of the outline contain
+`MAX_FACTOR`. The weight of the mask does not fall below its value in the config: the errors of the outline contain
 errors of the poses, so the learnt weight is a lower limit. A smaller weight would move the fit away from the masks, and
 the errors would then lower the weight again.
 
@@ -52,7 +52,7 @@ from jaxfit.fitting.tasks import FitShared, FitTask, Run, gather_batch
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.progress import ProgressTask, silent
 
-MOST_WINDOWS, MOST_FRAMES = 30, 800
+MAX_WINDOWS, MAX_FRAMES = 30, 800
 """Size of the sample. Further frames change the learnt values little."""
 LARGEST_SHARE, ALWAYS_WINDOWS, ALWAYS_FRAMES = 0.4, 2, 30
 """Largest share of the windows in the sample, and the number of windows and of frames that the sample may always have.
@@ -62,13 +62,13 @@ ROUNDS = 3
 CONVERGED = 0.05
 """Relative change of all values, below which no further round follows."""
 PRIOR_COUNT = 10.0
-MOST_FACTOR = 30.0
-MOST_CHANGE = 10.0
+MAX_FACTOR = 30.0
+MAX_CHANGE = 10.0
 """Largest factor on a value in one round."""
-LEAST_KEYPOINTS, LEAST_FRAMES, LEAST_MASKS = 100, 10, 10
+MIN_KEYPOINTS, MIN_FRAMES, MIN_MASKS = 100, 10, 10
 """Fewer detected keypoints, frames or masks in the sample do not determine the values that depend on them: N errors
 give a scale with a relative standard error of about 1/√(2N)."""
-LEAST_PER_FRAME = 4
+MIN_PER_FRAME = 4
 """Least mean number of detected keypoints in a frame: fewer keypoints hardly determine the orientation of a bird."""
 
 OFFSETS = "keypoint_offsets"
@@ -144,7 +144,7 @@ def learn(
     return values, tuple(remarks)
 
 
-def choose_windows(windows: Windows, most: int = MOST_WINDOWS) -> Int[np.ndarray, "S"]:
+def choose_windows(windows: Windows, most: int = MAX_WINDOWS) -> Int[np.ndarray, "S"]:
     """Return the rows of a sample of windows: of each track in turn, at random times. It is always the same.
 
     Args:
@@ -157,7 +157,7 @@ def choose_windows(windows: Windows, most: int = MOST_WINDOWS) -> Int[np.ndarray
     ordered = shuffled[np.argsort(turns, kind="stable")]
     frames = np.cumsum(windows.present[ordered].sum(1))
     share = max(int(LARGEST_SHARE * len(windows)), ALWAYS_WINDOWS, -(-ALWAYS_FRAMES // windows.present.shape[1]))
-    count = min(int(np.searchsorted(frames, MOST_FRAMES)) + 1, max(most, 1), MOST_WINDOWS, share)
+    count = min(int(np.searchsorted(frames, MAX_FRAMES)) + 1, max(most, 1), MAX_WINDOWS, share)
     return np.sort(ordered[:count])
 
 
@@ -168,7 +168,7 @@ def _learnable(config: FitConfig, windows: Windows, remarks: list[str]) -> list[
         remarks.append(f"no weights are learnt: the last stage has no {KEYPOINTS}")
         return []
     keypoints, frames = int((windows.confidence > 0).sum()), int(windows.present.sum())
-    if keypoints < max(LEAST_KEYPOINTS, LEAST_PER_FRAME * frames) or frames < LEAST_FRAMES:
+    if keypoints < max(MIN_KEYPOINTS, MIN_PER_FRAME * frames) or frames < MIN_FRAMES:
         remarks.append(f"no weights are learnt: {keypoints} keypoints in {frames} frames are too few")
         return []
     masks = int((windows.has_mask & windows.present).sum())
@@ -183,7 +183,7 @@ def _learnable(config: FitConfig, windows: Windows, remarks: list[str]) -> list[
             continue
         if name == MASK and config.edge != "unbiased":
             remarks.append(f"the weight of {MASK} is not learnt: it needs `edge: unbiased`")
-        elif name == MASK and masks < LEAST_MASKS:
+        elif name == MASK and masks < MIN_MASKS:
             remarks.append(f"the weight of {MASK} is not learnt: {masks} masks are too few")
         else:
             names.append(name)
@@ -283,6 +283,6 @@ def updated_precision(precision: float, evidence: Evidence, power: int = 1, leas
     """
     count, energy = max(evidence.count, 0.0), max(evidence.energy, 1e-12)
     variance = (energy / precision + PRIOR_COUNT) / (count + PRIOR_COUNT)
-    low, high = max(MOST_FACTOR ** -float(power), least), MOST_FACTOR ** float(power)
-    change = MOST_CHANGE ** float(power)
+    low, high = max(MAX_FACTOR ** -float(power), least), MAX_FACTOR ** float(power)
+    change = MAX_CHANGE ** float(power)
     return float(np.clip(np.clip(1 / variance, precision / change, precision * change), low, high))

@@ -39,11 +39,11 @@ USUAL_FOCAL, FOCAL_SD_LOG = 1.2, 0.5
 """Focal length relative to the longer side of the picture: 16 to 117 mm (2 sd) of a lens for 36 mm film."""
 DISTANCE_SD = 0.01
 """Relative standard deviation of a measured distance."""
-PER_BLOCK, BLOCK_S, MOST_BLOCKS = 5, 1.0, 200
+PER_BLOCK, BLOCK_S, MAX_BLOCKS = 5, 1.0, 200
 """Poses of a block, its length in seconds, and the number of blocks that the plane is estimated from."""
 ALONG = 2.0
 """Places of birds that spread this many times as far in one direction as across show the direction of the ledge."""
-MOST_ROUNDS, STEP = 5, 1e-3
+MAX_ROUNDS, STEP = 5, 1e-3
 
 
 class Distances(NamedTuple):
@@ -122,7 +122,7 @@ def estimate_ledge(
     sd, theta = _Deviations(size_sd, WITHIN_SD, TILT_SD, TILT_SD), problem.start()
     problem.check(theta, source)
     how: dict[str, Any] = {"jac": problem.jacobian, "loss": "soft_l1", "x_scale": "jac"}
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         solved = least_squares(problem.residuals, theta, args=(sd, size_sd), **how)
         theta = solved.x
         log_size, level = problem.errors(theta)
@@ -319,7 +319,7 @@ def _blocks(frames: int, interval_s: float) -> np.ndarray:
     """Return the positions of the frames of all blocks, `PER_BLOCK` for each block."""
     length = max(round(BLOCK_S / interval_s), 1)
     count = max(frames // length, 1)
-    starts = np.unique(np.linspace(0, count - 1, min(count, MOST_BLOCKS)).astype(int)) * length
+    starts = np.unique(np.linspace(0, count - 1, min(count, MAX_BLOCKS)).astype(int)) * length
     within = np.linspace(0, min(length, frames) - 1, PER_BLOCK).astype(int)
     return (starts[:, None] + within).reshape(-1)
 

@@ -17,14 +17,14 @@ from jaxfit.objective.objective import evaluate_curvature, sum_with_blocks
 CG_STEPS, CG_TOLERANCE = 100, 0.01
 """Largest number of conjugate-gradient steps within one step, and the relative residual at which they end. The
 first steps need few of them. A tolerance far below 1e-6 makes single precision underflow to 0/0."""
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-5, 1e8
+FIRST_DAMPING, MIN_DAMPING, MAX_DAMPING = 1e-2, 1e-5, 1e8
 """The damping μ of the first step, and the bounds of μ."""
 DAMPING_DECREASE, DAMPING_INCREASE = 0.2, 5.0
 """Factors on the damping after a step that lowered the loss, and after a step that did not lower the loss."""
 
-MOST_RELAXATION, MOMENTUM, PESSIMISTIC = 1.5, 0.4, 0.9
+MAX_RELAXATION, MOMENTUM, PESSIMISTIC = 1.5, 0.4, 0.9
 """Where the true curvature along the last step was less than `PESSIMISTIC` times that of H, the next step is longer by
-at most the factor `MOST_RELAXATION`, and continues the last step by the share `MOMENTUM`."""
+at most the factor `MAX_RELAXATION`, and continues the last step by the share `MOMENTUM`."""
 
 
 class _LevenbergState(NamedTuple):
@@ -101,7 +101,7 @@ def _levenberg_step(
         maxiter=CG_STEPS,
     )
     pessimistic = state.curvature_ratio < PESSIMISTIC
-    relaxation = 1 / jnp.maximum(state.curvature_ratio, 1 / MOST_RELAXATION)
+    relaxation = 1 / jnp.maximum(state.curvature_ratio, 1 / MAX_RELAXATION)
     change = jnp.where(pessimistic, relaxation * newton + MOMENTUM * state.change, newton)
     new_pose = add_rows(pose, change, program.shared)
     loss, new_gradient, blocks = _evaluate(program, problem, new_pose)
@@ -115,7 +115,7 @@ def _levenberg_step(
 
     taken = lower | ~state.prepared
     factor = jnp.where(lower, DAMPING_DECREASE, DAMPING_INCREASE)
-    damping = jnp.clip(state.damping * factor, LEAST_DAMPING, MOST_DAMPING)
+    damping = jnp.clip(state.damping * factor, MIN_DAMPING, MAX_DAMPING)
     return choose(taken, new_pose, pose), _LevenbergState(
         loss=choose(taken, loss, state.loss),
         gradient=choose(taken, new_gradient, state.gradient),

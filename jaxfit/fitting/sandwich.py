@@ -34,7 +34,7 @@ from jaxfit.fitting.posterior import Blocks, Posterior, WindowPosterior, invert_
 
 STEP = 1e-4
 """Step of the difference of two inverses, which is its relative error for B = H."""
-LEAST_PAIRS = 100
+MIN_PAIRS = 100
 """Number of pairs of residuals that a correlation needs: its standard deviation is at most 0.1."""
 
 
@@ -109,7 +109,7 @@ def lag_correlations(residuals: Float[np.ndarray, "T K 2"], counted: Bool[np.nda
     sign, found = np.sign(residuals) * counted[..., None], []
     for lag in range(1, len(sign)):
         pairs = 2 * int((counted[lag:] & counted[:-lag]).sum())
-        if pairs < LEAST_PAIRS:
+        if pairs < MIN_PAIRS:
             break
         correlation = np.sin(np.pi / 2 * (sign[lag:] * sign[:-lag]).sum() / pairs)
         if correlation <= 0:

@@ -33,7 +33,7 @@ LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "optax")
 """The libraries whose code becomes part of a trace."""
 SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion")
 """The settings of JAX that decide a trace."""
-MOST_LOADED = 32
+MAX_LOADED = 32
 """Most compiled programs that one function keeps in a process."""
 FOLDER = "jax_compilation_cache_dir"
 CHECKSUM = hashlib.sha256
@@ -66,7 +66,7 @@ class StoredProgram:
             return self._compiled(fixed, state)
         leaves = [jax.tree.leaves(part) for part in arguments]
         if key not in self._loaded:
-            if len(self._loaded) == MOST_LOADED:
+            if len(self._loaded) == MAX_LOADED:
                 self._loaded.pop(next(iter(self._loaded)))
             program = self._traced(key, leaves, [*map(jax.tree.structure, arguments)], others)
             call = functools.update_wrapper(lambda *leaves: program.call(*leaves), self._function)

@@ -13,7 +13,7 @@ from jaxfit.fitting.windows import Windows, window_hash
 from jaxfit.foundation.unfinished import Parts
 from jaxfit.model.kinematics import Pose
 
-LEAST_FRAMES = 100
+MIN_FRAMES = 100
 """Frames of every bird between two writes, for windows of fewer frames."""
 
 _POSE = {
@@ -135,7 +135,7 @@ def _error_bars(arrays: Mapping[str, np.ndarray], i: int) -> ErrorBars | None:
 def windows_per_part(birds: int, frames: int) -> int:
     """Return the number of windows that are fitted between two writes.
 
-    An interruption costs at most so many windows: about one window of every bird, or `LEAST_FRAMES` frames. Tiles are
+    An interruption costs at most so many windows: about one window of every bird, or `MIN_FRAMES` frames. Tiles are
     full.
 
     Args:
@@ -143,4 +143,4 @@ def windows_per_part(birds: int, frames: int) -> int:
         frames: frames of a window.
     """
     size = tile_size(frames)
-    return -(-birds * -(-LEAST_FRAMES // frames) // size) * size
+    return -(-birds * -(-MIN_FRAMES // frames) // size) * size

@@ -51,9 +51,9 @@ from jaxfit.model.kinematics import fold_bird, joint_transforms, posed_keypoints
 from jaxfit.model.rotation import unwrap_axis_angle
 from jaxfit.objective.posed_window import ViewMaps
 
-LEAST_POINTS = 4
+MIN_POINTS = 4
 """Triangulated keypoints of a frame that determine an orientation."""
-LEAST_SPREAD = 0.05
+MIN_SPREAD = 0.05
 """Smallest ratio of the second to the first extent of the triangulated keypoints: points on a line have no rotation."""
 ROUNDS = 5
 """Rounds of reweighting of the alignment, and `ROBUST` its scale relative to the extent of the bird."""
@@ -179,12 +179,12 @@ def initial_poses(
     root = np.asarray(rig.joints[0], np.float64)
     N, T = weight.shape[:2]
     R, transl, scale = np.full((N, T, 3, 3), np.nan), np.full((N, T, 3), np.nan), np.full((N, T), np.nan)
-    for n, t in np.argwhere((weight > 0).sum(-1) >= LEAST_POINTS).tolist():
+    for n, t in np.argwhere((weight > 0).sum(-1) >= MIN_POINTS).tolist():
         found = _align(shape, np.nan_to_num(points[n, t]), weight[n, t])
         if found is not None:
             R[n, t], scale[n, t] = found
     if not np.isfinite(scale).any():
-        problem = f"have no frame with {LEAST_POINTS} keypoints of a bird in two cameras"
+        problem = f"have no frame with {MIN_POINTS} keypoints of a bird in two cameras"
         raise InputError(source, problem, "see `jaxfit cameras check`")
     overall = float(np.nanmedian(scale))
     if not POSSIBLE_SIZES[0] < overall < POSSIBLE_SIZES[1]:
@@ -231,7 +231,7 @@ def _align(
         share = w / w.sum()
         a, b = shape - share @ shape, points - share @ points
         U, S, Vt = np.linalg.svd((share[:, None] * b).T @ a)
-        if S[1] < LEAST_SPREAD * S[0]:
+        if S[1] < MIN_SPREAD * S[0]:
             return None
         D = np.array([1, 1, np.sign(np.linalg.det(U @ Vt))])
         R = (U * D) @ Vt

@@ -27,7 +27,7 @@ from jaxfit.foundation.limits import DISTANCE_IMAGE_SIDES, TABLE_GB
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets, ViewMaps
 
-MOST_UNROLLED = 8
+MAX_UNROLLED = 8
 """Frames of the filter's window that are compared without a loop, which is several times faster."""
 
 
@@ -61,7 +61,7 @@ def weighted_median_filter(
     """
     if window < 1 or window % 2 == 0:
         raise ValueError(f"window must be odd and positive, not {window}")
-    T, half_window, unroll = len(keypoints_px), window // 2, min(window, MOST_UNROLLED)
+    T, half_window, unroll = len(keypoints_px), window // 2, min(window, MAX_UNROLLED)
     points = jnp.pad(jnp.asarray(keypoints_px), ((half_window, half_window), (0, 0), (0, 0)))
     weights = jnp.pad(jnp.asarray(confidence), ((half_window, half_window), (0, 0)))[..., None]
 
@@ -107,10 +107,10 @@ def distant_birds(observations: Observations) -> Bool[np.ndarray, "N T"]:
     allowed_px = DISTANCE_IMAGE_SIDES * size_px.max(-1, keepdims=True)
     corner_px, extent_px = (observations.box_px[..., axes].astype(np.float64) for axes in (slice(2), slice(2, 4)))
     keypoints = (observations.keypoints_px[:, :, k] for k in range(observations.num_keypoints))  # (0, 0) if missing
-    distant, least_px = np.zeros(observations.present.shape, bool), allowed_px.min(initial=np.inf)
+    distant, min_px = np.zeros(observations.present.shape, bool), allowed_px.min(initial=np.inf)
     everywhere = observations.keypoints_px, corner_px, corner_px + extent_px
     if not distant.size or all(
-        (each >= -least_px).all() and (each <= size_px.min() + least_px).all() for each in everywhere
+        (each >= -min_px).all() and (each <= size_px.min() + min_px).all() for each in everywhere
     ):
         return distant  # the usual case, in a tenth of the time
     for points_px in (corner_px, corner_px + extent_px, *keypoints):

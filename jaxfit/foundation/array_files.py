@@ -120,15 +120,15 @@ DAMAGED = (
 
 
 def load_npy(
-    path: str | Path, shape: str | None = None, mapped: bool = False, most_bytes: int = NPZ_BYTES
+    path: str | Path, shape: str | None = None, mapped: bool = False, max_bytes: int = NPZ_BYTES
 ) -> np.ndarray:
     """Read the array of an ``.npy`` without running pickled code.
 
     Args:
         path: the file.
         shape: text of sizes, as in `jaxfit.foundation.array_files.load_npz`; None allows any shape.
-        mapped: return a read-only memory map, which may be larger than `most_bytes`.
-        most_bytes: largest size of the array.
+        mapped: return a read-only memory map, which may be larger than `max_bytes`.
+        max_bytes: largest size of the array.
 
     Raises:
         InputError: the file cannot be read, is not an ``.npy``, is truncated or too large; or the array holds values
@@ -152,7 +152,7 @@ def load_npy(
             raise InputError(path, str(error), "check the path") from None
         if mapped and header.nbytes:
             return np.memmap(path, header.dtype, "r", header.offset, header.shape, "F" if header.fortran else "C")
-        check_size(path, header.nbytes, most_bytes)
+        check_size(path, header.nbytes, max_bytes)
         file.seek(0)
         with damage(path, "the array"):
             return plain_array(path, "the array", np.lib.format.read_array(file, max_header_size=NPY_HEADER_BYTES))
@@ -250,7 +250,7 @@ def load_npz(
     version: int | None = None,
     oldest: int = 1,
     optional: Mapping[str, str] | None = None,
-    most_bytes: int = NPZ_BYTES,
+    max_bytes: int = NPZ_BYTES,
 ) -> dict[str, np.ndarray]:
     """Read the named arrays of an ``.npz`` without running pickled code; other arrays are not read.
 
@@ -264,7 +264,7 @@ def load_npz(
             integer from 1. The version is checked first, because another version may have other arrays. None: no check.
         oldest: the oldest ``format_version`` that the caller supports.
         optional: name → shape of arrays that the file may lack.
-        most_bytes: largest size of all named arrays together.
+        max_bytes: largest size of all named arrays together.
 
     Returns:
         Name → array of real numbers, booleans or text.
@@ -286,7 +286,7 @@ def load_npz(
             check_shapes({name: header.shape for name, header in headers.items()}, layout)
         except ValueError as error:
             raise InputError(path, str(error), AGAIN) from None
-        check_size(path, sum(header.nbytes for header in headers.values()), most_bytes)
+        check_size(path, sum(header.nbytes for header in headers.values()), max_bytes)
         return {name: members[name].read(header) for name, header in headers.items()}
 
 

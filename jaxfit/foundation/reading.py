@@ -1,4 +1,4 @@
-"""Opening of files for reading with one-line errors, and JSON text."""
+"""The boundary around foreign files: every failure of a reader becomes a one-line error. JSON text."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import math
 import os
 import stat
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -50,6 +51,40 @@ def check_readable(path: str | Path, kind: str = "a file", absent: str = _CHECK_
         return Path(path)
 
 
+@contextmanager
+def reading(path: str | Path, kind: str, remedy: str = "", absent: str = _CHECK_PATH) -> Iterator[Path]:
+    """Convert every exception of a library that reads a file in the body to one InputError, as a context manager.
+
+    Call a library plainly in the body. Check shapes, finite numbers and ranges after the body, in the container that
+    receives the data.
+
+    Args:
+        path: the file.
+        kind: the expected kind of file with its article, such as ``a SLEAP project``.
+        remedy: the remedy of the message; the default is to write the file again.
+        absent: the remedy where the path does not exist.
+
+    Yields:
+        The path.
+
+    Raises:
+        InputError: the path is not a readable file (`check_readable`), or the body raises any exception; an InputError
+            of the body stays as it is.
+    """
+    with open_file(path, kind, absent):
+        pass
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # libraries warn about damage that the check of the content reports
+            yield Path(path)
+    except InputError:
+        raise
+    except Exception as error:  # libraries raise any class for damaged content, MemoryError and RecursionError too
+        text = str(error).strip()
+        reason = f"{type(error).__name__}: {text}" if isinstance(error, KeyError) or not text else text
+        raise InputError(path, f"is not {kind} that can be read: {reason}", remedy or "write the file again") from error
+
+
 def check_folder(path: str | Path, kind: str = "a folder", absent: str = _CHECK_PATH) -> Path:
     """Check that a path is a folder; arguments, result and errors as `check_readable`."""
     path = Path(path)
@@ -75,8 +110,8 @@ def open_file(path: str | Path, kind: str = "a file", absent: str = _CHECK_PATH)
             yield file
 
 
-def read_file(path: str | Path, most_bytes: int, kind: str = "a file") -> bytes:
-    """Return the bytes of a regular file of at most `most_bytes`.
+def read_file(path: str | Path, max_bytes: int, kind: str = "a file") -> bytes:
+    """Return the bytes of a regular file of at most `max_bytes`.
 
     Raises:
         InputError: as `check_readable`; or the file is larger.
@@ -86,21 +121,21 @@ def read_file(path: str | Path, most_bytes: int, kind: str = "a file") -> bytes:
         size = os.fstat(file.fileno()).st_size
         content = bytearray()
         # in parts, because read() reserves memory for the size that it is given
-        while size <= most_bytes and len(content) <= most_bytes and (part := file.read(2**18)):
+        while size <= max_bytes and len(content) <= max_bytes and (part := file.read(2**18)):
             content += part
-    if max(size, len(content)) > most_bytes:
-        problem = f"has {max(size, len(content)):,} bytes, more than {most_bytes:,}"
+    if max(size, len(content)) > max_bytes:
+        problem = f"has {max(size, len(content)):,} bytes, more than {max_bytes:,}"
         raise InputError(path, problem, f"give {kind} of at most this size")
     return bytes(content)
 
 
-def read_text(path: str | Path, most_bytes: int, kind: str) -> str:
-    """Return the text of a UTF-8 file of at most `most_bytes`, without a byte order mark.
+def read_text(path: str | Path, max_bytes: int, kind: str) -> str:
+    """Return the text of a UTF-8 file of at most `max_bytes`, without a byte order mark.
 
     Raises:
         InputError: as `read_file`; or the content is not UTF-8.
     """
-    content = read_file(path, most_bytes, kind)
+    content = read_file(path, max_bytes, kind)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -133,17 +168,17 @@ def _read_errors(path: Path, absent: str) -> Iterator[None]:
         raise InputError(path, problem, remedy or absent) from error
 
 
-def read_json_file(path: str | Path, most_bytes: int) -> Any:
+def read_json_file(path: str | Path, max_bytes: int) -> Any:
     """Return the content of a JSON file as dicts, lists and plain values.
 
     Args:
         path: the file.
-        most_bytes: size of the largest file that is accepted.
+        max_bytes: size of the largest file that is accepted.
 
     Raises:
         InputError: as `read_text` and `parse_json`.
     """
-    return parse_json(read_text(path, most_bytes, "a JSON file"), path)
+    return parse_json(read_text(path, max_bytes, "a JSON file"), path)
 
 
 def parse_json(text: str, source: object) -> Any:

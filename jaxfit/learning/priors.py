@@ -33,11 +33,11 @@ from jaxfit.model.anatomy import joint_group
 from jaxfit.model.bird import Bird
 from jaxfit.objective.posed_window import priors_of
 
-LEAST_SD_RAD = 0.02
+MIN_SD_RAD = 0.02
 """Smallest standard deviation of a component of the pose, for components that hardly move in the results."""
-LEAST_WIDTH = 1e-3
+MIN_WIDTH = 1e-3
 """Smallest width of a prior, for results whose poses are all the model's mean."""
-LEAST_BONE_SD = 0.01
+MIN_BONE_SD = 0.01
 """Smallest standard deviation of a bone's relative length."""
 
 
@@ -108,13 +108,13 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
         raise InputError(first_source, f"holds no valid pose{skipped}", "use results with fitted birds")
     poses = np.concatenate([pose[valid] for pose, valid, _ in tracks])
     effective = effective_count(tracks)
-    mean, covariance, shrinkage = _gaussian(poses, effective, LEAST_SD_RAD)
+    mean, covariance, shrinkage = _gaussian(poses, effective, MIN_SD_RAD)
     learnt = replace(
         bird, pose_mean=jnp.asarray(mean, jnp.float32), pose_covariance=jnp.asarray(covariance, jnp.float32)
     )
     bones_learnt = bool(np.ptp(np.array(bones), axis=0).max() > 1e-4)
     if bones_learnt:
-        bone_mean, bone_covariance, _ = _gaussian(np.array(bones), len(bones), LEAST_BONE_SD)
+        bone_mean, bone_covariance, _ = _gaussian(np.array(bones), len(bones), MIN_BONE_SD)
         learnt = replace(
             learnt,
             bone_mean=jnp.asarray(bone_mean, jnp.float32),
@@ -125,7 +125,7 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
     priors = priors_of(bird)
     whitened = (poses - np.asarray(priors.pose_mean)) @ np.asarray(priors.pose_whitener).T
     counts = len(poses), len(tracks), diverged, effective
-    width = max(float((whitened**2).mean()), LEAST_WIDTH)
+    width = max(float((whitened**2).mean()), MIN_WIDTH)
     return LearntPrior(learnt, *counts, shrinkage, bones_learnt, mean_change_rad, width)
 
 
@@ -177,13 +177,13 @@ def oas_shrinkage(matrix: Float[np.ndarray, "D D"], count: float) -> float:
 
 
 def _gaussian(
-    samples: Float[np.ndarray, "n D"], count: float, least_sd: float
+    samples: Float[np.ndarray, "n D"], count: float, min_sd: float
 ) -> tuple[Float[np.ndarray, "D"], Float[np.ndarray, "D D"], float]:
     """Return mean, covariance with shrunk correlations, and the shrinkage."""
     mean = samples.mean(axis=0)
     deviation = samples - mean
-    sd = np.sqrt((deviation**2).mean(axis=0) + least_sd**2)
-    # `least_sd` acts as independent noise: it increases the variances, not the covariances
+    sd = np.sqrt((deviation**2).mean(axis=0) + min_sd**2)
+    # `min_sd` acts as independent noise: it increases the variances, not the covariances
     correlation = (deviation / sd).T @ (deviation / sd) / len(samples)
     np.fill_diagonal(correlation, 1.0)
     shrinkage = oas_shrinkage(correlation, count)

@@ -20,7 +20,7 @@ def length_px(bird: Instance) -> int:
 
 
 def replace_parts(
-    birds: Sequence[Instance], birds_of_smaller_input: Sequence[Instance], least_length_px: float
+    birds: Sequence[Instance], birds_of_smaller_input: Sequence[Instance], min_length_px: float
 ) -> list[Instance]:
     """Return the birds of a frame, in which long birds of a smaller input replace their parts.
 
@@ -31,11 +31,11 @@ def replace_parts(
     Args:
         birds: birds of the usual input.
         birds_of_smaller_input: birds of the same frame in a smaller input.
-        least_length_px: shorter birds of the smaller input are dropped, image pixels.
+        min_length_px: shorter birds of the smaller input are dropped, image pixels.
     """
     kept = list(birds)
     for whole in birds_of_smaller_input:
-        if length_px(whole) < least_length_px:
+        if length_px(whole) < min_length_px:
             continue
         common = [common_pixels(bird, whole) for bird in kept]
         is_part = [n >= MIN_PART_SHARE * np.count_nonzero(bird.mask) for n, bird in zip(common, kept, strict=True)]

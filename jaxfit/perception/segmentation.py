@@ -40,7 +40,7 @@ LARGE_BIRD_PX = 200.0
 """Birds that are longer in the input are detected in parts, so an input of half the size detects them."""
 SMALLER_INPUTS = 2
 """Number of smaller inputs: half and a quarter of the size."""
-MOST_PEAKS = 10 * INSTANCES
+MAX_PEAKS = 10 * INSTANCES
 """More peaks are the output of a network that was not trained."""
 MIN_CELLS = 12
 """Instances with fewer cells are dropped."""
@@ -114,13 +114,13 @@ class BottomUp(SegmentationNetwork):
 
     def _with_large_birds(self, frame: UInt8[np.ndarray, "H W 3"], found: list[Instance]) -> list[Instance]:
         """Replace the parts of large birds; a smaller input is used only if a detection could be half a large bird."""
-        least_px = LARGE_BIRD_PX * max(frame.shape[:2]) / self._longer_side_px
+        min_px = LARGE_BIRD_PX * max(frame.shape[:2]) / self._longer_side_px
         for n in range(1, SMALLER_INPUTS + 1):
-            if not any(2 * length_px(bird) >= least_px for bird in found):
+            if not any(2 * length_px(bird) >= min_px for bird in found):
                 break
             array, placement = self.network_input(frame, self._longer_side_px / 2**n)
-            found = replace_parts(found, self._instances(self._model(array), placement), least_px)
-            least_px *= 2
+            found = replace_parts(found, self._instances(self._model(array), placement), min_px)
+            min_px *= 2
         return found
 
     def _instances(self, outputs: dict[str, np.ndarray], placement: Placement) -> list[Instance]:
@@ -130,7 +130,7 @@ class BottomUp(SegmentationNetwork):
         foreground, centre = (outputs[name][0, 0].astype(np.float32, copy=False) for name in ("foreground", "centre"))
         cell_px = placement.input_px[0] / foreground.shape[1]
         peaks = _find_peaks(centre)
-        if len(peaks) > MOST_PEAKS:
+        if len(peaks) > MAX_PEAKS:
             problem = f"gives {len(peaks)} centres of birds in one frame"
             raise InputError(self._model.path, problem, "give another network")
         assignment = _assign_cells(foreground, outputs["offset"][0] * OFFSET_UNIT_PX, peaks, cell_px)

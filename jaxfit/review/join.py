@@ -112,11 +112,11 @@ def _status(parts: Sequence[str]) -> str:
     return fitted[0] if len(set(fitted)) == 1 else "partly diverged"
 
 
-LEAST_CONFIDENCE = 0.5
+MIN_CONFIDENCE = 0.5
 """Pairs with a lower confidence are different tracks."""
-LEAST_SPREAD = 0.05
+MIN_SPREAD = 0.05
 """Least σ and τ: the noise of boxes."""
-LEAST_PAIRS = 20
+MIN_PAIRS = 20
 """Number of pairs of frames that determine σ and τ."""
 LARGEST_LOG_RATIO = 300.0
 
@@ -134,13 +134,13 @@ class Link(NamedTuple):
     """In [0.5, 1]."""
 
 
-def link_tracks(before: Observations, after: Observations, most_missing: int) -> list[Link]:
+def link_tracks(before: Observations, after: Observations, max_missing: int) -> list[Link]:
     """Return the pairs of tracks that are one bird.
 
     Args:
         before: observations of the earlier frames.
         after: observations of later frames of the same video.
-        most_missing: largest number of frames without the bird, in steps of the frame numbers.
+        max_missing: largest number of frames without the bird, in steps of the frame numbers.
     """
     step = frame_step(np.concatenate([before.frame_index, after.frame_index]))
     old, new = _boxes(before), _boxes(after)
@@ -153,7 +153,7 @@ def link_tracks(before: Observations, after: Observations, most_missing: int) ->
         end, start = int(np.flatnonzero(old.present[a])[-1]), int(np.flatnonzero(new.present[b])[0])
         gap = int(new.numbers[start] - old.numbers[end]) // step
         missing[a, b] = gap - 1
-        if gap - 1 <= most_missing:
+        if gap - 1 <= max_missing:
             width, height = after.image_size(b, start)
             places = (old.centre[a, end], old.size[a, end]), (new.centre[b, start], new.size[b, start])
             log_ratio[a, b] = _log_ratio(*places, spread(gap), width * height)
@@ -163,7 +163,7 @@ def link_tracks(before: Observations, after: Observations, most_missing: int) ->
     links = []
     for a, b in zip(*linear_sum_assignment(gain, maximize=True), strict=True):
         confidence = float(ratio[a, b] / (1 + total[a, b]))
-        if confidence >= LEAST_CONFIDENCE:
+        if confidence >= MIN_CONFIDENCE:
             links.append(Link(int(a), int(b), int(missing[a, b]), confidence))
     return links
 
@@ -189,11 +189,11 @@ def _spread(ranges: Sequence[_Boxes], gap: int, step: int) -> tuple[float, float
     """Return σ and τ after `gap` steps. Without enough pairs of frames, the variances grow linearly with the gap."""
     for lag in range(gap, 0, -1):
         moves, growths = (np.concatenate(each) for each in zip(*(_changes(r, lag * step) for r in ranges), strict=True))
-        if len(growths) >= LEAST_PAIRS:
+        if len(growths) >= MIN_PAIRS:
             scale = np.sqrt(gap / lag)
             sigma, tau = (scale * np.sqrt(np.mean(each**2)) for each in (moves, growths))
-            return max(sigma, LEAST_SPREAD), max(tau, LEAST_SPREAD)
-    return LEAST_SPREAD * np.sqrt(gap), LEAST_SPREAD * np.sqrt(gap)
+            return max(sigma, MIN_SPREAD), max(tau, MIN_SPREAD)
+    return MIN_SPREAD * np.sqrt(gap), MIN_SPREAD * np.sqrt(gap)
 
 
 def _changes(boxes: _Boxes, lag: int) -> tuple[np.ndarray, np.ndarray]:
@@ -383,7 +383,7 @@ def _trust(parts: Sequence[_Part]) -> dict[str, Any]:
 
 
 def _follow(
-    parts: Sequence[_Part], most_missing: int
+    parts: Sequence[_Part], max_missing: int
 ) -> tuple[list[JoinedTrack], list[Int[np.ndarray, "n"]], Int[np.ndarray, "N"]]:
     """Return what became of every track, the row of every track of each part, and the number of every row."""
     table: list[JoinedTrack] = []
@@ -392,7 +392,7 @@ def _follow(
     joined = None  # the observations of the parts so far
     for part in parts:
         own = replace(part.tracks.observations, masks={}, amodal_masks={})  # boxes are enough
-        links = {} if joined is None else {link.after: link for link in link_tracks(joined, own, most_missing)}
+        links = {} if joined is None else {link.after: link for link in link_tracks(joined, own, max_missing)}
         row = np.zeros(own.num_tracks, np.int64)
         for n, track in enumerate(own.track_id.tolist()):
             link = links.get(n)

@@ -116,7 +116,7 @@ SHORTLIST = 4
 SHARPNESS = 4.0
 """Exponent of the score against the distance from the chosen frames: 0 chooses by variety alone."""
 
-LEAST_GAP = 0.25
+MIN_GAP = 0.25
 """Least distance in time of chosen frames, as a share of the mean distance of evenly spaced frames."""
 
 
@@ -182,7 +182,7 @@ def choose(
         last = chosen[-1]
         look = np.linalg.norm(thumbnails - thumbnails[last], axis=-1)
         gap = np.abs(numbers - numbers[last]) / spacing
-        crowded |= gap < LEAST_GAP
+        crowded |= gap < MIN_GAP
         nearest = np.minimum(nearest, np.hypot(look / scale, np.minimum(gap, 1)))
         value = weight * nearest - np.where(crowded, 1e6, 0)
         value[chosen] = -np.inf

@@ -26,7 +26,7 @@ from jaxfit.simulation.viewpoint import Viewpoint, ring_viewpoints, viewpoint_of
 
 CAMERAS = "cameras.toml"
 """File of the cameras in the folder of a scene with several cameras."""
-MOST_CAMERAS = 32
+MAX_CAMERAS = 32
 
 
 class RigScene(NamedTuple):
@@ -68,8 +68,8 @@ def stage_rig(
     if unit_m is None:
         raise InputError(f"model {bird.name}", "has no `metres_per_unit`", "use the built-in murre")
     if isinstance(cameras, int):
-        if not 1 <= cameras <= MOST_CAMERAS:
-            raise InputError("simulate: cameras", f"is {cameras}", f"give 1 to {MOST_CAMERAS} cameras, or a file")
+        if not 1 <= cameras <= MAX_CAMERAS:
+            raise InputError("simulate: cameras", f"is {cameras}", f"give 1 to {MAX_CAMERAS} cameras, or a file")
         rng = np.random.default_rng((seed, 5))
         views = ring_viewpoints(rng, cameras, *size, LEDGE_DEPTH, distorted)
         cameras = tuple(view.camera(f"cam{i}", unit_m) for i, view in enumerate(views))

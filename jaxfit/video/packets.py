@@ -82,7 +82,7 @@ def frame_rate(stream: Any) -> float | None:
 
 
 _REORDER = 16  # the most pictures that a codec delays to change their order
-_MOST_DELAYED = 128  # a picture that is shown after so many later packets has a damaged time stamp
+_MAX_DELAYED = 128  # a picture that is shown after so many later packets has a damaged time stamp
 
 
 class Packet(NamedTuple):
@@ -221,7 +221,7 @@ class Timeline:
             self.troubled = True
             self._spoil(packet)
         self._held.append((number, packet, picture))
-        if self.stamped and any(packet.order - one.order > _MOST_DELAYED for one in self._pending):
+        if self.stamped and any(packet.order - one.order > _MAX_DELAYED for one in self._pending):
             self._count()  # otherwise all later pictures would wait in memory
 
     def finish(self) -> None:
@@ -281,7 +281,7 @@ _STAMPED = (MP4, _MATROSKA)  # every packet has a time stamp, so seeks are exact
 _REORDERED = ("h264", "hevc")  # AVI has no time stamps, and FFmpeg cannot derive correct time stamps for these
 _CHUNK_HEADER = 8  # bytes between the position in the index of an AVI file and the packet
 _FIRST_PACKETS = 500  # packets; a later first picture would make probing slow
-_MOST_HEADERS = 1024  # bytes; a larger gap between the packets of a Matroska file is damage
+_MAX_HEADERS = 1024  # bytes; a larger gap between the packets of a Matroska file is damage
 
 
 def add_packet(line: Timeline, packet: Any, torn: bool) -> Packet | None:
@@ -302,7 +302,7 @@ def demuxed(container: Any, stream: Any) -> Iterator[tuple[Any, bool]]:
         if not packet.size:  # a repeated picture in AVI, or the end of a stream
             continue
         if matroska and packet.pos is not None:
-            torn = torn or (end is not None and packet.pos - end > _MOST_HEADERS)
+            torn = torn or (end is not None and packet.pos - end > _MAX_HEADERS)
             end = packet.pos + packet.size
         if packet.stream_index == stream.index:
             yield packet, torn

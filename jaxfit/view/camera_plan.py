@@ -15,7 +15,7 @@ from jaxfit.view.drawing import dot, line, tag, text
 PANEL_PX, MARGIN_PX, TITLE_PX = 720, 70, 46
 EDGE_POINTS = 12
 """Points on each edge of an image, so that the distortion of a lens is visible."""
-LEAST_DEPTH = 0.1
+MIN_DEPTH = 0.1
 """Length of the drawn fields of view, at least this share of the largest distance between cameras."""
 PANELS = (("from above", 0, 1, "x", "y"), ("from the side", 0, 2, "x", "z"))
 
@@ -64,7 +64,7 @@ def _view_depth(cameras: Sequence[Camera]) -> float:
     point = np.linalg.lstsq(across.sum(axis=0), np.einsum("vij,vj->i", across, positions), rcond=None)[0]
     depths = np.einsum("vi,vi->v", point - positions, axes)
     farthest = np.linalg.norm(positions[:, None] - positions, axis=-1).max()
-    least = LEAST_DEPTH * farthest if farthest > 0 else 1.0
+    least = MIN_DEPTH * farthest if farthest > 0 else 1.0
     return max(float(np.median(depths)), least)
 
 

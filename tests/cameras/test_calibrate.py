@@ -5,8 +5,8 @@ import pytest
 from support import checkerboards
 
 from jaxfit.cameras.calibrate import (
-    LEAST_VIEWS,
-    MOST_VIEWS,
+    MIN_VIEWS,
+    MAX_VIEWS,
     Board,
     BoardViews,
     Lens,
@@ -208,10 +208,10 @@ def test_wrong_views_are_dropped():
 
 
 def test_equal_views_count_once():
-    poses = checkerboards.board_poses(np.random.default_rng(0), MOST_VIEWS + 5, BOARD[:2], [(*LEFT, *WORLD)], SIZE)
-    assert calibrate_lens(views("left", LEFT, WORLD, poses), BOARD).views <= MOST_VIEWS
-    still = views("left", LEFT, WORLD, (LEAST_VIEWS - 1) * poses[:1] + poses[: LEAST_VIEWS - 1])
-    with pytest.raises(InputError, match=rf"left\.mp4: has {LEAST_VIEWS - 1} different views of the board"):
+    poses = checkerboards.board_poses(np.random.default_rng(0), MAX_VIEWS + 5, BOARD[:2], [(*LEFT, *WORLD)], SIZE)
+    assert calibrate_lens(views("left", LEFT, WORLD, poses), BOARD).views <= MAX_VIEWS
+    still = views("left", LEFT, WORLD, (MIN_VIEWS - 1) * poses[:1] + poses[: MIN_VIEWS - 1])
+    with pytest.raises(InputError, match=rf"left\.mp4: has {MIN_VIEWS - 1} different views of the board"):
         calibrate_lens(still, BOARD)
 
 
@@ -227,10 +227,10 @@ def test_a_pair_needs_different_common_views():
 
 
 def test_wrong_views_leave_too_few():
-    poses = checkerboards.board_poses(np.random.default_rng(0), LEAST_VIEWS, BOARD[:2], [(*LEFT, *WORLD)], SIZE)
+    poses = checkerboards.board_poses(np.random.default_rng(0), MIN_VIEWS, BOARD[:2], [(*LEFT, *WORLD)], SIZE)
     wrong = views("left", LEFT, WORLD, poses)
     wrong.corners_px[4] += np.random.default_rng(5).normal(0, 8, wrong.corners_px[4].shape)
-    with pytest.raises(InputError, match=rf"has {LEAST_VIEWS - 1} views of the board that agree"):
+    with pytest.raises(InputError, match=rf"has {MIN_VIEWS - 1} views of the board that agree"):
         calibrate_lens(wrong, BOARD)
 
 

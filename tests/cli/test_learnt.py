@@ -44,7 +44,7 @@ def test_a_fit_with_learnt_yaml_gives_the_same_result(inputs, tmp_path):
 
 
 def test_too_few_data_keep_the_config_and_the_file_gives_the_reason(inputs, tmp_path, monkeypatch):
-    monkeypatch.setattr(learn, "LEAST_FRAMES", 1000)
+    monkeypatch.setattr(learn, "MIN_FRAMES", 1000)
     (tmp_path / "learning.yaml").write_text(CONFIG)
     command = arguments(inputs, tmp_path / "out")
     command[command.index("--config") + 1] = str(tmp_path / "learning.yaml")

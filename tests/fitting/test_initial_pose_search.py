@@ -14,8 +14,8 @@ from support.birds import exp_map, toy_bird
 
 from jaxfit.config.fit import InitialiseConfig
 from jaxfit.fitting.initial_poses import (
-    LEAST_SEPARATION_RAD,
-    LEAST_SPAN,
+    MIN_SEPARATION_RAD,
+    MIN_SPAN,
     candidate_orientations,
     choose_sequence,
     match_candidates,
@@ -60,7 +60,7 @@ def test_keypoints_that_match_no_orientation_give_a_moderate_depth():
     keypoints_px = np.full((3, BIRD.num_keypoints, 2), 100.0)
     pose = search(keypoints_px, ABOVE)
     span = np.ptp(np.asarray(BIRD.keypoints), axis=0).max()
-    assert np.all(pose.transl[..., 2] < 1.1 * CAMERA.focal_px * span / (LEAST_SPAN * CAMERA.size_px))
+    assert np.all(pose.transl[..., 2] < 1.1 * CAMERA.focal_px * span / (MIN_SPAN * CAMERA.size_px))
 
 
 def test_the_papers_candidates():
@@ -211,7 +211,7 @@ def test_hypotheses_differ(method):
     assert pose.global_orient.shape == (3, 6, 3)
     R = exp_map(pose.global_orient.reshape(-1, 3).astype(np.float64)).reshape(3, 6, 3, 3)
     for a, b in itertools.combinations(range(3), 2):
-        assert angle(R[a], R[b]).min() > LEAST_SEPARATION_RAD - 1e-3
+        assert angle(R[a], R[b]).min() > MIN_SEPARATION_RAD - 1e-3
     best = search(projected(planted), base)
     np.testing.assert_allclose(pose.global_orient[0], best.global_orient[0], atol=1e-5)
 

@@ -11,7 +11,7 @@ from support.birds import random_pose, solution_of, toy_bird
 from jaxfit.cli.main import main
 from jaxfit.data.solution import save_solution
 from jaxfit.foundation.errors import InputError
-from jaxfit.learning.priors import LEAST_SD_RAD, LEAST_WIDTH, effective_count, learn_prior, oas_shrinkage
+from jaxfit.learning.priors import MIN_SD_RAD, MIN_WIDTH, effective_count, learn_prior, oas_shrinkage
 from jaxfit.model.bird import check_bird
 from jaxfit.model.files import load_bird
 
@@ -36,7 +36,7 @@ def test_the_width_is_a_factor_on_the_covariance_of_the_model():
     assert learnt.width == pytest.approx(3, rel=0.1)
     assert learnt.pose_prior_weight == pytest.approx(1 / 6, rel=0.1)
     still = np.broadcast_to(np.asarray(BIRD.pose_mean, np.float32).reshape(-1, 3), drawn.shape)
-    assert learn_prior([("a", dataclasses.replace(result, body_pose=still), BIRD)]).width == LEAST_WIDTH
+    assert learn_prior([("a", dataclasses.replace(result, body_pose=still), BIRD)]).width == MIN_WIDTH
 
 
 def test_oas_by_hand():
@@ -93,7 +93,7 @@ def test_mean_and_covariance():
     np.testing.assert_allclose(learnt.bird.pose_mean, poses.mean(0), atol=1e-6)
     sample = np.cov(poses.T, bias=True)
     covariance = np.asarray(learnt.bird.pose_covariance, np.float64)
-    np.testing.assert_allclose(np.diag(covariance), np.diag(sample) + LEAST_SD_RAD**2, rtol=1e-5)
+    np.testing.assert_allclose(np.diag(covariance), np.diag(sample) + MIN_SD_RAD**2, rtol=1e-5)
     off = ~np.eye(21, dtype=bool)
     np.testing.assert_allclose(covariance[off], (1 - learnt.shrinkage) * sample[off], atol=1e-6)
     np.testing.assert_allclose(learnt.mean_change_rad, np.linalg.norm(poses.mean(0).reshape(7, 3), axis=1), rtol=1e-5)
@@ -111,7 +111,7 @@ def test_the_prior_of_one_motionless_bird_is_positive_definite():
     learnt = learn_prior([("a", still, BIRD)])
     assert learnt.effective_poses == 1
     assert learnt.shrinkage == 1
-    assert np.linalg.eigvalsh(np.asarray(learnt.bird.pose_covariance)).min() > 0.9 * LEAST_SD_RAD**2
+    assert np.linalg.eigvalsh(np.asarray(learnt.bird.pose_covariance)).min() > 0.9 * MIN_SD_RAD**2
     check_bird(learnt.bird, "learnt")
 
 

@@ -15,9 +15,9 @@ from jaxfit.evaluation.ablation.runs import fit_batches
 from jaxfit.fitting.evidence import Evidence, expanded, mask_evidence
 from jaxfit.fitting.fit import fit, fit_runs, learn_weights
 from jaxfit.fitting.learn import (
-    MOST_FACTOR,
-    MOST_FRAMES,
-    MOST_WINDOWS,
+    MAX_FACTOR,
+    MAX_FRAMES,
+    MAX_WINDOWS,
     PRIOR_COUNT,
     SETTINGS,
     choose_windows,
@@ -135,7 +135,7 @@ def test_the_fixed_point_is_the_posterior_mean_of_a_variance():
     precision = 1.0
     for _ in range(20):
         precision = updated_precision(precision, Evidence(1e6, 1e-6 * precision))
-    assert precision == MOST_FACTOR
+    assert precision == MAX_FACTOR
     assert updated_precision(1.0, Evidence(0.0, 0.0)) == pytest.approx(1.0)
     # the weight of the mask does not fall
     assert updated_precision(1.0, Evidence(90.0, 180.0), 1, 1.0) == 1
@@ -221,9 +221,9 @@ def test_the_sample_takes_tracks_in_turn():
     rows = choose_windows(windows)
     np.testing.assert_array_equal(rows, choose_windows(windows))
     assert len(rows) == 21  # 40 %
-    assert len(choose_windows(empty_windows(np.arange(100), 10))) == MOST_WINDOWS
+    assert len(choose_windows(empty_windows(np.arange(100), 10))) == MAX_WINDOWS
     assert set(tracks[rows]) == {0, 1, 2}
-    assert len(choose_windows(empty_windows(tracks, 200))) == MOST_FRAMES // 200
+    assert len(choose_windows(empty_windows(tracks, 200))) == MAX_FRAMES // 200
     assert len(choose_windows(windows, 1)) == 1
 
 

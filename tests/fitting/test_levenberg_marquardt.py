@@ -17,7 +17,7 @@ from jaxfit.fitting.levenberg_marquardt import (
     FIRST_DAMPING,
     LEVENBERG_MARQUARDT,
     MOMENTUM,
-    MOST_RELAXATION,
+    MAX_RELAXATION,
 )
 from jaxfit.fitting.problem import problem_window
 from jaxfit.foundation.errors import InputError
@@ -125,7 +125,7 @@ def test_a_step_is_longer_where_the_curvature_was_too_large():
     stage = PLACE
     problem = first_problem(stage)
     newton = dense_step(stage, problem, DAMPING)
-    for ratio, relaxation, momentum in ((0.8, 1.25, MOMENTUM), (0.1, MOST_RELAXATION, MOMENTUM), (0.95, 1.0, 0.0)):
+    for ratio, relaxation, momentum in ((0.8, 1.25, MOMENTUM), (0.1, MAX_RELAXATION, MOMENTUM), (0.95, 1.0, 0.0)):
         state = {"damping": DAMPING, "curvature_ratio": ratio, "change": 0.2 * newton}
         state = {name: jnp.asarray(value, jnp.float32) for name, value in state.items()}
         _, [(pose, after)] = take_steps(stage, problem, **state)

@@ -190,10 +190,10 @@ def test_a_single_array(tmp_path):
     path = tmp_path / "a.npy"
     np.save(path, np.eye(3))
     np.testing.assert_array_equal(load_npy(path), np.eye(3))
-    mapped = load_npy(path, "3 N", mapped=True, most_bytes=1)
+    mapped = load_npy(path, "3 N", mapped=True, max_bytes=1)
     np.testing.assert_array_equal(mapped, np.eye(3))
     with pytest.raises(InputError, match="take 0 MB in memory; the limit is 0 MB"):
-        load_npy(path, most_bytes=1)
+        load_npy(path, max_bytes=1)
     for content, message in (
         (FEW, "the array must have shape"),
         (FEW[:-1], "not a readable .npy: an array of shape"),

@@ -37,7 +37,7 @@ def toy_networks(segmenter):
         mock.patch.object(pipeline, "open_keypoint_detector", return_value=TrueKeypoints(FOOTAGE)),
         mock.patch.object(pipeline, "network_files", return_value={}),
         mock.patch.object(detections, "FRAMES_PER_PART", FRAMES_PER_PART),
-        mock.patch.object(stored_windows, "LEAST_FRAMES", 1),
+        mock.patch.object(stored_windows, "MIN_FRAMES", 1),
         mock.patch.object(provisional, "STEP_FRAMES", FRAMES_PER_PART),
         mock.patch.object(provisional, "LATER_FRAMES", 2),
     ):

@@ -83,9 +83,9 @@ class _Reader:
                 yield name, self._value(matrix, 0)
             position += 8 + size
 
-    def _expanded(self, content: bytes, most_bytes: int) -> bytes:
+    def _expanded(self, content: bytes, max_bytes: int) -> bytes:
         try:
-            return zlib.decompressobj().decompress(content, most_bytes)
+            return zlib.decompressobj().decompress(content, max_bytes)
         except zlib.error as error:
             self._damaged(str(error))
 

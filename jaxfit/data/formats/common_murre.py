@@ -66,7 +66,7 @@ def read_common_murre(
     folder = Path(folder)
     source = folder / ANNOTATIONS
     names = _names(keypoint_names)
-    array = load_npy(source, most_bytes=MURRE_BYTES)
+    array = load_npy(source, max_bytes=MURRE_BYTES)
     if array.dtype.kind not in "fiu":
         raise InputError(source, f"holds {array.dtype}, not numbers", "save it as an array of float64")
     files, (width, height) = _images(folder / IMAGES, progress)

@@ -269,8 +269,8 @@ def _since_mark(stack: list[Any]) -> list[Any]:
 
 _HDF5_REMEDY = "give the .h5 that DeepLabCut writes, or its .csv"
 _LAYOUTS = {b"frame_table": "table", b"frame": "fixed"}
-_MOST_BLOCKS = 100
-_MOST_LEVELS = 4
+_MAX_BLOCKS = 100
+_MAX_LEVELS = 4
 
 
 def find_pandas_table(root: Hdf5Group) -> Hdf5Group | None:
@@ -305,7 +305,7 @@ def read_deeplabcut_hdf5(table: Hdf5Group, path: Path) -> KeypointTable:
 def _read_table(table: Hdf5Group) -> tuple[list[tuple[str, ...]], np.ndarray, list[str]]:
     """Return columns, values and names of the rows of the layout `table`."""
     types = table.column_types("table")
-    blocks = sorted(name for name in types if name.startswith("values_block_"))[:_MOST_BLOCKS]
+    blocks = sorted(name for name in types if name.startswith("values_block_"))[:_MAX_BLOCKS]
     read = table.columns("table", {"index": "iuS", **dict.fromkeys(blocks, "iuf")}, ndim=None)
     columns: list[tuple[str, ...]] = []
     values = [np.zeros((len(read["index"]), 0))]
@@ -334,7 +334,7 @@ def _pickled_names(table: Hdf5Group, name: str) -> list[tuple[str, ...]]:
 def _read_fixed(table: Hdf5Group) -> tuple[list[tuple[str, ...]], np.ndarray, list[str]]:
     """Return columns, values and names of the rows of the layout `fixed`."""
     rows = ["/".join(levels) for levels in _axis(table, "axis1")]
-    blocks = _count(table, "nblocks", _MOST_BLOCKS)
+    blocks = _count(table, "nblocks", _MAX_BLOCKS)
     columns: list[tuple[str, ...]] = []
     values = [np.zeros((len(rows), 0))]
     for b in range(blocks):
@@ -353,7 +353,7 @@ def _axis(table: Hdf5Group, name: str) -> list[tuple[str, ...]]:
     if table.attribute(f"{name}_variety") != b"multi":
         return [(text,) for text in _row_texts(table, name, table.array(name, "iuS", 1))]
     levels = []
-    for i in range(_count(table, f"{name}_nlevels", _MOST_LEVELS)):
+    for i in range(_count(table, f"{name}_nlevels", _MAX_LEVELS)):
         texts = _row_texts(table, f"{name}_level{i}", table.array(f"{name}_level{i}", "iuS", 1))
         codes = table.array(f"{name}_label{i}", "iu", 1).astype(np.int64)
         if len(codes) and not (codes.min() >= -1 and codes.max() < len(texts)):

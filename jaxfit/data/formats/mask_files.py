@@ -33,7 +33,7 @@ _COVERED = 0.3
 _NEAR = 0.05
 """A keypoint outside a mask counts in part up to this distance, as a share of the longer side of the mask: the tips of
 bill, tail and wings lie on the outline, and many masks are a little too small."""
-_MOST_VALUES = 64
+_MAX_VALUES = 64
 """A picture with more grey values is no picture of labels: masks are where the grey value is 128 or more."""
 _NUMBER = re.compile(rf"\d{{1,{FRAME_DIGITS}}}", re.ASCII)
 
@@ -246,7 +246,7 @@ def masks_of_picture(picture: np.ndarray, file: Path, several_birds: bool) -> li
         InputError: the picture holds too many connected regions.
     """
     values = np.flatnonzero(np.bincount(picture.reshape(-1), minlength=1)[1:]) + 1
-    if len(values) > _MOST_VALUES or file.suffix.lower() in (".jpg", ".jpeg", ".webp"):
+    if len(values) > _MAX_VALUES or file.suffix.lower() in (".jpg", ".jpeg", ".webp"):
         half = 2**15 if picture.dtype == np.uint16 else 2**7
         picture, values = np.where(picture >= half, 255, 0).astype(np.uint8), np.array([255])
     if len(values) == 1 and several_birds:

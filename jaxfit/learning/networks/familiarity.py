@@ -36,7 +36,7 @@ from jaxfit.perception.segmentation import BottomUp, load_segmenter
 
 INSIDE = 0.99
 """Share of the training inputs whose distance is below 1."""
-LEAST_VARIANCE = 1e-3
+MIN_VARIANCE = 1e-3
 """Least variance of a direction of the activations, as a share of the mean variance."""
 MIN_INPUTS = 10
 """Least number of training inputs."""
@@ -105,7 +105,7 @@ def activation_statistics(activations: Float[np.ndarray, "N C"], source: object 
     shrinkage = oas_shrinkage(covariance, N) if C > 1 else 0.0
     covariance = (1 - shrinkage) * covariance + shrinkage * variance * np.eye(C)
     eigenvalues, directions = np.linalg.eigh(covariance)
-    whitening = directions.T / np.sqrt(np.maximum(eigenvalues, LEAST_VARIANCE * variance))[:, None]
+    whitening = directions.T / np.sqrt(np.maximum(eigenvalues, MIN_VARIANCE * variance))[:, None]
     unscaled = ActivationStatistics(mean, whitening)
     return ActivationStatistics(mean, whitening / np.quantile(unscaled.distance(values), INSIDE))
 

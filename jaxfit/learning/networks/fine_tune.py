@@ -85,7 +85,7 @@ LABELLED_SHARE = 0.6
 """Share of the samples from labelled frames; all others are simulated."""
 LABELLED_SCENE_SHARE = 0.3
 """Share of the labelled samples with a random scene; most samples keep the scene of the footage."""
-LEAST_COMMON_KEYPOINTS = 4
+MIN_COMMON_KEYPOINTS = 4
 """With fewer keypoints in common, the keypoint network sees no simulated frames."""
 STEPS_PER_SCENE = 8
 """Number of steps after which the samples come from one more simulated scene, so that the training can begin when the
@@ -356,7 +356,7 @@ def _sources(
         return [labelled]
     if network == "keypoints":
         mapped = simulated.frames(1).with_keypoints(data.keypoint_names)
-        least = min(LEAST_COMMON_KEYPOINTS, len(data.keypoint_names))
+        least = min(MIN_COMMON_KEYPOINTS, len(data.keypoint_names))
         if not ((mapped.visibility == 2).sum(-1) >= least).any():
             return [labelled]
     names = data.keypoint_names if network == "keypoints" else None

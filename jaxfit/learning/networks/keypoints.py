@@ -52,7 +52,7 @@ UNDETECTED_SHARE = 0.1
 """Share of the neighbours that the segmenter does not detect, so that they stay visible."""
 MIN_VISIBLE = 4
 """Least number of visible keypoints of a bird in the training data."""
-MOST_DRAWS = 1000
+MAX_DRAWS = 1000
 """Largest number of draws of a frame without a usable bird, so that damaged frames do not block the training."""
 _opposite = cache(opposite_keypoints)
 
@@ -118,7 +118,7 @@ def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: f
     Raises:
         InputError: none of many frames shows a bird.
     """
-    for _ in range(MOST_DRAWS):
+    for _ in range(MAX_DRAWS):
         s, n = draw_bird(rng, frames, SPREAD_SHARE)
         birds = _usable_birds(frames, s)
         if not len(birds) or (n is not None and n not in birds):
@@ -126,7 +126,7 @@ def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: f
         patch = _augmented_patch(rng, frames, s, int(rng.choice(birds)) if n is None else n, scene_share)
         if patch is not None:
             return _crop_sample(rng, *patch)
-    raise InputError("frames", f"show no bird in {MOST_DRAWS} draws", "film the frames again")
+    raise InputError("frames", f"show no bird in {MAX_DRAWS} draws", "film the frames again")
 
 
 def _augmented_patch(

@@ -19,12 +19,12 @@ from jaxtyping import Bool, Float
 
 from jaxfit.data.keypoint_names import opposite_keypoints
 from jaxfit.data.masks import decode_mask
-from jaxfit.learning.networks.labelled_frames import MOST_BIRDS, LabelledFrames
+from jaxfit.learning.networks.labelled_frames import MAX_BIRDS, LabelledFrames
 from jaxfit.learning.networks.labels import LabelledBird, LabelledPicture
 
-LEAST_COMMON = 6
+MIN_COMMON = 6
 """Least number of keypoints that two birds must share for a comparison."""
-LEAST_REFERENCES = 20
+MIN_REFERENCES = 20
 """With fewer comparable birds, nothing is detected."""
 NEAREST = 3
 """The distance of a bird is the mean over this number of nearest reference birds: one wrong label misleads less."""
@@ -74,8 +74,8 @@ def mixed_up_birds(
 def _distance(layout: np.ndarray, known: np.ndarray, others: np.ndarray, there: np.ndarray) -> float | None:
     """Return the mean distance of a layout to its nearest others; None with too few others."""
     common = known & there
-    usable = common.sum(1) >= min(LEAST_COMMON, known.sum())
-    if usable.sum() < LEAST_REFERENCES or known.sum() < 4:
+    usable = common.sum(1) >= min(MIN_COMMON, known.sum())
+    if usable.sum() < MIN_REFERENCES or known.sum() < 4:
         return None
     common, others = common[usable], others[usable]
     count = common.sum(1, keepdims=True)
@@ -138,8 +138,8 @@ def check_picture(
     if size != picture.size_px:
         problem = f"the picture is {size[0]}×{size[1]}, but the labels say {picture.size_px[0]}×{picture.size_px[1]}"
         return None, [left_out(problem)]
-    if len(picture.birds) > MOST_BIRDS:
-        return None, [left_out(f"the picture holds {len(picture.birds)} birds, more than {MOST_BIRDS}")]
+    if len(picture.birds) > MAX_BIRDS:
+        return None, [left_out(f"the picture holds {len(picture.birds)} birds, more than {MAX_BIRDS}")]
     usable, problems = [], []
     for bird in picture.birds:
         problem = _problem(bird, picture.size_px, network)
@@ -167,7 +167,7 @@ def check_sides(
     references_px, references_known = np.zeros((0, len(names), 2)), np.zeros((0, len(names)), bool)
     if simulated is not None:
         frames = simulated.with_keypoints(names)
-        usable = frames.known.sum(-1) >= LEAST_COMMON
+        usable = frames.known.sum(-1) >= MIN_COMMON
         references_px, references_known = frames.keypoints_px[usable], frames.known[usable]
     points = np.stack([bird.keypoints_px for _, bird in birds])
     known = np.stack([bird.visibility > 0 for _, bird in birds])

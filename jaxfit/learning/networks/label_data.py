@@ -58,11 +58,11 @@ _logger = logging.getLogger(__name__)
 
 GAP_FRAMES = 25
 """Pictures that are nearer to a held-out picture of their video, in frames, belong to neither part."""
-MOST_GAP = 0.1
+MAX_GAP = 0.1
 """Largest share of a video's pictures in the gap at a border of a held-out block; at least one picture."""
 PICTURES_PER_BLOCK = 50
 """Number of labelled pictures of a video for each held-out block of time."""
-MOST_HELD_OUT = 0.4
+MAX_HELD_OUT = 0.4
 """Largest share of the pictures that are held out as whole videos."""
 
 
@@ -79,7 +79,7 @@ class Split(NamedTuple):
 def split_pictures(pictures: Sequence[LabelledPicture], share: float) -> Split:
     """Hold out whole videos if there are several, or else blocks of consecutive labelled pictures.
 
-    Every label file is a video. Whole videos are held out if this keeps at least `1 − MOST_HELD_OUT` of the pictures
+    Every label file is a video. Whole videos are held out if this keeps at least `1 − MAX_HELD_OUT` of the pictures
     for the training. Otherwise, the last part of every video, or of every block of `PICTURES_PER_BLOCK` labelled
     pictures, is held out. Pictures at the borders of a held-out block belong to neither part if they are nearer than
     `GAP_FRAMES`.
@@ -115,7 +115,7 @@ def _by_video(pictures: Sequence[LabelledPicture], videos: list[list[int]], shar
             break
         held.append(video)
     holdout = sorted(i for video in held for i in video)
-    if len(holdout) > MOST_HELD_OUT * len(pictures):
+    if len(holdout) > MAX_HELD_OUT * len(pictures):
         return None
     names = ", ".join(pictures[video[0]].source.name for video in held)
     training = [i for i in range(len(pictures)) if i not in set(holdout)]
@@ -132,7 +132,7 @@ def _by_time(pictures: Sequence[LabelledPicture], videos: list[list[int]], share
             count = round(share * len(block)) or (len(block) > 1)
             holdout += block[len(block) - count :].tolist()
         held = set(holdout) & set(video)
-        reach = max(1, round(MOST_GAP * len(video)))
+        reach = max(1, round(MAX_GAP * len(video)))
         for place, i in enumerate(video):
             if i in held:
                 continue

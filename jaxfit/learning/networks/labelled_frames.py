@@ -18,7 +18,7 @@ from jaxfit.model.anatomy import MURRE_KEYPOINTS
 
 MARKER = "frames.npz"
 """The file of the labels; every folder of labelled frames contains this file."""
-MOST_BIRDS = 254
+MAX_BIRDS = 254
 """Largest number of birds in a frame."""
 UNKNOWN_OWNER = 255
 """Owner of a pixel that may be bird or background: the pixel does not count in the training of a segmenter."""
@@ -187,7 +187,7 @@ def _check_labels(frames: LabelledFrames, folder: Path) -> None:
         raise _wrong(folder, "type of numbers")
     valid = {
         "number of keypoints": frames.visibility.shape[2] == len(frames.keypoint_names),
-        "number of birds": frames.visibility.shape[1] <= MOST_BIRDS,
+        "number of birds": frames.visibility.shape[1] <= MAX_BIRDS,
         "number of frames": len(frames.pictures) > 0,
         "position of a keypoint": bool((np.abs(frames.keypoints_px.astype(np.float64)) <= LARGEST_POSITION_PX).all()),
         "visibility": bool((frames.visibility <= UNKNOWN).all()),

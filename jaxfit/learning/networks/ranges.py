@@ -6,9 +6,9 @@ from jaxfit.foundation.errors import InputError
 
 CHECKS = 10
 """Number of measurements on the held-out pictures during a training on labels."""
-_LEAST_STEPS = 20
+_MIN_STEPS = 20
 """Least number of steps of a training without labels."""
-_MOST_SCENES = 900
+_MAX_SCENES = 900
 
 
 def check_numbers(has_labels: bool, steps: int | None, scenes: int, seed: int, **shares: float) -> None:
@@ -24,12 +24,12 @@ def check_numbers(has_labels: bool, steps: int | None, scenes: int, seed: int, *
     Raises:
         InputError: a number outside its range.
     """
-    least = CHECKS if has_labels else _LEAST_STEPS
+    least = CHECKS if has_labels else _MIN_STEPS
     if steps is not None and steps < least:
         raise InputError("train: steps", f"is {steps}", f"give {least} or more")
     least = 0 if has_labels else 1
-    if not least <= scenes <= _MOST_SCENES:
-        raise InputError("train: scenes", f"is {scenes}", f"give {least} to {_MOST_SCENES}")
+    if not least <= scenes <= _MAX_SCENES:
+        raise InputError("train: scenes", f"is {scenes}", f"give {least} to {_MAX_SCENES}")
     if seed < 0:
         raise InputError("train: seed", f"is {seed}", "give a whole number from 0")
     for name, share in shares.items():

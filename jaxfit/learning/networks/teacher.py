@@ -56,7 +56,7 @@ FLOW_SIDE_PX = 480
 """Longer side of the pictures of the optical flow."""
 SMALLER = 2 / 3
 """Scale of the mirrored frame in the second run of the teacher."""
-MOST_MISSES = 3
+MAX_MISSES = 3
 """Number of consecutive examined frames without a mask that counts, after which the moved masks are of no use: the
 tracking of a seed continues in a frame in which two runs of the teacher detect its birds."""
 SEED_IOU = 0.7
@@ -351,9 +351,9 @@ def _walk(
         moved = [_resized(mask, film.size_px) > 0.5 for mask in carried]
         found, others = _segment(teacher, film.picture(number), moved)
         lost = [_iou(mask, before) <= MIN_IOU for mask, before in zip(found, moved, strict=True)]
-        if any(lost) or misses > MOST_MISSES:
+        if any(lost) or misses > MAX_MISSES:
             is_unbroken = False
-            lost = [misses > MOST_MISSES or is_lost for is_lost in lost]
+            lost = [misses > MAX_MISSES or is_lost for is_lost in lost]
             birds = _detected_again(teacher, film.picture(number), found, lost)
             found, lost = (birds, [False] * len(birds)) if birds else (found, lost)
         carried = [

@@ -156,7 +156,7 @@ def _smoothed(weights: Float[np.ndarray, "P J"], faces: Int[np.ndarray, "Q 3"]) 
 
 LARGEST_PERCENT = 5.0
 """The last colour of the picture."""
-LEAST_COMMON = 4
+MIN_COMMON = 4
 """Fewest common keypoints, or joints, that align two models."""
 
 
@@ -208,7 +208,7 @@ def _by_names(first: Bird, second: Bird) -> Similarity:
     for kind in ("keypoints", "joints"):
         place = [own[kind] for own in points]
         common = [name for name in place[0] if name in place[1]]
-        if len(common) >= LEAST_COMMON:
+        if len(common) >= MIN_COMMON:
             to_first = [np.stack([places[name] for name in common]) for places in place]
             return fit_similarity(to_first[1], to_first[0])
     raise InputError(second.name, f"shares no four keypoints or joints with {first.name}", "compare models of birds")

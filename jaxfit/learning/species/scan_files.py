@@ -19,9 +19,9 @@ from jaxfit.foundation.limits import KEYPOINTS, KEYPOINTS_BYTES, SCAN_BYTES, SCA
 from jaxfit.foundation.reading import check_readable, open_file, parse_json, read_text
 
 SCAN_FORMATS = (".ply", ".obj", ".stl", ".glb")
-MOST_FACES = 150_000
+MAX_FACES = 150_000
 """Scans with more faces are decimated to about this number."""
-LEAST_PART = 0.01
+MIN_PART = 0.01
 """Parts with a smaller share of the surface are skipped."""
 
 
@@ -73,7 +73,7 @@ def read_scan(path: str | Path) -> Scan:
         raise InputError(path, "has no area: all its faces are points or lines", "write the scan again")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     remarks = []
-    if count > MOST_FACES:
+    if count > MAX_FACES:
         mesh = _decimated(mesh)
         remarks.append(f"{count:,} faces were decimated to {len(mesh.faces):,}")
     mesh, remark = _without_small_parts(mesh)
@@ -98,13 +98,13 @@ def _meshes(path: Path, kind: str) -> list[trimesh.Trimesh]:
 
 
 def _decimated(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a mesh with at most `MOST_FACES` faces: all vertices in one cell of a grid become one of them."""
-    cell = np.sqrt(2 * mesh.area / MOST_FACES)
+    """Return a mesh with at most `MAX_FACES` faces: all vertices in one cell of a grid become one of them."""
+    cell = np.sqrt(2 * mesh.area / MAX_FACES)
     while True:
         coarse = trimesh.Trimesh(np.asarray(mesh.vertices) / cell, mesh.faces, process=False)
         coarse.merge_vertices(digits_vertex=0)
         coarse.update_faces(coarse.nondegenerate_faces() & coarse.unique_faces())
-        if len(coarse.faces) <= MOST_FACES:
+        if len(coarse.faces) <= MAX_FACES:
             coarse.remove_unreferenced_vertices()
             coarse.vertices = np.asarray(coarse.vertices) * cell
             return coarse
@@ -112,14 +112,14 @@ def _decimated(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def _without_small_parts(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, str]:
-    """Return the mesh without parts of less than `LEAST_PART` of the surface, and a remark about the parts."""
+    """Return the mesh without parts of less than `MIN_PART` of the surface, and a remark about the parts."""
     label = trimesh.graph.connected_component_labels(mesh.edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
     area = np.bincount(label, mesh.area_faces)
     share = area / area.sum()
     parts = np.flatnonzero(np.bincount(label) > 0)
     if len(parts) == 1:
         return mesh, ""
-    kept = np.intersect1d(parts, np.flatnonzero(share >= LEAST_PART))
+    kept = np.intersect1d(parts, np.flatnonzero(share >= MIN_PART))
     if not len(kept):
         return mesh, f"the scan has {len(parts):,} parts, all of them small; all are used"
     mesh.update_faces(np.isin(label, kept))
@@ -132,7 +132,7 @@ def _without_small_parts(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, str]:
     return mesh, remark
 
 
-LEAST_KEYPOINTS = 4
+MIN_KEYPOINTS = 4
 """Fewer keypoints do not determine position, orientation and size, with a check of left and right."""
 
 
@@ -160,8 +160,8 @@ def read_scan_keypoints(
     text = read_text(path, KEYPOINTS_BYTES, "a file of keypoints")
     points = _picked_points(text, path) if path.suffix.lower() == ".pp" else _json_points(text, path, numbered_vertices)
     names = propose_names(list(points), model_names)
-    if len(names.mapped) < LEAST_KEYPOINTS:
-        problem = f"has {len(names.mapped)} keypoints of the model; a fit needs {LEAST_KEYPOINTS}"
+    if len(names.mapped) < MIN_KEYPOINTS:
+        problem = f"has {len(names.mapped)} keypoints of the model; a fit needs {MIN_KEYPOINTS}"
         raise InputError(path, problem, f"the model has {', '.join(model_names)}")
     found = {model: points[own] for own, model in names.mapped.items()}
     spread = np.ptp(np.stack(list(found.values())), axis=0).max()

@@ -288,7 +288,7 @@ def _rows(posed: Linear, vertices, normals, faces, pairs: _Pairs, width: float, 
     ]
 
 
-LEAST_COARSE = 0.02
+MIN_COARSE = 0.02
 """Largest σ of the surface in the last step, as a share of the length: no scan has more noise."""
 
 
@@ -430,7 +430,7 @@ def _surface_steps(
         posed = fit.linearise(x)
         if model is None or step % 8 == 0:  # the visible part changes slowly
             model = ModelSamples.of(posed.vertices.astype(np.float64), faces, settings.samples)
-        largest = coarse * (1 - step / steps) + LEAST_COARSE
+        largest = coarse * (1 - step / steps) + MIN_COARSE
         rows = [targets.rows(posed)]
         rows += surface_rows(posed, model, scan, length, largest, settings.surface_weight)
         x = fit.step(x, Rows(*(np.concatenate(parts) for parts in zip(*rows, strict=True))))

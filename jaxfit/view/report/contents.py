@@ -272,9 +272,9 @@ def _texts_of(field: Field, key: str) -> dict[str, tuple[str, ...]]:
     return {name: tuple(each.text() for each in texts) for name, texts in _entries(field, key)}
 
 
-LEAST_CONFIDENCE = 0.5
+MIN_CONFIDENCE = 0.5
 """Tracks with a lower mean confidence of the keypoints are named."""
-LEAST_COVERAGE = 0.8
+MIN_COVERAGE = 0.8
 """Tracks with detections in a smaller share of their frames are named."""
 _NAMED = 12
 """Number of tracks or frames that a sentence names."""
@@ -329,13 +329,13 @@ def warnings_of(report: Report) -> list[Warned]:
         text = f"The detections may be no birds. Track (mean score): {_pairs(report.low_score_tracks)}."
         warned.append(Warned(f"{counted(len(report.low_score_tracks), 'track')} with a low score skipped", text))
     rated = [(track, track.quality) for track in report.tracks if track.quality is not None]
-    unsure = [track.track_id for track, quality in rated if quality.mean_confidence < LEAST_CONFIDENCE]
+    unsure = [track.track_id for track, quality in rated if quality.mean_confidence < MIN_CONFIDENCE]
     if unsure:
-        text = f"{_named(unsure)}: the mean confidence of the keypoints is below {LEAST_CONFIDENCE:g}."
+        text = f"{_named(unsure)}: the mean confidence of the keypoints is below {MIN_CONFIDENCE:g}."
         warned.append(Warned(f"{counted(len(unsure), 'track')} with uncertain keypoints", text))
-    sparse = [track.track_id for track, quality in rated if quality.coverage < LEAST_COVERAGE]
+    sparse = [track.track_id for track, quality in rated if quality.coverage < MIN_COVERAGE]
     if sparse:
-        text = f"{_named(sparse)}: detected in less than {100 * LEAST_COVERAGE:g} % of the frames of the track."
+        text = f"{_named(sparse)}: detected in less than {100 * MIN_COVERAGE:g} % of the frames of the track."
         warned.append(Warned(f"{counted(len(sparse), 'track')} with gaps", text))
     if report.corrections:
         warned.append(Warned("Corrected tracks", f"Corrections: {'; '.join(report.corrections)}."))

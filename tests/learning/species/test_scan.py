@@ -11,7 +11,7 @@ from support.scans import small_scan, write_scan
 from jaxfit.cli.main import main
 from jaxfit.foundation.array_files import load_npz
 from jaxfit.foundation.errors import InputError
-from jaxfit.learning.species.scan_files import MOST_FACES, read_scan, read_scan_keypoints
+from jaxfit.learning.species.scan_files import MAX_FACES, read_scan, read_scan_keypoints
 from jaxfit.learning.species.species import absolute_bones, body_length, mean_keypoints
 from jaxfit.learning.species.surface import fit_similarity, is_mirrored
 from jaxfit.model.anatomy import other_side
@@ -129,7 +129,7 @@ def test_small_parts_are_skipped_and_large_scans_decimated(tmp_path):
     dust = trimesh.creation.icosphere(subdivisions=1, radius=0.1).apply_translation((20, 0, 0))
     trimesh.util.concatenate([body, dust]).export(path)
     scan = read_scan(path)
-    assert len(scan.faces) <= MOST_FACES < len(body.faces)
+    assert len(scan.faces) <= MAX_FACES < len(body.faces)
     assert len(scan.remarks) == 2
     assert "decimated" in scan.remarks[0]
     assert "2 parts" in scan.remarks[1]
