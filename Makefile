@@ -1,7 +1,7 @@
 # Every target works as the first command in a fresh clone: it makes the virtual environment that it needs.
 PYTHON ?= python3
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 EXTRAS ?= dev
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 # The tests compile thousands of small programs, which takes longer than running them. So most tests do not optimise their
@@ -31,16 +31,13 @@ help:
 
 install: $(VENV)/installed
 
-$(VENV)/installed: pyproject.toml $(wildcard jaxfit/raster/cpp/*)
+$(VENV)/installed: pyproject.toml $(wildcard kernels/*)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "jaxfit needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 $(MAKECMDGOALS)"; exit 1; }
-	@command -v $${CXX:-c++} >/dev/null || \
-	  { echo "No C++ compiler found. Install one (Debian: apt install g++; macOS: xcode-select --install)"; \
-	    echo "or name it: make CXX=/path/to/compiler. Without a compiler jaxfit runs hundreds of times slower."; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	@$(BIN)/python -m pip uninstall -qq --yes jaxfit # the earlier name of this package, or other software
-	$(BIN)/python -m pip install --editable ".[$(EXTRAS)]"
+	CXX="$$($(BIN)/python kernels/compiler.py)" && export CXX && $(BIN)/python -m pip install --editable ".[$(EXTRAS)]"
 	@touch $@
 
 test: install

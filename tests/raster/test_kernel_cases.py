@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.kernel_cases import STORED, cases, read_cases
 
-KERNELS = Path(__file__).resolve().parents[2] / "jaxfit" / "raster" / "cpp"
+KERNELS = Path(__file__).resolve().parents[2] / "kernels"
 COMPILER = shlex.split(os.environ.get("CXX", "c++"))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax.ffi
 import pytest
 
-KERNELS = Path(__file__).resolve().parents[2] / "jaxfit" / "raster" / "cpp"
+KERNELS = Path(__file__).resolve().parents[2] / "kernels"
 COMPILER = shlex.split(os.environ.get("CXX", "c++"))
 
 # the codes are those of absl::StatusCode: 3 invalid argument, 8 resource exhausted, 13 internal

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax.ffi
 
 ROOT = Path(__file__).resolve().parents[2]
-SOURCE = ROOT / "jaxfit" / "raster" / "cpp"
+SOURCE = ROOT / "kernels"
 CASES = ROOT / "tests" / "raster" / "kernel_cases.txt"
 BUILD = ROOT / "build" / "portable"
 
