@@ -37,7 +37,7 @@ $(VENV)/installed: pyproject.toml $(wildcard kernels/*)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	@$(BIN)/python -m pip uninstall -qq --yes jaxfit # the earlier name of this package, or other software
-	CXX="$$($(BIN)/python kernels/compiler.py)" && export CXX && $(BIN)/python -m pip install --editable ".[$(EXTRAS)]"
+	CXX="$$($(BIN)/python kernels/compiler.py)" && export CXX && $(BIN)/python -m pip install --editable ".$(if $(EXTRAS),[$(EXTRAS)])"
 	@touch $@
 
 test: install
