@@ -1,4 +1,4 @@
-"""The layout of the code: docs/developers/architecture.md and modules.md are true, and the rules hold that they state."""
+"""The layout of the code: the rules of docs/developers/architecture.md and modules.md hold."""
 
 import ast
 import re
@@ -72,4 +72,3 @@ def test_no_modules_import_each_other():
 
 def test_no_module_uses_private_parts_of_jax():
     assert not [str(path) for path in MODULES if "jax._src" in path.read_text(encoding="utf-8")]
-

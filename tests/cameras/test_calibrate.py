@@ -5,8 +5,8 @@ import pytest
 from support import checkerboards
 
 from jaxfit.cameras.calibrate import (
-    MIN_VIEWS,
     MAX_VIEWS,
+    MIN_VIEWS,
     Board,
     BoardViews,
     Lens,

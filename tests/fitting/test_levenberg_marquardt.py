@@ -16,8 +16,8 @@ from jaxfit.fitting.levenberg_marquardt import (
     DAMPING_INCREASE,
     FIRST_DAMPING,
     LEVENBERG_MARQUARDT,
-    MOMENTUM,
     MAX_RELAXATION,
+    MOMENTUM,
 )
 from jaxfit.fitting.problem import problem_window
 from jaxfit.foundation.errors import InputError

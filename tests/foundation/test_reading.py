@@ -71,14 +71,14 @@ def test_errors_of_the_system(tmp_path, monkeypatch):
 def test_any_exception_of_a_library_is_one_line_with_the_file(tmp_path, error):
     file = tmp_path / "file.slp"
     file.write_bytes(b"1")
-    with pytest.raises(InputError, match=r"file\.slp: is not a SLEAP project that can be read: .+ \(export it again\)"):
-        with reading(file, "a SLEAP project", "export it again"):
-            raise error
+    message = r"file\.slp: is not a SLEAP project that can be read: .+ \(export it again\)"
+    with pytest.raises(InputError, match=message), reading(file, "a SLEAP project", "export it again"):
+        raise error
     with pytest.raises(InputError, match="does not exist"), reading(tmp_path / "absent", "a SLEAP project"):
         raise AssertionError("the body must not run")
 
 
 def test_an_input_error_of_the_body_stays_as_it_is(tmp_path):
     (tmp_path / "file").write_bytes(b"1")
-    with pytest.raises(InputError, match="^inner: problem"), reading(tmp_path / "file", "a file"):
+    with pytest.raises(InputError, match=r"^inner: problem"), reading(tmp_path / "file", "a file"):
         raise InputError("inner", "problem", "remedy")
