@@ -234,7 +234,7 @@ def _write_report(
 ) -> None:
     """Write the report, with what the birds do."""
     report = solution, bird, observations, summary, settings, folder, video
-    write_report(part / REPORT, *report, force=True, describe=partial(shown_behaviour, solution, bird, progress))
+    write_report(part / REPORT, *report, force=True, behaviour=shown_behaviour(solution, bird, progress))
 
 
 def _with_segmenter(

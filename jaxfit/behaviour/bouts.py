@@ -93,9 +93,9 @@ def find_bouts(description: Description, config: BehaviourConfig) -> Ethogram:
     """Return the bouts of all birds.
 
     A bout of a rule is a run of frames in which all conditions of `lasts` hold, with a frame in which all conditions of
-    `begins` hold (hysteresis). Interruptions of up to `bridge_s` belong to it, and runs shorter than `min_s` do not
+    `begins` hold (hysteresis). Interruptions of up to `bridge_s` belong to it, and runs shorter than `least_s` do not
     count. Rules of earlier behaviours take their frames first; what they leave of a bout counts if it has a frame of
-    `begins` and lasts `min_s`. For a flight, this includes the frames that its own take-off and landing take.
+    `begins` and lasts `least_s`. For a flight, this includes the frames that its own take-off and landing take.
 
     Args:
         description: features, with those of the config. Their times are known.
@@ -191,13 +191,13 @@ def _kept(
     frame_s: np.ndarray,
     rule: BehaviourRule,
 ) -> Bool[np.ndarray, "N T"]:
-    """Return the runs that contain a frame of `begins` and last at least `min_s`."""
+    """Return the runs that contain a frame of `begins` and last at least `least_s`."""
     kept, pause = np.zeros_like(mask), _pauses(time_s, frame_s, rule)
     for n, row in enumerate(mask):
         for run in _runs(row, pause):
             last = run.stop - 1
             seconds = time_s[last] + frame_s[last] - time_s[run.start]
-            kept[n, run] = begins[n, run].any() and seconds >= rule.min_s - _EPSILON_S
+            kept[n, run] = begins[n, run].any() and seconds >= rule.least_s - _EPSILON_S
     return kept
 
 

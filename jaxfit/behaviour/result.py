@@ -28,8 +28,7 @@ from jaxfit.foundation.extras import require_package
 from jaxfit.foundation.files import check_new_file, check_writable, write_errors, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.bird import Bird
-from jaxfit.view.report.behaviour import Behaviour
-from jaxfit.view.report.ethogram import ethogram_svg
+from jaxfit.view.report.behaviour import Behaviour, ethogram_svg
 
 UNEVEN = 0.2
 """Share by which the time between frames varies, from which the frame rate is called variable."""

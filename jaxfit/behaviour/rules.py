@@ -58,7 +58,7 @@ class BehaviourRule:
     """Instead of conditions: the end of each bout of this behaviour, if the bird is seen after it."""
     around_s: float = 0.3
     """With `start_of` and `end_of`: time before and after the start or the end, seconds."""
-    min_s: float = 0.0
+    least_s: float = 0.0
     """Shorter bouts do not count, seconds."""
     bridge_s: float = 0.2
     """Shorter interruptions, also without a pose, are part of the bout, seconds. With `start_of` and `end_of`: longest
@@ -68,7 +68,7 @@ class BehaviourRule:
 
     def __post_init__(self):
         require(bool(self.definition.strip()), "definition", "is empty", "say in one sentence what the bird does")
-        require_within(self, 0, _LONGEST_S, "around_s", "min_s", "bridge_s")
+        require_within(self, 0, _LONGEST_S, "around_s", "least_s", "bridge_s")
         ways = [bool(self.begins), self.start_of is not None, self.end_of is not None]
         remedy = "give one of them; `begins: {}` and `start_of: null` leave out what the base gives"
         require(sum(ways) == 1, "", f"has {sum(ways)} of begins, start_of and end_of", remedy)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import time
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -78,8 +77,8 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     report = done.solution, bird, observations, done.summary, config_to_yaml(config), result_folder
     measured = [_measured(table) for table in compared]
     measured[-1] = measured[-1]._replace(note=f"{measured[-1].note}; {numbers}")
-    describe = partial(shown_behaviour, done.solution, bird, terminal)
-    write_report(result_folder / REPORT, *report, scene_folder / FOOTAGE, measured=measured, describe=describe)
+    behaviour = shown_behaviour(done.solution, bird, terminal)
+    write_report(result_folder / REPORT, *report, scene_folder / FOOTAGE, measured=measured, behaviour=behaviour)
     if verbose:
         for output in (track_table(observations, done.solution), *compared, flag_quality_line(result), numbers):
             show(output)

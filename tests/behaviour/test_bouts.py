@@ -90,8 +90,8 @@ def test_a_bridge_joins_runs_of_which_one_begins():
 
 def test_short_runs_do_not_count():
     pitch = [60] * 2 + [0] + [60] * 4 + [0] + [60] * 7
-    assert found({"body_pitch": pitch}, {"begins": UP, "min_s": 0.5}) == [(8, 15)]
-    bridged = {"begins": UP, "min_s": 1.4, "bridge_s": 0.2}
+    assert found({"body_pitch": pitch}, {"begins": UP, "least_s": 0.5}) == [(8, 15)]
+    bridged = {"begins": UP, "least_s": 1.4, "bridge_s": 0.2}
     assert found({"body_pitch": pitch}, bridged) == [(0, 15)]  # interruptions are bridged first
 
 
@@ -100,7 +100,7 @@ def test_frame_rates_do_not_matter():
     for fps in (10, 25, 50):
         time_s = np.arange(4 * fps) / fps
         up = ((time_s > 0.95) & (time_s < 1.95)) | ((time_s > 2.15) & (time_s < 2.35)) | (time_s > 3.15)
-        rule = {"begins": UP, "bridge_s": 0.3, "min_s": 0.9}
+        rule = {"begins": UP, "bridge_s": 0.3, "least_s": 0.9}
         (bout,) = find_bouts(described({"body_pitch": 60.0 * up}, fps=fps), rules(up=rule)).bouts
         assert bout.start_s == pytest.approx(1, abs=0.051)
         assert bout.stop_s == pytest.approx(2.35, abs=0.051)
@@ -130,7 +130,7 @@ def test_every_bird_has_its_own_bouts():
 
 def test_one_frame_and_no_frame_with_a_value():
     assert found({"body_pitch": [60]}, {"begins": UP}) == [(0, 1)]
-    assert found({"body_pitch": [60]}, {"begins": UP, "min_s": 0.5}) == []
+    assert found({"body_pitch": [60]}, {"begins": UP, "least_s": 0.5}) == []
 
 
 def test_a_short_interruption_without_a_pose_belongs_to_the_bout():
@@ -147,7 +147,7 @@ def test_a_pause_of_the_camera_ends_a_bout():
 
 def test_a_bout_of_the_least_duration_counts():
     """Five frames last 0.5 s: `stop_s` - `start_s`."""
-    assert found({"body_pitch": [0] + [60] * 5 + [0]}, {"begins": UP, "min_s": 0.5}) == [(1, 6)]
+    assert found({"body_pitch": [0] + [60] * 5 + [0]}, {"begins": UP, "least_s": 0.5}) == [(1, 6)]
 
 
 # ----------------------------------------------------------------------------------------------------- several rules
@@ -166,7 +166,7 @@ def test_earlier_rules_take_their_frames():
 
 
 def test_a_run_that_is_too_short_takes_no_frames():
-    high, low = {"begins": {"body_pitch": "> 70"}, "min_s": 0.5}, {"begins": UP}
+    high, low = {"begins": {"body_pitch": "> 70"}, "least_s": 0.5}, {"begins": UP}
     ethogram = find_bouts(described({"body_pitch": [60, 80, 80, 60]}), rules(high=high, low=low))
     assert spans(ethogram) == [(0, 0, 4)]
 
@@ -174,7 +174,7 @@ def test_a_run_that_is_too_short_takes_no_frames():
 def test_what_an_earlier_rule_leaves_may_be_too_short():
     """Of 0.8 s, the earlier rule leaves 0.2 s and 0.4 s; the later rule has the short rest."""
     pitch = [60] * 2 + [80] * 2 + [60] * 4
-    high, up = {"begins": {"body_pitch": "> 70"}}, {"begins": UP, "min_s": 0.3}
+    high, up = {"begins": {"body_pitch": "> 70"}}, {"begins": UP, "least_s": 0.3}
     ethogram = find_bouts(described({"body_pitch": pitch}), rules(high=high, up=up, rest={"begins": UP}))
     assert spans(ethogram, "up") == [(0, 4, 8)]
     assert spans(ethogram, "rest") == [(0, 0, 2)]
@@ -197,7 +197,7 @@ def test_missing_poses_do_not_make_a_long_bout_too_short():
     """Of 2 s, every fourth frame has no pose."""
     valid = (np.arange(20) % 4 != 3)[None]
     ethogram = find_bouts(
-        described({"body_pitch": [60] * 20}, valid), rules(up={"begins": UP, "min_s": 0.5, "bridge_s": 0.3})
+        described({"body_pitch": [60] * 20}, valid), rules(up={"begins": UP, "least_s": 0.5, "bridge_s": 0.3})
     )
     assert (ethogram.state[valid] == 0).all()
 

@@ -57,7 +57,7 @@ def rule(**keys):
         (rule(begins={"body_pitch": f"> {'9' * 40}"}), "begins.body_pitch", "numbers up to"),
         (rule(begins={"tallness": "> 1"}), "begins.tallness", "is not known"),
         (rule(begins={"no_module:tall": "> 1"}), "begins.no_module:tall", "cannot be imported"),
-        (rule(min_s=-1), "min_s", "-1"),
+        (rule(least_s=-1), "least_s", "-1"),
         (rule(bridge_s=float("nan")), "bridge_s", "nan"),
         (rule(around_s=1e9), "around_s", "1000000000"),
         (lambda: BehaviourConfig({}), "behaviours", "0 rules"),
@@ -99,7 +99,7 @@ def test_own_rules_in_a_file(tmp_path):
         ('begins: {spead: "> 0.5"}', "behaviours.walking.begins.spead"),
         ('begins: {speed: "fast"}', "behaviours.walking.begins.speed"),
         ("begins: {speed: 0.5}", "behaviours.walking.begins.speed"),
-        ("min_s: -2", "behaviours.walking.min_s"),
+        ("least_s: -2", "behaviours.walking.least_s"),
         ("shortest_s: 2", "behaviours.walking.shortest_s"),
     ]:
         path.write_text(f"base: behaviour\nbehaviours:\n  walking:\n    {text}\n")
@@ -118,7 +118,7 @@ def test_conditions_of_a_file_replace_those_of_the_base(tmp_path):
     found = load_behaviour_config(own(tmp_path, text)).behaviours["walking"]
     shipped = load_behaviour_config().behaviours["walking"]
     assert found.lasts == {"speed": "> 0.1"}  # without `airborne` of the base
-    assert (found.begins, found.min_s, found.definition) == (shipped.begins, shipped.min_s, shipped.definition)
+    assert (found.begins, found.least_s, found.definition) == (shipped.begins, shipped.least_s, shipped.definition)
 
 
 def test_null_removes_a_rule_of_the_base(tmp_path):
@@ -176,7 +176,7 @@ def test_features_of_one_name_do_not_replace_each_other(tmp_path, monkeypatch):
 
 
 def test_the_command_shows_the_rules_of_a_file(tmp_path, capsys):
-    path = own(tmp_path, "base: behaviour\nbehaviours: {attack: null, walking: {min_s: 0.7}}\n")
+    path = own(tmp_path, "base: behaviour\nbehaviours: {attack: null, walking: {least_s: 0.7}}\n")
     assert main(["config", "show", str(path)]) == 0
     shown = own(tmp_path, capsys.readouterr().out, "shown.yaml")
     assert load_behaviour_config(shown) == load_behaviour_config(path)

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxfit.data.flags import CONTRADICTED, FLAGS, UNSURE, expected_error, flagged_ranges, flags
-from jaxfit.data.formats.fields import Field
 from jaxfit.data.observations import Observations, mean_confidence
 from jaxfit.data.result_folder import SUMMARY
 from jaxfit.data.solution import Solution
 from jaxfit.data.tracks import TrackQuality, frame_step, track_quality
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
 
 
@@ -145,7 +145,7 @@ def gather(
     Args:
         solution: the poses.
         observations: the detections of the same tracks and frames; None if they are unknown.
-        summary: content of `summary.json`, in the types of JSON.
+        summary: content of `summary.json`.
         config: the config as YAML.
         folder: folder of the result.
         bird: the model of the result; None leaves out error bars, which are shares of the length of the bird.
@@ -153,9 +153,6 @@ def gather(
     Raises:
         InputError: an entry of the summary has another type than jaxfit writes.
     """
-    field = Field(folder / SUMMARY, "", summary)
-    video = field["video"] if field.has("video") else None
-    named = video["file"].text() if video is not None and video.has("file") else None
     sizes = solution.image_size_px[solution.valid]
     times_s = np.full(len(solution.frame_index), np.nan) if solution.timestamp_s is None else solution.timestamp_s
     if solution.fps and not np.isfinite(times_s).all():
@@ -163,33 +160,52 @@ def gather(
     expected = np.full(solution.valid.shape, np.nan)
     if bird is not None:
         expected = np.where(solution.valid, expected_error(solution, bird), np.nan)
-    tracks = _tracks(solution, observations, _texts_of(field, "failures"), expected)
+    try:
+        entries = _entries(summary)
+        problems = {track: tuple(map(str, texts)) for track, texts in (summary.get("failures") or {}).items()}
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        problem = f"has an entry that jaxfit does not write: {error}"
+        raise InputError(folder / SUMMARY, problem, "run the reconstruction again") from error
+    video = entries["video"]
+    tracks = _tracks(solution, observations, problems, expected)
     return Report(
         folder=str(folder),
-        title=Path(named).name or named if named else folder.name,
-        video=named,
-        photographs=field["photographs"].integer() if field.has("photographs") else 0,
+        title=Path(video).name or video if video else folder.name,
         frames=solution.frame_index,
         step=frame_step(solution.frame_index),
         times_s=times_s,
         size_px=(int(sizes[0, 0]), int(sizes[0, 1])) if len(sizes) else None,
         fps=solution.fps,
         tracks=tuple(sorted(tracks, key=lambda track: (_first(track), track.position))),
-        damaged=tuple(_integers(video, "damaged")) if video is not None else (),
-        short_tracks={track: f"{each.integer()}" for track, each in _entries(field, "short_tracks")},
-        low_score_tracks={
-            track: f"{each.number(0, 1, 'run the reconstruction again'):.2f}"
-            for track, each in _entries(field, "low_score_tracks")
-        },
-        trust=field["trust"].text() if field.has("trust") else None,
-        trust_reasons=tuple(_texts(field, "trust_reasons")),
-        seconds={
-            name: each.number(0, 1e12, "run the reconstruction again") for name, each in _entries(field, "seconds")
-        },
-        facts=_facts(field),
-        corrections=tuple(_texts(field, "corrections")),
         config=config,
+        **entries,
     )
+
+
+def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a report that `summary.json` holds."""
+
+    def entries(key: str) -> list[tuple[str, Any]]:
+        return list((summary.get(key) or {}).items())
+
+    facts, video = {}, summary.get("video") or {}
+    if summary.get("model"):
+        facts["model"] = f"{summary['model']['name']} ({summary['model']['hash'][:12]})"
+    for kind, files in entries("networks"):
+        facts[f"network: {kind}"] = ", ".join(f"{name} ({digest[:12]})" for name, digest in files.items())
+    facts |= {name: str(version) for name, version in entries("versions")}
+    return {
+        "video": video.get("file"),
+        "damaged": tuple(int(frame) for frame in video.get("damaged") or ()),
+        "photographs": int(summary.get("photographs") or 0),
+        "short_tracks": {track: f"{frames:d}" for track, frames in entries("short_tracks")},
+        "low_score_tracks": {track: f"{score:.2f}" for track, score in entries("low_score_tracks")},
+        "trust": summary.get("trust"),
+        "trust_reasons": tuple(map(str, summary.get("trust_reasons") or ())),
+        "seconds": {name: float(seconds) for name, seconds in entries("seconds")},
+        "facts": facts,
+        "corrections": tuple(map(str, summary.get("corrections") or ())),
+    }
 
 
 def _first(track: Track) -> int:
@@ -243,33 +259,6 @@ def _image_size(solution: Solution) -> Float[np.ndarray, "N T"]:
     """Return the size of every bird in the image, in image pixels per model unit; NaN without a pose."""
     depth = np.where(solution.valid, solution.transl[..., 2], np.nan)
     return solution.scale * (solution.focal_px / solution.crop_px) * solution.crop[..., 2] / depth
-
-
-def _facts(field: Field) -> dict[str, str]:
-    """Return the model, the networks and the versions as texts."""
-    facts = {}
-    if field.has("model"):
-        model = field["model"]
-        facts["model"] = f"{model['name'].text()} ({model['hash'].text()[:12]})"
-    for kind, files in _entries(field, "networks"):
-        facts[f"network: {kind}"] = ", ".join(f"{name} ({each.text()[:12]})" for name, each in files.entries())
-    return facts | {name: each.text() for name, each in _entries(field, "versions")}
-
-
-def _entries(field: Field, key: str) -> list[tuple[str, Field]]:
-    return list(field[key].entries()) if field.has(key) else []
-
-
-def _texts(field: Field, key: str) -> list[str]:
-    return [each.text() for each in field[key]] if field.has(key) else []
-
-
-def _integers(field: Field, key: str) -> list[int]:
-    return [each.integer() for each in field[key]] if field.has(key) else []
-
-
-def _texts_of(field: Field, key: str) -> dict[str, tuple[str, ...]]:
-    return {name: tuple(each.text() for each in texts) for name, texts in _entries(field, key)}
 
 
 MIN_CONFIDENCE = 0.5

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,8 +18,7 @@ from jaxfit.data.solution import Solution, load_solution
 from jaxfit.data.world import as_filmed
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file, write_whole
-from jaxfit.foundation.limits import CONFIG_BYTES
-from jaxfit.foundation.reading import json_values, read_file
+from jaxfit.foundation.reading import reading
 from jaxfit.model.bird import Bird
 from jaxfit.view.report.behaviour import Behaviour
 from jaxfit.view.report.contents import gather
@@ -42,7 +40,7 @@ def write_report(
     video: Path | None,
     force: bool = False,
     measured: Sequence[Measured] = (),
-    describe: Callable[[], Behaviour | None] | None = None,
+    behaviour: Behaviour | None = None,
 ) -> None:
     """Write the report of a result as one HTML page that needs no other file.
 
@@ -56,17 +54,16 @@ def write_report(
         video: the footage; None writes a report without pictures.
         force: draw also on footage that is not the footage of the result.
         measured: metrics against a known truth.
-        describe: returns what the birds do, whose bouts are links to the footage. None writes no section.
+        behaviour: what the birds do; bouts are links to the footage. None writes no section.
 
     Raises:
         InputError: the footage does not belong to the result, or the file cannot be written.
     """
-    report = gather(solution, observations, json_values(summary), config, folder, bird)
+    report = gather(solution, observations, summary, config, folder, bird)
     pictures = []
     if video is not None and solution.valid.any():
         filmed, lens = as_filmed(folder, solution, bird)
         pictures = report_pictures(filmed, bird, video, observations, force, lens)
-    behaviour = None if describe is None else describe()
     film = None if video is None else film_address(video, path)
     write_whole(path, page(report, pictures, measured, behaviour, film).encode())
 
@@ -118,7 +115,8 @@ def report_of_result(
     check_new_file(path, overwrite or out is None)
     solution, bird = load_solution(folder)
     content = read_summary(folder)
-    config = read_file(folder / CONFIG, CONFIG_BYTES, "a config").decode("utf-8", "replace")
+    with reading(folder / CONFIG, "a config") as config_path:
+        config = config_path.read_text("utf-8", "replace")
     observations = None
     if (folder / OBSERVATIONS).is_file():
         observations = check_keypoints(read_coco(folder / OBSERVATIONS), bird.keypoint_names, folder / OBSERVATIONS)
@@ -128,8 +126,8 @@ def report_of_result(
     if video is not None and content.get("photographs"):
         raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
     footage = _footage(content, video)
-    own = None if describe is None else partial(describe, folder)
-    write_report(path, solution, bird, observations, content, config, folder, footage, force, describe=own)
+    behaviour = None if describe is None else describe(folder)
+    write_report(path, solution, bird, observations, content, config, folder, footage, force, behaviour=behaviour)
     return path
 
 
