@@ -22,7 +22,7 @@ from jaxfit.foundation.reading import reading
 from jaxfit.model.bird import Bird
 from jaxfit.view.report.behaviour import Behaviour
 from jaxfit.view.report.contents import gather
-from jaxfit.view.report.page import Measured, page, report_pictures
+from jaxfit.view.report.page import Measured, Picture, page, report_pictures
 
 REPORT = "report.html"
 
@@ -60,12 +60,19 @@ def write_report(
         InputError: the footage does not belong to the result, or the file cannot be written.
     """
     report = gather(solution, observations, summary, config, folder, bird)
-    pictures = []
-    if video is not None and solution.valid.any():
-        filmed, lens = as_filmed(folder, solution, bird)
-        pictures = report_pictures(filmed, bird, video, observations, force, lens)
+    pictures = _pictures(solution, bird, observations, folder, video, force)
     film = None if video is None else film_address(video, path)
     write_whole(path, page(report, pictures, measured, behaviour, film).encode())
+
+
+def _pictures(
+    solution: Solution, bird: Bird, observations: Observations | None, folder: Path, video: Path | None, force: bool
+) -> list[Picture]:
+    """Return frames of the footage with the birds; none without footage or poses."""
+    if video is None or not solution.valid.any():
+        return []
+    filmed, lens = as_filmed(folder, solution, bird)
+    return report_pictures(filmed, bird, video, observations, force, lens)
 
 
 def film_address(film: Path, page: Path) -> str | None:
@@ -126,8 +133,11 @@ def report_of_result(
     if video is not None and content.get("photographs"):
         raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
     footage = _footage(content, video)
-    behaviour = None if describe is None else describe(folder)
-    write_report(path, solution, bird, observations, content, config, folder, footage, force, behaviour=behaviour)
+    report = gather(solution, observations, content, config, folder, bird)
+    pictures = _pictures(solution, bird, observations, folder, footage, force)
+    behaviour = None if describe is None else describe(folder)  # last, because the footage may be wrong
+    film = None if footage is None else film_address(footage, path)
+    write_whole(path, page(report, pictures, (), behaviour, film).encode())
     return path
 
 
