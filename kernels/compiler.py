@@ -20,11 +20,14 @@ def zig_compiler(folder, python, target=None):
         python: the Python whose environment holds the package `ziglang`.
         target: the target of the compilation; None compiles for this machine.
     """
+    # The program itself, because `python -m ziglang` does not find the package within the isolated build of pip.
+    code = "import pathlib, ziglang; print(pathlib.Path(ziglang.__file__).with_name('zig'))"
+    zig = subprocess.run([python, "-c", code], check=True, capture_output=True, text=True).stdout.strip()
     # Debian's Python.h includes a file by its path from /usr/include, which Zig does not search.
     options = (f" -target {target}" if target else "") + " -idirafter /usr/include"
     folder.mkdir(exist_ok=True)
     for name, arguments in {"c++": f"c++{options}", "ar": "ar", "ranlib": "ranlib"}.items():
-        (folder / name).write_text(f'#!/bin/sh\nexec "{python}" -m ziglang {arguments} "$@"\n')
+        (folder / name).write_text(f'#!/bin/sh\nexec "{zig}" {arguments} "$@"\n')
         (folder / name).chmod(0o755)
     return folder / "c++"
 
