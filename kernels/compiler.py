@@ -23,8 +23,9 @@ def zig_compiler(folder, python, target=None):
     # The program itself, because `python -m ziglang` does not find the package within the isolated build of pip.
     code = "import pathlib, ziglang; print(pathlib.Path(ziglang.__file__).with_name('zig'))"
     zig = subprocess.run([python, "-c", code], check=True, capture_output=True, text=True).stdout.strip()
+    # Zig compiles for the processor of this machine by default, but the kernels choose the instruction set themselves.
     # Debian's Python.h includes a file by its path from /usr/include, which Zig does not search.
-    options = (f" -target {target}" if target else "") + " -idirafter /usr/include"
+    options = (f" -target {target}" if target else "") + " -mcpu=baseline -idirafter /usr/include"
     folder.mkdir(exist_ok=True)
     for name, arguments in {"c++": f"c++{options}", "ar": "ar", "ranlib": "ranlib"}.items():
         (folder / name).write_text(f'#!/bin/sh\nexec "{zig}" {arguments} "$@"\n')
