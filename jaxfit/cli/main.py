@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from jaxfit.cli.parser import build_parser
-from jaxfit.foundation.errors import InputError, one_line, shortened
-from jaxfit.foundation.limits import MESSAGE_CHARACTERS
+from jaxfit.foundation.errors import MAX_MESSAGE_CHARACTERS, InputError, one_line, shortened
 
 STOPPED = 130
 """Exit code of an interrupted command."""
@@ -87,12 +86,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 class OneLine(logging.Formatter):
-    """Formats a record as one line of at most `MESSAGE_CHARACTERS`: names in messages may come from damaged files."""
+    """Formats a record as one line of at most `MAX_MESSAGE_CHARACTERS`, since names may come from damaged files."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the prefix of the command and the message."""
         prefix = "jaxfit: "
-        return prefix + shortened(one_line(record.getMessage()), MESSAGE_CHARACTERS - len(prefix))
+        return prefix + shortened(one_line(record.getMessage()), MAX_MESSAGE_CHARACTERS - len(prefix))
 
 
 def _prepare_logging(verbose: bool) -> None:

@@ -143,7 +143,6 @@ def show_config(options: argparse.Namespace) -> None:
     from jaxfit.config.reconstruct import ReconstructConfig
     from jaxfit.config.yaml_file import documented_yaml, read_config, read_yaml, shipped_configs
     from jaxfit.evaluation.ablation.grid import GridConfig
-    from jaxfit.foundation.limits import CONFIG_BYTES
 
     kinds = {"reconstruct": ReconstructConfig, "ablation": GridConfig, "behaviour": BehaviourConfig}
     kind = kinds.get(options.name, FitConfig)
@@ -151,7 +150,7 @@ def show_config(options: argparse.Namespace) -> None:
         remedy = f"give one of {', '.join(shipped_configs())}, or a file with rules of behaviours"
         if not Path(options.name).is_file():
             raise InputError(options.name, "is not a shipped config", remedy)
-        text = read_text(options.name, CONFIG_BYTES, "a YAML file")
+        text = read_text(options.name, "a YAML file")
         if "behaviours" not in read_yaml(text, options.name).values:
             raise InputError(options.name, "holds no rules of behaviours", remedy)
         kind = BehaviourConfig

@@ -16,7 +16,6 @@ from jaxfit.data.formats.coco_records import Untracked
 from jaxfit.data.keypoint_names import NameMap, checked_map, map_keypoints, propose_names
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import NAME_MAP_BYTES
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import read_text
 
@@ -113,7 +112,7 @@ def show_names(names: NameMap, source: str, how: str) -> None:
 def _read_map(path: Path) -> dict[str, str | None]:
     """Return the map of a YAML file with one line `name in the file: name in the model` for every keypoint."""
     remedy = "write lines such as `beak: bill_tip`; null leaves a keypoint out"
-    value = read_yaml(read_text(path, NAME_MAP_BYTES, "a YAML file"), path).values
+    value = read_yaml(read_text(path, "a YAML file"), path).values
     if not value:
         raise InputError(path, "holds no map of names", remedy)
     for old, new in value.items():

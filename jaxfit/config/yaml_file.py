@@ -25,7 +25,6 @@ from jaxfit.config.checks import ConfigKeyError, first_key, join_keys, known_nam
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import (
     CONFIG_BASES,
-    CONFIG_BYTES,
     CONFIG_DIGITS,
     CONFIG_KEY_CHARACTERS,
     CONFIG_LEVELS,
@@ -294,7 +293,7 @@ def shipped_comment(name: str) -> dict[str, str]:
     """
     texts: dict[str, str] = {}
     key = ""
-    for line in read_text(_shipped_folder() / f"{name}.yaml", CONFIG_BYTES, "a YAML file").splitlines():
+    for line in read_text(_shipped_folder() / f"{name}.yaml", "a YAML file").splitlines():
         if not line.startswith("# "):
             break
         if line.startswith("#  ") and key:
@@ -446,7 +445,7 @@ def _choice() -> str:
 def _parse(source: str) -> YamlMapping:
     """Return the mapping that a YAML file or a shipped config holds."""
     path = _shipped_folder() / f"{source}.yaml" if source in shipped_configs() else source
-    return read_yaml(read_text(path, CONFIG_BYTES, "a YAML file"), source)
+    return read_yaml(read_text(path, "a YAML file"), source)
 
 
 def _resolve(base: str, source: str) -> str:

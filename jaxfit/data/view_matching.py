@@ -26,7 +26,6 @@ from jaxfit.cameras.triangulation import epipolar_error_px, fundamental_matrix
 from jaxfit.data.observations import Observations
 from jaxfit.data.views import MAX_ERROR
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CAMERA_BYTES
 from jaxfit.foundation.reading import read_text
 
 BLOCK_FRAMES = 5
@@ -57,7 +56,7 @@ def matches_of_file(path: Path, cameras: Sequence[Camera], observations: Sequenc
     Raises:
         InputError: the file cannot be read, a column is missing, or a row names no bird, or an unknown camera or track.
     """
-    text = read_text(path, CAMERA_BYTES, "a CSV file")
+    text = read_text(path, "a CSV file")
     try:
         rows = list(csv.DictReader(io.StringIO(text)))
     except csv.Error as error:

@@ -27,9 +27,9 @@ from jaxfit.fitting.solve import FitModel, compiled_part, fit_model, needs_mask,
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
 from jaxfit.fitting.windows import Windows, cut_windows, distant_birds, report_distant_birds, windows_key
-from jaxfit.foundation.array_files import check_memory, observations_bytes
+from jaxfit.foundation.array_files import MAX_TABLE_GB, check_memory, observations_bytes
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import TABLE_GB, WINDOW_GB
+from jaxfit.foundation.limits import WINDOW_GB
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.workers import Cluster
 from jaxfit.model.bird import Bird
@@ -45,8 +45,8 @@ def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[F
         source: name of the observations in messages.
 
     Raises:
-        InputError: the tables of poses, or one window, need more memory than `limits.TABLE_GB` or `limits.WINDOW_GB`,
-            and more than `memory_gb`.
+        InputError: the tables of poses, or one window, need more memory than `MAX_TABLE_GB` or `WINDOW_GB`, and more
+            than `memory_gb`.
     """
     config, N, T = configs[0], observations.num_tracks, observations.num_frames
     bones, K = bird.num_joints - 1, bird.num_keypoints
@@ -60,7 +60,7 @@ def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[F
     runs = f" in {len(configs)} runs" if len(configs) > 1 else ""
     remedy = "split the file into parts with fewer frames or tracks, or raise `memory_gb` in the config"
     tables = f"the poses of {N:,} tracks over {T:,} frames{runs}"
-    check_memory(source, tables, needed, remedy, max(TABLE_GB, config.memory_gb))
+    check_memory(source, tables, needed, remedy, max(MAX_TABLE_GB, config.memory_gb))
 
     search = config.initialise
     orientations = search.turns * search.directions if search.method == "so3" else search.turns

@@ -25,7 +25,6 @@ from jaxfit.data.world import in_frame_of_camera, largest_image_px
 from jaxfit.fitting.contacts import SLOW, feet_cam, interval_of, speed_lengths
 from jaxfit.fitting.ledge import metres
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CAMERA_BYTES
 from jaxfit.foundation.reading import read_text
 from jaxfit.model.bird import Bird
 
@@ -72,7 +71,7 @@ def read_distances(path: Path) -> Distances:
     columns = ("x1_px", "y1_px", "x2_px", "y2_px", "distance_m")
     remedy = f"write the columns {', '.join(columns)}, one row for each measured distance"
     try:
-        rows = list(csv.DictReader(io.StringIO(read_text(path, CAMERA_BYTES, "a CSV file"))))
+        rows = list(csv.DictReader(io.StringIO(read_text(path, "a CSV file"))))
     except csv.Error as error:
         raise InputError(path, f"is not a CSV file: {error}", remedy) from None
     values = np.zeros((len(rows), 5))

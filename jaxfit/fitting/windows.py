@@ -21,9 +21,9 @@ from jaxfit.data.masks import decode_mask
 from jaxfit.data.observations import FrameMasks, Observations
 from jaxfit.data.tracks import assumed_interval_s, frame_interval_s, frame_step
 from jaxfit.fitting.crops import crop_squares, cut_mask, mark_unknown
-from jaxfit.foundation.array_files import check_memory
+from jaxfit.foundation.array_files import MAX_TABLE_GB, check_memory
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import DISTANCE_IMAGE_SIDES, TABLE_GB
+from jaxfit.foundation.limits import DISTANCE_IMAGE_SIDES
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets, ViewMaps
 
@@ -337,7 +337,7 @@ def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray
     usable = prepared.usable(config.min_keypoints)
     needed = len(starts) * config.window * (80 + 60 * prepared.num_keypoints)
     what = f"the arrays of {len(starts):,} windows of {config.window:,} frames"
-    check_memory("observations", what, needed, "lower `window` in the config", max(TABLE_GB, config.memory_gb))
+    check_memory("observations", what, needed, "lower `window` in the config", max(MAX_TABLE_GB, config.memory_gb))
     track = starts[:, 0]
     frame = window_frames(prepared, config, starts)
     rows, columns = track[:, None], np.maximum(frame, 0)

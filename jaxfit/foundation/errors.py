@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from jaxfit.foundation.limits import MESSAGE_CHARACTERS
-
+MAX_MESSAGE_CHARACTERS = 300
+"""Longest message of an error or a warning on the command line."""
 _PREFIX = "jaxfit: "
 _SOURCE_CHARACTERS = 100
 """A message that is too long first shortens its source to this length, because the problem says more than a folder."""
@@ -15,7 +15,7 @@ class InputError(ValueError):
     """A file or an argument that jaxfit cannot use.
 
     The message names the file, the field and the remedy; the command line prints it without a traceback
-    and exits with code 2. The message is one line of at most `MESSAGE_CHARACTERS` with the command line's prefix:
+    and exits with code 2. The message is one line of at most `MAX_MESSAGE_CHARACTERS` with the command line's prefix:
     control characters of the data are escaped, and long parts are shortened in the middle.
     """
 
@@ -23,7 +23,7 @@ class InputError(ValueError):
         self.source, self.problem, self.remedy = str(source), problem, remedy
         punctuation = len(": " + " ()" * bool(remedy))
         parts = [one_line(part) for part in (self.source, problem, remedy)]
-        source_text, problem_text, remedy_text = _fitted(parts, MESSAGE_CHARACTERS - len(_PREFIX) - punctuation)
+        source_text, problem_text, remedy_text = _fitted(parts, MAX_MESSAGE_CHARACTERS - len(_PREFIX) - punctuation)
         super().__init__(f"{source_text}: {problem_text}" + (f" ({remedy_text})" if remedy else ""))
 
     def __reduce__(self) -> tuple:

@@ -1,11 +1,7 @@
 """Limits on input: jaxfit rejects larger input before it uses memory or time.
 
-Each limit is far above real input. docs/reference/limits.md lists all of them.
+Each limit is far above real input.
 """
-
-# --- messages
-MESSAGE_CHARACTERS = 300
-"""Longest message of an error or a warning on the command line."""
 
 # --- images and masks
 IMAGE_SIDE_PX = 16_384
@@ -82,13 +78,7 @@ TILE_OVERLAP = 0.9
 THREADS = 1024
 """Largest number of CPU cores."""
 
-# --- text files
-JSON_LEVELS = 100
-"""Largest depth of lists and objects inside each other in a JSON file."""
-
 # --- configs and grids
-CONFIG_BYTES = 1_000_000
-"""Largest size of a config or grid file. The shipped configs have about 3,000 bytes."""
 CONFIG_LEVELS = 50
 """Largest depth of lists and mappings inside each other in a config. The shipped configs have up to 6 levels."""
 CONFIG_VALUES = 100_000
@@ -101,18 +91,10 @@ CONFIG_BASES = 20
 """Most files in a chain of bases of one config."""
 GRID_RUNS = 10_000
 """Most runs of a grid or a sweep. The grid of the paper has 34 runs."""
-ABLATION_BYTES = 200_000_000
-"""Largest size of a file that describes the runs of an ablation (ablation.json), or their metrics."""
-
-# --- corrections of tracks
-EDITS_BYTES = 1_000_000
-"""Largest file of corrections of tracks (`--edits`). A correction takes about 20 bytes."""
 
 # --- pictures and videos
 IMAGE_PIXELS = 100_000_000
 """Most pixels of a picture or of a frame of a video: 300 MB in memory."""
-PICTURE_BYTES = 1 << 30
-"""Largest file of a picture."""
 PICTURE_SCANS = 100
 """Most scans of a progressive JPEG picture. Every scan takes the time of a whole picture; usual are ten."""
 FRAMES_PER_S = 100_000
@@ -147,36 +129,18 @@ INSTANCES = 1000
 """Most instances of a frame."""
 MASK_AREA = 50
 """Most area of all boxes of a frame's instances, as a multiple of the frame."""
-JSON_VALUES = 50_000_000
-"""Largest number of values in a JSON file; a value takes up to 72 bytes of memory."""
 
 # --- observations and truths
-OBSERVATIONS_BYTES = 2_000_000_000
-"""Largest COCO file."""
 TEXT_CHARACTERS = 4096
 """Longest name in a COCO file or a scene; tables of names take the length of the longest name for every frame."""
-MURRE_BYTES = 2**26
-"""Largest array of annotations of the data set common_murre_temporal; the published array has 336,000 bytes."""
-TABLE_GB = 2.0
-"""Largest memory of the tables of a file, by estimate: tables have a cell for every track in every frame."""
 
 # --- arrays (.npz and .npy files)
-NPZ_BYTES = 2**30
-"""Memory of all arrays that jaxfit reads from one .npz file: a result of about 1,000,000 birds × frames."""
-NPZ_ARRAYS = 1000
-"""Number of arrays in an .npz file."""
-NPZ_DIRECTORY_BYTES = 2**20
-"""Size of the table of contents of an .npz file."""
-NPY_HEADER_BYTES = 4096
-"""Size of the header of an array in an .npz or .npy file."""
 NPY_DIMENSIONS = 8
 """Dimensions of an array in an .npz or .npy file."""
 NPZ_TEXT_CHARACTERS = 1000
 """Length of one text in an array of texts."""
 
 # --- bird models
-MODEL_BYTES = 2**27
-"""Memory of all arrays of a bird model; the arrays of the murre have 2 MB."""
 MODEL_VERTICES = 100_000
 """Vertices of a bird model."""
 MODEL_FACES = 200_000
@@ -187,22 +151,16 @@ MODEL_KEYPOINTS = 256
 """Keypoints of a bird model."""
 MODEL_SHAPES = 256
 """Shape coefficients of a bird model."""
-CHECKPOINT_BYTES = 2**28
-"""Size of a PyTorch checkpoint of a bird model; published models have about 2 MB."""
 CHECKPOINT_OPCODES = 200_000
 """Length of the pickle of a PyTorch checkpoint."""
 CHECKPOINT_ENTRIES = 10_000
 """Files in a PyTorch checkpoint."""
-MODEL_JSON_BYTES = 2**24
-"""Size of the JSON file of a bird model; the published file has about 3 MB."""
 
 # --- scans
 SCAN_BYTES = 2 << 30
 """Largest file of a scan."""
 SCAN_FACES = 20_000_000
 """Most faces of a scan. A scan of more than 150,000 faces is decimated."""
-KEYPOINTS_BYTES = 1_000_000
-"""Largest file of the annotated keypoints of a scan."""
 
 # --- written files
 NAME_BYTES = 255
@@ -225,8 +183,6 @@ FRAME_DIGITS = 15
 """Most digits of a frame number in the name of a picture."""
 CONFIDENCE = 10.0
 """Largest score of a keypoint. Scores between 1 and this limit count as 1: peaks of a network may lie above 1."""
-CSV_BYTES = 2_000_000_000
-"""Largest CSV file: a million frames of 30 keypoints."""
 HDF5_BYTES = 1_000_000_000
 """Largest array that is read from an HDF5 file, without compression."""
 HDF5_ENTRIES = 10_000
@@ -235,8 +191,6 @@ HDF5_TEXTS = 100_000
 """Most texts of an array of texts in an HDF5 file, such as the names of tracks."""
 HDF5_TEXT_BYTES = 10_000_000
 """Largest text that is read from an HDF5 file."""
-NAME_MAP_BYTES = 100_000
-"""Largest file that maps names of keypoints."""
 MASKS_PER_PICTURE = 100
 """Most connected regions of a picture of masks."""
 
@@ -248,7 +202,5 @@ CAMERA_BYTES = 2_000_000
 about 1,000 bytes."""
 CAMERA_LEVELS = 50
 """Largest depth of lists and mappings inside each other in a file of cameras. Real files have up to 5 levels."""
-COLMAP_BYTES = 200_000_000
-"""Largest images.txt of COLMAP, which also holds the points of the images."""
 MAT_VARIABLES = 1000
 """Most variables in a .mat file."""

@@ -11,15 +11,15 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import JSON_LEVELS, JSON_VALUES
 
+MAX_FILE_BYTES = 2_000_000_000
+"""Largest file that is read into memory at once."""
 _CHECK_PATH = "check the path"
 # Errors of the operating system for a read: the problem, and the action that the user can take.
 _PROBLEMS = {
@@ -102,53 +102,42 @@ def open_file(path: str | Path, kind: str = "a file", absent: str = _CHECK_PATH)
     """
     path = Path(path)
     with _read_errors(path, absent):
-        _require_file(path, path.stat().st_mode, kind)  # before the open, because devices may react to it
-        # without O_NONBLOCK, opening a pipe that replaces the file now would wait for a writer
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
-        with os.fdopen(descriptor, "rb") as file:
-            _require_file(path, os.fstat(descriptor).st_mode, kind)
+        mode = path.stat().st_mode  # before the open, because opening a pipe waits and devices may react
+        if stat.S_ISDIR(mode):
+            raise InputError(path, f"is a folder, not {kind}", "check the path")
+        if not stat.S_ISREG(mode):
+            raise InputError(path, f"is a device or a pipe, not {kind}", "check the path")
+        with path.open("rb") as file:
             yield file
 
 
-def read_file(path: str | Path, max_bytes: int, kind: str = "a file") -> bytes:
-    """Return the bytes of a regular file of at most `max_bytes`.
+def read_file(path: str | Path, kind: str = "a file") -> bytes:
+    """Return the bytes of a regular file of at most `MAX_FILE_BYTES`.
 
     Raises:
         InputError: as `check_readable`; or the file is larger.
     """
     with open_file(path, kind) as file:
-        # the size of a file may change, and is 0 for files of the operating system
         size = os.fstat(file.fileno()).st_size
-        content = bytearray()
-        # in parts, because read() reserves memory for the size that it is given
-        while size <= max_bytes and len(content) <= max_bytes and (part := file.read(2**18)):
-            content += part
-    if max(size, len(content)) > max_bytes:
-        problem = f"has {max(size, len(content)):,} bytes, more than {max_bytes:,}"
-        raise InputError(path, problem, f"give {kind} of at most this size")
-    return bytes(content)
+        if size > MAX_FILE_BYTES:
+            problem = f"has {size:,} bytes, more than {MAX_FILE_BYTES:,}"
+            raise InputError(path, problem, f"give {kind} of at most this size")
+        return file.read()
 
 
-def read_text(path: str | Path, max_bytes: int, kind: str) -> str:
-    """Return the text of a UTF-8 file of at most `max_bytes`, without a byte order mark.
+def read_text(path: str | Path, kind: str) -> str:
+    """Return the text of a UTF-8 file of at most `MAX_FILE_BYTES`, without a byte order mark.
 
     Raises:
         InputError: as `read_file`; or the content is not UTF-8.
     """
-    content = read_file(path, max_bytes, kind)
+    content = read_file(path, kind)
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         problem = f"line {line} is not UTF-8 text (byte {error.start})"
         raise InputError(path, problem, f"give {kind}, saved as UTF-8") from None
-
-
-def _require_file(path: Path, mode: int, kind: str) -> None:
-    if stat.S_ISDIR(mode):
-        raise InputError(path, f"is a folder, not {kind}", "check the path")
-    if not stat.S_ISREG(mode):
-        raise InputError(path, f"is a device or a pipe, not {kind}", "check the path")
 
 
 @contextmanager
@@ -168,17 +157,13 @@ def _read_errors(path: Path, absent: str) -> Iterator[None]:
         raise InputError(path, problem, remedy or absent) from error
 
 
-def read_json_file(path: str | Path, max_bytes: int) -> Any:
+def read_json_file(path: str | Path, kind: str = "a JSON file") -> Any:
     """Return the content of a JSON file as dicts, lists and plain values.
-
-    Args:
-        path: the file.
-        max_bytes: size of the largest file that is accepted.
 
     Raises:
         InputError: as `read_text` and `parse_json`.
     """
-    return parse_json(read_text(path, max_bytes, "a JSON file"), path)
+    return parse_json(read_text(path, kind), path)
 
 
 def parse_json(text: str, source: object) -> Any:
@@ -191,49 +176,31 @@ def parse_json(text: str, source: object) -> Any:
         source: the file, for messages.
 
     Raises:
-        InputError: the text is empty, is not JSON (the message names line and column), has more than `JSON_LEVELS`
-            levels or `JSON_VALUES` values, holds a whole number that Python refuses to read (more than 4,300 digits),
-            or an object that holds a key twice.
+        InputError: the text is empty or is not JSON (the message names line and column), has more levels or digits
+            than Python reads, or has an object that holds a key twice.
     """
     if not text.strip():
         raise InputError(source, "is empty", "write it again")
-    # every value but the first follows one of these characters
-    values = sum(map(text.count, ",[{"))
-    if values > JSON_VALUES:
-        raise InputError(source, f"holds about {values:,} values, more than {JSON_VALUES:,}", "split the file")
+
+    def content_of(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        content = dict(pairs)
+        if len(content) < len(pairs):
+            twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
+            raise InputError(source, f'holds the key "{twice}" twice in one object', "remove one of the two")
+        return content
+
     try:
-        content = json.loads(text, object_pairs_hook=partial(_object, source))
+        return json.loads(text, object_pairs_hook=content_of)
     except json.JSONDecodeError as error:
         # a truncated file has its error at its end, or at the string or list that is not closed
-        cut = text.lstrip().startswith(("{", "[")) and not text.rstrip().endswith(("}", "]"))
-        remedy = "the file ends midway: copy or write it again" if cut else "correct the file or write it again"
+        truncated = text.lstrip().startswith(("{", "[")) and not text.rstrip().endswith(("}", "]"))
+        remedy = "the file ends midway: copy or write it again" if truncated else "correct the file or write it again"
         problem = f"is not valid JSON at line {error.lineno}, column {error.colno}: {error.msg}"
         raise InputError(source, problem, remedy) from None
-    except RecursionError:
-        raise _too_deep(source) from None
     except InputError:
         raise
-    except ValueError:
-        raise InputError(source, "holds a number of too many digits", "write it again") from None
-    level = [content] if isinstance(content, dict | list) else []
-    for _ in range(JSON_LEVELS):
-        values = (each.values() if isinstance(each, dict) else each for each in level)
-        level = [value for part in values for value in part if type(value) in (dict, list)]
-        if not level:
-            return content
-    raise _too_deep(source)
-
-
-def _object(source: object, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        twice = Counter(key for key, _ in pairs).most_common(1)[0][0]
-        raise InputError(source, f'holds the key "{twice}" twice in one object', "remove one of the two")
-    return content
-
-
-def _too_deep(source: object) -> InputError:
-    return InputError(source, f"is nested more than {JSON_LEVELS} levels deep", "write it again")
+    except (ValueError, RecursionError, MemoryError) as error:
+        raise InputError(source, f"is not JSON that can be read: {error}", "write it again") from None
 
 
 def json_text(content: Any, indent: int | None = 2) -> str:

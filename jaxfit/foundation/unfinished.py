@@ -34,7 +34,6 @@ from jaxfit.foundation.files import (
     write_errors,
     write_whole,
 )
-from jaxfit.foundation.limits import CONFIG_BYTES
 from jaxfit.foundation.reading import read_json_file
 
 RECORD = "record.json"
@@ -126,7 +125,7 @@ def read_record(folder: Path) -> Any:
     Raises:
         InputError: the file cannot be read, or is no JSON.
     """
-    return read_json_file(folder / RECORD, CONFIG_BYTES)
+    return read_json_file(folder / RECORD)
 
 
 def differences(held: Any, own: Any, name: str = "") -> Iterator[str]:

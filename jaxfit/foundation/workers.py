@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import LIBRARIES, TRACKING_LIBRARIES, library_versions, require_package
-from jaxfit.foundation.limits import CONFIG_BYTES
 from jaxfit.foundation.reading import read_json_file
 
 ATTEMPTS = 3
@@ -188,7 +187,7 @@ def _remote_client(scheduler: str) -> Iterator[Any]:
     named = f"--scheduler {scheduler}"
     address = scheduler
     if scheduler.endswith(".json"):
-        content = read_json_file(scheduler, CONFIG_BYTES)
+        content = read_json_file(scheduler)
         address = str(content.get("address")) if isinstance(content, dict) else ""
     try:
         with ThreadPoolExecutor(1) as thread:  # a notebook's thread already runs an event loop

@@ -18,7 +18,6 @@ import numpy as np
 from jaxfit.foundation.array_files import load_npz
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
-from jaxfit.foundation.limits import MODEL_BYTES
 from jaxfit.model.bird import ARRAY_FIELDS, Bird, check_bird, neutral_colours, unlimited_joints
 
 FORMAT_VERSION = 1
@@ -81,7 +80,7 @@ def load_bird(path: Path | str) -> Bird:
     path = Path(path)
     layout = ARRAY_FIELDS | STATIC_FIELDS
     optional = {field: layout.pop(field) for field in OPTIONAL_FIELDS} | {_UNIT: ""}
-    content = load_npz(path, layout, FORMAT_VERSION, optional=optional, max_bytes=MODEL_BYTES)
+    content = load_npz(path, layout, FORMAT_VERSION, optional=optional)
     for field, array in content.items():
         kinds = "U" if field in TEXT_FIELDS else "f" if field in (*ARRAY_FIELDS, _UNIT) and field != "faces" else "iu"
         if array.dtype.kind not in kinds:
@@ -126,7 +125,7 @@ def read_provenance(name_or_path: Path | str) -> dict[str, str]:
     """
     if str(name_or_path) == "murre":
         return {}
-    content = load_npz(name_or_path, {}, optional={_PROVENANCE: "lines"}, max_bytes=MODEL_BYTES)
+    content = load_npz(name_or_path, {}, optional={_PROVENANCE: "lines"})
     lines = content.get(_PROVENANCE, np.zeros(0, np.str_))
     if lines.dtype.kind != "U":
         raise InputError(name_or_path, f"{_PROVENANCE}: {lines.dtype} array, expected text", "adapt the model again")

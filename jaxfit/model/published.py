@@ -24,7 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import MODEL_JSON_BYTES
 from jaxfit.foundation.reading import check_readable, read_json_file
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, JOINT_NAMES, mirror_pairs
 from jaxfit.model.bird import Bird, check_bird, neutral_colours, unlimited_joints
@@ -174,7 +173,7 @@ def read_model_json(path: Path | str) -> dict[str, Any]:
             contain an object.
     """
     path = Path(path)
-    content = read_json_file(path, MODEL_JSON_BYTES)
+    content = read_json_file(path)
     if not isinstance(content, dict):
         raise InputError(path, "not a JSON object", "expected bird_eccv.json")
     return content

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CHECKPOINT_BYTES, CHECKPOINT_ENTRIES, CHECKPOINT_OPCODES, NPY_DIMENSIONS
+from jaxfit.foundation.limits import CHECKPOINT_ENTRIES, CHECKPOINT_OPCODES, NPY_DIMENSIONS
 from jaxfit.foundation.reading import read_file
 
 STORAGE_DTYPES = {
@@ -173,7 +173,7 @@ def _global(module: str, attribute: str, path: Path) -> _Name:
 
 
 def _require_size(value: Any) -> int:
-    if type(value) is not int or not 0 <= value <= CHECKPOINT_BYTES:
+    if type(value) is not int or not 0 <= value <= 2**28:
         raise ValueError("a size, offset or stride is out of range")
     return value
 
@@ -233,7 +233,7 @@ def read_tensors(path: Path | str) -> dict[str, np.ndarray]:
             that tensors do not need; or its stated sizes exceed its content.
     """
     path = Path(path)
-    content = read_file(path, CHECKPOINT_BYTES, "a checkpoint of a bird model")
+    content = read_file(path, "a checkpoint of a bird model")
     read = _read_zip if content.startswith(b"PK\x03\x04") else _read_legacy
     try:
         return read(content, path)

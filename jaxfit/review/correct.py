@@ -24,7 +24,6 @@ from jaxfit.fitting.fit import check_observations, fit_runs, windows_of
 from jaxfit.fitting.windows import Windows, window_hash
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_replaceable, new_folder
-from jaxfit.foundation.limits import CONFIG_BYTES
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.reading import read_file
 from jaxfit.model.bird import Bird
@@ -254,6 +253,6 @@ def correct_tracks(
 def read_config(folder: Path) -> tuple[FitConfig | ReconstructConfig, str]:
     """Return the config of a result, of a fit or of a reconstruction, and the text of its file."""
     path = folder / CONFIG
-    text = read_file(path, CONFIG_BYTES, "a config").decode("utf-8", "replace")
+    text = read_file(path, "a config").decode("utf-8", "replace")
     is_reconstruction = any(line.startswith("fit:") for line in text.splitlines())
     return (load_reconstruct_config(path) if is_reconstruction else load_config(path)), text

@@ -12,7 +12,6 @@ import numpy as np
 
 from jaxfit.data.observations import CELLS, MAPPINGS, Observations
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import EDITS_BYTES
 from jaxfit.foundation.reading import read_text
 
 EXAMPLES = {"swap": "3,5@120:200", "cut": "4@80", "join": "2,7", "delete": "6", "exclude": "3@10:20"}
@@ -85,7 +84,7 @@ def read_edits(path: str | Path) -> list[Edit]:
             the first such line.
     """
     edits = []
-    for number, line in enumerate(read_text(path, EDITS_BYTES, "a text file of corrections").splitlines(), 1):
+    for number, line in enumerate(read_text(path, "a text file of corrections").splitlines(), 1):
         text = line.strip()
         if text and not text.startswith("#"):
             try:

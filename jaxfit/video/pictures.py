@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import IMAGE_PIXELS, IMAGE_SIDE_PX, PICTURE_BYTES, PICTURE_SCANS
+from jaxfit.foundation.limits import IMAGE_PIXELS, IMAGE_SIDE_PX, PICTURE_SCANS
 from jaxfit.foundation.reading import check_folder, read_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -51,7 +51,7 @@ def read_picture(
     Returns None for a file that is not a picture of a type in `IMAGE_SUFFIXES`, is damaged, or is too large.
     """
     try:
-        content = read_file(file, PICTURE_BYTES, "a picture")  # OpenCV cannot open a name that is not UTF-8
+        content = read_file(file, "a picture")  # OpenCV cannot open a name that is not UTF-8
     except InputError:
         return None
     size = picture_size(content)

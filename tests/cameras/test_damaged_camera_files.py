@@ -233,13 +233,6 @@ def test_folders_without_a_clear_file_of_cameras_are_refused(tmp_path):
     refused(tmp_path / "bin", "is a binary model of COLMAP")
 
 
-@pytest.mark.parametrize("name", ["a.toml", "a.yaml", "a.xml", "a.json"])
-def test_a_huge_file_is_refused(tmp_path, name):
-    start = {"a.xml": "<?xml", "a.json": "{", "a.yaml": "%YAML:1.0\n", "a.toml": "[cam_0]\n"}[name]
-    (tmp_path / name).write_text(start + " " * CAMERA_BYTES)
-    refused(tmp_path / name, "bytes, more than 2,000,000")
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -256,7 +249,7 @@ def test_a_huge_file_is_refused(tmp_path, name):
 )
 def test_deep_nesting_is_refused(tmp_path, name, content):
     (tmp_path / name).write_text(content)
-    refused(tmp_path / name, "nested|nesting|more than 200 points")
+    refused(tmp_path / name, "nested|nesting|recursion|more than 200 points")
 
 
 def test_deep_nesting_of_a_mat_file_is_refused(tmp_path):

@@ -12,7 +12,7 @@ from rich.table import Table
 from jaxfit.cli import main as cli
 from jaxfit.cli.main import OneLine, main
 from jaxfit.cli.tables import right_aligned, show, show_facts
-from jaxfit.foundation.limits import MESSAGE_CHARACTERS
+from jaxfit.foundation.errors import MAX_MESSAGE_CHARACTERS
 
 NASTY = "[bold]x[/]\x1b[31m\n\udcc5:bird:"
 
@@ -36,7 +36,7 @@ def test_wrong_arguments(capsys, arguments, expected):
     assert line.startswith("jaxfit: ")
     assert expected in line
     assert line.isprintable()
-    assert len(line) <= MESSAGE_CHARACTERS
+    assert len(line) <= MAX_MESSAGE_CHARACTERS
 
 
 def test_logged_messages():
@@ -45,7 +45,7 @@ def test_logged_messages():
     assert line.isprintable()
     assert line.startswith("jaxfit: [bold]x[/]\\x1b[31m\\n\\udcc5")
     assert line.endswith("is damaged")
-    assert len(line) == MESSAGE_CHARACTERS
+    assert len(line) == MAX_MESSAGE_CHARACTERS
 
 
 def test_names_from_files_contain_no_markup(capsys):
@@ -68,7 +68,7 @@ def test_errors_of_the_system_are_one_line(tmp_path, capsys, path):
         assert main(command) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith("jaxfit: ")
-        assert len(line) <= MESSAGE_CHARACTERS
+        assert len(line) <= MAX_MESSAGE_CHARACTERS
 
 
 def test_an_unexpected_error_of_the_system(monkeypatch, capsys):

@@ -133,7 +133,7 @@ def test_other_inputs_are_refused(folder, capsys):
         FOOTAGE.write(folder / "frames")
         part = folder / "result.unfinished" / "frames" / "000000.npz"
         part.write_bytes(part.read_bytes()[:-30])
-        rejected(capsys, command(folder), "frames/000000.npz: is not a readable .npz", "remove this file", alone=False)
+        rejected(capsys, command(folder), "frames/000000.npz: is not an .npz file", "remove this file", alone=False)
         part.unlink()
         assert main(command(folder)) == 0
 

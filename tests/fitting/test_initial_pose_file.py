@@ -174,7 +174,7 @@ def test_damaged_files_are_rejected(tmp_path):
         with pytest.raises(InputError, match=r"cut\.npz"):
             load_initial_poses(tmp_path / "cut.npz", observed(), BIRD)
     np.savez(tmp_path / "objects.npz", **rows(9, init_pose=np.array([{}], dtype=object)))
-    with pytest.raises(InputError, match=r"objects\.npz.*Python objects"):
+    with pytest.raises(InputError, match=r"objects\.npz.*Object arrays"):
         load_initial_poses(tmp_path / "objects.npz", observed(), BIRD)
 
 

@@ -127,7 +127,7 @@ def test_error_names_the_wrong_field_of_a_mesh(avian_mesh_files, change, expecte
         (b'{"V": [[1, 2,\n', "line 2, column 1"),
         (b"[1, 2]", "not a JSON object"),
         (b"\xff\xfe\xfa", "line 1 is not UTF-8"),
-        (b"[" * 200_000, "levels deep"),
+        (b"[" * 200_000, "recursion depth"),
         (b"", "is empty"),
     ],
 )

@@ -73,7 +73,7 @@ def test_a_missing_part_and_a_damaged_part(video, tmp_path):
     file = tmp_path / "p" / "000001.npz"
     content = file.read_bytes()
     file.write_bytes(content[:-9])
-    with pytest.raises(InputError, match=r"000001\.npz: is not a readable .*remove this file"):
+    with pytest.raises(InputError, match=r"000001\.npz: is not an \.npz file .*remove this file"):
         run(video, Parts(tmp_path / "p", {}))
     file.unlink()
     resumed, done = run(video, Parts(tmp_path / "p", {}))

@@ -13,7 +13,6 @@ from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.tracks import track_quality
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import EDITS_BYTES
 from jaxfit.review.edits import EXAMPLES, Edit, apply_edits, edits_text, parse_edit, read_edits
 
 TEXTS = {
@@ -171,7 +170,6 @@ FILES = {
     "binary": (b"PK\x03\x04\xff\xfe\x00", "line 1 is not UTF-8 text (byte 4) (give a text file of corrections, saved"),
     "zeros": (bytes(100_000), "edits.txt: line 1: '\\x00"),
     "UTF-16": ("cut 4@80\n".encode("utf-16"), "is not UTF-8 text"),
-    "too large": (b"#" * (EDITS_BYTES + 1), "has 1,000,001 bytes, more than 1,000,000"),
     "nothing": (b"# nothing\n", "edits.txt: holds no correction (write one a line, for example swap 3,5@120:200)"),
     "unknown track": (b"exclude 9@110\n", "exclude 9@110: there is no track 9 (its tracks are 2, 4, 5)"),
 }

@@ -31,7 +31,6 @@ from jaxfit.cameras.formats.values import (
     stated_unit,
 )
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CAMERA_BYTES
 from jaxfit.foundation.reading import read_text
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
@@ -45,7 +44,7 @@ def read_anipose(path: Path) -> Parsed:
     Raises:
         InputError: the file is not valid TOML, is too large, or a camera lacks a value or holds an impossible value.
     """
-    text = read_text(path, CAMERA_BYTES, "a TOML file of cameras")
+    text = read_text(path, "a TOML file of cameras")
     if any(line.count(".") > _DOTS for line in text.split("\n")):
         raise InputError(path, f"has a line with more than {_DOTS} points", "give a file of cameras")
     try:

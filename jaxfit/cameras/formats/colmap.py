@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from jaxfit.cameras.camera import Camera, Lens
 from jaxfit.cameras.formats.values import LARGEST, Parsed, make_camera, parsed
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CAMERA_BYTES, CAMERAS, COLMAP_BYTES
+from jaxfit.foundation.limits import CAMERAS
 from jaxfit.foundation.reading import read_text
 
 _REMEDY = "export the model from COLMAP again, as text"
@@ -84,7 +84,7 @@ def read_colmap(folder: Path) -> Parsed:
 
 def _intrinsics(path: Path) -> dict[int, _Intrinsics]:
     found: dict[int, _Intrinsics] = {}
-    for line, text in enumerate(read_text(path, CAMERA_BYTES, "cameras.txt of COLMAP").splitlines(), 1):
+    for line, text in enumerate(read_text(path, "cameras.txt of COLMAP").splitlines(), 1):
         words = text.split()
         if not words or words[0].startswith("#"):
             continue
@@ -111,7 +111,7 @@ def _intrinsics(path: Path) -> dict[int, _Intrinsics]:
 
 def _images(path: Path) -> Iterator[tuple[int, str, int, tuple[np.ndarray, np.ndarray]]]:
     """Yield line, name, number of the camera, and pose of each image."""
-    lines = enumerate(read_text(path, COLMAP_BYTES, "images.txt of COLMAP").split("\n"), 1)
+    lines = enumerate(read_text(path, "images.txt of COLMAP").split("\n"), 1)
     count = 0
     for line, text in lines:
         words = text.split(maxsplit=9)

@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import yaml
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CAMERA_BYTES, CAMERA_LEVELS
+from jaxfit.foundation.limits import CAMERA_LEVELS
 from jaxfit.foundation.reading import parse_json, read_text
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -33,7 +33,7 @@ def read_storage(path: Path) -> dict[str, Any]:
     Raises:
         InputError: the file is too large, is nested too deep, is damaged, or holds no keys at its top level.
     """
-    text = read_text(path, CAMERA_BYTES, "a file of cv2.FileStorage").lstrip()
+    text = read_text(path, "a file of cv2.FileStorage").lstrip()
     if not text:
         raise InputError(path, "is empty", _REMEDY)
     if text.startswith("{"):

@@ -20,7 +20,6 @@ from jaxfit.data.masks import box_of_keypoints
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.array_files import check_memory, load_npy
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import MURRE_BYTES
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.video.pictures import image_files
@@ -66,7 +65,7 @@ def read_common_murre(
     folder = Path(folder)
     source = folder / ANNOTATIONS
     names = _names(keypoint_names)
-    array = load_npy(source, max_bytes=MURRE_BYTES)
+    array = load_npy(source)
     if array.dtype.kind not in "fiu":
         raise InputError(source, f"holds {array.dtype}, not numbers", "save it as an array of float64")
     files, (width, height) = _images(folder / IMAGES, progress)

@@ -34,7 +34,7 @@ import numpy as np
 from jaxfit.data.formats.hdf5 import Hdf5Group
 from jaxfit.data.formats.keypoint_table import KeypointTable, check_table_size
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CSV_BYTES, FRAME_DIGITS, HDF5_TEXT_BYTES, TABLE_VALUES
+from jaxfit.foundation.limits import FRAME_DIGITS, HDF5_TEXT_BYTES, TABLE_VALUES
 from jaxfit.foundation.reading import read_file
 
 COORDS = ("x", "y", "likelihood")
@@ -123,7 +123,7 @@ def read_deeplabcut_csv(path: Path) -> KeypointTable:
     Raises:
         InputError: the file cannot be read, a header row is missing, or a cell is not a number.
     """
-    lines = _lines(path, read_file(path, CSV_BYTES, "a CSV file"))
+    lines = _lines(path, read_file(path, "a CSV file"))
     header: list[list[str]] = []
     first: tuple[int, list[str]] | None = None
     for number, cells in lines:

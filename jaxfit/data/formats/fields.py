@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import OBSERVATIONS_BYTES, TEXT_CHARACTERS
+from jaxfit.foundation.limits import TEXT_CHARACTERS
 from jaxfit.foundation.reading import read_json_file
 
 _SURROGATE = re.compile("[\ud800-\udfff]")  # half of a character, which UTF-8 cannot represent
@@ -136,6 +136,6 @@ def read_json(path: Path) -> Field:
     """Return the content of a JSON file.
 
     Raises:
-        InputError: as `read_json_file`, with at most `limits.OBSERVATIONS_BYTES`.
+        InputError: as `read_json_file`.
     """
-    return Field(path, "", read_json_file(path, OBSERVATIONS_BYTES))
+    return Field(path, "", read_json_file(path))

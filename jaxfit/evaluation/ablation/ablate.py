@@ -25,7 +25,6 @@ from jaxfit.fitting.fit import check_observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.files import remove_leftovers, write_whole
-from jaxfit.foundation.limits import ABLATION_BYTES
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.reading import read_json_file
 from jaxfit.foundation.workers import Cluster
@@ -63,7 +62,7 @@ def claim_folder(
     if _is_new(folder):
         write_whole(path, json.dumps(own, indent=1).encode())
         return
-    held = read_json_file(path, ABLATION_BYTES)
+    held = read_json_file(path)
     if not isinstance(held, dict) or not isinstance(held.get("runs"), dict):
         raise InputError(path, "does not describe an ablation", "choose another --out")
     named = {name for run in own["runs"].values() for name in _import_paths(run)}

@@ -17,7 +17,6 @@ from jaxfit.evaluation.evaluate import Evaluation, evaluate
 from jaxfit.evaluation.truth import Truth, match_tracks
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
-from jaxfit.foundation.limits import ABLATION_BYTES
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.reading import json_text, read_json_file
 
@@ -97,8 +96,8 @@ def read_metrics(folder: Path) -> tuple[Evaluation, float, int]:
         InputError: a file cannot be read, or does not hold metrics.
     """
     path, remedy = folder / _EVALUATION, "remove this folder; then the same command fits the run again"
-    content = read_json_file(path, ABLATION_BYTES)
-    summary = read_json_file(folder / SUMMARY, ABLATION_BYTES)
+    content = read_json_file(path)
+    summary = read_json_file(folder / SUMMARY)
     try:
         evaluation = Evaluation.from_dict(content)
         seconds, runs_at_once = summary["seconds"]["fit"], summary["runs_at_once"]

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxfit.data.keypoint_names import propose_names
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import KEYPOINTS, KEYPOINTS_BYTES, SCAN_BYTES, SCAN_FACES
+from jaxfit.foundation.limits import KEYPOINTS, SCAN_BYTES, SCAN_FACES
 from jaxfit.foundation.reading import check_readable, open_file, parse_json, read_text
 
 SCAN_FORMATS = (".ply", ".obj", ".stl", ".glb")
@@ -157,7 +157,7 @@ def read_scan_keypoints(
             the model are given.
     """
     path = Path(path)
-    text = read_text(path, KEYPOINTS_BYTES, "a file of keypoints")
+    text = read_text(path, "a file of keypoints")
     points = _picked_points(text, path) if path.suffix.lower() == ".pp" else _json_points(text, path, numbered_vertices)
     names = propose_names(list(points), model_names)
     if len(names.mapped) < MIN_KEYPOINTS:
