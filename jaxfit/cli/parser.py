@@ -235,7 +235,7 @@ def _training(commands: Any) -> None:
     train.add_argument("--base", metavar="N.onnx", help=text)
     text = "share of the labelled frames for the check of the result; 0 trains without a check (default %(default)s)"
     train.add_argument("--holdout", type=float, default=0.2, metavar="SHARE", help=text)
-    text = "folder of simulated scenes; absent scenes are filmed: with labels while the network trains, else before it "
+    text = "folder of simulated scenes; absent scenes are filmed before the training "
     text += "(default: simulated_frames with labels, else training_frames, 5 GB)"
     train.add_argument("--frames", type=Path, metavar="DIR", help=text)
     train.add_argument(
@@ -245,8 +245,7 @@ def _training(commands: Any) -> None:
     train.add_argument("--varied", type=float, default=0.0, metavar="SHARE", help=text)
     text = "without labels: share of scenes in which the birds flap or fly (default %(default)s)"
     train.add_argument("--wings", type=float, default=0.0, metavar="SHARE", help=text)
-    text = "without labels: weights of EfficientNet-lite0, .pth (default: the encoder of the built-in segmenter)"
-    train.add_argument("--encoder", type=Path, metavar="FILE", help=text)
+    train.add_argument("--encoder", help=argparse.SUPPRESS)  # an option of earlier versions: `train` names the new way
     train.add_argument("--steps", type=int, help="number of training steps (default: by the number of labels)")
     train.add_argument("--seed", type=int, default=0, help="seed of new weights and of samples (default %(default)s)")
 

@@ -22,7 +22,7 @@ from jaxfit.learning.networks.ranges import check_numbers
 
 if TYPE_CHECKING:
     from jaxfit.learning.networks.fine_tune import FineTuned
-    from jaxfit.learning.networks.label_checks import LeftOut
+    from jaxfit.learning.networks.labels import LeftOut
 
 _logger = logging.getLogger(__name__)
 
@@ -55,9 +55,10 @@ def train(options: argparse.Namespace) -> None:
         raise InputError("--video", "is given with labels", "give the film of the labels by --images")
     if options.video and options.network != "segmenter":
         raise InputError("--video", "is given for keypoints", "a teacher makes masks: give labels by --labels")
+    if options.encoder:
+        remedy = "leave it out: a segmenter starts from the encoder of the built-in segmenter; or give --base"
+        raise InputError("--encoder", "is no option any more", remedy)
     if options.labels or options.video:
-        if options.encoder:
-            raise InputError("--encoder", "is given with labels", "give the network to start from by --base")
         _train_on_labels(options)
         return
     for name in ("images", "masks"):
@@ -72,7 +73,7 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
     scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
     # before the imports, which take seconds
     check_numbers(False, options.steps, scenes, options.seed, varied=options.varied, wings=options.wings)
-    from jaxfit.learning.networks.train import Simulation, default_schedule, train_network
+    from jaxfit.learning.networks.training import Simulation, default_schedule, train_network
 
     start = time.perf_counter()
     schedule = default_schedule(options.network, options.base)
@@ -80,8 +81,7 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
         schedule = schedule._replace(steps=options.steps)
     folder = options.frames or Path("training_frames")
     simulation = Simulation(folder, scenes, options.varied, options.wings)
-    what = options.network, options.out, simulation, schedule, options.seed, terminal, options.encoder, options.base
-    losses = train_network(*what)
+    losses = train_network(options.network, options.out, simulation, schedule, options.seed, terminal, options.base)
     loss = ", ".join(f"{name} {value:.3f}" for name, value in losses.items())
     show(f"{options.network} trained in {(time.perf_counter() - start) / 60:.0f} min, loss {loss} → {options.out}")
 
@@ -91,9 +91,9 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     check_numbers(
         True, options.steps, scenes, options.seed, holdout=options.holdout
     )  # before the imports, which take seconds
-    from jaxfit.learning.networks.filming import missing_scenes
     from jaxfit.learning.networks.fine_tune import LABELLED_SHARE, Settings, default_schedule, fine_tune
     from jaxfit.learning.networks.label_data import LabelFiles
+    from jaxfit.learning.networks.scenes import missing_scenes
 
     start = time.perf_counter()
     teacher = options.teacher if options.labels or options.teacher != "auto" else "general"
@@ -111,7 +111,7 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     if missing:
         simulated = f"{100 * (1 - LABELLED_SHARE):.0f} %"
         show(
-            f"{counted(missing, 'simulated scene')} will be filmed into {frames} while the network trains. "
+            f"{counted(missing, 'simulated scene')} will be filmed into {frames} before the network is trained. "
             f"{simulated} of the samples are simulated birds, so that the network does not forget birds that the "
             "labels lack. Later trainings use the scenes again."
         )

@@ -2,12 +2,12 @@
 
 Distance of a network's activations from the activations of its training. A network that `jaxfit train` wrote has an
 output `activations`: its last feature map, averaged over the cells. Its metadata hold the mean μ of the activations of
-its training inputs and a matrix W (`jaxfit.learning.networks.familiarity`). The distance of an input with activations a
-is ‖W (a − μ)‖. W whitens the activations of the training, and its scale is such that 99 % of the training inputs have a
+its training inputs and a matrix W (`jaxfit.learning.networks.network_files`). The distance of an input with activations
+a is ‖W (a − μ)‖. W whitens the activations of the training, and its scale is such that 99 % of the training inputs have a
 distance below 1.
 
 Calibration of confidences: from a network's raw value to the probability that the detection is right. The metadata of a
-network, such as the built-in keypoint network, may hold a curve (`jaxfit.learning.networks.calibration` fits it):
+network, such as the built-in keypoint network, may hold a curve (`tests/benchmarks/confidence_curve.py` fits it):
 points `value:probability`, separated by commas, with linear interpolation between them. The values increase and the
 probabilities do not decrease. Without a curve, the confidence is the network's own value.
 """

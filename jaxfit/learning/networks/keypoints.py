@@ -105,6 +105,11 @@ def _usable_birds(frames: LabelledFrames, s: int) -> Int[np.ndarray, "M"]:
     return np.flatnonzero((frames.visibility[s] == 2).sum(-1) >= least)
 
 
+def has_usable_bird(frames: LabelledFrames) -> bool:
+    """Return whether any bird of the frames has enough visible keypoints for a sample."""
+    return any(len(_usable_birds(frames, s)) for s in range(len(frames.visibility)))
+
+
 def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: float = SCENE_SHARE) -> KeypointSample:
     """Draw a random bird of a random frame, with random rotation, mirroring, appearance and errors of the masks.
 

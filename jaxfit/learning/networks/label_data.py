@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -27,9 +27,7 @@ from jaxfit.data.masks import decode_mask
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder
 from jaxfit.foundation.progress import ProgressTask, silent
-from jaxfit.learning.networks.filming import Filming
 from jaxfit.learning.networks.keypoints import CROPS, PAPER_PIXELS_PER_UNIT
-from jaxfit.learning.networks.label_checks import LeftOut, check_picture, check_sides
 from jaxfit.learning.networks.labelled_frames import (
     MARKER,
     UNKNOWN,
@@ -43,7 +41,10 @@ from jaxfit.learning.networks.labels import (
     LabelledBird,
     LabelledPicture,
     LabelSet,
+    LeftOut,
     StoredPicture,
+    check_picture,
+    check_sides,
     images_of,
     read_labels,
     read_pictures,
@@ -222,10 +223,10 @@ def prepare_frames(
             w, h = sizes[s].tolist()
             resample = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
             stored[s, :h, :w] = cv2.resize(pictures[s].pixels(), (w, h), interpolation=resample)
-            own = owner_of(picture.birds, picture.size_px)
+            birds = owner_of(picture.birds, picture.size_px)
             if picture.unknown is not None:
-                own[decode_mask(picture.unknown)] = UNKNOWN_OWNER
-            owner[s, :h, :w] = cv2.resize(own, (w, h), interpolation=cv2.INTER_NEAREST)
+                birds[decode_mask(picture.unknown)] = UNKNOWN_OWNER
+            owner[s, :h, :w] = cv2.resize(birds, (w, h), interpolation=cv2.INTER_NEAREST)
             per_unit[s] = factor * scale.pixels_per_unit(network, picture.size_px)
             for n, bird in enumerate(picture.birds):
                 points[s, n] = bird.keypoints_px * (w / picture.size_px[0], h / picture.size_px[1])
@@ -303,7 +304,6 @@ def prepare_data(
     labels: LabelSet | None = None,
     progress: ProgressTask = silent,
     teacher: Segmenter | None = None,
-    pictures_are_read: Callable[[], object] = lambda: None,
 ) -> FineTuningData:
     """Read and check labels, store their pictures in a folder, and hold out a part.
 
@@ -316,7 +316,6 @@ def prepare_data(
         labels: the labels, if they are read already.
         progress: reports progress.
         teacher: tracks the masks of a segmenter's labels to other frames of their films; None for labels only.
-        pictures_are_read: is called when all labels and pictures are read and reported.
 
     Raises:
         InputError: labels or pictures cannot be read, or too few labels can be used.
@@ -338,15 +337,16 @@ def prepare_data(
     if network == "keypoints":
         checked, mixed_up = check_sides([picture.labels for picture in stored], labels.keypoint_names, references)
         left_out += mixed_up
-        pairs = zip(stored, checked, strict=True)
-        stored = [StoredPicture(own, picture.file) for picture, own in pairs if own.birds]
+        stored = [StoredPicture(right, old.file) for old, right in zip(stored, checked, strict=True) if right.birds]
     stored.sort(key=lambda picture: (files.labels.index(picture.labels.source), picture.labels.frame))
-    _check_count(stored, left_out, files, network)
+    if not any(picture.labels.birds for picture in stored):
+        problem = f"holds no usable label: {left_out[0] if left_out else 'no bird'}"
+        needs = "" if network == "keypoints" else "; a segmenter needs masks (--masks)"
+        raise InputError(files.labels[0], problem, f"correct the labels{needs}")
     unused = [label for label in left_out if not label.bird]
     if unused:
         text = "%d of %d labelled pictures are not used, for example %s"
         _logger.warning(text, len(unused), len(labels.pictures), unused[0])
-    pictures_are_read()
     tracked = Tracked([], [], 0, [])
     if teacher is not None:
         shutil.rmtree(folder / TRACKED, ignore_errors=True)
@@ -366,9 +366,18 @@ def prepare_data(
         if not (held and i % TRACKED_PER_HELD == 0) and not _is_within(picture.labels, known, split.holdout)
     ]
     frames = prepare_frames(folder / FRAMES, [*training, *seen], labels.keypoint_names, scale, network)
-    said = tracked.sentence() if tracked.confirmed or tracked.doubtful else ""
-    kept = tracked.pictures, held, said
-    return FineTuningData(labels.keypoint_names, frames, stored, holdout, left_out, split, scale, *kept)
+    return FineTuningData(
+        keypoint_names=labels.keypoint_names,
+        frames=frames,
+        pictures=stored,
+        holdout=holdout,
+        left_out=left_out,
+        split=split,
+        scale=scale,
+        tracked=tracked.pictures,
+        tracked_holdout=held,
+        teacher=tracked.sentence() if tracked.confirmed or tracked.doubtful else "",
+    )
 
 
 def _is_within(picture: LabelledPicture, labels: Sequence[LabelledPicture], holdout: Sequence[int]) -> bool:
@@ -388,20 +397,13 @@ def read_label_files(network: str, files: LabelFiles, progress: ProgressTask = s
     return labels
 
 
-def _check_count(stored: list[StoredPicture], left_out: list[LeftOut], files: LabelFiles, network: str) -> None:
-    if any(picture.labels.birds for picture in stored):
-        return
-    problem = f"holds no usable label: {left_out[0] if left_out else 'no bird'}"
-    remedy = "correct the labels" if network == "keypoints" else "correct the labels; a segmenter needs masks (--masks)"
-    raise InputError(files.labels[0], problem, remedy)
-
-
-def fingerprint(data: FineTuningData, simulated: Filming | None, base: Path, settings: Sequence[object]) -> str:
+def fingerprint(data: FineTuningData, scenes: Sequence[Path], base: Path, settings: Sequence[object]) -> str:
     """Return a hash of everything that determines a training, so that only the same training is resumed."""
     content = hashlib.blake2b(digest_size=16)
     content.update(repr((tuple(settings), data.keypoint_names, data.scale, data.split)).encode())
     content.update(base.read_bytes())
-    content.update(b"" if simulated is None else simulated.identity)
+    for folder in scenes:
+        content.update((folder / MARKER).read_bytes())
     for array in (data.frames.keypoints_px, data.frames.visibility, data.frames.pixels_per_unit):
         content.update(np.ascontiguousarray(array).tobytes())
     for pictures, owner in zip(data.frames.pictures, data.frames.owner, strict=True):

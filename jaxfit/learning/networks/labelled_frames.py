@@ -125,13 +125,37 @@ def save_labels(
     )
 
 
-def load_frames(folder: str | Path) -> LabelledFrames:
-    """Load the frames that `film_scenes` or `prepare_frames` wrote.
+def load_frames(*folders: str | Path) -> LabelledFrames:
+    """Load the frames of a folder, or the frames of several folders as one.
+
+    The pictures of one folder are memory-mapped. Of several folders, only the file of the frame in use is open: index
+    one frame at a time.
+
+    Args:
+        folders: folders of frames of the same size with the same keypoints.
 
     Raises:
         InputError: the frames cannot be read, an earlier version wrote them, or the labels hold impossible values.
     """
-    folder = Path(folder)
+    parts = [_load_folder(Path(folder), is_open=len(folders) == 1) for folder in folders]
+    if len(parts) == 1:
+        return parts[0]
+    birds = max(part.visibility.shape[1] for part in parts)
+
+    def with_birds(array: np.ndarray) -> np.ndarray:
+        return np.concatenate([array, np.zeros((len(array), birds - array.shape[1], *array.shape[2:]), array.dtype)], 1)
+
+    return LabelledFrames(
+        cast(Any, _Joined([part.pictures for part in parts])),
+        cast(Any, _Joined([part.owner for part in parts])),
+        np.concatenate([with_birds(part.keypoints_px) for part in parts]),
+        np.concatenate([with_birds(part.visibility) for part in parts]),
+        np.concatenate([part.pixels_per_unit for part in parts]),
+        parts[0].keypoint_names,
+    )
+
+
+def _load_folder(folder: Path, is_open: bool) -> LabelledFrames:
     labels = load_npz(folder / MARKER, _LABELS, optional={"keypoint_names": "K"})
     points, visibility, scale = (labels[name] for name in _LABELS)
     pictures = load_npy(folder / "pictures.npy", f"{len(scale)} H W 3", mapped=True)
@@ -139,64 +163,48 @@ def load_frames(folder: str | Path) -> LabelledFrames:
     names = tuple(str(name) for name in labels.get("keypoint_names", MURRE_KEYPOINTS))
     frames = LabelledFrames(pictures, owner, points, visibility, scale, names)
     _check_labels(frames, folder)
-    return frames
+    if is_open:
+        return frames
+    files = (_FrameFile(folder / f"{name}.npy", getattr(frames, name).shape) for name in ("pictures", "owner"))
+    return frames._replace(**dict(zip(("pictures", "owner"), cast(Any, files), strict=True)))
 
 
-def join_frames(parts: Sequence[LabelledFrames]) -> LabelledFrames:
-    """Return the frames of several folders as one; the pictures stay memory-mapped, and index one frame at a time.
+class _FrameFile(NamedTuple):
+    """A file of frames that is not open."""
 
-    Args:
-        parts: frames of the same size with the same keypoints.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    birds = max(part.visibility.shape[1] for part in parts)
-    pictures, owner = (cast(Any, _Joined([getattr(part, name) for part in parts])) for name in ("pictures", "owner"))
-    points, visibility = (
-        np.concatenate([_with_birds(getattr(part, name), birds) for part in parts])
-        for name in ("keypoints_px", "visibility")
-    )
-    scale = np.concatenate([part.pixels_per_unit for part in parts])
-    return LabelledFrames(pictures, owner, points, visibility, scale, parts[0].keypoint_names)
-
-
-def _with_birds(array: np.ndarray, birds: int) -> np.ndarray:
-    """Return an array (S, N, …) with zeros for further birds."""
-    return np.concatenate([array, np.zeros((len(array), birds - array.shape[1], *array.shape[2:]), array.dtype)], 1)
+    path: Path
+    shape: tuple[int, ...]
 
 
 class _Joined(Sequence[np.ndarray]):
-    """Frames of several arrays in their order, which are not copied."""
+    """Frames of several files in their order; a frame is read when it is indexed."""
 
-    def __init__(self, arrays: Sequence[np.ndarray]):
-        self._frames = [(array, s) for array in arrays for s in range(len(array))]
-        self.shape = (len(self._frames), *arrays[0].shape[1:])
+    def __init__(self, files: Sequence[Any]):
+        self._frames = [(file.path, s) for file in files for s in range(file.shape[0])]
+        self.shape = (len(self._frames), *files[0].shape[1:])
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __getitem__(self, s: Any) -> Any:
-        array, place = self._frames[s]
-        return array[place]
+        path, place = self._frames[s]
+        return np.load(path, mmap_mode="r")[place]
 
 
 def _check_labels(frames: LabelledFrames, folder: Path) -> None:
     integers = all(array.dtype == np.uint8 for array in (frames.pictures, frames.owner, frames.visibility))
     numbers = all(array.dtype == np.float32 for array in (frames.keypoints_px, frames.pixels_per_unit))
-    if not (integers and numbers):  # the checks below need numbers
-        raise _wrong(folder, "type of numbers")
-    valid = {
-        "number of keypoints": frames.visibility.shape[2] == len(frames.keypoint_names),
-        "number of birds": frames.visibility.shape[1] <= MAX_BIRDS,
-        "number of frames": len(frames.pictures) > 0,
-        "position of a keypoint": bool((np.abs(frames.keypoints_px.astype(np.float64)) <= LARGEST_POSITION_PX).all()),
-        "visibility": bool((frames.visibility <= UNKNOWN).all()),
-        "scale": bool(((frames.pixels_per_unit > 0.01) & (frames.pixels_per_unit < 1e4)).all()),
-    }
-    for name, holds in valid.items():
-        if not holds:
-            raise _wrong(folder, name)
-
-
-def _wrong(folder: Path, name: str) -> InputError:
-    return InputError(folder, f"holds frames with a wrong {name}", "remove the folder, to make the frames again")
+    holds = {"type of numbers": integers and numbers}
+    if integers and numbers:
+        holds |= {
+            "number of keypoints": frames.visibility.shape[2] == len(frames.keypoint_names),
+            "number of birds": frames.visibility.shape[1] <= MAX_BIRDS,
+            "number of frames": len(frames.pictures) > 0,
+            "position of a keypoint": bool((np.abs(frames.keypoints_px) <= LARGEST_POSITION_PX).all()),
+            "visibility": bool((frames.visibility <= UNKNOWN).all()),
+            "scale": bool(((frames.pixels_per_unit > 0.01) & (frames.pixels_per_unit < 1e4)).all()),
+        }
+    for name, is_right in holds.items():
+        if not is_right:
+            problem = f"holds frames with a wrong {name}"
+            raise InputError(folder, problem, "remove the folder, to make the frames again")

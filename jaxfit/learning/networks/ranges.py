@@ -6,13 +6,10 @@ from jaxfit.foundation.errors import InputError
 
 CHECKS = 10
 """Number of measurements on the held-out pictures during a training on labels."""
-_MIN_STEPS = 20
-"""Least number of steps of a training without labels."""
-_MAX_SCENES = 900
 
 
 def check_numbers(has_labels: bool, steps: int | None, scenes: int, seed: int, **shares: float) -> None:
-    """Check the numbers of a training.
+    """Check the numbers of a training, and raise InputError for a number outside its range.
 
     Args:
         has_labels: whether a person or a teacher made labels.
@@ -20,19 +17,15 @@ def check_numbers(has_labels: bool, steps: int | None, scenes: int, seed: int, *
         scenes: number of simulated scenes.
         seed: seed of the samples.
         shares: `holdout`, `varied` or `wings`.
-
-    Raises:
-        InputError: a number outside its range.
     """
-    least = CHECKS if has_labels else _MIN_STEPS
-    if steps is not None and steps < least:
-        raise InputError("train: steps", f"is {steps}", f"give {least} or more")
-    least = 0 if has_labels else 1
-    if not least <= scenes <= _MAX_SCENES:
-        raise InputError("train: scenes", f"is {scenes}", f"give {least} to {_MAX_SCENES}")
+    fewest_steps, fewest_scenes = (CHECKS, 0) if has_labels else (20, 1)
+    if steps is not None and steps < fewest_steps:
+        raise InputError("train: steps", f"is {steps}", f"give {fewest_steps} or more")
+    if not fewest_scenes <= scenes <= 900:  # seeds of 1000 and more are for tests
+        raise InputError("train: scenes", f"is {scenes}", f"give {fewest_scenes} to 900")
     if seed < 0:
         raise InputError("train: seed", f"is {seed}", "give a whole number from 0")
     for name, share in shares.items():
-        most = 0.5 if name == "holdout" else 1
-        if not 0 <= share <= most:
-            raise InputError(f"train: {name}", f"is {share}", f"give a share of 0 to {most}")
+        largest = 0.5 if name == "holdout" else 1
+        if not 0 <= share <= largest:
+            raise InputError(f"train: {name}", f"is {share}", f"give a share of 0 to {largest}")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import json
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -13,10 +15,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxfit.data.formats.fields import read_json
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.files import new_folder
+from jaxfit.foundation.files import new_folder, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
-from jaxfit.learning.networks.labelled_frames import MARKER, LabelledFrames, create_pictures, load_frames, save_labels
+from jaxfit.learning.networks.labelled_frames import MARKER, LabelledFrames, save_labels
 from jaxfit.learning.networks.varied import Landscape, Species, draw_landscape, draw_species
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
@@ -249,77 +252,98 @@ def _visibility(points: Float[np.ndarray, "N K 3"], owner: np.ndarray, depths: n
 WIDTH, HEIGHT = 960, 640
 MAX_BIRDS = 14
 FRAMES_PER_SCENE = 10
+WORKERS = 2
+"""Number of processes that film."""
+SHARES = "shares.json"
+"""The shares of varied scenes and of scenes with wings in a folder of scenes."""
 FPS, EVERY = 12.0, 4
 """Every fourth frame at 12 frames/s: the frames of a scene are 1/3 s apart, so that postures differ."""
 
 
 def film_scenes(
     folder: str | Path,
-    seeds: range,
-    workers: int = 2,
-    overwrite: bool = False,
+    count: int,
+    varied: float | None = None,
+    wings: float | None = None,
     progress: ProgressTask = silent,
-    varied: float = 0.0,
-    wings: float = 0.0,
-) -> LabelledFrames:
-    """Simulate scenes and write their frames to a folder; the same seeds give the same frames.
+) -> tuple[Path, ...]:
+    """Film the scenes that a folder lacks, each into a folder of its own; the same seeds give the same frames.
 
     Args:
-        folder: folder to create, with about 32 MB per scene.
-        seeds: one seed per scene.
-        workers: number of parallel processes.
-        overwrite: replace the frames of an earlier run.
+        folder: folder of the scenes, with about 32 MB per scene. A folder in which an earlier version stored the frames
+            of all scenes is used as it is.
+        count: number of scenes, with seeds from 0.
+        varied: share of the scenes with other birds in other landscapes (`varied.py`).
+        wings: share of the scenes in which the birds flap or fly. None: the shares of the scenes in the folder.
         progress: reports every scene.
-        varied: share of the scenes with other birds in other landscapes (`jaxfit.learning.networks`).
-        wings: share of the scenes in which the birds flap or fly.
+
+    Returns:
+        The folders of the first `count` scenes.
 
     Raises:
-        InputError: the folder contains other files, or cannot be written.
+        InputError: the folder holds other files or scenes of other shares, or cannot be written; or the system ended a
+            process.
     """
-    most = MAX_VARIED_BIRDS if varied else MAX_BIRDS
-    with new_folder(folder, overwrite, marker=MARKER) as part:
-        pool = ProcessPoolExecutor(workers, mp_context=get_context("spawn"))  # a fork breaks compiled code
-        with progress("Filming simulated scenes for the training", len(seeds)) as report_progress, pool:
-            scenes = pool.map(partial(_film_scene, varied=varied, wings=wings), seeds)
-            _write_scenes(part, scenes, len(seeds), most, lambda: report_progress(1, ""))
-    return load_frames(folder)
+    folder = Path(folder)
+    folders = _scene_folders(folder, count)
+    path = folder / SHARES
+    stored = read_json(path).value if path.is_file() else {"varied": 0.0, "wings": 0.0}
+    shares = stored if varied is None else {"varied": varied, "wings": wings}
+    if shares != stored:
+        if folder.exists() and any(folder.iterdir()):
+            remedy = "give another folder, or remove this one"
+            raise InputError(folder, f"holds scenes of {stored}, not of {shares}", remedy)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(path, json.dumps(shares).encode())
+    missing = _missing(folders)
+    if not missing:
+        return folders
+    pool = ProcessPoolExecutor(min(WORKERS, len(missing)), get_context("spawn"))  # a fork breaks compiled code
+    with progress("Filming simulated scenes for the training", len(missing)) as report_progress, pool:
+        film = partial(film_scene, **shares)
+        try:
+            for _ in pool.map(film, [folders[seed] for seed in missing], missing):
+                report_progress(1, "")
+        except BrokenProcessPool as error:
+            problem = "is incomplete, because the system ended a process that films scenes"
+            raise InputError(folder, problem, "free memory and repeat the command, or give fewer --scenes") from error
+    return folders
 
 
-def film_scene(folder: Path, seed: int) -> None:
-    """Simulate one scene and write its frames to a folder; a folder that exists is not changed.
+def missing_scenes(folder: Path, count: int) -> int:
+    """Return how many of the first `count` scenes must be filmed; errors as `film_scenes`."""
+    return len(_missing(_scene_folders(folder, count)))
 
-    Raises:
-        InputError: the folder cannot be written.
-    """
+
+def _missing(folders: Sequence[Path]) -> list[int]:
+    return [seed for seed, folder in enumerate(folders) if not (folder / MARKER).exists()]
+
+
+def _scene_folders(folder: Path, count: int) -> tuple[Path, ...]:
     if (folder / MARKER).exists():
-        return
+        return (folder,)
+    names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
+    others = sorted(name for name in names if not name.startswith((".", "scene_")) and name != SHARES)
+    if others:
+        problem = f"holds other files than simulated scenes: {others[0]}"
+        raise InputError(folder, problem, "give another folder by --frames")
+    return tuple(folder / f"scene_{seed:04d}" for seed in range(count))
+
+
+def film_scene(folder: Path, seed: int, varied: float = 0.0, wings: float = 0.0) -> None:
+    """Simulate one scene and write its frames to a new folder."""
+    frames = draw_scene(seed, varied, wings)
     try:
         with new_folder(folder, marker=MARKER) as part:
-            _write_scenes(part, [_film_scene(seed)], 1, MAX_BIRDS)
+            np.save(part / "pictures.npy", frames.pictures)
+            np.save(part / "owner.npy", frames.owner)
+            save_labels(part, frames.keypoints_px, frames.visibility, frames.pixels_per_unit)
     except InputError:
         if not (folder / MARKER).exists():  # another command has filmed the same scene in the meantime
             raise
 
 
-def _write_scenes(
-    part: Path, scenes: Iterable[LabelledFrames], count: int, most: int, written: Callable[[], None] = lambda: None
-) -> None:
-    """Write the frames of `count` scenes with at most `most` birds to a folder, one scene after the other."""
-    S, K = count * FRAMES_PER_SCENE, load_murre().num_keypoints
-    pictures, owner = create_pictures(part, S, HEIGHT, WIDTH)
-    points, visibility = np.zeros((S, most, K, 2), np.float32), np.zeros((S, most, K), np.uint8)
-    scale = np.zeros(S, np.float32)
-    for i, frames in enumerate(scenes):
-        at = slice(i * FRAMES_PER_SCENE, (i + 1) * FRAMES_PER_SCENE)
-        N = frames.visibility.shape[1]
-        pictures[at], owner[at], scale[at] = frames.pictures, frames.owner, frames.pixels_per_unit
-        points[at, :N], visibility[at, :N] = frames.keypoints_px, frames.visibility
-        written()
-    del pictures, owner  # writes the memory-mapped files
-    save_labels(part, points, visibility, scale)
-
-
-def _film_scene(seed: int, varied: float = 0.0, wings: float = 0.0) -> LabelledFrames:
+def draw_scene(seed: int, varied: float = 0.0, wings: float = 0.0) -> LabelledFrames:
     """Simulate the frames of one scene: with probability `varied`, other birds in another landscape."""
     bird = load_murre()
     has_wings = bool(np.random.default_rng((seed, 13)).random() < wings)
@@ -327,12 +351,7 @@ def _film_scene(seed: int, varied: float = 0.0, wings: float = 0.0) -> LabelledF
         rng = np.random.default_rng((seed, 12))
         flight = WINGS_FLIGHT_SHARE if has_wings else FLIGHT_SHARE
         return draw_frames(rng, bird, FRAMES_PER_SCENE, WIDTH, HEIGHT, flight)
-    return _film_ledge(seed, bird, has_wings)
-
-
-def _film_ledge(seed: int, bird: Bird, wings: bool) -> LabelledFrames:
-    """Simulate murres on a ledge with a random camera, light and number of birds."""
-    scene = simulate_ledge(seed, bird, wings)
+    scene = simulate_ledge(seed, bird, has_wings)
     frames = list(_render_frames(scene, np.asarray(bird.faces)))
     pictures, owner, points, visibility = (np.stack(values) for values in zip(*frames, strict=True))
     scale = np.full(len(scene.kept), scene.pixels_per_unit, np.float32)

@@ -1,11 +1,10 @@
-"""Fine-tuning: mixed samples, early stopping, resumption, accuracy, the command."""
+"""Fine-tuning: comparison of networks, accuracy, the command."""
 
 import os
 import signal
 import subprocess
 import sys
 import time
-from functools import partial
 
 import numpy as np
 import pytest
@@ -13,107 +12,23 @@ from support.labelled_pictures import bird, coco, write_labels
 
 torch = pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
-from torch.utils.data import default_collate  # noqa: E402
-
 from jaxfit.cli.main import main  # noqa: E402
 from jaxfit.foundation.errors import InputError  # noqa: E402
-from jaxfit.learning.networks import fine_tune, keypoints, loop, segmenter  # noqa: E402  # noqa: E402
+from jaxfit.learning.networks import fine_tune, keypoints  # noqa: E402
+from jaxfit.learning.networks.fine_tune import keypoint_accuracy, segmenter_accuracy  # noqa: E402
 from jaxfit.learning.networks.label_data import LabelFiles, prepare_data  # noqa: E402
 from jaxfit.learning.networks.labelled_frames import UNKNOWN, load_frames  # noqa: E402
-from jaxfit.learning.networks.loop import (  # noqa: E402
-    Checkpoint,
-    Schedule,
-    Source,
-    _Order,
-    _Samples,
-    continue_training,
-)
-from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages  # noqa: E402
-from jaxfit.learning.networks.validation import keypoint_accuracy, segmenter_accuracy  # noqa: E402
+from jaxfit.learning.networks.training import Trained, weights_of  # noqa: E402
 from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
 from jaxfit.perception.network import OnnxModel, instance_of  # noqa: E402
 
 TIMES = range(0, 400, 50)
-SCHEDULE = Schedule(10, 2, 1e-3)
 
 
 @pytest.fixture
 def data(tmp_path):
     file = write_labels(tmp_path / "labels", coco({t: [bird(40 + t // 20, 30)] for t in TIMES}), list(TIMES))
     return prepare_data("segmenter", LabelFiles((file,)), 0.25, None, tmp_path / "training")
-
-
-@pytest.fixture
-def same_process(monkeypatch):
-    """Draw the batches in this process, because a new process takes seconds."""
-
-    def batches(sources, batch, seed, first, last):
-        samples = _Samples(sources, seed, first * batch, (last - first) * batch)
-        order = iter(_Order(sources, first * batch, (last - first) * batch))
-        for _ in range(last - first):
-            yield default_collate([samples[next(order)] for _ in range(batch)])
-
-    monkeypatch.setattr(loop, "batches", batches)
-
-
-def tiny_network():
-    torch.manual_seed(0)
-    return FeaturePyramid(residual_stages((4, 4), (0, 1)), (4, 4), (4,), {"foreground": 1, "centre": 1, "offset": 2})
-
-
-def trained(folder, state, score=None, stop_after=None):
-    """Train a tiny network; `stop_after` interrupts the training in this step."""
-    network = tiny_network()
-    taken = []
-
-    def loss(maps, sample):
-        if len(taken) == stop_after:
-            raise KeyboardInterrupt
-        taken.append(1)
-        return segmenter.loss(maps, sample)
-
-    sources = [Source(folder, partial(segmenter.draw_sample, scene_share=0.5))]
-    result = continue_training(network, loss, sources, SCHEDULE, 3, state, "mark", score)
-    return result, len(taken)
-
-
-@pytest.mark.usefixtures("same_process")
-@pytest.mark.extended
-def test_interrupted_training_gives_the_same_weights(data, tmp_path):
-    folder = tmp_path / "training" / "frames"
-    whole, _ = trained(folder, tmp_path / "whole.npz")
-    with pytest.raises(KeyboardInterrupt):
-        trained(folder, tmp_path / "parts.npz", stop_after=6)
-    resumed, steps = trained(folder, tmp_path / "parts.npz")
-    assert steps == 4
-    assert resumed.step == whole.step == 10
-    assert np.array_equal(resumed.weights, whole.weights)
-    assert not np.array_equal(whole.weights, loop.flat_weights(tiny_network()))
-    finished, steps = trained(folder, tmp_path / "parts.npz")
-    assert steps == 0
-    assert np.array_equal(finished.best_weights, whole.best_weights)
-
-
-@pytest.mark.usefixtures("same_process")
-def test_best_weights_and_early_stopping(data, tmp_path):
-    scores = iter([0.1, 0.5, 0.4, 0.5, 0.3, 0.2, 0.2, 0.1, 0.1, 0.1, 0.1, 0.1])
-    best, steps = trained(tmp_path / "training" / "frames", tmp_path / "best.npz", lambda: next(scores))
-    assert steps == 7  # four measurements after the last measurement of 0.5, which follows step 3
-    assert best.history[:, 1].tolist() == [0.1, 0.5, 0.4, 0.5, 0.3, 0.2, 0.2, 0.1]
-    with pytest.raises(KeyboardInterrupt):
-        trained(tmp_path / "training" / "frames", tmp_path / "short.npz", stop_after=3)
-    assert np.array_equal(best.best_weights, np.load(tmp_path / "short.npz")["weights"])
-
-
-@pytest.mark.usefixtures("same_process")
-def test_the_best_weights_are_trained_weights(data, tmp_path):
-    """A training that never reaches the score of the initial weights has a best step of its own."""
-    scores = iter([0.9, 0.1, 0.5, 0.4, 0.3])
-    best, steps = trained(tmp_path / "training" / "frames", tmp_path / "best.npz", lambda: next(scores))
-    assert steps == 4  # four measurements without a better score
-    assert best.best_step == 2
-    assert not np.array_equal(best.best_weights, loop.flat_weights(tiny_network()))
-    assert not np.array_equal(best.best_weights, best.weights)
 
 
 @pytest.fixture
@@ -126,14 +41,13 @@ def compared(tmp_path, monkeypatch):
     file = write_labels(tmp_path / "labels", coco({t: [bird()] for t in TIMES}), list(TIMES))
     written = []
 
-    def training(model, *_others):
-        weights = loop.flat_weights(model)
-        history = np.array([[0, 0.5], [5, 0.6], [10, 0.4]])
-        return Checkpoint("", 10, weights, weights, weights, weights + 1, history)
+    def training(model, *_others, **_options):
+        trained = {name: value + 1 for name, value in weights_of(model).items()}
+        return Trained(10, [(0, 0.5), (5, 0.6), (10, 0.4)], trained, {})
 
     def write(model, facts, path, longer_side_px):
-        trained = loop.flat_weights(model)[0] != initial[0]
-        written.append((path.name, longer_side_px, bool(trained)))
+        is_trained = not torch.equal(model.state_dict()["heads.centre.bias"], initial)
+        written.append((path.name, longer_side_px, is_trained))
 
     def compare(**scores):
         def accuracy(path, pictures):
@@ -146,9 +60,9 @@ def compared(tmp_path, monkeypatch):
         return result, written
 
     base = fine_tune.base_file("segmenter", "builtin")
-    initial = loop.flat_weights(fine_tune.load_segmenter_base(base))
+    initial = fine_tune.load_segmenter_base(base).state_dict()["heads.centre.bias"]
     for name, function in (
-        ("continue_training", training),
+        ("train", training),
         ("write_segmenter", write),
         ("load_segmenter", lambda path, kind: path),
         ("store_training_activations", lambda *_sources, **_options: None),
@@ -200,28 +114,6 @@ def test_the_command_says_which_networks_it_compares(tmp_path, monkeypatch, caps
         assert "score: mean of rows 1 and 2 │ 0.818 │ 0.904 │ 0.850" in said
         for sentence in sentences:
             assert sentence in said
-
-
-@pytest.mark.usefixtures("same_process")
-def test_state_of_another_training_is_rejected(data, tmp_path):
-    trained(tmp_path / "training" / "frames", tmp_path / "state.npz")
-    state = dict(np.load(tmp_path / "state.npz"))
-    np.savez(tmp_path / "state.npz", **state | {"fingerprint": "other"})
-    with pytest.raises(InputError, match="interrupted training with other labels or options"):
-        trained(tmp_path / "training" / "frames", tmp_path / "state.npz")
-    np.savez(tmp_path / "state.npz", **state | {"weights": state["weights"] * np.nan})
-    with pytest.raises(InputError, match="is damaged"):
-        trained(tmp_path / "training" / "frames", tmp_path / "state.npz")
-
-
-def test_samples_come_from_both_sources_by_their_shares(data, tmp_path):
-    folder = tmp_path / "training" / "frames"
-    sources = [Source(folder, lambda _rng, _frames, k=k: k, share) for k, share in enumerate((0.7, 0.3))]
-    samples = _Samples(sources, seed=1, first=100, count=400)
-    drawn = [samples[i] for i in range(400)]
-    assert np.mean(drawn) == pytest.approx(0.3, abs=0.07)
-    later = _Samples(sources, seed=1, first=150, count=400)
-    assert [later[i] for i in range(50)] == drawn[50:100]  # a sample depends on its number only
 
 
 def test_simulated_keypoints_take_the_names_of_the_labels(data, tmp_path):
@@ -289,7 +181,7 @@ def test_wrong_use_of_the_command(tmp_path, capsys):
 
 def test_wrong_numbers_are_rejected_before_the_imports(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.fine_tune", None)
-    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.train", None)
+    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.training", None)
     labels = ["--labels", "none.csv"]
     for options, message in (
         ([*labels, "--steps", "4"], "steps: is 4 (give 10 or more)"),
@@ -307,27 +199,32 @@ def test_wrong_numbers_are_rejected_before_the_imports(tmp_path, capsys, monkeyp
 def test_pictures_are_read_before_scenes_are_filmed(tmp_path, monkeypatch, caplog):
     """Pictures that do not fit the labels are reported at once, and an interruption says how to continue."""
     file = write_labels(tmp_path / "labels", coco({t: [bird()] for t in TIMES}), [])
-    empty, happened = tmp_path / "film", []
+    empty, out, scenes = tmp_path / "film", tmp_path / "mine.onnx", tmp_path / "scenes"
     write_labels(empty, coco({900: [bird()]}), [900])
-    monkeypatch.setattr(fine_tune.Filming, "__enter__", lambda _self: happened.append("filming"))
-    out, scenes = tmp_path / "mine.onnx", tmp_path / "scenes"
     settings = fine_tune.Settings(holdout=0, scenes=1)
-    with pytest.raises(InputError, match=r"no picture of the labels is in .*film, .*, for example frame_0000.png"):
-        fine_tune.fine_tune("segmenter", LabelFiles((file,), (empty,)), out, scenes, settings)
-    assert not happened
-    write_labels(file.parent, coco({t: [bird()] for t in TIMES}), list(TIMES)[1:])
 
-    def interrupted(*_arguments):
-        assert happened == ["filming"]
+    def interrupted(*_arguments, **_options):
         (tmp_path / "mine.onnx.training" / fine_tune.CHECKPOINT).touch()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fine_tune, "_fine_tune", interrupted)
+    monkeypatch.setattr(fine_tune, "film_scenes", interrupted)
+    with pytest.raises(InputError, match=r"no picture of the labels is in .*film, .*, for example frame_0000.png"):
+        fine_tune.fine_tune("segmenter", LabelFiles((file,), (empty,)), out, scenes, settings)
+    write_labels(file.parent, coco({t: [bird()] for t in TIMES}), list(TIMES)[1:])
     with pytest.raises(KeyboardInterrupt):
         fine_tune.fine_tune("segmenter", LabelFiles((file,)), out, scenes, settings)
     first, last = (record.getMessage() for record in caplog.records)
     assert first.startswith("1 of 8 labelled pictures are not used, for example labels.json: frame_0000.png")
     assert last.endswith("mine.onnx.training holds the work so far; the same command continues there")
+
+
+def test_labels_with_too_few_visible_keypoints_are_one_error(tmp_path):
+    points = [45, 35, 2, 65, 55, 1, 50, 40, 1, 55, 45, 1]
+    labels = coco({t: [bird(keypoints=points)] for t in TIMES}, ["beak", "tail", "wingL", "wingR"])
+    file = write_labels(tmp_path / "labels", labels, list(TIMES))
+    settings = fine_tune.Settings(scenes=0)
+    with pytest.raises(InputError, match="no bird of the training part has 4 visible keypoints"):
+        fine_tune.fine_tune("keypoints", LabelFiles((file,)), tmp_path / "mine.onnx", "", settings)
 
 
 @pytest.mark.extended
@@ -336,27 +233,26 @@ def test_command_after_a_kill(tmp_path):
     labels = write_labels(tmp_path / "labels", coco({t: [bird(40 + t // 20, 30)] for t in TIMES}), list(TIMES))
     # this network is not used, so it sees few pictures
     few = (
-        "from jaxfit.learning.networks import familiarity, fine_tune; familiarity.MAX_PICTURES = 20; "
+        "from jaxfit.learning.networks import fine_tune, network_files; network_files.MAX_PICTURES = 20; "
         "usual = fine_tune.default_schedule; fine_tune.default_schedule = lambda *x: usual(*x)._replace(batch=1)"
     )
     run = f"{few}; from jaxfit.cli.main import run; run()"
-    options = ["train", "segmenter", "--labels", str(labels), "--scenes", "0", "--steps", "10"]
+    options = ["train", "segmenter", "--labels", str(labels), "--holdout", "0", "--scenes", "0", "--steps", "10"]
     command = [sys.executable, "-c", run, *options]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     whole, parts = tmp_path / "whole.onnx", tmp_path / "parts.onnx"
     done = subprocess.run([*command, "--out", str(whole)], env=environment, capture_output=True, text=True, check=True)
     assert "torchvision" not in done.stderr  # a warning of the exporter
-    assert "base network" in done.stdout
-    assert "trained" in done.stdout
-    state = tmp_path / "parts.onnx.training" / "checkpoint.npz"
+    assert "nothing is held out" in done.stdout
+    state = tmp_path / "parts.onnx.training" / "checkpoint.pt"
     process = subprocess.Popen([*command, "--out", str(parts)], env=environment, start_new_session=True)
     while not state.exists() and process.poll() is None:
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert not parts.exists()
-    assert np.load(state)["step"] < 10
+    assert torch.load(state, weights_only=True)["step"] < 10
     subprocess.run([*command, "--out", str(parts)], env=environment, check=True)
     assert parts.read_bytes() == whole.read_bytes()
     assert not state.parent.exists()
-    assert OnnxModel(whole).metadata["trained_on"].startswith("8 labelled pictures")  # the held-out pictures too
+    assert OnnxModel(whole).metadata["trained_on"].startswith("8 labelled pictures")

@@ -1,4 +1,6 @@
-"""Labels of a user: formats, pictures, and labels that cannot be right."""
+"""Labels of a user: formats, pictures, labels that cannot be right, and the held-out part."""
+
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,10 +10,15 @@ from support.labelled_pictures import SIZE, bird, coco, write_labels
 pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.learning.networks.label_checks import mixed_up_birds
-from jaxfit.learning.networks.label_data import LabelFiles, prepare_data
+from jaxfit.learning.networks.label_data import GAP_FRAMES, LabelFiles, prepare_data, split_pictures
 from jaxfit.learning.networks.labelled_frames import UNKNOWN
-from jaxfit.learning.networks.labels import numbered_by_film, read_labels
+from jaxfit.learning.networks.labels import (
+    LabelledBird,
+    LabelledPicture,
+    mixed_up_birds,
+    numbered_by_film,
+    read_labels,
+)
 from jaxfit.model.files import load_murre
 
 TIMES = range(0, 400, 50)
@@ -209,3 +216,44 @@ def test_mixed_up_sides_are_detected():
     assert not np.delete(found, np.s_[::3]).any()
     without_sides = mixed_up_birds(labels, known, references, all_known, [f"point{k}" for k in range(len(names))])
     assert not without_sides.any()
+
+
+ANY_BIRD = LabelledBird("bird 1", np.ones(4), np.ones((1, 2)), np.full(1, 2), None)
+
+
+def films(*videos):
+    return [
+        LabelledPicture(Path(f"{v}.json"), f"{t}.png", t, (9, 9), (ANY_BIRD,))
+        for v, video in enumerate(videos)
+        for t in video
+    ]
+
+
+@pytest.mark.parametrize("times", [range(0, 40, 4), range(200), range(0, 20_000, 100)])
+def test_blocks_of_time(times):
+    labels = films(times)
+    split = split_pictures(labels, 0.2)
+    parts = split.training + split.holdout + split.gap
+    assert sorted(parts) == list(range(len(labels)))
+    assert len(split.holdout) == pytest.approx(0.2 * len(labels), abs=1)
+    # held-out pictures are few runs of consecutive labels
+    assert (np.diff(split.holdout) > 1).sum() < max(1, len(labels) / 40)
+    nearest = min(abs(labels[i].frame - labels[j].frame) for i in split.training for j in split.holdout)
+    step = times[1] - times[0]
+    assert nearest >= min(GAP_FRAMES, 2 * step)
+    assert nearest > step or step >= GAP_FRAMES
+
+
+def test_whole_videos():
+    split = split_pictures(films(range(10), range(30), range(12)), 0.2)
+    assert split.holdout == list(range(10))
+    assert "by video" in split.rule
+    assert not split.gap
+    halves = split_pictures(films(range(0, 900, 30), range(0, 900, 30)), 0.2)  # half of the labels is too much
+    assert "blocks of time" in halves.rule
+
+
+def test_too_few_pictures():
+    with pytest.raises(InputError, match="--holdout 0"):
+        split_pictures(films([5]), 0.2)
+    assert split_pictures(films([5]), 0).training == [0]

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from benchmarks.confidence_curve import Outcomes, fit_curve, keypoint_outcomes
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.learning.networks.calibration import Outcomes, fit_curve, keypoint_outcomes
 from jaxfit.learning.networks.labelled_frames import LabelledFrames
 from jaxfit.perception.network import instance_of
 
@@ -21,11 +21,6 @@ def test_the_curve_is_the_probability():
     np.testing.assert_allclose(curve(at), at**2, atol=0.03)
     assert (np.diff(curve.probabilities) >= 0).all()
     assert curve(np.zeros(1)) == 0
-
-
-def test_a_falling_share_becomes_a_constant_curve():
-    curve = fit_curve(outcomes(lambda value: 1 - value))
-    np.testing.assert_allclose(curve.probabilities[1:], 0.5, atol=0.03)
 
 
 def test_too_few_detections():

@@ -1,41 +1,19 @@
-"""Training on simulated frames: labels, samples, losses, export. It needs the extra `train`."""
+"""Samples of the networks, losses and architectures. It needs the extra `train`."""
 
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
-from jaxfit.foundation.errors import InputError  # noqa: E402
-from jaxfit.learning.networks import familiarity, keypoints, scenes, segmenter  # noqa: E402
+from torch import nn  # noqa: E402
+
+from jaxfit.learning.networks import keypoints, segmenter  # noqa: E402
 from jaxfit.learning.networks.augment import randomise_appearance  # noqa: E402
-from jaxfit.learning.networks.labelled_frames import SPREAD_UNITS, LabelledFrames, birds_with_spread_wings, load_frames  # noqa: E402
-from jaxfit.learning.networks.loop import Schedule  # noqa: E402
+from jaxfit.learning.networks.labelled_frames import SPREAD_UNITS, LabelledFrames, birds_with_spread_wings  # noqa: E402
 from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages  # noqa: E402
-from jaxfit.learning.networks.scenes import FRAMES_PER_SCENE, film_scenes  # noqa: E402
-from jaxfit.learning.networks.train import Simulation, train_network  # noqa: E402
 from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
-from jaxfit.perception.keypoints import BUILTIN_PATH, load_keypoint_detector  # noqa: E402
-from jaxfit.perception.network import (  # noqa: E402
-    MEAN_KEY,
-    WHITENING_KEY,
-    OnnxModel,
-)
-from jaxfit.perception.segmentation import load_segmenter  # noqa: E402
 
 K = len(MURRE_KEYPOINTS)
-QUICK = Schedule(20, 2, 1e-3)
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("frames") / "frames"
-    film_scenes(folder, range(1), workers=1)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def frames(folder):
-    return load_frames(folder)
 
 
 def two_squares():
@@ -48,25 +26,6 @@ def two_squares():
         points[0, n] = np.linspace((x0 + 5, 155), (x0 + 95, 245), K)
         visibility[0, n] = 2
     return LabelledFrames(pictures, owner, points, visibility, np.array([10.0], np.float32))
-
-
-def test_visible_keypoints_lie_on_their_bird(frames):
-    assert frames.pictures.shape[0] == FRAMES_PER_SCENE
-    assert frames.pictures.std() > 10
-    visible = np.argwhere(frames.visibility == 2)
-    assert len(visible) > 100
-    own = 0
-    for s, n, k in visible:
-        x, y = frames.keypoints_px[s, n, k].astype(int)
-        own += (frames.owner[s, max(y - 2, 0) : y + 3, max(x - 2, 0) : x + 3] == n + 1).any()
-    assert own > 0.99 * len(visible)  # the thinnest tips fall between pixels
-
-
-@pytest.mark.extended
-def test_same_seed_gives_the_same_frames(frames):
-    again = scenes._film_scene(0)
-    assert np.array_equal(again.owner, frames.owner)
-    assert np.array_equal(again.pictures, frames.pictures)
 
 
 def test_random_appearance():
@@ -169,7 +128,7 @@ def test_losses_are_lowest_for_the_true_maps():
 
 
 def test_peaks_are_probabilities():
-    class Logits(torch.nn.Module):
+    class Logits(nn.Module):
         def forward(self, pictures):
             logits = torch.full((1, 3, 12, 12), -20.0)
             logits[0, 0, 5, 7] = 20.0  # certainly here
@@ -189,69 +148,18 @@ def test_pyramid_strides():
     assert {name: tuple(map_.shape) for name, map_ in maps.items()} == {"a": (1, 2, 16, 24), "b": (1, 1, 16, 24)}
 
 
-@pytest.fixture
-def _few_pictures(monkeypatch):
-    """Training activations of few pictures, because the networks of these tests are not used."""
-    monkeypatch.setattr(familiarity, "MAX_PICTURES", 20)
-
-
-@pytest.mark.extended
-@pytest.mark.usefixtures("_few_pictures")
-def test_trained_segmenter_is_read_back(folder, frames, tmp_path):
-    losses = train_network("segmenter", tmp_path / "s.onnx", Simulation(folder, 1), QUICK)
-    assert set(losses) == {"foreground", "centre", "offset"}
-    model = OnnxModel(tmp_path / "s.onnx")
-    assert "no real footage" in model.metadata["trained_on"]
-    texts = [text for key, text in model.metadata.items() if key not in (MEAN_KEY, WHITENING_KEY)]
-    assert "/" not in "".join(texts)  # no local paths
-    assert load_segmenter(tmp_path / "s.onnx").class_names == ("bird",)
-    outputs = model(np.zeros((1, 3, 64, 96), np.float32))
-    assert outputs["foreground"].shape == (1, 1, 32, 48)
-    assert (tmp_path / "s.onnx").stat().st_size < 7e6
-
-
-@pytest.mark.extended
-@pytest.mark.usefixtures("_few_pictures")
-def test_trained_keypoint_network_is_read_back(folder, tmp_path):
-    train_network("keypoints", tmp_path / "k.onnx", Simulation(folder, 1), QUICK)
-    detector = load_keypoint_detector(tmp_path / "k.onnx")
-    assert detector.keypoint_names == MURRE_KEYPOINTS
-    assert (tmp_path / "k.onnx").stat().st_size < 4.8e6
-    assert OnnxModel(tmp_path / "k.onnx").metadata["background"] == "visible"
-
-
-@pytest.mark.extended
-@pytest.mark.usefixtures("_few_pictures")
-def test_a_training_from_a_base_network_begins_with_its_weights(folder, tmp_path):
-    still = QUICK._replace(learning_rate=1e-12)
-    train_network("keypoints", tmp_path / "k.onnx", Simulation(folder, 1), still, base="builtin")
-    picture = np.random.default_rng(0).uniform(0, 1, (1, 3, 192, 192)).astype(np.float32)
-    trained, builtin = (OnnxModel(path)(picture)["heatmaps"] for path in (tmp_path / "k.onnx", BUILTIN_PATH))
-    np.testing.assert_allclose(trained, builtin, atol=2e-3)
-
-
-def test_frames_of_an_earlier_version_are_rejected(frames, tmp_path):
-    labels = {"keypoints_px": frames.keypoints_px, "seen": frames.visibility, "pixels_a_unit": frames.pixels_per_unit}
-    np.savez(tmp_path / "frames.npz", **labels)
-    with pytest.raises(InputError, match=r"frames\.npz: lacks the array visibility"):
-        load_frames(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"scenes": 0}, "scenes"),
-        ({"scenes": 3}, "holds 1 scenes"),
-        ({"schedule": QUICK._replace(steps=3)}, "steps"),
-        ({"wings": 2}, "wings"),
-        ({"path": "n.pt"}, ".onnx"),
-        ({"encoder": "e.pth", "base": "builtin"}, "is given with a base network"),
-    ],
-)
-def test_invalid_arguments_are_rejected(folder, tmp_path, arguments, message):
-    path = tmp_path / arguments.pop("path", "n.onnx")
-    given = {key: arguments.pop(key) for key in ("scenes", "wings") if key in arguments}
-    simulation = Simulation(folder, **{"scenes": 1, **given})
-    with pytest.raises(InputError, match=message):
-        train_network("segmenter", path, simulation, **arguments)
-    assert not path.exists()
+def test_the_encoder_of_the_segmenter_learns_slowly_and_its_first_stages_not_at_all():
+    torch.manual_seed(0)
+    network = segmenter.segmenter_network()
+    groups = network.parameter_groups()
+    assert [group["share"] for group in groups] == [0.1, 1.0]
+    assert {id(p) for p in groups[0]["params"]} == {id(p) for p in network.down.parameters()}
+    assert sum(len(group["params"]) for group in groups) == len(list(network.parameters()))
+    trained = [any(p.requires_grad for p in stage.parameters()) for stage in network.down]
+    assert trained == [False] * segmenter.FIXED_STAGES + [True] * (5 - segmenter.FIXED_STAGES)
+    maps = network.eval()(torch.zeros(1, 3, 64, 64))
+    assert {name: tuple(map_.shape[1:]) for name, map_ in maps.items()} == {
+        "foreground": (1, 32, 32),
+        "centre": (1, 32, 32),
+        "offset": (2, 32, 32),
+    }

@@ -1,38 +1,30 @@
-"""Curves of confidences, fitted on known birds and stored in the ONNX file.
+"""Fit the curve of confidences of a keypoint network on simulated birds, and store the curve in the network file.
 
-The module needs the package `onnx`, but not PyTorch. `jaxfit.perception.network` describes the curves and reads
-them.
+    python tests/benchmarks/confidence_curve.py keypoints.onnx scenes
+
+`jaxfit.perception.network` describes the curves and reads them. The built-in segmenter
+detects the birds of `scenes`, a folder of simulated scenes that the network was not trained on, as in tracking.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import onnx
 from jaxtyping import Bool, Float
 from scipy.optimize import isotonic_regression
 
 from jaxfit.data.masks import box_of_mask
 from jaxfit.evaluation.detection import assign
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.files import write_whole
-from jaxfit.learning.networks.labelled_frames import LabelledFrames
+from jaxfit.learning.networks.labelled_frames import LabelledFrames, load_frames
+from jaxfit.learning.networks.network_files import set_metadata
 from jaxfit.perception.keypoints import load_keypoint_detector
 from jaxfit.perception.network import CONFIDENCE_KEY, Curve, Instance, KeypointDetector, Segmenter
-
-# pyright: reportMissingImports=false
-
-
-def set_metadata(path: str | Path, entries: Mapping[str, str]) -> None:
-    """Set entries of the metadata of an ONNX file; other entries and the network do not change."""
-    model = onnx.load(str(path))
-    kept = {entry.key: entry.value for entry in model.metadata_props}
-    onnx.helper.set_model_props(model, kept | dict(entries))
-    write_whole(path, model.SerializeToString())
-
+from jaxfit.perception.segmentation import load_segmenter
 
 RIGHT = 0.05
 """Largest error of a keypoint that is right, as a share of the longer side of the bird's box."""
@@ -147,3 +139,12 @@ def _longer_side(mask: Bool[np.ndarray, "H W"], points_px: Float[np.ndarray, "M 
     x0, y0, width, height = box_of_mask(mask) or (0, 0, 0, 0)
     corners = np.concatenate([[[x0, y0], [x0 + width, y0 + height]], points_px])
     return float(np.ptp(corners, axis=0).max())
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Fit the curve of confidences of a keypoint network.")
+    parser.add_argument("network", type=Path, help="ONNX file of the keypoint network; it is replaced")
+    parser.add_argument("scenes", type=Path, help="folder of simulated scenes of `jaxfit train`")
+    options = parser.parse_args()
+    known = load_frames(*sorted(options.scenes.glob("scene_*")))
+    calibrate_keypoints(options.network, known, load_segmenter("builtin"))
