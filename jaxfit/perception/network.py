@@ -3,8 +3,8 @@
 Distance of a network's activations from the activations of its training. A network that `jaxfit train` wrote has an
 output `activations`: its last feature map, averaged over the cells. Its metadata hold the mean μ of the activations of
 its training inputs and a matrix W (`jaxfit.learning.networks.network_files`). The distance of an input with activations
-a is ‖W (a − μ)‖. W whitens the activations of the training, and its scale is such that 99 % of the training inputs have a
-distance below 1.
+a is ‖W (a − μ)‖. W whitens the activations of the training, and its scale is such that 99 % of the training inputs have
+a distance below 1.
 
 Calibration of confidences: from a network's raw value to the probability that the detection is right. The metadata of a
 network, such as the built-in keypoint network, may hold a curve (`tests/benchmarks/confidence_curve.py` fits it):
