@@ -265,8 +265,15 @@ def write_nwb(
         require_package(package, "--to nwb")
     exported.require_poses()
     exported.require_fps()
-    exported.require_video()
-    began = _start(start)
+    try:
+        began = datetime.datetime.fromisoformat(start or "1970-01-01T00:00:00+00:00")
+    except ValueError:
+        remedy = "write for example 2024-06-01T12:00:00+02:00"
+        raise InputError("--start", f"is '{start}', not a time", remedy) from None
+    began = began if began.tzinfo else began.replace(tzinfo=datetime.UTC)
+    video = exported.require_video()
+    # from the folder of the files; the stored path if the footage was moved
+    link = os.path.relpath(video.resolve(), out.resolve()) if video.exists() else str(video)
     tracks = exported.solution.track_id.tolist()
     fitted = np.flatnonzero(exported.solution.valid.any(axis=1)).tolist()
     names = {tracks[n]: f"bird_{tracks[n]}.nwb" for n in fitted}
@@ -275,26 +282,12 @@ def write_nwb(
         progress("Writing NWB", len(fitted)) as report_progress,
     ):
         for n in fitted:
-            _write_bird(exported, n, began, _link(exported.require_video(), out), folder / names[tracks[n]])
+            _write_bird(exported, n, began, link, folder / names[tracks[n]])
             report_progress(1, names[tracks[n]])
     notes = []
     if start is None:
         notes.append("the start of the recording is unknown and stored as 1970-01-01: give --start to store the time")
     return [out / name for name in names.values()], notes
-
-
-def _start(text: str | None) -> datetime.datetime:
-    try:
-        time = datetime.datetime.fromisoformat(text or "1970-01-01T00:00:00+00:00")
-    except ValueError:
-        problem = f"is '{text}', not a time"
-        raise InputError("--start", problem, "write for example 2024-06-01T12:00:00+02:00") from None
-    return time if time.tzinfo else time.replace(tzinfo=datetime.UTC)
-
-
-def _link(video: Path, folder: Path) -> str:
-    """Return the path of the footage from the folder of the NWB files; the stored path if the footage was moved."""
-    return os.path.relpath(video.resolve(), folder.resolve()) if video.exists() else str(video)
 
 
 def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str, path: Path) -> None:

@@ -21,7 +21,7 @@ from jaxfit.data.projection import PosedBirds, image_focal_px, in_image
 from jaxfit.data.result_folder import CAMERAS
 from jaxfit.data.solution import select_solution
 from jaxfit.data.world import as_filmed
-from jaxfit.export.gltf import four_weights
+from jaxfit.export.glb import four_weights
 from jaxfit.export.result import Exported
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import skeleton_pairs
