@@ -6,7 +6,7 @@ import logging
 import jax
 import numpy as np
 import pytest
-from support.birds import toy_bird
+from support.birds import tiny_bird
 
 from jaxfit.config.build import with_values
 from jaxfit.config.fit import load_config
@@ -18,9 +18,9 @@ from jaxfit.model.camera import CropCamera
 from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
 
-BIRD, T, SIZE, BIRDS = toy_bird(shapes=0), 6, 64, 2
+BIRD, T, SIZE, BIRDS = tiny_bird(shapes=0), 6, 64, 2
 CAMERA = CropCamera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
-ONE_WINDOW_GB = 0.002
+ONE_WINDOW_GB = 0.0007
 """Memory in GB for one window of six frames."""
 
 
@@ -90,7 +90,7 @@ def test_batches_of_one_window_equal_separate_fits(observed):
 
 def test_a_batch_may_be_shorter_than_the_other_batches(observed):
     """Three runs of two windows in batches of four: the last batch has two windows."""
-    some = [dataclasses.replace(each, memory_gb=0.0066) for each in SWEEP]
+    some = [dataclasses.replace(each, memory_gb=4 * ONE_WINDOW_GB) for each in SWEEP]
     assert batch.frames_per_batch(BIRD, some[0]) // T == 4
     together = fit_runs(observed, BIRD, some)
     for a, b in zip(together, fit_runs(observed, BIRD, some[::-1])[::-1], strict=True):

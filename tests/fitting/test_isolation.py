@@ -30,7 +30,7 @@ def assert_independent(observed, settings, groups):
 
 
 def observe(frames):
-    """Return noisy observations of toy birds. The squared keypoints of one bird exceed float32."""
+    """Return noisy observations of tiny birds. The squared keypoints of one bird exceed float32."""
     observed = detect(BIRD, truths(frames, BIRDS), 1.0, 0.05, 0, camera=CAMERA)
     return replaced(observed, DIVERGING, np.full((frames, BIRD.num_keypoints, 2), 1e30))
 

@@ -23,7 +23,7 @@ from jaxfit.simulation.noise import detect
 
 NAMES = BIRD.keypoint_names
 SCALE = {"sd_sure_px": 1.0, "sd_unsure_px": 2.0, "dof": 30.0}
-TRUE = {"nape": (0, 0.4, 0.5), "left_eye": (0.3, -0.2, 0.1), "right_eye": (-0.3, -0.2, 0.1), "tail_tip": (0, -0.6, 0)}
+TRUE = {"nape": (0, 0.4, 0.5), "left_wingtip": (0.3, -0.2, 0.1), "right_wingtip": (-0.3, -0.2, 0.1), "tail_tip": (0, -0.6, 0)}
 PLACED = np.float32([TRUE.get(name, (0, 0, 0)) for name in NAMES])
 FRAMES = 20
 ONLY_KEYPOINTS = StageConfig("only", 12, ("keypoint_likelihood", "pose_prior"), solver="levenberg_marquardt")
@@ -95,8 +95,8 @@ def test_known_offsets_are_found():
     noise = np.random.default_rng(0).normal(size=exact.shape) * 0.3
     found = learnt(exact + noise)
     np.testing.assert_allclose(found.offsets, PLACED, atol=0.12)
-    mirrored = found.offsets[NAMES.index("right_eye")] * [-1, 1, 1]
-    np.testing.assert_array_equal(found.offsets[NAMES.index("left_eye")], mirrored)
+    mirrored = found.offsets[NAMES.index("right_wingtip")] * [-1, 1, 1]
+    np.testing.assert_array_equal(found.offsets[NAMES.index("left_wingtip")], mirrored)
     assert found.offsets[NAMES.index("nape"), 0] == 0  # a keypoint in the middle stays in the middle
     assert found.prior_sd < first_offsets(BIRD, {}).prior_sd  # most true offsets are 0
 

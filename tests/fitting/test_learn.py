@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.birds import random_pose, solution_of, toy_bird
+from support.birds import random_pose, solution_of, tiny_bird
 
 from jaxfit.cli.main import main
 from jaxfit.data.solution import save_solution
@@ -15,7 +15,7 @@ from jaxfit.learning.priors import MIN_SD_RAD, MIN_WIDTH, effective_count, learn
 from jaxfit.model.bird import check_bird
 from jaxfit.model.files import load_bird
 
-BIRD, T = toy_bird(), 12
+BIRD, T = tiny_bird(), 12
 
 
 def posed(seeds, spread=0.3):
@@ -24,7 +24,7 @@ def posed(seeds, spread=0.3):
     for seed in seeds:
         frames = [random_pose(BIRD, 100 * seed + t, spread) for t in range(T)]
         stacked = jax.tree.map(lambda *x: jnp.stack(x), *frames)
-        windows.append(dataclasses.replace(stacked, bone_length=jnp.ones(7), betas=jnp.zeros(2)))
+        windows.append(dataclasses.replace(stacked, bone_length=jnp.ones(3), betas=jnp.zeros(2)))
     return solution_of(BIRD, windows)
 
 
@@ -88,15 +88,15 @@ def test_mean_and_covariance():
     body[0, 3:5] = np.nan
     solution = dataclasses.replace(solution, valid=valid, body_pose=body)
     learnt = learn_prior([("a", solution, BIRD)])
-    poses = body[valid].reshape(-1, 21).astype(np.float64)
+    poses = body[valid].reshape(-1, 9).astype(np.float64)
     assert (learnt.poses, learnt.birds, learnt.diverged, learnt.bones_learnt) == (2 * T - 2, 2, 0, False)
     np.testing.assert_allclose(learnt.bird.pose_mean, poses.mean(0), atol=1e-6)
     sample = np.cov(poses.T, bias=True)
     covariance = np.asarray(learnt.bird.pose_covariance, np.float64)
     np.testing.assert_allclose(np.diag(covariance), np.diag(sample) + MIN_SD_RAD**2, rtol=1e-5)
-    off = ~np.eye(21, dtype=bool)
+    off = ~np.eye(9, dtype=bool)
     np.testing.assert_allclose(covariance[off], (1 - learnt.shrinkage) * sample[off], atol=1e-6)
-    np.testing.assert_allclose(learnt.mean_change_rad, np.linalg.norm(poses.mean(0).reshape(7, 3), axis=1), rtol=1e-5)
+    np.testing.assert_allclose(learnt.mean_change_rad, np.linalg.norm(poses.mean(0).reshape(3, 3), axis=1), rtol=1e-5)
     assert 0 < learnt.shrinkage <= 1
     np.testing.assert_array_equal(learnt.bird.bone_mean, BIRD.bone_mean)
     np.testing.assert_array_equal(learnt.bird.bone_covariance, BIRD.bone_covariance)
@@ -117,10 +117,10 @@ def test_the_prior_of_one_motionless_bird_is_positive_definite():
 
 def test_bone_lengths_are_learnt_if_they_differ():
     solution = posed([1, 2, 3])
-    lengths = np.broadcast_to(np.array([0.9, 1.0, 1.2])[:, None, None], (3, T, 7))
+    lengths = np.broadcast_to(np.array([0.9, 1.0, 1.2])[:, None, None], (3, T, 3))
     learnt = learn_prior([("a", dataclasses.replace(solution, bone_length=lengths), BIRD)])
     assert learnt.bones_learnt
-    np.testing.assert_allclose(learnt.bird.bone_mean, np.full(7, 3.1 / 3), rtol=1e-6)
+    np.testing.assert_allclose(learnt.bird.bone_mean, np.full(3, 3.1 / 3), rtol=1e-6)
     np.testing.assert_allclose(np.diag(learnt.bird.bone_covariance), np.var([0.9, 1.0, 1.2]) + 1e-4, rtol=1e-5)
     check_bird(learnt.bird, "learnt")
 
@@ -151,7 +151,7 @@ def test_the_command(tmp_path, capsys):
     with np.load(out) as stored:
         assert (int(stored["prior_poses"]), int(stored["prior_birds"])) == (36, 3)
         assert 0 < float(stored["prior_shrinkage"]) <= 1
-        assert stored["pose_covariance"].shape == (21, 21)
+        assert stored["pose_covariance"].shape == (9, 9)
     capsys.readouterr()
     assert main(["prior", "learn", str(tmp_path / "absent"), "--out", str(out)]) == 2
     assert "absent" in capsys.readouterr().err

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.birds import toy_bird
+from support.birds import tiny_bird
 from support.fits import config
 
 from jaxfit.config.fit import load_config
@@ -63,7 +63,7 @@ def test_usual_fits_are_not_refused():
         check_fit_memory(SimpleNamespace(num_tracks=size[0], num_frames=size[1]), load_murre(), [PAPER], "b.json")
     long = dataclasses.replace(PAPER, window=1000)
     check_fit_memory(SimpleNamespace(num_tracks=9, num_frames=1000), load_murre(), [long] * 3, "b.json")
-    check_fit_memory(SimpleNamespace(num_tracks=9, num_frames=100), toy_bird(), [config()], "b.json")
+    check_fit_memory(SimpleNamespace(num_tracks=9, num_frames=100), tiny_bird(), [config()], "b.json")
 
 
 def test_windows_are_refused_by_estimate():

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from support.birds import toy_bird
+from support.birds import tiny_bird
 
 from jaxfit.config.fit import CropConfig, load_config
 from jaxfit.data.masks import encode_mask
@@ -98,7 +98,7 @@ def test_the_masks_of_neighbours_belong_to_the_content_of_a_window():
 @pytest.mark.extended
 def test_a_hidden_half_does_not_shrink_the_bird():
     """The right half of the mask is hidden by a neighbour that has the same box."""
-    bird = toy_bird()
+    bird = tiny_bird()
     whole = detect(bird, [smooth_motion(bird, 2, 3)], 0.5, 0.0)
     masks, hidden = {}, {}
     for n, t in whole.masks:

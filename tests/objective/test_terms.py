@@ -104,10 +104,10 @@ def edges():
     rest = dataclasses.replace(
         still,
         global_orient=jnp.zeros((T, 3)),
-        body_pose=jnp.zeros((T, 7, 3)),
+        body_pose=jnp.zeros((T, 3, 3)),
         bone_length=PRIORS.bone_mean,
     )
-    at_mean = dataclasses.replace(rest, body_pose=jnp.broadcast_to(BIRD.pose_mean.reshape(7, 3), (T, 7, 3)))
+    at_mean = dataclasses.replace(rest, body_pose=jnp.broadcast_to(BIRD.pose_mean.reshape(3, 3), (T, 3, 3)))
     empty = dataclasses.replace(targets, mask=jnp.zeros((T, SIZE, SIZE), jnp.uint8))
     none_present = functools.reduce(without_frame, range(T), targets)
     return {

@@ -1,4 +1,4 @@
-"""Fits of toy birds that move smoothly, with known truth and small silhouettes."""
+"""Fits of tiny birds that move smoothly, with known truth and small silhouettes."""
 
 import dataclasses
 
@@ -7,12 +7,12 @@ import numpy as np
 from jaxfit.config.fit import load_config
 from jaxfit.model.camera import CropCamera, project
 from jaxfit.simulation.flock import smooth_motion
-from support.birds import pose_window, toy_bird
+from support.birds import pose_window, tiny_bird
 
-BIRD = toy_bird(shapes=0)
+BIRD = tiny_bird(shapes=0)
 T, SIZE = 6, 64
 CAMERA = CropCamera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
-ONE_WINDOW_GB = 0.002
+ONE_WINDOW_GB = 0.0007
 """Memory in GB for one window of six frames. Most tests use it, so that they share the compiled programs."""
 
 

@@ -20,7 +20,7 @@ from jaxfit.objective.posed_window import PosedWindow, Raster, Targets, priors_o
 from jaxfit.objective.registry import find_term, find_terms, known_terms
 from jaxfit.objective.residuals import residual_sum
 from jaxfit.raster.silhouette_reference import Blur
-from support.birds import random_pose, skin_by_hand, toy_bird
+from support.birds import random_pose, skin_by_hand, tiny_bird
 
 T, SIZE = 3, 32
 FRAME_S = 1 / 30
@@ -30,17 +30,17 @@ RASTER = Raster(Blur.for_size(SIZE), SIZE)
 
 
 def correlated_bird():
-    """The toy bird with priors that are not diagonal, so that the tests detect a transposed whitening matrix."""
-    bird, rng = toy_bird(), np.random.default_rng(5)
-    a, b = rng.normal(size=(21, 21)), rng.normal(size=(7, 7))
+    """The tiny bird with priors that are not diagonal, so that the tests detect a transposed whitening matrix."""
+    bird, rng = tiny_bird(), np.random.default_rng(5)
+    a, b = rng.normal(size=(9, 9)), rng.normal(size=(3, 3))
     return dataclasses.replace(
         bird,
-        pose_mean=jnp.asarray(0.2 * rng.normal(size=21), jnp.float32),
-        pose_covariance=jnp.asarray(0.05 * a @ a.T + 0.05 * np.eye(21), jnp.float32),
-        bone_mean=jnp.asarray(1 + 0.1 * rng.normal(size=7), jnp.float32),
-        bone_covariance=jnp.asarray(0.01 * b @ b.T + 0.01 * np.eye(7), jnp.float32),
+        pose_mean=jnp.asarray(0.2 * rng.normal(size=9), jnp.float32),
+        pose_covariance=jnp.asarray(0.05 * a @ a.T + 0.05 * np.eye(9), jnp.float32),
+        bone_mean=jnp.asarray(1 + 0.1 * rng.normal(size=3), jnp.float32),
+        bone_covariance=jnp.asarray(0.01 * b @ b.T + 0.01 * np.eye(3), jnp.float32),
         shape_variance=jnp.array([0.5, 2.0]),
-        joint_limits=jnp.asarray(np.sort(rng.normal(size=(7, 3, 2)) * 0.1), jnp.float32),
+        joint_limits=jnp.asarray(np.sort(rng.normal(size=(3, 3, 2)) * 0.1), jnp.float32),
     )
 
 
