@@ -23,7 +23,12 @@ from jaxfit.simulation.noise import detect
 
 NAMES = BIRD.keypoint_names
 SCALE = {"sd_sure_px": 1.0, "sd_unsure_px": 2.0, "dof": 30.0}
-TRUE = {"nape": (0, 0.4, 0.5), "left_wingtip": (0.3, -0.2, 0.1), "right_wingtip": (-0.3, -0.2, 0.1), "tail_tip": (0, -0.6, 0)}
+TRUE = {
+    "nape": (0, 0.4, 0.5),
+    "left_wingtip": (0.3, -0.2, 0.1),
+    "right_wingtip": (-0.3, -0.2, 0.1),
+    "tail_tip": (0, -0.6, 0),
+}
 PLACED = np.float32([TRUE.get(name, (0, 0, 0)) for name in NAMES])
 FRAMES = 20
 ONLY_KEYPOINTS = StageConfig("only", 12, ("keypoint_likelihood", "pose_prior"), solver="levenberg_marquardt")
