@@ -175,8 +175,8 @@ def test_links_out_of_the_documents_lead_to_pages_or_become_text(site):
         "[trust](trust.md#flags) [other](https://example.org) ![murre](../media/murre.png)"
     )
     page.file.src_uri = "reference/model_card.md"
-    led = site.on_page_markdown("[pixels](../../../docs/results/pixels.md)", page, None, None)
-    assert led == "[pixels](../results/pixels.md)"
+    led = site.on_page_markdown("[pixels](../../../docs/results/simulated.md#from-pixels)", page, None, None)
+    assert led == "[pixels](../results/simulated.md#from-pixels)"
 
 
 def test_the_site_needs_no_network():
