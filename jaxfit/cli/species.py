@@ -27,8 +27,7 @@ _AXES = {"X": (1, 0, 0), "Y": (0, 1, 0), "Z": (0, 0, 1)}
 def adapt_scan(options: argparse.Namespace) -> None:
     """Fit a model to a 3D scan, write the adapted model and a picture of the errors."""
     from jaxfit.learning.species.scan_files import read_scan, read_scan_keypoints
-    from jaxfit.learning.species.scan_fit import ScanSettings, fit_scan
-    from jaxfit.learning.species.scan_report import UNITS_MM, draw_scan, measure_scan
+    from jaxfit.learning.species.scan_fit import UNITS_MM, ScanSettings, draw_scan, fit_scan, measure_scan
     from jaxfit.learning.species.species import mean_keypoints, provenance_notes
     from jaxfit.learning.species.surface import is_mirrored
 
@@ -160,7 +159,7 @@ def _show_bones(base: Bird, adapted: Bird, widths: BoneWidths | None = None) -> 
 
 def _check_near(scan, keypoints, options: argparse.Namespace) -> None:
     """Report keypoints off the surface; raise InputError if most keypoints are far from the scan."""
-    from jaxfit.learning.species.scan_report import keypoints_off_surface
+    from jaxfit.learning.species.scan_fit import keypoints_off_surface
 
     length = float(np.ptp(scan.vertices, axis=0).max())
     off = keypoints_off_surface(scan.vertices, scan.faces, keypoints, length)

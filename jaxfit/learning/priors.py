@@ -124,9 +124,17 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
     mean_change_rad = np.linalg.norm(change, axis=1)
     priors = priors_of(bird)
     whitened = (poses - np.asarray(priors.pose_mean)) @ np.asarray(priors.pose_whitener).T
-    counts = len(poses), len(tracks), diverged, effective
-    width = max(float((whitened**2).mean()), MIN_WIDTH)
-    return LearntPrior(learnt, *counts, shrinkage, bones_learnt, mean_change_rad, width)
+    return LearntPrior(
+        bird=learnt,
+        poses=len(poses),
+        birds=len(tracks),
+        diverged=diverged,
+        effective_poses=effective,
+        shrinkage=shrinkage,
+        bones_learnt=bones_learnt,
+        mean_change_rad=mean_change_rad,
+        width=max(float((whitened**2).mean()), MIN_WIDTH),
+    )
 
 
 def effective_count(
@@ -285,9 +293,9 @@ def learn_motion(results: Sequence[tuple[object, Solution]]) -> LearntMotion:
     counts, shipped = np.stack(histograms), shipped_motion()
     total, effective = counts.sum(axis=0), effective_birds(frames)
     unshrunk, held_out = maximum_likelihood(total), []
-    for b, own in enumerate(counts if len(counts) > 1 else ()):
-        others = _shrunk(maximum_likelihood(total - own), shipped, effective_birds(np.delete(frames, b)))
-        held_out.append(own.sum() * mean_cost(own, others))
+    for b, of_bird in enumerate(counts if len(counts) > 1 else ()):
+        others = _shrunk(maximum_likelihood(total - of_bird), shipped, effective_birds(np.delete(frames, b)))
+        held_out.append(of_bird.sum() * mean_cost(of_bird, others))
     return LearntMotion(
         prior=_shrunk(unshrunk, shipped, effective),
         unshrunk=unshrunk,
@@ -387,7 +395,7 @@ def _shrinkage(effective: float) -> float:
 def _shrunk(learnt: MotionPrior, shipped: MotionPrior, effective: float) -> MotionPrior:
     """Return the geometric mean of learnt and shipped settings, weighted by the number of birds."""
     share = _shrinkage(effective)
-    return MotionPrior(*(own ** (1 - share) * other**share for own, other in zip(learnt, shipped, strict=True)))
+    return MotionPrior(*(new ** (1 - share) * old**share for new, old in zip(learnt, shipped, strict=True)))
 
 
 def motion_config(learnt: LearntMotion) -> str:

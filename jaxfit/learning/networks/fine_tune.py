@@ -465,10 +465,10 @@ def segmenter_accuracy(segmenter: Segmenter, pictures: Sequence[StoredPicture]) 
     """
     true = _observations(pictures, [_true_instances(picture.labels) for picture in pictures])
     detected = _observations(pictures, [segmenter(picture.pixels()) for picture in pictures])
-    both = overlap(detected, true)
-    ious = [iou[assign(iou, 1e-9)].sum() for iou in both.iou]
-    ap50, _ = average_precision(detected, true, both)
-    return {"mean_iou": float(np.sum(ious) / max(int(both.true.sum()), 1)), "ap50": ap50}
+    matches = overlap(detected, true)
+    ious = [iou[assign(iou, 1e-9)].sum() for iou in matches.iou]
+    ap50, _ = average_precision(detected, true, matches)
+    return {"mean_iou": float(np.sum(ious) / max(int(matches.true.sum()), 1)), "ap50": ap50}
 
 
 def keypoint_accuracy(
@@ -493,8 +493,8 @@ def keypoint_accuracy(
         instances = _true_instances(picture.labels)
         birds = [(bird, instance) for bird, instance in zip(picture.labels.birds, instances, strict=True) if instance]
         points_px, _ = detector(picture.pixels(), [instance for _, instance in birds])
-        for (bird, instance), found_px in zip(birds, points_px, strict=True):
-            error = np.linalg.norm(found_px[place] - bird.keypoints_px, axis=-1) / max(instance.mask.shape)
+        for (bird, instance), detected_px in zip(birds, points_px, strict=True):
+            error = np.linalg.norm(detected_px[place] - bird.keypoints_px, axis=-1) / max(instance.mask.shape)
             errors.append(np.where(place < 0, np.inf, error)[bird.visibility == 2])
     values = np.concatenate([*errors, np.zeros(0)])
     if not len(values):

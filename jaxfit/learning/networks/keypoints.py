@@ -168,8 +168,8 @@ def _augmented_patch(
     warp = np.column_stack([affine[:, :2], affine[:, 2] + shift])
     picture = cv2.warpAffine(picture, warp, (side, side), flags=cv2.INTER_LINEAR)
     owner = cv2.warpAffine(owner, warp, (side, side), flags=cv2.INTER_NEAREST)
-    own, *others = (n + 1, *(k for k in np.unique(owner[owner > 0]).tolist() if k != n + 1))
-    instance = instance_of(_faulty_mask(rng, owner == own, owner > 0), 1.0, "")
+    others = [k for k in np.unique(owner[owner > 0]).tolist() if k != n + 1]
+    instance = instance_of(_faulty_mask(rng, owner == n + 1, owner > 0), 1.0, "")
     if instance is None:
         return None
     detected = [k for k in others if rng.random() >= UNDETECTED_SHARE]

@@ -60,8 +60,8 @@ class LabelledFrames(NamedTuple):
         points = np.zeros((S, N, len(names), 2), np.float32)
         visibility = np.where((self.visibility > 0).any(-1, keepdims=True), UNKNOWN, 0)
         visibility = np.repeat(visibility, len(names), axis=-1).astype(np.uint8)
-        for own, old in propose_names(names, self.keypoint_names).mapped.items():
-            new, k = list(names).index(own), self.keypoint_names.index(old)
+        for new_name, old_name in propose_names(names, self.keypoint_names).mapped.items():
+            new, k = list(names).index(new_name), self.keypoint_names.index(old_name)
             points[:, :, new], visibility[:, :, new] = self.keypoints_px[:, :, k], self.visibility[:, :, k]
         return self._replace(keypoints_px=points, visibility=visibility, keypoint_names=tuple(names))
 

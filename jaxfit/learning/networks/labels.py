@@ -106,21 +106,21 @@ def read_labels(
         if file.is_dir():
             if needs_keypoints:
                 raise InputError(file, "is a folder of masks, without keypoints", "give a file of labelled keypoints")
-            found, own_names = list(_mask_pictures(file, progress)), (CENTRE,)
+            read, own_names = list(_mask_pictures(file, progress)), (CENTRE,)
         else:
             observations = _observations(file, images[i] if images else None, needs_keypoints)
             if masks is not None:
                 observations = add_masks(observations, masks, progress, images[i] if images else None)
-            found, own_names = list(_pictures(observations, file)), observations.keypoint_names
+            read, own_names = list(_pictures(observations, file)), observations.keypoint_names
         if not needs_keypoints:
-            found, own_names = [_with_centres(picture) for picture in found], (CENTRE,)
+            read, own_names = [_with_centres(picture) for picture in read], (CENTRE,)
         if names and sorted(own_names) != sorted(names):
             different = sorted(set(own_names) ^ set(names))
             problem = f"names other keypoints than {files[0].name}: {', '.join(different)} only in one of the two"
             raise InputError(file, problem, "label the same keypoints in all files")
         names = names or own_names
         order = [own_names.index(name) for name in names]
-        pictures += [_reordered(picture, order) for picture in found]
+        pictures += [_reordered(picture, order) for picture in read]
     commas = [name for name in names if "," in name]
     if commas:  # the network file separates the names by commas
         raise InputError(files[0], f"has a keypoint with a comma in its name: {commas[0]}", "rename the keypoint")
@@ -292,7 +292,7 @@ def numbered_by_film(pictures: Sequence[StoredPicture], film: Path) -> dict[int,
         return {picture.labels.frame: picture.labels for picture in pictures}
     listed = image_files(film)
     files = _files_of([picture.labels for picture in pictures], film, listed)
-    return {listed.index(file): own.labels for own, file in zip(pictures, files, strict=True) if file in listed}
+    return {listed.index(file): picture.labels for picture, file in zip(pictures, files, strict=True) if file in listed}
 
 
 def _video_pictures(
@@ -518,7 +518,7 @@ def check_sides(
     for (p, bird), is_wrong in zip(birds, wrong, strict=True):
         if not is_wrong:
             kept[p].append(bird)
-    return [picture._replace(birds=tuple(own)) for picture, own in zip(pictures, kept, strict=True)], problems
+    return [picture._replace(birds=tuple(birds)) for picture, birds in zip(pictures, kept, strict=True)], problems
 
 
 def _problem(bird: LabelledBird, size_px: tuple[int, int], network: str) -> str | None:

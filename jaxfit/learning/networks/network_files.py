@@ -224,22 +224,22 @@ def load_keypoint_base(path: Path, names: Sequence[str]) -> tuple[FeaturePyramid
     Raises:
         InputError: the file cannot be read, or is a network of another layout.
     """
-    own = tuple(OnnxModel(path).metadata.get("keypoint_names", "").split(","))
+    stored_names = tuple(OnnxModel(path).metadata.get("keypoint_names", "").split(","))
     weights = _weights(path)
     head = "network.heads.logits"
     shapes = {name: weights[name].shape for name in (f"{head}.weight", f"{head}.bias") if name in weights}
-    if set(shapes.values()) != {(len(own), 64, 3, 3), (len(own),)}:
+    if set(shapes.values()) != {(len(stored_names), 64, 3, 3), (len(stored_names),)}:
         raise InputError(path, f"{_OTHER_LAYOUT} keypoints`", _REMEDY)
     network = keypoint_network(len(names))
-    found = propose_names(names, own).mapped
+    counterparts = propose_names(names, stored_names).mapped
     for key in (f"{head}.weight", f"{head}.bias"):
         values = network.state_dict()[key.removeprefix("network.")].numpy().copy()
         for k, name in enumerate(names):
-            if name in found:
-                values[k] = weights[key][own.index(found[name])]
+            if name in counterparts:
+                values[k] = weights[key][stored_names.index(counterparts[name])]
         weights[key] = values
     _load_weights(network, weights, path, "keypoints")
-    return network, tuple(found.get(name, "") for name in names)
+    return network, tuple(counterparts.get(name, "") for name in names)
 
 
 def freeze_normalisation(network: nn.Module) -> None:

@@ -105,13 +105,15 @@ def _place(
     # most birds on water swim, the others stand on something that the picture does not show
     swims &= rng.random(N) < 0.95
     manners = ("fly",) if flies else ("stand", "swim")
-    posed = {manner: [one.pose(rng, N, manner) for one in species] for manner in manners}
+    posed = {manner: [kind_of_bird.pose(rng, N, manner) for kind_of_bird in species] for manner in manners}
     placed = []
     for n, (centre, kind) in enumerate(zip(centres, kinds, strict=True)):
-        own = scale * float(np.exp(rng.normal(0, 0.12)))
+        bird_scale = scale * float(np.exp(rng.normal(0, 0.12)))
         birds = posed["fly" if flies else "swim" if swims[n] else "stand"][kind]
         vertices, keypoints = birds.vertices_world[n], birds.keypoints_world[n]
-        screen, points = (_on_screen(world, R_cam_world, own, centre, N - n + 1) for world in (vertices, keypoints))
+        screen, points = (
+            _on_screen(world, R_cam_world, bird_scale, centre, N - n + 1) for world in (vertices, keypoints)
+        )
         low, high = vertices[:, 2].min(), vertices[:, 2].max()
         waterline = low + rng.uniform(0.25, 0.5) * (high - low) if swims[n] else None
         placed.append(_Placed(vertices, screen, points, species[kind], waterline, flies))
@@ -244,8 +246,8 @@ def _visibility(points: Float[np.ndarray, "N K 3"], owner: np.ndarray, depths: n
     height, width = owner.shape
     inside: Bool[np.ndarray, "N K"] = np.all((points[..., :2] >= 0) & (points[..., :2] < [width, height]), axis=-1)
     column, row = (np.clip(points[..., i].astype(int), 0, side - 1) for i, side in enumerate((width, height)))
-    own = owner[row, column] == np.arange(1, len(points) + 1)[:, None]
-    visible = inside & own & (points[..., 2] <= depths[row, column] + SURFACE_TOLERANCE)
+    is_bird = owner[row, column] == np.arange(1, len(points) + 1)[:, None]
+    visible = inside & is_bird & (points[..., 2] <= depths[row, column] + SURFACE_TOLERANCE)
     return inside.astype(np.uint8) + visible
 
 

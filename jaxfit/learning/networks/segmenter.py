@@ -126,21 +126,24 @@ def _targets(owner: np.ndarray) -> tuple[np.ndarray, ...]:
     offset = np.zeros((2, side, side), np.float32)
     at = (np.arange(side, dtype=np.float32) + 0.5) * STRIDE
     for n in np.unique(owner[owner > 0]):
-        own = cells == n
+        cells_of_bird = cells == n
         if n == UNKNOWN_OWNER:
-            foreground_weight[own] = 0
+            foreground_weight[cells_of_bird] = 0
             continue
-        rows, columns = np.nonzero(own)
+        rows, columns = np.nonzero(cells_of_bird)
         area = len(rows) * STRIDE**2
         if area < MIN_AREA_PX:
-            foreground_weight[own] = 0
+            foreground_weight[cells_of_bird] = 0
             continue
         x, y = at[columns].mean(), at[rows].mean()
         sigma = max(CENTRE_SIGMA * np.sqrt(area), 2.5)
         peak = np.exp(-((at - y)[:, None] ** 2 + (at - x)[None] ** 2) / (2 * sigma**2))
         centre = np.maximum(centre, peak.astype(np.float32))
-        offset[0][own], offset[1][own] = (x - at[columns]) / OFFSET_UNIT_PX, (y - at[rows]) / OFFSET_UNIT_PX
-        offset_weight[own] = 1 / len(rows)
+        offset[0][cells_of_bird], offset[1][cells_of_bird] = (
+            (x - at[columns]) / OFFSET_UNIT_PX,
+            (y - at[rows]) / OFFSET_UNIT_PX,
+        )
+        offset_weight[cells_of_bird] = 1 / len(rows)
     low = cv2.erode(cells, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     border = cv2.dilate(cells, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE) != low
     foreground_weight[border & (foreground_weight > 0)] = 2

@@ -208,16 +208,16 @@ def track_labels(
         progress: reports every frame.
     """
     films = [
-        (source, film, own)
+        (source, film, numbered)
         for source, group in groupby(pictures, key=lambda picture: picture.labels.source)
-        if (film := sources[source]) is not None and (own := numbered_by_film(list(group), film))
+        if (film := sources[source]) is not None and (numbered := numbered_by_film(list(group), film))
     ]
     result, confirmed = Tracked([], [], 0, []), 0
     for n, (source, video, labels) in enumerate(films):
-        own = folder / str(n)
-        own.mkdir(parents=True)
+        pictures_folder = folder / str(n)
+        pictures_folder.mkdir(parents=True)
         try:
-            film = read_film(video, sorted(labels), own, len(films), progress)
+            film = read_film(video, sorted(labels), pictures_folder, len(films), progress)
         except InputError as error:  # pictures of several sizes
             _logger.warning("no masks are tracked: %s", error)
             continue
@@ -225,19 +225,16 @@ def track_labels(
             continue
         labels = {number: labels[number] for number in sorted(labels) if number in film.files}
         seeds, doubtful = _confirmed(film, labels, teacher, progress)
-        found = sum(map(bool, seeds.values()))
-        confirmed += found
+        num_seeds = sum(map(bool, seeds.values()))
+        confirmed += num_seeds
         result.doubtful.extend(doubtful)
-        if found < len(doubtful):
+        if num_seeds < len(doubtful):
             continue
         for picture, is_unbroken in _track(film, seeds, teacher, progress):
             label = labels.get(picture.labels.frame)
             if label is None:
                 result.pictures.append(picture._replace(labels=picture.labels._replace(source=source)))
-            elif (
-                is_unbroken
-                and _iou(*(_union(_masks(each), film.size_px) for each in (label, picture.labels))) <= MIN_IOU
-            ):
+            elif is_unbroken and _iou(_bird_pixels(label), _bird_pixels(picture.labels)) <= MIN_IOU:
                 result.wrong.append(label)
     return result._replace(confirmed=confirmed)
 
@@ -251,8 +248,8 @@ def _confirmed(
     with single_opencv_thread(), progress("Comparing labels with the teacher", len(labels)) as report_progress:
         for number, label in labels.items():
             masks = _masks(label)
-            found, _ = _segment(teacher, film.picture(number), masks)
-            least = min((_iou(*both) for both in zip(masks, found, strict=True)), default=1.0)
+            detected, _ = _segment(teacher, film.picture(number), masks)
+            least = min((_iou(mask, bird) for mask, bird in zip(masks, detected, strict=True)), default=1.0)
             if least >= SEED_IOU:
                 seeds[number] = masks
             else:
@@ -265,6 +262,10 @@ def _confirmed(
 
 def _masks(picture: LabelledPicture) -> list[Mask]:
     return [decode_mask(bird.mask) for bird in picture.birds if bird.mask is not None]
+
+
+def _bird_pixels(picture: LabelledPicture) -> Mask:
+    return _union(_masks(picture), picture.size_px)
 
 
 def read_film(video: Path, seeds: Sequence[int], folder: Path, films: int = 1, progress: ProgressTask = silent) -> Film:
@@ -349,39 +350,39 @@ def _walk(
         if number not in film.files:
             continue
         moved = [_resized(mask, film.size_px) > 0.5 for mask in carried]
-        found, others = _segment(teacher, film.picture(number), moved)
-        lost = [_iou(mask, before) <= MIN_IOU for mask, before in zip(found, moved, strict=True)]
+        birds, others = _segment(teacher, film.picture(number), moved)
+        lost = [_iou(mask, before) <= MIN_IOU for mask, before in zip(birds, moved, strict=True)]
         if any(lost) or misses > MAX_MISSES:
             is_unbroken = False
             lost = [misses > MAX_MISSES or is_lost for is_lost in lost]
-            birds = _detected_again(teacher, film.picture(number), found, lost)
-            found, lost = (birds, [False] * len(birds)) if birds else (found, lost)
+            again = _detected_again(teacher, film.picture(number), birds, lost)
+            birds, lost = (again, [False] * len(again)) if again else (birds, lost)
         carried = [
             before if is_lost else _resized(mask, small_px)
-            for mask, before, is_lost in zip(found, carried, lost, strict=True)
+            for mask, before, is_lost in zip(birds, carried, lost, strict=True)
         ]
         misses = misses + 1 if any(lost) else 0
         if not misses:
-            total = np.sum(found, axis=0)
+            total = np.sum(birds, axis=0)
             unknown = others & (total == 0) | (total > 1)
-            yield film.stored(number, [mask & (total == 1) for mask in found], unknown), is_unbroken
+            yield film.stored(number, [mask & (total == 1) for mask in birds], unknown), is_unbroken
 
 
 def _detected_again(
-    teacher: Segmenter, picture: UInt8[np.ndarray, "H W 3"], found: Sequence[Mask], lost: Sequence[bool]
+    teacher: Segmenter, picture: UInt8[np.ndarray, "H W 3"], birds: Sequence[Mask], lost: Sequence[bool]
 ) -> list[Mask]:
     """Return the masks of all birds, with those of lost birds by two runs of the teacher; empty if birds stay lost.
 
     Lost birds are detected if as many birds without a mask are detected in both runs.
     """
     first, second = _two_runs(teacher, picture)
-    kept = [mask for mask, is_lost in zip(found, lost, strict=True) if not is_lost]
+    kept = [mask for mask, is_lost in zip(birds, lost, strict=True) if not is_lost]
     free = [first[i] & second[j] for i, j in _pairs(first, second)]
     free = [mask for mask in free if not any((mask & other).any() for other in kept)]
     if len(free) != sum(lost):
         return []
     left = iter(free)
-    return [next(left) if is_lost else mask for mask, is_lost in zip(found, lost, strict=True)]
+    return [next(left) if is_lost else mask for mask, is_lost in zip(birds, lost, strict=True)]
 
 
 def _segment(
@@ -400,18 +401,18 @@ def _segment(
     size_px = picture.shape[1], picture.shape[0]
     others = np.zeros(picture.shape[:2], bool)
     if isinstance(teacher, DetectorAndSaliency):
-        found = [_in_box(teacher, picture, place) for place in places]
-        covered = _union(found, size_px)
+        birds = [_in_box(teacher, picture, place) for place in places]
+        covered = _union(birds, size_px)
         for x0, y0, x1, y1 in (np.round(box).astype(int).tolist() for box in teacher.boxes(picture)):
             part = slice(max(y0, 0), y1), slice(max(x0, 0), x1)
             if not covered[part].any():
                 others[part] = True
-        return found, others
-    birds = [bird.whole(size_px) for bird in teacher(picture)]
-    of_place = dict(_pairs(places, birds))
-    found = [birds[of_place[i]] if i in of_place else np.zeros_like(others) for i in range(len(places))]
-    left = [bird for j, bird in enumerate(birds) if j not in of_place.values()]
-    return found, _union(left, size_px) & ~_union(found, size_px)
+        return birds, others
+    detected = [bird.whole(size_px) for bird in teacher(picture)]
+    of_place = dict(_pairs(places, detected))
+    birds = [detected[of_place[i]] if i in of_place else others for i in range(len(places))]
+    elsewhere = [bird for j, bird in enumerate(detected) if j not in of_place.values()]
+    return birds, _union(elsewhere, size_px) & ~_union(birds, size_px)
 
 
 def _in_box(teacher: DetectorAndSaliency, picture: UInt8[np.ndarray, "H W 3"], place: Mask) -> Mask:

@@ -327,9 +327,9 @@ def _draw_body(rng: np.random.Generator, bird: Bird) -> Bird:
 def _draw_plumage(rng: np.random.Generator, bird: Bird) -> Float[np.ndarray, "V 3"]:
     """Draw colours of the vertices: the murre's, one colour for each part of the body, or a random pattern."""
     kind = rng.random()
-    own = np.asarray(bird.vertex_colours, np.float64)[:, ::-1] ** GAMMA
+    murre = np.asarray(bird.vertex_colours, np.float64)[:, ::-1] ** GAMMA
     if kind < 0.25:
-        return np.clip(own * rng.uniform(0.5, 2, 3), 0.01, 0.95)
+        return np.clip(murre * rng.uniform(0.5, 2, 3), 0.01, 0.95)
     vertices, names = np.asarray(bird.vertices, np.float64), bird.joint_names
     weights = np.asarray(bird.skin_weights, np.float64)
     parts = [
@@ -339,7 +339,7 @@ def _draw_plumage(rng: np.random.Generator, bird: Bird) -> Float[np.ndarray, "V 
     low, high = np.quantile(vertices[:, 2], [0.2, 0.6])
     belly = 1 - np.clip((vertices[:, 2] - low) / (high - low), 0, 1)
     bill = np.clip((vertices[:, 1] - 9.2) / 0.6, 0, 1)  # the head ends 9.2 units in front of the root
-    colours = np.broadcast_to(_colour(rng), own.shape)
+    colours = np.broadcast_to(_colour(rng), murre.shape)
     for share in (belly, *parts, bill):
         if rng.random() < 0.6:
             colours = colours + share[:, None] * (_colour(rng) - colours)

@@ -206,7 +206,7 @@ def _by_names(first: Bird, second: Bird) -> Similarity:
     """Return the similarity from the second model to the first by common keypoints, or by common joints."""
     points = [rest_points(bird) for bird in (first, second)]
     for kind in ("keypoints", "joints"):
-        place = [own[kind] for own in points]
+        place = [of_model[kind] for of_model in points]
         common = [name for name in place[0] if name in place[1]]
         if len(common) >= MIN_COMMON:
             to_first = [np.stack([places[name] for name in common]) for places in place]

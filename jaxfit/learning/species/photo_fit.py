@@ -211,11 +211,11 @@ def bone_widths(model: Hierarchy, priors: Priors, data: Data, weights: Weights, 
     prior = np.linalg.inv(precision[:bones, :bones])
     images = _image_precisions(model, priors, data, weights, p)
     for n in range(len(p.own_bones)):
-        own = images[np.asarray(data.individual) == n].sum(axis=0)
-        precision += _without(own, own + own_precision, own_free)
+        individual = images[np.asarray(data.individual) == n].sum(axis=0)
+        precision += _without(individual, individual + own_precision, own_free)
     free = np.concatenate(free)
     posterior = np.linalg.inv(precision[np.ix_(free, free)])[:bones, :bones]
-    return BoneWidths(*(np.sqrt(np.diag(symmetric @ each @ symmetric.T)) for each in (prior, posterior)))
+    return BoneWidths(*(np.sqrt(np.diag(symmetric @ covariance @ symmetric.T)) for covariance in (prior, posterior)))
 
 
 def _image_precisions(
@@ -235,8 +235,8 @@ def _image_precisions(
     whitener = np.asarray(model.pose_whitener, np.float64)
     local = np.arange(to_rows.shape[1]) < scale
     precisions = []
-    for each in curvature:
-        rows = to_rows.T @ each @ to_rows
+    for matrix in curvature:
+        rows = to_rows.T @ matrix @ to_rows
         with_prior = rows.copy()
         with_prior[3 : 3 + angles, 3 : 3 + angles] += whitener.T @ whitener
         precisions.append(_without(rows, with_prior, local)[scale:, scale:])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -69,33 +69,41 @@ def read_photographs(
     if frames_per_track < 1:
         raise ValueError(f"frames_per_track: expected 1 or more, not {frames_per_track}")
     config = _keypoint_config()
-    parts: list[dict[str, Any]] = []
+    images: list[_Image] = []
     remarks: list[str] = []
     for file, (source, given) in enumerate(sources):
         checked = check_keypoints(given, bird.keypoint_names, source)
         observations = _few_frames(checked, config.min_keypoints, frames_per_track)
         solution = fit(observations, bird, config, progress=progress, source=source)
-        parts += _images(observations, solution, source, file)
-        images, fitted = int(checked.present.sum()), int(solution.valid.sum())
-        usable, chosen = (int(each.usable(config.min_keypoints).sum()) for each in (checked, observations))
-        remarks += _remarks(source, images, usable, chosen, fitted, frames_per_track)
-    if not parts:
+        images += _images(observations, solution, source, file)
+        usable, chosen = (int(part.usable(config.min_keypoints).sum()) for part in (checked, observations))
+        all_images, fitted = int(checked.present.sum()), int(solution.valid.sum())
+        remarks += _remarks(source, all_images, usable, chosen, fitted, frames_per_track)
+    if not images:
         raise InputError(sources[0][0], "has no usable image", "annotate at least four keypoints per bird")
-    own = {key: number for number, key in enumerate(dict.fromkeys(part["individual"] for part in parts))}
-
-    def stacked(key: str) -> np.ndarray:
-        return np.stack([part[key] for part in parts])
-
+    number = {key: n for n, key in enumerate(dict.fromkeys(image.individual for image in images))}
     return Photographs(
-        names=tuple(part["name"] for part in parts),
-        individual=np.array([own[part["individual"]] for part in parts]),
-        keypoints_px=stacked("keypoints_px"),
-        confidence=stacked("confidence"),
-        mask=stacked("mask"),
-        has_mask=stacked("has_mask"),
-        pose=jax.tree.map(lambda *x: np.stack(x), *(part["pose"] for part in parts)),
+        names=tuple(image.name for image in images),
+        individual=np.array([number[image.individual] for image in images]),
+        keypoints_px=np.stack([image.keypoints_px for image in images]),
+        confidence=np.stack([image.confidence for image in images]),
+        mask=np.stack([image.mask for image in images]),
+        has_mask=np.array([bool(image.mask.any()) for image in images]),
+        pose=jax.tree.map(lambda *x: np.stack(x), *(image.pose for image in images)),
         remarks=tuple(remarks),
     )
+
+
+class _Image(NamedTuple):
+    """One image; the fields are those of `Photographs`."""
+
+    name: str
+    individual: tuple[int, int]
+    """Position of the file, whose name others may have too, and number of the track."""
+    keypoints_px: np.ndarray
+    confidence: np.ndarray
+    mask: np.ndarray
+    pose: Pose
 
 
 def _remarks(source: object, images: int, usable: int, chosen: int, fitted: int, frames_per_track: int) -> list[str]:
@@ -130,24 +138,22 @@ def _few_frames(observations: Observations, min_keypoints: int, most: int) -> Ob
     return observations.with_keypoints(observations.keypoints_px, confidence)
 
 
-def _images(observations: Observations, solution: Solution, source: object, file: int) -> list[dict[str, Any]]:
-    """Return the images with a valid pose; `file` is the position of the source, whose name others may have too."""
+def _images(observations: Observations, solution: Solution, source: object, file: int) -> list[_Image]:
+    """Return the images with a valid pose."""
     images = []
     row = {int(track): n for n, track in enumerate(observations.track_id)}
-    for m, t in zip(*np.nonzero(solution.valid), strict=True):
-        track = int(solution.track_id[m])
-        n, crop = row[track], solution.crop[m, t]
-        full = observations.mask(n, int(t))
-        mask = np.zeros((MASK_PX, MASK_PX), np.uint8) if full is None else cut_mask(full, crop, MASK_PX)
+    for m, t in np.argwhere(solution.valid).tolist():
+        track, crop = int(solution.track_id[m]), solution.crop[m, t]
+        n = row[track]
+        mask = observations.mask(n, t)
         images.append(
-            {
-                "name": f"{source}: {observations.image_file(n, int(t)) or solution.frame_index[t]}, track {track}",
-                "individual": (file, track),
-                "keypoints_px": np.asarray(image_to_crop(observations.keypoints_px[n, t], crop), np.float32),
-                "confidence": np.asarray(observations.confidence[n, t]),
-                "mask": mask,
-                "has_mask": np.array(bool(mask.any())),
-                "pose": Pose(
+            _Image(
+                name=f"{source}: {observations.image_file(n, t) or solution.frame_index[t]}, track {track}",
+                individual=(file, track),
+                keypoints_px=np.asarray(image_to_crop(observations.keypoints_px[n, t], crop), np.float32),
+                confidence=np.asarray(observations.confidence[n, t]),
+                mask=np.zeros((MASK_PX, MASK_PX), np.uint8) if mask is None else cut_mask(mask, crop, MASK_PX),
+                pose=Pose(
                     solution.global_orient[m, t],
                     solution.body_pose[m, t],
                     solution.transl[m, t],
@@ -155,6 +161,6 @@ def _images(observations: Observations, solution: Solution, source: object, file
                     solution.bone_length[m, t],
                     solution.betas[m, t],
                 ),
-            }
+            )
         )
     return images

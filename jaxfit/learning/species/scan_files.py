@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +16,7 @@ from jaxtyping import Float, Int
 
 from jaxfit.data.keypoint_names import propose_names
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import KEYPOINTS, SCAN_BYTES, SCAN_FACES
-from jaxfit.foundation.reading import check_readable, open_file, parse_json, read_text
+from jaxfit.foundation.reading import read_json_file, reading
 
 SCAN_FORMATS = (".ply", ".obj", ".stl", ".glb")
 MAX_FACES = 150_000
@@ -48,53 +48,35 @@ def read_scan(path: str | Path) -> Scan:
         path: a .ply, .obj, .stl or .glb file.
 
     Raises:
-        InputError: the file cannot be read, has another format or no faces, is larger than the limits, or has
-            coordinates that are not finite.
+        InputError: the file cannot be read, has another format or no faces, or has coordinates that are not finite.
     """
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in SCAN_FORMATS:
         raise InputError(path, f"has the suffix {kind or 'of no format'}", f"give a scan as {', '.join(SCAN_FORMATS)}")
-    size = check_readable(path, "a scan").stat().st_size
-    if size > SCAN_BYTES:
-        raise InputError(path, f"has {size:,} bytes, more than {SCAN_BYTES:,}", "decimate the scan")
-    meshes = _meshes(path, kind)
+    with reading(path, "a scan"):
+        # bytes without a resolver: no textures or other files are read
+        file = io.BytesIO(path.read_bytes())
+        content = trimesh.load(file, file_type=kind[1:], process=False, maintain_order=True, skip_materials=True)
+        parts = content.dump() if isinstance(content, trimesh.Scene) else [content]
+        meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not meshes:
         raise InputError(path, "has no faces", "give a mesh, not a point cloud: reconstruct a surface first")
-    count = sum(len(mesh.faces) for mesh in meshes)
-    if count > SCAN_FACES:
-        raise InputError(path, f"has {count:,} faces, more than {SCAN_FACES:,}", "decimate the scan")
     numbered = np.array(meshes[0].vertices, np.float64) if len(meshes) == 1 and kind != ".stl" else None
     bare = [trimesh.Trimesh(m.vertices, m.faces, process=False) for m in meshes]
     mesh = cast(trimesh.Trimesh, trimesh.util.concatenate(bare))
     if not np.isfinite(mesh.vertices).all():
         raise InputError(path, "has vertices that are not finite", "write the scan again")
-    if not np.ptp(np.asarray(mesh.vertices), axis=0).max() > 0 or not mesh.area > 0:
+    if not mesh.area > 0:
         raise InputError(path, "has no area: all its faces are points or lines", "write the scan again")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    remarks = []
+    remarks, count = [], len(mesh.faces)
     if count > MAX_FACES:
         mesh = _decimated(mesh)
         remarks.append(f"{count:,} faces were decimated to {len(mesh.faces):,}")
     mesh, remark = _without_small_parts(mesh)
     remarks += [remark] if remark else []
     return Scan(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), numbered, tuple(remarks))
-
-
-def _meshes(path: Path, kind: str) -> list[trimesh.Trimesh]:
-    """Return the meshes with faces of a file, in one frame."""
-    with open_file(path, "a scan") as file:
-        try:
-            # bytes without a resolver: no textures or other files are read
-            content = trimesh.load(
-                io.BytesIO(file.read()), file_type=kind[1:], process=False, maintain_order=True, skip_materials=True
-            )
-        except MemoryError:
-            raise
-        except Exception as error:  # the readers raise errors of every kind
-            raise InputError(path, f"cannot be read as {kind[1:].upper()}: {error}", "write the scan again") from None
-    found = content.dump() if isinstance(content, trimesh.Scene) else [content]
-    return [mesh for mesh in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
 
 
 def _decimated(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -157,64 +139,49 @@ def read_scan_keypoints(
             the model are given.
     """
     path = Path(path)
-    text = read_text(path, "a file of keypoints")
-    points = _picked_points(text, path) if path.suffix.lower() == ".pp" else _json_points(text, path, numbered_vertices)
+    if path.suffix.lower() == ".pp":
+        content = _picked_points(path)
+    else:
+        content = read_json_file(path)
+        if not isinstance(content, dict):
+            example = 'write {"bill_tip": [x, y, z], "left_eye": 1234, …}'
+            raise InputError(path, "is not an object of keypoints", example)
+    points = {name: _point(name, value, path, numbered_vertices) for name, value in content.items()}
     names = propose_names(list(points), model_names)
     if len(names.mapped) < MIN_KEYPOINTS:
         problem = f"has {len(names.mapped)} keypoints of the model; a fit needs {MIN_KEYPOINTS}"
         raise InputError(path, problem, f"the model has {', '.join(model_names)}")
-    found = {model: points[own] for own, model in names.mapped.items()}
-    spread = np.ptp(np.stack(list(found.values())), axis=0).max()
-    if not spread > 0:
+    by_model = {model: points[name] for name, model in names.mapped.items()}
+    if not np.ptp(np.stack(list(by_model.values())), axis=0).max() > 0:
         raise InputError(path, "all keypoints are at one point", "annotate the keypoints again")
-    return found, names.unmapped
+    return by_model, names.unmapped
 
 
-def _json_points(text: str, path: Path, numbered: Float[np.ndarray, "N 3"] | None) -> dict[str, np.ndarray]:
-    content = parse_json(text, path)
-    if not isinstance(content, dict) or len(content) > KEYPOINTS:
-        raise InputError(path, "is not an object of keypoints", 'write {"bill_tip": [x, y, z], "left_eye": 1234, …}')
-    return {name: _json_point(name, value, path, numbered) for name, value in content.items()}
-
-
-def _json_point(name: str, value: Any, path: Path, numbered: Float[np.ndarray, "N 3"] | None) -> np.ndarray:
-    if isinstance(value, int) and not isinstance(value, bool):
+def _point(name: str, value: Any, path: Path, numbered: Float[np.ndarray, "N 3"] | None) -> np.ndarray:
+    """Return the point of a value: a vertex number, or three coordinates."""
+    if type(value) is int:
         if numbered is None:
             problem = f"{name} is a vertex number, but the vertices of this scan have no fixed order"
             raise InputError(path, problem, "give points [x, y, z], or the scan as one mesh in .ply or .obj")
         if not 0 <= value < len(numbered):
             raise InputError(path, f"{name}: vertex {value} is outside 0…{len(numbered) - 1}", "count from 0")
         return numbered[value]
-    return _point(name, value, path)
-
-
-def _point(name: str, value: Any, path: Path) -> np.ndarray:
     try:
-        point = np.array([float(number) for number in value], np.float64)
+        point = np.array(value, np.float64)
     except (TypeError, ValueError):
         point = np.zeros(0)
-    if isinstance(value, str) or point.shape != (3,) or not np.isfinite(point).all():
+    if point.shape != (3,) or not np.isfinite(point).all():
         raise InputError(path, f"{name} is not a point [x, y, z] and not a vertex number", "annotate it again")
     return point
 
 
-def _picked_points(text: str, path: Path) -> dict[str, np.ndarray]:
+def _picked_points(path: Path) -> dict[str, list[str | None]]:
     """Return the active points of a MeshLab file."""
-    if "<!ENTITY" in text:  # entities can expand to any size
-        raise InputError(path, "declares XML entities", "write the file with MeshLab")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise InputError(path, f"is not a file of picked points: {error}", "write the file with MeshLab") from None
-    points: dict[str, np.ndarray] = {}
-    for point in root.iter("point"):
-        name = point.get("name", "")
-        if point.get("active", "1") == "0":
-            continue
-        if not name or name in points:
-            problem = f"has two points named {name}" if name else "has a point without a name"
-            raise InputError(path, problem, "give every point the name of a keypoint in MeshLab")
-        points[name] = _point(name, [point.get(axis) for axis in "xyz"], path)
-    if len(points) > KEYPOINTS:
-        raise InputError(path, f"has {len(points):,} points, more than {KEYPOINTS:,}", "pick keypoints only")
-    return points
+    with reading(path, "a file of picked points", "write the file with MeshLab"):
+        picked = [point for point in ElementTree.parse(path).iter("point") if point.get("active", "1") != "0"]
+    names = Counter(point.get("name", "") for point in picked)
+    name, count = max(names.items(), key=lambda item: (not item[0], item[1]), default=("-", 1))
+    if not name or count > 1:
+        problem = f"has two points named {name}" if name else "has a point without a name"
+        raise InputError(path, problem, "give every point the name of a keypoint in MeshLab")
+    return {point.get("name", ""): [point.get(axis) for axis in "xyz"] for point in picked}

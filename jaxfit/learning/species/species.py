@@ -20,7 +20,6 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import KDTree
 
 from jaxfit.foundation.extras import own_version
-from jaxfit.foundation.limits import NPZ_TEXT_CHARACTERS
 from jaxfit.model.bird import Bird, model_hash
 from jaxfit.model.kinematics import Pose, Rig, fold_bird, joint_transforms, posed_keypoints, posed_vertices, rest_pose
 
@@ -109,7 +108,7 @@ def provenance_notes(base: Bird, facts: Mapping[str, Any]) -> dict[str, Any]:
         facts: what was free, from how many images, the settings.
     """
     lines = {"base": base.name, "base_hash": model_hash(base), "jaxfit": own_version(), **facts}
-    return {"provenance": np.array([f"{key}: {value}"[:NPZ_TEXT_CHARACTERS] for key, value in lines.items()])}
+    return {"provenance": np.array([f"{key}: {value}" for key, value in lines.items()])}
 
 
 def species_bird(
@@ -145,9 +144,9 @@ def mirror_vertices(bird: Bird) -> Int[np.ndarray, "V"]:
     """Return the vertex that mirrors each vertex at the plane x = 0. A vertex without a mirror image mirrors itself."""
     vertices = np.asarray(bird.vertices, np.float64)
     distance, other = KDTree(vertices).query(vertices * [-1, 1, 1])
-    own, other = np.arange(len(vertices)), np.asarray(other)
-    paired = (other[other] == own) & (distance < MIRROR_TOLERANCE * body_length(bird))
-    return np.where(paired, other, own)
+    vertex, other = np.arange(len(vertices)), np.asarray(other)
+    paired = (other[other] == vertex) & (distance < MIRROR_TOLERANCE * body_length(bird))
+    return np.where(paired, other, vertex)
 
 
 class Directions(NamedTuple):
@@ -221,8 +220,8 @@ def _laplacian(bird: Bird) -> sparse.csr_matrix:
 
 def _symmetric_functions(mirror: Int[np.ndarray, "V"], sign: int) -> sparse.csr_matrix:
     """Return orthonormal columns that span the even (sign 1) or odd (sign −1) functions of the vertices."""
-    own = np.arange(len(mirror))
-    left, alone = own[own < mirror], own[own == mirror]
+    vertex = np.arange(len(mirror))
+    left, alone = vertex[vertex < mirror], vertex[vertex == mirror]
     pairs = np.arange(len(left))
     rows = [left, mirror[left]]
     columns = [pairs, pairs]

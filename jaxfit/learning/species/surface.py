@@ -188,16 +188,16 @@ def robust_similarity(
     """
     size = _size(target)
     if up is not None:
-        above, own = up * size, np.array([0, 0, _size(source)])
-        source = np.concatenate([source, source.mean(0) + np.stack([own, -own])])
+        above, model_up = up * size, np.array([0, 0, _size(source)])
+        source = np.concatenate([source, source.mean(0) + np.stack([model_up, -model_up])])
         target = np.concatenate([target, target.mean(0) + np.stack([above, -above])])
     weight = np.ones(len(source))
     for _ in range(10):
-        found = fit_similarity(source, target, weight, mirrored)
-        error = np.linalg.norm(found.apply(source) - target, axis=1) / max(size, 1e-300)
+        similarity = fit_similarity(source, target, weight, mirrored)
+        error = np.linalg.norm(similarity.apply(source) - target, axis=1) / max(size, 1e-300)
         weight = 1 / (1 + (error / 0.3) ** 2) ** 2
     robust = np.sqrt((error**2 / (1 + (error / 0.3) ** 2)).mean())
-    return found, float(robust)
+    return similarity, float(robust)
 
 
 def _size(points: Float[np.ndarray, "P 3"]) -> float:

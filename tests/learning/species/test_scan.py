@@ -107,13 +107,6 @@ def test_unusable_files_of_keypoints_are_one_line_errors(tmp_path, content, says
         read_scan_keypoints(path, ["bill_tip", "tail_tip", "crown", "nape"], np.arange(30.0).reshape(10, 3))
 
 
-def test_a_file_of_picked_points_declares_no_entities(tmp_path):
-    path = tmp_path / "k.pp"
-    path.write_text('<!DOCTYPE a [<!ENTITY b "c">]><a/>')
-    with pytest.raises(InputError, match="entities"):
-        read_scan_keypoints(path, ["bill_tip"], None)
-
-
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb"])
 def test_scans_of_every_format_have_the_same_surface(tmp_path, suffix):
     path = tmp_path / f"scan{suffix}"
