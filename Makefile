@@ -13,13 +13,14 @@ export JAXFIT_REFERENCE
 # Some machines set this variable. Every process of the tests would then compile all imported modules again.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: install test extended docs portable lint bench demo notebooks wheel clean
+.PHONY: install test extended release docs portable lint bench demo notebooks wheel clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make install    the package with its compiled kernels, in $(VENV)"
-	@echo "make test       the test suite (under eight minutes on two cores)"
+	@echo "make test       the test suite (under five minutes on two cores)"
 	@echo "make extended   the slow tests, those that install packages in environments of their own, and the site"
+	@echo "make release    before a release: all checks, with all notebooks, the first hour and all compilers"
 	@echo "make docs       the documents as a site: open site/index.html, no network is needed"
 	@echo "make portable   the kernels with every compiler that is installed, sanitizers and emulators"
 	@echo "make lint       formatting, lint and types"
@@ -45,7 +46,10 @@ test: install
 
 extended: install docs
 	$(UNOPTIMISED) XLA_FLAGS="$$XLA_FLAGS $(QUICK_COMPILATION)" $(PYTEST) -m extended
-	$(BIN)/python tests/support/portable.py
+
+release: lint test portable
+	JAXFIT_RELEASE=1 $(MAKE) extended
+	$(BIN)/python tests/support/unchanged.py
 
 # The theme prints a notice about its own future otherwise.
 docs: install

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.unchanged import REASON, is_unchanged
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "first_hour.md"
 BLOCK = re.compile(r"^```(sh|python|text)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -48,6 +49,7 @@ def without_numbers(text):
 
 
 @pytest.mark.extended
+@pytest.mark.skipif(is_unchanged(PAGE), reason=REASON)
 def test_the_first_hour(tmp_path):
     for kind, code, shown in steps():
         printed = run([sys.executable, "-c", code] if kind == "python" else code, tmp_path)
