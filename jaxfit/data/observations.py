@@ -33,6 +33,8 @@ _LAYOUT = {
 }
 CELLS = tuple(name for name, (shape, _) in _LAYOUT.items() if shape.startswith("N T"))
 """Arrays with a value for every track and frame."""
+LARGEST_POSITION_PX = 1e6
+"""Largest absolute image position; greater numbers overflow or have a wrong unit."""
 MIN_KEYPOINTS = 3
 """Fewer keypoints do not determine the orientation of a bird."""
 MAPPINGS = ("masks", "amodal_masks", "own_images")
@@ -101,6 +103,13 @@ class Observations:
         arrays = validate_arrays(values | {"timestamp_s": timestamp_s}, _LAYOUT)
         check_times(arrays["timestamp_s"], self.fps)
         names = tuple(str(name) for name in arrays.pop("keypoint_names"))
+        twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
+        if twice is not None or not all(names):
+            raise ValueError(
+                f"keypoint_names must be different names, but hold {twice!r} twice"
+                if twice
+                else "keypoint_names must not hold an empty name"
+            )
         if len(np.unique(arrays["track_id"])) < len(arrays["track_id"]):
             raise ValueError(f"track_id must name each track once, not {arrays['track_id'].tolist()}")
         if (np.diff(arrays["frame_index"]) <= 0).any():
@@ -122,6 +131,8 @@ class Observations:
                 values = np.where(there, values, np.float32(0))
             if not np.isfinite(values).all():
                 raise ValueError(f"{name} must be finite where it is not missing")
+            if np.abs(values).max(initial=0) > LARGEST_POSITION_PX:
+                raise ValueError(f"{name} holds {np.abs(values).max():g}, which is no position in an image in pixels")
             values.flags.writeable = False
             arrays[name] = values
         for name, value in (arrays | {"keypoint_names": names}).items():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from support.tracking_files import LIKELIHOOD, NAMES, XY, T, write_csv, write_fixed, write_table
 
-from jaxfit.data.formats.deeplabcut import NotLiteralError, read_literal
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.foundation.errors import InputError
 
@@ -91,18 +90,9 @@ def test_a_pickled_attribute_is_never_run(tmp_path):
 
     for protocol in (0, 2, 4):
         path = write_table(tmp_path / "a.h5", names=pickle.dumps(Hostile(), protocol))
-        with pytest.raises(InputError, match=r"values_block_0_kind holds the instruction .*so that it is not read"):
+        with pytest.raises(InputError, match=r"pickled names of columns call .*system, so that they are not read"):
             read_observations(path, size_px=SIZE)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("protocol", [0, 1, 2, 4, 5])
-def test_literals_of_pickles(protocol):
-    value = [("net", "é", 1, 2.5, None, True), [], (), [1, [2, (3,)]], ("net", "net")]
-    assert read_literal(pickle.dumps(value, protocol)) == value
-    for wrong in (b"", b".", b"(", b"(lp0", b"]\x94h\x05.", b"a.", b"}.", pickle.dumps({1}, protocol)):
-        with pytest.raises(NotLiteralError):
-            read_literal(wrong)
 
 
 def without_scorer(text):
@@ -114,14 +104,18 @@ BAD_CSV = {
     "another file": (lambda text: "a,b\n1,2\n", "has no scorer row: its first line begins with 'a'"),
     "empty": (lambda text: "", "has no scorer row: its first line begins with ''"),
     "no coords": (lambda text: text.replace("coords", "0", 1), "begins with the rows scorer, bodyparts, not with"),
-    "text": (lambda text: text.replace("\n1,", "\n1,a", 1), "line 5 holds 'a.* for beak x"),
+    "text": (lambda text: text.replace("\n1,", "\n1,a", 1), "line 5: could not convert string to float: 'a"),
     "cut": (lambda text: text[:-30], r"line 7 has \d cells, not 10 .*may end midway"),
     "twice": (lambda text: text.replace("tailTip", "beak"), "holds the column x of beak twice"),
     "no y": (lambda text: text.replace(",y,", ",z,", 1), "has no column y of beak"),
     "frame twice": (lambda text: text.replace("\n3,", "\n2,"), "holds frame 2 twice"),
     "mixed rows": (lambda text: text.replace("\n3,", "\nimg.png,"), "names its row 1 by a number, and row 4 otherwise"),
     "no rows": (lambda text: "\n".join(text.split("\n")[:3]), "holds no frames"),
-    "position": (lambda text: text.replace("\n1,", "\n1,99999999", 1), "beak in frame 1 has the position"),
+    "position": (
+        lambda text: text.replace("\n1,", "\n1,99999999", 1),
+        "keypoints_px holds 1e.*, which is no position in an image",
+    ),
+    "space": (lambda text: text.replace("likelihood", "z"), "holds positions in space .*, not positions in an image"),
     "skeleton": (lambda text: text.replace(",x", ",length"), "has no column x of beak"),
     "quotes": (lambda text: '"' + text, "is not valid CSV"),
 }
@@ -139,5 +133,5 @@ def test_bad_csv(tmp_path, case):
 def test_likelihoods_of_another_scale(tmp_path):
     path = write_csv(tmp_path / "a.csv")
     path.write_text(path.read_text().replace(",0.", ",87."))
-    with pytest.raises(InputError, match=r"beak in frame 0 has the confidence 87.*scale the scores"):
+    with pytest.raises(InputError, match=r"holds a confidence of 87.*scale the scores"):
         read_observations(path, size_px=SIZE)

@@ -1,8 +1,6 @@
 """Damaged files of DeepLabCut, SLEAP and annotation programs: a success or one clear error, within bounds."""
 
 import json
-import pickle
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -11,9 +9,7 @@ from hypothesis import strategies as st
 from support.hostile import Isolated, many_examples
 from support.label_files import labelled_birds, write_label_file
 from support.mutations import HOSTILE_VALUES, damaged_arrays, damaged_bytes, damaged_tree
-from support.tracking_files import columns, project, write_analysis, write_csv, write_fixed, write_project, write_table
-
-from jaxfit.data.formats.deeplabcut import NotLiteralError, read_literal
+from support.tracking_files import project, write_analysis, write_csv, write_fixed, write_project, write_table
 
 READER = "support.format_calls:read_sized"
 PICTURES = [f"labeled-data/clip/img{i}.png" for i in range(4)]
@@ -111,16 +107,5 @@ def test_damaged_tasks_of_label_studio(tmp_path, reader):
         path.write_text(json.dumps(tree, default=str))
         outcome = reader(path)
         assert outcome.acceptable, outcome
-
-    check()
-
-
-@pytest.mark.parametrize("protocol", [0, 2, 5])
-def test_damaged_literals(protocol):
-    @many_examples
-    @given(damaged_bytes(pickle.dumps(columns(("b1", "b2")), protocol)))
-    def check(content):
-        with suppress(NotLiteralError):
-            read_literal(content)
 
     check()

@@ -176,18 +176,12 @@ def result(tasks):
 
 
 BAD = {
-    "no task": (lambda tasks: tasks.clear(), "holds no task"),
-    "no data": (lambda tasks: tasks[0].pop("data"), "lacks the key data"),
-    "no bird": (lambda tasks: [task.pop("predictions") for task in tasks], "no bird"),
-    "twice": (
-        lambda tasks: result(tasks).append(result(tasks)[1]),
-        "labels bill_tip of a bird in clip_000003.png twice",
-    ),
+    "no task": (lambda tasks: tasks.clear(), "holds no bird"),
+    "no data": (lambda tasks: tasks[0].pop("data"), "is not a file of Label Studio that can be read: KeyError: 'data'"),
+    "twice": (lambda tasks: result(tasks).append(result(tasks)[1]), "bill_tip of a bird in .*3.png is labelled twice"),
     "track twice": (lambda tasks: result(tasks)[4]["meta"].update(text="track 4"), "holds track 4 twice"),
-    "size": (lambda tasks: result(tasks)[0].update(original_width=91), "is 91, but clip_000003.png is 90 pixels"),
+    "size": (lambda tasks: result(tasks)[0].update(original_width=91), "is 90 pixels wide, but a label says 91"),
     "sizes": (lambda tasks: tasks[3]["data"].update(width=91), "pictures of several sizes"),
-    "position": (lambda tasks: result(tasks)[1]["value"].update(x="left"), "must be a number"),
-    "score": (lambda tasks: result(tasks)[1].update(score=3), "outside 0 to 1"),
 }
 
 
@@ -227,6 +221,20 @@ def test_labels_without_birds(tmp_path):
         else:
             with pytest.raises(InputError):
                 read(path)
+
+
+def test_key_points_without_rectangles_are_one_bird_a_picture(tmp_path):
+    def without_rectangles(tasks):
+        for task in tasks:
+            prediction = task["predictions"][0]
+            parts = [part for part in prediction["result"] if part.get("parentID") == prediction["result"][0]["id"]]
+            prediction["result"] = parts
+            for part in parts:
+                del part["parentID"]
+
+    path = change_task(lambda tasks: (tasks.pop(), without_rectangles(tasks)))(tmp_path)
+    seen = read(path)
+    assert seen.present.sum(0).tolist() == [1, 1, 1]
 
 
 def test_the_extra_is_needed(tmp_path, monkeypatch):

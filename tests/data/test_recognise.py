@@ -3,6 +3,7 @@
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from support.tracking_files import T, write_analysis, write_csv, write_project, 
 
 from jaxfit.data.formats import recognise
 from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.formats.keypoint_table import check_table_size
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.video.reader import probe_video
@@ -135,3 +137,9 @@ def test_without_the_extra(tmp_path, monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda package: None)
     with pytest.raises(InputError, match=r"needs h5py, which this installation lacks \(run pip install .*formats"):
         recognise.read_observations(write_table(tmp_path / "a.h5"))
+
+
+def test_tables_have_a_largest_size():
+    check_table_size(Path("hour.h5"), 15, 90_000, 1)
+    with pytest.raises(InputError, match=r"1,000 birds × 100,000 frames × 20 keypoints need .* \(split the file\)"):
+        check_table_size(Path("large.h5"), 1000, 100_000, 20)

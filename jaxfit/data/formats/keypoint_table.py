@@ -8,18 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfit.data.formats.fields import LARGEST_POSITION_PX
 from jaxfit.data.formats.image_sizes import add_times, image_sizes
 from jaxfit.data.masks import box_of_keypoints
 from jaxfit.data.observations import Observations
 from jaxfit.data.tracks import frame_numbers
+from jaxfit.foundation.array_files import check_memory, observations_bytes
 from jaxfit.foundation.errors import InputError, one_line, shortened
-from jaxfit.foundation.limits import CONFIDENCE, NAME_CHARACTERS, TABLE_BIRDS, TABLE_PICTURES, TABLE_VALUES
 
 _log = logging.getLogger(__name__)
 
 CERTAIN = 0.6
 """Confidence of a keypoint that is certain; DeepLabCut draws keypoints from 0.6 on."""
+_MAX_CONFIDENCE = 10
+"""Scores between 1 and this limit count as 1: peaks of a network may lie above 1."""
 _OUTSIDE = 0.2
 """Largest accepted fraction of certain keypoints outside their image."""
 
@@ -54,9 +55,8 @@ def check_table_size(source: Path, birds: int, frames: int, keypoints: int) -> N
     """Raise InputError if a file has no keypoints, or more birds, frames and keypoints than memory should hold."""
     if not (birds and keypoints):
         raise InputError(source, f"holds no {'keypoints' if birds else 'birds'}", "choose another file")
-    if birds > TABLE_BIRDS or birds * frames * keypoints > TABLE_VALUES:
-        problem = f"holds {birds:,} birds × {frames:,} frames × {keypoints:,} keypoints, too many for one table"
-        raise InputError(source, problem, "split the file")
+    size = f"{birds:,} birds × {frames:,} frames × {keypoints:,} keypoints"
+    check_memory(source, f"tables of {size}", observations_bytes(birds, frames, keypoints), "split the file")
 
 
 def table_observations(
@@ -75,35 +75,56 @@ def table_observations(
         size_px: width and height of the images of a file that stores none.
 
     Raises:
-        InputError: an unusable name, position or confidence, a frame twice, no image size, or a video that does not
-            fit.
+        InputError: a confidence above 10, a frame twice, no image size, or a video that does not fit.
+        ValueError: as `Observations`.
     """
-    _check_names(table, source)
-    keypoints, confidence = _checked(table, source)
+    keypoints = np.asarray(table.keypoints_px, np.float32)
+    known = np.isfinite(keypoints).all(-1)
+    confidence = known if table.confidence is None else known & ~np.isnan(table.confidence)
+    if table.confidence is not None:
+        if np.abs(table.confidence[confidence]).max(initial=0) > _MAX_CONFIDENCE:
+            largest = np.abs(table.confidence[confidence]).max()
+            raise InputError(source, f"holds a confidence of {largest:g}", "scale the scores to 0 to 1")
+        confidence = np.clip(np.where(confidence, table.confidence, 0), 0, 1)
+    confidence = confidence.astype(np.float32)
     numbers = None if table.pictures is None else frame_numbers(table.pictures, video)
     frames = table.frame_index if table.pictures is None else numbers if numbers is None else np.array(numbers)
     sizes = image_sizes(table.size_px, table.pictures, table.video, source, video, size_px)
     order = np.arange(keypoints.shape[1]) if frames is None else np.argsort(frames, kind="stable")
     keypoints, confidence = keypoints[:, order], confidence[:, order]
-    score = None if table.score is None else _clean_score(table.score[:, order])
+    # a score that is not a number counts as 1
+    score = (
+        1.0 if table.score is None else np.clip(np.nan_to_num(table.score[:, order], nan=1, posinf=1, neginf=1), 0, 1)
+    )
     names = _file_names(table, source, sizes.video, frames)[order]
     size = np.broadcast_to(sizes.size_px, (len(order), 2))[order]
     present = np.any(confidence > 0, axis=-1)
     _check_inside(keypoints, confidence, size, source)
     certain = confidence >= table.certain
     certain = np.where(certain.any(-1, keepdims=True), certain, confidence > 0)
-    box = np.where(present[..., None], _with_area(box_of_keypoints(keypoints, certain)), 0)
+    box = box_of_keypoints(keypoints, certain)
+    side = np.maximum(box[..., 2:], 1)  # a single keypoint has no area
+    box = np.concatenate([box[..., :2] + (box[..., 2:] - side) / 2, side], axis=-1)
     parts = {
         "keypoints_px": np.where(confidence[..., None] > 0, keypoints, 0),
         "confidence": confidence,
         "present": present,
-        "box_px": box,
-        "score": np.where(present, 1.0, 0.0) if score is None else np.where(present, score, 0.0),
+        "box_px": np.where(present[..., None], box, 0),
+        "score": np.where(present, score, 0.0),
     }
-    if frames is None:
-        parts, own = _photographs(parts, names, size)
-        named = {"track_id": np.arange(1, len(own) + 1), "frame_index": np.zeros(1, np.int64), "own_images": own}
-        return Observations(**named, **parts, **_common(table, size[:1], names[:1]))
+    common = {"keypoint_names": table.keypoint_names, "skeleton": table.skeleton}
+    if frames is None:  # every bird of every picture is a track in frame 0 of a picture of its own
+        at = np.argwhere(present)
+        own_images = {(i, 0): (str(names[t]), *map(int, size[t])) for i, (_, t) in enumerate(at.tolist())}
+        return Observations(
+            track_id=np.arange(1, len(at) + 1),
+            frame_index=np.zeros(1, np.int64),
+            image_size_px=size[:1].astype(np.int64),
+            file_name=names[:1],
+            own_images=own_images,
+            **{name: array[at[:, 0], at[:, 1]][:, None] for name, array in parts.items()},
+            **common,
+        )
     numbers = np.asarray(frames, np.int64)[order]
     if (np.diff(numbers) == 0).any():
         twice = int(numbers[:-1][np.diff(numbers) == 0][0])
@@ -116,91 +137,29 @@ def table_observations(
         tracks = ", ".join(f"{name} = {i}" for i, name in enumerate(table.bird_names, 1))
         _log.warning("%s: %d birds become tracks: %s", source, len(table.bird_names), shortened(one_line(tracks), 150))
     kept = np.any(present, axis=1)  # a bird without any keypoint is no track
-    parts = {name: array[kept] for name, array in parts.items()}
-    observations = Observations(track_id[kept], numbers, **parts, **_common(table, size, names))
+    observations = Observations(
+        track_id=track_id[kept],
+        frame_index=numbers,
+        image_size_px=size.astype(np.int64),
+        file_name=names,
+        **{name: array[kept] for name, array in parts.items()},
+        **common,
+    )
     return add_times(observations, sizes.video)
-
-
-def _common(table: KeypointTable, size: np.ndarray, names: np.ndarray) -> dict:
-    return {
-        "image_size_px": size.astype(np.int64),
-        "file_name": names,
-        "keypoint_names": table.keypoint_names,
-        "skeleton": table.skeleton,
-    }
-
-
-def _photographs(parts: dict[str, np.ndarray], names: np.ndarray, size: np.ndarray) -> tuple[dict, dict]:
-    """Return the arrays with one track for every bird of every picture, in frame 0, and the pictures of the tracks."""
-    at = np.argwhere(parts["present"])
-    own = {(i, 0): (str(names[t]), int(size[t][0]), int(size[t][1])) for i, (_, t) in enumerate(at.tolist())}
-    return {name: array[at[:, 0], at[:, 1]][:, None] for name, array in parts.items()}, own
-
-
-def _check_names(table: KeypointTable, source: Path) -> None:
-    names = table.keypoint_names
-    pictures = table.pictures or ()
-    if len(pictures) > TABLE_PICTURES:
-        raise InputError(source, f"names {len(pictures):,} pictures, more than {TABLE_PICTURES:,}", "split the file")
-    for name in (*names, *table.bird_names, *pictures, _video_name(table, source)):
-        if not name or len(name) > NAME_CHARACTERS:
-            problem = f"holds a name of {len(name):,} characters" if name else "holds an empty name"
-            raise InputError(source, problem, f"use names of 1 to {NAME_CHARACTERS} characters")
-    twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
-    if twice is not None:
-        raise InputError(source, f"holds the keypoint {twice} twice", "give every keypoint a name of its own")
-
-
-def _checked(table: KeypointTable, source: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return keypoints and confidences as float32, with confidence 0 where a keypoint is missing."""
-    keypoints = np.asarray(table.keypoints_px)
-    known = np.all(np.isfinite(keypoints), axis=-1)
-    confidence = known.astype(np.float32) if table.confidence is None else np.asarray(table.confidence, np.float64)
-    confidence = np.where(known & ~np.isnan(confidence), confidence, 0)
-
-    def first(wrong: np.ndarray, values: np.ndarray, problem: str, remedy: str) -> None:
-        if wrong.any():
-            n, t, k = np.argwhere(wrong)[0]
-            frame = table.frame_index[t] if table.pictures is None and table.frame_index is not None else None
-            where = f"frame {frame}" if table.pictures is None else table.pictures[t]
-            value = np.abs(values[n, t, k]).max()
-            raise InputError(source, f"{table.keypoint_names[k]} in {where} has {problem} {value:g}", remedy)
-
-    with np.errstate(invalid="ignore"):
-        far = np.any(np.abs(np.where(known[..., None], keypoints, 0)) > LARGEST_POSITION_PX, axis=-1)
-    first(far & (confidence > 0), keypoints, "the position", "give image pixels")
-    first(np.abs(confidence) > CONFIDENCE, confidence[..., None], "the confidence", "scale the scores to 0 to 1")
-    confidence = np.clip(confidence, 0, 1).astype(np.float32)
-    return np.where(known[..., None], keypoints, np.nan).astype(np.float32), confidence
-
-
-def _clean_score(score: np.ndarray) -> np.ndarray:
-    """Return scores in [0, 1]; a score that is not a number counts as 1."""
-    return np.clip(np.where(np.isfinite(score), score, 1), 0, 1)
-
-
-def _video_name(table: KeypointTable, source: Path) -> str:
-    return (table.video or source.stem).replace("\\", "/").rsplit("/", 1)[-1]
 
 
 def _file_names(table: KeypointTable, source: Path, video: Path | None, frames: np.ndarray | None) -> np.ndarray:
     if table.pictures is not None:
         return np.array(table.pictures, str).reshape(-1)
-    name = video.name if video is not None else _video_name(table, source)
+    stored = (table.video or source.stem).replace("\\", "/").rpartition("/")[2]
+    name = video.name if video is not None else stored
     return np.array([f"{name}#{frame}" for frame in (frames if frames is not None else ())], str).reshape(-1)
-
-
-def _with_area(boxes_px: np.ndarray) -> np.ndarray:
-    """Return boxes with sides of at least one pixel, with the same centres; a single keypoint has no area."""
-    side = np.maximum(boxes_px[..., 2:], 1)
-    return np.concatenate([boxes_px[..., :2] + (boxes_px[..., 2:] - side) / 2, side], axis=-1)
 
 
 def _check_inside(keypoints: np.ndarray, confidence: np.ndarray, size: np.ndarray, source: Path) -> None:
     """Raise InputError if many certain keypoints lie outside their image, as with pictures of another size."""
     certain = confidence >= CERTAIN
-    with np.errstate(invalid="ignore"):
-        outside = certain & ((keypoints < -1) | (keypoints > size[None, :, None] + 1)).any(-1)
+    outside = certain & ((keypoints < -1) | (keypoints > size[None, :, None] + 1)).any(-1)
     if outside.sum() > _OUTSIDE * certain.sum():
         t = int(np.flatnonzero(outside.any((0, 2)))[0])
         far = np.where(outside[:, t, :, None], keypoints[:, t], -np.inf).max((0, 1))

@@ -14,7 +14,10 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 from urllib.parse import unquote
@@ -22,17 +25,14 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.keypoint_table import KeypointTable, check_table_size
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
-from jaxfit.foundation.limits import IMAGE_SIDE_PX
 
 _log = logging.getLogger(__name__)
 
 _BIRD, _IMAGE = "bird", "image"
-_REMEDY = "export the project from Label Studio as JSON"
 
 
 def write_label_studio(
@@ -96,151 +96,136 @@ def _results(observations: Observations, n: int, t: int) -> list[dict[str, Any]]
     return results
 
 
-def read_label_studio(root: Field) -> KeypointTable:
-    """Read the tasks of a JSON file of Label Studio.
+def read_label_studio(tasks: Sequence[Mapping[str, Any]], source: Path) -> KeypointTable:
+    """Return the keypoints of the tasks of a JSON file of Label Studio.
 
     The labels of a task are its last annotation that is not cancelled, or else its last prediction. The scores of
-    predictions are confidences. A key point without a parent belongs to the smallest rectangle around the key point. A
-    task without labels is a frame without birds. A rectangle without the text `track N` is a bird of its own.
+    predictions are confidences. A key point without a parent belongs to the smallest rectangle around the key point,
+    and in a task without rectangles to the only bird. A task without labels is a frame without birds. A rectangle
+    without the text `track N` is a bird of its own.
+
+    sleap-io 0.9 does not replace this reader: its reader needs the key `meta.video`, which only its own files have.
+
+    Args:
+        tasks: the content of the file.
+        source: the file, for messages.
 
     Raises:
-        InputError: the file is damaged, or is not a list of tasks.
+        InputError: pictures of several sizes, a keypoint or a track twice, or no bird.
+        LookupError, TypeError: the content is not that of Label Studio.
     """
-    if not len(root):
-        root.fail("holds no task", _REMEDY)
-    names: dict[str, None] = {}
-    tasks = []
-    for task in root:
-        data = task["data"]
-        for name in data["keypoints"] if data.has("keypoints") else ():
-            names[name.text()] = None
-        tasks.append(_Task(task, _labels(task)))
-        names |= dict.fromkeys(name for bird in tasks[-1].birds for name in bird.points)
-    sizes = {task.size_px for task in tasks if task.size_px}
+    pictures = [_Picture(task) for task in tasks]
+    stored = [name for task in tasks for name in task["data"].get("keypoints", ())]
+    names = list(dict.fromkeys([*stored, *(name for p in pictures for bird in p.birds for name in bird.points)]))
+    sizes = sorted({picture.size_px for picture in pictures if picture.size_px})
     if len(sizes) > 1:
-        shown = " and ".join(f"{w}×{h}" for w, h in sorted(sizes)[:2])
-        raise InputError(root.source, f"has pictures of several sizes: {shown}", "export one project for every video")
-    lost = sum(task.lost for task in tasks)
+        shown = " and ".join(f"{w}×{h}" for w, h in sizes[:2])
+        raise InputError(source, f"has pictures of several sizes: {shown}", "export one project for every video")
+    lost = sum(picture.lost for picture in pictures)
     if lost:
-        _log.warning("%s: %d key points outside every rectangle belong to no bird and are skipped", root.source, lost)
-    return _table(root, tasks, tuple(names), next(iter(sizes), None))
+        _log.warning("%s: %d key points outside every rectangle belong to no bird and are skipped", source, lost)
+    tracks = sorted({bird.track for p in pictures for bird in p.birds if bird.track is not None})
+    untracked = [bird for picture in pictures for bird in picture.birds if bird.track is None]
+    if not (tracks or untracked):
+        raise InputError(source, "holds no bird", "label rectangles and key points, or choose another file")
+    N, T, K = len(tracks) + len(untracked), len(pictures), len(names)
+    check_table_size(source, N, T, K)
+    keypoints, confidence = np.full((N, T, K, 2), np.nan, np.float32), np.zeros((N, T, K), np.float32)
+    score = np.zeros((N, T), np.float32)
+    following = len(tracks)
+    for t, picture in enumerate(pictures):
+        for bird in picture.birds:
+            if bird.track is None:
+                n, following = following, following + 1
+            else:
+                n = tracks.index(bird.track)
+                if score[n, t]:
+                    problem = f"holds track {bird.track} twice in {picture.name}"
+                    raise InputError(source, problem, "remove one bird, or its text")
+            score[n, t] = bird.score
+            for name, (x, y, certainty) in bird.points.items():
+                keypoints[n, t, names.index(name)] = x, y
+                confidence[n, t, names.index(name)] = certainty
+    return KeypointTable(
+        tuple(names),
+        (*(f"track {track}" for track in tracks), *(f"untracked {i + 1}" for i in range(len(untracked)))),
+        keypoints,
+        confidence,
+        pictures=tuple(picture.name for picture in pictures),
+        score=score,
+        size_px=sizes[0] if sizes else None,
+    )
 
 
+@dataclass
 class _Bird:
     """A rectangle and its key points."""
 
-    def __init__(self, track: int | None, box: tuple[float, float, float, float], score: float):
-        self.track, self.box, self.score = track, box, score
-        self.points: dict[str, tuple[float, float, float]] = {}
-
-    def holds(self, x: float, y: float) -> bool:
-        """Return whether a position lies in the rectangle."""
-        left, top, width, height = self.box
-        return 0 <= x - left <= width and 0 <= y - top <= height
+    track: int | None
+    box: tuple[float, float, float, float]
+    score: float
+    points: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """Name → x, y, confidence."""
 
 
-class _Task:
+class _Picture:
     """The picture of a task and its birds."""
 
-    def __init__(self, task: Field, labels: Field | None):
+    def __init__(self, task: Mapping[str, Any]):
         data = task["data"]
-        url = unquote(data[_IMAGE].text()).replace("\\", "/")
-        self.picture = url.rpartition("/")[2].rpartition("?d=")[2]
-        self.size_px: tuple[int, int] | None = None
-        if data.has("width") and data.has("height"):
-            self.size_px = _size(data, "width", "height")
+        url = unquote(data[_IMAGE]).replace("\\", "/")
+        self.name = url.rpartition("/")[2].rpartition("?d=")[2]
+        self.size_px = (data["width"], data["height"]) if data.get("width") and data.get("height") else None
         self.lost = 0
-        self._predicted = labels is not None and labels.path.rpartition(".")[2].startswith("predictions")
-        found: dict[int | str, _Bird] = {}
-        results = list(labels["result"]) if labels is not None else []
-        for result in results:
-            if result.has("type") and result["type"].value == "rectanglelabels":
-                found[result["id"].identifier()] = self._bird(result)
-        for result in results:
-            if result.has("type") and result["type"].value == "keypointlabels":
-                self._add_point(result, found)
-        self.birds = list(found.values())
+        labels: list[Mapping[str, Any]] = []
+        for kind in ("predictions", "annotations"):
+            valid = [entry for entry in task.get(kind) or () if not entry.get("was_cancelled")]
+            if valid:
+                # labels of a person are certain, also where they keep the score of a prediction
+                scored = kind == "predictions"
+                labels = [part if scored else {**part, "score": 1.0} for part in valid[-1]["result"]]
+        rectangles = {part["id"]: self._bird(part) for part in labels if part.get("type") == "rectanglelabels"}
+        points = [part for part in labels if part.get("type") == "keypointlabels"]
+        if points and not rectangles:  # the template `Keypoint Labeling` has no rectangles
+            rectangles[None] = _Bird(None, (-math.inf, -math.inf, math.inf, math.inf), 1.0)
+        for part in points:
+            self._add_point(part, rectangles)
+        self.birds = list(rectangles.values())
 
-    def _bird(self, result: Field) -> _Bird:
-        width, height = self._size_of(result)
-        value = result["value"]
-        x, y, w, h = (value[key].number(-1e4, 1e4, "write percentages") for key in ("x", "y", "width", "height"))
-        box = (x * width / 100, y * height / 100, w * width / 100, h * height / 100)
-        texts = result["meta"]["text"].value if result.has("meta") and result["meta"].has("text") else None
-        words = str(texts[0] if isinstance(texts, list) and texts else texts).split()
-        numbered = len(words) == 2 and words[0] == "track" and words[1].isascii() and words[1].isdecimal()
-        track = int(words[1]) if numbered and len(words[1]) < 16 else None
-        return _Bird(track, box, self._score(result))
+    def _bird(self, part: Mapping[str, Any]) -> _Bird:
+        width, height = self._size_of(part)
+        value = part["value"]
+        sides = zip(("x", "y", "width", "height"), (width, height, width, height), strict=True)
+        x, y, w, h = (value[name] * size / 100 for name, size in sides)
+        texts = (part.get("meta") or {}).get("text") or ""
+        track = re.fullmatch(r"track ([0-9]{1,15})", str(texts[0] if isinstance(texts, list) else texts))
+        return _Bird(int(track[1]) if track else None, (x, y, w, h), float(part.get("score", 1.0)))
 
-    def _add_point(self, result: Field, birds: dict[int | str, _Bird]) -> None:
-        width, height = self._size_of(result)
-        value = result["value"]
-        x, y = (value[key].number(-1e4, 1e4, "write percentages") for key in ("x", "y"))
-        x, y = x * width / 100, y * height / 100
-        bird = birds.get(result["parentID"].identifier()) if result.has("parentID") else None
-        around = [other for other in birds.values() if other.holds(x, y)]
-        bird = bird or min(around, key=lambda other: other.box[2] * other.box[3], default=None)
-        names = [name.text() for name in value["keypointlabels"]] if value.has("keypointlabels") else []
+    def _add_point(self, part: Mapping[str, Any], birds: Mapping[Any, _Bird]) -> None:
+        width, height = self._size_of(part)
+        x, y = part["value"]["x"] * width / 100, part["value"]["y"] * height / 100
+        names = part["value"].get("keypointlabels")
+        around = [
+            bird
+            for bird in birds.values()
+            if bird.box[0] <= x <= bird.box[0] + bird.box[2] and bird.box[1] <= y <= bird.box[1] + bird.box[3]
+        ]
+        bird = birds.get(part.get("parentID")) or min(
+            around, key=lambda other: other.box[2] * other.box[3], default=None
+        )
         if bird is None or not names:
             self.lost += 1
             return
         if names[0] in bird.points:
-            result.fail(f"labels {names[0]} of a bird in {self.picture} twice", "remove one of the key points")
-        bird.points[names[0]] = x, y, self._score(result)
+            raise ValueError(f"{names[0]} of a bird in {self.name} is labelled twice; remove one of the key points")
+        bird.points[names[0]] = x, y, float(part.get("score", 1.0))
 
-    def _score(self, result: Field) -> float:
-        """Return the score of a prediction; labels of a person are certain, also where they keep a score."""
-        predicted = self._predicted and result.has("score")
-        return result["score"].number(0, 1, "scale the scores to 0 to 1") if predicted else 1.0
-
-    def _size_of(self, result: Field) -> tuple[int, int]:
-        if self.size_px is None:
-            self.size_px = _size(result, "original_width", "original_height")
-        elif result.has("original_width") and result["original_width"].value != self.size_px[0]:
-            problem = f"is {result['original_width'].value}, but {self.picture} is {self.size_px[0]} pixels wide"
-            result["original_width"].fail(problem, "give Label Studio the pictures in the size that was written")
+    def _size_of(self, part: Mapping[str, Any]) -> tuple[int, int]:
+        stored = part["original_width"], part["original_height"]
+        if self.size_px is not None and stored[0] != self.size_px[0]:
+            raise ValueError(
+                f"{self.name} is {self.size_px[0]} pixels wide, but a label says {stored[0]}; give Label Studio the "
+                "pictures in the size that was written"
+            )
+        self.size_px = self.size_px or stored
         return self.size_px
-
-
-def _size(field: Field, width: str, height: str) -> tuple[int, int]:
-    return field[width].integer(1, IMAGE_SIDE_PX), field[height].integer(1, IMAGE_SIDE_PX)
-
-
-def _labels(task: Field) -> Field | None:
-    """Return the annotation or prediction that holds the labels of a task."""
-    for key in ("annotations", "predictions"):
-        entries = list(task[key]) if task.has(key) else []
-        entries = [entry for entry in entries if not (entry.has("was_cancelled") and entry["was_cancelled"].value)]
-        if entries:
-            return entries[-1]
-    return None
-
-
-def _table(root: Field, tasks: list[_Task], names: tuple[str, ...], size_px: tuple[int, int] | None) -> KeypointTable:
-    """Return the table: birds with a track first, then every other bird as a track of its own."""
-    tracks = sorted({bird.track for task in tasks for bird in task.birds if bird.track is not None})
-    row = {track: n for n, track in enumerate(tracks)}
-    loose = [bird for task in tasks for bird in task.birds if bird.track is None]
-    N = len(tracks) + len(loose)
-    if not N:
-        root.fail("hold no bird", "label rectangles and key points, or choose another file")
-    check_table_size(root.source, N, len(tasks), len(names))
-    keypoints = np.full((N, len(tasks), len(names), 2), np.nan, np.float32)
-    confidence, score = np.zeros(keypoints.shape[:-1], np.float32), np.zeros((N, len(tasks)), np.float32)
-    column = {name: k for k, name in enumerate(names)}
-    following = len(tracks)
-    for t, task in enumerate(tasks):
-        taken: set[int] = set()
-        for bird in task.birds:
-            n = following if bird.track is None else row[bird.track]
-            following += bird.track is None
-            if n in taken:
-                root.fail(f"holds track {bird.track} twice in {task.picture}", "remove one bird, or its text")
-            taken.add(n)
-            score[n, t] = bird.score
-            for name, (x, y, certainty) in bird.points.items():
-                keypoints[n, t, column[name]] = x, y
-                confidence[n, t, column[name]] = certainty
-    birds = (*(f"track {track}" for track in tracks), *(f"untracked {i + 1}" for i in range(len(loose))))
-    pictures = tuple(task.picture for task in tasks)
-    return KeypointTable(names, birds, keypoints, confidence, pictures=pictures, score=score, size_px=size_px)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 from jaxfit.data.formats.coco import read_coco
@@ -12,14 +13,17 @@ from jaxfit.data.formats.hdf5 import HDF5_SIGNATURE, open_hdf5
 from jaxfit.data.formats.image_sizes import add_times, check_video
 from jaxfit.data.formats.keypoint_table import KeypointTable, table_observations
 from jaxfit.data.formats.label_studio import read_label_studio
-from jaxfit.data.formats.sleap import read_sleap_analysis, read_sleap_project
+from jaxfit.data.formats.sleap import read_sleap_analysis, read_sleap_project, read_with_sleap_io
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.reading import open_file
+from jaxfit.foundation.reading import open_file, reading
+
+_log = logging.getLogger(__name__)
 
 _WRITTEN_BY = "check the path; `jaxfit track` and `jaxfit import` write observations"
 _FORMATS = (
-    "give COCO or Label Studio json, DeepLabCut or Lightning Pose .csv, DeepLabCut .h5, SLEAP .slp or .analysis.h5"
+    "give COCO or Label Studio json, DeepLabCut or Lightning Pose .csv or .h5, SLEAP .slp, .analysis.h5 or .csv, "
+    "or files of NWB, JABS or AlphaTracker"
 )
 
 
@@ -29,11 +33,11 @@ def read_observations(
     size_px: tuple[int, int] | None = None,
     untracked: Untracked = "video",
 ) -> Observations:
-    """Read observations from COCO json, DeepLabCut, Lightning Pose or SLEAP; the content tells the format.
+    """Read observations from COCO json, DeepLabCut, Lightning Pose, SLEAP or others; the content tells the format.
 
     Keypoints keep the names of the file; `jaxfit.data.keypoint_names` maps the names to those of a model. Positions are
     those of the file. Likelihoods and scores become confidences. Files of DeepLabCut and SLEAP have no boxes: a bird
-    has the box of its certain keypoints.
+    has the box of its certain keypoints. The log holds one line about the file (`statement`).
 
     Args:
         path: the file.
@@ -50,30 +54,82 @@ def read_observations(
     path, video = Path(path), None if video is None else Path(video)
     with open_file(path, "a file of observations", _WRITTEN_BY) as file:
         start = file.read(4096)
+    kind, table = _keypoints(path, start, video)
+    with reading(path, kind):
+        if table is None:
+            observations = read_coco(path, video, untracked)
+            if video is not None:
+                check_video(observations, path, video)
+                observations = add_times(observations, video)
+        else:
+            observations = table_observations(table, path, video, size_px)
+    _log.info("%s: %s", path, statement(observations, kind))
+    return observations
+
+
+def statement(observations: Observations, kind: str) -> str:
+    """Return what a file of observations holds, in one line.
+
+    Args:
+        observations: the observations.
+        kind: the kind of file with its article, such as `a SLEAP project`.
+    """
+    N, T = observations.present.shape
+    films = sorted({str(name).partition("#")[0] for name in observations.file_name})
+    of = films[0] if len(films) == 1 else f"{len(films)} pictures" if films else "no film"
+    count = f"{observations.photographs} photographs" if observations.photographs else f"{T} frames"
+    return (
+        f"{kind} of {of}: {N} birds, {count}, {observations.num_keypoints} keypoints, {len(observations.masks)} masks"
+    )
+
+
+def _keypoints(path: Path, start: bytes, video: Path | None) -> tuple[str, KeypointTable | None]:
+    """Return the kind of a file with its article, and its table of keypoints; None for COCO, which has more.
+
+    Args:
+        path: the file.
+        start: its first bytes.
+        video: the video whose birds are read, if the file has birds of several videos.
+    """
     if start.startswith(HDF5_SIGNATURE):
-        return table_observations(_read_hdf5(path, video), path, video, size_px)
+        return _hdf5_keypoints(path, video)
     text = start.removeprefix(b"\xef\xbb\xbf").lstrip()
     if text[:1] == b"[":
-        return table_observations(read_label_studio(read_json(path)), path, video, size_px)
+        kind = "a file of Label Studio"
+        with reading(path, kind):
+            content = read_json(path).value
+            if content and "data" not in content[0] and "annotations" in content[0]:
+                kind = "a file of AlphaTracker"
+                return kind, read_with_sleap_io(path, kind, lambda sio, name: sio.load_alphatracker(name), video)
+            return kind, read_label_studio(content, path)
     if text[:1] == b"{" or path.suffix.lower() == ".json":
-        observations = read_coco(path, video, untracked)
-        if video is not None:
-            check_video(observations, path, video)
-            observations = add_times(observations, video)
-        return observations
+        return "a COCO file", None
+    if b"frame_idx" in text.partition(b"\n")[0]:
+        kind = "a CSV of SLEAP"
+        return kind, read_with_sleap_io(path, kind, lambda sio, name: sio.load_csv(name, format="sleap"), video)
     if text[:6].lower() == b"scorer" or path.suffix.lower() == ".csv":
-        return table_observations(read_deeplabcut_csv(path), path, video, size_px)
+        return "a CSV of DeepLabCut", read_deeplabcut_csv(path)
     raise InputError(path, "is empty" if not start else "is of no known format", _FORMATS)
 
 
-def _read_hdf5(path: Path, video: Path | None) -> KeypointTable:
-    with open_hdf5(path) as root:
-        if "instances" in root and "frames" in root:
-            return read_sleap_project(root, path, video)
-        if "tracks" in root and "node_names" in root:
-            return read_sleap_analysis(root, path)
-        table = find_pandas_table(root)
+def _hdf5_keypoints(path: Path, video: Path | None) -> tuple[str, KeypointTable]:
+    """Return kind and keypoints of an HDF5 file, as `_keypoints`."""
+    with open_hdf5(path, "an HDF5 file of observations") as file:
+        if "tracks" in file and "node_names" in file:
+            return "an analysis file of SLEAP", read_sleap_analysis(file, path)
+        table = find_pandas_table(file)
         if table is not None:
-            return read_deeplabcut_hdf5(table, path)
-        names = ", ".join(root.names()[:10]) or "nothing"
-        raise InputError(path, f"is an HDF5 file of no known format: it holds {names}", _FORMATS)
+            return "an HDF5 file of DeepLabCut", read_deeplabcut_hdf5(table, path)
+        names = list(file)
+        is_nwb = "nwb_version" in file.attrs
+    if "instances" in names and "frames" in names:
+        return "a SLEAP project", read_sleap_project(path, video)
+    if is_nwb:
+        return "an NWB file", read_with_sleap_io(path, "an NWB file", lambda sio, name: sio.load_nwb(name), video)
+    if "poseest" in names:
+        return "a file of JABS", read_with_sleap_io(
+            path, "a file of JABS", lambda sio, name: sio.load_jabs(name), video
+        )
+    raise InputError(
+        path, f"is an HDF5 file of no known format: it holds {', '.join(names[:10]) or 'nothing'}", _FORMATS
+    )

@@ -1,13 +1,10 @@
-"""Writer of labels and predictions of DeepLabCut, without pickles.
+"""Labels and predictions for DeepLabCut, with several animals.
 
-Source: the layout is that of `DataFrame.to_hdf` of pandas 3 (`format="fixed"`), which DeepLabCut reads.
+Every track is an individual `birdN` with the track id N. A keypoint without a position is an empty cell; predictions
+give it the likelihood 0. DeepLabCut has no place for hidden keypoints, boxes and masks, and labels have no confidences.
 
-Labels for DeepLabCut: `CollectedData_SCORER.csv` and `.h5` of several animals, written without pickles. Every track is
-an individual `birdN` with the track id N. A keypoint without a position is an empty cell. DeepLabCut has no place for
-confidences, hidden keypoints, boxes and masks.
-
-Predictions of DeepLabCut for several animals: one row for every frame, named by its number. Every track is an
-individual `birdN` with the track id N. A missing keypoint is an empty cell with likelihood 0.
+HDF5 files have the layout of `DataFrame.to_hdf` of pandas 3 (`format="fixed"`), written by h5py: sleap-io 0.9 writes no
+HDF5 of DeepLabCut, and pandas needs PyTables.
 """
 
 from __future__ import annotations
@@ -20,28 +17,17 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.data.formats.deeplabcut import COLUMN_LEVELS
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.files import write_whole
 
-COLUMN_LEVELS = ("scorer", "individuals", "bodyparts", "coords")
-"""Levels of the columns of a table with several animals."""
+Rows = Sequence[tuple[str, str, str]] | np.ndarray
+"""Names of rows: `labeled-data`, folder and picture (labels), or the frame numbers (predictions)."""
 
 
-def write_pandas_table(
-    path: Path, columns: Sequence[tuple[str, ...]], rows: Sequence[tuple[str, ...]] | np.ndarray, values: np.ndarray
-) -> None:
-    """Write a table of DeepLabCut as HDF5.
-
-    Args:
-        path: the file; an existing file is replaced.
-        columns: the texts of `COLUMNCOLUMN_LEVELS` of every column.
-        rows: three texts of every row (labels), or the frame number of every row (predictions).
-        values: (rows, columns) float64.
-
-    Raises:
-        InputError: the extra `formats` is not installed, or the file cannot be written.
-    """
+def _write_hdf5(path: Path, columns: Sequence[tuple[str, ...]], rows: Rows, values: np.ndarray) -> None:
+    """Write a table as HDF5; arguments as `_write_csv`."""
     require_extra("formats", str(path), "h5py")
     import h5py
 
@@ -69,12 +55,12 @@ def _write_axis(table: Any, axis: str, entries: Sequence[tuple[str, ...]], names
     """Write the names along an axis: for each level, the different texts and the position of every entry's text."""
     _describe(table, "GROUP", **{f"{axis}_variety": "multi"})
     for i in range(len(names) or 3):
-        own = [entry[i] for entry in entries]
-        texts = list(dict.fromkeys(own))
+        names_of_level = [entry[i] for entry in entries]
+        texts = list(dict.fromkeys(names_of_level))
         place = {text: k for k, text in enumerate(texts)}
         level, label = f"{axis}_level{i}", f"{axis}_label{i}"
         table[level] = np.array([text.encode() for text in texts] or [b""], "S")[: len(texts)]
-        table[label] = np.array([place[text] for text in own], np.int32)
+        table[label] = np.array([place[text] for text in names_of_level], np.int32)
         named = {"name": names[i], f"{axis}_name{names[i]}": names[i]} if names else {}
         _describe(table[level], "ARRAY", transposed=1, kind="string", nan_rep="nan", **named)
         _describe(table[label], "ARRAY", transposed=1)
@@ -91,9 +77,6 @@ def _describe(entry: Any, node: str, **attributes: str | int) -> None:
             entry.attrs.create(name, value.encode(), dtype=h5py.string_dtype("utf-8", len(value.encode())))
         else:
             entry.attrs[name] = np.uint8(value) if name == "transposed" else np.int64(value)
-
-
-_FOLDER = "labeled-data"
 
 
 def write_deeplabcut_labels(
@@ -121,20 +104,30 @@ def write_deeplabcut_labels(
     points = np.where(known[..., None], shortest, np.nan)
     values = points.transpose(1, 0, 2, 3).reshape(len(pictures), -1)  # one row per frame: bird, keypoint, x and y
     values = values if len(kept) else np.full((len(pictures), len(columns)), np.nan)
-    rows = [(_FOLDER, folder.name, picture) for picture in pictures]
+    rows = [("labeled-data", folder.name, picture) for picture in pictures]
     path = folder / f"CollectedData_{scorer}"
-    write_whole(path.with_name(path.name + ".csv"), _labels_csv(columns, rows, values).encode())
-    write_pandas_table(path.with_name(path.name + ".h5"), columns, rows, values)
+    _write_csv(path.with_name(path.name + ".csv"), columns, rows, values)
+    _write_hdf5(path.with_name(path.name + ".h5"), columns, rows, values)
 
 
-def _labels_csv(columns: list[tuple[str, ...]], rows: list[tuple[str, ...]], values: np.ndarray) -> str:
+def _write_csv(path: Path, columns: Sequence[tuple[str, ...]], rows: Rows, values: np.ndarray) -> None:
+    """Write a table as CSV.
+
+    Args:
+        path: the file; an existing file is replaced.
+        columns: the texts of `COLUMN_LEVELS` of every column.
+        rows: the name of every row.
+        values: (rows, columns) float64; NaN is an empty cell.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
+    names = [(str(row),) for row in rows] if isinstance(rows, np.ndarray) else list(rows)
+    empty = [""] * (len(names[0]) - 1 if names else 0)
     for i, level in enumerate(COLUMN_LEVELS):
-        writer.writerow([level, "", "", *(column[i] for column in columns)])
-    for row, numbers in zip(rows, values, strict=True):
-        writer.writerow([*row, *("" if np.isnan(number) else str(number) for number in numbers)])
-    return text.getvalue()
+        writer.writerow([level, *empty, *(column[i] for column in columns)])
+    cells = np.where(np.isnan(values), "", values.astype(str))
+    writer.writerows([*name, *row] for name, row in zip(names, cells.tolist(), strict=True))
+    write_whole(path, text.getvalue().encode())
 
 
 def write_deeplabcut_predictions(observations: Observations, path: str | Path, scorer: str = "jaxfit") -> None:
@@ -157,17 +150,5 @@ def write_deeplabcut_predictions(observations: Observations, path: str | Path, s
     points = np.where(confidence > 0, observations.keypoints_px[kept], np.float32(np.nan))
     values = np.concatenate([points, confidence], axis=-1).transpose(1, 0, 2, 3).reshape(observations.num_frames, -1)
     values = values.astype(str).astype(np.float64)  # the shortest digits that give the same float32
-    if path.suffix == ".csv":
-        write_whole(path, _predictions_csv(columns, observations.frame_index, values).encode())
-    else:
-        write_pandas_table(path, columns, observations.frame_index, values)
-
-
-def _predictions_csv(columns: list[tuple[str, ...]], frames: np.ndarray, values: np.ndarray) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    for i, level in enumerate(COLUMN_LEVELS):
-        writer.writerow([level, *(column[i] for column in columns)])
-    cells = np.where(np.isnan(values), "", values.astype(str))
-    writer.writerows([str(frame), *row] for frame, row in zip(frames.tolist(), cells.tolist(), strict=True))
-    return text.getvalue()
+    write = _write_csv if path.suffix == ".csv" else _write_hdf5
+    write(path, columns, observations.frame_index, values)
