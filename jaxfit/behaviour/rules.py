@@ -4,23 +4,24 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from math import inf, isfinite
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
+from pydantic import NonNegativeFloat
+
 from jaxfit.behaviour.registry import Feature, find_feature
-from jaxfit.config.checks import ConfigKeyError, require, require_within
+from jaxfit.config.build import config_dataclass
+from jaxfit.config.checks import ConfigKeyError, require
 from jaxfit.config.yaml_file import read_config
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CONFIG_NUMBER
 
 OTHER = "other"
 """State of a bird that shows no behaviour of the config."""
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _BETWEEN = re.compile(rf"\s*({_NUMBER}) to ({_NUMBER})\s*")
 _BEYOND = re.compile(rf"\s*([<>])\s*({_NUMBER})\s*")
-_LONGEST_S = 3600.0
 
 
 class Range(NamedTuple):
@@ -41,7 +42,7 @@ def read_range(text: str) -> Range | None:
     return None
 
 
-@dataclass(frozen=True)
+@config_dataclass
 class BehaviourRule:
     """When a bird shows a behaviour."""
 
@@ -56,11 +57,11 @@ class BehaviourRule:
     """Instead of conditions: the start of each bout of this behaviour, if the bird was seen before it."""
     end_of: str | None = None
     """Instead of conditions: the end of each bout of this behaviour, if the bird is seen after it."""
-    around_s: float = 0.3
+    around_s: NonNegativeFloat = 0.3
     """With `start_of` and `end_of`: time before and after the start or the end, seconds."""
-    least_s: float = 0.0
+    least_s: NonNegativeFloat = 0.0
     """Shorter bouts do not count, seconds."""
-    bridge_s: float = 0.2
+    bridge_s: NonNegativeFloat = 0.2
     """Shorter interruptions, also without a pose, are part of the bout, seconds. With `start_of` and `end_of`: longest
     pause of the video between both sides of the start or the end."""
     partner: bool = False
@@ -68,7 +69,6 @@ class BehaviourRule:
 
     def __post_init__(self):
         require(bool(self.definition.strip()), "definition", "is empty", "say in one sentence what the bird does")
-        require_within(self, 0, _LONGEST_S, "around_s", "least_s", "bridge_s")
         ways = [bool(self.begins), self.start_of is not None, self.end_of is not None]
         remedy = "give one of them; `begins: {}` and `start_of: null` leave out what the base gives"
         require(sum(ways) == 1, "", f"has {sum(ways)} of begins, start_of and end_of", remedy)
@@ -93,8 +93,6 @@ def _check_conditions(key: str, conditions: Mapping[str, str]) -> None:
     for name, text in conditions.items():
         path, found = f"{key}.{name}", read_range(text)
         require(found is not None, path, f"is {text!r}", "write for example '> 3', '< 3' or '-3 to 3'")
-        limits = [abs(limit) for limit in found or () if isfinite(limit)]
-        require(max(limits) <= CONFIG_NUMBER, path, f"is {text!r}", f"give numbers up to {CONFIG_NUMBER:g}")
         try:
             names.append(find_feature(name).name)
         except InputError as error:
@@ -103,7 +101,7 @@ def _check_conditions(key: str, conditions: Mapping[str, str]) -> None:
         require(names.count(names[-1]) == 1, path, problem, "remove one condition, or rename one of the functions")
 
 
-@dataclass(frozen=True)
+@config_dataclass
 class BehaviourConfig:
     """The behaviours that jaxfit distinguishes. A frame in which several apply has the first of them."""
 
@@ -117,7 +115,7 @@ class BehaviourConfig:
     """Name → rule, the most important behaviour first."""
 
     def __post_init__(self):
-        require(0 < len(self.behaviours) <= 100, "behaviours", f"has {len(self.behaviours)} rules", "give 1 to 100")
+        require(len(self.behaviours) > 0, "behaviours", "has no rules", "give at least one")
         for name, rule in self.behaviours.items():
             path = f"behaviours.{name}"
             require(re.fullmatch(r"[a-z][a-z0-9_]*", name) is not None, path, "is no name", "use a to z, 0 to 9 and _")

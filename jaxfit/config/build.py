@@ -1,68 +1,132 @@
-"""Config dataclasses ↔ plain values, single keys by their path, descriptions of keys."""
+"""The decorator of config dataclasses, their plain values, single keys by their path, and descriptions of keys."""
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import functools
-import inspect
+import json
 import re
-import types
 import typing
 from collections.abc import Iterable, Mapping
-from itertools import pairwise
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from jaxfit.config.checks import ConfigKeyError, first_key, join_keys, known_names, shown
+import pydantic
+import pydantic.dataclasses
+import pydantic_core
+from annotated_types import Ge, Le
+
+from jaxfit.config.checks import ConfigKeyError, join_keys, known_names, shown
 
 Config = TypeVar("Config")
+Fraction = Annotated[float, Ge(0), Le(1)]
+"""A number within 0 and 1."""
+
+_SETTINGS = pydantic.ConfigDict(
+    extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True, arbitrary_types_allowed=True
+)
+_EXPECTED = {
+    "bool_type": "true or false",
+    "int_type": "a whole number",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "string_type": "text",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "mapping_type": "a mapping of keys to values",
+    "dict_type": "a mapping of keys to values",
+    "dataclass_type": "a mapping of keys to values",
+    "too_short": "at least {min_length} value",
+    "literal_error": "{expected}",
+    "greater_than": "a number above {gt}",
+    "greater_than_equal": "{ge} or more",
+    "less_than": "a number below {lt}",
+    "less_than_equal": "{le} or less",
+}
+"""Type of an error of pydantic → the value that was expected."""
 
 
-def build_config(kind: type[Config], values: Any, where: str = "") -> Config:
+@typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, pydantic.Field))
+def config_dataclass(kind: type[Config]) -> type[Config]:
+    """Make a class an immutable dataclass that checks the types and ranges of its values; used as a decorator.
+
+    A whole number is accepted where a fraction is expected; true and false are no numbers. Checks of several fields
+    stand in `__post_init__` and raise `ConfigKeyError`, and so does the dataclass. The docstrings below the fields are
+    the descriptions of the keys. A class attribute `shipped` names a shipped config that sets all required keys;
+    `removed` maps keys of earlier versions to remedies.
+    """
+    built = pydantic.dataclasses.dataclass(kind, frozen=True, config=_SETTINGS)
+    construct = built.__init__
+
+    @functools.wraps(construct)
+    def checked(self: Any, *values: Any, **named: Any) -> None:
+        try:
+            construct(self, *values, **named)
+        except pydantic.ValidationError as error:
+            given = dict(zip(_fields(built), values, strict=False)) | named
+            raise _key_error(error, built, given) from None
+
+    built.__init__ = checked
+    return built
+
+
+def build_config(kind: type[Config], values: Any) -> Config:
     """Return a config dataclass built from plain values.
 
     Args:
-        kind: the frozen dataclass to build. An attribute `shipped` names a shipped config that sets all required keys.
+        kind: the config dataclass to build.
         values: plain values, as `plain_config` returns them; keys with a default may be absent.
-        where: path of this config inside a larger one, for messages.
 
     Raises:
         ConfigKeyError: an unknown key, a missing key, a value of the wrong type or outside its range.
     """
-    if not isinstance(values, dict):
-        raise ConfigKeyError(where, f"must be a mapping, not {shown(values)}")
-    fields = {field.name: field for field in dataclasses.fields(typing.cast(Any, kind))}
-    for key in values:
-        if key not in fields:
-            removed = getattr(kind, "removed", {}).get(key)
-            problem = "was removed" if removed else "is not a known key"
-            raise ConfigKeyError(join_keys(where, key), problem, removed or known_names(key, fields))
-    for name, field in fields.items():
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        if required and name not in values:
-            shipped = getattr(kind, "shipped", None)
-            remedy = f"add the key, or start from `base: {shipped}`" if shipped else "add the key"
-            raise ConfigKeyError(join_keys(where, name), "is missing", remedy)
-    hints = _type_hints(kind)
-    built = {key: _build_value(hints[key], value, join_keys(where, key)) for key, value in values.items()}
     try:
-        return kind(**built)
-    except ConfigKeyError as error:
-        raise error.within(where) from None
+        # JSON has the types of YAML: pydantic then takes a list for a tuple, but no text for a number
+        return pydantic.TypeAdapter(kind).validate_json(json.dumps(values))
+    except pydantic.ValidationError as error:
+        raise _key_error(error, kind, values) from None
 
 
-_type_hints = functools.cache(typing.get_type_hints)
+def _fields(kind: Any) -> dict[str, Any]:
+    return kind.__pydantic_fields__
+
+
+def _key_error(error: pydantic.ValidationError, kind: type, values: Any) -> ConfigKeyError:
+    """Return the first error of pydantic as an error that names a key.
+
+    Args:
+        error: the error of pydantic.
+        kind: the config dataclass.
+        values: the values that were given to the dataclass.
+    """
+    first = error.errors(include_url=False)[0]
+    where = ""
+    for part in first["loc"]:  # also holds names of types, which are no keys
+        if isinstance(part, int) and isinstance(values, dict):
+            part = list(_fields(kind))[part]  # a positional argument
+        if part in values if isinstance(values, dict) else isinstance(values, list | tuple) and isinstance(part, int):
+            where, values = join_keys(where, part), values[part]
+            annotation = _fields(kind)[part].annotation if part in _fields(kind) else None
+            inner = [hint for hint in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(hint)]
+            kind = typing.cast(type, inner[0]) if inner else kind
+    context = first.get("ctx", {})
+    if isinstance(cause := context.get("error"), ConfigKeyError):
+        return cause.within(where)
+    key = str(first["loc"][-1]) if first["loc"] else ""
+    if first["type"] == "unexpected_keyword_argument":
+        if remedy := getattr(kind, "removed", {}).get(key):
+            return ConfigKeyError(where, "was removed", remedy)
+        return ConfigKeyError(where, "is not a known key", known_names(key, _fields(kind)))
+    if first["type"] == "missing":
+        shipped = getattr(kind, "shipped", None)
+        remedy = f"add the key, or start from `base: {shipped}`" if shipped else "add the key"
+        return ConfigKeyError(join_keys(where, key), "is missing", remedy)
+    expected = _EXPECTED.get(first["type"], first["msg"]).format(**context)
+    return ConfigKeyError(where, f"is {shown(first['input'])}", f"expected {expected}")
 
 
 def plain_config(value: Any) -> Any:
     """Return a config, or a part of a config, as dicts, lists and plain values."""
-    if dataclasses.is_dataclass(value):
-        return {field.name: plain_config(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {key: plain_config(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [plain_config(item) for item in value]
-    return value
+    return pydantic_core.to_jsonable_python(value)
 
 
 def describes(plain: Any, config: Any) -> bool:
@@ -89,44 +153,6 @@ def describes(plain: Any, config: Any) -> bool:
 
 def _default(field: dataclasses.Field[Any]) -> Any:
     return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
-
-
-def _build_value(hint: Any, value: Any, where: str) -> Any:
-    """Return a value of the type `hint`, or raise a ConfigKeyError about the key `where`."""
-    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if dataclasses.is_dataclass(hint):
-        return build_config(typing.cast(type, hint), value, where)
-    if origin is Literal:
-        if not isinstance(value, str) or value not in arguments:
-            raise ConfigKeyError(where, f"is {shown(value)}", f"expected one of {', '.join(arguments)}")
-        return value
-    if origin in (types.UnionType, typing.Union):  # `Literal[…] | None` has the second type
-        options = [option for option in arguments if option is not types.NoneType]
-        if value is None and len(options) < len(arguments):
-            return None
-        # a list belongs to a tuple type, any other value to the other type
-        matches = (option for option in options if (typing.get_origin(option) is tuple) == isinstance(value, list))
-        return _build_value(next(matches, options[0]), value, where)
-    if origin is tuple:
-        if not isinstance(value, list):
-            raise ConfigKeyError(where, f"must be a list, not {shown(value)}")
-        return tuple(_build_value(arguments[0], item, f"{where}[{i}]") for i, item in enumerate(value))
-    if origin is Mapping:
-        if not isinstance(value, dict):
-            raise ConfigKeyError(where, f"must be a mapping, not {shown(value)}")
-        for key in value:
-            if not isinstance(key, str):
-                raise ConfigKeyError(where, f"has the key {shown(key)}", "expected text as key: use quotes")
-        return {key: _build_value(arguments[1], item, join_keys(where, key)) for key, item in value.items()}
-    if isinstance(value, int) and abs(value) >= 2**63:
-        raise ConfigKeyError(where, f"is {shown(value)}", "expected a number within 64 bits")
-    if hint is Any:
-        return value
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if not isinstance(value, hint) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigKeyError(where, f"is {shown(value)}", f"expected a value of type {hint.__name__}")
-    return value
 
 
 def with_values(config: Config, values: Mapping[str, Any]) -> Config:
@@ -193,7 +219,7 @@ def _locate(plain: Any, path: str, requested: str) -> tuple[Any, Any, bool]:
     rest, is_term = re.sub(r"\[(\d+)\]", r".\1", path), False
     while True:
         key: Any
-        key, rest = first_key(parent, rest)
+        key, rest = _first_key(parent, rest)
         if isinstance(parent, list):
             key = _stage_index(parent, key, requested)
         if not rest:
@@ -208,31 +234,35 @@ def _locate(plain: Any, path: str, requested: str) -> tuple[Any, Any, bool]:
         parent, is_term = value, key in ("terms", "override") and isinstance(value, dict)
 
 
+def _first_key(parent: Any, path: str) -> tuple[str, str]:
+    """Return the first key of a path and the rest of the path.
+
+    A key of the mapping `parent` may contain dots (a term's name); the longest key that fits is the first key.
+    """
+    known = [key for key in parent if f"{path}.".startswith(f"{key}.")] if isinstance(parent, dict) else []
+    key = max(known, key=len) if known else path.partition(".")[0]
+    return key, path[len(key) + 1 :]
+
+
 def _stage_index(stages: list[Any], key: str, requested: str) -> int:
     names = [stage.get("name") for stage in stages if isinstance(stage, dict)]
     if key in names:
         return names.index(key)
-    for i in range(len(stages)):
-        if key == str(i):
-            return i
+    if key.isdecimal() and int(key) < len(stages):
+        return int(key)
     raise ConfigKeyError(requested, f"names the unknown stage {key!r}", known_names(key, names))
 
 
 def field_help(kind: type) -> dict[str, str]:
     """Return field name → description of a config dataclass, from the docstrings below its fields."""
-    definition: Any = ast.parse(inspect.getsource(kind)).body[0]
-    return {
-        ast.unparse(field.target): " ".join(str(ast.literal_eval(text.value)).split())
-        for field, text in pairwise(definition.body)
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr)
-    }
+    return {name: " ".join((field.description or "").split()) for name, field in _fields(kind).items()}
 
 
 def option_help(kind: type, path: str) -> str:
     """Return the description and the default of the field at a path such as ``frames.start``, for `--help`."""
     *parents, name = path.split(".")
     for parent in parents:
-        kind = typing.get_type_hints(kind)[parent]
+        kind = _fields(kind)[parent].annotation
     default = getattr(kind, name)  # a dataclass keeps a field's default as a class attribute
     text = field_help(kind)[name].rstrip(".")
     return (text if default in (None, ()) else f"{text} (default {default})").replace("%", "%%")

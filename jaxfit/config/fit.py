@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
+from math import isfinite
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
-from jaxfit.config.checks import (
-    ConfigKeyError,
-    is_number,
-    known_names,
-    require,
-    require_positive,
-    require_within,
-    shown,
-)
+from annotated_types import Ge, MinLen
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+
+from jaxfit.config.build import config_dataclass
+from jaxfit.config.checks import ConfigKeyError, known_names, require, shown
 from jaxfit.config.yaml_file import read_config, shipped_comment, shipped_configs
-from jaxfit.foundation import limits
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CONFIG_NUMBER
 from jaxfit.objective.registry import Term, find_term, known_terms
 
 
@@ -31,7 +26,7 @@ def check_terms(key: str, terms: Mapping[str, Any]) -> None:
         terms: term name → weight, or → `{weight: …, setting: …}`.
 
     Raises:
-        ConfigKeyError: an unknown term or setting, or a value that is not a number in the allowed range.
+        ConfigKeyError: an unknown term or setting, or a value that is not a number, 0 or more.
     """
     for name, value in terms.items():
         term = require_term(f"{key}.{name}", name)
@@ -40,8 +35,8 @@ def check_terms(key: str, terms: Mapping[str, Any]) -> None:
             path = f"{key}.{name}.{setting}"
             if setting not in known:
                 raise ConfigKeyError(path, "is not a setting of this term", known_names(setting, known))
-            expected = f"expected a number from 0 to {CONFIG_NUMBER:g}"
-            require(is_number(number), path, f"is {shown(number)}", expected)
+            is_number = isinstance(number, int | float) and not isinstance(number, bool) and isfinite(number)
+            require(is_number and number >= 0, path, f"is {shown(number)}", "expected a number, 0 or more")
             require(setting not in term.positive or number > 0, path, f"is {number!r}", "expected a number above 0")
 
 
@@ -69,84 +64,70 @@ def term_settings(value: Any) -> dict[str, float]:
     return {key: float(number) for key, number in (value if isinstance(value, dict) else {"weight": value}).items()}
 
 
-PARAMETERS = ("global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
-"""Parameters of a pose that a stage can optimise."""
+Parameter = Literal["global_orient", "body_pose", "transl", "scale", "bone_length", "betas"]
+"""A parameter of a pose that a stage can optimise."""
+PARAMETERS = get_args(Parameter)
 GROUPS = ("published settings to reproduce", "settings to use")
 """Groups of shipped configs of fits."""
 
 
-@dataclass(frozen=True)
+@config_dataclass
 class CropConfig:
     """The square crops of a bird that the fit works on."""
 
     mode: Literal["box", "image"] = "box"
     """`box`: a square around the bird; its size is constant in a window and its centre follows the bird.
     `image`: the whole image, which must be square."""
-    padding: float = 0.15
+    padding: NonNegativeFloat = 0.15
     """Margin on each side of the window's largest box, as a fraction of the box's longer side."""
-    size_px: int = 256
+    size_px: Annotated[int, Ge(16)] = 256
     """Side of the crops in which silhouettes and masks are compared, in pixels. All other quantities in pixels refer to
-    a 256-pixel crop, so that this setting does not change the objective. At most 1,024."""
-    focal_px: float = 2167.0
+    a 256-pixel crop, so that this setting does not change the objective."""
+    focal_px: PositiveFloat = 2167.0
     """Focal length of the crop camera, in pixels of a 256-pixel crop; the principal point is the middle of the crop."""
 
-    def __post_init__(self):
-        require_within(self, 16, limits.CROP_SIZE_PX, "size_px")
-        require_positive(self, limits.FOCAL_PX, "focal_px")
-        require_within(self, 0, limits.CROP_PADDING, "padding")
 
-
-@dataclass(frozen=True)
+@config_dataclass
 class InitialiseConfig:
     """The search for initial poses, for a fit without given initial poses."""
 
     method: Literal["viewing_axis", "so3"] = "viewing_axis"
     """`viewing_axis`: the bird is seen from above and is rotated about the viewing axis (the paper's method).
     `so3`: all orientations, for cameras that do not look down."""
-    turns: int = 30
+    turns: PositiveInt = 30
     """Number of equal rotations about the viewing axis (30 rotations of 12°)."""
-    directions: int = 100
+    directions: PositiveInt = 100
     """Number of viewing directions on the sphere; only for `so3`."""
-    candidates: int = 64
+    candidates: PositiveInt = 64
     """Number of best orientations per frame from which the sequence of the window is chosen."""
-    smoothness: float = 400.0
+    smoothness: NonNegativeFloat = 400.0
     """Cost of a rotation of 1 radian between consecutive frames in the choice of the sequence, in squared pixels of a
     256-pixel crop."""
-    hypotheses: int = 1
+    hypotheses: PositiveInt = 1
     """Number of distinct initial poses that are fitted side by side until a stage with `keep_best` ends."""
 
-    def __post_init__(self):
-        require_within(self, 1, limits.TURNS, "turns")
-        require_within(self, 1, limits.DIRECTIONS, "directions")
-        require_within(self, 1, limits.CANDIDATES, "candidates")
-        require_within(self, 1, limits.HYPOTHESES, "hypotheses")
-        require_within(self, 0, limits.SMOOTHNESS, "smoothness")
-        orientations = self.turns * self.directions if self.method == "so3" else self.turns
-        problem = f"is {self.directions}, with {self.turns} turns {orientations:,} orientations"
-        require(orientations <= limits.ORIENTATIONS, "directions", problem, f"expected at most {limits.ORIENTATIONS:,}")
 
-
-@dataclass(frozen=True)
+@config_dataclass
 class StageConfig:
     """One stage of the fit: the optimised parameters, the active terms and the number of steps."""
 
     name: str
     """Name in progress messages and results."""
-    steps: int
-    """Number of steps of the solver, at most 100,000."""
-    terms: tuple[str, ...]
+    steps: PositiveInt
+    """Number of steps of the solver."""
+    terms: Annotated[tuple[str, ...], MinLen(1)]
     """Names of the active terms; the key `terms` of the whole config holds their weights and settings."""
-    optimised: tuple[str, ...] = ("global_orient", "body_pose", "transl", "scale")
+    optimised: tuple[Parameter, ...] = ("global_orient", "body_pose", "transl", "scale")
     """Optimised parameters: global_orient, body_pose, transl, scale, bone_length, betas."""
     solver: Literal["adam", "levenberg_marquardt"] = "adam"
     """`adam`: for all terms. `levenberg_marquardt`: needs 10 to 30 steps instead of hundreds; all terms of the library,
     and terms of others that return residuals (docs/developers/term.md)."""
-    learning_rate: float = 0.01
+    learning_rate: PositiveFloat = 0.01
     """Adam's step size, in each parameter's own unit."""
-    step_scale: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
+    step_scale: Mapping[Parameter, NonNegativeFloat | tuple[NonNegativeFloat, ...]] = field(default_factory=dict)
     """Parameter → factor on its step size; `transl` may have three factors (x, y, z). 0 keeps a parameter fixed, for
     both solvers."""
-    blur: float = 1.0
+    blur: PositiveFloat = 1.0
     """Blur of the silhouette's edge relative to the paper's blur; a value below 1 is sharper."""
     keypoints_off: tuple[str, ...] = ()
     """Names of keypoints that this stage ignores; names that the model lacks are allowed."""
@@ -158,28 +139,20 @@ class StageConfig:
     """Whether only the best hypothesis of each bird continues after this stage."""
 
     def __post_init__(self):
-        require_within(self, 1, limits.STEPS, "steps")
-        require_positive(self, limits.LEARNING_RATE, "learning_rate")
-        require_positive(self, limits.BLUR, "blur")
-        require(len(self.terms) > 0, "terms", "is empty", "name at least one term")
         for name in self.terms:
             require_term("terms", name)
-        for key in ("optimised", "step_scale"):
-            for name in getattr(self, key):
-                require(name in PARAMETERS, key, f"names {name!r}", f"known: {', '.join(PARAMETERS)}")
         for name, factor in self.step_scale.items():
-            factors = factor if isinstance(factor, tuple) else (factor,)
-            valid = len(factors) == 1 or (len(factors) == 3 and name == "transl")
+            valid = not isinstance(factor, tuple) or len(factor) == 1 or (len(factor) == 3 and name == "transl")
             expected = "expected a number, 0 or more; `transl` may have three"
-            require(valid and all(map(is_number, factors)), f"step_scale.{name}", f"is {factor!r}", expected)
+            require(valid, f"step_scale.{name}", f"is {shown(factor)}", expected)
         check_terms("override", self.override)
 
 
-LEARNABLE = ("keypoint_likelihood", "mask_smooth_l1", "keypoint_offsets")
-"""Terms whose scale or weight can be learnt from the data, and the key `keypoint_offsets`."""
+Learnable = Literal["keypoint_likelihood", "mask_smooth_l1", "keypoint_offsets"]
+"""A term whose scale or weight can be learnt from the data, or the key `keypoint_offsets`."""
 
 
-@dataclass(frozen=True)
+@config_dataclass
 class FitConfig:
     """All settings of a fit; the defaults are the paper's best setting."""
 
@@ -187,21 +160,20 @@ class FitConfig:
     removed: ClassVar[Mapping[str, str]] = {"grow_masks_px": "remove the key and set `edge: unbiased`"}
     """Keys of earlier versions → what to do."""
 
-    stages: tuple[StageConfig, ...]
+    stages: Annotated[tuple[StageConfig, ...], MinLen(1)]
     """The stages of the fit, in their order."""
     terms: Mapping[str, Any]
     """Weight of each term, as a number, or as `{weight: …, setting: …}` with settings such as sigma_px (in pixels of
     a 256-pixel crop)."""
-    window: int = 100
-    """Number of frames that are fitted together; longer tracks are cut into windows, and 1 fits every frame alone;
-    at most 10,000."""
-    overlap: int = 0
+    window: PositiveInt = 100
+    """Number of frames that are fitted together; longer tracks are cut into windows, and 1 fits every frame alone."""
+    overlap: NonNegativeInt = 0
     """Number of frames that consecutive windows of a track share; never more than half of `window`. The poses of these
     frames pass gradually from one window to the next, so that a bird does not jump from window to window. 0: windows
     follow each other."""
     common_size: bool = True
     """Whether one scale holds for the whole window, instead of one scale per frame."""
-    filter_window: int = 5
+    filter_window: PositiveInt = 5
     """Number of frames of the weighted median filter over detected keypoints; 1 switches the filter off."""
     unknown_pixels: bool = False
     """Whether the mask terms skip the pixels that may or may not show the bird: pixels outside its mask, but in the
@@ -210,14 +182,14 @@ class FitConfig:
     """Edge of the silhouette. `soft_rasterizer`: as published; the silhouette is larger than its mesh, by 1.5 pixels at
     blur 1. `unbiased`: the covered area of the pixels, filtered like the mask; the silhouette has the area of its
     mesh."""
-    min_keypoints: int = 4
+    min_keypoints: PositiveInt = 4
     """Number of confident keypoints that a frame needs to be fitted."""
     crop: CropConfig = CropConfig()
     initialise: InitialiseConfig = InitialiseConfig()
     error_bars: bool = False
     """Whether the result has error bars: standard deviations of the pose and covariances of the keypoints
     (docs/reference/result_folder.md). They assume that the terms of the last stage are negative log-likelihoods."""
-    learn_weights: tuple[str, ...] = ()
+    learn_weights: tuple[Learnable, ...] = ()
     """What is learnt from the data before the fit (docs/method/learnt_weights.md): the scale of `keypoint_likelihood`,
     the weight of `mask_smooth_l1`, and `keypoint_offsets`. The values of the config are then the initial values, and
     weak prior knowledge. The result holds the learnt values in `learnt.yaml`."""
@@ -227,30 +199,18 @@ class FitConfig:
     backend: Literal["auto", "native", "reference"] = "auto"
     """Implementation of the silhouette: the compiled kernel (`native`), the pure-JAX `reference`, or the kernel if
     available (`auto`)."""
-    memory_gb: float = 3.0
+    memory_gb: PositiveFloat = 3.0
     """Memory that one batch may use, in GB; larger inputs are fitted in several batches. Tables of the whole fit that
     need more memory by estimate are rejected."""
 
     def __post_init__(self):
-        require_within(self, 1, limits.WINDOW_FRAMES, "window")
-        require_within(self, 0, limits.WINDOW_FRAMES, "overlap")
-        require_within(self, 1, limits.KEYPOINTS, "min_keypoints")
-        require_within(self, 1, limits.FILTER_FRAMES, "filter_window")
         odd = self.filter_window % 2 == 1
         remedy = "expected an odd number of frames; 1 switches the filter off"
         require(odd, "filter_window", f"is {self.filter_window}", remedy)
-        require_positive(self, limits.MEMORY_GB, "memory_gb")
-        require(len(self.stages) > 0, "stages", "is empty", "a fit needs at least one stage")
-        problem, remedy = f"holds {len(self.stages)} stages", f"expected at most {limits.STAGES}"
-        require(len(self.stages) <= limits.STAGES, "stages", problem, remedy)
         check_terms("terms", self.terms)
         for name, offset in self.keypoint_offsets.items():
-            key, far = f"keypoint_offsets.{name}", limits.KEYPOINT_OFFSET
-            require(len(offset) == 3, key, f"has {len(offset)} numbers", "expected three: x, y, z")
-            near = all(abs(number) <= far for number in offset)  # false for NaN
-            require(near, key, f"is {list(offset)}", f"expected numbers from -{far:g} to {far:g}")
-        for name in self.learn_weights:
-            require(name in LEARNABLE, "learn_weights", f"names {name!r}", f"expected some of {', '.join(LEARNABLE)}")
+            problem = f"has {len(offset)} numbers"
+            require(len(offset) == 3, f"keypoint_offsets.{name}", problem, "expected three: x, y, z")
         for i, stage in enumerate(self.stages):
             if stage.carry_moments:
                 adam = stage.solver == self.stages[max(i - 1, 0)].solver == "adam"

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
-from jaxfit.config.checks import require_within
+from annotated_types import Ge
+
+from jaxfit.config.build import config_dataclass
 from jaxfit.config.fit import FitConfig, shipped_fit_configs
 from jaxfit.config.perception import TrackConfig
 from jaxfit.config.yaml_file import OWN_FILE, read_config
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import IMAGE_SIDE_PX
 
 
-@dataclass(frozen=True)
+@config_dataclass
 class OverlayConfig:
     """The drawing of a reconstruction on its video."""
 
@@ -24,16 +25,13 @@ class OverlayConfig:
     """Whether a strip below the picture shows every bird from its left side."""
     detections: bool = True
     """Whether rings mark the detected keypoints beside the fitted keypoints."""
-    max_width_px: int | None = 1920
+    max_width_px: Annotated[int, Ge(16)] | None = 1920
     """Largest width of the overlay, in pixels; wider footage is scaled down, and null keeps the size."""
     codec: Literal["auto", "h264", "vp9", "mpeg4"] = "auto"
     """Codec of the overlay; `auto` uses H.264 where an H.264 encoder is installed."""
 
-    def __post_init__(self):
-        require_within(self, 16, IMAGE_SIDE_PX, "max_width_px")
 
-
-@dataclass(frozen=True)
+@config_dataclass
 class ReconstructConfig:
     """All settings of a reconstruction from video."""
 

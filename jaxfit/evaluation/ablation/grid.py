@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from jaxfit.config.build import get_value, get_values, plain_config, with_values
+from jaxfit.config.build import config_dataclass, get_value, get_values, plain_config, with_values
 from jaxfit.config.checks import ConfigKeyError, known_names, require, shown
 from jaxfit.config.fit import FitConfig, load_config
 from jaxfit.config.yaml_file import read_config
@@ -19,7 +19,7 @@ from jaxfit.foundation.errors import InputError, one_line, shortened
 from jaxfit.foundation.limits import GRID_RUNS
 
 
-@dataclass(frozen=True)
+@config_dataclass
 class CrossConfig:
     """Runs for all combinations of some values."""
 
@@ -37,7 +37,7 @@ class CrossConfig:
             require(path not in self.set, where, "is also a key of `set`", "remove one of the two")
 
 
-@dataclass(frozen=True)
+@config_dataclass
 class ClaimConfig:
     """A claim that a grid can test: runs with some values are better than runs with other values."""
 
@@ -52,7 +52,7 @@ class ClaimConfig:
     """Whether the claim also holds if there is no difference."""
 
 
-@dataclass(frozen=True)
+@config_dataclass
 class GridConfig:
     """The runs of an ablation and the claims that the runs test."""
 
