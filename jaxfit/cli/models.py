@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxfit.cli.tables import counted, right_aligned, show, show_facts
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.reading import json_text, read_text
+from jaxfit.foundation.reading import json_text
 from jaxfit.model.files import find_bird, read_provenance, save_bird
 
 
@@ -141,7 +141,7 @@ def show_config(options: argparse.Namespace) -> None:
     from jaxfit.behaviour.rules import BehaviourConfig
     from jaxfit.config.fit import FitConfig
     from jaxfit.config.reconstruct import ReconstructConfig
-    from jaxfit.config.yaml_file import documented_yaml, read_config, read_yaml, shipped_configs
+    from jaxfit.config.yaml_file import documented_yaml, read_config, read_yaml_file, shipped_configs
     from jaxfit.evaluation.ablation.grid import GridConfig
 
     kinds = {"reconstruct": ReconstructConfig, "ablation": GridConfig, "behaviour": BehaviourConfig}
@@ -150,8 +150,7 @@ def show_config(options: argparse.Namespace) -> None:
         remedy = f"give one of {', '.join(shipped_configs())}, or a file with rules of behaviours"
         if not Path(options.name).is_file():
             raise InputError(options.name, "is not a shipped config", remedy)
-        text = read_text(options.name, "a YAML file")
-        if "behaviours" not in read_yaml(text, options.name).values:
+        if "behaviours" not in read_yaml_file(options.name).values:
             raise InputError(options.name, "holds no rules of behaviours", remedy)
         kind = BehaviourConfig
     print(documented_yaml(read_config(kind, options.name)), end="")  # noqa: T201

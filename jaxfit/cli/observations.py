@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, NamedTuple
 from rich.table import Table
 
 from jaxfit.cli.tables import EscapedTable, counted, right_aligned, show, show_facts, track_table
-from jaxfit.config.yaml_file import read_yaml
+from jaxfit.config.yaml_file import read_yaml_file
 from jaxfit.data.formats.coco_records import Untracked
 from jaxfit.data.keypoint_names import NameMap, checked_map, map_keypoints, propose_names
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import terminal
-from jaxfit.foundation.reading import read_text
 
 if TYPE_CHECKING:
     from jaxfit.evaluation.tracking import ObservationsEvaluation
@@ -112,7 +111,7 @@ def show_names(names: NameMap, source: str, how: str) -> None:
 def _read_map(path: Path) -> dict[str, str | None]:
     """Return the map of a YAML file with one line `name in the file: name in the model` for every keypoint."""
     remedy = "write lines such as `beak: bill_tip`; null leaves a keypoint out"
-    value = read_yaml(read_text(path, "a YAML file"), path).values
+    value = read_yaml_file(path).values
     if not value:
         raise InputError(path, "holds no map of names", remedy)
     for old, new in value.items():

@@ -37,10 +37,10 @@ _EXPECTED = {
     "dataclass_type": "a mapping of keys to values",
     "too_short": "at least {min_length} value",
     "literal_error": "{expected}",
-    "greater_than": "a number above {gt}",
-    "greater_than_equal": "{ge} or more",
-    "less_than": "a number below {lt}",
-    "less_than_equal": "{le} or less",
+    "greater_than": "a number above {gt:g}",
+    "greater_than_equal": "{ge:g} or more",
+    "less_than": "a number below {lt:g}",
+    "less_than_equal": "{le:g} or less",
 }
 """Type of an error of pydantic → the value that was expected."""
 
@@ -54,7 +54,7 @@ def config_dataclass(kind: type[Config]) -> type[Config]:
     the descriptions of the keys. A class attribute `shipped` names a shipped config that sets all required keys;
     `removed` maps keys of earlier versions to remedies.
     """
-    built = pydantic.dataclasses.dataclass(kind, frozen=True, config=_SETTINGS)
+    built: Any = pydantic.dataclasses.dataclass(kind, frozen=True, config=_SETTINGS)
     construct = built.__init__
 
     @functools.wraps(construct)
@@ -90,16 +90,18 @@ def _fields(kind: Any) -> dict[str, Any]:
     return kind.__pydantic_fields__
 
 
-def _key_error(error: pydantic.ValidationError, kind: type, values: Any) -> ConfigKeyError:
-    """Return the first error of pydantic as an error that names a key.
+def _key_error(error: pydantic.ValidationError, kind: Any, values: Any) -> ConfigKeyError:
+    """Return one error of pydantic as an error that names a key.
 
     Args:
         error: the error of pydantic.
         kind: the config dataclass.
         values: the values that were given to the dataclass.
     """
-    first = error.errors(include_url=False)[0]
+    # a wrong key explains why another key is missing
+    first = min(error.errors(include_url=False), key=lambda problem: problem["type"] != "unexpected_keyword_argument")
     where = ""
+    part: Any
     for part in first["loc"]:  # also holds names of types, which are no keys
         if isinstance(part, int) and isinstance(values, dict):
             part = list(_fields(kind))[part]  # a positional argument
@@ -107,7 +109,7 @@ def _key_error(error: pydantic.ValidationError, kind: type, values: Any) -> Conf
             where, values = join_keys(where, part), values[part]
             annotation = _fields(kind)[part].annotation if part in _fields(kind) else None
             inner = [hint for hint in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(hint)]
-            kind = typing.cast(type, inner[0]) if inner else kind
+            kind = inner[0] if inner else kind
     context = first.get("ctx", {})
     if isinstance(cause := context.get("error"), ConfigKeyError):
         return cause.within(where)
@@ -248,8 +250,9 @@ def _stage_index(stages: list[Any], key: str, requested: str) -> int:
     names = [stage.get("name") for stage in stages if isinstance(stage, dict)]
     if key in names:
         return names.index(key)
-    if key.isdecimal() and int(key) < len(stages):
-        return int(key)
+    numbers = list(map(str, range(len(stages))))
+    if key in numbers:
+        return numbers.index(key)
     raise ConfigKeyError(requested, f"names the unknown stage {key!r}", known_names(key, names))
 
 

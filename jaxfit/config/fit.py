@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import field
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args
 
@@ -35,8 +35,13 @@ def check_terms(key: str, terms: Mapping[str, Any]) -> None:
             path = f"{key}.{name}.{setting}"
             if setting not in known:
                 raise ConfigKeyError(path, "is not a setting of this term", known_names(setting, known))
-            is_number = isinstance(number, int | float) and not isinstance(number, bool) and isfinite(number)
-            require(is_number and number >= 0, path, f"is {shown(number)}", "expected a number, 0 or more")
+            is_number = isinstance(number, int | float) and not isinstance(number, bool)
+            require(
+                is_number and 0 <= number <= sys.float_info.max,
+                path,
+                f"is {shown(number)}",
+                "expected a number, 0 or more",
+            )
             require(setting not in term.positive or number > 0, path, f"is {number!r}", "expected a number above 0")
 
 

@@ -62,6 +62,17 @@ def read_yaml(text: str, source: object) -> YamlMapping:
         raise InputError(source, "is nested too deeply", "use fewer levels") from None
 
 
+def read_yaml_file(path: str | Path, absent: str = "check the path") -> YamlMapping:
+    """Return the mapping that a YAML file holds; `absent` is the remedy where there is no file.
+
+    Raises:
+        InputError: the path is not a readable file, or as `read_yaml`.
+    """
+    with reading(path, "a YAML file", absent=absent) as file:
+        text = file.read_text(encoding="utf-8-sig")
+    return read_yaml(text, path)
+
+
 class _Reader:
     """Converts the nodes of a YAML text to plain values, and keeps their lines."""
 
@@ -197,7 +208,7 @@ _Representer.add_representer(float, _represent_float)
 
 def _yaml(plain: Any, flow_style: bool | None = False) -> str:
     """Return plain values as YAML text; with the flow style None, lists and mappings of plain values have one line."""
-    writer = YAML(typ="safe", pure=True)
+    writer: Any = YAML(typ="safe", pure=True)
     writer.Representer = _Representer
     writer.default_flow_style = flow_style
     writer.width = 80 if flow_style is False else 110
@@ -259,15 +270,13 @@ def _read(source: str, kind: type, above: tuple[str, ...] = ()) -> _Content:
         above: the files whose bases lead to this file.
     """
     shipped = source in shipped_configs()
+    absent = f"give a YAML file or one of {', '.join(shipped_configs())}"
+    values, lines = read_yaml_file(_shipped_folder() / f"{source}.yaml" if shipped else source, absent)
     # one file can have several paths: links, and names such as folder/../file
     identity = source if shipped else os.path.realpath(source)
     if identity in above:
         circle = " → ".join(Path(file).name for file in (*above, identity))
         raise InputError(source, "the `base` keys form a circle", circle)
-    absent = f"give a YAML file or one of {', '.join(shipped_configs())}"
-    with reading(_shipped_folder() / f"{source}.yaml" if shipped else source, "a YAML file", absent=absent) as path:
-        text = path.read_text(encoding="utf-8-sig")
-    values, lines = read_yaml(text, source)
     content = _Content(values, {path: (source, line) for path, line in lines.items()})
 
     def base_content(base: Any, path: str, kind: type) -> _Content:

@@ -16,7 +16,9 @@ from jaxfit.config.checks import ConfigKeyError, known_names, require, shown
 from jaxfit.config.fit import FitConfig, load_config
 from jaxfit.config.yaml_file import read_config
 from jaxfit.foundation.errors import InputError, one_line, shortened
-from jaxfit.foundation.limits import GRID_RUNS
+
+GRID_RUNS = 10_000
+"""Most runs of a grid or a sweep. The grid of the paper has 34 runs."""
 
 
 @config_dataclass

@@ -3,10 +3,9 @@
 import pytest
 from support.cli_files import CONFIG
 
-from jaxfit.evaluation.ablation.grid import load_grid, require_runs, short
+from jaxfit.evaluation.ablation.grid import GRID_RUNS, load_grid, require_runs, short
 from jaxfit.fitting.solve import compiled_part
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import GRID_RUNS
 
 
 def grid_file(folder, text):
