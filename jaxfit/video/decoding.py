@@ -1,127 +1,58 @@
-"""Decoding of frames as players show them: whole pictures, rotation, colours; damaged frames are reported."""
+"""Decoding of video files by PyAV: frame numbers, presentation times, seeking, and pictures as players show them."""
 
 from __future__ import annotations
 
+import heapq
 import logging
 import math
 import struct
-from collections.abc import Callable, Generator, Iterator
-from fractions import Fraction
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import av
-import av.error
 import av.filter
 import cv2
 import numpy as np
+from av import error as av_error
+from av.error import FFmpegError
 from av.sidedata.sidedata import Type
+from av.stream import Disposition
 from av.video.reformatter import ColorTrc, Interpolation
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.video.packets import (
-    Timeline,
-    add_packet,
-    begin,
-    checked_by_index,
-    demuxed,
-    frame_count,
-    opened,
-    packet_timeline,
-    time_of,
-)
+from jaxfit.foundation.reading import open_file
 
 _logger = logging.getLogger(__name__)
 
 EXACT = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.BITEXACT
 """Settings that convert colours identically on every machine."""
-
+MP4, MATROSKA = "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm"
+"""Names of formats in FFmpeg. In both, every packet has a time stamp, so that seeks are exact."""
+_RAW = ("h264", "hevc", "m4v", "mpegvideo", "mjpeg")
+"""Formats that are only the stream of a codec. Without time stamps, the rate in the codec's header counts."""
+_REORDER = 64  # packets; the time stamps of packets that are further apart in a file are in order
+_FIRST_PACKETS = 500  # packets; a later first picture would make probing slow
+_FPS_RANGE = 1e-5, 1e5  # other rates come from damaged headers
 _HDR = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}
 _LARGEST_TILT = math.tan(math.radians(1))  # players ignore smaller deviations from multiples of 90°, as FFmpeg does
 
 
-class Turn(NamedTuple):
-    """Rotation by a multiple of 90°, and reflection: rows and columns are swapped first, then the order is reversed."""
+class Frame(NamedTuple):
+    """One frame of a video."""
 
-    transposed: bool
-    reversed_x: bool
-    reversed_y: bool
-
-    def size_px(self, width: int, height: int) -> tuple[int, int]:
-        """Return the width and height of a turned picture."""
-        return (height, width) if self.transposed else (width, height)
-
-    def apply(self, picture: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H2 W2 3"]:
-        """Return the turned picture."""
-        if self.transposed:
-            picture = cv2.transpose(picture)
-        if self.reversed_x or self.reversed_y:
-            picture = cv2.flip(picture, -1 if self.reversed_x and self.reversed_y else int(self.reversed_x))
-        return picture
-
-
-_UPRIGHT = Turn(False, False, False)
-
-
-def display_turn(picture: Any) -> Turn | None:
-    """Return how players turn a decoded picture, from its display matrix; None for an angle between multiples of 90°.
-
-    The display matrix (a b u; c d v; x y w) of a container or of a codec maps the coded position (p, q) to the shown
-    position (a·p + c·q + x, b·p + d·q + y). Scale and translation are ignored, as FFmpeg ignores both.
-    """
-    content = _display_matrix(picture)
-    if content is None or len(content) != 36:
-        return _UPRIGHT
-    a, b, _, c, d, *_ = struct.unpack("=9i", content)
-    straight, crossed = math.hypot(a, d), math.hypot(b, c)
-    if crossed <= _LARGEST_TILT * straight:
-        return Turn(False, a < 0, d < 0)
-    if straight <= _LARGEST_TILT * crossed:
-        return Turn(True, c < 0, b < 0)
-    return None
-
-
-def _display_matrix(picture: Any) -> bytes | None:
-    try:
-        return next((bytes(data) for data in picture.side_data if data.type == Type.DISPLAYMATRIX), None)
-    except ValueError:  # data of a type that PyAV does not know
-        return None
-
-
-def displayed_size(picture: Any) -> tuple[int, int]:
-    """Return the width and height in pixels of a decoded picture as players show the picture."""
-    return (display_turn(picture) or _UPRIGHT).size_px(picture.width, picture.height)
-
-
-def displayed(picture: Any) -> UInt8[np.ndarray, "H W 3"]:
-    """Return the pixels of a decoded picture, turned as players turn the picture.
-
-    The conversion follows the colour matrix and the range of the picture; BT.601 without a matrix, as in FFmpeg.
-
-    Raises:
-        av.error.FFmpegError: the pixel format is damaged.
-    """
-    picture_bgr = picture.to_ndarray(format="bgr24", interpolation=EXACT)
-    return (display_turn(picture) or _UPRIGHT).apply(picture_bgr)
-
-
-def warn_of_difference(path: Path, stream: Any, picture: Any) -> None:
-    """Warn if players show a video in another way: tilted, with stretched pixels, or with tone mapping."""
-    if display_turn(picture) is None:
-        _logger.warning("%s: players tilt this video by an angle between multiples of 90°, jaxfit does not", path)
-    aspect = stream.sample_aspect_ratio
-    if aspect and aspect != 1:
-        remedy = "convert the video to square pixels, because the camera model needs square pixels"
-        _logger.warning(
-            "%s: players stretch the pixels of this video to %s; %s", path, f"{aspect}".replace("/", ":"), remedy
-        )
-    if picture.color_trc in _HDR:
-        kind = _HDR[picture.color_trc]
-        _logger.warning("%s: is HDR video (%s), so that colours look pale; convert the video to SDR", path, kind)
-
-
-_FILTER = "bwdif"
+    index: int
+    """Number of the frame, from 0. The number of a picture does not depend on the first frame that is read."""
+    picture: UInt8[np.ndarray, "H W 3"]
+    """Pixels as players show the frame: upright and deinterlaced. The channel order is blue, green, red."""
+    time_s: float | None
+    """Presentation time in seconds: the time stamp of the container, which ffprobe shows as `pts_time`. An edit list is
+    applied. The first frame often has the time 0, but transport streams and recordings that were cut begin later.
+    Without time stamps, the number of the frame divided by the frame rate; None if the rate is unknown too."""
 
 
 class NumberedPicture(NamedTuple):
@@ -133,100 +64,82 @@ class NumberedPicture(NamedTuple):
     """None if the picture is damaged."""
 
 
-def deinterlaced(path: Path, pictures: Iterator[NumberedPicture]) -> Iterator[NumberedPicture]:
-    """Yield consecutive pictures; interlaced pictures are deinterlaced, all other pictures are unchanged.
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Open a file. Gives its container and its default video stream.
 
-    FFmpeg's filter `bwdif` fills the lines of one field from the other field and from the neighbours of the picture.
-    A result depends on a picture and its two neighbours only, and not on where the reading begins. Damaged pictures are
-    not used.
+    Raises:
+        InputError: the file is not a readable video.
     """
-    before: Any = None
-    waiting: NumberedPicture | None = None
-    lines: _Filter | None = None
-    for numbered in pictures:
-        picture = numbered.picture
-        if waiting is not None and lines is not None:
-            yield waiting._replace(picture=lines.next(picture))
-            waiting = None
-        if picture is None or not picture.interlaced_frame:
-            lines = None
-            yield numbered
-        else:
-            lines = lines or _Filter(path, before, picture)
-            waiting = numbered
-        before = picture
-    if waiting is not None and lines is not None:
-        yield waiting._replace(picture=lines.next(None))
+    with open_file(path, "a video") as file:
+        try:
+            # a playlist may name other files and network addresses
+            container = av.open(file, options={"protocol_whitelist": "none"}, metadata_errors="replace")
+        except (FFmpegError, ValueError) as error:
+            problem = f"is not a readable video: {getattr(error, 'strerror', error)}"
+            raise InputError(path, problem, "the file may be incomplete or of another type") from error
+        with container:
+            stream: Any = container.streams.best("video")
+            # the cover picture of a music file is also a video stream
+            if stream is None or stream.disposition & Disposition.attached_pic:
+                raise InputError(path, "has no video stream", "give a video or a folder of images")
+            if stream.codec_context is None:
+                raise InputError(path, "has a codec that this PyAV cannot decode", "convert the video to H.264")
+            stream.thread_type = "SLICE"  # with threads for frames, the detected damage would vary from run to run
+            yield container, stream
 
 
-class _Filter:
-    """Deinterlaces consecutive pictures.
+def frame_count(stream: Any) -> int | None:
+    """Return the number of frames that players show; None if the container does not store a number.
 
-    Args:
-        path: the file, for a warning.
-        before: the picture before the first picture; None if unknown.
-        first: the first picture.
+    An edit list of an MP4 file hides frames. FFmpeg marks these frames in its index, or leaves the frames out.
     """
+    if not stream.frames or stream.container.format.name != MP4:
+        return stream.frames or None
+    return sum(not entry.is_discard for entry in stream.index_entries) or stream.frames
 
-    def __init__(self, path: Path, before: Any, first: Any):
-        self._path, self._last, self._graph = path, first, av.filter.Graph()
+
+def frame_rate(stream: Any) -> float | None:
+    """Return the mean frame rate in frames per second; None if the rate is unknown, or absurd because of damage."""
+    rate = stream.average_rate or stream.guessed_rate
+    if stream.container.format.name in _RAW:  # the mean rate is a default of FFmpeg
+        rate = stream.guessed_rate or rate
+    return float(rate) if rate and _FPS_RANGE[0] <= rate <= _FPS_RANGE[1] else None
+
+
+def first_picture(container: Any, stream: Any) -> Any:
+    """Return the first picture that can be decoded; None if there is none in the first packets."""
+    packets = container.demux(stream)
+    for _ in range(_FIRST_PACKETS):
         try:
-            source = self._graph.add(
-                "buffer",
-                video_size=f"{first.width}x{first.height}",
-                pix_fmt=first.format.name,
-                time_base=str(first.time_base or Fraction(1, 1000)),
-                pixel_aspect="1/1",
-                colorspace=str(int(first.colorspace)),
-                range=str(int(first.color_range)),
-            )
-            filtering = self._graph.add(_FILTER, mode="send_frame", deint="interlaced")
-            self._graph.link_nodes(source, filtering, self._graph.add("buffersink")).configure()
-            if before is not None and _alike(before, first):
-                self._graph.vpush(before)
-                self._graph.vpush(first)
-                self._graph.vpull()  # the picture before
-            else:
-                self._graph.vpush(first)
-        except (av.error.FFmpegError, ValueError) as error:
-            self._fail(error)
-
-    def next(self, following: Any) -> Any:
-        """Return the last picture deinterlaced, given the following picture; None if there is none."""
-        picture, self._last = self._last, following
-        if self._graph is None:
-            return picture
-        try:
-            self._graph.vpush(following if following is not None and _alike(picture, following) else None)
-            return self._graph.vpull()
-        except (av.error.FFmpegError, ValueError) as error:
-            self._fail(error)
-            return picture
-
-    def _fail(self, error: Exception) -> None:
-        self._graph = None
-        _logger.warning("%s: cannot be deinterlaced (%s), the frames keep two fields", self._path, error)
+            packet = next(packets, None)
+            pictures = [] if packet is None else stream.decode(packet)
+        except FFmpegError:
+            continue
+        if packet is None or pictures:
+            return pictures[0] if pictures else None
+    return None
 
 
-def _alike(a: Any, b: Any) -> bool:
-    return (a.width, a.height, a.format.name) == (b.width, b.height, b.format.name)
+def frame_times(path: Path, stop: int) -> Float[np.ndarray, "F"]:
+    """Return the presentation times of the frames of a video before frame `stop`, without decoding.
+
+    Returns:
+        (F,) times in seconds as `Frame.time_s`, at most `stop`; NaN for unknown times.
+
+    Raises:
+        InputError: the file is not a readable video.
+    """
+    with opened(path) as (_, stream):
+        rate, time_base = frame_rate(stream), stream.time_base
+    packets = _packets(path, stop)
+    if packets.stamps is None:
+        return np.arange(min(packets.count, stop)) / (rate or np.nan)
+    return np.array([float(stamp * time_base) for stamp in packets.stamps[:stop]], np.float64)
 
 
-class Frame(NamedTuple):
-    """One frame of a video."""
-
-    index: int
-    """Number of the frame, from 0. The number of a picture does not depend on the first frame that is read."""
-    picture: UInt8[np.ndarray, "H W 3"]
-    """Pixels as players show the frame: upright and deinterlaced. The channel order is blue, green, red."""
-    time_s: float | None
-    """Presentation time in seconds, as `jaxfit.video.packets.time_of` defines it. None if the time is unknown."""
-
-
-def decode(
-    path: Path, numbers: range, size_px: tuple[int, int], stopped: Callable[[], bool]
-) -> Generator[Frame | int, None, None]:
-    """Yield the requested frames of a video in order. For a damaged or lost frame, yield only its number.
+def decode(path: Path, numbers: range, size_px: tuple[int, int], stopped: Callable[[], bool]) -> Iterator[Frame | int]:
+    """Yield the requested frames of a video in order. For a damaged frame, yield only its number.
 
     If the container has time stamps (mp4, mkv, webm), the packets of earlier frames are counted and not decoded.
     Decoding starts at the third last keyframe before the first requested frame. A stream with gradual refresh has no
@@ -244,111 +157,270 @@ def decode(
     if not numbers:
         return
     with opened(path) as (container, stream):
-        begun = begin(container, stream, numbers.start, stopped)
-        if begun is not None:
-            yield from _read(path, container, stream, *begun, numbers, size_px, stopped)
-            return
+        stamps = _seek(path, container, stream, numbers.start)
+        for number, time_s, picture in deinterlaced(path, _numbered(path, container, stream, stamps, stopped)):
+            if number in numbers:
+                yield number if picture is None else Frame(number, _pixels(path, number, picture, size_px), time_s)
+            if number >= numbers[-1]:
+                return
+
+
+class _Packets(NamedTuple):
+    """The frames at the beginning of a file, from its packets."""
+
+    count: int
+    stamps: list[int] | None
+    """Time stamps in the order of presentation; None if stamps are missing or contradict each other."""
+    keys: list[int]
+    """Numbers of the keyframes."""
+
+
+def _packets(path: Path, stop: int) -> _Packets:
+    """Return the frames from the first picture that can be decoded to at least frame `stop`, without decoding."""
     with opened(path) as (container, stream):
-        line = packet_timeline(container, stream)
-        yield from _read(path, container, stream, demuxed(container, stream), line, numbers, size_px, stopped)
+        first, has_stamps = first_picture(container, stream), _has_stamps(container, stream)
+    frames: list[tuple[int | None, bool]] = []
+    with opened(path) as (container, stream):
+        try:
+            for packet in filter(_is_shown, container.demux(stream)):
+                if first is None or None in (first.pts, packet.pts) or packet.pts >= first.pts:
+                    frames.append((packet.pts, packet.is_keyframe))
+                if len(frames) > stop + _REORDER:
+                    break
+        except FFmpegError:  # the file ends here
+            pass
+    stamps: set[Any] = {stamp for stamp, _ in frames}
+    if not has_stamps or None in stamps or len(stamps) < len(frames):
+        return _Packets(len(frames), None, [])
+    frames.sort()
+    return _Packets(len(frames), sorted(stamps), [i for i, (_, is_key) in enumerate(frames) if is_key])
 
 
-def _read(
-    path: Path,
-    container: Any,
-    stream: Any,
-    packets: Iterator[tuple[Any, bool]],
-    line: Timeline,
-    numbers: range,
-    size_px: tuple[int, int],
-    stopped: Callable[[], bool],
-) -> Iterator[Frame | int]:
-    pictures = _numbered(path, container, stream, packets, line, stopped)
-    for number, time_s, picture in deinterlaced(path, pictures):
-        if stopped():
-            return
-        if number in numbers:
-            picture_bgr = None if picture is None else _convert(path, number, picture, size_px)
-            yield number if picture_bgr is None else Frame(number, picture_bgr, time_s)
-        if number >= numbers[-1]:
-            return
+def _has_stamps(container: Any, stream: Any) -> bool:
+    # AVI has no time stamps, and FFmpeg cannot derive correct time stamps for these codecs
+    return not (container.format.name == "avi" and stream.codec_context.name in ("h264", "hevc"))
+
+
+def _is_shown(packet: Any) -> bool:
+    """Return whether players show the picture of a packet."""
+    # no content: a repeated picture in AVI, or the end of a stream. VP8 has packets that serve only as references.
+    hidden = packet.size and packet.stream.codec_context.name == "vp8" and not memoryview(packet)[0] & 0x10
+    return bool(packet.size) and not hidden and not packet.is_discard
+
+
+def _seek(path: Path, container: Any, stream: Any, start: int) -> list[int]:
+    """Move to the third last keyframe up to frame `start`; return the time stamps of the frames up to there and beyond.
+
+    Returns an empty list, and stays at the beginning, if the file has no time stamps to seek by.
+    """
+    if not start or container.format.name not in (MP4, MATROSKA):
+        return []
+    packets = _packets(path, start)
+    keys = packets.keys[: bisect_left(packets.keys, start + 1)][-3:]
+    if packets.stamps is None or not keys or keys[0] == 0:
+        return []
+    container.seek(packets.stamps[keys[0]], stream=stream)
+    return packets.stamps
 
 
 def _numbered(
-    path: Path,
-    container: Any,
-    stream: Any,
-    packets: Iterator[tuple[Any, bool]],
-    line: Timeline,
-    stopped: Callable[[], bool],
+    path: Path, container: Any, stream: Any, stamps: list[int], stopped: Callable[[], bool]
 ) -> Iterator[NumberedPicture]:
-    """Yield all pictures from the first packet on, in the order of their numbers."""
-    any_picture, problem = False, ""
-    decoded = _decoded(packets, stream, line, stopped)
-    while True:
+    """Yield the pictures from the current position of a container on, in the order of their numbers.
+
+    A number is a rank: the number of packets in the file that are shown earlier. It is correct for a variable frame
+    rate, and does not change if a picture cannot be decoded. As in OpenCV, counting begins at the first picture of the
+    file that can be decoded. If time stamps are missing or contradict each other, pictures are counted as they come.
+
+    A damaged or missing picture spoils all pictures after it, up to the next keyframe, because decoders do not report
+    which of these pictures repeat the damage.
+
+    Args:
+        path, container, stream: the opened file.
+        stamps: time stamps of the frames of the file up to a frame after the current position; empty at its beginning.
+        stopped: as for `decode`.
+    """
+    number = len(stamps)
+    has_stamps, rate = _has_stamps(container, stream), frame_rate(stream)
+    waiting: list[Any] = []  # the time stamps of packets whose pictures were not yet decoded, as a heap
+    last: Any = -math.inf
+    is_begun, is_spoilt, problem = False, False, ""
+
+    def numbered(picture: Any, stamp: int | None) -> NumberedPicture:
+        nonlocal number
+        time_s = number / rate if rate else None
+        if has_stamps and stamp is not None:
+            time_s = float(stamp * stream.time_base)
+        number += 1
+        return NumberedPicture(number - 1, time_s, picture)
+
+    packets = container.demux(stream)
+    packet: Any = True
+    while packet is not None and not stopped():
         try:
-            picture = next(decoded, None)
-        except av.error.FFmpegError as error:
-            problem, picture = f": {error.strerror}", None
-        if stopped():
-            return
-        if picture is None:
-            line.finish()
-        else:
-            if not any_picture:
+            packet = next((packet for packet in packets if packet.size), None)
+        except FFmpegError as error:  # the container is damaged: the decoder still returns its last pictures
+            packet, problem = None, f": {error.strerror}"
+        if packet is not None and _is_shown(packet):
+            has_stamps = has_stamps and packet.pts is not None
+            if has_stamps:
+                heapq.heappush(waiting, packet.pts)
+        try:
+            pictures = stream.decode(packet)  # None flushes the decoder
+        except FFmpegError as error:
+            pictures, is_spoilt = [], True
+            problem = problem if is_begun else f": {error.strerror}"
+            if not has_stamps and is_begun:
+                yield numbered(None, None)
+        for picture in pictures:
+            stamp: Any = picture.pts
+            has_stamps = has_stamps and stamp is not None and stamp > last
+            if not is_begun:
+                is_begun, problem = True, ""
                 warn_of_difference(path, stream, picture)
-            any_picture = True
-            line.show(picture)
-        for number, packet, whole in line.ready():
-            yield NumberedPicture(number, time_of(number, packet, line, stream), whole)
-        if picture is None:
-            break
-    if not any_picture:
+                waiting = [later for later in waiting if has_stamps and later >= stamp]
+                heapq.heapify(waiting)
+                number = bisect_left(stamps, stamp) if stamps and stamp is not None else 0
+            while has_stamps and waiting and waiting[0] < stamp:
+                is_spoilt = True
+                yield numbered(None, heapq.heappop(waiting))
+            if has_stamps:
+                last = stamp
+                if waiting and waiting[0] == last:
+                    heapq.heappop(waiting)
+            is_spoilt = picture.is_corrupt or (is_spoilt and not picture.key_frame)
+            yield numbered(None if is_spoilt else picture, stamp)
+    if stopped():
+        return
+    while has_stamps and is_begun and waiting:
+        last = heapq.heappop(waiting)
+        yield numbered(None, last)
+    if not is_begun and not stamps:
         raise InputError(path, f"no frame can be decoded{problem}", "the file may be incomplete or damaged")
-    _warn_if_short(path, container, stream, line, problem)
+    expected, end_s = frame_count(stream), number / rate if rate else 0.0
+    if has_stamps and is_begun:
+        end_s = float(last * stream.time_base)
+    if problem or number < (expected or 0):
+        _logger.warning("%s: ends after %d of %s frames%s", path, number, expected or "more", problem)
+    elif not expected and container.duration and len(container.streams) == 1:
+        promised_s = container.duration / av.time_base
+        if end_s + 1 < promised_s:
+            _logger.warning("%s: ends after %.1f of %.1f seconds", path, end_s, promised_s)
 
 
-def _convert(path: Path, number: int, picture: Any, size_px: tuple[int, int]) -> np.ndarray | None:
-    """Return the pixels of a decoded picture; None if its pixel format is damaged."""
+def deinterlaced(path: Path, pictures: Iterator[NumberedPicture]) -> Iterator[NumberedPicture]:
+    """Yield the pictures; from the first interlaced picture on, interlaced pictures are deinterlaced.
+
+    FFmpeg's filter `bwdif` fills the lines of one field from the other field and from the neighbours of the picture.
+    Damaged pictures are not used.
+    """
+    graph: Any = None
+    waiting: deque[NumberedPicture] = deque()
+
+    def filtered() -> Iterator[NumberedPicture]:
+        """Yield the pictures that the filter has finished, with the damaged pictures between them."""
+        while waiting:
+            try:
+                picture = None if waiting[0].picture is None else graph.vpull()
+            except (av_error.BlockingIOError, av_error.EOFError):  # it needs the next picture, or has no more
+                return
+            yield waiting.popleft()._replace(picture=picture)
+
+    for numbered in pictures:
+        picture = numbered.picture
+        if graph is None and picture is not None and picture.interlaced_frame:
+            graph = _deinterlacer(picture)
+        if graph is None:
+            yield numbered
+            continue
+        waiting.append(numbered)
+        if picture is not None:
+            try:
+                graph.vpush(picture)
+            except FFmpegError as error:
+                raise InputError(
+                    path, f"its frame {numbered.number} cannot be deinterlaced: {error.strerror}"
+                ) from error
+        yield from filtered()
+    if graph is not None:
+        graph.vpush(None)
+        yield from filtered()
+
+
+def _deinterlacer(first: Any) -> Any:
+    """Return a filter for pictures of the format of the first picture."""
+    graph = av.filter.Graph()
+    source = graph.add(
+        "buffer",
+        video_size=f"{first.width}x{first.height}",
+        pix_fmt=first.format.name,
+        time_base=str(first.time_base or "1/1000"),
+        pixel_aspect="1/1",
+        colorspace=str(int(first.colorspace)),
+        range=str(int(first.color_range)),
+    )
+    bwdif = graph.add("bwdif", mode="send_frame", deint="interlaced")
+    graph.link_nodes(source, bwdif, graph.add("buffersink")).configure()
+    return graph
+
+
+def display_turn(picture: Any) -> tuple[bool, bool, bool] | None:
+    """Return how players turn a decoded picture: whether rows and columns are swapped, then x and y reversed.
+
+    The display matrix (a b u; c d v; x y w) of a container or of a codec maps the coded position (p, q) to the shown
+    position (a·p + c·q + x, b·p + d·q + y). Scale and translation are ignored, as FFmpeg ignores both.
+
+    Returns:
+        Three flags; None for an angle between multiples of 90°.
+    """
+    try:
+        content = next((bytes(data) for data in picture.side_data if data.type == Type.DISPLAYMATRIX), None)
+    except ValueError:  # data of a type that PyAV does not know
+        content = None
+    if content is None or len(content) != 36:
+        return False, False, False
+    a, b, _, c, d, *_ = struct.unpack("=9i", content)
+    straight, crossed = math.hypot(a, d), math.hypot(b, c)
+    if crossed <= _LARGEST_TILT * straight:
+        return False, a < 0, d < 0
+    if straight <= _LARGEST_TILT * crossed:
+        return True, c < 0, b < 0
+    return None
+
+
+def displayed_size(picture: Any) -> tuple[int, int]:
+    """Return the width and height in pixels of a decoded picture as players show the picture."""
+    is_transposed = (display_turn(picture) or (False,))[0]
+    return (picture.height, picture.width) if is_transposed else (picture.width, picture.height)
+
+
+def _pixels(path: Path, number: int, picture: Any, size_px: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+    """Return the pixels of a decoded picture, turned as players turn the picture.
+
+    The conversion follows the colour matrix and the range of the picture; BT.601 without a matrix, as in FFmpeg.
+    """
     width, height = displayed_size(picture)
     if (width, height) != size_px:
         problem = f"its frame {number} is {width}×{height}, but the video is {size_px[0]}×{size_px[1]}"
         raise InputError(path, problem, "convert the video to a single size")
-    try:
-        return displayed(picture)
-    except av.error.FFmpegError:
-        return None
+    picture_bgr = picture.to_ndarray(format="bgr24", interpolation=EXACT)
+    is_transposed, is_reversed_x, is_reversed_y = display_turn(picture) or (False, False, False)
+    if is_transposed:
+        picture_bgr = cv2.transpose(picture_bgr)
+    if is_reversed_x or is_reversed_y:
+        picture_bgr = cv2.flip(picture_bgr, -1 if is_reversed_x and is_reversed_y else int(is_reversed_x))
+    return picture_bgr
 
 
-def _decoded(
-    packets: Iterator[tuple[Any, bool]], stream: Any, line: Timeline, stopped: Callable[[], bool]
-) -> Iterator[Any]:
-    """Yield decoded pictures in the order of the decoder. Every packet is added to the timeline first."""
-    problem = None
-    packets = checked_by_index(packets, stream, line)
-    while not stopped():
-        try:
-            packet, torn = next(packets, (None, False))
-        except av.error.FFmpegError as error:  # the container is damaged: the decoder still returns its last pictures
-            problem, packet, torn = error, None, False
-        if packet is not None:
-            add_packet(line, packet, torn)
-        try:
-            pictures = stream.decode(packet)  # None flushes the decoder
-        except av.error.FFmpegError:  # one packet is damaged: the timeline misses its frame at the next picture
-            pictures, line.troubled = [], True
-        yield from pictures
-        if packet is None:
-            break
-    if problem is not None:
-        raise problem
-
-
-def _warn_if_short(path: Path, container: Any, stream: Any, line: Timeline, problem: str) -> None:
-    frames = frame_count(stream)
-    if problem or line.number + line.skipped < (frames or 0):
-        _logger.warning("%s: ends after %d of %s frames%s", path, line.number, frames or "more", problem)
-    elif not frames and container.duration and line.last is not None and len(container.streams) == 1:
-        promised, end = container.duration / av.time_base, float(line.last * stream.time_base)
-        if end + 1 < promised:
-            _logger.warning("%s: ends after %.1f of %.1f seconds", path, end, promised)
+def warn_of_difference(path: Path, stream: Any, picture: Any) -> None:
+    """Warn if players show a video in another way: tilted, with stretched pixels, or with tone mapping."""
+    if display_turn(picture) is None:
+        _logger.warning("%s: players tilt this video by an angle between multiples of 90°, jaxfit does not", path)
+    aspect = stream.sample_aspect_ratio
+    if aspect and aspect != 1:
+        remedy = "convert the video to square pixels, because the camera model needs square pixels"
+        ratio = f"{aspect.numerator}:{aspect.denominator}"
+        _logger.warning("%s: players stretch the pixels of this video to %s; %s", path, ratio, remedy)
+    if picture.color_trc in _HDR:
+        kind = _HDR[picture.color_trc]
+        _logger.warning("%s: is HDR video (%s), so that colours look pale; convert the video to SDR", path, kind)

@@ -12,11 +12,13 @@ from queue import SimpleQueue
 from threading import Event, Semaphore, Thread, current_thread
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+from jaxtyping import UInt8
+
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import check_readable
-from jaxfit.video.decoding import Frame, decode, displayed_size
-from jaxfit.video.packets import first_picture, frame_count, frame_rate, opened
-from jaxfit.video.pictures import image_files, read_picture
+from jaxfit.video.decoding import Frame, decode, displayed_size, first_picture, frame_count, frame_rate, opened
+from jaxfit.video.pictures import image_files, page_count, read_pages, read_picture
 
 _logger = logging.getLogger(__name__)
 
@@ -42,12 +44,12 @@ def probe_video(path: str | Path, *, fps: float | None = None) -> VideoInfo:
         InputError: as ``read_frames``.
     """
     path = _existing(path)
-    if path.is_dir():
-        files = image_files(path)
-        first = next((image for image in map(read_picture, files) if image is not None), None)
+    if _holds_pictures(path):
+        count = len(image_files(path)) if path.is_dir() else page_count(path)
+        first = next((picture for _, _, picture in _pictures(path, range(count)) if picture is not None), None)
         if first is None:
             raise InputError(path, "has no readable image", "the files may be damaged, too large, or not be images")
-        return VideoInfo(len(files), fps, (first.shape[1], first.shape[0]))
+        return VideoInfo(count, fps, (first.shape[1], first.shape[0]))
     if fps is not None:
         raise InputError(path, "is a video, which has its own frame rate", "give a rate only for a folder of images")
     with opened(path) as (container, stream):
@@ -61,11 +63,12 @@ def read_frames(
 ) -> FrameReader:
     """Return a reader of the frames of a video, or of a folder of images in the order of their names (2 before 10).
 
-    Frames are numbered from 0 in the order in which they are shown. The number of a picture does not depend on `start`
-    (`Timeline` describes the numbering and the treatment of variable frame rates). Damaged frames are skipped, together
-    with the frames that depend on them, up to the next keyframe. The numbers of later frames stay correct. One warning
-    lists the skipped frames, and so does `FrameReader.damaged`. A decoder detects damage only by contradictions in the
-    data: in VP8 and VP9 most damage is not detected. If a file is truncated, the frames end with a warning.
+    Frames are numbered from 0 in the order in which they are shown, from the first frame that can be decoded, as in
+    OpenCV. The number of a picture does not depend on `start`. Damaged frames are skipped, together with the frames
+    that depend on them, up to the next keyframe. The numbers of later frames stay correct, unless the damage hides
+    frames from FFmpeg (in AVI, MKV and transport streams). One warning lists the skipped frames, and so does
+    `FrameReader.damaged`. A decoder detects damage only by contradictions in the data: in VP8 and VP9 most damage is
+    not detected. If a file is truncated, the frames end with a warning.
 
     Frames come as players show them: rotated and mirrored by the display matrix of the file, in 8 bits by its colour
     matrix and range, and deinterlaced where pictures are interlaced. Three things differ, and a warning reports each:
@@ -73,7 +76,7 @@ def read_frames(
     HDR video is not tone mapped.
 
     Args:
-        path: a file of any type that FFmpeg reads, or a folder of images.
+        path: a file of any type that FFmpeg reads, a TIFF file with one page per frame, or a folder of images.
         start: number of the first frame to read.
         stop: number of the frame before which reading stops. None reads to the end.
         step: distance between the numbers of the frames to read.
@@ -127,20 +130,35 @@ class FrameReader:
             warn_of_damage(self.path, self.damaged, self._numbers.step)
 
     def _read(self, stopped: Callable[[], bool]) -> Generator[Frame | int, None, None]:
-        if not self.path.is_dir():
+        if not _holds_pictures(self.path):
             yield from decode(self.path, self._numbers, self.info.size_px, stopped)
             return
-        files, fps = image_files(self.path), self.info.fps
-        for i in range(len(files))[self._numbers.start : self._numbers.stop : self._numbers.step]:
-            picture = read_picture(files[i])
+        numbers, fps = range(self.info.frames or 0), self.info.fps
+        numbers = numbers[self._numbers.start : self._numbers.stop : self._numbers.step]
+        for number, file, picture in _pictures(self.path, numbers):
             if picture is None:
-                yield i
+                yield number
                 continue
-            size = picture.shape[1], picture.shape[0]
-            if size != self.info.size_px:
-                problem = f"is {size[0]}×{size[1]}, but the images before are {'×'.join(map(str, self.info.size_px))}"
-                raise InputError(files[i], problem, "all images of a folder must have one size")
-            yield Frame(i, picture, i / fps if fps else None)
+            height, width, _ = picture.shape
+            if (width, height) != self.info.size_px:
+                problem = f"is {width}×{height}, but the images before are {'×'.join(map(str, self.info.size_px))}"
+                raise InputError(file, problem, "all images of a folder must have one size")
+            yield Frame(number, picture, number / fps if fps else None)
+
+
+def _holds_pictures(path: Path) -> bool:
+    """Return whether a path is a folder of images or a TIFF file, whose pages are the frames."""
+    return path.is_dir() or path.suffix.lower() in (".tif", ".tiff")
+
+
+def _pictures(path: Path, numbers: range) -> Iterator[tuple[int, Path, UInt8[np.ndarray, "H W 3"] | None]]:
+    """Yield number, file and pixels (None if damaged) of the images of a folder, or of the pages of a TIFF file."""
+    if not path.is_dir():
+        yield from ((page, path, picture) for page, picture in read_pages(path, numbers))
+        return
+    files = image_files(path)
+    for i in numbers:
+        yield i, files[i], read_picture(files[i])
 
 
 T = TypeVar("T")

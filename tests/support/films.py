@@ -121,4 +121,4 @@ def overwrite(path, at, length):
 
 def reader_threads():
     """The threads that decode frames ahead."""
-    return [thread for thread in threading.enumerate() if thread.name == "frames"]
+    return [thread for thread in threading.enumerate() if thread.name == "ahead"]

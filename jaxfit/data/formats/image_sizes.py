@@ -14,7 +14,7 @@ from jaxfit.data.footage import read_footage
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import IMAGE_SIDE_PX
-from jaxfit.video.packets import frame_times
+from jaxfit.video.decoding import frame_times
 from jaxfit.video.pictures import read_picture
 from jaxfit.video.reader import probe_video
 
