@@ -12,16 +12,18 @@ Source: PyTorch, `torch/serialization.py`.
 
 from __future__ import annotations
 
+import io
 import pickle
+import pickletools
 import struct
 import zipfile
 from collections import OrderedDict
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxfit.foundation.reading import reading
+from jaxfit.foundation.reading import read_file, reading
 
 STORAGE_DTYPES = {
     "DoubleStorage": "<f8",
@@ -34,6 +36,7 @@ STORAGE_DTYPES = {
     "ByteStorage": "|u1",
 }
 LEGACY_MAGIC, LEGACY_PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
+_MAX_MEMO = 1_000_000
 
 
 class _StorageType(NamedTuple):
@@ -60,9 +63,16 @@ class _Tensor(NamedTuple):
 class _Unpickler(pickle.Unpickler):
     """Builds dicts, lists, numbers, text and `_Tensor`; notes the storages by key."""
 
-    def __init__(self, file: BinaryIO | Any):
+    def __init__(self, file: io.BytesIO):
         super().__init__(file)
         self.storages: dict[str, _Storage] = {}
+        start = file.tell()
+        for opcode, argument, _ in pickletools.genops(file):  # also checks the lengths of texts
+            if (
+                opcode.name in ("PUT", "LONG_BINPUT") and int(argument or 0) > _MAX_MEMO
+            ):  # memory for all smaller numbers
+                raise pickle.UnpicklingError("it numbers its parts beyond any checkpoint")
+        file.seek(start)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
@@ -94,8 +104,8 @@ def read_tensors(path: Path | str) -> dict[str, np.ndarray]:
             need; or a tensor reaches outside its storage.
     """
     with reading(path, "a PyTorch checkpoint of tensors", "use the file as its authors published it") as path:
-        read = _read_zip if zipfile.is_zipfile(path) else _read_legacy
-        root, numbers = read(path)
+        file = io.BytesIO(read_file(path))
+        root, numbers = _read_zip(file) if zipfile.is_zipfile(file) else _read_legacy(file)
         if not isinstance(root, dict):
             raise ValueError("it does not contain a dictionary of tensors")
         return {
@@ -111,35 +121,34 @@ def _array(tensor: _Tensor, numbers: np.ndarray) -> np.ndarray:
     return np.ndarray(tensor.shape, numbers.dtype, numbers.data, tensor.offset * numbers.itemsize, strides)
 
 
-def _read_legacy(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+def _read_legacy(file: io.BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
     """Return the object of a legacy file and the numbers of its storages."""
-    with path.open("rb") as file:
-        if _Unpickler(file).load() != LEGACY_MAGIC or _Unpickler(file).load() != LEGACY_PROTOCOL:
-            raise ValueError("it does not begin as a file of torch.save")
-        if _Unpickler(file).load()["little_endian"] is not True:
-            raise ValueError("it was not written on a little-endian machine")
-        unpickler = _Unpickler(file)
-        root = unpickler.load()
-        numbers = {}
-        for key in _Unpickler(file).load():
-            storage = unpickler.storages[key]
-            (numel,) = struct.unpack("<q", file.read(8))
-            if numel != storage.numel:
-                raise ValueError(f"storage {key} has {numel} numbers, its tensors expect {storage.numel}")
-            numbers[key] = np.frombuffer(file.read(numel * np.dtype(storage.dtype).itemsize), storage.dtype, numel)
-        return root, numbers
+    file.seek(0)
+    if _Unpickler(file).load() != LEGACY_MAGIC or _Unpickler(file).load() != LEGACY_PROTOCOL:
+        raise ValueError("it does not begin as a file of torch.save")
+    if _Unpickler(file).load()["little_endian"] is not True:
+        raise ValueError("it was not written on a little-endian machine")
+    unpickler = _Unpickler(file)
+    root = unpickler.load()
+    numbers = {}
+    for key in _Unpickler(file).load():
+        storage = unpickler.storages[key]
+        (numel,) = struct.unpack("<q", file.read(8))
+        if numel != storage.numel:
+            raise ValueError(f"storage {key} has {numel} numbers, its tensors expect {storage.numel}")
+        numbers[key] = np.frombuffer(file.read(numel * np.dtype(storage.dtype).itemsize), storage.dtype, numel)
+    return root, numbers
 
 
-def _read_zip(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+def _read_zip(file: io.BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
     """Return the object of a zip file and the numbers of its storages."""
-    with zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(file) as archive:
         (name,) = [name for name in archive.namelist() if name.endswith("data.pkl")]
         folder = name.removesuffix("data.pkl")
         if f"{folder}byteorder" in archive.namelist() and archive.read(f"{folder}byteorder") != b"little":
             raise ValueError("it was not written on a little-endian machine")
-        with archive.open(name) as file:
-            unpickler = _Unpickler(file)
-            root = unpickler.load()
+        unpickler = _Unpickler(io.BytesIO(archive.read(name)))
+        root = unpickler.load()
         numbers = {
             key: np.frombuffer(archive.read(f"{folder}data/{key}"), storage.dtype, storage.numel)
             for key, storage in unpickler.storages.items()

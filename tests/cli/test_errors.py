@@ -9,8 +9,9 @@ import pytest
 from support.cli_files import arguments, rejected
 
 from jaxfit.cli.main import main
-from jaxfit.config.fit import shipped_fit_configs
+from jaxfit.config.fit import load_config, shipped_fit_configs
 from jaxfit.config.reconstruct import load_reconstruct_config
+from jaxfit.config.yaml_file import config_to_yaml
 
 
 def first_annotation(**changes):
@@ -133,3 +134,32 @@ def test_config_show(tmp_path, capsys):
         assert main(["config", "show", name]) == 0
         assert "# " in capsys.readouterr().out
     rejected(capsys, ["config", "show", "papr"], "papr", "paper")
+
+
+@pytest.mark.parametrize("option", ["observations", "--model", "--init", "--config", "--truth", "--segmenter", "video"])
+def test_paths_that_are_no_files(inputs, tmp_path, capsys, option):
+    os.mkfifo(tmp_path / "pipe")  # a reader that opens the pipe never returns
+    (tmp_path / "loop").symlink_to("loop")
+    for path in (tmp_path / "pipe", tmp_path / "loop", tmp_path / ("n" * 300), "/dev/zero"):
+        command = {
+            "observations": ["fit", str(path), "--out", "out"],
+            "--truth": ["evaluate", str(inputs / "birds.json"), "--truth", str(path)],
+            "--segmenter": ["track", str(tmp_path), "--segmenter", str(path), "--out", "o.json"],
+            "video": ["track", str(path), "--out", "o.json"],
+        }.get(option, [*arguments(inputs, tmp_path / "out"), option, str(path)])
+        rejected(capsys, command)
+
+
+def test_a_stored_ablation_runs_no_code(inputs, tmp_path, capsys, monkeypatch):
+    """A term `module:function` that only a stored ablation.json names is not imported."""
+    (tmp_path / "spy.py").write_text(f"open({str(tmp_path / 'it ran')!r}, 'w')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "grid.yaml").write_text("config: paper\ncrosses: [{cross: {terms.keypoints: [1, 2]}}]\n")
+    config = config_to_yaml(load_config("paper")).replace("acceleration", "spy:term")
+    stored = {"format_version": 1, "runs": {"keypoints=1": config}, "model": "", "observations": "", "truth": ""}
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "ablation.json").write_text(json.dumps(stored))
+    known = ["--truth", str(inputs / "birds.json"), "--model", str(inputs / "toy.npz")]
+    grid = ["--grid", str(tmp_path / "grid.yaml"), "--out", str(tmp_path / "out")]
+    rejected(capsys, ["ablate", str(inputs / "birds.json"), *known, *grid], "another")
+    assert not (tmp_path / "it ran").exists()

@@ -1,14 +1,7 @@
 """COCO json: files that would take much time or memory are rejected at once, with the figure and a remedy."""
 
-import json
-import os
-
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.coco_files import annotation, content, saved
-from support.hostile import Isolated, many_examples
-from support.mutations import damaged_bytes, damaged_tree
 
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.foundation.errors import InputError
@@ -89,43 +82,3 @@ def test_names_are_bounded(tmp_path):
     data = content()
     data["categories"][0]["keypoints"] = names
     rejected(tmp_path, data, "keypoints holds 1001 names, more than 1000")
-
-
-def test_a_key_that_occurs_twice(tmp_path):
-    text = json.dumps(content())
-    rejected(tmp_path, text[:-1] + ', "images": []}', 'holds the key "images" twice')
-
-
-def test_what_is_no_regular_file(tmp_path):
-    os.mkfifo(tmp_path / "pipe.json")
-    (tmp_path / "loop.json").symlink_to(tmp_path / "loop.json")
-    for path in (
-        tmp_path / "pipe.json",
-        tmp_path / "loop.json",
-        "/dev/zero",
-        tmp_path / ("a" * 300),
-        tmp_path / "a\0b",
-    ):
-        with pytest.raises(InputError) as caught:
-            read_coco(path)
-        assert str(caught.value).isprintable()
-
-
-VALID = content()
-BYTES = json.dumps(VALID).encode()
-
-
-def test_damaged_files(tmp_path):
-    """Any damage of a valid file ends in observations or in InputError, within a bound on memory and time."""
-    path = tmp_path / "birds.json"
-    trees = damaged_tree(VALID).map(lambda tree: json.dumps(tree).encode())
-    with Isolated("support.hostile_data:read_and_write_coco") as reader:
-
-        @many_examples
-        @given(st.one_of(damaged_bytes(BYTES), trees))
-        def check(damaged):
-            path.write_bytes(damaged)
-            outcome = reader(path)
-            assert outcome.acceptable, outcome
-
-        check()

@@ -7,10 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
 from support.birds import toy_bird
-from support.hostile import Isolated, fewer_examples
-from support.mutations import damaged_npz
 
 from jaxfit.data.solution import FORMAT_VERSION, Solution, load_solution, save_solution
 from jaxfit.foundation.errors import InputError
@@ -283,18 +280,3 @@ def test_unasked_arrays_are_not_read(tmp_path):
     save_solution(make(), BIRD, "", {}, tmp_path / "out")
     rewrite(tmp_path / "out", extra=np.array([{}], dtype=object))
     load_solution(tmp_path / "out")
-
-
-def test_any_damage_is_one_error(tmp_path):
-    save_solution(make(valid=np.ones((N, T), bool)), BIRD, "", {}, tmp_path / "out")
-    path = tmp_path / "out" / "poses.npz"
-    with Isolated("jaxfit.data.solution:load_solution", memory_mb=150) as reader:
-
-        @fewer_examples
-        @given(damaged_npz(path.read_bytes()))
-        def check(damaged):
-            path.write_bytes(damaged)
-            outcome = reader(tmp_path / "out")
-            assert outcome.acceptable, outcome
-
-        check()

@@ -5,10 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from hypothesis import given
 from support.birds import tiny_bird
-from support.hostile import Isolated, fewer_examples
-from support.mutations import damaged_npz
 
 from jaxfit.config.fit import load_config
 from jaxfit.data.observations import Observations
@@ -190,19 +187,3 @@ def test_a_bird_without_initial_poses_is_rejected(tmp_path):
     initial = load_initial_poses(saved(tmp_path, result(tracks=(4,))), observed(), BIRD)
     with pytest.raises(InputError, match="has no pose for track 9"):
         poses(initial)
-
-
-@pytest.mark.parametrize("arrays", [result(), rows(9)], ids=["result", "regressor"])
-def test_any_damage_is_one_error(tmp_path, arrays):
-    whole = saved(tmp_path, arrays).read_bytes()
-    with Isolated("support.hostile_calls:read_initial_poses", memory_mb=60) as reader:
-
-        @fewer_examples
-        @given(damaged_npz(whole))
-        def check(damaged):
-            path = tmp_path / "damaged.npz"
-            path.write_bytes(damaged)
-            outcome = reader(path)
-            assert outcome.acceptable, outcome
-
-        check()

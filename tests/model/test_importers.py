@@ -4,10 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given
 from support.checkpoints import write_legacy, write_zip
-from support.hostile import Isolated, fewer_examples
-from support.mutations import damaged_arrays, damaged_bytes, damaged_tree
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, mirror_pairs
@@ -199,36 +196,3 @@ def test_files_that_do_not_belong_to_the_model(tmp_path, avian_mesh_files):
 
 def test_mirror_pairs():
     assert mirror_pairs(["right_eye", "tail", "left_eye", "left_foot"]) == ((2, 0),)
-
-
-def test_any_damage_of_the_json_is_one_error(tmp_path, avian_mesh_files):
-    path, prior_path = avian_mesh_files
-    whole, tree = path.read_bytes(), json.loads(path.read_text())
-    with Isolated("jaxfit.model.published:import_avian_mesh", memory_mb=150) as reader:
-
-        @fewer_examples
-        @given(damaged_bytes(whole) | damaged_tree(tree).map(lambda value: json.dumps(value).encode()))
-        def check(content):
-            path.write_bytes(content)
-            outcome = reader(path, prior_path)
-            assert outcome.acceptable, outcome
-
-        check()
-
-
-def test_any_damage_of_the_tensors_is_one_error(tmp_path):
-    path, arrays = tmp_path / "aves.pt", {}
-    write_aves(path, lambda _, content: arrays.update(content))
-    with Isolated("jaxfit.model.published:import_aves", memory_mb=150) as reader:
-
-        @fewer_examples
-        @given(damaged_arrays(arrays))
-        def check(changed):
-            try:
-                write_zip(path, changed)
-            except KeyError:  # a type that PyTorch lacks
-                return
-            outcome = reader(path)
-            assert outcome.acceptable, outcome
-
-        check()

@@ -8,9 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from support.hostile import Isolated, fewer_examples
-from support.mutations import damaged_npz
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import ARRAY_FIELDS, Bird, check_bird, describe_bird, model_hash
@@ -283,17 +280,3 @@ def test_description_of_an_open_mesh():
     assert facts["boundary_edges"] == 3
     assert facts["volume"] is None
     assert facts["shape_variance"] is None
-
-
-def test_any_damage_is_one_error(tmp_path):
-    path = saved(tmp_path)
-    with Isolated("jaxfit.model.files:load_bird", memory_mb=150) as reader:
-
-        @fewer_examples
-        @given(damaged_npz(path.read_bytes()))
-        def check(damaged):
-            path.write_bytes(damaged)
-            outcome = reader(path)
-            assert outcome.acceptable, outcome
-
-        check()

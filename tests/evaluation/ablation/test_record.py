@@ -6,11 +6,7 @@ import os
 import sys
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.birds import toy_bird
-from support.hostile import Isolated, many_examples
-from support.mutations import damaged_bytes, damaged_tree
 
 from jaxfit.cli.parser import build_parser
 from jaxfit.config.build import describes, plain_config
@@ -186,30 +182,3 @@ def test_damaged_metrics(folder, name, content):
     (folder / name).write_text(content)
     with pytest.raises(InputError):
         read_metrics(folder)
-
-
-@pytest.fixture(scope="module")
-def readers():
-    with Isolated("support.hostile_configs:call") as call:
-        yield call
-
-
-@pytest.mark.extended
-@pytest.mark.parametrize("reader", ["record", "metrics"])
-def test_any_damage_is_one_error(folder, readers, reader):
-    store_metrics(folder)
-    path = folder / "out" / "ablation.json" if reader == "record" else folder / "evaluation.json"
-    if reader == "record":
-        claim(folder, folder / "out")
-        (folder / "grid.yaml").rename(folder / "out" / "grid.yaml")
-    valid = path.read_bytes()
-    trees = damaged_tree(json.loads(valid)).map(lambda changed: json.dumps(changed).encode())
-
-    @many_examples
-    @given(st.one_of(damaged_bytes(valid), trees))
-    def check(content):
-        path.write_bytes(content)
-        outcome = readers(reader, path)
-        assert outcome.acceptable, outcome
-
-    check()
