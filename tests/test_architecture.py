@@ -1,4 +1,4 @@
-"""The layout of the code: the rules of docs/developers/architecture.md and modules.md hold."""
+"""The layout of the code: the rules of docs/developers/architecture.md hold."""
 
 import ast
 import re
@@ -6,8 +6,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-TEXT = ROOT / "docs" / "developers" / "architecture.md"
-DOCUMENT = TEXT.with_name("modules.md")
+DOCUMENT = ROOT / "docs" / "developers" / "architecture.md"
 PACKAGE = ROOT / "jaxfit"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
@@ -38,7 +37,7 @@ def imports(path):
 
 
 def test_paths_in_the_text_of_the_documents_exist():
-    text = TEXT.read_text(encoding="utf-8") + DOCUMENT.read_text(encoding="utf-8")
+    text = DOCUMENT.read_text(encoding="utf-8")
     named = re.findall(r"`([\w*./]+(?:/|\.py|\.cc|\.yaml))`", text)
     assert not [path for path in named if not any(list(folder.glob(path)) for folder in (PACKAGE, ROOT))]
 
@@ -46,7 +45,7 @@ def test_paths_in_the_text_of_the_documents_exist():
 def test_the_document_names_the_floor_of_every_package():
     present = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in MODULES} - {"__init__"}
     lacking, removed = present - floors().keys(), floors().keys() - present
-    assert not lacking | removed, f'modules.md, "Floors": add {lacking or "none"}, remove {removed or "none"}'
+    assert not lacking | removed, f'architecture.md, "Floors": add {lacking or "none"}, remove {removed or "none"}'
 
 
 def test_modules_import_from_lower_floors_only():
