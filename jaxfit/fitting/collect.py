@@ -24,48 +24,17 @@ from jaxtyping import Array, Float, Int
 from jaxfit.data.flags import flag_counts, flagged_ranges
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
-from jaxfit.fitting.batch import Fitted
+from jaxfit.fitting.batch import FittedWindow
 from jaxfit.fitting.error_bars import ErrorBars, blend_error_bars, error_bar_shapes
 from jaxfit.fitting.solve import FitModel
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.extras import LIBRARIES, library_versions
 from jaxfit.model.bird import Bird, model_hash
 from jaxfit.model.camera import CropCamera, crop_to_image, image_to_crop, project
-from jaxfit.model.kinematics import Pose, window_keypoints, window_transforms
+from jaxfit.model.kinematics import Pose, Rig, window_keypoints, window_transforms
 from jaxfit.model.rotation import axis_angle_to_matrix, matrix_to_axis_angle, unwrap_axis_angle
 
 _logger = logging.getLogger(__name__)
-
-
-class FittedWindow(NamedTuple):
-    """The result of one window of T frames, as NumPy arrays."""
-
-    pose: Pose
-    loss: dict[str, float]
-    """Weighted value of each term in the objective."""
-    keypoints_cam: np.ndarray
-    """(T, K, 3) camera frame of the crop, model units."""
-    keypoints_px: np.ndarray
-    """(T, K, 2) crop pixels."""
-    failure: str
-    """Reason why the fit diverged; empty if the fit did not diverge."""
-    ambiguity_deg: np.ndarray
-    """(T,) as `Solution.ambiguity_deg`."""
-    error_bars: ErrorBars | None = None
-    """None if the config has none."""
-
-
-def window_of_batch(fitted: Fitted, i: int) -> FittedWindow:
-    """Return the result of problem `i` of a batch."""
-    # copies, so that a window does not keep the arrays of its batch
-    pose, report = jax.tree.map(lambda x: x[i].copy(), (fitted.pose, fitted.report))
-    loss = {name: float(value) for name, value in report.loss.items()}
-    failure = str(fitted.failure[i])
-    if not failure and not (pose.scale > 0).all():  # a solver may step across 0
-        failure = "the size of the bird is not above 0"
-    ambiguity_deg = fitted.ambiguity_deg[i].copy()
-    bars = None if fitted.error_bars is None else jax.tree.map(lambda x: x[i].copy(), fitted.error_bars)
-    return FittedWindow(pose, loss, report.keypoints_cam, report.keypoints_px, failure, ambiguity_deg, bars)
 
 
 def collect_windows(
@@ -360,7 +329,7 @@ def _with_poses(
         transl=changed(old.transl, root_cam - scale[:, None] * np.asarray(model.rig.joints)[0]),
         scale=changed(np.broadcast_to(old.scale, len(old.transl)), scale),
     )
-    keypoints_cam, keypoints_px = (np.asarray(each) for each in _keypoints(model, pose))
+    keypoints_cam, keypoints_px = (np.asarray(each) for each in _keypoints(model.rig, model.camera, pose))
     return result._replace(
         pose=pose,
         keypoints_cam=changed(result.keypoints_cam, keypoints_cam[at]),
@@ -377,9 +346,9 @@ def _nearest_axis_angle(old: Float[Array, "m J 3"], new: Float[Array, "m J 3"]) 
 
 
 @eqx.filter_jit
-def _keypoints(model: FitModel, pose: Pose) -> tuple[Float[Array, "T K 3"], Float[Array, "T K 2"]]:
-    points_cam = window_keypoints(model.rig, window_transforms(model.rig, pose), pose)
-    return points_cam, project(points_cam, model.camera)
+def _keypoints(rig: Rig, camera: CropCamera, pose: Pose) -> tuple[Float[Array, "T K 3"], Float[Array, "T K 2"]]:
+    points_cam = window_keypoints(rig, window_transforms(rig, pose), pose)
+    return points_cam, project(points_cam, camera)
 
 
 def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict[str, Any]:

@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit.config.fit import FitConfig, StageConfig
-from jaxfit.fitting.batch import take_tile, tile_rows, tile_size
 from jaxfit.fitting.outline_noise import independent_errors, outline_errors, shown_frames
 from jaxfit.fitting.posterior import Blocks, Columns, broad_precision, posterior_of, window_blocks, with_shared
 from jaxfit.fitting.problem import Problem, Program, problem_window
 from jaxfit.fitting.solve import FitModel, stage_hyperparameters, stage_program
+from jaxfit.fitting.tiles import take_tile, tile_rows, tile_size
 from jaxfit.model.kinematics import Pose
 from jaxfit.objective.curvature import frame_rows
 from jaxfit.objective.objective import evaluate_curvature

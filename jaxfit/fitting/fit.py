@@ -19,13 +19,13 @@ from jaxfit.data.flags import with_doubts
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import bytes_per_frame
-from jaxfit.fitting.collect import FittedWindow, blend_seams, collect_windows
+from jaxfit.fitting.collect import blend_seams, collect_windows
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.learn import Learnt, learn
 from jaxfit.fitting.solve import FitModel, compiled_part, fit_model, needs_mask, without_mask_stages
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
+from jaxfit.fitting.tasks import FitTask, fit_windows
 from jaxfit.fitting.windows import Windows, cut_windows, distant_birds, report_distant_birds, windows_key
 from jaxfit.foundation.array_files import MAX_TABLE_GB, check_memory, observations_bytes
 from jaxfit.foundation.errors import InputError
@@ -139,8 +139,8 @@ def learn_weights(
     observations = check_observations(observations, bird, source)
     used = config if observations.masks else without_mask_stages(config)
     model = checked_model(observations, bird, [used], initial_poses, source)
-    windows = _cut_runs(observations, [used], initial_poses, source)[0].windows
-    values, remarks = learn(model, used, windows, initial_poses, progress, source)
+    (windows,) = _windows_of_runs(observations, [used], initial_poses, source)
+    values, remarks = learn(model, used, windows, progress, source)
     config = replace(config, learn_weights=())
     return Learnt(with_values(config, values) if values else config, values, remarks)
 
@@ -182,33 +182,24 @@ def fit_runs(
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")
     model = checked_model(observations, bird, configs, initial_poses, source)
-    runs = _cut_runs(observations, configs, initial_poses, source)
+    windows = _windows_of_runs(observations, configs, initial_poses, source)
     if select is not None:
-        runs = [run._replace(windows=run.windows[select]) for run in runs]
+        windows = [each[select] for each in windows]
     # each problem is one window of one run
-    problems = [(r, w) for r, run in enumerate(runs) for w in range(len(run.windows))]
-    results = {} if stored is None else {(0, w): result for w, result in stored.find(runs[0].windows).items()}
-    missing = [problem for problem in problems if problem not in results]
-    shared = FitShared(model, initial_poses)
-    batches = in_batches(missing, runs, shared, observations.num_tracks, stored, cluster)
-    birds = len(np.unique(runs[0].windows.track))
+    problems = [(r, w) for r, some in enumerate(windows) for w in range(len(some))]
+    results = {} if stored is None else {(0, w): result for w, result in stored.find(windows[0]).items()}
+    task = FitTask(list(configs), windows, [problem for problem in problems if problem not in results])
+    birds = len(np.unique(windows[0].track))
     subject = f"{birds} {'bird' if birds == 1 else 'birds'}" + (f" × {len(configs)} runs" if len(configs) > 1 else "")
-    _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), configs[0].window, len(batches))
-    with progress(f"Fitting {subject}", steps_per_batch(configs[0]) * len(batches)) as report_progress:
-        results |= fit_batches(batches, runs, shared, stored, cluster, report_progress)
-    solutions = (
-        collect_windows(
-            observations,
-            run.windows,
-            final_results(r, run, results, model),
-            bird,
-            model.camera,
-            run.config.common_size,
-            skipped,
-        )
-        for r, run in enumerate(runs)
-    )
-    return [with_doubts(solution, observations, bird, progress) for solution in solutions]
+    results |= fit_windows(task, model, observations.num_tracks, subject, progress, stored, cluster)
+    solutions = []
+    for r, (config, some) in enumerate(zip(configs, windows, strict=True)):
+        fitted = [results.pop((r, w)) for w in range(len(some))]
+        if config.overlap_frames:
+            fitted = blend_seams(some, fitted, model)
+        solution = collect_windows(observations, some, fitted, bird, model.camera, config.common_size, skipped)
+        solutions.append(with_doubts(solution, observations, bird, progress))
+    return solutions
 
 
 def checked_model(
@@ -231,17 +222,9 @@ def checked_model(
     if unknown:
         problem = f"`keypoint_offsets` names keypoints that the model lacks: {', '.join(sorted(unknown))}"
         raise InputError("config", problem, f"the model has {', '.join(bird.keypoint_names)}")
-    model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0])
+    model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0], initial_poses)
     check_terms(configs[0], model)
     return model
-
-
-def final_results(
-    r: int, run: Run, results: dict[tuple[int, int], FittedWindow], model: FitModel
-) -> list[FittedWindow]:
-    """Take the result of every window of run `r` out of `results`, blended where windows share frames."""
-    own = [results.pop((r, w)) for w in range(len(run.windows))]
-    return blend_seams(run.windows, own, model) if run.config.overlap_frames else own
 
 
 def _without_mask_stages(configs: Sequence[FitConfig], source: object) -> list[FitConfig]:
@@ -286,10 +269,10 @@ def windows_of(observations: Observations, config: FitConfig, source: object) ->
     return windows
 
 
-def _cut_runs(
+def _windows_of_runs(
     observations: Observations, configs: Sequence[FitConfig], initial_poses: InitialPoses | None, source: object
-) -> list[Run]:
-    """Return the run of each config. Runs with an equal `windows_key` share their windows."""
+) -> list[Windows]:
+    """Return the windows of each config. Configs with an equal `windows_key` share their windows."""
     windows: dict[Hashable, Windows] = {}
     for config in configs:
         key = windows_key(config)
@@ -298,11 +281,10 @@ def _cut_runs(
             if initial_poses is not None:
                 if config.overlap_frames and initial_poses.crop is not None:
                     problem = "holds one crop for every frame, but windows that share a frame have two"
-                    raise InputError(
-                        initial_poses.source, problem, "set `overlap: 0` in the config, or leave out --init"
-                    )
+                    remedy = "set `overlap: 0` in the config, or leave out --init"
+                    raise InputError(initial_poses.source, problem, remedy)
                 initial_poses.check_crops(windows[key])
-    return [Run(config, windows[windows_key(config)]) for config in configs]
+    return [windows[windows_key(config)] for config in configs]
 
 
 def _fitted_bird(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None) -> Bird:

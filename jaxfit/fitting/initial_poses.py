@@ -24,7 +24,7 @@ from jaxfit.config.fit import InitialiseConfig
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import LAYOUT, check_poses
 from jaxfit.data.tracks import positions_in
-from jaxfit.fitting.batch import join_tiles, take_tile, tile_rows, tile_size
+from jaxfit.fitting.tiles import join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.array_files import load_npz, npz_names, validate_arrays
 from jaxfit.foundation.errors import InputError

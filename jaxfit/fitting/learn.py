@@ -45,10 +45,9 @@ from jaxfit.config.fit import FitConfig, term_settings
 from jaxfit.config.yaml_file import config_to_yaml, rounded
 from jaxfit.fitting.batch import Batch, fit_batch, frames_per_batch
 from jaxfit.fitting.evidence import KEYPOINTS, MASK, Evidence, measure
-from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.keypoint_offsets import first_offsets, learn_offsets
 from jaxfit.fitting.solve import FitModel, fit_model
-from jaxfit.fitting.tasks import FitShared, FitTask, Run, gather_batch
+from jaxfit.fitting.tasks import FitTask, gather_batch
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.progress import ProgressTask, silent
 
@@ -110,7 +109,6 @@ def learn(
     model: FitModel,
     config: FitConfig,
     windows: Windows,
-    initial_poses: InitialPoses | None = None,
     progress: ProgressTask = silent,
     source: object = "observations",
 ) -> tuple[dict[str, Value], tuple[str, ...]]:
@@ -121,10 +119,9 @@ def learn(
     no likelihoods, so that no scale has a unit.
 
     Args:
-        model: the bird and the camera.
+        model: the bird, the camera, and initial poses.
         config: the config of the fit, with stages that the observations allow.
         windows: all windows.
-        initial_poses: as for the fit.
         progress: shows progress.
         source: name of the observations in messages.
     """
@@ -136,7 +133,7 @@ def learn(
         steps = config.stages[-1].steps
         total = sum(stage.steps for stage in config.stages[:-1]) + steps // 2 + (ROUNDS - 1) * (steps // 4)
         with progress(f"Learning weights from {len(some)} windows", total) as report_progress:
-            values = _learn_values(model, first, FitShared(model, initial_poses), some, names, report_progress, remarks)
+            values = _learn_values(model, first, some, names, report_progress, remarks)
     for remark in remarks:
         _logger.warning("%s: %s", source, remark)
     shown = ", ".join(f"{path} = {shown_value(value)}" for path, value in values.items())
@@ -193,7 +190,6 @@ def _learnable(config: FitConfig, windows: Windows, remarks: list[str]) -> list[
 def _learn_values(
     model: FitModel,
     config: FitConfig,
-    shared: FitShared,
     windows: Windows,
     names: Sequence[str],
     report_progress: Any,
@@ -201,8 +197,8 @@ def _learn_values(
 ) -> dict[str, Value]:
     """Return the learnt values, by the paths of their keys."""
     stage, first = config.stages[-1], config
-    task = FitTask([Run(config, windows)], [(0, w) for w in range(len(windows))])
-    batch = gather_batch(shared, task)
+    task = FitTask([config], [windows], [(0, w) for w in range(len(windows))])
+    batch = gather_batch(model, task)
     stages = (*config.stages[:-1], replace(stage, steps=max(stage.steps // 2, 1)))
     fitted = fit_batch(model, [replace(config, stages=stages, error_bars=False)], batch, report_progress)
     more = replace(stage, steps=max(stage.steps // 4, 1), carry_moments=False, keep_best=False)

@@ -12,11 +12,11 @@ import numpy as np
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.tracks import frame_step
-from jaxfit.fitting.batch import tile_size
 from jaxfit.fitting.fit import checked_model
 from jaxfit.fitting.solve import FitModel
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches
+from jaxfit.fitting.tasks import FitTask, fit_batches, in_batches
+from jaxfit.fitting.tiles import tile_size
 from jaxfit.fitting.windows import Windows, first_frames, prepare_observations, window_starts, windows_at
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.workers import Cluster
@@ -131,9 +131,9 @@ class ProvisionalFit:
             return
         if self._report is None:
             self._report = self._exit.enter_context(self._progress("Fitting", None))
-        runs, shared = [Run(self._config, waiting[:count])], FitShared(model, None)
-        batches = in_batches([(0, w) for w in range(count)], runs, shared, birds, self._stored, self._cluster)
-        fit_batches(batches, runs, shared, self._stored, self._cluster, self._report)
+        task = FitTask([self._config], [waiting[:count]], [(0, w) for w in range(count)])
+        batches = in_batches(task, model, birds, self._stored, self._cluster)
+        fit_batches(batches, task, model, self._stored, self._cluster, self._report)
 
 
 def _joined(parts: Sequence[Windows]) -> Windows:

@@ -16,6 +16,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxfit.config.fit import FitConfig, InitialiseConfig, StageConfig
+from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program, Solver, problem_loss, problem_window
 from jaxfit.fitting.stored_programs import StoredProgram
@@ -177,22 +178,24 @@ STEP_SHAPES = {
 
 
 class FitModel(NamedTuple):
-    """The bird, its folded arrays, its priors and the crop camera, for all stages of a fit."""
+    """What all tasks of a fit share: the bird, its folded arrays, its priors, the crop camera, and initial poses."""
 
     bird: Bird
     rig: Rig
     """With the keypoints of the config (`keypoint_offsets`)."""
     priors: Priors
     camera: CropCamera
+    initial_poses: InitialPoses | None = None
+    """Initial poses of all tracks and frames, from a file. None: a search."""
 
 
-def fit_model(bird: Bird, config: FitConfig) -> FitModel:
+def fit_model(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None = None) -> FitModel:
     """Return the model of a fit: the bird, folded, with the keypoints of the config, and its crop camera."""
     rig = fold_bird(bird)
     if config.keypoint_offsets:
         offsets = [config.keypoint_offsets.get(name, (0.0, 0.0, 0.0)) for name in bird.keypoint_names]
         rig = move_keypoints(rig, np.array(offsets, np.float32))
-    return FitModel(bird, rig, priors_of(bird), crop_camera(config))
+    return FitModel(bird, rig, priors_of(bird), crop_camera(config), initial_poses)
 
 
 def crop_camera(config: FitConfig) -> CropCamera:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxfit.fitting.batch import tile_size
-from jaxfit.fitting.collect import FittedWindow
+from jaxfit.fitting.batch import FittedWindow
 from jaxfit.fitting.error_bars import ErrorBars, pack, unpack
+from jaxfit.fitting.tiles import tile_size
 from jaxfit.fitting.windows import Windows, window_hash
 from jaxfit.foundation.unfinished import Parts
 from jaxfit.model.kinematics import Pose

@@ -27,13 +27,14 @@ from jaxfit.data.projection import in_image
 from jaxfit.data.solution import WORLD, Solution
 from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
 from jaxfit.data.world import in_camera, whole_picture, world_arrays
-from jaxfit.fitting.collect import FittedWindow, frame_error_bars, gather_windows, pose_shapes
+from jaxfit.fitting.batch import FittedWindow
+from jaxfit.fitting.collect import blend_seams, frame_error_bars, gather_windows, pose_shapes
 from jaxfit.fitting.error_bars import error_bar_shapes
-from jaxfit.fitting.fit import check_observations, checked_model, final_results, fit
+from jaxfit.fitting.fit import check_observations, checked_model, fit
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.ledge import metres
 from jaxfit.fitting.solve import crop_camera, without_mask_stages
-from jaxfit.fitting.tasks import FitShared, Run, fit_batches, in_batches, steps_per_batch
+from jaxfit.fitting.tasks import FitTask, fit_windows
 from jaxfit.fitting.windows import (
     Windows,
     first_frames,
@@ -133,16 +134,13 @@ def fit_views(
     has_pose = np.asarray(np.isfinite(initial.global_orient).all(-1))
     windows = view_windows(views.cameras, prepared, config, origin_m, unit_m, points, has_pose, source)
     model = checked_model(prepared[0], bird, [config], initial, source)
-    run, shared = Run(config, windows), FitShared(model, initial)
-    problems = [(0, w) for w in range(len(windows))]
-    small = replace(config, memory_gb=config.memory_gb / len(views.cameras))
-    batches = in_batches(problems, [Run(small, windows)], shared, prepared[0].num_tracks, None, cluster)
+    task = FitTask([config], [windows], [(0, w) for w in range(len(windows))])
     subject = f"{prepared[0].num_tracks} birds × {len(views.cameras)} views"
-    _logger.info("%s, %d windows of %d frames, %d batches", subject, len(problems), config.window, len(batches))
-    with progress(f"Fitting {subject}", steps_per_batch(config) * len(batches)) as report_progress:
-        results = fit_batches(batches, [run], shared, None, cluster, report_progress)
-    ordered = final_results(0, run, results, model)
-    solution = _solution(views, prepared[0], windows, ordered, bird, origin_m, unit_m)
+    results = fit_windows(task, model, prepared[0].num_tracks, subject, progress, cluster=cluster)
+    fitted = [results[problem] for problem in task.problems]
+    if config.overlap_frames:
+        fitted = blend_seams(windows, fitted, model)
+    solution = _solution(views, prepared[0], windows, fitted, bird, origin_m, unit_m)
     seen = ((in_camera(solution, bird, camera), own) for camera, own in zip(views.cameras, checked, strict=True))
     return with_doubts_of_views(solution, seen, bird, progress)
 

@@ -30,7 +30,7 @@ def results(common_size):
         sizes = np.full(1 if common_size else 6, size) * np.linspace(1, 1.1, 1 if common_size else 6)
         changed = dataclasses.replace(motion, scale=sizes, transl=np.asarray(motion.transl) * size)
         pose = Pose(**{name: np.asarray(value, np.float32) for name, value in vars(changed).items()})
-        points_cam, points_px = (np.asarray(each) for each in _keypoints(MODEL, pose))
+        points_cam, points_px = (np.asarray(each) for each in _keypoints(MODEL.rig, MODEL.camera, pose))
         found.append(FittedWindow(pose, {"keypoints": 1.0}, points_cam, points_px, "", np.zeros(6, np.float32)))
     return found
 
@@ -46,7 +46,7 @@ def test_a_bird_has_the_size_of_the_model_in_all_windows(windows):
     for w, result in enumerate(results(True)):
         own = slice(6 * w, 6 * w + 6)
         pose = dataclasses.replace(result.pose, transl=solution.transl[0, own], scale=solution.scale[0, own])
-        points_cam, points_px = _keypoints(MODEL, pose)
+        points_cam, points_px = _keypoints(MODEL.rig, MODEL.camera, pose)
         np.testing.assert_allclose(solution.keypoints_cam[0, own], points_cam, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(points_px, result.keypoints_px, atol=1e-2)  # the picture of the fitted pose
         expected = crop_to_image(result.keypoints_px, windows.crop[w].astype(np.float32), MODEL.camera.size_px)

@@ -7,13 +7,13 @@ import logging
 import cv2
 import numpy as np
 import pytest
-from support.fits import BIRD, config, keypoints_of, truths
+from support.fits import config
 
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.fitting.crops import cut_mask
-from jaxfit.fitting.fit import fit, windows_of
+from jaxfit.fitting.fit import windows_of
 from jaxfit.fitting.windows import cut_windows, distant_birds, load_targets, report_distant_birds, without_distant_birds
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.limits import CROP_IMAGE_SIDES, DISTANCE_IMAGE_SIDES
@@ -158,31 +158,3 @@ def test_the_report_names_tracks_and_frames(caplog):
     (record,) = caplog.records
     assert record.getMessage() == f"birds.json: track 7, {reports[7][0]} (and 1 more track)"
     assert not report_distant_birds(observed(), "birds.json")
-
-
-@pytest.mark.extended
-def test_a_fit_reports_distant_frames(caplog):
-    points = keypoints_of(truths(birds=2))
-    frames = points.shape[1]
-    points[1, 2, 0] = FAR
-    far = Observations(
-        track_id=np.arange(2),
-        frame_index=np.arange(frames),
-        present=np.ones((2, frames), bool),
-        keypoints_px=points,
-        confidence=np.ones(points.shape[:3]),
-        box_px=np.zeros((2, frames, 4)),
-        image_size_px=np.full((frames, 2), 256),
-        file_name=np.full(frames, "a.png"),
-        keypoint_names=BIRD.keypoint_names,
-    )
-    settings = config(steps=(2, 1))
-    settings = dataclasses.replace(settings, stages=settings.stages[:1])
-    with caplog.at_level(logging.WARNING, "jaxfit"):
-        solution = fit(far, BIRD, settings, source="birds.json")
-    assert solution.status.tolist() == ["ok"] * 2
-    assert np.argwhere(~solution.valid).tolist() == [[1, 2]]
-    assert list(solution.failures) == [1]
-    assert solution.failures[1][0].startswith("frame 2 skipped: a box or a keypoint lies more than 1 ×")
-    (record,) = caplog.records
-    assert record.getMessage().startswith("birds.json: track 1, frame 2 skipped: ")

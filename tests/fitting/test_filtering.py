@@ -62,52 +62,6 @@ def test_an_exact_half_is_enough_in_spite_of_rounding():
         assert filter_signal([1, 2, 3, 4, 5], confidence, 5)[2, 0] == 3
 
 
-def test_the_window_is_shorter_at_the_ends():
-    values = filter_signal([10, 20, 30, 40, 50], [1] * 5, 3)
-    np.testing.assert_array_equal(values[:, 0], [10, 20, 30, 40, 40])
-
-
-def test_outliers_are_removed_and_missing_keypoints_are_ignored():
-    values = [10, 11, 900, 13, 14]
-    assert filter_signal(values, [1] * 5, 5)[2, 0] == 13
-    assert filter_signal(values, [1, 1, 0, 0, 0], 5)[2, 0] == 10  # a missing keypoint has the median of its neighbours
-    assert np.isfinite(filter_signal([np.nan, 5, 6], [0, 1, 1], 3)).all()
-
-
-def test_the_input_is_returned_if_all_neighbours_are_missing():
-    values = filter_signal([7, 8, 9, 10, 11], [0, 0, 0, 0, 1], 3)
-    np.testing.assert_array_equal(values[:, 0], [7, 8, 9, 11, 11])
-
-
-def test_a_window_of_one_frame_and_constant_signals_are_unchanged():
-    rng = np.random.default_rng(0)
-    keypoints, confidence = (
-        rng.normal(size=(9, 4, 2)).astype(np.float32),
-        rng.random((9, 4)).astype(np.float32),
-    )
-    np.testing.assert_array_equal(weighted_median_filter(keypoints, confidence, 1), keypoints)
-    constant = np.broadcast_to(keypoints[:1], keypoints.shape)
-    np.testing.assert_array_equal(weighted_median_filter(constant, confidence, 5), constant)
-
-
-def test_the_filter_is_equivariant_to_shift_and_reversal_and_invariant_to_the_scale_of_the_confidence():
-    rng = np.random.default_rng(1)
-    keypoints = rng.integers(0, 1000, (12, 3, 2)).astype(np.float32)
-    confidence = rng.integers(0, 9, (12, 3)).astype(np.float32) / 8
-    plain = weighted_median_filter(keypoints, confidence, 5)
-    np.testing.assert_array_equal(weighted_median_filter(keypoints + 64, confidence, 5), plain + 64)
-    np.testing.assert_array_equal(weighted_median_filter(keypoints, confidence / 4, 5), plain)
-    np.testing.assert_array_equal(weighted_median_filter(keypoints[::-1], confidence[::-1], 5), plain[::-1])
-
-
-def test_batches():
-    rng = np.random.default_rng(2)
-    keypoints, confidence = rng.random((2, 6, 3, 2), np.float32), rng.random((2, 6, 3), np.float32)
-    batched = jax.vmap(lambda k, c: weighted_median_filter(k, c, 3))(keypoints, confidence)
-    for k, c, result in zip(keypoints, confidence, batched, strict=True):
-        np.testing.assert_array_equal(weighted_median_filter(k, c, 3), result)
-
-
 @pytest.mark.parametrize("window", [0, 2, -1])
 def test_window_must_be_odd(window):
     with pytest.raises(ValueError, match="window must be odd and positive"):

@@ -76,14 +76,6 @@ def test_the_arrays_of_the_solution_are_consistent(solution):
     assert set(solution.loss) == {"keypoints", "mask", "pose_prior", "velocity", "acceleration"}
 
 
-@pytest.mark.extended
-def test_the_common_size_is_constant_in_a_window(solution, observed):
-    assert (np.ptp(solution.scale, axis=1) == 0).all()
-    keypoints_only = dataclasses.replace(config(common_size=False), stages=config(steps=(30, 1)).stages[:1])
-    size_per_frame = fit(observed.select(tracks=[0]), BIRD, keypoints_only)
-    assert np.ptp(size_per_frame.scale[0]) > 1e-4
-
-
 @pytest.mark.usefixtures("distant_birds")
 @pytest.mark.parametrize("windows_per_batch", [1, 2])
 def test_a_diverged_bird_does_not_change_the_other_birds(observed, windows_per_batch):
@@ -180,18 +172,6 @@ def test_the_batch_size_does_not_change_the_result(observed, caplog):
         fit(observed, BIRD, settings[1])
     compiled = [r.getMessage() for r in caplog.records if r.getMessage().startswith("Compiling")]
     assert not [m for m in compiled if any(name in m for name in ("advance", "begin", "report", "initial"))]
-
-
-def test_the_windows_of_a_long_track_are_independent():
-    observations = detect(BIRD, truths(2 * T - 2, 1), camera=CAMERA)
-    result = fit(observations, BIRD, config(steps=(30, 2)))
-    assert result.valid.all()
-    parts = [fit(observations.select(frames=f), BIRD, config(steps=(30, 2))) for f in (slice(0, T), slice(T, None))]
-    for name in ("global_orient", "keypoints_px", "scale"):
-        joined = np.concatenate([getattr(part, name) for part in parts], axis=1)
-        np.testing.assert_array_equal(getattr(result, name), joined, err_msg=name)
-    total = sum(np.asarray(part.loss["keypoints"]) for part in parts)
-    np.testing.assert_allclose(result.loss["keypoints"], total, rtol=1e-6)
 
 
 def in_a_large_image(observations, corner=(210, 90), size=(400, 300)):
@@ -300,7 +280,7 @@ def test_the_better_hypothesis_is_kept(observed, after_first):
         fitted = fit_two_hypotheses(observed, two_stages(after_first), order)
         assert fitted.pose.global_orient.shape == (1, T, 3)
         assert not any(fitted.failure)
-        error_px = np.linalg.norm(fitted.report.keypoints_px * SIZE / CROP_PX - keypoints_of(truths()[:1]), axis=-1)
+        error_px = np.linalg.norm(fitted.keypoints_px * SIZE / CROP_PX - keypoints_of(truths()[:1]), axis=-1)
         assert error_px.mean() < 0.25
         assert not fitted.ambiguity_deg.any()  # the reversed pose is much less likely
 

@@ -6,31 +6,24 @@ import logging
 import jax
 import numpy as np
 import pytest
-from support.birds import tiny_bird
+from support import fits
+from support.fits import BIRD, CAMERA, ONE_WINDOW_GB, T, truths
 
 from jaxfit.config.build import with_values
-from jaxfit.config.fit import load_config
 from jaxfit.fitting import batch, tasks
 from jaxfit.fitting import fit as fit_module
 from jaxfit.fitting.fit import fit, fit_runs
 from jaxfit.fitting.solve import advance
-from jaxfit.model.camera import CropCamera
-from jaxfit.simulation.flock import smooth_motion
 from jaxfit.simulation.noise import detect
 
-BIRD, T, SIZE, BIRDS = tiny_bird(shapes=0), 6, 64, 2
-CAMERA = CropCamera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
-ONE_WINDOW_GB = 0.0007
-"""Memory in GB for one window of six frames."""
+BIRDS = 2
 
 
 def config(steps=(12, 2), **values):
-    paper = load_config("paper")
-    stages = tuple(dataclasses.replace(s, steps=n) for s, n in zip(paper.stages, steps, strict=True))
-    crop = dataclasses.replace(paper.crop, mode="image", size_px=SIZE)
+    base = fits.config(steps=steps, memory_gb=1.0)
     terms = {"keypoints": 0.625, "mask": 0.0625, "pose_prior": 0.1, "velocity": 0.1, "acceleration": 0.1}
-    base = dataclasses.replace(paper, window=T, stages=stages, crop=crop, terms=terms, filter_window=1)
-    return with_values(base, {path.replace("__", "."): value for path, value in values.items()})
+    changes = {path.replace("__", "."): value for path, value in values.items()}
+    return with_values(dataclasses.replace(base, terms=terms), changes)
 
 
 SWEEP = [config(terms__velocity=0.1), config(terms__velocity=10), config(terms__velocity=10, filter_window=3)]
@@ -38,7 +31,7 @@ SWEEP = [config(terms__velocity=0.1), config(terms__velocity=10), config(terms__
 
 @pytest.fixture(scope="module")
 def observed():
-    return detect(BIRD, [smooth_motion(BIRD, T, seed) for seed in range(BIRDS)], 1.0, 0.05, 0, camera=CAMERA)
+    return detect(BIRD, truths(birds=BIRDS), 1.0, 0.05, 0, camera=CAMERA)
 
 
 @pytest.fixture(scope="module")
@@ -75,19 +68,6 @@ def test_runs_of_a_sweep_equal_separate_fits(observed, swept):
     assert np.abs(swept[1].keypoints_px - swept[2].keypoints_px).max() > 0.1
 
 
-def test_the_order_of_the_runs_does_not_change_the_results(observed, swept):
-    reordered = fit_runs(observed, BIRD, SWEEP[::-1])[::-1]
-    for a, b in zip(swept, reordered, strict=True):
-        assert_equal(a, b)
-
-
-def test_batches_of_one_window_equal_separate_fits(observed):
-    small = [dataclasses.replace(each, memory_gb=ONE_WINDOW_GB) for each in SWEEP]
-    together = fit_runs(observed, BIRD, small)
-    for each, solution in zip(small, together, strict=True):
-        assert_equal(solution, fit(observed, BIRD, each))
-
-
 def test_a_batch_may_be_shorter_than_the_other_batches(observed):
     """Three runs of two windows in batches of four: the last batch has two windows."""
     some = [dataclasses.replace(each, memory_gb=4 * ONE_WINDOW_GB) for each in SWEEP]
@@ -118,12 +98,6 @@ def test_equal_first_stages_are_computed_once(observed, monkeypatch):
     for each, solution in zip(sweep, shared, strict=True):
         assert_equal(solution, fit(observed, BIRD, each))
     assert np.abs(shared[0].keypoints_px - shared[2].keypoints_px).max() > 0.01
-
-
-def test_runs_with_equal_initial_poses_but_other_weights_are_computed_separately(observed, monkeypatch):
-    counts = count_problems(monkeypatch)
-    fit_runs(observed, BIRD, SWEEP[:2])
-    assert counts == [2 * BIRDS, 2 * BIRDS]
 
 
 def test_hypotheses_of_different_runs_are_not_mixed(observed, monkeypatch):

@@ -132,25 +132,16 @@ def nan_at(array, *at):
         (rows(9, init_translation=np.zeros((4, 3))), r"init_translation must have shape .* A is 9 in init_pose"),
         (rows(9, init_pose=np.zeros((9, 11, 3)), init_bone_length=np.ones((9, 10))), r"poses of 11 joints \(.* 4"),
         (rows(9, init_bone_length=np.ones((9, J))), "`init_bone_length`"),
-        (rows(9, init_pose=np.zeros((9, J, 4))), "init_pose must have shape"),
-        (rows(9, init_pose=np.zeros((9, 3 * J))), "init_pose"),
         (rows(9, init_pose=nan_at(np.zeros((9, J, 3)), 2, 1)), "NaN or infinite"),
-        (rows(9, init_translation=np.full((9, 3), np.inf)), "NaN or infinite"),
         (rows(9, init_translation=None), "init_translation"),
         (result(transl=None), "transl"),
         (result(body_pose=np.zeros((2, 5, J + 1, 3)), bone_length=np.ones((2, 5, J + 1))), "poses of 6 joints"),
         (result(betas=np.zeros((2, 5, 9))), "9 shape coefficients .*2"),
-        (result(scale=np.ones((2, 5, 1))), "scale"),
-        (result(transl=np.zeros((2, 4, 3))), "transl"),
-        (result(body_pose=np.zeros((2, 5, J - 1, 4))), "body_pose"),
         (result(bone_length=np.ones((2, 5, J))), "bone_length"),
         (result(transl=nan_at(np.zeros((2, 5, 3)), 0, 1)), "transl.*NaN"),
-        (result(body_pose=np.full((2, 5, J - 1, 3), np.inf)), "body_pose.*NaN|NaN.*body_pose"),
         (result(scale=np.full((2, 5), -1.0)), "scale is not above 0 for track 9, frame 10"),
         (result(track_id=np.zeros(2, int)), "track_id holds track 0 twice"),
         (rows(9, init_pose=np.full((9, J, 3), "1")), "init_pose must be of type float32, not <U1"),
-        (rows(9, init_pose=np.zeros((9, J, 3), complex)), "init_pose holds complex128"),
-        (rows(9, init_bone_length=np.zeros((9, J - 1), "M8[s]")), "init_bone_length holds datetime64"),
         (result(tracks=(), crop=np.zeros((0, 5, 3))), "no pose for any"),
         ({"something": np.ones(3)}, "init_pose"),
     ],
@@ -160,19 +151,6 @@ def test_unsuitable_files_are_rejected(tmp_path, arrays, message):
     with pytest.raises(InputError, match=message) as caught:
         load_initial_poses(path, observed(), BIRD)
     assert str(caught.value).startswith(f"{path}: ")
-
-
-def test_damaged_files_are_rejected(tmp_path):
-    with pytest.raises(InputError, match=r"absent\.npz"):
-        load_initial_poses(tmp_path / "absent.npz", observed(), BIRD)
-    whole = saved(tmp_path, result()).read_bytes()
-    for content in (b"", b"text", whole[: len(whole) // 2], whole[:-30], b"\x80\x04c" + whole):
-        (tmp_path / "cut.npz").write_bytes(content)
-        with pytest.raises(InputError, match=r"cut\.npz"):
-            load_initial_poses(tmp_path / "cut.npz", observed(), BIRD)
-    np.savez(tmp_path / "objects.npz", **rows(9, init_pose=np.array([{}], dtype=object)))
-    with pytest.raises(InputError, match=r"objects\.npz.*Object arrays"):
-        load_initial_poses(tmp_path / "objects.npz", observed(), BIRD)
 
 
 def test_poses_of_other_crops_are_rejected(tmp_path):

@@ -1,13 +1,11 @@
 """The result of a bird is the same, bit by bit, alone and among any other birds."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from support.fits import BIRD, CAMERA, T, config, replaced, truths
 
-from jaxfit.fitting.batch import FRAMES_PER_TILE, join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.fitting.fit import fit
+from jaxfit.fitting.tiles import FRAMES_PER_TILE, join_tiles, take_tile, tile_rows, tile_size
 from jaxfit.model.kinematics import Pose
 from jaxfit.simulation.noise import detect
 
@@ -47,13 +45,6 @@ def test_birds_do_not_depend_on_each_other():
 def test_birds_in_short_windows_do_not_depend_on_each_other(window):
     settings = config(window=window, steps=(60, 5), memory_gb=1.0)
     assert_independent(observe(2 * window), settings, [[0], [2], [3, DIVERGING, 0]])
-
-
-@pytest.mark.extended
-def test_birds_with_hypotheses_do_not_depend_on_each_other():
-    settings = config(steps=(60, 5), memory_gb=1.0)
-    initialise = dataclasses.replace(settings.initialise, hypotheses=3)
-    assert_independent(observe(T), dataclasses.replace(settings, initialise=initialise), [[0], [2], [3, DIVERGING, 0]])
 
 
 def test_tiles_hold_every_row_once():

@@ -124,20 +124,6 @@ def test_offsets_are_0_without_data_and_smaller_with_little_data():
     assert np.linalg.norm(unsure.offsets) < 0.5 * np.linalg.norm(learnt(exact).offsets)
 
 
-def test_learnt_offsets_do_not_change_once_they_are_found():
-    exact = keypoints_px(move_keypoints(fold_bird(BIRD), PLACED), POSE)
-    first = learnt(exact)
-    given = dataclasses.replace(PLAIN, keypoint_offsets=first.by_name(BIRD))
-    again = learn_offsets(
-        fit_model(BIRD, given)._replace(camera=CAMERA),
-        first_offsets(BIRD, given.keypoint_offsets),
-        one_window(POSE),
-        targets(exact),
-        SCALE,
-    )
-    np.testing.assert_allclose(again.offsets, first.offsets, atol=0.02)
-
-
 def observed():
     """Return single pictures whose keypoints have the offsets, and a little noise."""
     exact = detect(BIRD, [POSE], camera=CAMERA)

@@ -184,14 +184,6 @@ def test_the_command(tmp_path, capsys):
     assert config.stages == load_config("map").stages
 
 
-def test_a_config_of_fast_motion_can_be_read(tmp_path):
-    """YAML reads 1e+06 as text."""
-    learnt = dataclasses.replace(learn_motion([("a", moving(1, 10))]), prior=MotionPrior(1e6, 1.0))
-    (tmp_path / "motion.yaml").write_text(motion_config(learnt))
-    config = load_config(tmp_path / "motion.yaml")
-    assert config.stage_settings(config.stages[-1])["motion_likelihood"] == {"weight": 1, "sd_rad_s2": 1e6, "dof": 1}
-
-
 def test_bad_input_of_the_command(tmp_path, capsys):
     save_solution(_without_middle(moving(1, 3)), BIRD, "", {}, tmp_path / "short")
     save_solution(moving(1, 5), BIRD, "", {}, tmp_path / "good")

@@ -103,23 +103,6 @@ def test_without_data_the_values_of_the_config_stay(exact, caplog, changes):
     assert caplog.text.count("no weights are learnt") == 1
 
 
-@pytest.mark.extended
-def test_overridden_settings_and_terms_of_others_keep_their_values(exact):
-    stage = dataclasses.replace(STAGE, override={"keypoint_likelihood": {"sd_sure_px": 2.0}})
-    learnt = learn_weights(noisy(exact, 3.0), BIRD, dataclasses.replace(LEARNING, stages=(stage,)))
-    assert learnt.values == {}
-    assert learnt.config.terms == LEARNING.terms
-
-
-@pytest.mark.extended
-def test_a_model_without_prior_learns_from_keypoints_alone(exact):
-    terms = {"keypoint_likelihood": TERMS["keypoint_likelihood"]}
-    own = dataclasses.replace(LEARNING, stages=(dataclasses.replace(STAGE, terms=tuple(terms)),), terms=terms)
-    learnt = learn_weights(noisy(exact, 3.0), BIRD, own)
-    assert learnt.values or len(learnt.remarks) == 1
-    assert all(np.isfinite(value) for value in learnt.values.values())
-
-
 def test_several_configs_do_not_learn(exact):
     with pytest.raises(InputError, match="learn_weights"):
         fit_runs(exact, BIRD, [LEARNING, LEARNING])

@@ -26,7 +26,7 @@ def fitted(monkeypatch):
     done = []
 
     def recorded(shared, task, report_progress=None):
-        windows = task.runs[0].windows
+        windows = task.windows[0]
         done.extend((int(windows.track_id[w]), int(windows.frame[w].max(initial=-1))) for _, w in task.problems)
         return quick_fit(shared, task)
 

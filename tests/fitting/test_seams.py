@@ -60,7 +60,7 @@ def windows_of_two():
 
 def result_of(pose, failure=""):
     pose = Pose(**{name: np.asarray(value, np.float32) for name, value in vars(pose).items()})
-    points_cam, points_px = (np.asarray(each) for each in _keypoints(MODEL, pose))
+    points_cam, points_px = (np.asarray(each) for each in _keypoints(MODEL.rig, MODEL.camera, pose))
     return FittedWindow(
         pose, {"keypoints": 1.0}, points_cam, points_px, failure, np.zeros(len(pose.transl), np.float32)
     )
@@ -112,7 +112,7 @@ def test_rotations_follow_the_shortest_path():
         expected = Slerp([0, 1], ends)(weight)
         own = Rotation.from_rotvec(blended[1].pose.global_orient[t])
         assert (expected.inv() * own).magnitude() < 1e-5
-    expected = _keypoints(MODEL, blended[1].pose)[0]
+    expected = _keypoints(MODEL.rig, MODEL.camera, blended[1].pose)[0]
     np.testing.assert_allclose(blended[1].keypoints_cam, expected, atol=1e-5)
 
 

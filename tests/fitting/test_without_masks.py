@@ -8,10 +8,8 @@ import pytest
 from support.fits import BIRD, CAMERA, config, truths
 
 from jaxfit.config.fit import StageConfig, load_config, shipped_fit_configs
-from jaxfit.data.formats.coco import read_coco
 from jaxfit.fitting.fit import _without_mask_stages, fit
 from jaxfit.fitting.solve import needs_mask, without_mask_stages
-from jaxfit.model.published import import_model
 from jaxfit.simulation.noise import detect
 
 
@@ -59,16 +57,6 @@ def test_a_stage_that_was_to_be_followed_by_masks_converges():
     alone = total_loss(observations, dataclasses.replace(whole, stages=whole.stages[:1]))
     assert (loss < 1.005 * converged).all()
     assert (alone > 1.05 * converged).any()
-
-
-@pytest.mark.extended
-def test_photographs_with_keypoints_only_converge(reference_dir):
-    bird = import_model("aves", [reference_dir / "models" / "aves"])
-    for species in ("029.American_Crow", "087.Mallard"):
-        observations = dataclasses.replace(read_coco(reference_dir / "cub" / f"{species}.json"), masks={})
-        photo = dataclasses.replace(load_config("photo"), learn_weights=())
-        converged = total_loss(observations, with_last_steps(without_mask_stages(photo), 300), bird)
-        assert (total_loss(observations, photo, bird) < 1.005 * converged).all()
 
 
 def staged(*stages):

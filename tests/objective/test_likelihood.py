@@ -46,13 +46,6 @@ def test_the_pull_of_an_outlier_falls_with_its_distance():
     assert pull[1] > pull[2] > pull[3]
 
 
-def test_unsure_keypoints_count_less():
-    error = [[[5.0, -3.0]]]
-    costs = [float(errors_term(error, c)) for c in (0.0, 0.01, 0.5, 1.0)]
-    assert costs[0] == 0
-    assert 0 < costs[1] < costs[2] < costs[3]
-
-
 def test_gradients_of_the_keypoint_term_with_respect_to_its_settings():
     targets = random_targets()
     pose = window_pose()

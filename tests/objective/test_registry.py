@@ -30,10 +30,8 @@ def decorated(window, *, width=1, offset=0.0):
 number = 3.0
 def no_default(window, *, x): return 0.0
 def wrong_default(window, *, x=None): return 0.0
-def flag(window, *, x=True): return 0.0
 def positional(window, x=1.0): return 0.0
 def nothing(): return 0.0
-def only(*, window): return 0.0
 def weighs(window, *, weight=1.0): return 0.0
 """
 
@@ -48,12 +46,9 @@ def own_registry(monkeypatch):
 def package(tmp_path, monkeypatch):
     (tmp_path / "own_priors.py").write_text(MODULE)
     (tmp_path / "broken_priors.py").write_text("raise RuntimeError('no luck')")
-    (tmp_path / "ending_priors.py").write_text("import sys\nsys.exit(0)")
-    (tmp_path / "odd_priors.py").write_text("def __getattr__(name): raise SystemExit(name)")
     monkeypatch.syspath_prepend(str(tmp_path))
     yield tmp_path
-    for name in ("own_priors", "odd_priors"):
-        sys.modules.pop(name, None)
+    sys.modules.pop("own_priors", None)
 
 
 def test_a_term_of_this_session():
@@ -149,23 +144,14 @@ def test_by_entry_point(package, monkeypatch):
     [
         ("absent_priors:plain", ("cannot be imported", "absent_priors", "PYTHONPATH")),
         ("broken_priors:plain", ("cannot be imported", "RuntimeError: no luck")),
-        ("ending_priors:plain", ("cannot be imported", "SystemExit")),
-        ("odd_priors:plain", ("has no function 'plain'",)),
-        ("a\0b:plain", ("cannot be imported",)),
-        ("x" * 5000 + ":plain", ("cannot be imported",)),
-        (".own_priors:plain", ("cannot be imported",)),
         ("own_priors:absent", ("has no function 'absent'",)),
         ("own_priors:number", ("is not a function", "float")),
         ("own_priors:no_default", ("'x'", "default of the setting is not a finite number")),
         ("own_priors:wrong_default", ("'x'", "default of the setting is not a finite number")),
-        ("own_priors:flag", ("'x'", "default of the setting is not a finite number")),
         ("own_priors:positional", ("'x', which is not keyword-only",)),
         ("own_priors:nothing", ("does not take the window",)),
-        ("own_priors:only", ("does not take the window",)),
         ("own_priors:weighs", ("'weight'",)),
         ("builtins:max", ("does not take the window",)),
-        (":plain", ("cannot be imported",)),
-        ("own_priors:", ("has no function",)),
     ],
 )
 def test_objects_that_are_not_terms_are_rejected(package, path, words):

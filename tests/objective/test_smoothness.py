@@ -17,7 +17,7 @@ from jaxfit.model.kinematics import fold_bird
 from jaxfit.objective.likelihood import motion_likelihood
 from jaxfit.objective.posed_window import PosedWindow, priors_of
 from jaxfit.objective.residuals import huber, residual_sum
-from jaxfit.objective.temporal import geodesic_velocity, huber_velocity, low_pass
+from jaxfit.objective.temporal import acceleration, geodesic_velocity, huber_velocity, low_pass, velocity
 from jaxfit.objective.terms import feet_on_ground, joint_limits
 
 BONES, L = 4, 8
@@ -39,6 +39,13 @@ def by_hand(term, orient, body, present, beta_global=10.0, beta_pose=1.0, **sett
         return beta_global * fast_energy(orient, present, **settings) + beta_pose * fast_energy(
             flat, present, **settings
         )
+    if term in (velocity, acceleration):
+        order, total = 1 if term is velocity else 2, 0.0
+        for i in range(len(orient) - order):
+            if all(present[i : i + order + 1]):
+                for theta, beta in ((orient, beta_global), (body, beta_pose)):
+                    total += beta * np.linalg.norm(np.diff(theta[i : i + order + 1], order, axis=0))
+        return total
     total = 0.0
     for i in range(len(orient) - 1):
         if present[i] and present[i + 1]:
@@ -62,6 +69,8 @@ def fast_energy(x, present, cutoff_cycles_per_frame):
 
 
 CASES = [
+    pytest.param(velocity, {}, id="velocity"),
+    pytest.param(acceleration, {}, id="acceleration"),
     pytest.param(geodesic_velocity, {}, id="geodesic"),
     pytest.param(huber_velocity, {"delta_rad": 1.2}, id="huber"),
     pytest.param(low_pass, {"cutoff_cycles_per_frame": 0.2}, id="low_pass"),
@@ -132,6 +141,13 @@ def test_velocity_on_rotations_ignores_full_turns_of_the_axis_angle():
     for term, own in ((geodesic_velocity, {}), (huber_velocity, {}), (motion_likelihood, {"sd_rad_s2": 700.0})):
         before, after = (float(term_value(term, o, body, present, **own)) for o in (orient, again))
         assert after == pytest.approx(before, rel=1e-4)
+
+
+def test_steady_motion_has_no_acceleration():
+    steady = np.arange(7.0)[:, None] * [0.25, -0.5, 0.125]
+    body = np.broadcast_to(steady[:, None], (7, BONES, 3))
+    assert float(term_value(acceleration, steady, body, np.ones(7, bool))) == 0
+    assert float(term_value(velocity, steady, body, np.ones(7, bool))) > 1
 
 
 def test_huber_limits_the_gradient_of_fast_joints():

@@ -29,7 +29,6 @@ from support.terms_by_hand import (
     without_frame,
 )
 
-from jaxfit.model.rotation import safe_norm
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
 from jaxfit.objective.posed_window import PosedWindow, Priors, priors_of
 from jaxfit.objective.registry import find_term, find_terms
@@ -159,14 +158,6 @@ def test_gradients_are_right():
     check_grads(total, at, order=1, modes=["rev"], eps=2e-3, atol=0.05, rtol=0.02)
 
 
-def test_safe_norm():
-    x = jnp.array([[3.0, 4.0], [0.0, 0.0], [1e-20, 0.0]])
-    np.testing.assert_allclose(safe_norm(x)[:2], [5, 0])
-    slope = np.asarray(jax.jit(jax.grad(lambda x: safe_norm(x).sum()))(x))
-    np.testing.assert_allclose(slope[:2], [[0.6, 0.8], [0, 0]], rtol=1e-6)
-    assert np.isfinite(slope).all()
-
-
 def test_the_sum_is_weighted():
     pose, start, targets = window_pose(), window_pose(50), random_targets()
     rng = np.random.default_rng(0)
@@ -202,14 +193,6 @@ def test_settings_are_traced():
     gradient = jax.jit(jax.grad(lambda v: total(settings(*v))))(jnp.array(sweep[0]))
     assert np.isfinite(gradient).all()
     assert (np.abs(gradient) > 0).all()
-
-
-def test_settings_of_terms():
-    assert find_term("keypoints").settings == {"sigma_px": 50.0}
-    assert find_term("velocity").settings == {"beta_global": 10.0, "beta_pose": 1.0}
-    assert find_term("mask").settings == {}
-    with pytest.raises(KeyError):
-        find_term("unknown")
 
 
 def test_common_size():

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxfit.fitting.collect import FittedWindow
+from jaxfit.fitting.batch import FittedWindow
 from jaxfit.fitting.tasks import failed_windows
 from jaxfit.fitting.windows import window_content
 from jaxfit.foundation.errors import InputError
@@ -21,14 +21,14 @@ def add(shared, task):
     return shared + task
 
 
-def quick_fit(shared, task, _report_progress=None):
+def quick_fit(model, task, _report_progress=None):
     """Return poses that depend on the content of the window and on the config, as `fit_task` does, in no time."""
     results = []
     for r, w in task.problems:
-        run = task.runs[r]
-        content = repr(window_content(run.windows, w)) + repr(run.config)
+        config = task.configs[r]
+        content = repr(window_content(task.windows[r], w)) + repr(config)
         value = np.float32(zlib.crc32(content.encode()) / 2**32 + 0.5)
-        (empty,) = failed_windows(shared.model, run.config, 1, "")
+        (empty,) = failed_windows(model, config, 1, "")
         filled = jax.tree.map(lambda x, value=value: np.full_like(x, value), empty.pose)
         points = np.full_like(empty.keypoints_cam, value), np.full_like(empty.keypoints_px, value)
         angle_deg = np.full_like(empty.ambiguity_deg, value)

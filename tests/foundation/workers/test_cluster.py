@@ -16,7 +16,7 @@ from support.worker_tasks import add, attempts, deadly, failing, quick_fit, refu
 from jaxfit.cli.main import main
 from jaxfit.fitting.fit import fit, fit_runs, windows_of
 from jaxfit.fitting.stored_windows import StoredWindows
-from jaxfit.fitting.tasks import Run, cut_task
+from jaxfit.fitting.tasks import FitTask
 from jaxfit.fitting.windows import window_content
 from jaxfit.foundation import workers as module
 from jaxfit.foundation.errors import InputError
@@ -112,15 +112,15 @@ def test_runs_that_share_windows_share_the_rows_of_a_task():
     """Run 0 and run 1 have equal windows, and the task holds other windows of run 0 than of run 1."""
     configs = [settings(), replace(settings(), terms=settings().terms | {"pose_prior": 1.0}), settings(min_keypoints=5)]
     observed = observe()
-    runs = [Run(each, windows_of(observed, each, "observations")) for each in configs]
+    windows = [windows_of(observed, each, "observations") for each in configs]
     problems = [(0, 0), (0, 4), (1, 3), (2, 5)]
-    task = cut_task(runs, problems)
+    task = FitTask(configs, windows, problems).part(problems)
     for (r, w), (same, row) in zip(problems, task.problems, strict=True):
         assert r == same
-        assert window_content(task.runs[r].windows, row) == window_content(runs[r].windows, w)
+        assert window_content(task.windows[r], row) == window_content(windows[r], w)
     assert task.problems == [(0, 0), (0, 2), (1, 1), (2, 0)]
-    assert [len(run.windows) for run in task.runs] == [3, 3, 1]
-    np.testing.assert_array_equal(task.runs[0].windows.keypoints_px, task.runs[1].windows.keypoints_px)
+    assert [len(some) for some in task.windows] == [3, 3, 1]
+    np.testing.assert_array_equal(task.windows[0].keypoints_px, task.windows[1].keypoints_px)
 
 
 def test_tasks_are_taken_as_they_are_needed(workers):
