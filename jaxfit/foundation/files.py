@@ -1,15 +1,11 @@
-"""Atomic writing of files and folders, and temporary names beside them.
+"""Atomic writing of files and folders.
 
-Temporary files and folders next to a target; removal of the temporary files of killed processes. A writer of `out`
-first creates `.out.<hex>.lock` in the same folder and holds a lock (flock) on this file as long as `.out.<hex>.part` or
-`.out.<hex>.old` exists. The operating system frees the lock when the process ends, also after SIGKILL. A file `.lock`
-without a lock therefore belongs to no living process. The next write into the folder removes this file with its `.part`
-and `.old`. An `.old` without its target is the earlier folder of an interrupted replacement, and is renamed back to its
-target.
-
-On a shared disk, some network file systems keep locks to each computer. The lock file therefore names its computer, and
-what another computer has left is removed only after `LEFTOVER_DAYS` without a change. Where the file system has no
-locks, nothing is removed.
+A writer of `out` first creates `.out.<computer>.<hex>.lock` in the same folder and holds a lock on this file as long as
+`.part` or `.old` of the same name exists. The operating system frees the lock when the process ends, also after
+SIGKILL. A lock file that nobody has locked therefore belongs to no living process, and the next write into the folder
+removes this file with its `.part` and `.old`. An `.old` without its target is the earlier folder of an interrupted
+replacement, and is renamed back to its target. The name of the computer is there because some network file systems
+keep locks to each computer.
 """
 
 from __future__ import annotations
@@ -20,35 +16,27 @@ import platform
 import re
 import secrets
 import shutil
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+from filelock import FileLock
+
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import LEFTOVER_DAYS, NAME_BYTES
 
 # Errors of the operating system for a write, and the action that the user can take.
 _REMEDIES = {
     errno.ENOSPC: "free some space or choose another place",
     errno.EDQUOT: "free some of your quota or choose another place",
-    errno.EFBIG: "choose a file system that supports files of this size",
     errno.EROFS: "choose a place with write access",
     errno.EACCES: "change its permissions or choose a place with write access",
     errno.EPERM: "change its permissions or choose a place with write access",
     errno.EBUSY: "it is a mount point or in use: choose a folder inside it",
-    errno.EIO: "check the disk or choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
-    errno.ENOENT: "choose another place",
     errno.ENOTDIR: "a part of its path is a file: choose another place",
     errno.EEXIST: "a part of its path is a file: choose another place",
     errno.ELOOP: "a symbolic link of its path leads back to itself: choose another place",
-    errno.EINVAL: "choose another name",
-    errno.EILSEQ: "choose another name",
-    errno.ENXIO: "choose another place",
-    errno.ESTALE: "check the network disk or choose another place",
-    errno.ENOTEMPTY: "another program has written there in the meantime: choose another place",
 }
 
 
@@ -58,10 +46,10 @@ def write_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in _REMEDIES:
+        if error.errno is None:
             raise
         problem = f"cannot be written: {os.strerror(error.errno)}"
-        raise InputError(path, problem, _REMEDIES[error.errno]) from error
+        raise InputError(path, problem, _REMEDIES.get(error.errno, "choose another place")) from error
 
 
 @contextmanager
@@ -80,16 +68,11 @@ def resolved(path: Path) -> Path:
     """Return the absolute path without symbolic links; a path that cannot exist is an InputError."""
     with write_errors(path):
         try:
-            names = [os.fsencode(name) for name in path.parts]
-        except UnicodeEncodeError:
-            names = [b"\0"]
-        if any(b"\0" in name for name in names):
-            raise InputError(path, "contains a character that no file name has", "choose another name")
-        if any(len(name) > NAME_BYTES for name in names):
-            raise OSError(errno.ENAMETOOLONG, "")
-        with suppress(FileNotFoundError):
-            path.stat()  # resolve() has other errors for cyclic links
-        return path.resolve()
+            with suppress(FileNotFoundError):
+                path.stat()  # resolve() has other errors for cyclic links
+            return path.resolve()
+        except ValueError:
+            raise InputError(path, "contains a character that no file name has", "choose another name") from None
 
 
 @contextmanager
@@ -161,7 +144,7 @@ def new_file(path: str | Path) -> Iterator[Path]:
     path = resolved(named)  # a symbolic link stays a link, and its target is replaced
     if path.exists() and not path.is_file():
         raise InputError(named, "is a folder or a device, not a file", "choose another name")
-    with write_errors(named), created_parents(path), temporary(path) as names:
+    with write_errors(named), created_parents(path), _temporary(path) as names:
         with _own_name(names.part, named):
             yield names.part
         _sync(names.part)
@@ -192,7 +175,7 @@ def new_folder(path: str | Path, overwrite: bool = False, marker: str | None = N
     named = Path(path)
     check_replaceable(named, overwrite, marker)
     path = resolved(named)
-    with write_errors(named), created_parents(path), temporary(path) as names:
+    with write_errors(named), created_parents(path), _temporary(path) as names:
         names.part.mkdir()
         with _own_name(names.part, named):
             yield names.part
@@ -239,7 +222,7 @@ def check_writable(path: str | Path) -> None:
     target = resolved(path)
     with write_errors(path):  # permissions alone are not sufficient information, so try a write
         existing = next(parent for parent in target.parents if parent.exists())
-        with temporary(existing / target.name) as names:
+        with _temporary(existing / target.name) as names:
             names.part.mkdir()
 
 
@@ -251,7 +234,7 @@ def _contains_current(path: Path) -> bool:
     return path == current or path in current.parents
 
 
-def _replace_folder(names: Temporary, path: Path) -> None:
+def _replace_folder(names: _Names, path: Path) -> None:
     """Rename the new folder to `path`; if this fails, restore the existing folder."""
     if not path.exists():
         names.part.rename(path)
@@ -265,29 +248,29 @@ def _replace_folder(names: Temporary, path: Path) -> None:
     shutil.rmtree(names.old, ignore_errors=True)
 
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
-
-_LOCK = re.compile(r"\..*\.[0-9a-f]{8}\.lock", re.DOTALL)
-_MARK = b"jaxfit"
+_COMPUTER = re.sub(r"[^A-Za-z0-9-]", "-", platform.node())[:20]
+_LOCK = re.compile(rf"(\.(.*)\.{_COMPUTER}\.[0-9a-f]{{8}})\.lock", re.DOTALL)
 _own_parts: set[Path] = set()
 """Temporary folders of this process; files in them need no lock of their own."""
 
 
-class Temporary(NamedTuple):
+class _Names(NamedTuple):
     """The temporary names for one target."""
 
     part: Path
     """The new file or folder, until it is complete."""
     old: Path
     """The earlier folder, while the new folder takes its name."""
+    lock: Path
+
+    @classmethod
+    def beside(cls, folder: Path, stem: str) -> _Names:
+        """Return the names with a stem in the folder of the target, so that a rename stays in one file system."""
+        return cls(*(folder / f"{stem}.{kind}" for kind in ("part", "old", "lock")))
 
 
 @contextmanager
-def temporary(target: Path) -> Iterator[Temporary]:
+def _temporary(target: Path) -> Iterator[_Names]:
     """Yield temporary names in the folder of a target, and remove the files that still have these names at the end.
 
     Removes first what killed processes have left in the folder.
@@ -298,104 +281,35 @@ def temporary(target: Path) -> Iterator[Temporary]:
     Raises:
         OSError: the folder does not allow new files.
     """
-    if not _own_parts.isdisjoint(target.parents):
-        names = _names(_stem(target))
+    name = os.fsencode(target.name)[:200].decode(errors="ignore")  # 255 bytes is the longest name
+    names = _Names.beside(target.parent, f".{name}.{_COMPUTER}.{secrets.token_hex(4)}")
+    inside = not _own_parts.isdisjoint(target.parents)
+    if not inside:
+        remove_leftovers(target.parent)
+    with nullcontext() if inside else FileLock(names.lock, blocking=False):
+        _own_parts.add(names.part)
         try:
             yield names
         finally:
-            _remove(names.part)
-        return
-    remove_leftovers(target.parent)
-    stem, descriptor = _locked(target)
-    names = _names(stem)
-    _own_parts.add(names.part)
-    try:
-        yield names
-    finally:
-        try:
-            _finish(stem, names)
-        except KeyboardInterrupt:  # in the middle of the removal
-            _finish(stem, names)
-            raise
-        finally:
             _own_parts.discard(names.part)
-            if descriptor is not None:
-                os.close(descriptor)
+            _remove(names.part)
+            if not os.path.lexists(names.old):
+                with suppress(OSError):  # Windows removes the lock file at the end of the lock
+                    names.lock.unlink()
 
 
 def remove_leftovers(folder: Path) -> None:
     """Remove the temporary files and folders in a folder that no living process owns."""
     with suppress(OSError, ValueError):  # the folder may not exist or not be readable, and no folder has a NUL
-        for name in os.listdir(folder):  # noqa: PTH208 - a list, because the loop removes names
-            if _LOCK.fullmatch(name):
-                with suppress(OSError):  # the lock of a living process or of another user
-                    _remove_group(folder / name)
-
-
-def _names(stem: Path) -> Temporary:
-    return Temporary(stem.with_name(f"{stem.name}.part"), stem.with_name(f"{stem.name}.old"))
-
-
-def _stem(target: Path) -> Path:
-    # in the same folder, so that a rename stays within one file system; 255 bytes is the longest name
-    name = os.fsencode(target.name)[:200].decode(errors="ignore")
-    return target.with_name(f".{name}.{secrets.token_hex(4)}")
-
-
-def _lock_of(stem: Path) -> Path:
-    return stem.with_name(f"{stem.name}.lock")
-
-
-def _locked(target: Path) -> tuple[Path, int | None]:
-    """Create and lock a lock file for a target; the descriptor is None where the file system has no locks."""
-    while True:
-        stem = _stem(target)
-        lock = _lock_of(stem)
-        descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        try:
-            if not try_lock(descriptor) or not is_open(lock, descriptor):
-                os.close(descriptor)  # another process has just taken the new file for a leftover
-                continue
-            os.write(descriptor, b"\n".join((_MARK, os.fsencode(platform.node()), os.fsencode(target.name))))
-        except OSError as error:
-            os.close(descriptor)
-            lock.unlink(missing_ok=True)
-            if isinstance(error, NoLocksError):
-                return stem, None
-            raise
-        return stem, descriptor
-
-
-class NoLocksError(OSError):
-    """The file system or the operating system has no locks."""
-
-
-def try_lock(descriptor: int) -> bool:
-    """Lock an open file; False if another process has locked the file."""
-    if fcntl is None:
-        raise NoLocksError
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError as error:
-        raise NoLocksError from error
-    return True
-
-
-def is_open(path: Path, descriptor: int) -> bool:
-    """Return whether a path still names the open file."""
-    try:
-        return os.path.samestat(path.lstat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
-
-
-def _finish(stem: Path, names: Temporary) -> None:
-    """Remove the temporary names; the lock file stays where they could not be removed."""
-    _remove(names.part)
-    if not any(map(os.path.lexists, names)):
-        _lock_of(stem).unlink(missing_ok=True)
+        for lock in list(folder.iterdir()):
+            if match := _LOCK.fullmatch(lock.name):
+                with suppress(OSError), FileLock(lock, blocking=False):  # a living process has locked the file
+                    names, target = _Names.beside(folder, match[1]), folder / match[2]
+                    if os.path.lexists(names.old) and not os.path.lexists(target):
+                        names.old.rename(target)
+                    _remove(names.part)
+                    _remove(names.old)
+                    lock.unlink()
 
 
 def _remove(path: Path) -> None:
@@ -404,34 +318,3 @@ def _remove(path: Path) -> None:
     else:
         with suppress(OSError):
             path.unlink()
-
-
-def _remove_group(lock: Path) -> None:
-    """Remove a lock file and its temporary names if no living process owns them."""
-    descriptor = os.open(lock, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
-    try:
-        if not try_lock(descriptor) or not is_open(lock, descriptor):
-            return
-        content = os.read(descriptor, 4096).split(b"\n", 2)
-        stem = lock.with_name(lock.name.removesuffix(".lock"))
-        names = _names(stem)
-        if content == [b""] and not any(map(os.path.lexists, names)):  # killed before the content was written
-            lock.unlink()
-        if len(content) != 3 or content[0] != _MARK:
-            return
-        if content[1] != os.fsencode(platform.node()) and _age_days(lock, *names) < LEFTOVER_DAYS:
-            return
-        target = lock.with_name(Path(os.fsdecode(content[2])).name)
-        if os.path.lexists(names.old):
-            if os.path.lexists(target):
-                _remove(names.old)
-            else:
-                names.old.rename(target)
-        _finish(stem, names)
-    finally:
-        os.close(descriptor)
-
-
-def _age_days(*paths: Path) -> float:
-    changed = max(path.lstat().st_mtime for path in paths if os.path.lexists(path))
-    return (time.time() - changed) / 86400

@@ -4,16 +4,13 @@ Parts of a long computation: numbered `.npz` files in one folder, with a record 
 appears whole or not at all. The record `record.json` is written with the first file. A computation that depends on
 something else is refused as long as the folder holds files.
 
-The folder of the result `out` is `out.unfinished`. The process that works in the folder holds a lock (flock) on the
-file `lock`. The operating system frees the lock when the process ends, also after SIGKILL, so no lock of a dead process
-remains. Where the file system has no locks, and on Windows, nothing prevents a second process.
+The folder of the result `out` is `out.unfinished`. The process that works in the folder holds a lock on the file
+`lock`. The operating system frees the lock when the process ends, also after SIGKILL.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import platform
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -21,20 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from jaxfit.foundation.array_files import load_npz
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.files import (
-    NoLocksError,
-    created_parents,
-    is_open,
-    remove_leftovers,
-    resolved,
-    try_lock,
-    write_errors,
-    write_whole,
-)
-from jaxfit.foundation.reading import read_json_file
+from jaxfit.foundation.files import created_parents, remove_leftovers, resolved, write_errors, write_whole
+from jaxfit.foundation.reading import check_readable, read_json_file
 
 RECORD = "record.json"
 """Name of the file that holds the record."""
@@ -123,9 +112,9 @@ def read_record(folder: Path) -> Any:
     """Return the record of the parts in a folder.
 
     Raises:
-        InputError: the file cannot be read, or is no JSON.
+        InputError: the file is absent, cannot be read, or is no JSON.
     """
-    return read_json_file(folder / RECORD)
+    return read_json_file(check_readable(folder / RECORD, "a record", "remove this folder to begin again"))
 
 
 def differences(held: Any, own: Any, name: str = "") -> Iterator[str]:
@@ -163,8 +152,7 @@ def unfinished_work(result: Path) -> Iterator[Path]:
         with write_errors(named):
             path = resolved(named)
             stack.enter_context(created_parents(path))
-            descriptor = _lock_folder(named, path)
-        stack.callback(os.close, descriptor)
+            stack.enter_context(_locked_folder(named, path))
         try:
             yield named
         except BaseException:
@@ -174,32 +162,20 @@ def unfinished_work(result: Path) -> Iterator[Path]:
         _remove(path)
 
 
-def _lock_folder(named: Path, path: Path) -> int:
-    """Create the folder if it is absent, lock its lock file and return the open file."""
-    lock = path / _LOCK
-    while True:
-        path.mkdir(exist_ok=True)
-        if any(path.iterdir()) and not lock.is_file():
-            raise InputError(named, "holds files of another program", "choose another --out")
-        try:
-            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)
-        except FileNotFoundError:  # another process has just removed the folder
-            continue
-        try:
-            is_locked = try_lock(descriptor)
-        except NoLocksError:
-            return descriptor
-        if not is_locked:
-            owner = os.read(descriptor, 200).decode(errors="replace")
-            os.close(descriptor)
-            problem = f"another jaxfit works on this result{f' ({owner})' if owner else ''}"
-            raise InputError(named, problem, "wait until it ends, or choose another --out")
-        if is_open(lock, descriptor):
-            with suppress(OSError):  # a full disk: the name of the owner is for messages only
-                os.ftruncate(descriptor, 0)
-                os.write(descriptor, f"process {os.getpid()} on {platform.node()}".encode())
-            return descriptor
-        os.close(descriptor)
+def _locked_folder(named: Path, path: Path) -> FileLock:
+    """Create the folder if it is absent, and return its lock, which this process now holds."""
+    file = path / _LOCK
+    path.mkdir(exist_ok=True)
+    if any(path.iterdir()) and not file.is_file():
+        problem = "holds files, but no lock, so it is not a folder of unfinished work"
+        raise InputError(named, problem, "choose another --out, or remove this folder")
+    lock = FileLock(file, blocking=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        problem, remedy = "another jaxfit works on this result", "wait until it ends, or choose another --out"
+        raise InputError(named, problem, remedy) from None
+    return lock
 
 
 def _remove(path: Path) -> None:
