@@ -24,9 +24,8 @@ def test_the_curve_is_the_probability():
 
 
 def test_too_few_detections():
-    for values in (np.linspace(0.1, 1, 50), np.full(1000, 0.5), np.zeros(1000)):
-        with pytest.raises(InputError, match="at least 200"):
-            fit_curve(Outcomes(values, values > 0.3))
+    with pytest.raises(InputError, match="at least 200"):
+        fit_curve(Outcomes(np.linspace(0.1, 1, 50), np.ones(50, bool)))
 
 
 def square(mask_x, shape=(60, 100)):

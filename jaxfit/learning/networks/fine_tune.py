@@ -48,7 +48,14 @@ from jaxfit.learning.networks.label_data import (
     read_label_files,
 )
 from jaxfit.learning.networks.labelled_frames import LabelledFrames, load_frames
-from jaxfit.learning.networks.labels import LabelledPicture, LeftOut, StoredPicture, load_reference_birds
+from jaxfit.learning.networks.labels import (
+    CENTRE,
+    LabelledPicture,
+    LabelSet,
+    LeftOut,
+    StoredPicture,
+    load_reference_birds,
+)
 from jaxfit.learning.networks.network_files import (
     Probabilities,
     base_file,
@@ -61,7 +68,7 @@ from jaxfit.learning.networks.network_files import (
 from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.ranges import check_numbers
 from jaxfit.learning.networks.scenes import film_scenes
-from jaxfit.learning.networks.teacher import Taught, as_labels, open_teacher, teach
+from jaxfit.learning.networks.teacher import Taught, open_teacher, teach
 from jaxfit.learning.networks.training import Schedule, Source, Trained, train, weights_of
 from jaxfit.perception.keypoint_layouts import HeatmapLayout, KeypointInput, read_metadata
 from jaxfit.perception.keypoints import OnnxKeypoints, crop_settings, load_keypoint_detector
@@ -184,7 +191,8 @@ def fine_tune(
             raise InputError("train: labels", "are missing", "give --labels, or --video with --teacher")
         (folder / TRACKED).mkdir(parents=True, exist_ok=True)
         taught = teach(files.images[0], teacher, folder / TRACKED, progress)
-        labels, files, teacher = as_labels(taught), LabelFiles(files.images, files.images), None
+        labels = LabelSet((CENTRE,), tuple(picture.labels for picture in taught.pictures))
+        files, teacher = LabelFiles(files.images, files.images), None
     torch.manual_seed(settings.seed)
     starts: tuple[str, ...] = labels.keypoint_names
     if network == "segmenter":

@@ -17,14 +17,13 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain
 from pathlib import Path
 
 import cv2
 import numpy as np
 import onnx
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
@@ -40,7 +39,7 @@ from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.segmenter import segmenter_network
 from jaxfit.learning.priors import oas_shrinkage
 from jaxfit.perception.keypoints import BUILTIN_PATH, CropSettings, load_keypoint_detector
-from jaxfit.perception.network import OUTPUT, ActivationStatistics, Instance, OnnxModel, Segmenter, instance_of
+from jaxfit.perception.network import OUTPUT, ActivationStatistics, OnnxModel, Segmenter, instance_of
 from jaxfit.perception.segmentation import BUILTIN, LONGER_SIDE_PX, BottomUp, load_segmenter
 
 OPSET = 18
@@ -413,6 +412,8 @@ def store_training_activations(
 ) -> None:
     """Store the statistics of the activations of a trained network over its training pictures.
 
+    The pictures lie at even distances, and every second picture has a random appearance.
+
     Args:
         which: `segmenter` or `keypoints`.
         path: the ONNX file; it is replaced.
@@ -424,64 +425,27 @@ def store_training_activations(
         InputError: the file is no such network, or the pictures show fewer than 10 birds.
     """
     count = MAX_PICTURES // len(sources)
-    shown = chain.from_iterable(pictures_in_use(frames, count) for frames in sources)
-    if which == "segmenter":
-        inputs = segmenter_inputs(path, (picture for picture, _ in shown))
-    else:
-        inputs = keypoint_inputs(
-            path, ((p, labelled_birds(owner) if segmenter is None else segmenter(p)) for p, owner in shown)
-        )
-    store_activations(path, inputs, count * len(sources), progress)
+    store_activations(path, _training_inputs(which, path, sources, segmenter, count), count * len(sources), progress)
 
 
-def pictures_in_use(
-    frames: LabelledFrames, count: int, seed: int = 0
-) -> Iterator[tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"]]]:
-    """Return pictures at even distances and the bird of each pixel; every second picture has a random appearance.
-
-    Args:
-        frames: S labelled frames.
-        count: number of pictures; a frame is repeated if S is smaller.
-        seed: seed of the random appearance.
-    """
-    for i, s in enumerate(np.linspace(0, len(frames.pictures) - 1, count).round().astype(int).tolist()):
-        picture, owner = np.asarray(frames.pictures[s]), np.asarray(frames.owner[s])
-        if i % 2:
-            zoom = APPEARANCE_SIDE_PX / max(picture.shape[:2])
-            picture = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
-            owner = cv2.resize(owner, picture.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-            rng = np.random.default_rng((seed, i))
-            picture = randomise_appearance(rng, np.asarray(picture, np.uint8), np.asarray(owner) > 0)
-        yield picture, np.asarray(owner, np.uint8)
-
-
-def labelled_birds(owner: UInt8[np.ndarray, "H W"]) -> list[Instance]:
-    """Return the labelled birds of a picture as a segmenter would report the birds."""
-    birds = (instance_of(owner == n, 1.0, "bird") for n in np.unique(owner[owner > 0]))
-    return [bird for bird in birds if bird is not None]
-
-
-def segmenter_inputs(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "H W 3"]]) -> Iterator[np.ndarray]:
-    """Return the inputs (1, 3, h, w) of a bottom-up segmenter for whole frames.
-
-    Raises:
-        InputError: the file is no bottom-up segmenter.
-    """
-    segmenter = load_segmenter(path, kind="bottom_up")
-    assert isinstance(segmenter, BottomUp)
-    for picture in pictures:
-        yield segmenter.network_input(picture)[0]
-
-
-def keypoint_inputs(
-    path: str | Path, pictures: Iterable[tuple[UInt8[np.ndarray, "H W 3"], Sequence[Instance]]]
+def _training_inputs(
+    which: str, path: str | Path, sources: Sequence[LabelledFrames], segmenter: Segmenter | None, count: int
 ) -> Iterator[np.ndarray]:
-    """Return the inputs (N, 3, h, w) of a keypoint network for pictures and their birds.
-
-    Raises:
-        InputError: the file is no keypoint network.
-    """
-    detector = load_keypoint_detector(path)
-    for picture, birds in pictures:
-        if birds:
-            yield detector.network_input(picture, birds, range(len(birds)))[0]
+    """Yield the inputs of a network for some pictures: whole frames, or the crops of all birds of a frame."""
+    whole = load_segmenter(path, kind="bottom_up") if which == "segmenter" else None
+    detector = load_keypoint_detector(path) if which == "keypoints" else None
+    for frames in sources:
+        for i, s in enumerate(np.linspace(0, len(frames.pictures) - 1, count).round().astype(int).tolist()):
+            picture, owner = np.asarray(frames.pictures[s]), np.asarray(frames.owner[s])
+            if i % 2:
+                zoom = APPEARANCE_SIDE_PX / max(picture.shape[:2])
+                picture = np.asarray(cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA))
+                owner = np.asarray(cv2.resize(owner, picture.shape[1::-1], interpolation=cv2.INTER_NEAREST))
+                picture = randomise_appearance(np.random.default_rng((0, i)), picture, owner > 0)
+            if isinstance(whole, BottomUp):
+                yield whole.network_input(picture)[0]
+            elif detector is not None:
+                labelled = (instance_of(owner == n, 1.0, "bird") for n in np.unique(owner[owner > 0]))
+                birds = [bird for bird in labelled if bird] if segmenter is None else segmenter(picture)
+                if birds:
+                    yield detector.network_input(picture, birds, range(len(birds)))[0]

@@ -30,9 +30,7 @@ from jaxfit.foundation.array_files import load_npy
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.learning.networks.labels import (
-    CENTRE,
     LabelledPicture,
-    LabelSet,
     StoredPicture,
     mask_bird,
     numbered_by_film,
@@ -181,11 +179,6 @@ def open_teacher(name: str) -> Segmenter | None:
     if name == "auto":
         name = GENERAL if all(path.exists() for path in general_files()) else "none"
     return None if name == "none" else load_segmenter(name)
-
-
-def as_labels(taught: Taught) -> LabelSet:
-    """Return the labels of a teacher in the structure of the labels of a person."""
-    return LabelSet((CENTRE,), tuple(picture.labels for picture in taught.pictures))
 
 
 def track_labels(

@@ -14,7 +14,7 @@ torch = pytest.importorskip("torch", reason="needs the extra `train` (PyTorch)")
 
 from jaxfit.cli.main import main  # noqa: E402
 from jaxfit.foundation.errors import InputError  # noqa: E402
-from jaxfit.learning.networks import fine_tune, keypoints  # noqa: E402
+from jaxfit.learning.networks import fine_tune  # noqa: E402
 from jaxfit.learning.networks.fine_tune import keypoint_accuracy, segmenter_accuracy  # noqa: E402
 from jaxfit.learning.networks.label_data import LabelFiles, prepare_data  # noqa: E402
 from jaxfit.learning.networks.labelled_frames import UNKNOWN, load_frames  # noqa: E402
@@ -117,19 +117,13 @@ def test_the_command_says_which_networks_it_compares(tmp_path, monkeypatch, caps
 
 
 def test_simulated_keypoints_take_the_names_of_the_labels(data, tmp_path):
-    frames = load_frames(tmp_path / "training" / "frames")._replace(
-        keypoints_px=np.arange(6 * 2 * 20 * 2, dtype=np.float32).reshape(6, 2, 20, 2),
-        visibility=np.stack([np.full((6, 20), 2, np.uint8), np.zeros((6, 20), np.uint8)], 1),
-        keypoint_names=MURRE_KEYPOINTS,
-    )
-    mapped = frames.with_keypoints(["beak", "own", "eyeR"])
+    frames = load_frames(tmp_path / "training" / "frames")
+    points = np.arange(6 * 2 * 20 * 2, dtype=np.float32).reshape(6, 2, 20, 2)
+    visibility = np.stack([np.full((6, 20), 2, np.uint8), np.zeros((6, 20), np.uint8)], 1)
+    mapped = frames._replace(keypoints_px=points, visibility=visibility, keypoint_names=MURRE_KEYPOINTS)
+    mapped = mapped.with_keypoints(["beak", "own", "eyeR"])
     assert mapped.visibility[0].tolist() == [[2, UNKNOWN, 2], [0, 0, 0]]
-    assert np.array_equal(mapped.keypoints_px[:, :, 2], frames.keypoints_px[:, :, MURRE_KEYPOINTS.index("right_eye")])
-    sample = keypoints.draw_sample(
-        np.random.default_rng(0),
-        mapped._replace(owner=data.frames.owner)._replace(visibility=np.full((6, 2, 3), 2, np.uint8)),
-    )
-    assert sample.weight.shape == (3,)
+    assert np.array_equal(mapped.keypoints_px[:, :, 2], points[:, :, MURRE_KEYPOINTS.index("right_eye")])
 
 
 def test_accuracy_of_known_detections(data):
@@ -161,39 +155,37 @@ def test_accuracy_of_known_detections(data):
 
 
 def test_wrong_use_of_the_command(tmp_path, capsys):
-    out = str(tmp_path / "mine.onnx")
-    assert main(["train", "segmenter", "--images", str(tmp_path), "--out", out]) == 2
-    assert "--images: needs labels" in capsys.readouterr().err
     labels = str(write_labels(tmp_path / "labels", coco({0: [bird()]}), [0]))
-    command = ["train", "segmenter", "--labels", labels, "--scenes", "0", "--out", out]
-    for extra, message in (
-        ([], "has no bird"),
-        (["--holdout", "0.9"], "holdout"),
-        (["--base", labels], "cannot be loaded"),
-        (["--images", labels, labels], "names 2 videos or folders for 1 files"),
+    command = ["train", "segmenter", "--scenes", "0", "--out", str(tmp_path / "mine.onnx")]
+    for options, message in (
+        (["--images", str(tmp_path)], "--images: needs labels"),
+        (["--encoder", "e.pth"], "--encoder: is no option any more"),
+        (["--labels", labels], "has no bird"),
+        (["--labels", labels, "--base", labels], "cannot be loaded"),
+        (["--labels", labels, "--images", labels, labels], "names 2 videos or folders for 1 files"),
     ):
-        assert main([*command, *extra]) == 2
+        assert main([*command, *options]) == 2
         *_progress, error = capsys.readouterr().err.strip().split("\n")
         assert error.startswith("jaxfit: ")
         assert message in error
     assert sorted(path.name for path in tmp_path.iterdir()) == ["labels"]
 
 
-def test_wrong_numbers_are_rejected_before_the_imports(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.fine_tune", None)
-    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.training", None)
-    labels = ["--labels", "none.csv"]
-    for options, message in (
-        ([*labels, "--steps", "4"], "steps: is 4 (give 10 or more)"),
-        ([*labels, "--holdout", "0.9"], "holdout: is 0.9 (give a share of 0 to 0.5)"),
-        ([*labels, "--scenes", "-1"], "scenes: is -1 (give 0 to 900)"),
-        (["--steps", "19"], "steps: is 19 (give 20 or more)"),
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--labels", "none.csv", "--steps", "4"], "steps: is 4 (give 10 or more)"),
+        (["--labels", "none.csv", "--holdout", "0.9"], "holdout: is 0.9 (give a share of 0 to 0.5)"),
+        (["--labels", "none.csv", "--scenes", "-1"], "scenes: is -1 (give 0 to 900)"),
         (["--scenes", "0"], "scenes: is 0 (give 1 to 900)"),
         (["--seed", "-1"], "seed: is -1 (give a whole number from 0)"),
-        (["--wings", "2"], "wings: is 2.0 (give a share of 0 to 1)"),
-    ):
-        assert main(["train", "keypoints", *options, "--out", str(tmp_path / "mine.onnx")]) == 2
-        assert capsys.readouterr().err == f"jaxfit: train: {message}\n"
+    ],
+)
+def test_wrong_numbers_are_rejected_before_the_imports(tmp_path, capsys, monkeypatch, options, message):
+    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.fine_tune", None)
+    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.training", None)
+    assert main(["train", "keypoints", *options, "--out", str(tmp_path / "mine.onnx")]) == 2
+    assert capsys.readouterr().err == f"jaxfit: train: {message}\n"
 
 
 def test_pictures_are_read_before_scenes_are_filmed(tmp_path, monkeypatch, caplog):

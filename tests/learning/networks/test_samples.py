@@ -10,7 +10,6 @@ from torch import nn  # noqa: E402
 from jaxfit.learning.networks import keypoints, segmenter  # noqa: E402
 from jaxfit.learning.networks.augment import randomise_appearance  # noqa: E402
 from jaxfit.learning.networks.labelled_frames import SPREAD_UNITS, LabelledFrames, birds_with_spread_wings  # noqa: E402
-from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages  # noqa: E402
 from jaxfit.model.anatomy import MURRE_KEYPOINTS  # noqa: E402
 
 K = len(MURRE_KEYPOINTS)
@@ -140,12 +139,6 @@ def test_peaks_are_probabilities():
     assert maps[1, 3, 3] == pytest.approx(0.5, abs=1e-3)
     assert maps[2].max() < 1e-3
     assert maps[0].argmax() == 5 * 12 + 7
-
-
-def test_pyramid_strides():
-    network = FeaturePyramid(residual_stages((4, 8, 12), (0, 1, 1)), (4, 8, 12), (8, 6), {"a": 2, "b": 1}).eval()
-    maps = network(torch.zeros(1, 3, 32, 48))
-    assert {name: tuple(map_.shape) for name, map_ in maps.items()} == {"a": (1, 2, 16, 24), "b": (1, 1, 16, 24)}
 
 
 def test_the_encoder_of_the_segmenter_learns_slowly_and_its_first_stages_not_at_all():

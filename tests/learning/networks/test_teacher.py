@@ -1,7 +1,5 @@
 """Labels by a teacher: tracked masks and unknown pixels of a toy film, doubtful teachers and labels."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from support.cli_files import rejected
 from jaxfit.data.masks import decode_mask
 from jaxfit.foundation.errors import InputError
 from jaxfit.learning.networks import fine_tune, teacher
-from jaxfit.learning.networks.label_data import LabelFiles, prepare_data, prepare_frames
+from jaxfit.learning.networks.label_data import LabelFiles, Scale, prepare_data, prepare_frames
 from jaxfit.learning.networks.labelled_frames import UNKNOWN_OWNER
 from jaxfit.learning.networks.labels import LabelledPicture, StoredPicture, mask_bird
 from jaxfit.learning.networks.segmenter import _targets
@@ -146,19 +144,15 @@ def test_only_frames_near_the_labels_are_read(film, tmp_path, monkeypatch):
 def test_unknown_pixels_do_not_count(film, tmp_path):
     hidden = np.roll(true_mask(3), 40, axis=1)
     picture = read_film(film, [3], tmp_path).stored(3, [true_mask(3)], hidden)
-    frames = prepare_frames(tmp_path / "frames", [picture], ("centre",), scale(), "segmenter")
+    frames = prepare_frames(
+        tmp_path / "frames", [picture], ("centre",), Scale(SIDE, 160, CropSettings(2, 2)), "segmenter"
+    )
     assert np.array_equal(np.asarray(frames.owner[0]) == UNKNOWN_OWNER, hidden)
     _, weight, centre, _, offset_weight = _targets(np.pad(frames.owner[0], ((0, 200), (0, 160))))
     assert (weight[0][np.pad(hidden, ((0, 200), (0, 160)))[::2, ::2]] == 0).all()
     assert weight.astype(bool).sum() == weight.size - hidden[::2, ::2].sum()
     assert (offset_weight > 0).sum() == true_mask(3)[::2, ::2].sum()
     assert np.unravel_index(centre[0].argmax(), centre[0].shape) == pytest.approx((55 / 2, 31 / 2), abs=1)
-
-
-def scale():
-    from jaxfit.learning.networks.label_data import Scale
-
-    return Scale(SIDE, 160, CropSettings(2, 2))
 
 
 def test_training_data_with_tracked_frames(film, tmp_path):
@@ -173,13 +167,10 @@ def test_training_data_with_tracked_frames(film, tmp_path):
     assert held == [16, 18]
     frames = {picture.labels.frame for picture in data.tracked}
     assert frames == {*range(1, 20, 2), *range(19, FRAMES)}
-    assert len(data.tracked_holdout) == 4
-    assert len(data.frames.pictures) == len(data.split.training) + len(frames - {17}) - 4 + (17 in _held(data))
+    tracked_holdout = {picture.labels.frame for picture in data.tracked_holdout}
+    assert len(tracked_holdout) == 4
+    assert len(data.frames.pictures) == len(data.split.training) + len(frames - {17} - tracked_holdout)
     assert "confirms: 10; other frames with tracked masks: 20" in data.teacher
-
-
-def _held(data):
-    return {picture.labels.frame for picture in data.tracked_holdout}
 
 
 def test_open_teacher(monkeypatch, tmp_path):
@@ -198,12 +189,6 @@ def test_doubt(confirmed, iou, reasons):
     doubt = fine_tune._doubt(teacher.Taught([], confirmed, 24), result)
     assert len(doubt.split("; ")) == reasons
     assert doubt.startswith("no label of a person")
-
-
-def test_paths_are_of_the_film(film, tmp_path):
-    picture = read_film(film, [3], tmp_path).stored(3, [true_mask(3)], np.zeros_like(true_mask(3)))
-    assert picture.labels.source == Path(film)
-    assert picture.labels.unknown is None
 
 
 @pytest.mark.parametrize(

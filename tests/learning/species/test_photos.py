@@ -7,6 +7,7 @@ import pytest
 
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import write_coco
+from jaxfit.data.observations import Observations
 from jaxfit.foundation.array_files import load_npz
 from jaxfit.learning.species.models import compare_birds
 from jaxfit.learning.species.photo_fit import PhotoSettings, fit_photographs
@@ -79,12 +80,16 @@ def test_the_command_writes_a_model_with_provenance_and_keeps_fixed_parts(photog
     write_coco(observations.select(tracks=np.arange(1, 6)), tmp_path / "birds.json")
     arguments = ["adapt", "photos", str(tmp_path / "birds.json"), "--out", str(tmp_path / "m.npz")]
     assert main([*arguments, "--fix", "shape,offset"]) == 0
-    assert "1 of 5 images have no mask" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "1 of 5 images have no mask" in printed
+    assert "5 images of 5 individuals" in printed
+    assert "prior ± %" in printed
     model = load_bird(tmp_path / "m.npz")
     assert np.array_equal(model.vertices, bird.vertices)
     assert not np.array_equal(model.bone_mean, bird.bone_mean)
     lines = list(load_npz(tmp_path / "m.npz", {"provenance": "lines"})["provenance"])
-    assert {"free: bones", "images: 5", "individuals: 5", "images_with_mask: 4"} <= set(lines)
+    assert {"free: bones", "images: 5", "individuals: 5", "images_with_mask: 4", "frames_per_track: 10"} <= set(lines)
+    assert any(line.startswith("bones_not_determined: ") for line in lines)
 
 
 @pytest.mark.parametrize(("fixed", "says"), [("feathers", "not a part"), ("bones,shape,offset", "nothing is left")])
@@ -93,32 +98,26 @@ def test_wrong_parts_are_one_line_errors(tmp_path, capsys, fixed, says):
     assert says in capsys.readouterr().err
 
 
-def as_one_track(observations, frames):
-    """Return observations of a track whose frames all show the second photograph, without its mask."""
-    observations = observations.select(tracks=np.array([1]))
-    return replace(
-        observations,
-        frame_index=np.arange(frames),
-        present=np.ones((1, frames), bool),
-        keypoints_px=np.repeat(observations.keypoints_px, frames, axis=1),
-        confidence=np.repeat(observations.confidence, frames, axis=1),
-        occluded=None,
-        score=None,
-        timestamp_s=None,
-        box_px=np.repeat(observations.box_px, frames, axis=1),
-        image_size_px=np.full((frames, 2), 256),
-        file_name=np.array([str(t) for t in range(frames)]),
-        own_images={},
-        masks={},
-    )
-
-
 @pytest.mark.parametrize(("most", "used"), [(FRAMES_PER_TRACK, 10), (2, 2), (25, 25), (104, 25)])
-def test_a_track_gives_few_frames(photographs, most, used):
-    long = as_one_track(photographs[2], 25)
-    chosen = np.flatnonzero(_few_frames(long, 4, most).usable(4)[0])
+def test_a_track_gives_few_frames(most, used):
+    chosen = np.flatnonzero(_few_frames(labelled_track(25), 1, most).usable(1)[0])
     assert len(chosen) == used
     assert chosen[[0, -1]].tolist() == [0, 24]
+
+
+def labelled_track(frames):
+    """Return observations of one bird with one keypoint."""
+    return Observations(
+        track_id=np.zeros(1, int),
+        frame_index=np.arange(frames),
+        present=np.ones((1, frames), bool),
+        keypoints_px=np.full((1, frames, 1, 2), 5, np.float32),
+        confidence=np.ones((1, frames, 1), np.float32),
+        box_px=np.full((1, frames, 4), 9, np.float32),
+        image_size_px=np.full((frames, 2), 256),
+        file_name=np.array([str(t) for t in range(frames)]),
+        keypoint_names=("centre",),
+    )
 
 
 def test_remarks_say_how_many_images_are_used_and_why():
@@ -128,24 +127,6 @@ def test_remarks_say_how_many_images_are_used_and_why():
     assert track.startswith("a.json: 10 of 104 images are used: at most 10 of each track, at equal distances")
     assert "--frames-per-track" in track
     assert failed == "a.json: 2 of 10 images are not used: the fit of their keypoints failed"
-
-
-@pytest.mark.extended
-def test_the_command_says_how_many_frames_of_a_track_it_uses_and_which_bones_they_do_not_determine(
-    photographs, tmp_path, capsys
-):
-    write_coco(as_one_track(photographs[2], 25), tmp_path / "birds.json")
-    arguments = ["adapt", "photos", str(tmp_path / "birds.json"), "--out", str(tmp_path / "m.npz")]
-    assert main([*arguments, "--frames-per-track", "3", "--fix", "shape,offset"]) == 0
-    printed = capsys.readouterr().out
-    assert "birds.json: 3 of 25 images are used: at most 3 of each track" in printed
-    assert "3 images of 1 individual" in printed
-    assert "prior ± %" in printed
-    warning = next(line for line in printed.splitlines() if "do not determine the length of" in line)
-    assert "neck" in warning
-    lines = list(load_npz(tmp_path / "m.npz", {"provenance": "lines"})["provenance"])
-    assert {"images: 3", "frames_per_track: 3"} <= set(lines)
-    assert any(line.startswith("bones_not_determined: ") and "neck" in line for line in lines)
 
 
 def test_a_number_of_frames_below_1_is_an_error(tmp_path, capsys):
