@@ -23,7 +23,8 @@ from mkdocs.structure.files import File
 from pymdownx.slugs import slugify
 
 from jaxfit.behaviour.rules import BehaviourConfig
-from jaxfit.cli.parser import build_parser
+from jaxfit.cli.arguments import Parser
+from jaxfit.cli.parser import COMMANDS
 from jaxfit.config.build import field_help
 from jaxfit.config.fit import FitConfig
 from jaxfit.config.reconstruct import ReconstructConfig
@@ -86,22 +87,14 @@ def _cell(text: object) -> str:
     return "`".join(parts)
 
 
-def leaf_commands(parser: argparse.ArgumentParser, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any, str]]:
-    """Return the commands of a parser that run something: the name, the parser and the help of each."""
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            helps = {choice.dest: choice.help for choice in action._choices_actions}
-            for name, command in action.choices.items():
-                inner = list(leaf_commands(command, (*path, name)))
-                yield from inner or [(" ".join((*path, name)), command, str(helps[name]))]
-
-
 def commands() -> str:
-    """Return a section for every command, with its usage and all its arguments."""
+    """Return a section for every command, with all its arguments."""
     lines = []
-    for name, parser, _ in leaf_commands(build_parser()):
+    for name, command in (item for group in COMMANDS.values() for item in group.items()):
+        parser = Parser(prog=f"jaxfit {name}")
+        command.declare(parser)
         formatter = parser._get_formatter()
-        lines += [f"## jaxfit {name}", "", str(parser.description), "", "| argument | meaning |", "| --- | --- |"]
+        lines += [f"## jaxfit {name}", "", command.text, "", "| argument | meaning |", "| --- | --- |"]
         for action in parser._actions:
             if action.help is argparse.SUPPRESS or action.dest == "help":
                 continue

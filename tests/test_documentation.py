@@ -12,6 +12,7 @@ import pytest
 
 import jaxfit
 from jaxfit.cli.main import main
+from jaxfit.cli.parser import COMMANDS
 from jaxfit.objective import registry
 from jaxfit.objective.residuals import residual_sum
 
@@ -106,13 +107,9 @@ def test_configs_are_valid(tmp_path):
         load(tmp_path / "mine.yaml")
 
 
-def test_every_command_stands_in_a_document(capsys):
-    with pytest.raises(SystemExit):
-        main(["--help"])
-    known = re.findall(r"^    (\w+) ", capsys.readouterr().out, re.MULTILINE)
-    assert len(known) > 5
+def test_every_command_stands_in_a_document():
     text = "".join(path.read_text(encoding="utf-8") for path in DOCUMENTS)
-    assert not [name for name in known if f"jaxfit {name}" not in text]
+    assert not [name for group in COMMANDS.values() for name in group if f"jaxfit {name}" not in text]
 
 
 def test_the_readme_is_short():

@@ -48,7 +48,7 @@ def arguments(parser, path=("jaxfit",)):
     """Return command → its arguments, of a parser and of all parsers in it."""
     inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     if not inner:
-        return {" ".join(path): [action for action in parser._actions if action.dest != "help"]}
+        return {" ".join(path): [action for action in parser.declared()._actions if action.dest != "help"]}
     return {
         name: actions
         for choice, command in inner[0].choices.items()

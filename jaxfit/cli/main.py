@@ -62,6 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
         arguments: the command's arguments; None takes the arguments of the process.
     """
+    if (sys.argv[1:] if arguments is None else arguments)[:1] == ["bench"]:
+        return _rejected(InputError("bench", "was removed", "in a checkout of jaxfit, `make bench` measures the speed"))
     options = build_parser().parse_args(arguments)
     _prepare_logging(options.verbose)
     try:
