@@ -13,11 +13,12 @@ from scipy.stats import bootstrap
 
 from jaxfit.behaviour.describe import Description, circular_mean
 from jaxfit.behaviour.rules import OTHER, BehaviourConfig, BehaviourRule, Range
-from jaxfit.view.report.behaviour import NO_POSE
 
 LEVEL, RESAMPLES = 0.95, 2000
 """Level of the intervals of time budgets, and number of resamples of the bootstrap."""
 _EPSILON_S = 1e-6
+NO_POSE = -1
+"""State of a bird without a pose."""
 
 
 class Bout(NamedTuple):

@@ -1,16 +1,20 @@
-"""`behaviour_of`: features, bouts and time budgets as the report shows them."""
+"""What birds do over time, for people: the section of the report, and the ethogram alone as a drawing."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxfit.behaviour.bouts import Budget, Ethogram
+from jaxfit.behaviour.bouts import NO_POSE, Budget, Ethogram
 from jaxfit.behaviour.describe import Description, by_reason
 from jaxfit.behaviour.rules import OTHER, BehaviourConfig
-from jaxfit.view.report.behaviour import Behaviour, Kind, ShownBout, ShownBudget
-from jaxfit.view.report.curves import Curve
+from jaxfit.view.report.axis import Axis, clock
+from jaxfit.view.report.curves import Curve, plot_of
+from jaxfit.view.report.rendering import rendered
 
 CURVES = {
     "body_pitch": "Body pitch",
@@ -26,85 +30,197 @@ RULES_NOTE = (
     "simulated murres. Look at bouts in the film before you use them."
 )
 """What every page says about the behaviours."""
-OTHER_DEFINITION = "The bird has a pose, and no rule holds."
+MEANINGS = {
+    "Ethogram": "Which bird shows which behaviour when. A frame has one behaviour: the first whose rule holds.",
+    "Bout": "A behaviour of one bird from its start to its stop, without interruption.",
+    "Time budget": "Time of a behaviour ÷ time with a pose. The 95 % interval is that of the bootstrap over birds. "
+    "Few birds give an interval that is too narrow, and one bird gives none.",
+}
+"""Definitions of the words of the section."""
 
 
-def behaviour_of(
-    description: Description,
-    ethogram: Ethogram,
-    budget: Sequence[Budget],
-    config: BehaviourConfig,
-    notes: Sequence[str] | None = None,
-) -> Behaviour:
-    """Return what the birds of a result do, for `jaxfit.view.report`.
+class Kind(NamedTuple):
+    """One behaviour."""
+
+    name: str
+    """As people read it."""
+    definition: str
+    """A sentence."""
+    colour: int | None
+    """Position in `BEHAVIOUR_COLOURS`; None for a bird that shows no behaviour of the config."""
+
+
+class Mark(NamedTuple):
+    """One run of columns of a row of the ethogram."""
+
+    start: int
+    stop: int
+    kind: int
+    """Position in `BehaviourPage.kinds`."""
+    title: str
+    """The tooltip."""
+    href: str | None
+    """Address of the film at the start of the bout."""
+
+
+class BehaviourPage:
+    """What N birds do in T frames, as a report shows it (`jaxfit.view.report.page.Behaviour`).
 
     Args:
         description: features of all birds and all frames of the result.
         ethogram: the bouts of the same birds.
         budget: the time budgets of the ethogram.
         config: the rules of the ethogram.
-        notes: sentences about what is estimated or unknown; None: those of the birds (`Flock.notes`).
+        notes: sentences about what is estimated or unknown.
     """
-    solution, names = description.flock.solution, list(ethogram.names)
-    order = {name: n for n, name in enumerate(config.behaviours)}
-    kinds = [
-        Kind("other", OTHER_DEFINITION, None)
-        if name == OTHER
-        else Kind(name.replace("_", " "), config.behaviours[name].definition, order[name])
-        for name in names
-    ]
-    bouts = [
-        ShownBout(each.bird, names.index(each.behaviour), each.frames, each.start_s, each.stop_s, each.partner)
-        for each in ethogram.bouts
-    ]
-    return Behaviour(
-        track_id=solution.track_id,
-        frames=solution.frame_index,
-        times_s=ethogram.time_s,
-        kinds=kinds,
-        state=ethogram.state,
-        bouts=bouts,
-        curves=_curves(description),
-        budget=_budget(names, budget, solution.track_id),
-        notes=_notes(description, ethogram, description.flock.notes if notes is None else notes),
-    )
 
+    def __init__(
+        self,
+        description: Description,
+        ethogram: Ethogram,
+        budget: Sequence[Budget],
+        config: BehaviourConfig,
+        notes: Sequence[str] = (),
+    ):
+        self.ethogram, self.budget = ethogram, budget
+        self.track_id, self.frames = description.flock.solution.track_id, description.flock.solution.frame_index
+        self.axis = Axis(self.frames, ethogram.time_s)
+        colours = {name: i for i, name in enumerate(config.behaviours)}
+        self.kinds = [
+            Kind("other", "The bird has a pose, and no rule holds.", None)
+            if name == OTHER
+            else Kind(name.replace("_", " "), config.behaviours[name].definition, colours[name])
+            for name in ethogram.names
+        ]
+        """In the order of `ethogram.names`: the most important behaviour first, the absence of a behaviour last."""
+        features = {feature.name: feature for feature in description.features}
+        self.curves = [
+            Curve(
+                title,
+                UNITS.get(name) or features[name].shown_unit(description.flock.unit),
+                description.values[name],
+                features[name].definition,
+            )
+            for name, title in CURVES.items()
+            if name in features
+        ]
+        self.notes = [
+            RULES_NOTE,
+            *(f"{note[:1].upper()}{note[1:]}{'' if note.endswith('.') else '.'}" for note in notes),
+        ]
+        lacking = {CURVES[name].lower(): reason for name, reason in description.missing.items() if name in CURVES}
+        self.notes += [f"No curve of {_listed(names)}: {reason}." for reason, names in by_reason(lacking).items()]
+        lacking = {name.replace("_", " "): reason for name, reason in ethogram.missing.items()}
+        for reason, names in by_reason(lacking).items():
+            self.notes.append(f"The result cannot show {_listed(names)}: {reason}.")
 
-def _curves(description: Description) -> list[Curve]:
-    by_name = {each.name: each for each in description.features}
-    curves = []
-    for name, title in CURVES.items():
-        if name in by_name:
-            unit = UNITS.get(name) or by_name[name].shown_unit(description.flock.unit)
-            curves.append(Curve(title, unit, description.values[name], by_name[name].definition))
-    return curves
+    @property
+    def shown(self) -> list[int]:
+        """Positions of the kinds that occur."""
+        return [kind for kind in range(len(self.kinds)) if (self.ethogram.state == kind).any()]
 
+    @property
+    def meanings(self) -> list[tuple[str, str]]:
+        """Words of the section and their definitions."""
+        kinds = [(kind.name[:1].upper() + kind.name[1:], kind.definition) for kind in self.kinds]
+        return [*MEANINGS.items(), *kinds, *((curve.title, curve.definition) for curve in self.curves)]
 
-def _budget(names: Sequence[str], budget: Sequence[Budget], track_id: np.ndarray) -> list[ShownBudget]:
-    shares = {(row.track, row.behaviour): row.share for row in budget}
-    rows = []
-    for row in budget:
-        if row.track is None:
-            of_birds = np.array([shares[track, row.behaviour] for track in track_id.tolist()])
-            kind = names.index(row.behaviour)
-            rows.append(ShownBudget(kind, row.seconds, row.bouts, row.share, row.low, row.high, of_birds))
-    return rows
+    def section(self, order: Sequence[int], film: str | None) -> str:
+        """Return the section of the report, HTML.
 
+        Args:
+            order: positions of the birds, in the order of the rows.
+            film: address of the film, relative to the page; None draws bouts without links.
+        """
+        kind_of = {name: kind for kind, name in enumerate(self.ethogram.names)}
+        of_all = [(kind_of[row.behaviour], row) for row in self.budget if row.track is None]
+        shares: dict[int, list[tuple[int, float]]] = {track: [] for track in self.track_id.tolist()}
+        for row in self.budget:
+            if row.track is not None and row.share > 0:
+                shares[row.track].append((kind_of[row.behaviour], row.share))
+        return rendered(
+            "behaviour.html",
+            behaviour=self,
+            axis=self.axis,
+            rows=[(n, self.marks(n, film)) for n in order],
+            plots=[(curve, plot_of(curve, self.axis, self.track_id, order)) for curve in self.curves],
+            ethogram_notes=self.reading_notes(film),
+            budget=of_all,
+            absent=[self.kinds[kind].name for kind, row in of_all if not row.share > 0],
+            shares=shares,
+        )
 
-def _notes(description: Description, ethogram: Ethogram, notes: Sequence[str]) -> list[str]:
-    """Return sentences about what is estimated, what is simulated, and what the result cannot show."""
-    absent = {title.lower(): description.missing[name] for name, title in CURVES.items() if name in description.missing}
-    lacking = {name.replace("_", " "): reason for name, reason in ethogram.missing.items()}
-    sentences = [RULES_NOTE, *map(_sentence, notes)]
-    sentences += [f"No curve of {_listed(names)}: {reason}." for reason, names in by_reason(absent).items()]
-    for reason, names in by_reason(lacking).items():
-        sentences.append(f"The result cannot show {_listed(names)}: {reason}.")
-    return sentences
+    def marks(self, bird: int, film: str | None) -> list[Mark]:
+        """Return the runs of columns of a bird. A column with several behaviours has the most important behaviour.
+
+        A column that no bout fills, but in which the bird has a pose, shows its state without a colour.
+
+        Args:
+            bird: position of the bird.
+            film: address of the film; None makes no links.
+        """
+        at = self.axis.at // self.axis.per_column
+        kind_of = {name: i for i, name in enumerate(self.ethogram.names)}
+        bouts = [bout for bout in self.ethogram.bouts if bout.bird == bird]
+        bouts.sort(key=lambda bout: (-kind_of[bout.behaviour], bout.frames.stop - bout.frames.start))
+        owner = np.full(self.axis.columns, -2)
+        owner[at[self.ethogram.state[bird] != NO_POSE]] = -1
+        for i, bout in enumerate(bouts):
+            owner[at[bout.frames.start] : at[bout.frames.stop - 1] + 1] = i
+        track, marks = f"track {self.track_id[bird]}", []
+        for a, b in pairwise([0, *(np.flatnonzero(np.diff(owner)) + 1).tolist(), self.axis.columns]):
+            if owner[a] == -1:
+                marks.append(Mark(a, b, len(self.kinds) - 1, f"{track}: {self.kinds[-1].name}", None))
+            elif owner[a] >= 0:
+                bout = bouts[owner[a]]
+                kind = kind_of[bout.behaviour]
+                first, last = self.frames[bout.frames.start], self.frames[bout.frames.stop - 1]
+                times = f"{clock(bout.start_s)} to {clock(bout.stop_s)} ({clock(bout.stop_s - bout.start_s)})"
+                title = f"{track}: {self.kinds[kind].name}, {times}, frames {first:,} to {last:,}"
+                title += "" if bout.partner is None else f", with track {bout.partner}"
+                href = None if film is None else f"{film}#t={max(bout.start_s, 0):.2f}"
+                marks.append(Mark(a, b, kind, title, href))
+        return marks
+
+    def reading_notes(self, film: str | None) -> list[str]:
+        """Return sentences about how to read the ethogram."""
+        notes = [] if film is None else ["A click on a bout opens the film at its start."]
+        if self.axis.per_column > 1:
+            notes.append(
+                f"One column shows {self.axis.per_column} frames. A column with several behaviours shows the behaviour "
+                "that stands first in the legend, so short bouts look longer than they are."
+            )
+        return [*notes, "White: no pose."]
+
+    def svg(self, title: str = "Ethogram", film: str | None = None) -> str:
+        """Return the ethogram as a file of its own: title, legend, axis, one row for each bird, and notes.
+
+        Args:
+            title: the heading.
+            film: address of the film, relative to the file; None draws bouts without links.
+        """
+        width, edge, letter = 1000, 16, 6.4  # of the drawing, its margin, and a letter on average, pixels
+        legend, x, y = [], float(edge), 42
+        for i in self.shown:
+            wide = 44 + letter * len(self.kinds[i].name)
+            if x + wide > width and x > edge:
+                x, y = float(edge), y + 20
+            legend.append((i, x, y))
+            x += wide
+        return rendered(
+            "ethogram.svg",
+            behaviour=self,
+            axis=self.axis,
+            title=title,
+            legend=legend,
+            rows=[(n, self.marks(n, film)) for n in range(len(self.track_id))],
+            notes=[line for note in [*self.notes, *self.reading_notes(film)] for line in textwrap.wrap(note, 150)],
+            top=y + 52,
+            width=width,
+            edge=edge,
+            letter=letter,
+        )
 
 
 def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}"

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from jaxfit.behaviour.birds import flock_of, times_known
 from jaxfit.behaviour.bouts import Budget, Ethogram, find_bouts, time_budget
 from jaxfit.behaviour.describe import Description, describe
-from jaxfit.behaviour.page import behaviour_of
+from jaxfit.behaviour.page import BehaviourPage
 from jaxfit.behaviour.registry import Feature
 from jaxfit.behaviour.rules import BehaviourConfig, load_behaviour_config
 from jaxfit.behaviour.tables import boris_project, bout_columns, budget_columns, check_features_path, features_file
@@ -28,7 +28,6 @@ from jaxfit.foundation.extras import require_package
 from jaxfit.foundation.files import check_new_file, check_writable, write_errors, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.bird import Bird
-from jaxfit.view.report.behaviour import Behaviour, ethogram_svg
 
 UNEVEN = 0.2
 """Share by which the time between frames varies, from which the frame rate is called variable."""
@@ -46,11 +45,11 @@ class Described(NamedTuple):
     """Sentences about what is estimated, unknown or undecidable, for people."""
 
     @property
-    def shown(self) -> Behaviour | None:
+    def shown(self) -> BehaviourPage | None:
         """What a report shows; None without an ethogram."""
         if self.ethogram is None:
             return None
-        return behaviour_of(self.description, self.ethogram, self.budget, self.config, self.notes)
+        return BehaviourPage(self.description, self.ethogram, self.budget, self.config, self.notes)
 
     def select(self, rows: Int[np.ndarray, "M"], columns: Int[np.ndarray, "L"]) -> Described:
         """Return what M of the birds do in L of the frames.
@@ -151,12 +150,12 @@ def describe_result(
     return described._replace(notes=(*_notes_of_quality(folder, solution), *described.notes))
 
 
-def shown_behaviour(solution: Solution, bird: Bird, progress: ProgressTask = silent) -> Behaviour | None:
+def shown_behaviour(solution: Solution, bird: Bird, progress: ProgressTask = silent) -> BehaviourPage | None:
     """Return what the birds of a solution do, for its report; None without poses or times."""
     return describe_solution(solution, bird, progress=progress).shown if solution.valid.any() else None
 
 
-def behaviour_of_result(folder: Path, progress: ProgressTask = silent) -> Behaviour | None:
+def behaviour_of_result(folder: Path, progress: ProgressTask = silent) -> BehaviourPage | None:
     """Return what the birds of a result folder do, for its report; None without poses, times or moving birds.
 
     Raises:
@@ -231,7 +230,7 @@ def write_described(
         bouts = bout_columns(exported, description, ethogram, described.config)
         files[paths["bouts"]] = lambda: csv_table(bouts, {})
         files[paths["budget"]] = lambda: csv_table(budget_columns(described.budget), {})
-        files[paths["ethogram"]] = lambda: ethogram_svg(shown, f"Birds of {exported.source.name}").encode()
+        files[paths["ethogram"]] = lambda: shown.svg(f"Birds of {exported.source.name}").encode()
         files[paths["boris"]] = lambda: boris_project(exported, ethogram, described.config)
     with progress("Writing tables", len(files)) as report_progress:
         for path, content in files.items():

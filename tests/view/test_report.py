@@ -17,8 +17,8 @@ from support import overlays
 from support.cli_files import rejected
 from support.exported import BIRD, FRAMES, TRACKS, error_bars, solution, write_result
 
-from jaxfit.behaviour.bouts import OTHER, Bout, Ethogram, time_budget
-from jaxfit.behaviour.page import behaviour_of
+from jaxfit.behaviour.bouts import OTHER, Bout, Budget, Ethogram, time_budget
+from jaxfit.behaviour.page import BehaviourPage, Kind
 from jaxfit.behaviour.registry import own_features
 from jaxfit.behaviour.rules import load_behaviour_config
 from jaxfit.cli.main import main
@@ -26,16 +26,15 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import rest_length
-from jaxfit.view.report.behaviour import Behaviour, Kind, ShownBout, ShownBudget, ethogram_svg
 from jaxfit.view.report.contents import gather, next_steps, warnings_of
-from jaxfit.view.report.curves import Curve, line_path, scale_of
+from jaxfit.view.report.curves import line_path, scale_of
 from jaxfit.view.report.page import Measured, page, spread_frames
 from jaxfit.view.report.timeline import timeline_of
 from jaxfit.view.report.write import film_address, report_of_result
 
 FILM = "b<script>alert(1)</script>\n&.mp4"
 BOW = '<b>bow</b> & "x"'
-KINDS = (Kind(BOW, "It <i>bows</i>.", 0), Kind("standing", "It stands.", 1), Kind("other", "No rule holds.", None))
+NAMES = (BOW, "standing", OTHER)
 SVG = "{http://www.w3.org/2000/svg}"
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -162,7 +161,7 @@ def test_pictures_show_the_footage_with_the_birds_and_bouts_lead_to_it(drawn):
         assert np.abs(picture[: overlays.HEIGHT].astype(int) - overlays.GREY).max() > 60  # birds on grey footage
     assert {"frame 5, 1 bird", "frame 4, 2 birds"} <= {image.get("alt") for image in images}
     addresses = [each.get("href") for each in root.iter("a")]
-    assert [address.partition("#t=")[0] for address in addresses] == ["../film.mp4"] * len(behaviour.bouts)
+    assert [address.partition("#t=")[0] for address in addresses] == ["../film.mp4"] * len(behaviour.ethogram.bouts)
 
 
 def test_frames_with_many_poses_are_chosen():
@@ -296,20 +295,29 @@ def test_a_browser_draws_the_page(drawn, tmp_path, width):
     assert footage > 0.05
 
 
-def behaviour_in(track_id, frames, state, **changes):
-    """Return a behaviour with the bouts of its states, at 10 frames a second."""
-    state = np.asarray(state)
+def behaviour_in(track_id, frames, state, notes=(), **values):
+    """Return a behaviour with the bouts of its states, at 10 frames a second; `values` are those of features."""
+    state, track_id = np.asarray(state), np.asarray(track_id)
     times_s, bouts = np.asarray(frames) / 10, []
     for bird, row in enumerate(state):
         edges = [0, *(np.flatnonzero(np.diff(row)) + 1), len(row)]
         for a, b in itertools.pairwise(edges):
             if row[a] in (0, 1):
-                bouts.append(ShownBout(bird, int(row[a]), slice(a, b), times_s[a], times_s[b - 1] + 0.1, 8))
+                bouts.append(Bout(bird, NAMES[row[a]], slice(a, b), times_s[a], times_s[b - 1] + 0.1, 8, {}))
+    ethogram = Ethogram(NAMES, state, tuple(bouts), times_s, np.full(len(times_s), 0.1), {})
     posed = (state >= 0).sum(1)
-    with np.errstate(invalid="ignore"):
-        budget = [ShownBudget(k, 1.0, 1, 0.4, 0.2, 0.7, (state == k).sum(1) / posed) for k in range(3)]
-    made = Behaviour(np.asarray(track_id), np.asarray(frames), times_s, KINDS, state, bouts, (), budget, ())
-    return made._replace(**changes)
+    budget = [Budget(None, name, 1.0, 0.4, 1, 0.2, 0.7) for name in NAMES]
+    for n in np.flatnonzero(posed):
+        shares = [(state[n] == k).sum() / posed[n] for k in range(3)]
+        budget += [Budget(track_id[n], name, 1.0, share, 1, 0, 0) for name, share in zip(NAMES, shares, strict=True)]
+    rules = {BOW: SimpleNamespace(definition="It <i>bows</i>."), "standing": SimpleNamespace(definition="It stands.")}
+    features = [
+        SimpleNamespace(name=name, definition="Pitch <of> the body.", shown_unit=lambda unit: "°") for name in values
+    ]
+    solution = SimpleNamespace(track_id=track_id, frame_index=np.asarray(frames))
+    flock = SimpleNamespace(solution=solution, unit="m")
+    description = SimpleNamespace(flock=flock, features=features, values=values, missing={})
+    return BehaviourPage(description, ethogram, budget, SimpleNamespace(behaviours=rules), notes)
 
 
 @pytest.fixture(scope="module")
@@ -317,8 +325,7 @@ def behaviour(report):
     """Three birds in frames 10, 12, 14, 18, 20: one bows and stands, one shows nothing, one has no pose."""
     state = [[0, 0, 1, 1, 1], [2, 2, -1, 2, 2], [-1] * 5]
     values = np.where(np.array(state) < 0, np.nan, np.linspace(0, 40, 5))
-    curve = Curve("Body pitch", "°", values, "Pitch <of> the body.")
-    return behaviour_in(TRACKS, report.frames, state, curves=(curve,), notes=("The vertical is <estimated>.",))
+    return behaviour_in(TRACKS, report.frames, state, notes=("The vertical is <estimated>.",), body_pitch=values)
 
 
 @pytest.fixture(scope="module")
@@ -347,7 +354,7 @@ def test_bouts_have_tooltips_and_lead_to_the_film(behaving):
 
 
 def test_words_of_the_behaviour_are_text(behaving):
-    assert with_class(section(behaving, "Behaviour"), "notes")[0].findtext("li") == "The vertical is <estimated>."
+    assert with_class(behaving, "notes")[0].findall("li")[1].text == "The vertical is <estimated>."
     words = text_of(section(behaving, "What the words mean"))
     for word in ("Ethogram", "Bout", "Time budget", f"{BOW}It <i>bows</i>.", "Pitch <of> the body."):
         assert word in words
@@ -362,7 +369,7 @@ def test_pages_without_behaviour_have_no_section(report, behaviour, folder, made
     ):
         assert section(parsed(page(other, [], behaviour=behaviour)), "Behaviour") is None
     with pytest.raises(ValueError, match="behaviour: expected the 3 birds and 5 frames"):
-        page(report, [], behaviour=behaviour._replace(frames=behaviour.frames + 1))
+        page(report, [], behaviour=behaviour_in(TRACKS, report.frames + 1, behaviour.ethogram.state))
 
 
 def test_curves_have_gaps_ticks_and_a_line_for_each_bird(behaving):
@@ -391,20 +398,20 @@ def test_single_values_outside_the_axis_do_not_flatten_a_curve():
 def test_long_footage_has_at_most_500_columns_and_shows_short_behaviours():
     state = np.ones((1, 4000), int)
     state[0, 2001:2003] = 0
-    drawn = ElementTree.fromstring(ethogram_svg(behaviour_in([3], np.arange(4000), state)))
+    drawn = ElementTree.fromstring(behaviour_in([3], np.arange(4000), state).svg())
     short = next(each for each in drawn.iter(f"{SVG}g") if BOW in each.findtext(f"{SVG}title", ""))
     assert float(short.find(f"{SVG}rect").get("width")) == pytest.approx(894 / 500, abs=0.01)
     assert "3:20.10 to 3:20.30 (0.20 s), frames 2,001 to 2,002" in short.findtext(f"{SVG}title")
 
 
 def test_the_ethogram_is_a_drawing_of_its_own(behaviour):
-    drawn = ElementTree.fromstring(ethogram_svg(behaviour, "<film> & more", "../film.mp4"))
+    drawn = ElementTree.fromstring(behaviour.svg("<film> & more", "../film.mp4"))
     texts = [each.text for each in drawn.iter(f"{SVG}text")]
     for word in ("<film> & more", BOW, "standing", "other", "3", "7", "8", "10", "1.0 s", "frame"):
         assert word in texts
     assert "The vertical is <estimated>." in texts
     assert [each.get("href") for each in drawn.iter(f"{SVG}a")] == ["../film.mp4#t=1.00", "../film.mp4#t=1.40"]
-    assert not list(ElementTree.fromstring(ethogram_svg(behaviour)).iter(f"{SVG}a"))
+    assert not list(ElementTree.fromstring(behaviour.svg()).iter(f"{SVG}a"))
 
 
 def test_films_have_addresses_that_are_no_script(tmp_path):
@@ -424,21 +431,20 @@ def test_descriptions_become_sections():
     features = [each for each in own_features() if each.name in ("body_pitch", "wing_spread")]
     values = {each.name: np.zeros((2, 3)) for each in features}
     solution = SimpleNamespace(track_id=np.array([4, 2]), frame_index=np.arange(3))
-    flock = SimpleNamespace(solution=solution, unit="length", notes=("the vertical is estimated from 2 birds",))
+    flock = SimpleNamespace(solution=solution, unit="length")
     missing = {"speed": "the times are unknown", "neighbour_distance": "the result has one bird"}
     description = SimpleNamespace(flock=flock, features=features, values=values, missing=missing)
     bout = Bout(1, "take_off", slice(0, 2), 0.0, 0.2, None, {})
     state = np.array([[1, 1, 1], [0, 0, -1]])
     names = "take_off", OTHER
     ethogram = Ethogram(names, state, (bout,), np.arange(3) / 10, np.full(3, 0.1), {"bow": "the model has no bill"})
-    made = behaviour_of(description, ethogram, time_budget(ethogram, solution.track_id), config)
+    budget, notes = time_budget(ethogram, solution.track_id), ("the vertical is estimated from 2 birds",)
+    made = BehaviourPage(description, ethogram, budget, config, notes)
     take_off = Kind("take off", config.behaviours["take_off"].definition, list(config.behaviours).index("take_off"))
-    assert list(made.kinds) == [take_off, Kind("other", "The bird has a pose, and no rule holds.", None)]
-    assert made.bouts == [ShownBout(1, 0, slice(0, 2), 0.0, 0.2, None)]
-    assert [(row.share, row.of_birds.tolist()) for row in made.budget] == [
-        (pytest.approx(0.4), [0.0, 1.0]),
-        (pytest.approx(0.6), [1.0, 0.0]),
-    ]
+    assert made.kinds == [take_off, Kind("other", "The bird has a pose, and no rule holds.", None)]
+    bars = with_class(ElementTree.fromstring(f"<div>{made.section([0, 1], None)}</div>"), "bouts")
+    widths = [[re.search(r"width:([\d.]+)", bar.get("style"))[1] for bar in row] for row in bars]
+    assert widths == [["100.00"], ["66.67"], ["100.00"], ["100.00"]]
     assert [(each.title, each.unit) for each in made.curves] == [
         ("Body pitch", "°"),
         ("Wing spread", "share of the wing span"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -17,10 +17,8 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.view.overlay import overlay_pictures
-from jaxfit.view.report.axis import Axis, duration
-from jaxfit.view.report.behaviour import Behaviour, ethogram_notes, marks_of
+from jaxfit.view.report.axis import duration
 from jaxfit.view.report.contents import Report, Track, counted, next_steps, warnings_of
-from jaxfit.view.report.curves import plot_of
 from jaxfit.view.report.rendering import rendered
 from jaxfit.view.report.timeline import SmallCurve, error_curve, size_curve, timeline_of
 
@@ -111,12 +109,6 @@ _MEANINGS = {
     "Trust": "A comparison of this footage with the footage that the networks were trained on. High trust is no "
     "proof: look at the overlay.",
 }
-_MEANINGS_OF_BEHAVIOUR = {
-    "Ethogram": "Which bird shows which behaviour when. A frame has one behaviour: the first whose rule holds.",
-    "Bout": "A behaviour of one bird from its start to its stop, without interruption.",
-    "Time budget": "Time of a behaviour ÷ time with a pose. The 95 % interval is that of the bootstrap over birds. "
-    "Few birds give an interval that is too narrow, and one bird gives none.",
-}
 
 
 class Measured(NamedTuple):
@@ -126,6 +118,34 @@ class Measured(NamedTuple):
     rows: Sequence[Sequence[str]]
     note: str
     """What the columns mean."""
+
+
+class Behaviour(Protocol):
+    """What the birds of a report do over time: `jaxfit.behaviour.page.BehaviourPage`."""
+
+    @property
+    def track_id(self) -> np.ndarray:
+        """(N,) numbers of the tracks."""
+        ...
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(T,) numbers of the frames."""
+        ...
+
+    @property
+    def kinds(self) -> Sequence[Any]:
+        """The behaviours; `colour` of each is its position in `BEHAVIOUR_COLOURS`, or None."""
+        ...
+
+    @property
+    def meanings(self) -> Sequence[tuple[str, str]]:
+        """Words of the section and their definitions."""
+        ...
+
+    def section(self, order: Sequence[int], film: str | None) -> str:
+        """Return the section, HTML."""
+        ...
 
 
 class Cell(NamedTuple):
@@ -160,10 +180,14 @@ def page(
         meanings = [pair for pair in meanings if pair[0] != "Size in the image"]
     if not report.has_error_bars:
         meanings = [pair for pair in meanings if pair[0] != "Error bars"]
-    section: dict[str, Any] = {"behaviour": None}
+    section = None
     if behaviour is not None and report.over_time and report.poses:
-        section = _behaviour_section(report, behaviour, film)
-        meanings += [*_MEANINGS_OF_BEHAVIOUR.items(), *behaviour.meanings]
+        if len(behaviour.track_id) != len(report.tracks) or not np.array_equal(behaviour.frames, report.frames):
+            expected = f"the {len(report.tracks)} birds and {len(report.frames)} frames of the report"
+            came = f"{len(behaviour.track_id)} birds and {len(behaviour.frames)} frames"
+            raise ValueError(f"behaviour: expected {expected}, got {came}")
+        section = behaviour.section([track.position for track in report.tracks], film)
+        meanings += behaviour.meanings
     headings, rows = _table(report)
     length = counted(report.photographs, "photograph") if report.photographs else counted(len(report.frames), "frame")
     if not report.photographs and report.duration_s is not None:
@@ -184,27 +208,9 @@ def page(
         table_rows=rows,
         meanings=meanings,
         facts=[*footage, ("result", report.folder), *report.facts.items()],
-        **section,
+        behaviour=behaviour,
+        section=section,
     )
-
-
-def _behaviour_section(report: Report, behaviour: Behaviour, film: str | None) -> dict[str, Any]:
-    """Return the values of the template of behaviour."""
-    expected = len(report.tracks), len(report.frames)
-    if behaviour.state.shape != expected or not np.array_equal(behaviour.frames, report.frames):
-        came = f"{behaviour.state.shape[0]} birds and {len(behaviour.frames)} frames"
-        raise ValueError(
-            f"behaviour: expected the {expected[0]} birds and {expected[1]} frames of the report, got {came}"
-        )
-    axis, order = Axis(behaviour.frames, behaviour.times_s), [track.position for track in report.tracks]
-    return {
-        "behaviour": behaviour,
-        "axis": axis,
-        "rows": [(n, marks_of(behaviour, n, axis, film)) for n in order],
-        "plots": [(curve, plot_of(curve, axis, behaviour.track_id, order)) for curve in behaviour.curves],
-        "ethogram_notes": ethogram_notes(axis, film),
-        "absent": [behaviour.kinds[entry.kind].name for entry in behaviour.budget if not entry.share > 0],
-    }
 
 
 def _footage(report: Report) -> str:

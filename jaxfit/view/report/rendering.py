@@ -15,9 +15,9 @@ from jaxfit.view.report.axis import duration
 from jaxfit.view.report.contents import counted
 
 
-def rendered(template: str, **values: Any) -> str:
+def rendered(template: str, **values: Any) -> Markup:
     """Return a template of `templates/` with its values."""
-    return _environment.get_template(template).render(**values)
+    return Markup(_environment.get_template(template).render(**values))
 
 
 def _visible(value: Any) -> Any:

@@ -20,9 +20,8 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file, write_whole
 from jaxfit.foundation.reading import reading
 from jaxfit.model.bird import Bird
-from jaxfit.view.report.behaviour import Behaviour
 from jaxfit.view.report.contents import gather
-from jaxfit.view.report.page import Measured, Picture, page, report_pictures
+from jaxfit.view.report.page import Behaviour, Measured, Picture, page, report_pictures
 
 REPORT = "report.html"
 
