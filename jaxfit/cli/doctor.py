@@ -40,8 +40,9 @@ def doctor(_options: argparse.Namespace) -> None:
     """Print the state of every part of the installation."""
     findings = [finding for check in _CHECKS for finding in _checked(check)]
     table = EscapedTable(pad_edge=False)
-    for column in ("part", "state", "remedy"):
-        table.add_column(column, overflow="fold")
+    table.add_column("part", no_wrap=True)
+    table.add_column("state", overflow="fold", ratio=3, min_width=20)
+    table.add_column("remedy", overflow="fold", ratio=2)
     for finding in findings:
         table.add_row(finding.part, finding.state, finding.remedy)
     show(table)

@@ -542,7 +542,8 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"jaxfit {own_version()}")
     parser.add_argument("-v", "--verbose", action="store_true", help="print more messages, also of libraries")
-    families: dict[str, Any] = {"": parser.add_subparsers(required=True, metavar="COMMAND", help=argparse.SUPPRESS)}
+    subparsers = parser.add_subparsers(required=True, prog="jaxfit", metavar="COMMAND", help=argparse.SUPPRESS)
+    families: dict[str, Any] = {"": subparsers}
     for group in COMMANDS.values():
         for name, command in group.items():
             family, _, action = name.rpartition(" ")
@@ -565,10 +566,8 @@ def _groups() -> str:
     lines = []
     for group, commands in COMMANDS.items():
         lines.append(f"{group}:")
-        texts = {
-            name.split()[0]: _FAMILIES.get(name.split()[0], command.text).rstrip(".")
-            for name, command in commands.items()
-        }
-        for name, text in texts.items():
-            lines += textwrap.wrap(text, 78, initial_indent=f"  {name:<13}", subsequent_indent=" " * 15)
+        words = {name.split()[0]: command for name, command in commands.items()}
+        for word, command in words.items():
+            text = _FAMILIES.get(word) or _phrase(command.text)
+            lines += textwrap.wrap(text, 78, initial_indent=f"  {word:<13}", subsequent_indent=" " * 15)
     return "\n".join([*lines, "", "`jaxfit COMMAND --help` lists the arguments of a command."])
