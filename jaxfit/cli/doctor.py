@@ -39,22 +39,23 @@ class Finding(NamedTuple):
 def doctor(_options: argparse.Namespace) -> None:
     """Print the state of every part of the installation."""
     findings = [finding for check in _CHECKS for finding in _checked(check)]
-    table = EscapedTable(pad_edge=False)
-    table.add_column("part", no_wrap=True)
-    table.add_column("state", overflow="fold", ratio=3, min_width=20)
-    table.add_column("remedy", overflow="fold", ratio=2)
+    table = EscapedTable(show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
     for finding in findings:
-        table.add_row(finding.part, finding.state, finding.remedy)
+        table.add_row(finding.part, finding.state)
+        if finding.remedy:
+            table.add_row("", f"→ {finding.remedy}")
     show(table)
     missing = [finding for finding in findings if finding.remedy]
     faults, packages = (sum(finding.optional == optional for finding in missing) for optional in (False, True))
     if faults:
-        show(f"{counted(faults, 'part')} missing or in need of repair: the last column says what to do")
+        show(f"{counted(faults, 'part')} missing or in need of repair: → says what to do")
     else:
         show("everything that jaxfit requires works")
     if packages:
         are = "optional package is" if packages == 1 else "optional packages are"
-        show(f"{packages} {are} not installed, or too old: only the commands in the last column need them")
+        show(f"{packages} {are} not installed, or too old: → says which commands need them")
 
 
 def _checked(check: Callable[[], Iterator[Finding]]) -> list[Finding]:

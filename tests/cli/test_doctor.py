@@ -43,10 +43,20 @@ def test_optional_packages_are_no_faults(capsys, monkeypatch):
     assert main(["doctor"]) == 0
     assert capsys.readouterr().out.splitlines()[-2:] == [
         "everything that jaxfit requires works",
-        "1 optional package is not installed, or too old: only the commands in the last column need them",
+        "1 optional package is not installed, or too old: → says which commands need them",
     ]
     monkeypatch.setattr(doctor, "_CHECKS", (lambda: iter([doctor.Finding("kernels", "none", "compile them")]),))
     assert main(["doctor"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == (
-        "1 part missing or in need of repair: the last column says what to do"
+        "1 part missing or in need of repair: → says what to do"
     )
+
+
+def test_a_long_path_leaves_the_parts_readable(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    found = [doctor.Finding("built-in keypoint network", "loads"), doctor.Finding("cache", "/long" * 60)]
+    monkeypatch.setattr(doctor, "_CHECKS", (lambda: iter(found),))
+    assert main(["doctor"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert any("built-in keypoint network" in line and "loads" in line for line in lines)
+    assert max(map(len, lines)) <= 80
