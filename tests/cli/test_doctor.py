@@ -47,9 +47,7 @@ def test_optional_packages_are_no_faults(capsys, monkeypatch):
     ]
     monkeypatch.setattr(doctor, "_CHECKS", (lambda: iter([doctor.Finding("kernels", "none", "compile them")]),))
     assert main(["doctor"]) == 0
-    assert capsys.readouterr().out.splitlines()[-1] == (
-        "1 part missing or in need of repair: → says what to do"
-    )
+    assert capsys.readouterr().out.splitlines()[-1] == ("1 part missing or in need of repair: → says what to do")
 
 
 def test_a_long_path_leaves_the_parts_readable(capsys, monkeypatch):
