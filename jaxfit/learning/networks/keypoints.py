@@ -130,19 +130,26 @@ def draw_sample(rng: np.random.Generator, frames: LabelledFrames, scene_share: f
             continue
         patch = _augmented_patch(rng, frames, s, int(rng.choice(birds)) if n is None else n, scene_share)
         if patch is not None:
-            return _crop_sample(rng, *patch)
+            return _crop_sample(rng, patch)
     raise InputError("frames", f"show no bird in {MAX_DRAWS} draws", "film the frames again")
+
+
+class _Patch(NamedTuple):
+    """The surroundings of a bird, with random appearance."""
+
+    picture: np.ndarray
+    birds: list[Instance]
+    """The detected birds, first the bird itself."""
+    points_px: np.ndarray
+    visibility: np.ndarray
+    relative_scale: float
+    """Scale of the picture relative to the paper's footage."""
 
 
 def _augmented_patch(
     rng: np.random.Generator, frames: LabelledFrames, s: int, n: int, scene_share: float
-) -> tuple[np.ndarray, list[Instance], np.ndarray, np.ndarray, float] | None:
-    """Resample the surroundings of a bird to about the network's scale; None if too little of the bird is visible.
-
-    Returns:
-        Picture with random appearance, the detected birds (first the bird itself), keypoints in pixels of the picture,
-        visibility of each keypoint, and the scale of the picture relative to the paper's footage.
-    """
+) -> _Patch | None:
+    """Resample the surroundings of a bird to about the network's scale; None if too little of the bird is visible."""
     bird = instance_of(frames.owner[s] == n + 1, 1.0, "")
     if bird is None:
         return None
@@ -177,7 +184,7 @@ def _augmented_patch(
     birds = [instance, *(bird for bird in neighbours if bird is not None)]
     picture = randomise_appearance(rng, picture, owner > 0, scene_share)
     points_px = (points_px - low) @ affine[:, :2].T + affine[:, 2]
-    return picture, birds, points_px, visibility, float(relative_scale * factor)
+    return _Patch(picture, birds, points_px, visibility, float(relative_scale * factor))
 
 
 def _faulty_mask(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) -> np.ndarray:
@@ -219,19 +226,12 @@ _MASK_ERRORS = {
 for example without wings; `torn`: one side is missing."""
 
 
-def _crop_sample(
-    rng: np.random.Generator,
-    picture: np.ndarray,
-    birds: list[Instance],
-    points_px: np.ndarray,
-    visibility: np.ndarray,
-    relative_scale: float,
-) -> KeypointSample:
-    """Crop the first of some birds as the detector does, with random margins."""
-    pad, dilate = (int(side * relative_scale * rng.uniform(0.4, 2.0)) for side in (CROPS.pad_px, CROPS.dilate_px))
+def _crop_sample(rng: np.random.Generator, patch: _Patch) -> KeypointSample:
+    """Crop the first bird of a patch as the detector does, with random margins."""
+    pad, dilate = (int(px * patch.relative_scale * rng.uniform(0.4, 2.0)) for px in (CROPS.pad_px, CROPS.dilate_px))
     crops = CROPS._replace(pad_px=pad, dilate_px=dilate)
-    crop_picture, crop = crops.crop(picture, birds, 0, (SIDE_PX, SIDE_PX))
-    position = crop.to_crop(points_px) / STRIDE
+    crop_picture, crop = crops.crop(patch.picture, patch.birds, 0, (SIDE_PX, SIDE_PX))
+    position, visibility = crop.to_crop(patch.points_px) / STRIDE, patch.visibility
     known = visibility != UNKNOWN
     present = known & (visibility > 0) & ((position >= 0) & (position < SIDE_PX / STRIDE)).all(-1)
     weight = known * np.where(present, np.where(visibility == 2, 1.0, OCCLUDED_WEIGHT), ABSENT_WEIGHT)

@@ -165,8 +165,10 @@ def _load_folder(folder: Path, is_open: bool) -> LabelledFrames:
     _check_labels(frames, folder)
     if is_open:
         return frames
-    files = (_FrameFile(folder / f"{name}.npy", getattr(frames, name).shape) for name in ("pictures", "owner"))
-    return frames._replace(**dict(zip(("pictures", "owner"), cast(Any, files), strict=True)))
+    return frames._replace(
+        pictures=cast(Any, _FrameFile(folder / "pictures.npy", pictures.shape)),
+        owner=cast(Any, _FrameFile(folder / "owner.npy", owner.shape)),
+    )
 
 
 class _FrameFile(NamedTuple):

@@ -354,8 +354,9 @@ def train_network(
     check_writable(path)  # before the training, not after it
     torch.manual_seed(seed)
     network = _initial_network(which, base)
-    folders = film_scenes(*simulation, progress)
-    frames, scenes = load_frames(*folders), simulation.scenes
+    scenes = simulation.scenes
+    folders = film_scenes(simulation.folder, scenes, simulation.varied, simulation.wings, progress)
+    frames = load_frames(*folders)
     if len(frames.pictures) != scenes * FRAMES_PER_SCENE:  # a folder of an earlier version, with all frames in one file
         problem = f"holds {len(frames.pictures) // FRAMES_PER_SCENE} scenes, not {scenes}"
         raise InputError(simulation.folder, problem, "give another folder or the same number of scenes")

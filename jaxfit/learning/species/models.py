@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,6 +32,7 @@ from jaxfit.view.mesh_views import (
     error_colours,
     surface_views,
 )
+from jaxfit.view.report.rendering import rendered
 
 SMOOTHING_STEPS = 8
 """Number of times that the skin weights of a vertex are averaged with those of its neighbours."""
@@ -231,15 +231,18 @@ def draw_comparison(path: str | Path, first: Bird, second: Bird, comparison: Com
 
 HIDDEN = 0.02
 """A keypoint this far behind the visible surface is hidden in a view, as a share of the bird's length."""
-STYLE = """
-body { font: 16px/1.5 sans-serif; margin: 2em auto; max-width: 1300px; color: #222; background: #fafafa }
-figure { display: inline-block; margin: 4px; background: white; border: 1px solid #ddd; vertical-align: top }
-figcaption { text-align: center; padding: 4px }
-text { font: bold 12px sans-serif; text-anchor: middle; dominant-baseline: central }
-table { border-collapse: collapse } td, th { padding: 3px 12px; text-align: left; border-bottom: 1px solid #ddd }
-.hidden circle { fill: none; stroke-dasharray: 3 2 } .hidden text { fill: #777 }
-circle { fill: #ffd34d; stroke: #333 }
-"""
+
+
+class _View(NamedTuple):
+    """A picture of a model from one side, and its keypoints there."""
+
+    name: str
+    width: int
+    height: int
+    png: str
+    """Base64."""
+    points: list[list[float]]
+    visible: list[bool]
 
 
 def write_keypoint_page(bird: Bird, path: str | Path) -> None:
@@ -253,29 +256,11 @@ def write_keypoint_page(bird: Bird, path: str | Path) -> None:
     vertices = np.asarray(bird.vertices, np.float64)
     middle = (vertices.min(0) + vertices.max(0)) / 2
     zoom = (TILE_PX - 2 * MARGIN_PX) / np.ptp(vertices, axis=0).max()
-    figures, seen_in = [], [[] for _ in bird.keypoint_names]
-    for name in VIEWS:
-        figure, visible = _view(bird, name, middle, zoom)
-        figures.append(figure)
-        for k in np.flatnonzero(visible):
-            seen_in[k].append(name)
-    rows = "".join(
-        f"<tr><td>{k + 1}</td><td><code>{escape(name)}</code></td><td>{', '.join(seen_in[k]) or 'no view'}</td></tr>\n"
-        for k, name in enumerate(bird.keypoint_names)
-    )
-    title = f"Keypoints of the model {escape(bird.name)}"
-    page = (
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{STYLE}</style>'
-        f"</head><body><h1>{title}</h1>\n<p>Left and right are those of the bird, not of the picture. A dashed ring: "
-        f"the keypoint is hidden in this view. Move the pointer over a number to see the name.</p>\n"
-        f"{''.join(figures)}\n"
-        f"<table><tr><th></th><th>name in files</th><th>visible from</th></tr>\n{rows}</table></body></html>\n"
-    )
-    write_whole(path, page.encode())
+    views = [_view(bird, name, middle, zoom) for name in VIEWS]
+    write_whole(path, rendered("keypoints.html", bird=bird, views=views).encode())
 
 
-def _view(bird: Bird, name: str, middle: Float[np.ndarray, "3"], zoom: float) -> tuple[str, np.ndarray]:
-    """Return the figure of one view, and whether each keypoint is visible in this view."""
+def _view(bird: Bird, name: str, middle: Float[np.ndarray, "3"], zoom: float) -> _View:
     right, down = (np.array(axis, float) for axis in VIEWS[name])
     axes = np.stack([right, down, np.cross(right, down)])
     vertices, faces = np.asarray(bird.vertices, np.float64), np.asarray(bird.faces)
@@ -292,15 +277,5 @@ def _view(bird: Bird, name: str, middle: Float[np.ndarray, "3"], zoom: float) ->
     row = np.clip(points[:, 1].astype(int), 0, height - 1)
     length_px = float(np.ptp(vertices[:, 1])) * zoom
     visible = points[:, 2] < depth[row, column] + HIDDEN * length_px
-    marks = "".join(
-        f'<g class="{"seen" if visible[k] else "hidden"}"><title>{escape(label)}</title>'
-        f'<circle cx="{x:.1f}" cy="{y:.1f}" r="9"/><text x="{x:.1f}" y="{y:.1f}">{k + 1}</text></g>'
-        for k, (label, (x, y)) in enumerate(zip(bird.keypoint_names, points[:, :2], strict=True))
-    )
     image = base64.b64encode(png.tobytes()).decode()
-    return (
-        f'<figure><svg width="{TILE_PX}" height="{height}" viewBox="0 0 {TILE_PX} {height}">'
-        f'<image href="data:image/png;base64,{image}" width="{TILE_PX}" height="{height}"/>{marks}</svg>'
-        f"<figcaption>{name}</figcaption></figure>\n",
-        visible,
-    )
+    return _View(name, TILE_PX, height, image, points[:, :2].tolist(), visible.tolist())
