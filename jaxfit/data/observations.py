@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from jaxfit.data.footage import FootageIdentity
-from jaxfit.data.masks import LazyMasks, decode_mask
+from jaxfit.data.masks import decode_mask
 from jaxfit.foundation.array_files import validate_arrays
 from jaxfit.foundation.errors import InputError
 
@@ -139,7 +139,7 @@ class Observations:
             object.__setattr__(self, name, value)
         for name in ("masks", "amodal_masks"):
             masks = getattr(self, name)
-            for (n, t), rle in () if isinstance(masks, LazyMasks) else masks.items():
+            for (n, t), rle in masks.items():
                 width, height = self.image_size(n, t)
                 if tuple(rle["size"]) != (height, width):
                     problem = f"{name}[{n}, {t}] is {rle['size']}, its image {[height, width]} (height, width)"
@@ -227,8 +227,6 @@ class Observations:
         new_column = {old: new for new, old in enumerate(columns.tolist())}
 
         def moved(mapping):
-            if isinstance(mapping, LazyMasks):
-                return mapping.select(new_row, new_column)
             kept = ((n, t) for n, t in mapping if n in new_row and t in new_column)
             return {(new_row[n], new_column[t]): mapping[n, t] for n, t in kept}
 

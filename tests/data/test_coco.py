@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pycocotools import mask as coco_mask
 from support.coco_files import MASK, annotation, compressed, content, saved, uncompressed
 from support.observations import assert_same
 
 from jaxfit.data.formats.coco import read_coco, write_coco
-from jaxfit.data.formats.rle import run_lengths
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
@@ -71,16 +69,6 @@ def test_times_of_the_frames(tmp_path):
         assert np.isnan(unknown.timestamp_s).all()
     write_coco(unknown, tmp_path / "again.json")
     assert "info" not in json.loads((tmp_path / "again.json").read_text())
-
-
-@pytest.mark.parametrize("value", [0, -25, 1e9, "25", float("nan"), True])
-def test_absurd_times_are_rejected(tmp_path, value):
-    with pytest.raises(InputError, match=r"birds\.json: info\.fps (is|must be) .*(remove fps|write the file again)"):
-        read_coco(saved(tmp_path, content() | {"info": {"fps": value}}))
-    timed = content()
-    timed["images"][0] |= {"timestamp_s": value if isinstance(value, str | bool) else 1e300}
-    with pytest.raises(InputError, match=r"images\[0\]\.timestamp_s (is|must be) "):
-        read_coco(saved(tmp_path, timed))
 
 
 def test_what_is_hidden_keeps_its_place(tmp_path):
@@ -168,7 +156,7 @@ def test_writing_and_reading_gives_the_same(tmp_path):
     assert written["categories"][0]["skeleton"] == [[1, 2], [2, 3]]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_round_trip_of_anything(tmp_path_factory, seed):
     rng = np.random.default_rng(seed)
@@ -214,13 +202,6 @@ def test_real_annotations(reference_dir, tmp_path):
         assert [seen.mask(n, 0).sum() for n in range(len(raw))] == [a["area"] for a in raw]
         write_coco(seen, tmp_path / "again.json")
         assert_same(read_coco(tmp_path / "again.json"), seen)
-
-
-@settings(max_examples=200, deadline=None)
-@given(runs=st.lists(st.integers(0, 2**24), min_size=1, max_size=12))  # more, and pycocotools writes past its buffer
-def test_run_lengths_as_pycocotools_writes_them(runs):
-    text = coco_mask.frPyObjects({"size": [1, 1], "counts": runs}, 1, 1)["counts"]
-    assert run_lengths(text.decode()) == runs
 
 
 def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):

@@ -10,9 +10,7 @@ from support.toy_footage import FRAMES, Footage, TrueKeypoints, TrueSegmenter
 
 from jaxfit.config.perception import TrackConfig
 from jaxfit.data.footage import FootageIdentity, footage_of, read_footage
-from jaxfit.data.formats import coco_parts
 from jaxfit.data.formats.coco import read_coco, write_coco
-from jaxfit.data.formats.coco_parts import parts_folder
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.image_sizes import add_times
 from jaxfit.data.projection import projected_observations
@@ -37,7 +35,7 @@ def test_tracking_stores_the_identity_of_the_whole_video(tmp_path):
 
 
 @pytest.mark.parametrize("footage", [KNOWN, FootageIdentity(7), FootageIdentity(None, KNOWN.first_frame), None])
-def test_observations_and_results_keep_the_identity(tmp_path, monkeypatch, footage):
+def test_observations_and_results_keep_the_identity(tmp_path, footage):
     made = dataclasses.replace(solution(), footage=footage)
     save_solution(made, BIRD, "", summarise(made, BIRD, {}), tmp_path / "result")
     assert load_solution(tmp_path / "result")[0].footage == footage
@@ -45,10 +43,6 @@ def test_observations_and_results_keep_the_identity(tmp_path, monkeypatch, foota
     assert observed.select([0], [1, 2]).footage == footage
     write_coco(observed, tmp_path / "birds.json")
     assert read_coco(tmp_path / "birds.json").footage == footage
-    monkeypatch.setattr(coco_parts, "PARTS_FROM", 1)
-    write_coco(observed, tmp_path / "long.json")
-    assert parts_folder(tmp_path / "long.json").is_dir()
-    assert read_coco(tmp_path / "long.json").footage == footage
 
 
 def test_imported_keypoints_get_the_identity_of_their_video(tmp_path):

@@ -41,24 +41,22 @@ from typing import Any, cast
 
 import numpy as np
 
-from jaxfit.data.formats.coco_parts import read_coco_parts, write_coco_parts
+from jaxfit.data.footage import footage_of
 from jaxfit.data.formats.coco_records import (
-    Annotation,
-    Categories,
     Image,
     Untracked,
     complete_export,
-    read_annotation,
+    errors_of,
+    read_annotations,
     read_categories,
-    read_fps,
     read_images,
-    read_info_footage,
 )
 from jaxfit.data.formats.fields import Field, read_json
-from jaxfit.data.formats.rle import mask_areas
+from jaxfit.data.formats.rle import first_invalid
 from jaxfit.data.observations import Observations
 from jaxfit.data.tracks import track_quality
 from jaxfit.foundation.array_files import check_memory, observations_bytes
+from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
 
 _log = logging.getLogger(__name__)
@@ -79,98 +77,101 @@ def read_coco(path: str | Path, video: Path | None = None, untracked: Untracked 
     Raises:
         InputError: the file cannot be read, or its content is invalid; the message names file, field and remedy.
     """
-    path = Path(path)
-    stored = read_coco_parts(path)
-    return coco_observations(complete_export(read_json(path), video, untracked)) if stored is None else stored
+    return coco_observations(complete_export(read_json(Path(path)), video, untracked))
 
 
 def coco_observations(root: Field) -> Observations:
-    """Return the observations of the content of a COCO file; result and errors as ``read_coco``."""
-    if not isinstance(root.value, dict):
-        root.fail("must hold an object with images, categories and annotations", "give a COCO json")
-    images = read_images(root["images"])
-    categories = read_categories(root["categories"])
-    annotations: list[Annotation] = []
-    skipped = 0
-    for annotation in root["annotations"]:
-        category = annotation["category_id"].identifier()
-        if category in categories.others:
-            skipped += 1
-        elif category in categories.birds:
-            annotations.append(read_annotation(annotation, images, categories.names))
-        else:
-            annotation["category_id"].fail(f"is {category!r}, which no category has", "add the category")
-    if skipped:
-        _log.warning("%s: skipped %d annotations of categories without the keypoints of the bird", root.source, skipped)
-        if not annotations:
-            problem = f"hold no bird ({skipped} of other categories)"
-            root["annotations"].fail(problem, "run detection on footage with a bird in it, or choose another file")
-    return _assemble(root, list(images.values()), categories, annotations)
+    """Return the observations of the content of a COCO file, as `complete_export` returns the content.
 
-
-def _assemble(root: Field, images: list[Image], categories: Categories, found: list[Annotation]) -> Observations:
+    Raises:
+        InputError: as `read_coco`.
+    """
+    images = read_images(root)
+    categories = read_categories(root)
+    birds, others = read_annotations(root, images, categories)
+    if others:
+        _log.warning("%s: skipped %d annotations of categories without the keypoints of the bird", root.source, others)
+        if not birds:
+            problem = f"annotations hold no bird ({others} of other categories)"
+            remedy = "run detection on footage with a bird in it, or choose another file"
+            raise InputError(root.source, problem, remedy)
     first_image: dict[int, Image] = {}
-    for image in images:
+    for image in images.values():
         first_image.setdefault(image.frame_index, image)
     frames = sorted(first_image)
-    tracks = sorted({annotation.track_id for annotation in found})
+    tracks = sorted({bird.track_id for bird in birds})
     N, T, K = len(tracks), len(frames), len(categories.names)
     check_memory(
         root.source,
         f"annotations of {N:,} tracks over {T:,} frames with {K} keypoints",
-        observations_bytes(N, T, K, max(len(image.file_name) for image in images)),
+        observations_bytes(N, T, K, max(len(image.file_name) for image in images.values())),
         "split the file; for photographs, give every image frame_index 0",
     )
     row = {track: n for n, track in enumerate(tracks)}
     column = {frame: t for t, frame in enumerate(frames)}
+    cells = [(row[bird.track_id], column[bird.image.frame_index]) for bird in birds]
+    holder = dict(zip(cells, birds, strict=True))
+    if len(holder) < len(birds):
+        i = next(i for i, cell in enumerate(cells) if holder[cell] is not birds[i])
+        bird, other = birds[i], holder[cells[i]]
+        problem = f"annotations hold track_id {bird.track_id} twice in frame_index {bird.image.frame_index}: "
+        raise InputError(root.source, f"{problem}{bird.label} and {other.label}", "give one of them another track_id")
+    at = tuple(np.array(cells, np.int64).reshape(-1, 2).T)
+    keypoints = np.array([bird.keypoints for bird in birds], np.float64).reshape(-1, K, 3)
+    visibility = keypoints[..., 2]
+    confidence = (visibility > 0).astype(np.float32)
+    for i, bird in enumerate(birds):
+        if bird.scores is not None:
+            confidence[i] = np.where(visibility[i] > 0, bird.scores, 0)
 
-    keypoints = np.zeros((N, T, K, 4), np.float32)
-    box, score = np.zeros((N, T, 4), np.float32), np.zeros((N, T), np.float32)
-    holder: dict[tuple[int, int], Annotation] = {}
-    for annotation in found:
-        cell = row[annotation.track_id], column[annotation.image.frame_index]
-        if cell in holder:
-            root["annotations"].fail(
-                f"holds track_id {annotation.track_id} twice in frame_index {annotation.image.frame_index}: "
-                f"{holder[cell].label} and {annotation.label}",
-                "remove one, or give it another track_id",
-            )
-        holder[cell] = annotation
-        keypoints[cell] = annotation.keypoints
-        box[cell], score[cell] = annotation.box, annotation.score
-    present = np.zeros((N, T), bool)
-    for cell in holder:
-        present[cell] = True
-    return Observations(
-        track_id=np.array(tracks, np.int64),
-        frame_index=np.array(frames),
-        present=present,
-        keypoints_px=keypoints[..., :2],
-        confidence=keypoints[..., 2],
-        box_px=box,
-        image_size_px=np.array([[first_image[f].width, first_image[f].height] for f in frames]),
-        file_name=np.array([first_image[f].file_name for f in frames]),
-        keypoint_names=categories.names,
-        skeleton=categories.skeleton,
-        masks={cell: a.rle for cell, a in holder.items() if a.rle is not None},
-        amodal_masks={cell: a.amodal_rle for cell, a in holder.items() if a.amodal_rle is not None},
-        occluded=keypoints[..., 3] > 0,
-        score=score,
-        timestamp_s=np.array([first_image[f].timestamp_s for f in frames]),
-        fps=read_fps(root),
-        footage=read_info_footage(root),
-        own_images={
-            cell: (a.image.file_name, a.image.width, a.image.height)
-            for cell, a in holder.items()
-            if a.image != first_image[a.image.frame_index]
-        },
-    )
+    def placed(values: Any, *shape: int, dtype: Any = np.float32) -> np.ndarray:
+        array = np.zeros((N, T, *shape), dtype)
+        with np.errstate(over="ignore"):  # a number that is too large becomes infinite
+            array[at] = np.reshape(values, (len(birds), *shape))
+        return array
+
+    masks = {
+        name: {cell: rle for cell, bird in holder.items() if (rle := getattr(bird, name)) is not None}
+        for name in ("rle", "amodal_rle")
+    }
+    for found in masks.values():
+        invalid = first_invalid([*found.values()])
+        if invalid is not None:
+            label = holder[[*found][invalid]].label
+            problem = f"{label}: segmentation.counts is corrupt: its runs do not cover the image"
+            raise InputError(root.source, problem, "write the mask again with pycocotools, or leave segmentation out")
+    info = root.value.get("info")
+    info = Field(root.source, "info", info if isinstance(info, dict) else {})
+    with errors_of(root, "the content"):
+        return Observations(
+            track_id=np.array(tracks, np.int64),
+            frame_index=np.array(frames),
+            present=placed(np.ones(len(birds), bool), dtype=bool),
+            keypoints_px=placed(np.where(visibility[..., None] != 0, keypoints[..., :2], 0), K, 2),
+            confidence=placed(confidence, K),
+            box_px=placed([bird.box for bird in birds], 4),
+            image_size_px=np.array([[first_image[f].width, first_image[f].height] for f in frames]),
+            file_name=np.array([first_image[f].file_name for f in frames]),
+            keypoint_names=categories.names,
+            skeleton=categories.skeleton,
+            masks=masks["rle"],
+            amodal_masks=masks["amodal_rle"],
+            occluded=placed(visibility == 1, K, dtype=bool),
+            score=placed([bird.score for bird in birds]),
+            timestamp_s=np.array([first_image[f].timestamp_s for f in frames]),
+            fps=float(info["fps"].value) if info.has("fps") else None,
+            footage=footage_of(info["footage"]) if info.has("footage") else None,
+            own_images={
+                cell: (bird.image.file_name, bird.image.width, bird.image.height)
+                for cell, bird in holder.items()
+                if bird.image[:4] != first_image[bird.image.frame_index][:4]
+            },
+        )
 
 
 def write_coco(observations: Observations, path: str | Path, info: Mapping[str, str] | None = None) -> None:
     """Write observations as COCO json, completely or not at all.
 
-    Beside a long file, `jaxfit.data.formats.coco_parts` writes a binary copy that opens fast.
     ``read_coco`` reads the same observations, except that the tracks are sorted by ``track_id`` and tracks without a
     detection are missing.
 
@@ -182,6 +183,8 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
     Raises:
         InputError: the file cannot be written.
     """
+    from pycocotools import mask as coco_mask
+
     images: dict[tuple, dict[str, Any]] = {}
     timestamp_s = cast(np.ndarray, observations.timestamp_s).tolist()
 
@@ -196,9 +199,8 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         # the image of the frame comes before other images of the same frame
         image_id(t, str(observations.file_name[t]), width, height)
     annotations = []
-    # masks that are read when they are needed are read here once, in the order of their file
-    read = {name: dict(getattr(observations, name)) for name in ("masks", "amodal_masks")}
-    areas = dict(zip(read["masks"], mask_areas([*read["masks"].values()]), strict=True))
+    masks = observations.masks
+    areas = dict(zip(masks, coco_mask.area(cast(Any, [*masks.values()])).tolist() if masks else (), strict=True))
     scores = cast(np.ndarray, observations.score)
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
         confidence = observations.confidence[n, t]
@@ -218,9 +220,10 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         }
         if scores[n, t] != 1:
             annotation["score"] = float(_shortest(scores[n, t]))
-        for key, masks in (("segmentation", read["masks"]), ("amodal_segmentation", read["amodal_masks"])):
-            if (n, t) in masks:
-                annotation[key] = _json_rle(masks[n, t])
+        if (n, t) in masks:
+            annotation["segmentation"] = _json_rle(masks[n, t])
+        if (n, t) in observations.amodal_masks:
+            annotation["amodal_segmentation"] = _json_rle(observations.amodal_masks[n, t])
         if (n, t) in areas:
             annotation["area"] = areas[n, t]
         annotations.append(annotation)
@@ -236,9 +239,7 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
     about |= {} if observations.footage is None else {"footage": observations.footage.entries()}
     if about:
         content = {"info": about, **content}
-    encoded = json.dumps(content, allow_nan=False).encode()
-    write_whole(path, encoded)
-    write_coco_parts(observations, read, Path(path), encoded)
+    write_whole(path, json.dumps(content, allow_nan=False).encode())
 
 
 def _json_rle(rle: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit.data.formats.fields import LARGEST_POSITION_PX
 from jaxfit.data.masks import box_of_keypoints
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.array_files import check_memory, load_npy
@@ -175,8 +174,6 @@ def _known(
     known = np.asarray(~absent & (confidence > 0))
     if not known.any():
         raise InputError(source, "holds no keypoint with a position", _REMEDY)
-    if np.abs(position[known]).max() > LARGEST_POSITION_PX:
-        raise InputError(source, f"holds a position of {np.abs(position[known]).max():.3g}, which is no pixel", _REMEDY)
     flagged, placed = int((confidence == 0).sum()), int((~absent & (confidence == 0)).sum())
     unplaced = int((absent & (confidence > 0)).sum())
     answer = f"{int((~known).sum())} of {known.size}: third number 0 ({flagged}, {placed} of them with a position)"

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import math
-import re
 import reprlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import TEXT_CHARACTERS
 from jaxfit.foundation.reading import read_json_file
-
-_SURROGATE = re.compile("[\ud800-\udfff]")  # half of a character, which UTF-8 cannot represent
-LARGEST_POSITION_PX = 1e6
-"""Largest absolute image position; greater numbers overflow or have a wrong unit."""
 
 
 def _shown(value: Any) -> str:
@@ -78,13 +72,8 @@ class Field:
         return len(self._expect(list, "a list"))
 
     def text(self) -> str:
-        """Return the value as text that files and terminals can hold."""
-        text = self._expect(str, "text")
-        if len(text) > TEXT_CHARACTERS:
-            self.fail(f"has {len(text):,} characters, more than {TEXT_CHARACTERS:,}", "shorten the text")
-        if "\0" in text or _SURROGATE.search(text):
-            self.fail(f"holds a character that is no text ({_shown(text)})", "write plain text")
-        return text
+        """Return the value as text."""
+        return self._expect(str, "text")
 
     def integer(self, lowest: int = -(2**62), highest: int = 2**62) -> int:
         """Return the value as a whole number within bounds; 3.0 counts as 3."""
@@ -101,35 +90,6 @@ class Field:
         if not lowest <= value <= highest:  # also rejects NaN
             self.fail(f"is {_shown(value)}, outside {lowest:g} to {highest:g}", remedy)
         return float(value)
-
-    def identifier(self) -> int | str:
-        """Return an id: a whole number or text."""
-        return self.value if isinstance(self.value, str) else self.integer()
-
-    def numbers(self, count: int | None = None, why: str = "") -> Sequence[float]:
-        """Return the value as a list of finite numbers.
-
-        Args:
-            count: expected number of entries; None for any.
-            why: end of the message about a wrong count.
-        """
-        values = self._expect(list, "a list of numbers")
-        if count is not None and len(values) != count:
-            self.fail(f"has {len(values)} numbers, not {count}{why}")
-        for i, value in enumerate(values):
-            if type(value) not in (int, float):
-                Field(self.source, f"{self.path}[{i}]", value)._expect((int, float), "a number")
-            if not -math.inf < value < math.inf:
-                self.fail(f"holds {value} at [{i}]", "mark unknown keypoints by v = 0, or remove the annotation")
-        return values
-
-    def positions(self, count: int | None = None, why: str = "") -> Sequence[float]:
-        """Return the value as a list of positions or lengths in pixels."""
-        values = self.numbers(count, why)
-        for i, value in enumerate(values):
-            if abs(value) > LARGEST_POSITION_PX:
-                self.fail(f"holds {_shown(value)} at [{i}], which is no image position", "give image pixels")
-        return values
 
 
 def read_json(path: Path) -> Field:

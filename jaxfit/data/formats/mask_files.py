@@ -17,14 +17,13 @@ import cv2
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from jaxfit.data.formats.coco_records import complete_export, read_images
+from jaxfit.data.formats.coco_records import complete_export, errors_of, read_images
 from jaxfit.data.formats.fields import read_json
-from jaxfit.data.formats.rle import read_segmentation
+from jaxfit.data.formats.rle import first_invalid, read_segmentation
 from jaxfit.data.masks import box_of_mask, decode_mask, encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.tracks import frame_numbers
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import FRAME_DIGITS, MASKS_PER_PICTURE
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.video.pictures import IMAGE_SUFFIXES, image_files, read_picture
 
@@ -35,7 +34,9 @@ _NEAR = 0.05
 bill, tail and wings lie on the outline, and many masks are a little too small."""
 _MAX_VALUES = 64
 """A picture with more grey values is no picture of labels: masks are where the grey value is 128 or more."""
-_NUMBER = re.compile(rf"\d{{1,{FRAME_DIGITS}}}", re.ASCII)
+_MAX_REGIONS = 100
+"""A picture with more connected regions is no picture of one mask for every bird."""
+_NUMBER = re.compile(r"\d{1,15}", re.ASCII)
 
 _Masks = Callable[[int, int], Sequence[np.ndarray]]
 
@@ -180,26 +181,28 @@ def _stem(name: str) -> str:
 def _coco_masks(observations: Observations, source: Path, names: dict[tuple[int, int], str]) -> _Masks:
     """Return a function of bird and frame that returns the masks of the image in a COCO file."""
     root = complete_export(read_json(source))
-    images = read_images(root["images"])
+    images = read_images(root)
     pictures = {Path(image.file_name).name for image in images.values()}
     key_of = str if pictures & set(names.values()) else _stem  # pictures of masks may be of another type
     keys = {at: key_of(name) for at, name in names.items()}
     shared = {key_of(name) for name in pictures} & set(keys.values())
     by_name = bool(observations.own_images) or (bool(shared) and len(set(keys.values())) == len(keys))
-    found: dict[Any, list[dict[str, Any]]] = {}
-    for annotation in root["annotations"]:
-        image = images.get(annotation["image_id"].identifier())
-        crowd = annotation.has("iscrowd") and annotation["iscrowd"].integer(0, 1)
-        if image is None or crowd or not annotation.has("segmentation"):
-            continue
-        rle = read_segmentation(annotation["segmentation"], image.height, image.width)
-        if rle is not None:
-            key = key_of(Path(image.file_name).name) if by_name else image.frame_index
-            found.setdefault(key, []).append(rle)
+    masks: dict[Any, list[dict[str, Any]]] = {}
+    for i, annotation in enumerate(root["annotations"].value):
+        with errors_of(root, f"annotations[{i}]"):
+            image = images.get(annotation["image_id"])
+            if image is None or annotation.get("iscrowd") == 1:
+                continue
+            rle = read_segmentation(annotation.get("segmentation"), image.height, image.width)
+            if rle is None:
+                continue
+            if first_invalid([rle]) is not None:
+                raise ValueError("segmentation.counts is corrupt: its runs do not cover the image")
+            masks.setdefault(key_of(Path(image.file_name).name) if by_name else image.frame_index, []).append(rle)
 
     def masks_of(n: int, t: int) -> list[np.ndarray]:
         key = keys[n, t] if by_name else int(observations.frame_index[t])
-        return [decode_mask(rle) for rle in found.get(key, ())]
+        return [decode_mask(rle) for rle in masks.get(key, ())]
 
     return masks_of
 
@@ -251,8 +254,8 @@ def masks_of_picture(picture: np.ndarray, file: Path, several_birds: bool) -> li
         picture, values = np.where(picture >= half, 255, 0).astype(np.uint8), np.array([255])
     if len(values) == 1 and several_birds:
         count, regions = cv2.connectedComponents((picture == values[0]).astype(np.uint8))
-        if count - 1 > MASKS_PER_PICTURE:
-            problem = f"holds {count - 1:,} connected regions, more than {MASKS_PER_PICTURE:,}"
+        if count - 1 > _MAX_REGIONS:
+            problem = f"holds {count - 1:,} connected regions, more than {_MAX_REGIONS:,}"
             raise InputError(file, problem, "give one grey value to every bird")
         return [regions == i for i in range(1, count)]
     return [picture == value for value in values]
