@@ -14,6 +14,9 @@ from jaxtyping import Bool, Float
 
 from jaxfit.data.formats.rle import foreground_runs
 
+MAX_IMAGE_SIDE_PX = 16_384
+"""Longest side of an image. The run lengths of larger masks overflow the buffers of pycocotools."""
+
 
 def box_of_mask(mask: np.ndarray) -> tuple[int, int, int, int] | None:
     """Return the tight box of an (H, W) mask: x, y of the first pixel, width, height; None for an empty mask."""

@@ -30,14 +30,12 @@ import numpy as np
 
 from jaxfit.data.formats.fields import Field
 from jaxfit.data.formats.rle import read_segmentation
-from jaxfit.data.masks import box_of_keypoints
+from jaxfit.data.masks import MAX_IMAGE_SIDE_PX, box_of_keypoints
 from jaxfit.data.tracks import frame_numbers
 from jaxfit.foundation.errors import InputError
 
 _log = logging.getLogger(__name__)
 
-MAX_IMAGE_SIDE_PX = 16_384
-"""Longest side of an image. The run lengths of larger masks overflow the buffers of pycocotools."""
 _REMEDIES = {
     "track_id": "give every annotation the track_id of its bird; for photographs, a unique number",
     "frame_index": "give every image the number of its frame in the video; for photographs, 0",

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
 import numpy as np
+from PIL import ExifTags, Image
 
 from jaxfit.data.footage import read_footage
+from jaxfit.data.masks import MAX_IMAGE_SIDE_PX
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import IMAGE_SIDE_PX
+from jaxfit.foundation.reading import reading
 from jaxfit.video.decoding import frame_times
-from jaxfit.video.pictures import read_picture
 from jaxfit.video.reader import probe_video
+
+_log = logging.getLogger(__name__)
 
 _VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".wmv")
 
@@ -59,7 +64,7 @@ def image_sizes(
     Raises:
         InputError: no source of the size, or two sources that contradict each other.
     """
-    if stored is not None and not all(1 <= side <= IMAGE_SIDE_PX for side in stored):
+    if stored is not None and not all(1 <= side <= MAX_IMAGE_SIDE_PX for side in stored):
         raise InputError(source, f"stores images of {stored[0]}×{stored[1]} pixels", "write the file again")
     if video is not None:
         info = probe_video(video)
@@ -115,9 +120,11 @@ def _picture_sizes(pictures: Sequence[str], source: Path) -> np.ndarray | None:
         places = [folder / name for folder in folders]
         places += [source.parent / Path(name).name, source.parent / "images" / Path(name).name]
         file = next(filter(_is_file, places), None)
-        image = None if file is None else read_picture(file, grey=True)
-        if image is not None:
-            sizes[t] = image.shape[1], image.shape[0]
+        if file is not None:
+            with reading(file, "a picture"), Image.open(file) as image:
+                # pictures that cameras store on their side are turned, as when their pixels are read
+                turned = image.getexif().get(ExifTags.Base.Orientation, 1) >= 5
+                sizes[t] = image.size[::-1] if turned else image.size
     known = sizes[sizes[:, 0] > 0]
     if not len(known):
         return None
@@ -146,7 +153,11 @@ def _video_beside(source: Path, stored: str | None) -> Path | None:
         and not source.name[len(file.stem) :][:1].isdecimal()  # clip10.csv is not of clip1.mp4
         and _is_file(file)
     ]
-    return max(videos, key=lambda file: len(file.stem), default=None)
+    found = max(videos, key=lambda file: len(file.stem), default=None)
+    if found is not None and not re.match(r"DLC|[._]|$", source.name[len(found.stem) :]):
+        # DeepLabCut names tables of shortened or cropped films by words after the name of the film
+        _log.warning("%s: takes %s, whose name begins its name (give another film by --video)", source, found.name)
+    return found
 
 
 def _video_of_size(size_px: tuple[int, int], source: Path, stored: str | None) -> Path | None:
