@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy.lib.format import open_memmap
 
-from jaxfit.data.observations import LARGEST_POSITION_PX
 from jaxfit.data.keypoint_names import propose_names
+from jaxfit.data.observations import LARGEST_POSITION_PX
 from jaxfit.foundation.array_files import load_npy, load_npz
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
