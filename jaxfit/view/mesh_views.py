@@ -155,6 +155,17 @@ VIEWS = {  # name → right and down of the view, in the axes of the bird: x rig
 }
 
 
+class Surface(NamedTuple):
+    """A mesh with the colours of its vertices (blue, green, red in [0, 1])."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    """In the axes of the bird: x right, y forward, z up."""
+    faces: Int[np.ndarray, "F 3"]
+    colours: Float[np.ndarray, "V 3"]
+    lift: float = 0.0
+    """Distance by which the surface is drawn nearer to the viewer, in the unit of the vertices."""
+
+
 def six_views(bird: Bird, path: str | Path, posture: Posture | str | None = None) -> None:
     """Draw a bird from left, right, front, back, above and below at one scale, and write a PNG.
 
@@ -178,25 +189,47 @@ def six_views(bird: Bird, path: str | Path, posture: Posture | str | None = None
             raise ValueError(f"posture must be one of {', '.join(POSTURES)}, not {posture!r}")
         posture = POSTURES[posture]
     vertices = _posed(bird, posture)
-    vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
-    zoom = (TILE_PX - 2 * MARGIN_PX) / np.ptp(vertices, axis=0).max()
-    colours, faces = np.asarray(bird.vertex_colours)[:, ::-1], np.asarray(bird.faces)
+    zoom = _zoom(vertices)
     # lighter than in nature, since shading is invisible on dark plumage
-    colours = np.clip(0.1 + 0.9 * colours**0.75, 0, 1)
-    spans = {name: np.ptp(vertices @ np.array(axes, float).T, axis=0) * zoom for name, axes in VIEWS.items()}
-    names = list(VIEWS)
-    heights = [max(spans[name][1] for name in row) + 2 * MARGIN_PX for row in (names[:3], names[3:])]
-    tiles = []
-    for name, (right, down) in VIEWS.items():
-        axes = np.array([right, down, np.cross(right, down)], float)
-        height = round(heights[names.index(name) // 3])
-        tile = np.full((height, TILE_PX, 3), PAPER, np.uint8)
-        tile = draw_parallel(tile, vertices @ axes.T * zoom, faces, colours, samples=4, light=LIGHT)
-        title = np.full((TITLE_PX, TILE_PX, 3), PAPER, np.uint8)
-        text(title, name, (TILE_PX - text_width(name, TEXT_PX)) / 2, TITLE_PX * 0.6, TEXT_PX, DARK)
-        tiles.append(np.vstack([title, tile]))
-    sheet = np.vstack([np.hstack(tiles[:3]), np.hstack(tiles[3:]), _scale(bird, zoom)])
-    write_png(path, sheet)
+    colours = np.clip(0.1 + 0.9 * np.asarray(bird.vertex_colours)[:, ::-1] ** 0.75, 0, 1)
+    rows = _six_tiles([Surface(vertices, np.asarray(bird.faces), colours)], vertices, zoom, samples=4)
+    write_png(path, np.vstack([*rows, _scale(bird, zoom)]))
+
+
+def _zoom(points: Float[np.ndarray, "P 3"]) -> float:
+    """Return the pixels of a unit of length with which the longest side of the box of points fills a tile."""
+    return (TILE_PX - 2 * MARGIN_PX) / float(np.ptp(points, axis=0).max())
+
+
+def _six_tiles(
+    surfaces: Sequence[Surface], points: Float[np.ndarray, "P 3"], zoom: float, samples: int
+) -> list[UInt8[np.ndarray, "_ W 3"]]:
+    """Draw surfaces from six sides with their names, and return two rows of three tiles.
+
+    Args:
+        surfaces: what is drawn together.
+        points: points whose box is in the middle of all views, and which every view holds.
+        zoom: pixels of a unit of length.
+        samples: as for `jaxfit.raster.zbuffer.draw`.
+    """
+    middle, names, rows = (points.min(0) + points.max(0)) / 2, list(VIEWS), []
+    first = np.cumsum([0, *(len(surface.vertices) for surface in surfaces)])
+    faces = np.concatenate([surface.faces + start for surface, start in zip(surfaces, first[:-1], strict=True)])
+    colours = np.concatenate([surface.colours for surface in surfaces])
+    for row in (names[:3], names[3:]):
+        height = round(max(np.ptp(points @ np.array(VIEWS[name][1], float)) for name in row) * zoom + 2 * MARGIN_PX)
+        tiles = []
+        for name in row:
+            right, down = VIEWS[name]
+            axes = np.array([right, down, np.cross(right, down)], float)
+            seen = [(s.vertices - middle) @ axes.T * zoom - [0, 0, s.lift * zoom] for s in surfaces]
+            tile = np.full((height, TILE_PX, 3), PAPER, np.uint8)
+            tile = draw_parallel(tile, np.concatenate(seen), faces, colours, samples, LIGHT)
+            title = np.full((TITLE_PX, TILE_PX, 3), PAPER, np.uint8)
+            text(title, name, (TILE_PX - text_width(name, TEXT_PX)) / 2, TITLE_PX * 0.6, TEXT_PX, DARK)
+            tiles.append(np.vstack([title, tile]))
+        rows.append(np.hstack(tiles))
+    return rows
 
 
 def _posed(bird: Bird, posture: Posture | None) -> Float[np.ndarray, "V 3"]:
@@ -241,17 +274,6 @@ RAMP = np.array([[214, 160, 90], [235, 235, 225], [70, 190, 250], [40, 40, 200]]
 """Blue, green, red: blue for 0, then white, orange, and red for the largest value."""
 
 
-class Surface(NamedTuple):
-    """A mesh with the colours of its vertices (blue, green, red in [0, 1])."""
-
-    vertices: Float[np.ndarray, "V 3"]
-    """In the axes of the bird: x right, y forward, z up."""
-    faces: Int[np.ndarray, "F 3"]
-    colours: Float[np.ndarray, "V 3"]
-    lift: float = 0.0
-    """Distance by which the surface is drawn nearer to the viewer, in the unit of the vertices."""
-
-
 def error_colours(values: Float[np.ndarray, "V"], largest: float) -> Float[np.ndarray, "V 3"]:
     """Return the colours of values between 0 and `largest`; larger values have the colour of `largest`."""
     at = np.clip(np.nan_to_num(values, nan=largest) / largest, 0, 1) * (len(RAMP) - 1)
@@ -271,41 +293,12 @@ def surface_views(
         lines: text below the views.
     """
     points = np.concatenate([surface.vertices for block in rows for surface in block])
-    middle = (points.min(0) + points.max(0)) / 2
-    zoom = (TILE_PX - 2 * MARGIN_PX) / np.ptp(points, axis=0).max()
     parts = []
     for block, label in zip(rows, labels, strict=True):
-        tiles = [_tile(block, name, middle, zoom, points) for name in VIEWS]
         heading = np.full((LINE_PX + 10, 3 * TILE_PX, 3), PAPER, np.uint8)
         text(heading, label, MARGIN_PX, LINE_PX * 0.7, TEXT_PX, DARK)
-        parts += [heading, _row(tiles[:3]), _row(tiles[3:])]
+        parts += [heading, *_six_tiles(block, points, _zoom(points), samples=3)]
     write_png(path, np.vstack([*parts, _foot(largest, lines)]))
-
-
-def _row(tiles: Sequence[UInt8[np.ndarray, "_ W 3"]]) -> UInt8[np.ndarray, "H X 3"]:
-    """Return tiles side by side, filled below to one height."""
-    height = max(len(tile) for tile in tiles)
-    below = [((0, height - len(tile)), (0, 0), (0, 0)) for tile in tiles]
-    return np.hstack([np.pad(tile, pad, constant_values=PAPER[0]) for tile, pad in zip(tiles, below, strict=True)])
-
-
-def _tile(block: Sequence[Surface], name: str, middle, zoom: float, points) -> UInt8[np.ndarray, "H W 3"]:
-    right, down = (np.array(axis, float) for axis in VIEWS[name])
-    axes = np.stack([right, down, np.cross(right, down)])
-    height = round(float(np.ptp(points @ down)) * zoom) + 2 * MARGIN_PX
-    tile = np.full((height, TILE_PX, 3), PAPER, np.uint8)
-    first, vertices, faces, colours = 0, [], [], []
-    for surface in block:
-        seen = (surface.vertices - middle) @ axes.T
-        vertices.append((seen - [0, 0, surface.lift]) * zoom)
-        faces.append(surface.faces + first)
-        colours.append(surface.colours)
-        first += len(surface.vertices)
-    stacked = [np.concatenate(arrays) for arrays in (vertices, faces, colours)]
-    tile = draw_parallel(tile, *stacked, samples=3, light=LIGHT)
-    title = np.full((TITLE_PX, TILE_PX, 3), PAPER, np.uint8)
-    text(title, name, (TILE_PX - text_width(name, TEXT_PX)) / 2, TITLE_PX * 0.6, TEXT_PX, GREY)
-    return np.vstack([title, tile])
 
 
 def _foot(largest: float, lines: Sequence[str]) -> UInt8[np.ndarray, "H W 3"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -264,13 +264,21 @@ def overlay_frame(
     check_outputs([out], video, overwrite)
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise InputError(out, f"an image cannot end in {out.suffix!r}", "give a name that ends in .png or .jpg")
-    more: dict[str, Any] = {"lens": lens, "side_views": side_views, "max_width": max_width, "force": force}
-    drawn = [*overlay_pictures(solution, bird, video, [frame_index], observations=observations, **more)]
-    if not drawn:
+    drawn = overlay_pictures(
+        solution,
+        bird,
+        video,
+        [frame_index],
+        observations=observations,
+        lens=lens,
+        side_views=side_views,
+        max_width=max_width,
+        force=force,
+    )
+    _, image = next(drawn, (None, None))
+    if image is None:
         raise too_short(video, solution, info.frames or 0)
-    for _, image in drawn:
-        _, encoded = cv2.imencode(out.suffix, image)
-        write_whole(out, encoded.tobytes())
+    write_whole(out, cv2.imencode(out.suffix, image)[1].tobytes())
 
 
 def overlay_pictures(
