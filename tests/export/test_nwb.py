@@ -12,15 +12,31 @@ pynwb = pytest.importorskip("pynwb", reason="pynwb is not installed")
 pytest.importorskip("ndx_pose", reason="ndx-pose is not installed")
 
 
-def test_a_file_holds_one_bird_and_its_keypoints(tmp_path):
-    made = write_result(tmp_path / "result", video="/films/a/clip.mp4")
-    jaxfit.export_result(tmp_path / "result", "nwb", tmp_path / "nwb", start="2024-06-01T12:00:00+02:00")
-    assert sorted(path.name for path in (tmp_path / "nwb").iterdir()) == ["bird_3.nwb", "bird_7.nwb", "export.json"]
-    path = tmp_path / "nwb" / "bird_7.nwb"
+SHAPE = len(TRACKS), len(FRAMES), BIRD.num_keypoints
+VARIANCE = np.arange(np.prod(SHAPE), dtype=np.float32).reshape(SHAPE)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A result with error bars and flags, and the folder of its files."""
+    folder = tmp_path_factory.mktemp("nwb")
+    doubts = np.zeros(SHAPE[:2], np.int8)
+    doubts[1] = [1, -1, -1, 4, 12]
+    bars = error_bars(SHAPE, keypoints_px_cov=VARIANCE[..., None, None] * np.diag([1, 4]).astype(np.float32))
+    made = write_result(folder / "result", video="/films/a/clip.mp4", **bars, doubts=doubts)
+    jaxfit.export_result(folder / "result", "nwb", folder / "nwb", start="2024-06-01T12:00:00+02:00")
+    return made, folder / "nwb"
+
+
+def test_a_file_holds_one_bird_and_its_keypoints(written):
+    """Positions, and standard deviations in the order of the skeleton."""
+    made, folder = written
+    assert sorted(path.name for path in folder.iterdir()) == ["bird_3.nwb", "bird_7.nwb", "export.json"]
+    path = folder / "bird_7.nwb"
     assert not pynwb.validate(path=path)
     with pynwb.NWBHDF5IO(path, "r") as io:
         file = io.read()
-        pose = file.processing["behavior"]["PoseEstimation"]
+        pose, sd = file.processing["behavior"]["PoseEstimation"], file.processing["behavior"]["keypoints_sd"]
         assert file.subject.subject_id == "bird_7"
         assert "partly diverged" in file.notes
         assert pose.source_video.external_file[0] == "/films/a/clip.mp4"
@@ -32,6 +48,26 @@ def test_a_file_holds_one_bird_and_its_keypoints(tmp_path):
             np.testing.assert_allclose(series.timestamps[:], np.array(FRAMES) / FPS)
             assert np.isnan(series.confidence[:]).all()
             assert "NaN where the result does not hold detections" in series.confidence_definition
+        expected = np.sqrt(VARIANCE[1])[..., None] * [1, 2]
+        expected[~made.valid[1]] = np.nan
+        np.testing.assert_allclose(sd.data[:], expected, rtol=1e-6)
+        np.testing.assert_allclose(sd.timestamps[:], np.array(FRAMES) / FPS)
+        assert sd.unit == "pixels"
+        assert "networks these values are too small" in sd.description
+
+
+def test_flags_are_intervals(written):
+    """An interval for each range of frames with one flag."""
+    with pynwb.NWBHDF5IO(written[1] / "bird_7.nwb", "r") as io:
+        rows = io.read().intervals["pose_flags"].to_dataframe()
+    assert rows.flag.tolist() == ["contradicted", "unsure"]
+    assert rows.doubts.tolist() == [
+        "keypoints far from the pose",
+        "a second pose fits almost as well; error bars above 10 % of the length",
+    ]
+    step = 2 / FPS  # every second frame was used
+    np.testing.assert_allclose(rows.start_time, [10 / FPS, 18 / FPS])
+    np.testing.assert_allclose(rows.stop_time, [10 / FPS + step, 20 / FPS + step])
 
 
 def test_names_with_slashes():
@@ -49,46 +85,3 @@ def test_wrong_use(tmp_path, capsys):
     with pytest.raises(InputError, match=r"film\.mp4"):
         jaxfit.export_result(tmp_path / "result", "nwb", tmp_path / "nwb", video=tmp_path / "film.mp4")
     assert not (tmp_path / "nwb").exists()
-
-
-def test_error_bars_and_flags(tmp_path):
-    """Standard deviations in the order of the skeleton, and an interval for each range of frames with one flag."""
-    shape = (len(TRACKS), len(FRAMES), BIRD.num_keypoints)
-    variance = np.arange(np.prod(shape), dtype=np.float32).reshape(shape)
-    covariance = variance[..., None, None] * np.diag([1, 4]).astype(np.float32)
-    doubts = np.zeros(shape[:2], np.int8)
-    doubts[1] = [1, -1, -1, 4, 12]
-    made = write_result(
-        tmp_path / "result", video="/films/clip.mp4", **error_bars(shape, keypoints_px_cov=covariance), doubts=doubts
-    )
-    jaxfit.export_result(tmp_path / "result", "nwb", tmp_path / "nwb")
-    path = tmp_path / "nwb" / "bird_7.nwb"
-    assert not pynwb.validate(path=path)
-    with pynwb.NWBHDF5IO(path, "r") as io:
-        file = io.read()
-        behaviour = file.processing["behavior"]
-        sd = behaviour["keypoints_sd"]
-        expected = np.sqrt(variance[1])[..., None] * [1, 2]
-        expected[~made.valid[1]] = np.nan
-        np.testing.assert_allclose(sd.data[:], expected, rtol=1e-6)
-        np.testing.assert_allclose(sd.timestamps[:], np.array(FRAMES) / FPS)
-        assert sd.unit == "pixels"
-        assert "networks these values are too small" in sd.description
-        rows = file.intervals["pose_flags"].to_dataframe()
-        assert rows.flag.tolist() == ["contradicted", "unsure"]
-        assert rows.doubts.tolist() == [
-            "keypoints far from the pose",
-            "a second pose fits almost as well; error bars above 10 % of the length",
-        ]
-        step = 2 / FPS  # every second frame was used
-        np.testing.assert_allclose(rows.start_time, [10 / FPS, 18 / FPS])
-        np.testing.assert_allclose(rows.stop_time, [10 / FPS + step, 20 / FPS + step])
-
-
-def test_results_without_error_bars_and_flags_have_neither(tmp_path):
-    write_result(tmp_path / "result", video="/films/clip.mp4")
-    jaxfit.export_result(tmp_path / "result", "nwb", tmp_path / "nwb")
-    with pynwb.NWBHDF5IO(tmp_path / "nwb" / "bird_3.nwb", "r") as io:
-        file = io.read()
-        assert file.intervals is None or "pose_flags" not in file.intervals
-        assert "keypoints_sd" not in file.processing["behavior"].data_interfaces

@@ -1,10 +1,11 @@
-"""A reader of `.glb` files that poses the meshes, written from the glTF 2.0 specification with NumPy alone."""
+"""A reader of `.glb` files that poses the meshes, written from the glTF 2.0 specification with NumPy and SciPy."""
 
 import json
 import struct
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 TYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -60,16 +61,7 @@ class Glb:
     def matrix(self, node, animated):
         """The global transform of a node."""
         values = self.root["nodes"][node] | animated.get(node, {})
-        x, y, z, w = np.array(values.get("rotation", [0, 0, 0, 1]), float) / np.linalg.norm(
-            values.get("rotation", [0, 0, 0, 1])
-        )
-        rotation = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        rotation = Rotation.from_quat(values.get("rotation", [0, 0, 0, 1])).as_matrix()
         own = np.eye(4)
         own[:3, :3] = rotation * np.array(values.get("scale", [1, 1, 1]), float)
         own[:3, 3] = values.get("translation", [0, 0, 0])

@@ -150,7 +150,7 @@ def test_unknown_numbers_of_frames_are_not_compared(tmp_path):
         overlay(made, BIRD, own, tmp_path / "o2.mp4")
 
 
-@pytest.mark.parametrize("value", [7, "text", "AAAA", "ä", [1]])
+@pytest.mark.parametrize("value", [7, "AAAA"])
 def test_a_damaged_identity_is_one_error(tmp_path, capsys, monkeypatch, value):
     monkeypatch.chdir(tmp_path)  # a long path shortens the message
     tmp_path = Path()

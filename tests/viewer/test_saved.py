@@ -121,12 +121,14 @@ def test_a_page_that_is_too_large_loses_the_film_and_then_fails(result, tmp_path
 def test_earlier_pages_are_replaced_on_demand_only(result, tmp_path, capsys):
     seen, _ = result
     page, folder = tmp_path / "page.html", tmp_path / "folder"
+    page.write_text("an earlier page")
+    folder.mkdir()
+    (folder / "index.html").write_text("an earlier page")
     for path in (page, folder):
-        assert main(["view", str(seen.folder), "--save", str(path)]) == 0
-        assert "left out: corrections" in capsys.readouterr().out
         rejected(capsys, ["view", str(seen.folder), "--save", str(path)], path.name)
-        assert main(["view", str(seen.folder), "--save", str(path), "--overwrite"]) == 0
-        capsys.readouterr()
+    assert main(["view", str(seen.folder), "--save", str(folder), "--overwrite"]) == 0
+    assert "left out: corrections" in capsys.readouterr().out
+    assert (folder / "data").is_dir()
     other = tmp_path / "other"
     other.mkdir()
     (other / "mine.txt").write_text("mine")
