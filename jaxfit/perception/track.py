@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import time
 from pathlib import Path
 from typing import NamedTuple
+
+import numpy as np
 
 from jaxfit.config.perception import TrackConfig
 from jaxfit.data.footage import read_footage
@@ -14,40 +16,34 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import Clock, ProgressTask, silent
 from jaxfit.foundation.unfinished import Parts
 from jaxfit.foundation.workers import Cluster
-from jaxfit.model.anatomy import mirror_pairs, skeleton_pairs
+from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.perception.detections import (
-    Detections,
-    LocalDetections,
+    detect,
     expected_frames,
+    load_stored_frames,
     open_keypoint_detector,
     open_segmenter,
-    process_frames,
+    tracked_frames,
 )
 from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segmenter
 from jaxfit.perception.tracking import (
     RecordedFrame,
     Tracker,
-    TrackRecorder,
     drop_low_scores,
     drop_short_tracks,
     load_tracker,
     mean_scores,
-    repair_left_right_flips,
+    observations_of,
 )
 from jaxfit.perception.trust import Trust, footage_signals, judge
-from jaxfit.perception.worker_tasks import WorkerDetections
+from jaxfit.perception.worker_tasks import detect_on_workers
 from jaxfit.video.reader import read_frames
 
 _logger = logging.getLogger(__name__)
 
 RETRY_FRAMES, RETRY_MIN_SCORE = 8, 0.05
 """After a video without any bird: number of frames that are segmented again, and their least score."""
-
-
-ObservationsFrom = Callable[[int], Observations]
-"""Function of the position of a frame that returns the observations from this frame on. Short tracks and tracks of low
-scores are skipped, as at the end of the video, but only these frames count."""
 
 
 class TrackingResult(NamedTuple):
@@ -116,7 +112,6 @@ def run_tracking(
     progress: ProgressTask = silent,
     parts: Parts | None = None,
     cluster: Cluster | None = None,
-    on_frame: Callable[[ObservationsFrom], object] | None = None,
 ) -> TrackingResult:
     """Track a video as `track_video` does, and also return trust, skipped tracks, damaged frames and durations.
 
@@ -127,65 +122,72 @@ def run_tracking(
         cluster: worker processes that run the networks of `config`, in place of `segmenter` and `keypoints`. They read
             the video and the files of the networks under the same paths. If the tracker uses pictures, or the video
             does not say its length, the networks run in this process. None: this process.
-        on_frame: called after each frame, with a function that returns the observations so far.
     """
     frames, has_own_segmenter = config.frames, segmenter is not None
-    reader, given_tracker = read_frames(source, frames.start, frames.stop, frames.step), tracker
+    reader = read_frames(source, frames.start, frames.stop, frames.step)
     config, choice = (config, None) if has_own_segmenter else with_chosen_segmenter(source, config, progress)
     keypoints, segmenter = keypoints or open_keypoint_detector(config), segmenter or open_segmenter(config)
-    footage, names = read_footage(source, reader.info.frames), keypoints.keypoint_names
-    recorder = TrackRecorder(names, skeleton_pairs(names), reader.info.fps, footage)
     clock = Clock()
     total = expected_frames(reader, frames)
+    stored = load_stored_frames(parts, lambda: tracker or _tracker_of(config))
+    items = list(stored.items)
+    records = [item for item in items if isinstance(item, RecordedFrame)]
+    start = records[-1].frame_index + frames.step if records else frames.start
+
     end = None if total is None else frames.start + total * frames.step
-
-    def new_tracker() -> Tracker:
-        return given_tracker or _tracker_of(config)
-
-    if cluster is not None and (reason := _no_workers(new_tracker(), end)):
+    if cluster is not None and (reason := _no_workers(stored.tracker, end)):
         _logger.warning("%s: the networks run in this process, because %s", source, reason)
         cluster = None
+    if cluster is not None and end is not None:
+        detections = detect_on_workers(cluster, reader.path, config, range(start, end, frames.step), clock)
+    else:
+        remaining = reader if start == frames.start else read_frames(source, start, frames.stop, frames.step)
+        detections = detect(remaining, segmenter, keypoints, clock)
+    num_keypoints, name = len(keypoints.keypoint_names), reader.path.name
+    with progress("Tracking", total) as report_progress:
+        if records:
+            report_progress(len(records), "stored frames")
+        if not stored.is_complete:
+            tracked = tracked_frames(detections, stored.tracker, num_keypoints, name, clock, parts)
+            begun_s, num_new = time.perf_counter(), 0
+            for item in tracked:
+                items.append(item)
+                if isinstance(item, RecordedFrame):
+                    num_new += 1
+                    rate, birds = num_new / (time.perf_counter() - begun_s), len(item.masks)
+                    noun = "bird" if birds == 1 else "birds"
+                    note = f"{len(records) + num_new} frames, {rate:.1f} frames/s, {birds} {noun} now"
+                    report_progress(1, note)
 
-    def detections_from(start: int) -> Detections:
-        if cluster is not None and end is not None:
-            return WorkerDetections(cluster, reader.path, config, range(start, end, frames.step), clock)
-        own = reader if start == frames.start else read_frames(source, start, frames.stop, frames.step)
-        return LocalDetections(own, segmenter, keypoints, clock)
-
-    least = getattr(segmenter, "min_track_score", 0.0) if config.min_track_score is None else config.min_track_score
-
-    def frame_added() -> None:
-        if on_frame is not None:
-            on_frame(lambda first: _clean(recorder.observations(first), config, least)[1])
-
-    processed = process_frames(
-        detections_from, reader.path.name, total, frames, new_tracker, recorder, clock, progress, parts, frame_added
-    )
-    if not processed.frames:
+    records = [item for item in items if isinstance(item, RecordedFrame)]
+    damaged = [item for item in items if isinstance(item, int)]
+    if not records:
         raise InputError(source, f"has no frame from {frames.start} on", "begin with an earlier frame")
+    min_score = getattr(segmenter, "min_track_score", 0.0) if config.min_track_score is None else config.min_track_score
     with clock("clean up"):
-        all_tracks = recorder.observations()
-        long_tracks, observations = _clean(all_tracks, config, least)
+        names, footage = keypoints.keypoint_names, read_footage(source, reader.info.frames)
+        all_tracks = observations_of(records, names, skeleton_pairs(names), reader.info.fps, footage)
+        long_tracks = drop_short_tracks(all_tracks, config.min_track_frames)
+        observations = drop_low_scores(long_tracks, min_score)
     lengths = dict(zip(all_tracks.track_id.tolist(), all_tracks.present.sum(1).tolist(), strict=True))
     short_tracks = {track: length for track, length in lengths.items() if track not in long_tracks.track_id}
     scores = dict(zip(long_tracks.track_id.tolist(), mean_scores(long_tracks).tolist(), strict=True))
     low_score_tracks = {track: score for track, score in scores.items() if track not in observations.track_id}
-    distances = [each.tolist() for each in processed.distances]
+    distances = [
+        np.concatenate([record.segmenter_distance for record in records]).tolist(),
+        np.concatenate([record.keypoint_distance for record in records]).tolist(),
+    ]
     trust = judge(footage_signals(all_tracks, short_tracks, distances, getattr(keypoints, "curve", None) is not None))
-    skipped = short_tracks, low_score_tracks, processed.damaged
-    result = TrackingResult(observations, *skipped, None, trust, choice, clock.seconds)
-    if observations.num_tracks:
-        return result
-    return result._replace(failure=_failure(source, config, result, processed.frames, least, has_own_segmenter))
-
-
-def _clean(tracks: Observations, config: TrackConfig, least: float) -> tuple[Observations, Observations]:
-    """Return the long tracks, and the repaired long tracks with a mean score of at least `least`."""
-    long_tracks = drop_short_tracks(tracks, config.min_track_frames)
-    observations = drop_low_scores(long_tracks, least)
-    if config.repair_left_right_flips:
-        observations, _ = repair_left_right_flips(observations, mirror_pairs(observations.keypoint_names))
-    return long_tracks, observations
+    failure = None
+    if not observations.num_tracks:
+        if low_score_tracks:
+            failure = _only_low_scores(source, trust, low_score_tracks, min_score)
+        elif short_tracks:
+            best_score = max(float(record.score.max(initial=0.0)) for record in records)
+            failure = _only_short_tracks(source, config, trust, short_tracks, best_score)
+        else:
+            failure = _no_bird(source, config, len(records), has_own_segmenter)
+    return TrackingResult(observations, short_tracks, low_score_tracks, damaged, failure, trust, choice, clock.seconds)
 
 
 def _no_workers(tracker: Tracker, end: int | None) -> str | None:
@@ -212,23 +214,6 @@ def _remedy(trust: Trust, setting: str) -> str:
     networks = ["label frames (jaxfit suggest)", "use other networks (--segmenter)"]
     first, second, last = [*networks, setting] if trust.level == "low" else [setting, *networks]
     return f"{first}, {second}, or {last}"
-
-
-def _failure(
-    source: str | Path,
-    config: TrackConfig,
-    result: TrackingResult,
-    frames: list[RecordedFrame],
-    least: float,
-    has_own_segmenter: bool,
-) -> InputError:
-    """Return why a result has no track."""
-    if result.low_score_tracks:
-        return _only_low_scores(source, result.trust, result.low_score_tracks, least)
-    if result.short_tracks:
-        best_score = max(float(frame.score.max(initial=0.0)) for frame in frames)
-        return _only_short_tracks(source, config, result.trust, result.short_tracks, best_score)
-    return _no_bird(source, config, len(frames), has_own_segmenter)
 
 
 def _only_low_scores(source: str | Path, trust: Trust, low_score_tracks: dict[int, float], least: float) -> InputError:

@@ -12,23 +12,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8
 
 from jaxfit.config.perception import FramesConfig, TrackConfig
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import Clock
 from jaxfit.foundation.workers import Cluster, FailedTask
 from jaxfit.perception.detections import (
-    Distances,
     FrameDetections,
-    Keypoints,
-    LocalDetections,
-    joined_distances,
+    detect,
     network_files,
     open_keypoint_detector,
     open_segmenter,
 )
-from jaxfit.perception.network import Instance, KeypointDetector, Segmenter
+from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import read_frames, warn_of_damage
 
@@ -49,41 +45,22 @@ class DetectionShared(NamedTuple):
     """Sizes of the video and of the files of the networks in bytes; of a folder, the number of its pictures."""
 
 
-class PackedInstance(NamedTuple):
-    """An instance without a network: its mask has one bit per pixel."""
-
-    bits: UInt8[np.ndarray, "bytes"]
-    shape: tuple[int, int]
-    x0: int
-    y0: int
-    score: float
-    label: str
-
-
 class DetectedFrame(NamedTuple):
     """The detections of one frame, as a worker sends them."""
 
-    frame_index: int
-    time_s: float | None
-    size_px: tuple[int, int]
-    instances: list[PackedInstance]
-    keypoints: Keypoints
-    """Keypoints of all instances."""
-    distances: Distances
+    detections: FrameDetections
+    """Without picture; the masks have one bit per pixel, and `keypoints` is not a function but its result."""
+    shapes: list[tuple[int, int]]
+    """Heights and widths of the masks."""
 
 
-class DetectedRange(NamedTuple):
-    """The result of a task."""
+def detect_on_workers(
+    cluster: Cluster, video: Path, config: TrackConfig, frames: range, clock: Clock
+) -> Generator[FrameDetections | int]:
+    """Return the detections of worker processes, as `jaxfit.perception.detections.detect`.
 
-    frames: list[DetectedFrame]
-    damaged: list[int]
-    """Numbers of the frames of the range that cannot be read."""
-
-
-class WorkerDetections:
-    """Detections by worker processes.
-
-    The keypoints of all instances are detected, because the tracker works in this process.
+    The keypoints of all instances are detected, because the tracker works in this process. Frames that no worker could
+    compute count as damaged.
 
     Args:
         cluster: the workers.
@@ -93,58 +70,59 @@ class WorkerDetections:
         clock: measures the time until the workers send frames.
 
     Raises:
-        InputError: during the iteration; a worker cannot read the video or a network.
+        InputError: a network does not exist; during the iteration: a worker cannot read the video or a network.
     """
+    return _in_order(cluster, shared_data(video, config), _ranges(frames), frames.step, clock)
 
-    damaged: list[int]
-    """Numbers of the frames so far that could not be read, or that no worker could compute."""
 
-    def __init__(self, cluster: Cluster, video: Path, config: TrackConfig, frames: range, clock: Clock):
-        self._cluster, self._step, self._clock = cluster, frames.step, clock
-        self._ranges = [frames[i : i + FRAMES_PER_TASK] for i in range(0, len(frames), FRAMES_PER_TASK)]
-        config = _with_absolute_paths(config)
-        sizes = tuple(_state(file)[0] for file in _files(video, config))
-        self._shared = DetectionShared(video, config, sizes)
-        self._distances: list[Distances] = []
-        self.damaged = []
+def shared_data(video: Path, config: TrackConfig) -> DetectionShared:
+    """Return the data that all tasks share.
 
-    def __iter__(self) -> Generator[FrameDetections]:
-        self.damaged = []
-        try:
-            for number, part in enumerate(self._clock.each("detect", self._parts())):
-                if isinstance(part, FailedTask):
-                    self.damaged += self._ranges[number]
-                    _logger.warning("%s: no detections: %s", self._shared.video, part.reason)
-                    continue
-                damaged = list(part.damaged)
-                for frame in part.frames:
-                    while damaged and damaged[0] < frame.frame_index:
-                        self.damaged.append(damaged.pop(0))
-                    self._distances.append(frame.distances)
-                    instances = [_unpacked(each) for each in frame.instances]
-                    yield FrameDetections(*frame[:3], instances, lambda found=frame.keypoints: found, None)
-                self.damaged += damaged
-        finally:
-            warn_of_damage(self._shared.video, self.damaged, self._step)
+    Raises:
+        InputError: a network does not exist.
+    """
+    config = _with_absolute_paths(config)
+    return DetectionShared(video, config, tuple(_state(file)[0] for file in _files(video, config)))
 
-    def _parts(self) -> Iterator[DetectedRange | FailedTask]:
-        """Yield the results of the tasks in the order of the frames."""
-        arrived: dict[int, DetectedRange | FailedTask] = {}
+
+def _ranges(frames: range) -> list[range]:
+    return [frames[i : i + FRAMES_PER_TASK] for i in range(0, len(frames), FRAMES_PER_TASK)]
+
+
+def _in_order(
+    cluster: Cluster, shared: DetectionShared, ranges: list[range], step: int, clock: Clock
+) -> Generator[FrameDetections | int]:
+    """Yield the detections of all tasks in the order of the frames."""
+    damaged: list[int] = []
+
+    def results() -> Iterator[list[DetectedFrame | int] | FailedTask]:
+        arrived: dict[int, list[DetectedFrame | int] | FailedTask] = {}
         wanted = 0
-        for number, part in self._cluster.run(detect_range, self._shared, self._ranges):
-            arrived[number] = part
+        for number, result in cluster.run(detect_range, shared, ranges):
+            arrived[number] = result
             while wanted in arrived:
                 yield arrived.pop(wanted)
                 wanted += 1
 
-    def take_distances(self) -> Distances:
-        """Return the distances of the frames since the last call."""
-        taken, self._distances = self._distances, []
-        return joined_distances(taken)
+    try:
+        for numbers, result in zip(ranges, clock.each("detect", results()), strict=False):
+            if isinstance(result, FailedTask):
+                _logger.warning("%s: no detections: %s", shared.video, result.reason)
+            for item in numbers if isinstance(result, FailedTask) else result:
+                if isinstance(item, int):
+                    damaged.append(item)
+                    yield item
+                else:
+                    yield _unpacked(item)
+    finally:
+        warn_of_damage(shared.video, damaged, step)
 
 
-def detect_range(shared: DetectionShared, frames: range) -> DetectedRange:
+def detect_range(shared: DetectionShared, frames: range) -> list[DetectedFrame | int]:
     """Detect the instances and keypoints of some frames, in a worker process.
+
+    Returns:
+        The frames, and the numbers of the frames that cannot be read, in order.
 
     Raises:
         InputError: the video or a network cannot be read here, or the video differs from the video of the command.
@@ -156,19 +134,11 @@ def detect_range(shared: DetectionShared, frames: range) -> DetectedRange:
             if state[0] != size:
                 raise InputError(file, "differs from the file of the command", "copy the same file to all machines")
         reader = read_frames(shared.video, frames.start, frames.stop, frames.step)
-        detections = LocalDetections(reader, *_networks(shared.config, states[1:]), Clock())
-        found = [
-            DetectedFrame(
-                *frame[:3],
-                [_packed(instance) for instance in frame.instances],
-                frame.keypoints(),
-                detections.take_distances(),
-            )
-            for frame in detections
-        ]
+        segmenter, keypoints = _networks(shared.config, states[1:])
+        detections = detect(reader, segmenter, keypoints, Clock())
+        return [item if isinstance(item, int) else _packed(item) for item in detections]
     except InputError as error:
         raise InputError(f"worker on {platform.node()}: {error.source}", error.problem, error.remedy) from error
-    return DetectedRange(found, reader.damaged)
 
 
 @lru_cache(1)
@@ -206,11 +176,17 @@ def _with_absolute_paths(config: TrackConfig) -> TrackConfig:
     return replace(config, frames=FramesConfig(), **own)
 
 
-def _packed(instance: Instance) -> PackedInstance:
-    return PackedInstance(np.packbits(instance.mask), instance.mask.shape, *instance[1:])
+def _packed(detections: FrameDetections) -> DetectedFrame:
+    shapes = [instance.mask.shape for instance in detections.instances]
+    instances = [instance._replace(mask=np.packbits(instance.mask)) for instance in detections.instances]
+    keypoints: Any = detections.keypoints()
+    return DetectedFrame(detections._replace(instances=instances, keypoints=keypoints, picture=None), shapes)
 
 
-def _unpacked(packed: PackedInstance) -> Instance:
-    height, width = packed.shape
-    mask = np.unpackbits(packed.bits, count=height * width).reshape(height, width).astype(bool)
-    return Instance(mask, *packed[2:])
+def _unpacked(detected: DetectedFrame) -> FrameDetections:
+    instances = [
+        instance._replace(mask=np.unpackbits(instance.mask, count=height * width).reshape(height, width).astype(bool))
+        for instance, (height, width) in zip(detected.detections.instances, detected.shapes, strict=True)
+    ]
+    keypoints: Any = detected.detections.keypoints
+    return detected.detections._replace(instances=instances, keypoints=lambda: keypoints)
