@@ -7,7 +7,6 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +24,6 @@ from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.tracks import track_quality
 from jaxfit.fitting.collect import summarise
 from jaxfit.fitting.fit import fit, learn_weights
-from jaxfit.fitting.provisional import ProvisionalFit
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import LIBRARIES, TRACKING_LIBRARIES, library_versions
@@ -38,15 +36,15 @@ from jaxfit.model.files import load_murre
 from jaxfit.perception.detections import check_segmenter, network_files, open_keypoint_detector
 from jaxfit.perception.network import KeypointDetector, Segmenter
 from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segmenter
-from jaxfit.perception.track import ObservationsFrom, TrackingResult, run_tracking
+from jaxfit.perception.track import TrackingResult, run_tracking
 from jaxfit.video.pictures import image_files
 from jaxfit.video.reader import VideoInfo, probe_video
 from jaxfit.view.overlay import check_outputs, is_inside, overlay
 from jaxfit.view.report.write import REPORT, write_report
 
-_AFTER_TRACKING = ("min_track_frames", "min_track_score", "repair_left_right_flips")
+_AFTER_TRACKING = ("min_track_frames", "min_track_score")
 """Settings of tracking that are applied to the stored frames."""
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2
 """Version of the stored frames and windows."""
 _BLOCK_BYTES = 1 << 22
 
@@ -145,11 +143,10 @@ def reconstruct(
     config in `config.yaml`, and with the quality of tracks and the hashes of networks in `summary.json`; `overlay.mp4`
     and its contact sheet `overlay.png`; `report.html`. The folder is written completely or not at all.
 
-    A window is fitted as soon as its frames are tracked (`jaxfit.fitting.provisional`). Until the folder is written,
-    `FOLDER.unfinished` beside the folder holds the tracked frames and the fitted windows. After an interruption or a
-    failure, a call with the same arguments continues there. The files of the result are then those of an uninterrupted
-    call, bit by bit, on the same machine; durations and drawn videos may differ. With networks of the caller
-    (`segmenter`, `keypoints`), tracking begins again and only fitted windows are kept.
+    Until the folder is written, `FOLDER.unfinished` beside the folder holds the tracked frames and the fitted windows.
+    After an interruption or a failure, a call with the same arguments continues there. The files of the result are then
+    those of an uninterrupted call, bit by bit, on the same machine; durations and drawn videos may differ. With
+    networks of the caller (`segmenter`, `keypoints`), tracking begins again and only fitted windows are kept.
 
     Args:
         video: a video, or a folder of frames.
@@ -182,7 +179,6 @@ def reconstruct(
         own_networks = {kind: files for kind, files in network_files(config.track).items() if not replaced[kind]}
         networks = file_hashes(own_networks)
         names = names_in_model(keypoints.keypoint_names, bird.keypoint_names, config.track.keypoints.file)
-        in_model = partial(map_keypoints, names=names, model_names=bird.keypoint_names)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
             stored, workers = None, None
@@ -196,17 +192,18 @@ def reconstruct(
                 return f"{sum(parts.size_bytes for parts in (stored, fitted) if parts) / 1e6:.1f} MB stored"
 
             fit_progress = annotated(progress, lambda: f"{windows.state}, {disk_used()}")
-            with ProvisionalFit(bird, config.fit, windows, fit_progress, video, cluster) as provisional_fit:
-
-                def on_frame(observations_from: ObservationsFrom) -> None:
-                    with clock("fit"):
-                        provisional_fit(lambda first: in_model(observations_from(first)))
-
-                more = {"progress": annotated(progress, disk_used), "parts": stored, "cluster": workers}
-                tracking = run_tracking(video, config.track, segmenter, keypoints, **more, on_frame=on_frame)
-                tracking = tracking._replace(choice=choice, observations=in_model(tracking.observations))
+            tracking = run_tracking(
+                video,
+                config.track,
+                segmenter,
+                keypoints,
+                progress=annotated(progress, disk_used),
+                parts=stored,
+                cluster=workers,
+            )
+            observations = map_keypoints(tracking.observations, names, bird.keypoint_names)
+            tracking = tracking._replace(choice=choice, observations=observations)
         _check_tracking(tracking, stored)
-        observations = tracking.observations
         with clock("fit"):
             config, learnt_yaml = _learn_weights(config, observations, bird, video, progress)
             solution = fit(observations, bird, config.fit, None, fit_progress, video, windows, cluster)

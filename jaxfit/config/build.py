@@ -81,13 +81,29 @@ def build_config(kind: type[Config], values: Any) -> Config:
     """
     try:
         # JSON has the types of YAML: pydantic then takes a list for a tuple, but no text for a number
-        return pydantic.TypeAdapter(kind).validate_json(json.dumps(values))
+        return pydantic.TypeAdapter(kind).validate_json(json.dumps(_without_unused(kind, values)))
     except pydantic.ValidationError as error:
         raise _key_error(error, kind, values) from None
 
 
 def _fields(kind: Any) -> dict[str, Any]:
     return kind.__pydantic_fields__
+
+
+def _kind_of_key(kind: Any, key: Any) -> Any:
+    """Return the config dataclass of the values of a key; None for plain values."""
+    annotation = _fields(kind)[key].annotation if key in _fields(kind) else None
+    hints = (annotation, *typing.get_args(annotation))
+    return next((hint for hint in hints if dataclasses.is_dataclass(hint)), None)
+
+
+def _without_unused(kind: Any, values: Any) -> Any:
+    """Return plain values without the removed options that are off, which the configs of earlier results hold."""
+    if kind is None or not isinstance(values, dict):
+        return values
+    removed = getattr(kind, "removed", {})
+    used = {key: value for key, value in values.items() if value is not False or key not in removed}
+    return {key: _without_unused(_kind_of_key(kind, key), value) for key, value in used.items()}
 
 
 def _key_error(error: pydantic.ValidationError, kind: Any, values: Any) -> ConfigKeyError:
@@ -107,9 +123,7 @@ def _key_error(error: pydantic.ValidationError, kind: Any, values: Any) -> Confi
             part = list(_fields(kind))[part]  # a positional argument
         if part in values if isinstance(values, dict) else isinstance(values, list | tuple) and isinstance(part, int):
             where, values = join_keys(where, part), values[part]
-            annotation = _fields(kind)[part].annotation if part in _fields(kind) else None
-            inner = [hint for hint in (annotation, *typing.get_args(annotation)) if dataclasses.is_dataclass(hint)]
-            kind = inner[0] if inner else kind
+            kind = _kind_of_key(kind, part) or kind
     context = first.get("ctx", {})
     if isinstance(cause := context.get("error"), ConfigKeyError):
         return cause.within(where)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
 from annotated_types import Ge, Le
 from pydantic import NonNegativeInt, PositiveInt
@@ -102,6 +103,12 @@ class TrackerConfig:
 class TrackConfig:
     """All settings of tracking; the defaults are the paper's settings with the built-in networks."""
 
+    removed: ClassVar[Mapping[str, str]] = {
+        "repair_left_right_flips": "remove the key: fits of repaired keypoints were not better, because the fit treats "
+        "exchanged sides as outliers"
+    }
+    """Keys of earlier versions → what to do. Configs of earlier results hold such keys with `false`."""
+
     frames: FramesConfig = FramesConfig()
     segmenter: SegmenterConfig = SegmenterConfig()
     keypoints: KeypointsConfig = KeypointsConfig()
@@ -111,7 +118,5 @@ class TrackConfig:
     min_track_score: Fraction | None = None
     """Tracks with a lower mean score are skipped; null uses the value in the file of the segmenter (0.65 for the
     built-in segmenter), or 0."""
-    repair_left_right_flips: bool = False
-    """Exchange left and right keypoints in frames where the network confuses the two sides; the paper does not."""
     threads: PositiveInt | None = None
     """Number of CPU cores for each of the two networks, which run at the same time; null uses all cores."""

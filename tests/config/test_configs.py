@@ -6,7 +6,8 @@ import typing
 
 import pytest
 
-from jaxfit.config.build import field_help
+from jaxfit.config.build import build_config, field_help, plain_config
+from jaxfit.config.checks import ConfigKeyError
 from jaxfit.config.fit import FitConfig, StageConfig, load_config, shipped_fit_configs
 from jaxfit.config.perception import SegmenterConfig, TrackConfig
 from jaxfit.config.reconstruct import OverlayConfig, ReconstructConfig, load_reconstruct_config
@@ -299,3 +300,12 @@ def test_shipped_files_hold_only_overrides():
         below = load_config(values["base"]) if "base" in values else FitConfig
         for key in values.keys() - {"base", "stages", "terms"}:
             assert getattr(load_config(name), key) != getattr(below, key), (name, key)
+
+
+def test_configs_of_earlier_results_hold_removed_options():
+    plain = plain_config(load_reconstruct_config())
+    plain["track"]["repair_left_right_flips"] = False
+    assert build_config(ReconstructConfig, plain) == load_reconstruct_config()
+    plain["track"]["repair_left_right_flips"] = True
+    with pytest.raises(ConfigKeyError, match=r"`track\.repair_left_right_flips` was removed \(remove the key"):
+        build_config(ReconstructConfig, plain)

@@ -16,7 +16,7 @@ from jaxfit.fitting.fit import fit
 from jaxfit.fitting.windows import filter_observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.perception.network import instance_of
-from jaxfit.perception.tracking import TrackRecorder, drop_low_scores, drop_short_tracks
+from jaxfit.perception.tracking import drop_low_scores, drop_short_tracks, observations_of, record_frame
 
 NAMES, SIZE = ("bill", "left_eye", "right_eye"), (60, 40)
 
@@ -30,14 +30,15 @@ def blob(x, y, score=0.9):
 
 def record(frames, names=NAMES):
     """frames: number → list of (identity, column)."""
-    recorder = TrackRecorder(names, [(0, 1)])
+    recorded = []
     for t, birds in frames.items():
         points = np.array([[[x + k, t] for k in range(len(names))] for _, x in birds], np.float32)
         confidence = np.tile(np.linspace(0, 1, len(names)), (len(birds), 1))
         instances = [blob(x, 5, 0.5 + x / 100) for _, x in birds]
         identities = [one for one, _ in birds]
-        recorder.add(t, f"v.mp4#{t}", SIZE, instances, identities, points.reshape(-1, len(names), 2), confidence)
-    return recorder.observations()
+        points = points.reshape(-1, len(names), 2)
+        recorded.append(record_frame(t, f"v.mp4#{t}", SIZE, instances, identities, points, confidence))
+    return observations_of(recorded, names, [(0, 1)])
 
 
 def test_run_lengths_of_a_patch_are_those_of_the_whole_image():
@@ -83,16 +84,13 @@ def test_a_video_without_birds_is_a_file_like_any_other(tmp_path):
         fit(seen, None, load_config("paper"), source="none.json")
 
 
-def test_a_recorder_refuses_what_contradicts_itself():
+def test_a_frame_that_contradicts_itself_is_refused():
+    """A tracker or a network of the caller may err."""
     one, points = [blob(0, 0)], np.zeros((1, 3, 2))
-    recorder = TrackRecorder(NAMES)
-    recorder.add(4, "a", SIZE, one, [1], points, points[..., 0])
-    with pytest.raises(ValueError, match="must increase, but 4 follows 4"):
-        recorder.add(4, "a", SIZE, one, [1], points, points[..., 0])
     with pytest.raises(ValueError, match=r"each bird once, not \[1, 1\]"):
-        recorder.add(5, "a", SIZE, one * 2, [1, 1], np.zeros((2, 3, 2)), np.zeros((2, 3)))
-    with pytest.raises(ValueError, match=r"must have shapes \(1, 3, 2\) and \(1, 3\), not \(1, 2, 2\)"):
-        recorder.add(5, "a", SIZE, one, [1], points[:, :2], points[..., 0])
+        record_frame(5, "a", SIZE, one * 2, [1, 1], np.zeros((2, 3, 2)), np.zeros((2, 3)))
+    with pytest.raises(ValueError, match=r"must have 2 instances, not \(1, 1\)"):
+        record_frame(5, "a", SIZE, one * 2, [1, 2], points, points[..., 0])
 
 
 def test_short_tracks_are_dropped_by_their_detections():

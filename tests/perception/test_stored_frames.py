@@ -8,7 +8,6 @@ from jaxfit.config.perception import FramesConfig, TrackConfig, TrackerConfig
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.unfinished import Parts
 from jaxfit.perception import detections, track
-from jaxfit.perception.detections import load_frames
 from jaxfit.perception.track import run_tracking
 from jaxfit.perception.tracking import load_tracker
 
@@ -84,12 +83,11 @@ def test_a_missing_part_and_a_damaged_part(video, tmp_path):
 def test_numbers_of_birds_that_do_not_agree(video, tmp_path):
     run(video, Parts(tmp_path / "p", {}))
     path = tmp_path / "p" / "000000.npz"
-    for name in ("birds", "mask_length"):
-        arrays = dict(np.load(path))
-        arrays[name] = arrays[name] + 1
-        np.savez(path.with_name("000007.npz"), **arrays)
-        with pytest.raises(InputError, match=r"000007\.npz: holds frames whose numbers of birds do not agree"):
-            load_frames(Parts(tmp_path / "p", {}), 7)
+    arrays = dict(np.load(path))
+    arrays["birds"] = arrays["birds"] + 1
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match=r"000000\.npz: holds frames whose numbers of birds do not agree"):
+        run(video, Parts(tmp_path / "p", {}))
 
 
 @pytest.mark.parametrize("uses_pictures", [True, False])

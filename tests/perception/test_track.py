@@ -122,26 +122,6 @@ def test_birds_without_a_track_are_neighbours_in_crops_only(video):
     assert keypoints.counts == [3] * FRAMES
 
 
-def test_repair_of_left_right_flips_is_optional(video):
-    pairs = BIRD.keypoint_pairs
-
-    class Flipped(TrueKeypoints):
-        def __call__(self, frame, instances):
-            points, confidence = super().__call__(frame, instances)
-            if frame[0, 0, 0] == 6:
-                for left, right in pairs:
-                    points[:, [left, right]] = points[:, [right, left]]
-            return points, confidence
-
-    def run(repair):
-        config = TrackConfig(repair_left_right_flips=repair)
-        return track_video(video, config, TrueSegmenter(FOOTAGE), Flipped(FOOTAGE)).keypoints_px
-
-    truth = track_video(video, TrackConfig(), TrueSegmenter(FOOTAGE), TrueKeypoints(FOOTAGE)).keypoints_px
-    assert (run(False)[:, 6] != truth[:, 6]).any()
-    np.testing.assert_array_equal(run(True), truth)
-
-
 def test_progress_reports_speed_and_birds(video):
     reports = []
 
@@ -160,28 +140,6 @@ def test_progress_reports_speed_and_birds(video):
     assert [done for done, _ in reports[1:]] == [1] * FRAMES
     assert reports[1][1].endswith("frames/s, 3 birds now")
     assert reports[-1][1].endswith(" 1 bird now")
-
-
-def test_the_observations_after_each_frame(video):
-    """They end with the frame of the call, and are cleaned as those of the whole video."""
-    seen = []
-
-    def on_frame(observations_from):
-        seen.append([observations_from(first) for first in (0, len(seen) // 2)])
-
-    config = TrackConfig(min_track_frames=3, min_track_score=0.75)
-    tracking, _, _ = tracked(video, config, [(t, 0) for t in range(4, FRAMES)], on_frame=on_frame)
-    assert len(seen) == FRAMES
-    for t, (whole, part) in enumerate(seen):
-        assert whole.frame_index.tolist() == list(range(t + 1))
-        assert part.frame_index.tolist() == list(range(t // 2, t + 1))
-    assert [whole.num_tracks for whole, _ in seen[:4]] == [0, 0, 2, 2]  # the third bird has a low score
-    for name, value in vars(tracking.observations).items():
-        np.testing.assert_equal(getattr(seen[-1][0], name), value, err_msg=name)
-    last = seen[-1][1]  # from frame 5 on, where one bird is gone
-    assert last.track_id.tolist() == tracking.observations.track_id[tracking.observations.present[:, -1]].tolist()
-    assert last.masks.keys() == {(0, t) for t in range(FRAMES - 5)}
-    np.testing.assert_array_equal(last.keypoints_px[0], FOOTAGE.keypoints_px[5:, 1].astype(np.float32))
 
 
 def test_durations_of_all_parts(video):

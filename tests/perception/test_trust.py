@@ -5,7 +5,7 @@ import pytest
 
 from jaxfit.perception import trust
 from jaxfit.perception.network import instance_of
-from jaxfit.perception.tracking import TrackRecorder
+from jaxfit.perception.tracking import observations_of, record_frame
 from jaxfit.perception.trust import FootageSignals, footage_signals, judge
 
 GOOD = FootageSignals(
@@ -24,13 +24,13 @@ GOOD = FootageSignals(
 
 def observed(frames):
     """Observations of frames, each a dictionary: track → (score, confidence of both keypoints)."""
-    recorder = TrackRecorder(("a", "b"))
+    recorded = []
     for t, birds in enumerate(frames):
         instances = [instance_of(np.ones((4, 4), bool), score, "bird") for score, _ in birds.values()]
         confidence = np.array([[value, value] for _, value in birds.values()], np.float32).reshape(-1, 2)
         points = np.zeros((len(birds), 2, 2), np.float32)
-        recorder.add(t, f"{t}.png", (20, 20), instances, list(birds), points, confidence)
-    return recorder.observations()
+        recorded.append(record_frame(t, f"{t}.png", (20, 20), instances, list(birds), points, confidence))
+    return observations_of(recorded, ("a", "b"))
 
 
 def test_signals_by_hand():

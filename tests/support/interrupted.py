@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxfit import pipeline
 from jaxfit.cli.main import main
-from jaxfit.fitting import provisional, stored_windows
+from jaxfit.fitting import stored_windows
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.unfinished import Parts
 from jaxfit.perception import detections, track
@@ -24,7 +24,7 @@ from support.toy_footage import QUICK, Footage, TrueKeypoints, TrueSegmenter
 FOOTAGE = Footage()
 FRAMES_PER_PART = 5
 CONFIG = QUICK.replace("window: 12", "window: 6")
-"""Two windows for each of three birds. After ten of twelve frames, the first three windows are complete."""
+"""Two windows for each of three birds."""
 
 
 @contextmanager
@@ -38,8 +38,6 @@ def toy_networks(segmenter):
         mock.patch.object(pipeline, "network_files", return_value={}),
         mock.patch.object(detections, "FRAMES_PER_PART", FRAMES_PER_PART),
         mock.patch.object(stored_windows, "MIN_FRAMES", 1),
-        mock.patch.object(provisional, "STEP_FRAMES", FRAMES_PER_PART),
-        mock.patch.object(provisional, "LATER_FRAMES", 2),
     ):
         yield segmenter
 

@@ -25,7 +25,6 @@ from jaxfit.foundation.unfinished import Parts
 from jaxfit.foundation.workers import Cluster, open_cluster
 from jaxfit.model.files import load_murre, save_bird
 from jaxfit.perception import detections, track, worker_tasks
-from jaxfit.perception.detections import LocalDetections
 from jaxfit.perception.track import run_tracking
 from jaxfit.perception.tracking import load_tracker
 from jaxfit.simulation.scene import simulate
@@ -103,21 +102,18 @@ def test_a_task_that_fails_costs_its_frames(video, workers, monkeypatch, caplog)
     assert "no detections: failed 3 times on the workers: RuntimeError: no memory" in caplog.text
 
 
-def test_files_that_a_worker_cannot_use(video, workers, tmp_path, monkeypatch):
+def test_files_that_a_worker_cannot_use(video, workers, tmp_path):
     """Another size than in the command, and a network that is not there."""
-    states, absent = worker_tasks._state, tmp_path / "absent.onnx"
-    monkeypatch.setattr(worker_tasks, "_state", lambda file: (7, 0) if file == video else states(file))
-    detections = worker_tasks.WorkerDetections(workers, video, CONFIG, range(FRAMES), None)
-    monkeypatch.setattr(worker_tasks, "_state", states)
-    detections._clock = track.Clock()
+    absent = tmp_path / "absent.onnx"
+    shared = worker_tasks.shared_data(video, CONFIG)
+    other = shared._replace(sizes=(7, *shared.sizes[1:]))
     with pytest.raises(InputError, match=rf"worker on .*: {video}: differs from the file of the command"):
-        list(detections)
+        worker_tasks.detect_range(other, range(2))
     missing = dataclasses.replace(CONFIG, segmenter=SegmenterConfig(str(absent)))
     with pytest.raises(InputError, match=r"absent\.onnx: cannot be read: No such file"):
-        worker_tasks.WorkerDetections(workers, video, missing, range(FRAMES), track.Clock())
-    detections._shared = detections._shared._replace(config=missing)
+        worker_tasks.detect_on_workers(workers, video, missing, range(FRAMES), track.Clock())
     with pytest.raises(InputError, match=r"worker on .*absent\.onnx: cannot be read: No such file"):
-        list(detections)
+        worker_tasks.detect_range(shared._replace(config=missing), range(2))
 
 
 def test_a_changed_network_is_loaded_again(video, tmp_path, monkeypatch):
@@ -128,8 +124,7 @@ def test_a_changed_network_is_loaded_again(video, tmp_path, monkeypatch):
     for content in (b"1", b"1", b"22"):
         if not file.exists() or file.read_bytes() != content:
             file.write_bytes(content)
-        detections = worker_tasks.WorkerDetections(None, video, CONFIG, range(2), None)
-        assert len(worker_tasks.detect_range(detections._shared, range(2)).frames) == 2
+        assert len(worker_tasks.detect_range(worker_tasks.shared_data(video, CONFIG), range(2))) == 2
     assert len(opened) == 2
 
 
@@ -140,7 +135,7 @@ def test_networks_that_run_in_this_process(video, workers, monkeypatch, caplog, 
     if "number" in reason:
         monkeypatch.setattr(track, "expected_frames", lambda *_: None)
     used = []
-    monkeypatch.setattr(track, "LocalDetections", lambda *given: used.append(1) or LocalDetections(*given))
+    monkeypatch.setattr(track, "detect", lambda *given: used.append(1) or detections.detect(*given))
     run_tracking(video, CONFIG, *networks(), tracker, cluster=workers)
     assert used
     assert reason in caplog.text
