@@ -20,6 +20,10 @@ _ROTATION_TOLERANCE = 1e-3
 """Largest deviation of RᵀR from the identity: the digits of a text file, not another matrix."""
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
 _ROUND_TRIP_PX = 0.01
+_MAX_PX = 1e7
+"""Largest focal length and largest position of the principal point."""
+_MAX_NUMBER = 1e12
+"""Largest coordinate and coefficient; squares of larger numbers lose the small ones beside them."""
 
 
 def _undistort_points(points: np.ndarray, K: np.ndarray, distortion: np.ndarray, *more: Any) -> np.ndarray:
@@ -70,6 +74,9 @@ class Camera:
                 raise ValueError(f"{name} must have the shape {shape}, not {np.shape(getattr(self, name))}") from None
             if not np.isfinite(value).all():
                 raise ValueError(f"{name} must be finite")
+            limit = _MAX_PX if name == "matrix" else _MAX_NUMBER
+            if np.abs(value).max(initial=0) > limit:
+                raise ValueError(f"{name} holds {np.abs(value).max():g}, more than {limit:g}")
             object.__setattr__(self, name, value)
         if len(self.distortion) not in _COEFFICIENTS[self.lens]:
             allowed = ", ".join(map(str, _COEFFICIENTS[self.lens]))

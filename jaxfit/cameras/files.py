@@ -33,7 +33,6 @@ from jaxfit.cameras.formats.opencv import read_opencv, read_opencv_folder
 from jaxfit.cameras.formats.values import Parsed, Unit, in_metres, natural
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
-from jaxfit.foundation.limits import CAMERAS
 from jaxfit.foundation.reading import check_folder, open_file
 
 _FORMATS = (
@@ -106,12 +105,12 @@ def write_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
         path: the file; an existing file is replaced.
 
     Raises:
-        ValueError: there is no camera, there are too many, or two cameras have one name.
+        ValueError: there is no camera, or two cameras have one name.
         InputError: the system rejects the write.
     """
     names = [camera.name for camera in cameras]
-    if not 1 <= len(names) <= CAMERAS:
-        raise ValueError(f"cameras must hold 1 to {CAMERAS} cameras, not {len(names)}")
+    if not names:
+        raise ValueError("cameras must hold at least one camera")
     if len(set(names)) < len(names):
         raise ValueError(f"cameras must have different names, not {names}")
     write_whole(path, anipose_text(cameras).encode("utf-8"))
@@ -163,8 +162,6 @@ def _read_folder(folder: Path) -> Parsed:
     ((kind, found),) = present.items()
     if not found:
         raise InputError(folder, "holds no file of cameras", _FORMATS)
-    if len(found) > CAMERAS:
-        raise InputError(folder, f"holds {len(found):,} {kind}, more than {CAMERAS:,}", "name the file of the cameras")
     if len(found) == 1:
         return _reader(found[0])(found[0])
     if kind == "TOML files":

@@ -95,6 +95,8 @@ def test_position_and_field_of_view():
         ({"distortion": np.zeros(3)}, "4, 5, 8, 12, 14 coefficients, not 3"),
         ({"lens": "mirror"}, "lens must be one of perspective, fisheye"),
         ({"size_px": (0, 3)}, "size_px must be in 1"),
+        ({"matrix": np.array([[900, 0, 6e9], [0, 900, 300], [0, 0, 1]])}, r"matrix holds 6e\+09, more than 1e\+07"),
+        ({"transl_cam": [0, 0, 1e33]}, r"transl_cam holds 1e\+33, more than 1e\+12"),
     ],
 )
 def test_impossible_values_are_refused(changes, message):

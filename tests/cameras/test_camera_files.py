@@ -397,7 +397,7 @@ def test_any_camera_is_read_back_as_it_was_written(tmp_path_factory, cameras):
 
 def test_cameras_that_no_file_can_hold_are_refused(tmp_path):
     camera = Camera("a", MATRIX, FIVE, ROTATION, TRANSL)
-    with pytest.raises(ValueError, match="cameras must hold 1 to 1000 cameras, not 0"):
+    with pytest.raises(ValueError, match="cameras must hold at least one camera"):
         write_cameras([], tmp_path / "none.toml")
     with pytest.raises(ValueError, match="different names"):
         write_cameras([camera, camera], tmp_path / "two.toml")

@@ -30,29 +30,19 @@ from jaxfit.cameras.formats.values import (
     parsed,
     stated_unit,
 )
-from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.reading import read_text
+from jaxfit.foundation.reading import read_text, reading
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
-_DOTS = 200
-"""Most points in a line. tomllib takes minutes for a key of a million parts, a.a.a.…"""
 
 
 def read_anipose(path: Path) -> Parsed:
     """Read the cameras of a TOML file of anipose, of Pose2Sim or of `anipose_text`.
 
     Raises:
-        InputError: the file is not valid TOML, is too large, or a camera lacks a value or holds an impossible value.
+        InputError: the file is not valid TOML, or a camera lacks a value or holds an impossible value.
     """
-    text = read_text(path, "a TOML file of cameras")
-    if any(line.count(".") > _DOTS for line in text.split("\n")):
-        raise InputError(path, f"has a line with more than {_DOTS} points", "give a file of cameras")
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(path, f"is not valid TOML: {error}", "correct the file or write it again") from None
-    except (RecursionError, ValueError):  # ValueError: a whole number of more than 4,300 digits
-        raise InputError(path, "is nested too deep or holds too large a number", "write the file again") from None
+    with reading(path, "a TOML file of cameras", "correct the file or write it again"):
+        content = tomllib.loads(read_text(path, "a TOML file of cameras"))
     metadata = content.pop("metadata", {})
     if not isinstance(metadata, dict):
         fail(path, "metadata", "must be a table")

@@ -38,9 +38,9 @@ def read_dannce(path: Path) -> Parsed:
     params = variables.get("params", variables.get("camParams"))
     if params is None:
         return parsed(path, [_single(path, variables)], "DANNCE", None, "mm")
-    cells = [_unwrapped(each) for each in params] if isinstance(params, list) else []
+    cells = params if isinstance(params, list) else [params]
     names = variables.get("camnames", [])
-    names = [_unwrapped(each) for each in names] if isinstance(names, list) else [names]
+    names = names if isinstance(names, list) else [names]
     if names and len(names) != len(cells):
         problem = f"holds {len(cells)} cameras and {len(names)} camnames"
         raise InputError(path, problem, "write one name for each camera")
@@ -71,7 +71,7 @@ def _camera(path: Path, field: str, name: str, values: Any) -> Camera:
     missing = [key for key in ("K", rotation, "t") if key not in values]
     if missing:
         raise InputError(path, f"{field or 'the file'} lacks {', '.join(missing)}", _REMEDY)
-    if np.any(values.get("m", 0) == 1):
+    if values.get("m") == 1:
         raise InputError(path, f"{where}m marks the image of a mirror", "mirrored cameras are not supported")
     K = numbers(path, f"{where}K", values["K"], (3, 3)).T
     if K[2, :2].any():
@@ -88,10 +88,3 @@ def _camera(path: Path, field: str, name: str, values: Any) -> Camera:
     R = numbers(path, where + rotation, values[rotation], (3, 3)).T
     transl = numbers(path, f"{where}t", values["t"], (3,))
     return make_camera(path, field, name, K, np.array([k1, k2, p1, p2, k3]), (R, transl), None, MATLAB_PIXELS)
-
-
-def _unwrapped(value: Any) -> Any:
-    """Return the value inside lists of one entry, as which cells and structs are read."""
-    while isinstance(value, list) and len(value) == 1:
-        value = value[0]
-    return value

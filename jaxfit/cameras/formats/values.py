@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,7 +12,6 @@ import numpy as np
 
 from jaxfit.cameras.camera import Camera, Lens
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CAMERAS, NAME_CHARACTERS
 
 Unit = Literal["m", "cm", "mm"]
 """Units of length of camera files."""
@@ -26,10 +24,6 @@ WHOLE_PIXELS = 0.5
 MATLAB_PIXELS = -0.5
 """What to add to a principal point where pixel centres are at 1, 2, 3, …, as in MATLAB."""
 
-LARGEST = 1e12
-"""Largest absolute number of a camera; squares of larger numbers may overflow."""
-_LONGEST = 100
-"""Most numbers of one field of a camera."""
 _REMEDY = "write the file again with the program that made it"
 
 
@@ -56,12 +50,10 @@ def parsed(source: Path, cameras: Sequence[Camera], form: str, unit: Unit | None
         usual: the usual unit of the program.
 
     Raises:
-        InputError: there is no camera, there are more than `CAMERAS`, or two cameras have one name.
+        InputError: there is no camera, or two cameras have one name.
     """
     if not cameras:
         raise InputError(source, "holds no camera", "give a file of calibrated cameras")
-    if len(cameras) > CAMERAS:
-        raise InputError(source, f"holds {len(cameras):,} cameras, more than {CAMERAS:,}", "split the file")
     names = [camera.name for camera in cameras]
     for name in names:
         if names.count(name) > 1:
@@ -122,53 +114,26 @@ def numbers(source: Path, field: str, value: Any, *shapes: tuple[int, ...]) -> n
     Raises:
         InputError: the value is of another kind or shape, or not finite.
     """
-    expected = " or ".join("a vector" if shape == (-1,) else "×".join(map(str, shape)) for shape in shapes)
-    flat, shape = _flat(source, field, value)
-    array = np.array(flat, np.float64)
+    is_matrix = isinstance(value, dict) and "data" in value
+    try:
+        array = np.asarray(value["data"] if is_matrix else value)
+        if is_matrix:
+            sides = value["sizes"] if "sizes" in value else (value["rows"], value["cols"])
+            array = array.reshape(sides)
+    except (ValueError, TypeError, LookupError, OverflowError):
+        problem = "has another number of values than rows × cols" if is_matrix else "has rows of different lengths"
+        fail(source, field, problem)
+    if array.dtype.kind not in "fiu":
+        fail(source, field, "must hold numbers")
     if not np.isfinite(array).all():
         fail(source, field, "holds a value that is not finite")
-    if np.abs(array).max(initial=0) > LARGEST:
-        fail(source, field, f"holds a number above {LARGEST:g}")
-    sides = [side for side in shape if side != 1]
+    sides = [side for side in array.shape if side != 1]
     for allowed in shapes:
         if (allowed == (-1,) and len(sides) <= 1) or sides == [side for side in allowed if side != 1]:
-            return array.reshape(allowed)
-    fail(source, field, f"must have the shape {expected}, not {'×'.join(map(str, shape)) or 'of one number'}")
-
-
-def _flat(source: Path, field: str, value: Any) -> tuple[list[float], tuple[int, ...]]:
-    """Return the numbers of nested lists, or of a matrix of OpenCV, and their shape."""
-    if isinstance(value, dict) and "data" in value:
-        flat, shape = _flat(source, f"{field}.data", value["data"])
-        stated: Any = value.get("sizes", [value.get("rows"), value.get("cols")])
-        stated = [stated] if type(stated) is int else stated  # XML has no lists of one entry
-        sides = [side for side in stated if type(side) is int and 0 <= side <= _LONGEST] if type(stated) is list else []
-        if not sides or sides != stated or math.prod(sides) != len(flat) or len(shape) > 1:
-            fail(source, field, f"has {len(flat)} numbers, which is not rows × cols")
-        return flat, tuple(sides)
-    entries: Any = value.tolist() if isinstance(value, np.ndarray) else value
-    return _nested(source, field, entries)
-
-
-def _nested(source: Path, field: str, value: Any) -> tuple[list[float], tuple[int, ...]]:
-    """Return the numbers of nested lists and their shape."""
-    if type(value) in (int, float):
-        try:
-            return [float(value)], ()
-        except OverflowError:
-            fail(source, field, "holds a number that is too large")
-    if not isinstance(value, list):
-        kinds = {str: "text", dict: "a table", bool: "true or false"}
-        fail(source, field, f"must hold numbers, not {kinds.get(type(value), 'another value')}")
-    if len(value) > _LONGEST:
-        fail(source, field, f"has {len(value):,} entries, more than {_LONGEST}")
-    parts = [_nested(source, f"{field}[{i}]", part) for i, part in enumerate(value)]
-    if len({shape for _, shape in parts}) > 1:
-        fail(source, field, "has rows of different lengths")
-    flat = [number for part, _ in parts for number in part]
-    if len(flat) > _LONGEST:
-        fail(source, field, f"has {len(flat):,} numbers, more than {_LONGEST}")
-    return flat, (len(value), *(parts[0][1] if parts else ()))
+            return array.astype(np.float64).reshape(allowed)
+    expected = " or ".join("a vector" if shape == (-1,) else "×".join(map(str, shape)) for shape in shapes)
+    actual = "×".join(map(str, array.shape)) or "of one number"
+    fail(source, field, f"must have the shape {expected}, not {actual}")
 
 
 def image_size(source: Path, field: str, value: Any) -> tuple[int, int] | None:
@@ -189,10 +154,7 @@ def camera_name(source: Path, field: str, value: Any) -> str:
     """Return the name of a camera, which is text or a whole number in the file."""
     if type(value) not in (str, int):
         fail(source, field, "must be text", "name the camera")
-    text = str(value)
-    if not 0 < len(text) <= NAME_CHARACTERS:
-        fail(source, field, f"must have 1 to {NAME_CHARACTERS} characters, not {len(text):,}", "name the camera")
-    return text
+    return str(value)
 
 
 def stated_unit(source: Path, field: str, value: Any) -> Unit | None:
