@@ -8,7 +8,7 @@ from jaxtyping import Float
 from jaxfit.behaviour.birds import Birds, whole_frames
 from jaxfit.behaviour.posture import heading_deg, turn_deg
 from jaxfit.behaviour.registry import feature
-from jaxfit.fitting.contacts import SPEED_S
+from jaxfit.fitting.ledge import SPEED_S
 
 
 def rate(values: Float[np.ndarray, "N T *D"], birds: Birds, circular: bool = False) -> Float[np.ndarray, "N T *D"]:

@@ -35,7 +35,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxfit.data.solution import ERROR_BARS
-from jaxfit.fitting.posterior import WindowPosterior, window_posteriors
+from jaxfit.fitting.posterior import Posterior, window_posteriors
 from jaxfit.fitting.problem import Problem, Program
 from jaxfit.fitting.sandwich import (
     constant_deviation,
@@ -193,7 +193,7 @@ def _keypoints_and_derivatives(program: Program, problems: Problem, pose: Pose) 
 
 
 def _error_bars(
-    program: Program, problem: Problem, pose: Pose, window: WindowPosterior, keypoints: _Keypoints, common_size: bool
+    program: Program, problem: Problem, pose: Pose, window: Posterior, keypoints: _Keypoints, common_size: bool
 ) -> ErrorBars:
     """Return the error bars of one window."""
     T, _, _, D = keypoints.derivative.shape
@@ -206,13 +206,15 @@ def _error_bars(
     by_transl[:, :, 3 * bones + 3 : 3 * bones + 6] = np.eye(3)
     at_scale = 3 * bones + 6
     common_size &= problem.targets.views is None  # several views know the size
-    if common_size:  # points/scale: its derivative has a part along the point itself
+    if (
+        common_size
+    ):  # quotient rule: d(x/s) = dx/s − x·ds/s², so that the deviation of the size is along the viewing ray
         by_cam /= scale[:, None, None, None]
         by_cam[..., at_scale] -= points / scale[:, None, None] ** 2
         by_transl /= scale[:, None, None]
         by_transl[..., at_scale] -= pose.transl / scale[:, None] ** 2
 
-    variance = np.zeros((T, D))
+    variance = np.zeros((T, D))  # fixed parameters have none
     variance[:, columns] = np.einsum("tii->ti", covariance)
     ends = np.cumsum([at_scale + 1, *(bones if name == "bone_length" else shapes for name in program.shared)])
     shared_variance = {name: variance[:, a:b] for name, a, b in zip(program.shared, ends[:-1], ends[1:], strict=True)}
@@ -258,6 +260,7 @@ def _tangent_sd(pose: Pose, columns: np.ndarray, covariance: np.ndarray) -> Floa
         at = position[3 * j : 3 * j + 3]
         if (at >= 0).all():
             full[:, j] = covariance[:, at[:, None], at]
+    # exp(r + dr) = exp(r)·exp(Jr(r)·dr) to first order, so δ = Jr·dr has the covariance Jr·Σ·Jrᵀ
     Jr = np.asarray(right_jacobian(jnp.asarray(angles, jnp.float32)), np.float64)
     return np.sqrt(np.einsum("tjab,tjbc,tjac->tja", Jr, full, Jr))
 
@@ -271,6 +274,7 @@ def _in_views(
         linear, offset = np.asarray(views.linear, np.float64), np.asarray(views.offset, np.float64)
         points = (np.einsum("tvij,tkj->tvki", linear, points) + offset[:, :, None]).reshape(T, -1, 3)
         slope = np.einsum("tvij,tkjp->tvkip", linear, slope).reshape(T, -1, 3, slope.shape[-1])
+    # u = f·x/z + c: du = f·(dx/z − x·dz/z²)
     x, z, camera = points[..., :2], points[..., 2:], program.camera
     by_px = camera.focal_px * (slope[..., :2, :] / z[..., None] - (x / z**2)[..., None] * slope[..., 2:, :])
     return camera.focal_px * x / z + camera.centre_px, by_px
@@ -294,7 +298,10 @@ class _Noise(NamedTuple):
 
     @property
     def gaussian(self) -> float:
-        """Variance of a Gaussian of equal Fisher information, in units of `variance`."""
+        """Variance of a Gaussian of equal Fisher information, in units of `variance`.
+
+        The Fisher information of a t of n dimensions is (ν + n)/(ν + n + 2) per squared scale; n = 2.
+        """
         return 1.0 if math.isinf(self.dof) else (self.dof + 4) / (self.dof + 2)
 
     @property
@@ -304,6 +311,8 @@ class _Noise(NamedTuple):
 
     def precision(self, error_px: Float[np.ndarray, "T K 2"]) -> Float[np.ndarray, "T K"]:
         """Return the curvature of the term for x and y of a keypoint, at some errors (`residual_curvature`)."""
+        # ρ = (ν + 2)/2·log(1 + q/ν) with q = ‖e‖²/s²; the mean over directions of its second derivative is
+        # 2(ρ′ + q·ρ″)/s² = (1 + 2/ν)/(1 + q/ν)²/s²
         squared = (error_px**2).sum(-1) / self.scale2
         return (1 + 2 / self.dof) / (1 + squared / self.dof) ** 2 / self.variance
 
@@ -324,7 +333,7 @@ def _noise(problem: Problem) -> _Noise | None:
 
 
 def _covariance(
-    program: Program, problem: Problem, window: WindowPosterior, keypoints_px: np.ndarray, J: np.ndarray
+    program: Program, problem: Problem, window: Posterior, keypoints_px: np.ndarray, J: np.ndarray
 ) -> tuple[Float[np.ndarray, "T P P"], float]:
     """Return the covariance of the parameters of each frame (`sandwich`), and the misfit factor.
 
@@ -333,14 +342,14 @@ def _covariance(
         keypoints_px: (T, K, 2) the fitted keypoints.
         J: (T, K, 2, P) their derivatives.
     """
-    covariance, misfit = window.posterior.frame_covariance(), 1.0
+    covariance, misfit = window.covariance.of_frames(), 1.0
     present = np.asarray(problem.targets.present, bool)
     noise = _noise(problem)
     if noise is not None:
         error_px = keypoints_px - np.asarray(problem.targets.keypoints_px, np.float64)
         counted = (noise.confidence > 0) & present[:, None]
         misfit = _misfit(noise, error_px, counted, _propagate(J, covariance))
-        factor = time_factor(lag_correlations(error_px, counted), fit_correlation(J, window.posterior, present))
+        factor = time_factor(lag_correlations(error_px, counted), fit_correlation(J, window.covariance, present))
         if factor > 1:
             data = data_blocks(J, counted * noise.precision(error_px), len(window.columns.own))
             covariance = covariance + (factor - 1) * spread(window.precision, covariance, data)
@@ -354,6 +363,8 @@ def _covariance(
 
 def _misfit(noise: _Noise, error_px: np.ndarray, counted: np.ndarray, px_cov: np.ndarray) -> float:
     """Return the misfit factor of a window, see the head of this module; 1 for windows with few detected keypoints."""
+    # the residual of a keypoint has the variance σ²(1 − h) with the leverage h, the share of its variance that the fit
+    # takes: h = tr(J·Σ·Jᵀ)/(2σ²), the mean over x and y
     leverage = np.einsum("tkii->tk", px_cov) / (2 * noise.gaussian * noise.variance)
     squared = (error_px**2).sum(-1) / (noise.variance * (1 - np.minimum(leverage, MAX_LEVERAGE)))
     squared = squared[counted & np.isfinite(squared)]

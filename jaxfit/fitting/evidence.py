@@ -1,6 +1,19 @@
 """What a sample of windows says about the precision of a term: the effective number of errors, and their energy.
 
 `fitting/learn.py` has the equations and their sources.
+
+Errors of an outline are not independent from pixel to pixel. If the outline is displaced by an error with a Gaussian
+correlation of length τ, the filtered mask error ẽ (σ: the width of the filter) has
+
+    N = L/√(2π(τ² + 2σ²)),   r = Σ(ẽ filtered to the width 2σ)²/Σẽ² = ½·√((τ² + 2σ²)/(τ² + 8σ²)),
+
+with the length L of the outline. r gives τ, as a median over masks. The variance Σẽ²/N is a mean over masks: it
+contains the outlines that the fit does not reach, so that the weight does not count all outlines as known.
+
+The precision N/Σẽ² makes the mask term know the mean displacement of a piece of the outline as well as the data do: for
+a standard deviation s of the displacement, it is √2·σ/(τ·s²).
+
+Source: ours, for outlines.
 """
 
 from __future__ import annotations
@@ -14,9 +27,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.ndimage import gaussian_filter
 
 from jaxfit.config.fit import FitConfig, StageConfig
-from jaxfit.fitting.outline_noise import independent_errors, outline_errors, shown_frames
 from jaxfit.fitting.posterior import Blocks, Columns, broad_precision, posterior_of, window_blocks, with_shared
 from jaxfit.fitting.problem import Problem, Program, problem_window
 from jaxfit.fitting.solve import FitModel, stage_hyperparameters, stage_program
@@ -26,6 +39,7 @@ from jaxfit.objective.curvature import frame_rows
 from jaxfit.objective.objective import evaluate_curvature
 from jaxfit.objective.residuals import as_list
 from jaxfit.raster.silhouette import silhouette
+from jaxfit.raster.silhouette_reference import UNKNOWN
 
 KEYPOINTS, MASK = "keypoint_likelihood", "mask_smooth_l1"
 MIN_MEAN_WEIGHT = 0.1
@@ -33,6 +47,11 @@ MIN_MEAN_WEIGHT = 0.1
 MIN_SHARE = 0.5
 """Least part of the N errors that the fit must leave. tr(Σ·H), the part that the fit takes up, is an approximation by
 the curvature. Where it is larger, its error decides about the value, and the value of the config stays."""
+
+MASKS_PER_WINDOW = 25
+"""Number of masks of a window whose errors are filtered."""
+LARGEST_RATIO = 0.49
+"""Largest r, for which τ is 12σ. For a displacement of the whole outline, r is ½."""
 
 
 class Evidence(NamedTuple):
@@ -124,6 +143,7 @@ def expanded(evidence: Evidence, dof: float) -> Evidence:
     """
     if evidence.count == 0:
         return evidence
+    # w = (ν + 2)/(ν + q) and Σ w·q = energy: ν·Σ w = (ν + 2)·M − energy for M keypoints, and count = 2M
     mean_weight = 1 + 2 / dof * (1 - evidence.energy / evidence.count)
     return evidence._replace(energy=evidence.energy / max(mean_weight, MIN_MEAN_WEIGHT))
 
@@ -167,10 +187,12 @@ def _frame_statistics(program: Program, problems: Problem, pose: Pose) -> _Frame
         T, D = frame_rows(pose, program.shared).shape
         for name in (each for each in (KEYPOINTS, MASK) if each in settings):
             H = evaluate_curvature(window, program.terms, {name: settings[name]}, second_order=True)
+            # these terms link no frames, so that a probe in all frames at once gives one column of all blocks
             units = jnp.broadcast_to(jnp.eye(D)[:, None], (D, T, D))
             curvature[name] = jax.lax.map(H.product, units).transpose(1, 2, 0)
         of_keypoints = dict(settings[KEYPOINTS])
         weight = of_keypoints.pop("weight")
+        # E = Σ w·ρ(s) has the gradient of the squares Σ w·ρ′(s)·s at the same errors; 2ρ′ is their precision
         energy = sum(
             jnp.sum(each.weight * 2 * each.kernel.slope(squared) * squared)
             for each in as_list(program.terms[KEYPOINTS].function(window, **of_keypoints))
@@ -200,10 +222,71 @@ def _window_sums(
     posterior = posterior_of(*full, broad_precision(program, pose))
     if isinstance(posterior, str):
         return None
-    covariance = posterior.posterior.frame_covariance()
+    # tr(Σ·H): the terms have blocks of single frames, so the blocks of Σ of single frames are enough
+    covariance = posterior.covariance.of_frames()
     both = np.concatenate([full[1].own, full[1].shared])
     taken = {name: np.sum(covariance * H[:, both[:, None], both]) for name, H in local.curvature.items()}
     sums = {KEYPOINTS: np.array([2 * local.keypoints, taken[KEYPOINTS], local.energy])}
     if MASK in taken:
         sums[MASK] = np.array([local.masks, taken[MASK], 0.0])
     return sums
+
+
+def shown_frames(frames: int) -> np.ndarray:
+    """Return the positions of the frames whose outlines are compared."""
+    return np.unique(np.linspace(0, frames - 1, min(frames, MASKS_PER_WINDOW)).round().astype(int))
+
+
+def outline_errors(
+    shown: Float[np.ndarray, "M H W"],
+    mask: np.ndarray,
+    has_mask: np.ndarray,
+    program: Program,
+) -> Float[np.ndarray, "M 3"]:
+    """Return Σẽ², Σ(ẽ filtered to twice the width)², and the length of the outline in pixels, of each mask."""
+    sigma, rows = program.raster.blur.filter_sd_px, []
+    for silhouette_px, t in zip(shown, shown_frames(len(has_mask)).tolist(), strict=True):
+        if has_mask[t]:
+            unknown = mask[t] == UNKNOWN
+            rows.append(outline_error(silhouette_px, (mask[t] != 0) & ~unknown, unknown, sigma))
+    return np.array(rows).reshape(-1, 3)
+
+
+def outline_error(
+    shown: Float[np.ndarray, "H W"], mask: np.ndarray, unknown: np.ndarray, sigma: float
+) -> tuple[float, float, float]:
+    """Return Σẽ², Σ(ẽ filtered to twice the width)², and the length of the outline in pixels, of one mask.
+
+    Args:
+        shown: the filtered silhouette.
+        mask, unknown: the pixels of the mask, and those without information.
+        sigma: width of the filter of the silhouette, in pixels.
+    """
+    known = np.ones(mask.shape, bool)
+    if unknown.any():
+        known = gaussian_filter(unknown.astype(np.float32), sigma, mode="constant") < 0.01
+    error = np.where(known, shown - gaussian_filter(mask.astype(np.float32), sigma, mode="constant"), 0)
+    wider = gaussian_filter(error, np.sqrt(3) * sigma, mode="constant")
+    length = (np.hypot(*np.gradient(shown)) * known).sum()
+    return float((error**2).sum()), float((wider**2).sum()), float(length)
+
+
+def outline_correlation_px(ratio: float, sigma: float) -> float:
+    """Return the correlation length τ of the displacement of an outline, from the ratio r; 0 for r ≤ ¼."""
+    q = min(4 * min(ratio, LARGEST_RATIO) ** 2, 1.0)  # (τ² + 2σ²)/(τ² + 8σ²)
+    return float(np.sqrt(max((8 * q - 2) * sigma**2 / (1 - q), 0.0)))
+
+
+def independent_errors(outlines: Float[np.ndarray, "M 3"], sigma: float) -> tuple[float, float]:
+    """Return the mean number N of independent errors of a mask, and the mean over masks of Σẽ²/N.
+
+    Args:
+        outlines: `outline_error` of some masks.
+        sigma: width of the filter, in pixels of the silhouette.
+    """
+    squared, wider, length = outlines[(outlines[:, 0] > 0) & (outlines[:, 2] > 0)].T
+    if not len(squared):
+        return 0.0, 0.0
+    tau = outline_correlation_px(float(np.median(wider / squared)), sigma)
+    count = length / np.sqrt(2 * np.pi * (tau**2 + 2 * sigma**2))
+    return float(count.mean()), float((squared / count).mean())

@@ -84,7 +84,10 @@ def match_candidates(
     Returns:
         Costs and scales, (C,). If all confidences are 0, the costs are 0.
     """
+    # scaled orthographic camera: pixel = s·(R·x)_xy + shift; a bird's depth is small beside its distance
     flat = jnp.einsum("cij,kj->cki", candidates[:, :2], model_keypoints)  # (C, K, 2)
+    # iteratively reweighted least squares: the minimum of Σ c·ρ(e²) is that of Σ c·ρ′(e²)·e² with ρ′ at the last
+    # errors, and ρ′(e²) = (σ²/(σ² + e²))² for Geman-McClure
     weight = jnp.broadcast_to(confidence, flat.shape[:2])
     for _ in range(4):
         scale, shift = _similarity(flat, keypoints_px, weight)
@@ -96,6 +99,7 @@ def match_candidates(
 
 def _similarity(flat, keypoints_px, weight):
     """Return the least-squares scale (C,) and shift (C, 2) from orthographic points (C, K, 2) to pixels."""
+    # with the weighted means m of both: s = Σ w·(x − m_x)·(y − m_y) / Σ w·‖x − m_x‖², shift = m_y − s·m_x
     total = jnp.maximum(jnp.sum(weight, axis=1), 1e-6)[:, None]
     mean_flat = jnp.sum(weight[..., None] * flat, axis=1) / total
     mean_px = jnp.sum(weight[..., None] * keypoints_px, axis=1) / total
@@ -112,6 +116,9 @@ def choose_sequence(cost: Float[Array, "T M"], rotation: Float[Array, "T M 3 3"]
     The minimum is exact, by dynamic programming (Viterbi). Angles between consecutive frames are in radians.
     """
 
+    # Bellman: best_t+1(n) = cost_t+1(n) + min_m [best_t(m) + smoothness · angle(m, n)]. `predecessors` holds the
+    # minimising m, so that the path is read backward from the best last candidate. It takes T·M² operations for M^T
+    # paths.
     def forward(best, current):
         cost_t, angle = current
         transition = best[:, None] + smoothness * angle
@@ -141,6 +148,9 @@ def _orientations(
     nearest = jnp.argmin(distance, axis=1)
     match = jax.lax.map(lambda frame: match_candidates(candidates, model_keypoints, *frame), (keypoints_px, confidence))
     cost = match.cost[nearest]
+    # Further hypotheses: the best sequence among candidates that are far from all earlier hypotheses in every frame.
+    # Only the `candidates` best orientations of a frame take part, because the time grows with the square of their
+    # number.
     exclusion = jnp.zeros_like(cost)
     orientations, scales = [], []
     for _ in range(config.hypotheses):
@@ -150,7 +160,7 @@ def _orientations(
         chosen = index[frames, path]
         orientations.append(candidates[chosen])
         scales.append(match.scale_px[nearest, chosen])
-        trace = jnp.einsum("tij,cij->tc", candidates[chosen], candidates)
+        trace = jnp.einsum("tij,cij->tc", candidates[chosen], candidates)  # tr(RaᵀRb) = 1 + 2 cos θ
         exclusion = jnp.where((trace - 1) / 2 > np.cos(MIN_SEPARATION_RAD), EXCLUDED_COST, exclusion)
     return jnp.stack(orientations), jnp.stack(scales)
 
@@ -208,6 +218,8 @@ def _search_tile(
 
     def initial_pose(R, scale_px, keypoints_px, confidence) -> tuple[Array, Array, Array]:
         window_scale_px = jnp.maximum(jnp.median(scale_px), min_scale_px)
+        # pixels per model unit = f·scale/z: the median frame has the size of the model, other frames keep their ratio
+        # to it
         depth = camera.focal_px / window_scale_px
         scale = jnp.ones(1) if common_size else jnp.clip(scale_px / window_scale_px, 0.5, 2.0)
         # the bird rotates about its root joint, as in `joint_transforms`

@@ -84,6 +84,7 @@ def learn_offsets(
     # frames without the bird have arbitrary poses
     J, error = np.where(seen[..., None, None], J, 0), np.where(seen[..., None], targets.keypoints_px - keypoints_px, 0)
     weight = seen * (scale["dof"] + 2) / (scale["dof"] + (error**2).sum(-1) / variance) / variance
+    # e was measured with the offsets before: linear in the offset, the error without them is e + J·o_before
     error = error + np.einsum("wtkac,kc->wtka", J, before.offsets)
     H = np.einsum("wtk,wtkab,wtkac->kbc", weight, J, J)
     slope = np.einsum("wtk,wtkac,wtka->kc", weight, J, error)
@@ -100,12 +101,14 @@ def _posterior(bird: Bird, H: Float[np.ndarray, "K 3 3"], slope: Float[np.ndarra
         both, sum_of_both = H[k] + H[other] * np.outer(_MIRROR, _MIRROR), slope[k] + slope[other] * _MIRROR
         used = np.arange(3) if other != k else np.array([1, 2])
         half = 1.0 if other != k else 0.5
+        # a pair shares one offset o, mirrored by M = diag(−1, 1, 1): H_pair = H_k + M·H_other·M, and the slopes alike
         covariance = np.linalg.inv(half * both[np.ix_(used, used)] + np.eye(len(used)) / prior_sd**2)
         offset = np.zeros(3)
         offset[used] = covariance @ (half * sum_of_both[used])
         offsets[k], offsets[other] = offset, offset * (_MIRROR if other != k else 1)
         squared += float(offset @ offset)
         determined += len(used) - float(np.trace(covariance)) / prior_sd**2
+    # γ counts the numbers that the data determine: each has 1 − Σ_ii/τ², and τ² = Σ‖o‖²/γ with the hyperprior
     variance = (squared + PRIOR_COUNT * prior_sd**2) / (determined + PRIOR_COUNT)
     return Offsets(offsets, float(np.sqrt(variance)))
 

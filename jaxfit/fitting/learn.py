@@ -12,7 +12,7 @@ tr(Σ·H) counts.
 
 A round computes γ and Σ w‖e‖² at the poses of a sample of windows, sets β, and continues the fit with the new values.
 
-Errors of the outline are not independent from pixel to pixel: `fitting/outline_noise.py` counts them.
+Errors of the outline are not independent from pixel to pixel: `fitting/evidence.py` counts them.
 
 Hyperpriors: the values of the config count as `PRIOR_COUNT` observations, and limit the result to a factor of
 `MAX_FACTOR`. The weight of the mask does not fall below its value in the config: the errors of the outline contain

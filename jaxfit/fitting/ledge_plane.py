@@ -22,8 +22,7 @@ from jaxfit.data.flags import CONTRADICTED, flags
 from jaxfit.data.projection import in_image, upward
 from jaxfit.data.solution import Solution, select_solution
 from jaxfit.data.world import in_frame_of_camera, largest_image_px
-from jaxfit.fitting.contacts import SLOW, feet_cam, interval_of, speed_lengths
-from jaxfit.fitting.ledge import metres
+from jaxfit.fitting.ledge import SLOW, feet_cam, interval_of, metres, speed_lengths
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import read_text
 from jaxfit.model.bird import Bird

@@ -93,6 +93,8 @@ def _levenberg_step(
     diagonal = allowed(curvature.diagonal)
     # a parameter without curvature has no gradient and does not change
     diagonal = jnp.where(diagonal > 0, diagonal, 1.0)
+    # (H + μ·diag H)·d = −g without the matrix; the diagonal as preconditioner makes angles, lengths and scales
+    # comparable
     newton, _ = cg(
         lambda d: allowed(curvature.product(d)) + state.damping * diagonal * d,
         -gradient,
@@ -100,6 +102,7 @@ def _levenberg_step(
         tol=CG_TOLERANCE,
         maxiter=CG_STEPS,
     )
+    # H bounds the objective from above, so its step is too short where κ < 1: over-relaxation by 1/κ, with momentum
     pessimistic = state.curvature_ratio < PESSIMISTIC
     relaxation = 1 / jnp.maximum(state.curvature_ratio, 1 / MAX_RELAXATION)
     change = jnp.where(pessimistic, relaxation * newton + MOMENTUM * state.change, newton)
@@ -107,12 +110,14 @@ def _levenberg_step(
     loss, new_gradient, blocks = _evaluate(program, problem, new_pose)
     not_finite = ~(jnp.isfinite(state.loss) & jnp.isfinite(state.gradient).all())
     lower = state.prepared & ~not_finite & (loss < state.loss) & jnp.isfinite(new_gradient).all()
+    # along c the objective is E + g·c + ½κ·c·H·c: solved for κ at the new pose
     bend = jnp.vdot(change, curvature.product(change))
     ratio = 2 * (loss - state.loss - jnp.vdot(gradient, change)) / jnp.where(bend > 0, bend, 1.0)
 
     def choose(which: Bool[Array, ""], new: Any, old: Any) -> Any:
         return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
 
+    # a step that is not taken leaves pose, loss and gradient, so that only the damping (×5) changes the next attempt
     taken = lower | ~state.prepared
     factor = jnp.where(lower, DAMPING_DECREASE, DAMPING_INCREASE)
     damping = jnp.clip(state.damping * factor, MIN_DAMPING, MAX_DAMPING)

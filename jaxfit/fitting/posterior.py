@@ -73,24 +73,16 @@ class Blocks(NamedTuple):
         """The diagonals of the frames and of the corner."""
         return np.einsum("tii->ti", self.band[0]), np.diagonal(self.corner)
 
+    def of_frames(self) -> Float[np.ndarray, "T P P"]:
+        """Return the block of the P = L + C parameters of each frame: its own, then the shared ones."""
+        shared = np.broadcast_to(self.corner, (len(self.border), *self.corner.shape))
+        return np.block([[self.band[0], self.border], [self.border.transpose(0, 2, 1), shared]])
+
     def plus_diagonal(self, own: Float[np.ndarray, "T L"], shared: Float[np.ndarray, "C"]) -> Blocks:
         """Return the matrix plus a diagonal matrix."""
         band = self.band.copy()
         np.einsum("tii->ti", band[0])[...] += own
         return Blocks(band, self.border, self.corner + np.diag(shared))
-
-
-class Posterior(NamedTuple):
-    """The Gaussian approximation of the posterior of one window."""
-
-    covariance: Blocks
-    """The blocks of H⁻¹ inside the band. Blocks outside the band are not 0; they are not computed."""
-
-    def frame_covariance(self) -> Float[np.ndarray, "T P P"]:
-        """Return the covariance of the P = L + C parameters of each frame: its own, then the shared ones."""
-        own, border, corner = self.covariance.band[0], self.covariance.border, self.covariance.corner
-        shared = np.broadcast_to(corner, (len(own), *corner.shape))
-        return np.block([[own, border], [border.transpose(0, 2, 1), shared]])
 
 
 class Factors(NamedTuple):
@@ -116,16 +108,20 @@ def factorise(H: Blocks) -> Factors:
     band = np.concatenate([H.band, np.zeros((3, BANDWIDTH, L, L))], axis=1)  # frames after the last: 0
     (invert_triangle,) = get_lapack_funcs(("trtri",), dtype=np.float64)
     inverses, gains = np.zeros((T, L, L)), np.zeros((2, T, L, L))
+    # Block elimination. D_t, E_t, F_t are the blocks (t, t), (t, t + 1), (t, t + 2) after the elimination of the frames
+    # before t. The elimination of frame t leaves its Schur complement in the frames that follow:
+    #   D_{t+1} −= E_tᵀD_t⁻¹E_t,   E_{t+1} −= E_tᵀD_t⁻¹F_t,   D_{t+2} −= F_tᵀD_t⁻¹F_t
     for t in range(T):
-        factor = np.linalg.cholesky(band[0, t])
+        factor = np.linalg.cholesky(band[0, t])  # raises where D_t is not positive definite
         # products of L×L matrices only: linear algebra on several threads is slow for larger ones on a busy machine
         inverse_factor, _ = invert_triangle(factor, lower=1)
         inverses[t] = inverse_factor.T @ inverse_factor
         for k in (1, 2):
-            gains[k - 1, t] = inverses[t] @ band[k, t]
+            gains[k - 1, t] = inverses[t] @ band[k, t]  # D_t⁻¹E_t and D_t⁻¹F_t
         band[0, t + 1] -= band[1, t].T @ gains[0, t]
         band[1, t + 1] -= band[1, t].T @ gains[1, t]
         band[0, t + 2] -= band[2, t].T @ gains[1, t]
+    # the shared parameters last: their block of H⁻¹ is (S − UᵀA⁻¹U)⁻¹
     border = _solve_band(inverses, gains, H.border)
     schur = H.corner - np.einsum("tic,tid->cd", H.border, border)
     factor = np.linalg.cholesky((schur + schur.T) / 2)
@@ -135,13 +131,14 @@ def factorise(H: Blocks) -> Factors:
 
 def _solve_band(inverses: np.ndarray, gains: np.ndarray, right: Float[np.ndarray, "T L R"]) -> np.ndarray:
     """Return A⁻¹ times some right-hand sides, (T, L, R)."""
+    # A = GᵀDG, where G has ones on its diagonal and the gains right of it: two triangular systems
     T = len(inverses)
     rest = np.concatenate([right, np.zeros((BANDWIDTH, *right.shape[1:]))])
-    for t in range(T):
+    for t in range(T):  # Gᵀy = b, forward in time
         for k in (1, 2):
             rest[t + k] -= gains[k - 1, t].T @ rest[t]
     found = np.zeros_like(rest)
-    for t in reversed(range(T)):
+    for t in reversed(range(T)):  # D·G·x = y, backward in time
         found[t] = inverses[t] @ rest[t] - gains[0, t] @ found[t + 1] - gains[1, t] @ found[t + 2]
     return found[:T]
 
@@ -151,13 +148,14 @@ def solve_blocks(
 ) -> tuple[Float[np.ndarray, "T L R"], Float[np.ndarray, "C R"]]:
     """Return x with H·x = b for R right-hand sides b: the part of the frames and that of the shared parameters."""
     inside = _solve_band(factors.inverses, factors.gains, own)
-    # UᵀA⁻¹b = (A⁻¹U)ᵀb
+    # With V = A⁻¹U and K the corner of H⁻¹: x_shared = K·(b_shared − Vᵀb_frames), x_frames = A⁻¹b_frames − V·x_shared.
+    # UᵀA⁻¹b = Vᵀb needs no second solution.
     of_window = factors.corner @ (shared - np.einsum("tic,tir->cr", factors.border, own))
     return inside - factors.border @ of_window, of_window
 
 
-def invert_blocks(H: Blocks, factors: Factors | None = None) -> Posterior:
-    """Return the Gaussian with the precision H: log-determinant and selected inverse.
+def invert_blocks(H: Blocks, factors: Factors | None = None) -> Blocks:
+    """Return the selected inverse: the blocks of H⁻¹ inside the band, the border and the corner.
 
     Args:
         H: the precision.
@@ -168,7 +166,10 @@ def invert_blocks(H: Blocks, factors: Factors | None = None) -> Posterior:
     """
     (_, T, L, _) = H.band.shape
     inverses, gains, V, corner = factorise(H) if factors is None else factors
-    # backward: the blocks of A⁻¹ inside the band
+    # Takahashi: G·A⁻¹ = D⁻¹G⁻ᵀ, whose blocks right of the diagonal are 0. With Z = A⁻¹ and the gains G₁, G₂ of frame t,
+    # the rows of frame t give the blocks inside the band from those of later frames only:
+    #   Z_{t,t+1} = −G₁Z_{t+1,t+1} − G₂Z_{t+2,t+1},   Z_{t,t+2} = −G₁Z_{t+1,t+2} − G₂Z_{t+2,t+2},
+    #   Z_{t,t} = D_t⁻¹ − Z_{t,t+1}G₁ᵀ − Z_{t,t+2}G₂ᵀ
     inside = np.zeros((BANDWIDTH + 1, T + BANDWIDTH, L, L))
     for t in reversed(range(T)):
         first, second = gains[:, t]
@@ -177,9 +178,10 @@ def invert_blocks(H: Blocks, factors: Factors | None = None) -> Posterior:
         own = inverses[t] - inside[1, t] @ first.T - inside[2, t] @ second.T
         inside[0, t] = (own + own.T) / 2
     inside = inside[:, :T]
+    # the border: the block of frames of H⁻¹ is A⁻¹ + V·K·Vᵀ, its border −V·K
     for k in range(BANDWIDTH + 1):
         inside[k, : T - k] += V[: T - k] @ corner @ V[k:].swapaxes(1, 2)
-    return Posterior(Blocks(inside, -V @ corner, corner))
+    return Blocks(inside, -V @ corner, corner)
 
 
 class Products(NamedTuple):
@@ -212,6 +214,9 @@ def curvature_products(program: Program, problems: Problem, pose: Pose) -> Produ
         columns = np.array([*np.tile(own, PERIOD), *shared, -1])
         offsets = np.array([*np.repeat(np.arange(PERIOD), len(own)), *np.full(len(shared) + 1, -1)])
         frames, count = jnp.arange(T)[:, None], len(columns)
+        # Column l of the blocks of frame t is H·e with e = 1 at (t, l). A frame links at most two frames before and
+        # two after, so e may be 1 in the frames t, t + 5, … at once: every row of the product belongs to one of these
+        # frames.
 
         def product(probe):
             column, offset = probe
@@ -243,7 +248,8 @@ def blocks_of(products: Products, is_shared: np.ndarray) -> Blocks:
     frames = np.arange(T)
     for k in range(BANDWIDTH + 1):
         at, later = frames[: T - k], frames[k:]
-        # a block from the column of frame t + k, and its transpose from the column of frame t
+        # H is symmetric up to rounding: the mean of a block from the column of frame t + k and its transpose from
+        # frame t
         above = own[later % PERIOD, :, at][..., ~is_shared].transpose(0, 2, 1)
         below = own[at % PERIOD, :, later][..., ~is_shared]
         band[k, : T - k] = (above + below) / 2
@@ -251,6 +257,7 @@ def blocks_of(products: Products, is_shared: np.ndarray) -> Blocks:
     H = Blocks(band, by_shared[..., ~is_shared].transpose(1, 2, 0), (corner + corner.T) / 2)
     expected = np.concatenate([product[:, ~is_shared].ravel(), product[:, is_shared].sum(axis=0)])
     found = np.concatenate([each.ravel() for each in multiply(H, change[:, ~is_shared], change[0, is_shared])])
+    # angles, lengths and scales have different units: rows in units of √H_ii
     unit = np.sqrt(np.maximum(np.concatenate([each.ravel() for each in H.diagonal]), 1e-6))
     if not np.linalg.norm((found - expected) / unit) <= TOLERANCE * np.linalg.norm(expected / unit):
         raise ValueError(f"a term links frames that are more than {BANDWIDTH} frames apart, or is not finite")
@@ -278,10 +285,11 @@ class Columns(NamedTuple):
     """Positions of the columns that all frames share."""
 
 
-class WindowPosterior(NamedTuple):
-    """The posterior of one window, and its columns."""
+class Posterior(NamedTuple):
+    """The Gaussian approximation of the posterior of one window, and its columns."""
 
-    posterior: Posterior
+    covariance: Blocks
+    """The blocks of H⁻¹ inside the band. Blocks outside the band are not 0; they are not computed."""
     columns: Columns
     precision: Blocks
     """H, with the broad prior."""
@@ -323,6 +331,7 @@ def broad_precision(program: Program, pose: Pose, px_per_unit: float | None = No
         pose: the pose of one window.
         px_per_unit: `ViewMaps.px_per_unit` of several views, whose crops bound x, y and z; None for one view.
     """
+    # the width w of the crop at the depth of the bird, model units; a uniform distribution has the deviation w/√12
     depth = np.abs(np.asarray(pose.transl)[:, 2:])
     crop = depth * program.camera.size_px / program.camera.focal_px
     if px_per_unit is not None:
@@ -374,7 +383,7 @@ def window_blocks(
     return found
 
 
-def window_posteriors(program: Program, problems: Problem, pose: Pose) -> list[WindowPosterior | str]:
+def window_posteriors(program: Program, problems: Problem, pose: Pose) -> list[Posterior | str]:
     """Return the posterior of each of B problems of a stage at its fitted pose, or the reason why it has none.
 
     Args:
@@ -391,7 +400,7 @@ def window_posteriors(program: Program, problems: Problem, pose: Pose) -> list[W
     return [each if isinstance(each, str) else posterior_of(*each, broad(b)) for b, each in enumerate(blocks)]
 
 
-def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -> WindowPosterior | str:
+def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -> Posterior | str:
     """Return the posterior with the curvature H, or the reason why it has none.
 
     Args:
@@ -401,13 +410,14 @@ def posterior_of(H: Blocks, columns: Columns, broad: Float[np.ndarray, "T D"]) -
     """
     own, shared = broad[:, columns.own], broad[0, columns.shared]
     of_frames, of_window = H.diagonal
+    # a ridge relative to the diagonal has no unit, so that all parameters lose the same share of precision
     for ridge in RIDGES:
         precision = H.plus_diagonal(own + ridge * of_frames, shared + ridge * of_window)
         try:
             factors = factorise(precision)
         except np.linalg.LinAlgError:
             continue
-        return WindowPosterior(invert_blocks(precision, factors), columns, precision, factors)
+        return Posterior(invert_blocks(precision, factors), columns, precision, factors)
     return "the curvature of the objective is not positive definite"
 
 

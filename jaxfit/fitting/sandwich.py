@@ -30,7 +30,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit.fitting.posterior import Blocks, Posterior, WindowPosterior, invert_blocks, solve_blocks
+from jaxfit.fitting.posterior import Blocks, Posterior, invert_blocks, solve_blocks
 
 STEP = 1e-4
 """Step of the difference of two inverses, which is its relative error for B = H."""
@@ -46,6 +46,7 @@ def data_blocks(J: Float[np.ndarray, "T K 2 P"], precision: Float[np.ndarray, "T
         precision: of x and y of every keypoint, 1/pixel²; 0 for keypoints that do not count.
         own: number of parameters of a frame.
     """
+    # a keypoint depends on its own frame only: no block links two frames, and the band beside the diagonal is 0
     T, P = len(J), J.shape[-1]
     rows = (np.sqrt(precision)[..., None, None] * J).reshape(T, -1, P)
     full = rows.swapaxes(1, 2) @ rows
@@ -61,15 +62,16 @@ def spread(H: Blocks, covariance: Float[np.ndarray, "T P P"], B: Blocks) -> Floa
 
     Args:
         H: a positive definite matrix.
-        covariance: the blocks of H⁻¹, as `Posterior.frame_covariance`.
+        covariance: the blocks of H⁻¹, as `Blocks.of_frames`.
         B: a positive semi-definite matrix, not much greater than H.
     """
+    # d/dε (H + εB)⁻¹ = −H⁻¹B·H⁻¹ at ε = 0; the difference quotient costs one more selected inverse and no dense product
     more = Blocks(*(h + STEP * b for h, b in zip(H, B, strict=True)))
-    return (covariance - invert_blocks(more).frame_covariance()) / STEP
+    return (covariance - invert_blocks(more).of_frames()) / STEP
 
 
 def constant_deviation(
-    window: WindowPosterior,
+    window: Posterior,
     whitener: Float[np.ndarray, "D D"],
     first: int,
     weight: float,
@@ -86,13 +88,14 @@ def constant_deviation(
     """
     (T, _, C), at = window.precision.border.shape, window.columns.own
     inside = (at >= first) & (at < first + len(whitener))
-    missing = 1 - 1 / max(int(present.sum()), 1)
+    missing = 1 - 1 / max(int(present.sum()), 1)  # C = (1 − 1/n)·p⁻¹: a single frame misses nothing
     if missing <= 0 or weight <= 0 or not inside.any():
         return np.zeros((T, len(at) + C, len(at) + C))
     pull = np.zeros((T, len(at), len(whitener)))
-    # p·C^½ with p = 2w·WᵀW and C = missing·p⁻¹
+    # p·C^½ in every frame: p = 2w·WᵀW has the square root √(2w)·Wᵀ, and C = missing·p⁻¹, so p·C^½ = √(2w·missing)·Wᵀ
     pull[:, inside] = np.sqrt(2 * weight * missing) * whitener.T[at[inside] - first]
     pull *= present[:, None, None]
+    # V = H⁻¹(1 ⊗ p·C^½): one right-hand side for each parameter of the prior
     own, shared = solve_blocks(window.factors, pull, np.zeros((C, len(whitener))))
     V = np.concatenate([own, np.broadcast_to(shared, (T, *shared.shape))], axis=1)
     return V @ V.swapaxes(1, 2)
@@ -111,28 +114,30 @@ def lag_correlations(residuals: Float[np.ndarray, "T K 2"], counted: Bool[np.nda
         pairs = 2 * int((counted[lag:] & counted[:-lag]).sum())
         if pairs < MIN_PAIRS:
             break
+        # Sheppard: the signs of Gaussians with correlation ρ have the mean product (2/π)·arcsin ρ
         correlation = np.sin(np.pi / 2 * (sign[lag:] * sign[:-lag]).sum() / pairs)
-        if correlation <= 0:
+        if correlation <= 0:  # the sum of noisy correlations at long lags would have no limit
             break
         found.append(correlation)
     return np.array(found)
 
 
-def fit_correlation(J: Float[np.ndarray, "T K 2 P"], posterior: Posterior, present: Bool[np.ndarray, "T"]) -> float:
+def fit_correlation(J: Float[np.ndarray, "T K 2 P"], covariance: Blocks, present: Bool[np.ndarray, "T"]) -> float:
     """Return κ: the correlation of the errors of the projected keypoints between consecutive frames; 0 without pairs.
 
     Args:
         J: as for `data_blocks`.
-        posterior: the posterior.
+        covariance: the blocks of H⁻¹.
         present: the frames that count.
     """
-    own, pairs = J[..., : posterior.covariance.band.shape[-1]], present[1:] & present[:-1]
+    own, pairs = J[..., : covariance.band.shape[-1]], present[1:] & present[:-1]
     if not pairs.any():
         return 0.0
     T, _, _, L = own.shape
     rows = own.reshape(T, -1, L)
-    variance = np.sum((rows @ posterior.covariance.band[0]) * rows, axis=(1, 2))
-    shared = np.sum((rows[:-1] @ posterior.covariance.band[1, :-1]) * rows[1:], axis=(1, 2))[pairs].sum()
+    # covariances of the projected keypoints: tr(J_t·Σ_tt·J_tᵀ) of one frame, tr(J_t·Σ_t,t+1·J_t+1ᵀ) of neighbours
+    variance = np.sum((rows @ covariance.band[0]) * rows, axis=(1, 2))
+    shared = np.sum((rows[:-1] @ covariance.band[1, :-1]) * rows[1:], axis=(1, 2))[pairs].sum()
     return float(np.clip(shared / np.sqrt(variance[1:][pairs].sum() * variance[:-1][pairs].sum()), 0, 1))
 
 

@@ -15,7 +15,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxfit.config.fit import FitConfig, InitialiseConfig, StageConfig
+from jaxfit.config.fit import FitConfig, InitialiseConfig, Parameter, StageConfig
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.levenberg_marquardt import LEVENBERG_MARQUARDT
 from jaxfit.fitting.problem import Hyperparameters, Problem, Program, Solver, problem_loss, problem_window
@@ -166,7 +166,7 @@ def report(program: Program, problems: Problem, pose: Pose) -> Report:
 
 SOLVERS: Mapping[str, Solver] = {"adam": ADAM, "levenberg_marquardt": LEVENBERG_MARQUARDT}
 """Solvers by their name in `StageConfig.solver`."""
-STEP_SHAPES = {
+STEP_SHAPES: Mapping[Parameter, tuple[int, ...]] = {
     "global_orient": (3,),
     "body_pose": (1, 3),
     "transl": (3,),
@@ -278,7 +278,7 @@ def shared_parameters(stage: StageConfig) -> tuple[str, ...]:
 def stage_hyperparameters(config: FitConfig, stage: StageConfig, keypoint_names: Sequence[str]) -> Hyperparameters:
     """Return the hyperparameters of one stage of one config, as NumPy arrays for one problem."""
 
-    def step_size(name: str, shape: tuple[int, ...]) -> np.ndarray:
+    def step_size(name: Parameter, shape: tuple[int, ...]) -> np.ndarray:
         scale = np.asarray(stage.step_scale.get(name, 1.0), np.float32)
         size = stage.learning_rate * scale if name in stage.optimised else 0.0
         return np.array(np.broadcast_to(size, shape), np.float32)

@@ -54,6 +54,7 @@ def sum_of_curvatures(curvatures: Sequence[Curvature]) -> Curvature:
     def product(d: Rows) -> Rows:
         return sum((H.product(d) for H in curvatures), start=jnp.zeros_like(d))
 
+    # curvatures add: H = Σ λ·H_term, and so do products and diagonals
     return Curvature(product, sum((H.diagonal for H in curvatures), start=jnp.zeros(())))
 
 

@@ -34,6 +34,7 @@ def keypoint_likelihood(
 
     Source: Lange, Little and Taylor 1989, *Robust Statistical Modeling Using the t Distribution*.
     """
+    # the scale is geometric in the confidence: log s is linear between log s₀ and log s₁
     confidence = jnp.asarray(window.targets.confidence)
     scale_px = keypoint_sd_px(confidence, sd_sure_px, sd_unsure_px)
     error = (window.keypoints_px - window.targets.keypoints_px) / scale_px[..., None]
@@ -85,6 +86,7 @@ def motion_likelihood(
 
     Source: Lange, Little and Taylor 1989 (the density); Huynh 2009, *Metrics for 3D Rotations* (rotations).
     """
+    # an acceleration needs three frames with the bird
     complete = jnp.asarray(complete_runs(window.present, 2), jnp.float32)
     scale_rad = sd_rad_s2 * window.frame_s**2  # radians per frame²
 

@@ -118,6 +118,8 @@ def residual_curvature(
     stochastic estimator of the trace of the influence matrix (random signs).
     """
 
+    # E = Σ w·ρ(s), s = ‖r‖²: dE = Σ 2w·ρ′·r·dr. Without the derivatives of J and of ρ′, the second derivative is
+    # Jᵀ·diag(2w·ρ′)·J. ρ is concave in s, so the square with the slope ρ′ at the current s lies above ρ everywhere.
     def factor_of(each: Residuals) -> Float[Array, "..."]:
         slope = _mean_slope(each) if second_order else each.kernel.slope(_squared(each))
         factor = jax.lax.stop_gradient(2 * each.weight * slope)
@@ -168,6 +170,7 @@ def _from_jax(window: PosedWindow, values_at: Callable[[Rows], list], factors: l
     def product(d: Rows) -> Rows:
         return backward([factor * change for factor, change in zip(factors, forward(d), strict=True)])[0]
 
+    # E[(Jᵀ·√D·u)ᵢ²] = Σ_r J_ri²·D_r = H_ii, because random signs of different residuals have the mean product 0
     def probe(signs: Sequence[Int8[Array | np.ndarray, "..."]]) -> Rows:
         return backward([jnp.sqrt(factor) * sign for factor, sign in zip(factors, signs, strict=True)])[0] ** 2
 
@@ -187,6 +190,7 @@ def as_list(residuals: Residuals | Sequence[Residuals]) -> list[Residuals]:
 def _mean_slope(residuals: Residuals) -> Float[Array, "*G"]:
     """Return max(ρ′ + 2sρ″/n, 0) of each group of n residuals."""
     squared = _squared(residuals)
+    # d²ρ(‖r‖²)/dr² = 2ρ′·I + 4ρ″·r·rᵀ; the mean of rrᵀ over directions is s/n·I. Negative curvature counts as 0.
     slope, bend = jax.jvp(residuals.kernel.slope, (squared,), (jnp.ones_like(squared),))
     return jnp.maximum(slope + 2 * squared * bend / residuals.values.shape[-1], 0)
 

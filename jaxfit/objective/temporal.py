@@ -80,6 +80,7 @@ def geodesic_velocity(
 
     Source: Huynh 2009, *Metrics for 3D Rotations*, Φ₆; the sums as in Hägerlind et al. 2024, velocity term.
     """
+    # the norm of the concatenated rotation vectors is √(Σ_j d_j²): all joints are one group
     orient, joints, complete = _rotations_between_frames(window)
     joints = joints.reshape(len(joints), 3 * joints.shape[1])
     return Residuals(orient, beta_global * complete, NORM), Residuals(joints, beta_pose * complete, NORM)
@@ -140,6 +141,7 @@ def low_pass(
     frames = window.present.shape[0]
     # k = 0, the mean pose, has weight 0 and is excluded, because log 0 is not finite
     log_frequency = np.log(np.arange(1, frames) / (2 * frames))
+    # 1/(1 + (f_c/f)^2n) = sigmoid(2n·(log f − log f_c)), n the order of the filter: finite gradients for every f_c
     response = jax.nn.sigmoid(2 * BUTTERWORTH_ORDER * (log_frequency - jnp.log(cutoff_cycles_per_frame)))
     fill = _interpolation(window.present)
 

@@ -26,6 +26,7 @@ def keypoints(window: PosedWindow, *, sigma_px: Scalar | float = 50.0) -> Residu
 
     Source: Hägerlind et al. 2024, keypoint term; x and y separately as in Badger et al. 2020.
     """
+    # groups of one residual: x and y of a keypoint are outliers independently
     error_px = window.keypoints_px - window.targets.keypoints_px
     confidence = window.targets.confidence[..., None]
     return Residuals(
@@ -97,6 +98,7 @@ def pose_prior(window: PosedWindow) -> Residuals:
     Source: Badger et al. 2020, pose prior.
     """
     present = window.targets.present
+    # ‖W(x − μ)‖² with WᵀW = Σ⁻¹; a frame without the bird has the weight 0
     offset = window.pose.body_pose.reshape(present.shape[0], -1) - window.priors.pose_mean
     return Residuals(offset @ window.priors.pose_whitener.T, jnp.asarray(present, jnp.float32))
 
@@ -119,6 +121,7 @@ def size_prior(window: PosedWindow, *, sd_log: Scalar | float = 0.05) -> Residua
 
     Source: ours; a log-normal size, Huxley 1932, *Problems of Relative Growth*.
     """
+    # a mean over frames: one bird has one size, however long the window is
     present = jnp.asarray(window.present, jnp.float32)
     scale = jnp.broadcast_to(jnp.maximum(jnp.asarray(window.pose.scale), 1e-3), present.shape)
     return Residuals(jnp.log(scale)[:, None] / sd_log, present / jnp.maximum(jnp.sum(present), 1.0))
@@ -187,6 +190,7 @@ def feet_on_ground(window: PosedWindow, *, sigma_units: Scalar | float = 0.5) ->
     Source: ours; zero velocity of feet in contact as in Rempe et al. 2021, *HuMoR*, with a robust loss instead of
     predicted contacts.
     """
+    # in the crop of the first frame, a foot at rest stays where it is although the crop follows the bird
     feet = window.keypoint_indices("left_foot", "right_foot")
     displacement = jnp.diff(window.keypoints_static_cam[:, feet], axis=0)
     complete = jnp.asarray(complete_runs(window.present, 1), jnp.float32)[:, None]

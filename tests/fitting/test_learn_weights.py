@@ -12,7 +12,7 @@ from jaxfit.config.fit import StageConfig, load_config
 from jaxfit.data.masks import decode_mask, encode_mask
 from jaxfit.evaluation.ablation.grid import Run
 from jaxfit.evaluation.ablation.runs import fit_batches
-from jaxfit.fitting.evidence import Evidence, expanded, mask_evidence
+from jaxfit.fitting.evidence import Evidence, expanded, mask_evidence, outline_correlation_px, outline_error
 from jaxfit.fitting.fit import fit, fit_runs, learn_weights
 from jaxfit.fitting.learn import (
     MAX_FACTOR,
@@ -23,7 +23,6 @@ from jaxfit.fitting.learn import (
     choose_windows,
     updated_precision,
 )
-from jaxfit.fitting.outline_noise import outline_correlation_px, outline_error
 from jaxfit.fitting.windows import Windows
 from jaxfit.foundation.errors import InputError
 from jaxfit.simulation.noise import detect

@@ -10,8 +10,7 @@ from jaxfit.cameras.files import read_cameras, write_cameras
 from jaxfit.cli.ledge import _undistorted
 from jaxfit.cli.main import main
 from jaxfit.data.solution import load_solution, save_solution, select_solution
-from jaxfit.fitting.contacts import find_contacts
-from jaxfit.fitting.ledge import on_ledge
+from jaxfit.fitting.ledge import find_contacts, on_ledge
 from jaxfit.fitting.ledge_plane import Distances, estimate_ledge, plane_of, read_distances
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import load_murre

@@ -30,10 +30,10 @@ def test_the_selected_inverse_is_that_of_the_dense_matrix(frames, L, C):
     H = random_precision(frames, L, C)
     posterior, full = invert_blocks(H), dense(H)
     inverse = np.linalg.inv(full)
-    for own, expected in zip(posterior.covariance, blocks(inverse, frames, L), strict=True):
+    for own, expected in zip(posterior, blocks(inverse, frames, L), strict=True):
         np.testing.assert_allclose(own, expected, atol=1e-9)
     at = [*range(L), *range(frames * L, len(full))]
-    np.testing.assert_allclose(posterior.frame_covariance()[0], inverse[np.ix_(at, at)], atol=1e-9)
+    np.testing.assert_allclose(posterior.of_frames()[0], inverse[np.ix_(at, at)], atol=1e-9)
     x, shared = np.arange(frames * L, dtype=float).reshape(frames, L), np.arange(C, dtype=float)
     product = np.concatenate([each.ravel() for each in multiply(H, x, shared)])
     np.testing.assert_allclose(product, full @ np.concatenate([x.ravel(), shared]))
@@ -57,7 +57,7 @@ def test_kalman_smoother():
         gain = filtered[t] / predicted[t + 1]
         smoothed.append(filtered[t] + gain**2 * (smoothed[-1] - predicted[t + 1]))
     empty = np.zeros((frames, 1, 0)), np.zeros((0, 0))
-    own = invert_blocks(Blocks(band, *empty)).covariance.band[0, :, 0, 0]
+    own = invert_blocks(Blocks(band, *empty)).band[0, :, 0, 0]
     np.testing.assert_allclose(own, smoothed[::-1], rtol=1e-12)
 
 
@@ -107,7 +107,7 @@ def test_posterior_of_a_window():
         assert 3 * J + 2 not in each.columns.own  # depth
         assert len(each.columns.own) == 3 * J + 2
         assert len(each.columns.shared) == D - 3 * J - 3
-        sd = np.sqrt(np.einsum("tii->ti", each.posterior.frame_covariance()))
+        sd = np.sqrt(np.einsum("tii->ti", each.covariance.of_frames()))
         assert np.isfinite(sd).all()
         assert sd[:, : 3 * J].max() < np.pi / np.sqrt(3)
 
@@ -120,7 +120,7 @@ def test_a_bird_with_few_keypoints_has_finite_error_bars(keypoints):
     for confidence in (few, 1.0):
         own = window_posteriors(*fitted(confidence))[0]
         assert not isinstance(own, str)
-        covariance = own.posterior.frame_covariance()
+        covariance = own.covariance.of_frames()
         assert np.isfinite(covariance).all()
         assert (np.linalg.eigvalsh(covariance) > 0).all()
         orient_sd.append(np.sqrt(np.diagonal(covariance[0])[:3]))
@@ -135,7 +135,7 @@ def test_missing_frames_do_not_count():
     targets = dataclasses.replace(targets, present=present, confidence=targets.confidence * present[..., None])
     own = window_posteriors(program, several._replace(targets=targets), poses)[0]
     assert not isinstance(own, str)
-    angle_sd = np.sqrt(np.diagonal(own.posterior.covariance.band[0, -1]))[:3]
+    angle_sd = np.sqrt(np.diagonal(own.covariance.band[0, -1]))[:3]
     np.testing.assert_allclose(angle_sd, np.pi / np.sqrt(3), rtol=1e-4)
 
 

@@ -25,7 +25,7 @@ def test_solutions_and_spread_are_those_of_dense_matrices(frames, L, C):
     np.testing.assert_allclose(found, np.linalg.solve(dense(H), right), atol=1e-9)
     inverse = np.linalg.inv(dense(H))
     expected = inverse @ dense(B) @ inverse
-    for t, own_frame in enumerate(spread(H, invert_blocks(H).frame_covariance(), B)):
+    for t, own_frame in enumerate(spread(H, invert_blocks(H).of_frames(), B)):
         at = [*range(t * L, (t + 1) * L), *range(frames * L, frames * L + C)]
         np.testing.assert_allclose(own_frame, expected[np.ix_(at, at)], rtol=0.01, atol=0.01 * np.abs(expected).max())
 
@@ -79,7 +79,7 @@ def test_error_bars_of_a_constant_pose_are_those_of_many_fits():
     poses = np.tile(deviations, (1, line.frames))
     noise = rng.normal(size=(draws, line.frames)) / np.sqrt(line.noise_precision)
     measured = line.errors(poses, noise).var(axis=0)
-    plain = line.window.posterior.frame_covariance()
+    plain = line.window.covariance.of_frames()
     present = np.ones(line.frames, bool)
     wide = plain + constant_deviation(line.window, line.whitener, 0, line.weight, present)
     middle = slice(5, -5)
@@ -111,12 +111,12 @@ def test_noise_that_agrees_between_frames():
     independent = line.errors(zero, white)[:, 5:-5].var(axis=0).mean(axis=0)
     J = np.broadcast_to([[1.0, 0.0], [0.0, 0.0]], (line.frames, 1, 2, 2))
     present = np.ones(line.frames, bool)
-    kappa = fit_correlation(J, line.window.posterior, present)
+    kappa = fit_correlation(J, line.window.covariance, present)
     factor = time_factor(rho ** np.arange(1, line.frames), kappa)
     data = data_blocks(J, np.full((line.frames, 1), line.noise_precision), 2)
-    found = factor * np.einsum(
-        "tii->ti", spread(line.window.precision, line.window.posterior.frame_covariance(), data)
-    )[5:-5].mean(axis=0)
+    found = factor * np.einsum("tii->ti", spread(line.window.precision, line.window.covariance.of_frames(), data))[
+        5:-5
+    ].mean(axis=0)
     assert (measured > 2 * independent).all()
     np.testing.assert_allclose(found, measured, rtol=0.25)
 
