@@ -161,7 +161,11 @@ def test_learning_lowers_the_error_and_the_file_repeats_the_fit(tmp_path):
 
 @pytest.mark.parametrize(
     ("offsets", "words"),
-    [("{nape: [0, 1]}", "three"), ("{nape: [0, 1, .nan]}", "expected a finite number"), ("{nape: 3}", "expected a list")],
+    [
+        ("{nape: [0, 1]}", "three"),
+        ("{nape: [0, 1, .nan]}", "expected a finite number"),
+        ("{nape: 3}", "expected a list"),
+    ],
 )
 def test_wrong_offsets_are_an_error_of_the_config(tmp_path, offsets, words):
     (tmp_path / "mine.yaml").write_text(f"base: photo\nkeypoint_offsets: {offsets}\n")
