@@ -131,7 +131,7 @@ def apply_edits(observations: Observations, edits: Sequence[Edit], source: objec
             observations = _moved(observations, {rows[1]: rows[0]}, present)
             observations = observations.select(tracks=np.arange(observations.num_tracks) != rows[1])
         elif edit.kind == "exclude":
-            observations = _excluded(observations, rows[0], frames)
+            observations = _moved(observations, {rows[0]: None}, frames)
         else:
             observations = observations.select(tracks=~np.isin(np.arange(observations.num_tracks), rows))
         kept = observations.present.any(axis=1)
@@ -160,8 +160,8 @@ def _frames(observations: Observations, edit: Edit, source: object) -> np.ndarra
     return (numbers >= start) & (numbers < stop)
 
 
-def _moved(observations: Observations, target: dict[int, int], frames: np.ndarray) -> Observations:
-    """Return observations in which some rows have moved to other rows in some frames; what they leave is empty."""
+def _moved(observations: Observations, target: dict[int, int | None], frames: np.ndarray) -> Observations:
+    """Return observations in which some rows have moved to other rows in some frames, or are removed there (None)."""
     arrays: dict[str, Any] = {}
     for name in CELLS:
         old = np.asarray(getattr(observations, name))
@@ -169,23 +169,13 @@ def _moved(observations: Observations, target: dict[int, int], frames: np.ndarra
         for row in target:
             new[row, frames] = 0
         for row, other in target.items():
-            new[other, frames] = old[row, frames]
+            if other is not None:
+                new[other, frames] = old[row, frames]
         arrays[name] = new
     for name in MAPPINGS:
         mapping = getattr(observations, name)
-        arrays[name] = {(target.get(n, n) if frames[t] else n, t): value for (n, t), value in mapping.items()}
-    return replace(observations, **arrays)
-
-
-def _excluded(observations: Observations, row: int, frames: np.ndarray) -> Observations:
-    """Return observations in which one row is empty in some frames."""
-    arrays: dict[str, Any] = {}
-    for name in CELLS:
-        arrays[name] = np.array(getattr(observations, name))
-        arrays[name][row, frames] = 0
-    for name in MAPPINGS:
-        mapping = getattr(observations, name)
-        arrays[name] = {(n, t): mapping[n, t] for n, t in mapping if n != row or not frames[t]}
+        places = (((target.get(n, n) if frames[t] else n), t, value) for (n, t), value in mapping.items())
+        arrays[name] = {(n, t): value for n, t, value in places if n is not None}
     return replace(observations, **arrays)
 
 

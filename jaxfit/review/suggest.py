@@ -91,48 +91,8 @@ def read_result(path: Path, video: Path) -> Result:
 IMAGES, MARKER = "images", "suggested.csv"
 _DEEPLABCUT = Path("deeplabcut") / "labeled-data"
 
-_README = """Frames of {video} to label, suggested by jaxfit.
-
-images/        the {count} pictures; the number at the end of a name is the number of the frame
-suggested.csv  why every frame was suggested
-coco.json      the labels that jaxfit detected, with masks and confidences
-
-Correct the labels in ONE of these programs. Move wrong keypoints, remove keypoints that cannot be placed,
-add missing birds, and remove detections that are no birds.
-
-CVAT
-  1. Create a task. Paste the content of cvat_labels.json into the tab "Raw" of the labels. Add images/.
-  2. Upload annotations: format "COCO Keypoints 1.0", file cvat.json.
-  3. After the correction, export in the format "COCO Keypoints 1.0" and unpack the archive.
-     The attribute "bird" is the number of the bird. Give a new bird a new number.
-  4. jaxfit import person_keypoints_default.json --masks {out}/coco.json --out corrected.json
-
-Label Studio
-  1. Start Label Studio with LABEL_STUDIO_LOCAL_FILES_SERVING_ENABLED=true and
-     LABEL_STUDIO_LOCAL_FILES_DOCUMENT_ROOT={out}
-  2. Create a project. Paste label_studio.xml into the code of the labelling interface.
-     Add a source storage of local files: {out}/images
-  3. Import label_studio.json. A new bird is a rectangle with key points inside.
-  4. After the correction, export as JSON (not as COCO, which rounds positions to whole pixels).
-  5. jaxfit import export.json --masks {out}/coco.json --out corrected.json
-
-DeepLabCut
-  1. Copy deeplabcut/labeled-data/{folder} into the folder labeled-data of a project for several animals,
-     whose scorer is "{scorer}" and whose individuals are: {birds}.
-     For another scorer, rename the files and run deeplabcut.convertcsv2h5.
-  2. Open the folder in the labelling tool, and correct and save the labels.
-  3. jaxfit import CollectedData_{scorer}.h5 --masks {out}/coco.json --out corrected.json
-
-SLEAP
-  1. Open labels.slp. A double click turns a prediction into a label that can be corrected.
-     The tab "Labeling Suggestions" lists all frames.
-  2. Save the project.
-  3. jaxfit import labels.slp --masks {out}/coco.json --out corrected.json
-     labels.slp holds the absolute paths of the pictures. SLEAP asks for a picture that was moved.
-
-The pictures of the folder deeplabcut are the files of images/ under a second name (hard links), where the disk
-allows it. coco.json can be corrected by a program of your own, too.
-"""
+_README = Path(__file__).with_name("labelling.txt")
+"""Text of `README.txt` of the folder, with fields in braces."""
 
 
 def picture_name(video: Path, number: int) -> str:
@@ -173,7 +133,8 @@ def write_labels(observations: Observations, video: Path, folder: Path, final: P
     write_deeplabcut_labels(named, pictures, deeplabcut, scorer)
     birds = ", ".join(f"bird{track}" for track in named.track_id[named.present.any(1)].tolist()) or "bird1"
     facts = {"video": one_line(video.name), "count": len(pictures), "out": one_line(final), "birds": birds}
-    write_whole(folder / "README.txt", _README.format(**facts, folder=_stem(video), scorer=scorer).encode())
+    text = _README.read_text(encoding="utf-8").format(**facts, folder=_stem(video), scorer=scorer)
+    write_whole(folder / "README.txt", text.encode())
 
 
 def write_list(rows: list[tuple], path: Path) -> None:
