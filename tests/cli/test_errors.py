@@ -1,79 +1,19 @@
-"""Unusable input of the command line: one line of explanation, exit code 2, no written files."""
+"""Unusable command lines and files: one line of explanation, exit code 2, no written files."""
 
 import json
 import os
 import pickle
 
+import cv2
 import numpy as np
 import pytest
-from support.cli_files import arguments, rejected
+from support.cli_files import arguments, rejected, write_inputs
 
 from jaxfit.cli.main import main
 from jaxfit.config.fit import load_config, shipped_fit_configs
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.config.yaml_file import config_to_yaml
-
-
-def first_annotation(**changes):
-    def change(content):
-        content["annotations"][0] |= changes
-        return content
-
-    return change
-
-
-def keypoints_with(value):
-    def change(content):
-        content["annotations"][0]["keypoints"][0] = value
-        return content
-
-    return change
-
-
-def renamed(content):
-    names = content["categories"][0]["keypoints"]
-    names[:] = [f"point {i}" for i in range(len(names))]
-    return content
-
-
-def doubled(content):
-    content["annotations"].append(content["annotations"][0] | {"id": 999})
-    return content
-
-
-def other_size(content):
-    content["images"][0]["width"] += 7
-    return content
-
-
-def nobody(content):
-    for annotation in content["annotations"]:
-        annotation["keypoint_scores"] = [0.0] * 12
-    return content
-
-
-BAD_OBSERVATIONS = {
-    "malformed": (lambda content: "{'images': []}", ["JSON"]),
-    "truncated": (lambda content: json.dumps(content)[:-200], ["JSON"]),
-    "nan": (keypoints_with(float("nan")), ["annotations[0].keypoints", "nan"]),
-    "infinite": (keypoints_with(float("inf")), ["annotations[0].keypoints", "inf"]),
-    "score": (first_annotation(keypoint_scores=[1.5] * 12), ["keypoint_scores", "1.5"]),
-    "count": (first_annotation(keypoints=[1, 2, 2]), ["keypoints", "3 numbers, not 36"]),
-    "names": (renamed, ["has no keypoint of the model by name", "point 0", "--names"]),
-    "mask size": (other_size, ["segmentation", "size"]),
-    "duplicate": (doubled, ["track_id 4", "twice"]),
-    "no usable frame": (nobody, ["no track has a frame"]),
-}
-
-
-@pytest.mark.parametrize("name", BAD_OBSERVATIONS)
-def test_unusable_observations(inputs, tmp_path, capsys, name):
-    change, words = BAD_OBSERVATIONS[name]
-    content = change(json.loads((inputs / "birds.json").read_text()))
-    path = tmp_path / "bad.json"
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    rejected(capsys, arguments(inputs, tmp_path / "out", obs=path), str(path), *words)
-    assert not (tmp_path / "out").exists()
+from jaxfit.foundation.errors import MAX_MESSAGE_CHARACTERS
 
 
 class Evil:
@@ -86,44 +26,124 @@ class Evil:
         return os.mkdir, (str(self.mark),)
 
 
-def test_unusable_models(inputs, tmp_path, capsys):
-    whole = (inputs / "toy.npz").read_bytes()
-    mark = tmp_path / "it ran"
-    with np.load(inputs / "toy.npz") as arrays:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The inputs of the command line, and damaged ones."""
+    folder = tmp_path_factory.mktemp("damaged")
+    write_inputs(folder)
+    content = json.loads((folder / "birds.json").read_text())
+
+    def write(name, change):
+        changed = json.loads(json.dumps(content))
+        change(changed)
+        (folder / name).write_text(json.dumps(changed))
+
+    write("score.json", lambda c: c["annotations"][0].update(keypoint_scores=[1.5] * 12))
+    write("names.json", lambda c: c["categories"][0].update(keypoints=[f"point {i}" for i in range(12)]))
+    write("twice.json", lambda c: c["annotations"].append(c["annotations"][0] | {"id": 999}))
+    write("nobody.json", lambda c: [row.update(keypoint_scores=[0.0] * 12) for row in c["annotations"]])
+    with np.load(folder / "toy.npz") as arrays:
         kept = dict(arrays)
-    np.savez(tmp_path / "newer.npz", **(kept | {"format_version": np.int32(99)}))
-    np.savez(tmp_path / "objects.npz", **(kept | {"name": np.array([Evil(mark)], dtype=object)}))
-    (tmp_path / "truncated.npz").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "evil.npz").write_bytes(pickle.dumps(Evil(mark)))
-    (tmp_path / "evil.pt").write_bytes(pickle.dumps(Evil(mark)))
-    (tmp_path / "empty.npz").write_bytes(b"")
-    for name, words in (
-        ("newer", ["99", "newer jaxfit"]),
-        ("objects", ["Object arrays cannot be loaded"]),
-        ("truncated", []),
-        ("evil", []),
-        ("empty", []),
-        ("absent", []),
+    np.savez(folder / "newer.npz", **(kept | {"format_version": np.int32(99)}))
+    np.savez(folder / "objects.npz", **(kept | {"name": np.array([Evil(folder / "it ran")], dtype=object)}))
+    for name in ("evil.npz", "evil.pt"):
+        (folder / name).write_bytes(pickle.dumps(Evil(folder / "it ran")))
+    (folder / "cut.npz").write_bytes((folder / "toy.npz").read_bytes()[:200])
+    (folder / "bad.yaml").write_text("base: paper\nwindows: 3\n")
+    (folder / "names.yaml").write_text("a: 3\n")
+    (folder / "empty.yaml").write_text("{}\n")
+    (folder / "unknown.yaml").write_text("paw: crown\n")
+    (folder / "notes.txt").write_text("precious")
+    (folder / "masks").mkdir()
+    cv2.imwrite(str(folder / "masks" / "0.png"), np.ones((9, 9), np.uint8))
+    return folder
+
+
+FIT = "fit {}/birds.json --model {}/toy.npz --config {}/quick.yaml --out {}/out"
+BAD = [
+    ("bench silhouette --json", "bench: was removed (in a checkout of jaxfit, `make bench`"),
+    ("fit {}/absent.json --out {}/out", "absent.json: does not exist"),
+    (f"{FIT} --unit m", "--unit: is given without --cameras"),
+    (f"{FIT} --offsets 0,1", "--offsets: is given without --cameras"),
+    (f"{FIT} --focal-px 900", "--focal-px: is given without --ledge"),
+    (FIT.replace("birds", "score"), "keypoint_scores"),
+    (FIT.replace("birds", "names"), "has no keypoint of the model by name"),
+    (FIT.replace("birds", "twice"), "twice"),
+    (FIT.replace("birds", "nobody"), "no track has a frame"),
+    (FIT.replace("toy", "newer"), "newer jaxfit"),
+    (FIT.replace("toy", "objects"), "Object arrays cannot be loaded"),
+    (FIT.replace("quick", "bad"), "line 2: `windows` is not a known key (did you mean window?"),
+    (FIT.replace("{}/quick.yaml", "papr"), "papr: does not exist (give a YAML file or one of ablation, aves, "),
+    (f"{FIT} --init {{}}/cut.npz", "cut.npz"),
+    (f"{FIT} --names {{}}/names.yaml", "maps 'a' to '3', which is not a name"),
+    (f"{FIT} --names {{}}/empty.yaml", "holds no map of names"),
+    (f"{FIT} --names {{}}/unknown.yaml", "maps paw"),
+    ("model info {}/absent.npz", "absent.npz: does not exist"),
+    ("model info {}/evil.npz", "evil.npz"),
+    ("model import aves {}/evil.pt --out {}/out", "evil.pt"),
+    ("model view murre --posture dancing --out {}/out", "--posture: 'dancing' is not a known posture (known: standing"),
+    ("evaluate {}/absent --truth {}/birds.json", "absent: does not exist (check the path; `jaxfit fit` and"),
+    ("evaluate {} --truth {}/birds.json", "poses.npz"),
+    ("evaluate {}/birds.json --truth {}/masks --plot {}/out", "--plot: is given without --calibration"),
+    ("config show papr", "papr: is not a shipped config (give one of ablation, aves, "),
+    ("simulate --out {}/out --birds 0", "birds"),
+    ("simulate --out {}/out --size wide", "--size: is wide"),
+    ("simulate --out {}/out --size 12x8", "size"),
+    ("simulate --out {}/out --seed -3", "seed"),
+    ("simulate --out {}/out --distortion", "--distortion: is given without --cameras"),
+    ("track {}/none.mp4 --out {}/out", "none.mp4: does not exist"),
+    ("track {}/notes.txt --out {}/out", "notes.txt: is not a readable video"),
+    ("track {}/masks --config paper --out {}/out", "paper: is the config of a fit"),
+    ("track {}/masks --start 4 --stop 3 --out {}/out", "`track.frames.stop` is 3, and `start` is 4"),
+    ("demo --out {}", "holds files that are not an earlier demo"),
+    ("demo --out {}/notes.txt", "is a file"),
+    ("export {} --to glb --frames 3 --out {}/out", "--frames: is '3', not a range of frames"),
+]
+
+
+@pytest.mark.parametrize(("command", "words"), BAD, ids=[command.replace("{}/", "")[:50] for command, _ in BAD])
+def test_a_bad_command_is_one_line(folder, capsys, command, words):
+    before = sorted(folder.iterdir())
+    rejected(capsys, command.replace("{}", str(folder)).split(), words)
+    assert sorted(path for path in folder.iterdir() if path.name != "cache") == before
+    assert not (folder / "it ran").exists(), "code from the file has run"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ([], "COMMAND (see `jaxfit --help`)"),
+        (["frobnicate" * 99], "(see `jaxfit --help`)"),
+        (["fit"], "fit: the following arguments are required: OBS, --out (see `jaxfit fit --help`)"),
+        (["cameras"], "cameras: the following arguments are required: ACTION (see `jaxfit cameras --help`)"),
+        (["track", "v", "--out", "o", "--step", "9" * 5000], "--step: invalid int value: '9999"),
+        (["fit", "o", "--out", "x", "--workers", "2", "--scheduler", "a"], "not allowed with argument --workers"),
+        (["model", "info", "m", "\udcc5\n" * 300], "(see `jaxfit --help`)"),
+    ],
+)
+def test_wrong_arguments(capsys, arguments, expected):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    said = capsys.readouterr()
+    assert (stopped.value.code, said.out) == (2, "")
+    line = said.err.removesuffix("\n")
+    assert line.startswith("jaxfit: ")
+    assert expected in line
+    assert line.isprintable()
+    assert len(line) <= MAX_MESSAGE_CHARACTERS
+
+
+def test_help_lists_the_commands_by_group_and_the_arguments_of_one(capsys):
+    for command, expected in (
+        (["--help"], ["start:\n  demo ", "  cameras      calibrate, describe and check cameras\n"]),
+        (["cameras", "--help"], ["show ", "check ", "calibrate "]),
+        (["track", "--help"], ["--min-score SCORE", "VIDEO", "(default 10)"]),
     ):
-        path = tmp_path / f"{name}.npz"
-        rejected(capsys, arguments(inputs, tmp_path / "out", model=path), str(path), *words)
-        rejected(capsys, ["model", "info", str(path)], str(path), *words)
-    rejected(
-        capsys, ["model", "import", "aves", str(tmp_path / "evil.pt"), "--out", str(tmp_path / "m.npz")], "evil.pt"
-    )
-    assert not mark.exists(), "code from the file has run"
-    assert not (tmp_path / "m.npz").exists()
-    assert not (tmp_path / "out").exists()
-
-
-def test_unusable_configs_and_starting_poses(inputs, tmp_path, capsys):
-    bad = tmp_path / "bad.yaml"
-    bad.write_text("base: paper\nwindows: 3\n")
-    rejected(capsys, arguments(inputs, tmp_path / "out", config=bad), str(bad), "`windows`", "window")
-    (tmp_path / "cut.npz").write_bytes(b"PK\x03\x04")
-    command = [*arguments(inputs, tmp_path / "out"), "--init", str(tmp_path / "cut.npz")]
-    rejected(capsys, command, "cut.npz")
-    assert not (tmp_path / "out").exists()
+        with pytest.raises(SystemExit) as stopped:
+            main(command)
+        assert stopped.value.code == 0
+        said = capsys.readouterr().out
+        assert all(text in said for text in expected)
 
 
 def test_config_show(tmp_path, capsys):
@@ -133,7 +153,6 @@ def test_config_show(tmp_path, capsys):
     for name in (*shipped_fit_configs(), "ablation"):
         assert main(["config", "show", name]) == 0
         assert "# " in capsys.readouterr().out
-    rejected(capsys, ["config", "show", "papr"], "papr", "paper")
 
 
 @pytest.mark.parametrize("option", ["observations", "--model", "--init", "--config", "--truth", "--segmenter", "video"])

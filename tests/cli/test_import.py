@@ -105,26 +105,6 @@ def test_few_keypoints(inputs, tmp_path, csv_file, capsys):
     assert "has 2 keypoints of the model by name; a fit needs 3" in printed.err
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("paw: crown", ["maps paw"]),
-        ("beakTip: knee", ["maps beakTip to knee, which the model lacks"]),
-        ("beakTip: nape\neyeL: nape", ["maps both beakTip and eyeL to nape"]),
-        ("- a", ["holds no mapping of keys to values"]),
-        ("{}", ["holds no map of names"]),
-        ("a: [", ["line 2 is not valid YAML"]),
-        ("a: 3", ["maps 'a' to '3', which is not a name"]),
-        ("[" * 5000, ["line 1 is nested"]),
-        ("\x80", ["is not"]),
-    ],
-)
-def test_unusable_maps(inputs, tmp_path, csv_file, capsys, content, words):
-    (tmp_path / "map.yaml").write_bytes(content.encode("latin-1"))
-    command = ["import", str(csv_file), "--out", str(tmp_path / "out.json"), "--names", str(tmp_path / "map.yaml")]
-    rejected(capsys, [*command, "--size", "64x64", "--model", str(inputs / "toy.npz")], *words, alone=False)
-
-
 def test_names_with_markup_and_no_known_name(inputs, tmp_path, capsys):
     names = [f"[/red]{i}" for i in range(len(BIRD.keypoint_names))]
     path = write_as_csv(inputs / "birds.json", tmp_path / "a.csv", names)

@@ -17,28 +17,6 @@ from jaxfit.foundation.errors import MAX_MESSAGE_CHARACTERS
 NASTY = "[bold]x[/]\x1b[31m\n\udcc5:bird:"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ([], "COMMAND (see `jaxfit --help`)"),
-        (["frobnicate" * 99], "(see `jaxfit --help`)"),
-        (["fit"], "fit: the following arguments are required: OBS, --out (see `jaxfit fit --help`)"),
-        (["track", "v", "--out", "o", "--step", "9" * 5000], "--step: invalid int value: '9999"),
-        (["model", "info", "m", "\udcc5\n" * 300], "(see `jaxfit --help`)"),
-    ],
-)
-def test_wrong_arguments(capsys, arguments, expected):
-    with pytest.raises(SystemExit) as stopped:
-        main(arguments)
-    said = capsys.readouterr()
-    assert (stopped.value.code, said.out) == (2, "")
-    line = said.err.removesuffix("\n")
-    assert line.startswith("jaxfit: ")
-    assert expected in line
-    assert line.isprintable()
-    assert len(line) <= MAX_MESSAGE_CHARACTERS
-
-
 def test_logged_messages():
     record = logging.LogRecord("jaxfit", logging.WARNING, "", 1, "%s is damaged", (NASTY * 99,), None)
     line = OneLine().format(record)

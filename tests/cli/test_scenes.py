@@ -108,34 +108,11 @@ def test_a_scene_is_overwritten_only_on_request(scene, tmp_path, capsys):
     rejected(capsys, ["simulate", *SMALL, "--out", str(tmp_path / "thesis"), "--overwrite"], "thesis", alone=False)
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "word"),
-    [("--birds", "0", "birds"), ("--size", "wide", "size"), ("--size", "12x8", "size"), ("--seed", "-3", "seed")],
-)
-def test_unusable_options_of_simulate(option, value, word, tmp_path, capsys):
-    rejected(capsys, ["simulate", "--out", str(tmp_path / "s"), option, value], word)
-    assert not (tmp_path / "s").exists()
-
-
 def test_the_murre_has_six_sides(tmp_path, capsys):
     out = tmp_path / "views.png"
     assert main(["model", "view", "murre", "--posture", "standing", "--out", str(out)]) == 0
     assert out.read_bytes().startswith(b"\x89PNG")
-    rejected(capsys, ["model", "view", "murre", "--posture", "dancing", "--out", str(out)], "dancing", "standing")
     assert main(["model", "info", "murre"]) == 0
-
-
-def test_the_demo_keeps_other_folders(tmp_path, capsys):
-    (tmp_path / "overlay.mp4").write_text("precious")
-    rejected(capsys, ["demo", "--out", str(tmp_path)], "not an earlier demo")
-    rejected(capsys, ["demo", "--out", str(tmp_path / "overlay.mp4")], "is a file")
-    assert [path.name for path in tmp_path.iterdir() if path.name != "cache"] == ["overlay.mp4"]
-
-
-def test_one_bird_is_singular(tmp_path, capsys):
-    size = ["--size", "480x280"]
-    assert main(["simulate", "--birds", "1", "--frames", "2", *size, "--out", str(tmp_path / "one")]) == 0
-    assert "1 bird over 2 frames: " in capsys.readouterr().out
 
 
 class TruthOfTheScene:
