@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from support.cli_files import rejected
+from support.overlays import film
 
 from jaxfit import Observations, load_reconstruct_config, pipeline, read_coco
 from jaxfit.cli import demo
@@ -94,8 +95,7 @@ def test_unusable_videos_of_overlay(scene, tmp_path, capsys):
 
     rejected(capsys, command(tmp_path / "none.mp4"), "none.mp4", alone=False)
     rejected(capsys, command(scene / "truth.json"), "truth.json", alone=False)
-    assert main(["simulate", *SMALL[:2], "--frames", "3", "--size", "480x280", "--out", str(tmp_path / "short")]) == 0
-    rejected(capsys, command(tmp_path / "short" / "footage.mp4"), "footage.mp4", alone=False)
+    rejected(capsys, command(film(tmp_path / "other.mp4")), "other.mp4", "--force", alone=False)
     assert not (tmp_path / "o.mp4").exists()
 
 
