@@ -7,6 +7,7 @@ from support.cli_files import arguments
 from jaxfit.cli.main import main
 from jaxfit.config.fit import load_config
 from jaxfit.data.solution import load_solution
+from jaxfit.fitting import learn
 
 CONFIG = """
 base: paper
@@ -42,10 +43,15 @@ def test_a_fit_with_learnt_yaml_gives_the_same_result(inputs, tmp_path):
     np.testing.assert_array_equal(a.keypoints_px, b.keypoints_px)
 
 
-def test_a_term_that_is_not_learnt_keeps_the_config_and_the_file_gives_the_reason(inputs, tmp_path):
-    text = f"base: {inputs / 'quick.yaml'}\nlearn_weights: [keypoint_likelihood]\n"
-    (tmp_path / "learning.yaml").write_text(text + "terms: {keypoint_likelihood: {sd_sure_px: 2}}\n")
+def test_too_few_data_keep_the_config_and_the_file_gives_the_reason(inputs, tmp_path, monkeypatch):
+    monkeypatch.setattr(learn, "MIN_FRAMES", 1000)
+    (tmp_path / "learning.yaml").write_text(
+        f"base: {inputs / 'quick.yaml'}\nlearn_weights: [keypoint_likelihood]\n"
+        "terms: {keypoint_likelihood: {sd_sure_px: 2}}\n"
+        "stages: [{name: only, steps: 2, terms: [keypoint_likelihood]}]\n"
+    )
     assert main(arguments(inputs, tmp_path / "out", config=tmp_path / "learning.yaml")) == 0
     text = (tmp_path / "out" / "learnt.yaml").read_text()
-    assert "# no weights are learnt: the last stage has no keypoint_likelihood" in text
+    assert "# no weights are learnt: " in text
+    assert "are too few" in text
     assert load_config(tmp_path / "out" / "learnt.yaml").terms["keypoint_likelihood"]["sd_sure_px"] == 2
