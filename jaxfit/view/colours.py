@@ -60,6 +60,9 @@ tritanopia (Machado et al. 2009)."""
 OTHER_BEHAVIOUR: Colour = (155, 145, 133)
 """A bird that shows no behaviour of the config; drawn as a thin bar."""
 
+FLAG_COLOURS = {"ok": "#9fb8a6", "unsure": "#f5b700", "contradicted": "#c1121f"}
+"""Flag of a pose → colour in timelines of reports and of the viewer, as HTML names it."""
+
 PLUMAGE_SHARE = 0.4
 """Weight of the model's colours in the colours of a drawn bird; the rest is the colour of the track."""
 

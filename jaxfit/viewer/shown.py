@@ -26,7 +26,7 @@ from jaxfit.export.result import Exported
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import skeleton_pairs
 from jaxfit.view.birds import REGION_95, Detected, DrawnBird, outlines
-from jaxfit.view.colours import css, track_colour
+from jaxfit.view.colours import FLAG_COLOURS, css, track_colour
 from jaxfit.viewer.arrays import in_steps, pack
 
 FRAMES = 50
@@ -115,6 +115,7 @@ class Shown:
             "skeleton": [list(pair) for pair in skeleton_pairs(s.keypoint_names)],
             "keypoints": list(s.keypoint_names),
             "flags": list(FLAGS),
+            "flag_colours": [FLAG_COLOURS[flag] for flag in FLAGS],
             "values": self.kinds_of_values,
             "region_radius": float(np.sqrt(REGION_95)),
             "detected": self.observations is not None,

@@ -10,7 +10,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from jaxfit.foundation.errors import one_line
-from jaxfit.view.colours import behaviour_colour, css, ink_on, track_colour
+from jaxfit.view.colours import FLAG_COLOURS, behaviour_colour, css, ink_on, track_colour
 from jaxfit.view.report.axis import duration
 from jaxfit.view.report.contents import counted
 
@@ -43,4 +43,9 @@ _environment.filters |= {
     "duration": duration,
     "quoted": shlex.quote,
 }
-_environment.globals |= {"behaviour_colour": behaviour_colour, "ink_on": ink_on, "track_colour": track_colour}
+_environment.globals |= {
+    "behaviour_colour": behaviour_colour,
+    "flag_colours": FLAG_COLOURS,
+    "ink_on": ink_on,
+    "track_colour": track_colour,
+}

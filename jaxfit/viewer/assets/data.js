@@ -14,6 +14,7 @@
  * @property {[number, number][]} skeleton
  * @property {string[]} keypoints
  * @property {string[]} flags
+ * @property {string[]} flag_colours
  * @property {ValueName[]} values
  * @property {number} region_radius radius of a region of 95 %, in standard deviations
  * @property {boolean} detected

@@ -347,7 +347,7 @@ async function open() {
   const film = facts.film;
   if (film) state.film = new Film(film, state.times, frames);
   const first = facts.results[0];
-  state.timeline = new Timeline(find("rows"), first.tracks, frames, { seek: go, select });
+  state.timeline = new Timeline(find("rows"), first.tracks, frames, first.flag_colours, { seek: go, select });
   if (facts.corrections) {
     state.corrections = new Corrections(facts.corrections, {
       state: () => ({ frame: state.frames[state.i], selected: [...state.selected], range: state.range }),

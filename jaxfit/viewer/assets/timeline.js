@@ -4,20 +4,22 @@
 /** @typedef {{id: number, colour: string}} Row */
 
 const ROW = 15, LABEL = 46, CURVE = 64;
-/** Colours of the flags ok, unsure, contradicted, and the share of the row that they fill. */
-const FLAG_COLOURS = ["", "#9fb8a6", "#f0a818", "#c62828"], FILLED = [0, 0.55, 0.8, 1];
+/** Share of the row that the flags ok, unsure and contradicted fill. */
+const FILLED = [0, 0.55, 0.8, 1];
 
 export class Timeline {
   /**
    * @param {HTMLElement} parent
    * @param {Row[]} rows
    * @param {number[]} frames
+   * @param {string[]} colours of the flags ok, unsure, contradicted
    * @param {{seek: (i: number) => void, select: (track: number, more: boolean) => void}} actions
    */
-  constructor(parent, rows, frames, actions) {
+  constructor(parent, rows, frames, colours, actions) {
     this.parent = parent;
     this.rows = rows;
     this.frames = frames;
+    this.colours = ["", ...colours];
     this.still = document.createElement("canvas");
     this.cursor = document.createElement("canvas");
     this.cursor.className = "cursor";
@@ -103,7 +105,7 @@ export class Timeline {
       for (let t = from; t < to; t++) worst = Math.max(worst, this.flags[n * T + t]);
       if (!worst) continue;
       const left = LABEL + ((width - LABEL) * c) / columns, high = (ROW - 4) * FILLED[worst];
-      context.fillStyle = FLAG_COLOURS[worst];
+      context.fillStyle = this.colours[worst];
       context.fillRect(left, top + ROW - 2 - high, (width - LABEL) / columns + 0.5, high);
     }
   }
