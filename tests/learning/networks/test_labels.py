@@ -68,13 +68,6 @@ def test_every_annotation_without_a_track_is_a_bird(tmp_path, caplog, keys):
     assert not caplog.text
 
 
-def test_keypoints_without_tracks(tmp_path):
-    birds = [bird(x, 30, keypoints=[x + 5, 35, 2]) for x in (10, 60, 110)]
-    file = write_labels(tmp_path, without(coco({t: birds for t in TIMES}, ["beak"]), "track_id"), [])
-    pictures = read_labels([file], []).pictures
-    assert [[int(own.keypoints_px[0, 0]) for own in picture.birds] for picture in pictures] == [[15, 65, 115]] * 8
-
-
 @pytest.mark.parametrize("numbers", [(1, 2), (300, 310)])  # of 8 and of 16 bits
 def test_folder_of_masks(tmp_path, numbers):
     masks, images = tmp_path / "masks", tmp_path / "images"

@@ -13,7 +13,6 @@ from jaxfit.foundation.errors import InputError  # noqa: E402
 from jaxfit.learning.networks.keypoints import KeypointMaps  # noqa: E402
 from jaxfit.learning.networks.network_files import (  # noqa: E402
     Probabilities,
-    activation_statistics,
     base_file,
     load_keypoint_base,
     load_segmenter_base,
@@ -126,16 +125,6 @@ def test_unlike_inputs_are_far_away_and_statistics_can_be_replaced(tmp_path):
             monitor.add(model(array), 1)
     alike, unlike = np.split(monitor.take(), 2)
     assert np.median(alike) < 1 < 3 < unlike.min()
-
-
-def test_dead_and_constant_channels_have_finite_distances():
-    values = RNG.random((40, 3))
-    values[:, 1] = 0
-    statistics = activation_statistics(values)
-    assert np.isfinite(statistics.whitening).all()
-    far = statistics.distance(np.array([[0.5, 9.0, 0.5], [np.nan, 0, 0], [np.inf, 0, 0]]))
-    assert (far > 1).all()
-    assert np.isfinite(far).all()
 
 
 def test_unusable_inputs(tmp_path):

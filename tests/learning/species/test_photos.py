@@ -12,11 +12,9 @@ from jaxfit.foundation.array_files import load_npz
 from jaxfit.learning.species.models import compare_birds
 from jaxfit.learning.species.photo_fit import PhotoSettings, fit_photographs
 from jaxfit.learning.species.photographs import FRAMES_PER_TRACK, _few_frames, _remarks, read_photographs
-from jaxfit.learning.species.species import absolute_bones, symmetric_bones
+from jaxfit.learning.species.species import absolute_bones
 from jaxfit.model.files import load_bird, load_murre, save_bird
 from jaxfit.simulation.species import random_species, simulate_photographs
-
-QUICK = PhotoSettings(modes=3, rounds=(60, 40, 40))
 
 
 @pytest.fixture(scope="module")
@@ -32,13 +30,6 @@ def photographs():
     return bird, species, observations
 
 
-@pytest.fixture(scope="module")
-def fitted(photographs):
-    bird, _, observations = photographs
-    images = read_photographs([("photographs", observations)], bird)
-    return images, fit_photographs(images, bird, QUICK)
-
-
 def bone_error(bird, species):
     """Return the mean error of the bones up to one common factor."""
     ratio = absolute_bones(bird) / absolute_bones(species)
@@ -46,32 +37,21 @@ def bone_error(bird, species):
 
 
 @pytest.mark.extended
-def test_a_bad_image_among_six_loses_its_weight_and_is_listed(photographs, fitted):
-    images, fit = fitted
-    assert fit.disagreeing == [0]
-    assert fit.weight[0] < 0.1
-    first = fit_photographs(images, photographs[0], QUICK._replace(rounds=(30,)))
-    assert first.disagreeing == [0]  # found before masks are compared, and before the image bends the species
-
-
-@pytest.mark.extended
-def test_the_species_is_nearer_to_the_truth_than_the_base_in_spite_of_the_bad_image(photographs, fitted):
-    bird, species, _ = photographs
-    assert bone_error(fitted[1].bird, species) < 0.9 * bone_error(bird, species)
-    error = compare_birds(species, fitted[1].bird).of_first.mean()
-    assert error < 0.6 * compare_birds(species, bird).of_first.mean()
-
-
-@pytest.mark.extended
-def test_the_new_priors_are_covariances_and_images_without_masks_are_used(fitted, tmp_path):
-    images, fit = fitted
+def test_the_species_is_nearer_to_the_truth_than_the_base_in_spite_of_a_bad_image(photographs, tmp_path):
+    bird, species, observations = photographs
+    images = read_photographs([("photographs", observations)], bird)
     assert images.has_mask.tolist() == [True] * 5 + [False]
     assert "photograph_000.png" in images.names[0]
-    bird = fit.bird
-    save_bird(bird, tmp_path / "m.npz")  # checks all fields
+    fit = fit_photographs(images, bird, PhotoSettings(modes=3, rounds=(60, 40, 40)))
+    assert fit.disagreeing == [0]
+    assert fit.weight[0] < 0.1
+    assert bone_error(fit.bird, species) < 0.9 * bone_error(bird, species)
+    error = compare_birds(species, fit.bird).of_first.mean()
+    assert error < 0.6 * compare_birds(species, bird).of_first.mean()
+    save_bird(fit.bird, tmp_path / "m.npz")  # checks all fields
     for left, right in bird.joint_pairs:
-        assert float(bird.bone_mean[left - 1]) == pytest.approx(float(bird.bone_mean[right - 1]), abs=1e-6)
-    assert (np.linalg.eigvalsh(np.asarray(bird.bone_covariance, float)) > 0).all()
+        assert float(fit.bird.bone_mean[left - 1]) == pytest.approx(float(fit.bird.bone_mean[right - 1]), abs=1e-6)
+    assert (np.linalg.eigvalsh(np.asarray(fit.bird.bone_covariance, float)) > 0).all()
 
 
 @pytest.mark.extended
@@ -92,9 +72,16 @@ def test_the_command_writes_a_model_with_provenance_and_keeps_fixed_parts(photog
     assert any(line.startswith("bones_not_determined: ") for line in lines)
 
 
-@pytest.mark.parametrize(("fixed", "says"), [("feathers", "not a part"), ("bones,shape,offset", "nothing is left")])
-def test_wrong_parts_are_one_line_errors(tmp_path, capsys, fixed, says):
-    assert main(["adapt", "photos", "absent.json", "--out", str(tmp_path / "m.npz"), "--fix", fixed]) == 2
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (["--fix", "feathers"], "not a part"),
+        (["--fix", "bones,shape,offset"], "nothing is left"),
+        (["--frames-per-track", "0"], "--frames-per-track: is 0"),
+    ],
+)
+def test_wrong_options_are_one_line_errors(tmp_path, capsys, option, says):
+    assert main(["adapt", "photos", "absent.json", "--out", str(tmp_path / "m.npz"), *option]) == 2
     assert says in capsys.readouterr().err
 
 
@@ -127,19 +114,3 @@ def test_remarks_say_how_many_images_are_used_and_why():
     assert track.startswith("a.json: 10 of 104 images are used: at most 10 of each track, at equal distances")
     assert "--frames-per-track" in track
     assert failed == "a.json: 2 of 10 images are not used: the fit of their keypoints failed"
-
-
-def test_a_number_of_frames_below_1_is_an_error(tmp_path, capsys):
-    arguments = ["adapt", "photos", "absent.json", "--out", str(tmp_path / "m.npz"), "--frames-per-track", "0"]
-    assert main(arguments) == 2
-    assert "--frames-per-track: is 0" in capsys.readouterr().err
-
-
-def test_left_and_right_bones_share_one_length():
-    bird = load_murre()
-    matrix = symmetric_bones(bird)
-    assert matrix.sum() == bird.num_joints - 1
-    names = np.array(bird.joint_names[1:])
-    pairs = [set(names[column > 0]) for column in matrix.T]
-    assert {"left_wrist", "right_wrist"} in pairs
-    assert {"head"} in pairs
