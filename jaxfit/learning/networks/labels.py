@@ -106,21 +106,26 @@ def read_labels(
         if file.is_dir():
             if needs_keypoints:
                 raise InputError(file, "is a folder of masks, without keypoints", "give a file of labelled keypoints")
-            read, own_names = list(_mask_pictures(file, progress)), (CENTRE,)
+            read, file_names = list(_mask_pictures(file, progress)), (CENTRE,)
         else:
             observations = _observations(file, images[i] if images else None, needs_keypoints)
             if masks is not None:
                 observations = add_masks(observations, masks, progress, images[i] if images else None)
-            read, own_names = list(_pictures(observations, file)), observations.keypoint_names
+            read, file_names = list(_pictures(observations, file)), observations.keypoint_names
         if not needs_keypoints:
-            read, own_names = [_with_centres(picture) for picture in read], (CENTRE,)
-        if names and sorted(own_names) != sorted(names):
-            different = sorted(set(own_names) ^ set(names))
+            read = [picture._replace(birds=tuple(map(_at_centre, picture.birds))) for picture in read]
+            file_names = (CENTRE,)
+        if names and sorted(file_names) != sorted(names):
+            different = sorted(set(file_names) ^ set(names))
             problem = f"names other keypoints than {files[0].name}: {', '.join(different)} only in one of the two"
             raise InputError(file, problem, "label the same keypoints in all files")
-        names = names or own_names
-        order = [own_names.index(name) for name in names]
-        pictures += [_reordered(picture, order) for picture in read]
+        names = names or file_names
+        order = [file_names.index(name) for name in names]
+        for picture in read:
+            birds = (
+                b._replace(keypoints_px=b.keypoints_px[order], visibility=b.visibility[order]) for b in picture.birds
+            )
+            pictures.append(picture._replace(birds=tuple(birds)))
     commas = [name for name in names if "," in name]
     if commas:  # the network file separates the names by commas
         raise InputError(files[0], f"has a keypoint with a comma in its name: {commas[0]}", "rename the keypoint")
@@ -201,30 +206,14 @@ def _mask_pictures(folder: Path, progress: ProgressTask) -> Iterator[LabelledPic
 
 def mask_bird(number: int, mask: np.ndarray) -> LabelledBird:
     """Return the bird of a mask, with the centre of its box as keypoint."""
-    box = np.array(box_of_mask(mask), np.float32)
-    centre = (box[:2] + box[2:] / 2)[None]
-    return LabelledBird(f"bird {number}", box, centre, np.full(1, 2, np.uint8), encode_mask(mask))
+    box, nowhere = np.array(box_of_mask(mask), np.float32), np.zeros(0)
+    return _at_centre(LabelledBird(f"bird {number}", box, nowhere, nowhere, encode_mask(mask)))
 
 
-def _with_centres(picture: LabelledPicture) -> LabelledPicture:
-    """Return a picture whose birds have one keypoint, the centre of the box."""
-    return picture._replace(
-        birds=tuple(
-            bird._replace(
-                keypoints_px=(bird.box_px[:2] + bird.box_px[2:] / 2)[None].astype(np.float32),
-                visibility=np.full(1, 2, np.uint8),
-            )
-            for bird in picture.birds
-        )
-    )
-
-
-def _reordered(picture: LabelledPicture, order: Sequence[int]) -> LabelledPicture:
-    birds = (
-        bird._replace(keypoints_px=bird.keypoints_px[order], visibility=bird.visibility[order])
-        for bird in picture.birds
-    )
-    return picture._replace(birds=tuple(birds))
+def _at_centre(bird: LabelledBird) -> LabelledBird:
+    """Return a bird with one keypoint, the centre of its box."""
+    centre = (bird.box_px[:2] + bird.box_px[2:] / 2)[None].astype(np.float32)
+    return bird._replace(keypoints_px=centre, visibility=np.full(1, 2, np.uint8))
 
 
 _LEVELS = 4

@@ -394,7 +394,12 @@ def _segment(
     size_px = picture.shape[1], picture.shape[0]
     others = np.zeros(picture.shape[:2], bool)
     if isinstance(teacher, DetectorAndSaliency):
-        birds = [_in_box(teacher, picture, place) for place in places]
+        birds = []
+        for place in places:
+            x, y, width, height = box_of_mask(place) or (0, 0, 0, 0)
+            corners_px = np.array([x, y, x + width, y + height], np.float32)
+            bird = teacher.instance_in_box(picture, corners_px, CONTEXT) if width else None
+            birds.append(np.zeros_like(others) if bird is None else bird.whole(size_px))
         covered = _union(birds, size_px)
         for x0, y0, x1, y1 in (np.round(box).astype(int).tolist() for box in teacher.boxes(picture)):
             part = slice(max(y0, 0), y1), slice(max(x0, 0), x1)
@@ -406,16 +411,6 @@ def _segment(
     birds = [detected[of_place[i]] if i in of_place else others for i in range(len(places))]
     elsewhere = [bird for j, bird in enumerate(detected) if j not in of_place.values()]
     return birds, _union(elsewhere, size_px) & ~_union(birds, size_px)
-
-
-def _in_box(teacher: DetectorAndSaliency, picture: UInt8[np.ndarray, "H W 3"], place: Mask) -> Mask:
-    box = box_of_mask(place)
-    if box is None:
-        return np.zeros(picture.shape[:2], bool)
-    x, y, width, height = box
-    corners_px = np.array([x, y, x + width, y + height], np.float32)
-    bird = teacher.instance_in_box(picture, corners_px, CONTEXT)
-    return np.zeros(picture.shape[:2], bool) if bird is None else bird.whole((picture.shape[1], picture.shape[0]))
 
 
 def _two_runs(teacher: Segmenter, picture: UInt8[np.ndarray, "H W 3"]) -> tuple[list[Mask], list[Mask]]:

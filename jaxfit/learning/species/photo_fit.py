@@ -161,11 +161,6 @@ def run_steps(model: Hierarchy, data: Data, weights: Weights, p: Parameters, sta
     return p, state, model.image_losses(p, data, weights.mask)
 
 
-def initial_state(p: Parameters):
-    """Return the state of Adam before the first step."""
-    return optax.scale_by_adam().init(p)
-
-
 UNDETERMINED = 0.5**0.5
 """Ratio of the widths above which the photographs say less about a bone than the prior: the precision of the posterior
 is the sum of that of the prior and that of the photographs."""
@@ -346,14 +341,22 @@ def fit_photographs(
     Source: Wang et al. 2021, *Birds of a Feather*, section 4, for a species mean that all images share.
     """
     extended = with_offsets(bird, 0 if "offset" in fixed else settings.modes, settings.offset_sd)
-    model, data = _model(extended), _data(photographs)
+    model = _model(extended)
+    data = Data(
+        keypoints_px=jnp.asarray(photographs.keypoints_px),
+        confidence=jnp.asarray(photographs.confidence),
+        mask=jnp.asarray(photographs.mask, jnp.uint8),
+        has_mask=jnp.asarray(photographs.has_mask, jnp.float32),
+        individual=jnp.asarray(photographs.individual),
+        scale=jnp.asarray(photographs.pose.scale),
+    )
     individuals = int(photographs.individual.max()) + 1
     p = _start(photographs, bird, extended, individuals)
     between_bones = np.linalg.inv(np.asarray(model.bone_precision, np.float64))
     first_bones = settings.within**2 * between_bones
     first_shape = settings.within**2 * np.asarray(bird.shape_variance, np.float64)
     own_bones, own_shape = first_bones, first_shape
-    weight, state = np.ones(len(photographs.names)), initial_state(p)
+    weight, state = np.ones(len(photographs.names)), optax.scale_by_adam().init(p)
     step = _step_sizes(p, bird, fixed)
     with progress(f"Fitting {len(weight)} images", sum(settings.rounds)) as report_progress:
         # the first round has no steps: images that no pose of the base fits lose weight before they bend the species
@@ -404,17 +407,6 @@ def _model(bird: Bird) -> Hierarchy:
         pose_whitener=priors_of(bird).pose_whitener,
         bone_precision=jnp.asarray(symmetric_bone_precision(bird), jnp.float32),
         shape_precision=1 / bird.shape_variance,
-    )
-
-
-def _data(photographs: Photographs) -> Data:
-    return Data(
-        keypoints_px=jnp.asarray(photographs.keypoints_px),
-        confidence=jnp.asarray(photographs.confidence),
-        mask=jnp.asarray(photographs.mask, jnp.uint8),
-        has_mask=jnp.asarray(photographs.has_mask, jnp.float32),
-        individual=jnp.asarray(photographs.individual),
-        scale=jnp.asarray(photographs.pose.scale),
     )
 
 

@@ -133,8 +133,11 @@ class PosedFit:
 
     def step(self, x: Float[np.ndarray, "P"], rows: Rows, damping: float = 1e-3) -> Float[np.ndarray, "P"]:
         """Return the parameters after one damped Gauss-Newton step on the rows and the priors."""
-        hessian, gradient = normal_equations(rows)
-        hessian += self.precision
+        # JᵀWJ + Λ and JᵀWr + Λ (x − μ), with the precision Λ and the mean μ of the prior
+        weighted = rows.jacobian * rows.weight[:, None].astype(np.float32)
+        hessian = (weighted.T @ rows.jacobian).astype(np.float64)
+        hessian = (hessian + hessian.T) / 2 + self.precision
+        gradient = (weighted.T @ rows.residual.astype(np.float32)).astype(np.float64)
         gradient += self.precision @ (x - self.prior_mean)
         # the damping keeps a step finite in directions that neither the data nor a prior determines
         hessian[np.diag_indices(self.size)] += damping * np.diag(hessian) + 1e-6
@@ -142,13 +145,6 @@ class PosedFit:
         # a rotation by more than half a radian is outside the range of the linearisation
         largest = np.abs(np.concatenate([step[:3], step[6 : 7 + len(self.bird.pose_mean)]])).max()
         return x + step * min(1.0, 0.5 / max(largest, 1e-12))
-
-
-def normal_equations(rows: Rows) -> tuple[Float[np.ndarray, "P P"], Float[np.ndarray, "P"]]:
-    """Return Jᵀ·diag(w)·J and Jᵀ·diag(w)·r, in float64."""
-    weighted = rows.jacobian * rows.weight[:, None].astype(np.float32)
-    hessian = (weighted.T @ rows.jacobian).astype(np.float64)
-    return (hessian + hessian.T) / 2, (weighted.T @ rows.residual.astype(np.float32)).astype(np.float64)
 
 
 DENSER = 4
