@@ -103,7 +103,7 @@ def optimised():
 @pytest.fixture
 def distant_birds(monkeypatch):
     """Let a fit accept birds at any distance, whose objective overflows."""
-    monkeypatch.setattr("jaxfit.fitting.windows.DISTANCE_IMAGE_SIDES", 1e35)
+    monkeypatch.setattr("jaxfit.fitting.windows.MAX_DISTANCE_IMAGE_SIDES", 1e35)
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxfit.foundation.limits import IMAGE_SIDE_PX
-
+MAX_IMAGE_SIDE_PX = 16_384
+"""Longest side of an image. The run lengths of larger masks overflow the buffers of pycocotools."""
 Lens = Literal["perspective", "fisheye"]
 """Models of lens distortion, as OpenCV defines them (`cv2.projectPoints`, `cv2.fisheye.projectPoints`)."""
 
@@ -92,8 +92,8 @@ class Camera:
         object.__setattr__(self, "R_cam_world", U @ V)  # removes the rounding of a text file
         if self.size_px is not None:
             width, height = (int(side) for side in self.size_px)
-            if not (1 <= width <= IMAGE_SIDE_PX and 1 <= height <= IMAGE_SIDE_PX):
-                raise ValueError(f"size_px must be in 1…{IMAGE_SIDE_PX}, not {width}×{height}")
+            if not (1 <= width <= MAX_IMAGE_SIDE_PX and 1 <= height <= MAX_IMAGE_SIDE_PX):
+                raise ValueError(f"size_px must be in 1…{MAX_IMAGE_SIDE_PX}, not {width}×{height}")
             object.__setattr__(self, "size_px", (width, height))
         for name in shapes:
             getattr(self, name).flags.writeable = False

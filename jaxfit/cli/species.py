@@ -10,10 +10,9 @@ import numpy as np
 from jaxfit.cli.tables import counted, right_aligned, show
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_writable
-from jaxfit.foundation.limits import MODEL_FACES, MODEL_VERTICES
 from jaxfit.foundation.progress import terminal
 from jaxfit.foundation.reading import json_text
-from jaxfit.model.bird import Bird
+from jaxfit.model.bird import MAX_FACES, MAX_VERTICES, Bird
 from jaxfit.model.files import find_bird, load_bird, save_bird
 
 if TYPE_CHECKING:
@@ -211,9 +210,9 @@ def model_rig(options: argparse.Namespace) -> None:
     bird, mesh = load_bird(options.like), read_scan(options.mesh)
     for remark in mesh.remarks:
         show(remark)
-    if len(mesh.vertices) > MODEL_VERTICES or len(mesh.faces) > MODEL_FACES:
+    if len(mesh.vertices) > MAX_VERTICES or len(mesh.faces) > MAX_FACES:
         problem = f"has {len(mesh.vertices):,} vertices and {len(mesh.faces):,} faces"
-        remedy = f"a model has at most {MODEL_VERTICES:,} and {MODEL_FACES:,}: decimate the mesh"
+        remedy = f"a model has at most {MAX_VERTICES:,} and {MAX_FACES:,}: decimate the mesh"
         raise InputError(options.mesh, problem, remedy)
     placement = read_placement(options.like, bird)
     if placement is None:

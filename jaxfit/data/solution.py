@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxfit.cameras.camera import MAX_IMAGE_SIDE_PX
 from jaxfit.data.footage import FootageIdentity, footage_of
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.observations import check_times
@@ -17,7 +18,6 @@ from jaxfit.data.result_folder import CONFIG, LEARNT, MODEL, POSES, SUMMARY
 from jaxfit.foundation.array_files import load_npz, validate_arrays
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder, write_whole
-from jaxfit.foundation.limits import IMAGE_SIDE_PX
 from jaxfit.foundation.reading import check_folder, check_readable, json_text
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_bird, save_bird
@@ -204,8 +204,8 @@ class Solution:
         focal_px, crop_px = float(camera["focal_px"]), int(camera["crop_px"])
         if not 0 < focal_px < math.inf:
             raise ValueError(f"focal_px must be above 0 and finite, not {focal_px}")
-        if not 1 <= crop_px <= IMAGE_SIDE_PX:
-            raise ValueError(f"crop_px must be in 1…{IMAGE_SIDE_PX}, not {crop_px}")
+        if not 1 <= crop_px <= MAX_IMAGE_SIDE_PX:
+            raise ValueError(f"crop_px must be in 1…{MAX_IMAGE_SIDE_PX}, not {crop_px}")
         times = np.full(len(arrays["frame_index"]), np.nan) if self.timestamp_s is None else self.timestamp_s
         layout = {"frame_index": LAYOUT["frame_index"], "timestamp_s": _TIMES["timestamp_s"]}
         arrays |= validate_arrays({"frame_index": arrays["frame_index"], "timestamp_s": times}, layout)
@@ -339,7 +339,7 @@ def check_poses(arrays: Mapping[str, np.ndarray], fitted: np.ndarray) -> None:
         require("crop", arrays["crop"][..., 2] > 0, "has a size that is not above 0")
     if "image_size_px" in arrays:
         size = arrays["image_size_px"]
-        require("image_size_px", (size > 0) & (size <= IMAGE_SIDE_PX), f"is not in 1…{IMAGE_SIDE_PX}")
+        require("image_size_px", (size > 0) & (size <= MAX_IMAGE_SIDE_PX), f"is not in 1…{MAX_IMAGE_SIDE_PX}")
 
 
 def save_solution(

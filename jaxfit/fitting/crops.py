@@ -6,13 +6,15 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jaxfit.cameras.camera import MAX_IMAGE_SIDE_PX
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CROP_IMAGE_SIDES, IMAGE_SIDE_PX
 from jaxfit.model.camera import CROP_PX
 from jaxfit.raster.silhouette_reference import UNKNOWN
 
+MAX_CROP_IMAGE_SIDES = 2
+"""Largest side of a crop, as a multiple of the longer side of its image."""
 MIN_SIZE_PX = 16.0
 """Smallest side of a crop, in image pixels."""
 MARGIN_PX = 3.0
@@ -29,7 +31,7 @@ def crop_squares(
 ) -> Float[np.ndarray, "W T 3"]:
     """Return (x0, y0, size) in image pixels for every frame of some windows: whole numbers, one size for each window.
 
-    The size is at most `limits.CROP_IMAGE_SIDES` times the longer side of the window's largest image.
+    The size is at most `MAX_CROP_IMAGE_SIDES` times the longer side of the window's largest image.
 
     Raises:
         InputError: `mode: image` with images that are not square or not of one size.
@@ -42,7 +44,7 @@ def crop_squares(
         elif config.mode == "image":
             crop[w] = _whole_image(image_px)
         else:
-            largest_px = float(CROP_IMAGE_SIDES * image_px.max())
+            largest_px = float(MAX_CROP_IMAGE_SIDES * image_px.max())
             crop[w] = _around_the_bird(observations, n, frame[w], present[w], largest_px, config)
     return crop
 
@@ -90,8 +92,10 @@ def cut_mask(mask: Bool[np.ndarray, "H W"], crop: Float[np.ndarray, "3"], mask_p
         ValueError: the crop is larger than `crop_squares` allows.
     """
     x0, y0, size = (int(v) for v in crop)
-    if size > CROP_IMAGE_SIDES * IMAGE_SIDE_PX:
-        raise ValueError(f"crop must have a side of at most {CROP_IMAGE_SIDES * IMAGE_SIDE_PX} pixels, not {size}")
+    if size > MAX_CROP_IMAGE_SIDES * MAX_IMAGE_SIDE_PX:
+        raise ValueError(
+            f"crop must have a side of at most {MAX_CROP_IMAGE_SIDES * MAX_IMAGE_SIDE_PX} pixels, not {size}"
+        )
     rows, columns = mask.shape
     top, left, bottom, right = max(y0, 0), max(x0, 0), min(y0 + size, rows), min(x0 + size, columns)
     if top >= bottom or left >= right:

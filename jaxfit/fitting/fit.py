@@ -29,10 +29,12 @@ from jaxfit.fitting.tasks import FitTask, fit_windows
 from jaxfit.fitting.windows import Windows, cut_windows, distant_birds, report_distant_birds, windows_key
 from jaxfit.foundation.array_files import MAX_TABLE_GB, check_memory, observations_bytes
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import WINDOW_GB
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.foundation.workers import Cluster
 from jaxfit.model.bird import Bird
+
+MAX_WINDOW_GB = 8.0
+"""Largest memory of one window, by estimate, unless `memory_gb` is larger."""
 
 
 def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[FitConfig], source: object) -> None:
@@ -45,7 +47,7 @@ def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[F
         source: name of the observations in messages.
 
     Raises:
-        InputError: the tables of poses, or one window, need more memory than `MAX_TABLE_GB` or `WINDOW_GB`, and more
+        InputError: the tables of poses, or one window, need more memory than `MAX_TABLE_GB` or `MAX_WINDOW_GB`, and
             than `memory_gb`.
     """
     config, N, T = configs[0], observations.num_tracks, observations.num_frames
@@ -70,7 +72,7 @@ def check_fit_memory(observations: Observations, bird: Bird, configs: Sequence[F
     needed = config.window * (search.hypotheses * bytes_per_frame(bird, config) + search_bytes)
     window = f"the arrays of a window of {config.window:,} frames"
     remedy = "lower `window`, `crop.size_px` or the numbers of `initialise`, or raise `memory_gb`"
-    check_memory("config", window, needed, remedy, max(WINDOW_GB, config.memory_gb))
+    check_memory("config", window, needed, remedy, max(MAX_WINDOW_GB, config.memory_gb))
 
 
 _logger = logging.getLogger(__name__)

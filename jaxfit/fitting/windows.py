@@ -23,7 +23,6 @@ from jaxfit.data.tracks import assumed_interval_s, frame_interval_s, frame_step
 from jaxfit.fitting.crops import crop_squares, cut_mask, mark_unknown
 from jaxfit.foundation.array_files import MAX_TABLE_GB, check_memory
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import DISTANCE_IMAGE_SIDES
 from jaxfit.model.camera import CROP_PX, image_to_crop
 from jaxfit.objective.posed_window import Targets, ViewMaps
 
@@ -94,17 +93,21 @@ _filter_birds = jax.jit(jax.vmap(weighted_median_filter, (0, 0, None)), static_a
 _logger = logging.getLogger(__name__)
 
 _LISTED_FRAMES = 10
-_PROBLEM = f"a box or a keypoint lies more than {DISTANCE_IMAGE_SIDES:g} × the image's longer side outside the image"
+MAX_DISTANCE_IMAGE_SIDES = 1.0
+"""Largest distance of a box or a keypoint outside its image, as a multiple of the image's longer side."""
+_PROBLEM = (
+    f"a box or a keypoint lies more than {MAX_DISTANCE_IMAGE_SIDES:g} × the image's longer side outside the image"
+)
 
 
 def distant_birds(observations: Observations) -> Bool[np.ndarray, "N T"]:
     """Return where the box or a keypoint of a bird is far outside its image.
 
     The distance is measured in x and in y, from the nearest edge of the image. It is far if it exceeds
-    `limits.DISTANCE_IMAGE_SIDES` times the longer side of the image. Missing keypoints do not count.
+    `MAX_DISTANCE_IMAGE_SIDES` times the longer side of the image. Missing keypoints do not count.
     """
     size_px = observations.image_sizes_px()
-    allowed_px = DISTANCE_IMAGE_SIDES * size_px.max(-1, keepdims=True)
+    allowed_px = MAX_DISTANCE_IMAGE_SIDES * size_px.max(-1, keepdims=True)
     corner_px, extent_px = (observations.box_px[..., axes].astype(np.float64) for axes in (slice(2), slice(2, 4)))
     keypoints = (observations.keypoints_px[:, :, k] for k in range(observations.num_keypoints))  # (0, 0) if missing
     distant, min_px = np.zeros(observations.present.shape, bool), allowed_px.min(initial=np.inf)

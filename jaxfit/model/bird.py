@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import MODEL_FACES, MODEL_JOINTS, MODEL_KEYPOINTS, MODEL_SHAPES, MODEL_VERTICES
 
 
 class Bird(eqx.Module):
@@ -119,7 +118,9 @@ ARRAY_FIELDS = {
 """Array fields of `Bird` and their axes: V vertices, F faces, J joints, K keypoints, S shapes, B = J−1 bones,
 D = 3B angles."""
 
-_LIMITS = {"V": MODEL_VERTICES, "F": MODEL_FACES, "J": MODEL_JOINTS, "K": MODEL_KEYPOINTS, "S": MODEL_SHAPES}
+MAX_VERTICES, MAX_FACES = 100_000, 200_000
+"""Largest mesh of a bird model."""
+_LIMITS = {"V": MAX_VERTICES, "F": MAX_FACES}
 
 
 def check_bird(bird: Bird, source: object) -> Bird:
@@ -188,7 +189,6 @@ class _Checker:
     def check_tree(self) -> None:
         parents = self.bird.parents
         self.require("parents", len(parents) >= 2, "a bird needs a root and at least one more joint")
-        self.require("parents", len(parents) <= MODEL_JOINTS, f"{len(parents)} joints, the limit is {MODEL_JOINTS}")
         self.require("parents", parents[0] == -1, f"joint 0 must be the root, −1, not {parents[0]}")
         for joint, parent in enumerate(parents[1:], start=1):
             problem = f"the parent of joint {joint} must be one of 0…{joint - 1}, not {parent}"

@@ -26,9 +26,9 @@ import numpy as np
 import scipy.special
 from jaxtyping import Bool, Float, Int, Num, UInt8
 
+from jaxfit.cameras.camera import MAX_IMAGE_SIDE_PX
 from jaxfit.config.perception import Background
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CROP_MARGIN_PX, IMAGE_SIDE_PX, NETWORK_ASPECT
 from jaxfit.perception.network import IMAGENET_MEAN, IMAGENET_STD, OnnxModel
 
 ACTIVATIONS = ("none", "sigmoid", "softmax")
@@ -46,6 +46,11 @@ Source: `HeatmapPredictor` of DeepLabCut 3, `MSRAHeatmap` and `UDPHeatmap` of MM
 
 BACKGROUNDS: tuple[str, ...] = get_args(Background)
 """Backgrounds of the crops: `black` outside the bird's dilated mask, or `visible` except other birds (`crop_bird`)."""
+
+_MAX_MARGIN_PX = 4096
+"""Largest margin of a crop, and largest side of the square that dilates a mask."""
+_MAX_ASPECT = 8
+"""Largest ratio of the sides of an input. The crop of a bird has the same ratio."""
 
 T = TypeVar("T")
 
@@ -137,15 +142,15 @@ def _positive(numbers: tuple[float, ...]) -> tuple[float, ...]:
 
 def _size(text: str) -> tuple[int, int]:
     width, height = _numbers(text, 2)
-    if not (1 <= width <= IMAGE_SIDE_PX and 1 <= height <= IMAGE_SIDE_PX):
-        raise ValueError(f"width,height in pixels, at most {IMAGE_SIDE_PX}")
+    if not (1 <= width <= MAX_IMAGE_SIDE_PX and 1 <= height <= MAX_IMAGE_SIDE_PX):
+        raise ValueError(f"width,height in pixels, at most {MAX_IMAGE_SIDE_PX}")
     return int(width), int(height)
 
 
 def _pixels(text: str) -> int:
     (number,) = _numbers(text, 1)
-    if not 0 <= number <= CROP_MARGIN_PX:
-        raise ValueError(f"0 to {CROP_MARGIN_PX} pixels")
+    if not 0 <= number <= _MAX_MARGIN_PX:
+        raise ValueError(f"0 to {_MAX_MARGIN_PX} pixels")
     return round(number)
 
 
@@ -204,9 +209,9 @@ def read_input(model: OnnxModel, metadata: KeypointMetadata) -> KeypointInput:
     default = metadata.input_size or DEFAULT_SIZE_PX
     width, height = width or default[0], height or default[1]
     model.check_input((port.shape[0], height, width, 3))
-    if max(width, height) > NETWORK_ASPECT * min(width, height):
+    if max(width, height) > _MAX_ASPECT * min(width, height):
         problem = f"has an input of {width}×{height} pixels"
-        raise InputError(model.path, problem, f"one side may be {NETWORK_ASPECT} times as long as the other")
+        raise InputError(model.path, problem, f"one side may be {_MAX_ASPECT} times as long as the other")
     return KeypointInput(
         size_px=(width, height),
         batch=port.shape[0],

@@ -27,18 +27,17 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from jaxfit.cameras.camera import MAX_IMAGE_SIDE_PX
 from jaxfit.data.masks import box_of_mask, encode_patch
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import (
-    ACTIVATION_CHANNELS,
-    CURVE_POINTS,
-    IMAGE_SIDE_PX,
-    INSTANCES,
-    MASK_AREA,
-    NETWORK_BYTES,
-    NETWORK_INPUT_VALUES,
-)
 from jaxfit.foundation.reading import open_file
+
+MAX_INSTANCES = 1000
+"""Most instances of a frame; more are the output of a network that does not detect birds."""
+_MAX_MASK_AREA = 50
+"""Largest area of all boxes of a frame's instances, as a multiple of the frame."""
+_MAX_INPUT_VALUES = 3 << 26
+"""Most values of an input of a network: 800 MB of floats, a picture of 8192×8192."""
 
 
 class Instance(NamedTuple):
@@ -109,8 +108,10 @@ def collect_instances(
             continue
         collected.append(instance)
         area += instance.mask.size
-        if len(collected) > INSTANCES or area > MASK_AREA * frame_px[0] * frame_px[1]:
-            problem = f"detects more than {INSTANCES} instances in one frame, or boxes of {MASK_AREA} times its area"
+        if len(collected) > MAX_INSTANCES or area > _MAX_MASK_AREA * frame_px[0] * frame_px[1]:
+            problem = (
+                f"detects more than {MAX_INSTANCES} instances in one frame, or boxes of {_MAX_MASK_AREA} times its area"
+            )
             raise InputError(source, problem, "raise min_score, or give another network")
     return collected
 
@@ -178,8 +179,6 @@ class OnnxModel:
         self.path = Path(path)
         with open_file(self.path, "an ONNX file") as file:
             size = os.fstat(file.fileno()).st_size
-        if size > NETWORK_BYTES:
-            raise InputError(path, f"has {size:,} bytes", f"the limit is {NETWORK_BYTES:,}")
         if size and _has_external_data(self.path):
             problem = "stores its weights in another file (external data), which is not read"
             raise InputError(path, problem, "save the network as one file: onnx.save(onnx.load(path), new_path)")
@@ -225,9 +224,9 @@ class OnnxModel:
     def check_input(self, shape: Sequence[int | None]) -> None:
         """Raise InputError if an input of this shape has no values or too many values; None is a variable side."""
         sides = [side for side in shape if side is not None]
-        if sides and (min(sides) < 1 or max(sides) > IMAGE_SIDE_PX or math.prod(sides) > NETWORK_INPUT_VALUES):
+        if sides and (min(sides) < 1 or max(sides) > MAX_IMAGE_SIDE_PX or math.prod(sides) > _MAX_INPUT_VALUES):
             problem = f"has an input of {' × '.join(map(str, sides))} values"
-            remedy = f"the limits are {IMAGE_SIDE_PX} for a side and {NETWORK_INPUT_VALUES:,} values"
+            remedy = f"the limits are {MAX_IMAGE_SIDE_PX} for a side and {_MAX_INPUT_VALUES:,} values"
             raise InputError(self.path, problem, remedy)
 
     def check_outputs(self, outputs: Mapping[str, Any], expected: Mapping[str, Sequence[int | str | None]]) -> None:
@@ -356,7 +355,7 @@ def activation_monitor(model: OnnxModel) -> ActivationMonitor | None:
     if texts == [None, None]:
         return None
     mean, whitening = (_decode(text or "") for text in texts)
-    if mean is None or whitening is None or not 1 <= len(mean) <= ACTIVATION_CHANNELS:
+    if mean is None or whitening is None:
         raise _damaged_activations(model)
     if len(whitening) != len(mean) ** 2 or OUTPUT not in {port.name for port in model.outputs}:
         raise _damaged_activations(model)
@@ -374,8 +373,6 @@ def _encode(values: np.ndarray) -> str:
 
 def _decode(text: str) -> Float[np.ndarray, "n"] | None:
     """Decode finite numbers; None for any other text."""
-    if len(text) > 8 * ACTIVATION_CHANNELS**2:
-        return None
     try:
         data = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError):
@@ -416,8 +413,6 @@ def read_curve(model: OnnxModel, key: str) -> Curve | None:
     if text is None:
         return None
     try:
-        if text.count(",") >= CURVE_POINTS:
-            raise ValueError("too many points")
         points = np.array([[float(number) for number in point.split(":")] for point in text.split(",")])
         values, probabilities = points.T
     except ValueError as error:

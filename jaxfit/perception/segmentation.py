@@ -12,10 +12,16 @@ from scipy.ndimage import find_objects
 
 from jaxfit.config.perception import GENERAL
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import INSTANCES
 from jaxfit.perception.general_networks import check_general_files, general_files
 from jaxfit.perception.merging import Tiled, length_px, replace_parts
-from jaxfit.perception.network import Instance, OnnxModel, Segmenter, activation_monitor, collect_instances
+from jaxfit.perception.network import (
+    MAX_INSTANCES,
+    Instance,
+    OnnxModel,
+    Segmenter,
+    activation_monitor,
+    collect_instances,
+)
 from jaxfit.perception.segmentation_inputs import Placement, SegmentationNetwork
 from jaxfit.perception.segmentation_layouts import DetectorAndSaliency, MaskRcnn, RfDetrSeg, Saliency, YoloSeg, Yolox
 
@@ -40,7 +46,7 @@ LARGE_BIRD_PX = 200.0
 """Birds that are longer in the input are detected in parts, so an input of half the size detects them."""
 SMALLER_INPUTS = 2
 """Number of smaller inputs: half and a quarter of the size."""
-MAX_PEAKS = 10 * INSTANCES
+MAX_PEAKS = 10 * MAX_INSTANCES
 """More peaks are the output of a network that was not trained."""
 MIN_CELLS = 12
 """Instances with fewer cells are dropped."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -13,13 +12,12 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CLASSES, DETECTIONS, METADATA_CHARACTERS, METADATA_DEPTH
 from jaxfit.perception.network import Instance, OnnxModel, instance_of
 
 STRIDES = (8, 16, 32)
 """Cell sizes of the grids of both YOLO families, pixels of the input."""
-_QUOTED = re.compile(r"""'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*\"""", re.DOTALL)
-_LITERAL = re.compile(rf"(?:{_QUOTED.pattern}|None|True|False|[\d.\s,:\[\](){{}}])*", re.DOTALL)
+_MAX_BOXES = 10_000
+"""Most boxes of a frame that are compared with each other; boxes with lower scores are dropped."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
@@ -90,22 +88,9 @@ def literal_metadata(model: OnnxModel, key: str) -> Any:
         return None
     text = model.metadata[key]
     try:
-        if not _is_flat(text):
-            raise ValueError("operators or deep nesting, which need much memory")
         return ast.literal_eval(text)
-    except (ValueError, SyntaxError) as error:
+    except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
         raise InputError(model.path, f"metadata `{key}` cannot be read: {text[:80]!r}", "export it again") from error
-
-
-def _is_flat(text: str) -> bool:
-    """Whether a text contains only names, numbers, quoted text, and brackets of at most `METADATA_DEPTH` levels."""
-    if len(text) > METADATA_CHARACTERS or not _LITERAL.fullmatch(text):
-        return False
-    depth = deepest = 0
-    for bracket in re.findall(r"[\[({})\]]", _QUOTED.sub("", text)):
-        depth += 1 if bracket in "[({" else -1
-        deepest = max(deepest, depth)
-    return deepest <= METADATA_DEPTH
 
 
 _NAMES = (
@@ -140,10 +125,8 @@ def names_of(model: OnnxModel, names: Sequence[str] | None, count: int | None) -
         count: number of classes; None if the shapes of the network do not contain it.
 
     Raises:
-        InputError: the numbers of names and classes differ, the metadata cannot be read, or there are too many classes.
+        InputError: the numbers of names and classes differ, or the metadata cannot be read.
     """
-    if count is not None and count > CLASSES:
-        raise InputError(model.path, f"has {count:,} classes", f"the limit is {CLASSES:,}")
     own = literal_metadata(model, "names") if names is None else list(names)
     if own is None:
         own = COCO if count in (None, len(COCO)) else [f"class_{i}" for i in range(count or 0)]
@@ -322,8 +305,8 @@ def non_maximum_suppression(
     """
     if not len(corners_px):
         return np.zeros(0, int)
-    if len(corners_px) > DETECTIONS:  # the time is quadratic
-        best = np.argsort(-scores, kind="stable")[:DETECTIONS]
+    if len(corners_px) > _MAX_BOXES:  # the time is quadratic
+        best = np.argsort(-scores, kind="stable")[:_MAX_BOXES]
         return best[non_maximum_suppression(corners_px[best], scores[best], labels[best], max_iou)]
     xywh = np.concatenate([corners_px[:, :2], corners_px[:, 2:] - corners_px[:, :2]], 1)
     kept = cv2.dnn.NMSBoxesBatched(xywh.tolist(), scores.tolist(), labels.tolist(), 0.0, max_iou)

@@ -12,11 +12,17 @@ from support.fits import config
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.observations import Observations
-from jaxfit.fitting.crops import cut_mask
+from jaxfit.fitting.crops import MAX_CROP_IMAGE_SIDES, cut_mask
 from jaxfit.fitting.fit import windows_of
-from jaxfit.fitting.windows import cut_windows, distant_birds, load_targets, report_distant_birds, without_distant_birds
+from jaxfit.fitting.windows import (
+    MAX_DISTANCE_IMAGE_SIDES,
+    cut_windows,
+    distant_birds,
+    load_targets,
+    report_distant_birds,
+    without_distant_birds,
+)
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.limits import CROP_IMAGE_SIDES, DISTANCE_IMAGE_SIDES
 
 T, WIDTH, HEIGHT = 4, 40, 30
 FAR = 300_000.0
@@ -85,7 +91,7 @@ def test_the_largest_crop_is_cheap(corner):
         cut_mask(np.ones((20, 20), bool), np.array([*corner, FAR]), 64)
 
 
-@pytest.mark.parametrize("edge", [(-DISTANCE_IMAGE_SIDES, 0), (0, -DISTANCE_IMAGE_SIDES), (2, 0), (0, 1.75)])
+@pytest.mark.parametrize("edge", [(-MAX_DISTANCE_IMAGE_SIDES, 0), (0, -MAX_DISTANCE_IMAGE_SIDES), (2, 0), (0, 1.75)])
 def test_distance_is_measured_from_the_image_in_longer_sides(edge):
     """The image has 40 × 30 pixels, so that its far edges are at 1 and 0.75 sides."""
     at_limit = np.array(edge) * WIDTH
@@ -135,10 +141,10 @@ def test_crops_are_not_larger_than_the_image_with_a_margin():
     longer = damaged(observed(boxes=False), (0, 1), keypoint=[2 * WIDTH, 3])
     windows = cut_windows(longer, config(T, mode="box", min_keypoints=3))
     assert windows.present.all()
-    assert windows.crop[0, :, 2].tolist() == [CROP_IMAGE_SIDES * WIDTH] * T
+    assert windows.crop[0, :, 2].tolist() == [MAX_CROP_IMAGE_SIDES * WIDTH] * T
     assert windows.crop[1, 0, 2] < WIDTH
     padded = dataclasses.replace(config(T), crop=CropConfig(padding=2.0))
-    assert (cut_windows(observed(), padded).crop[..., 2] == CROP_IMAGE_SIDES * WIDTH).all()
+    assert (cut_windows(observed(), padded).crop[..., 2] == MAX_CROP_IMAGE_SIDES * WIDTH).all()
 
 
 def test_no_frame_without_a_distant_box():
