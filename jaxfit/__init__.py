@@ -5,7 +5,7 @@
     bird = jaxfit.load_murre()
     observations = jaxfit.read_coco("birds.json")
     solution = jaxfit.fit(observations, bird, jaxfit.load_config("paper"))
-    print(solution.keypoints_px.shape, solution.status)
+    print(solution.keypoints.px.shape, solution.status)
 
 All public names, by subject; `help(jaxfit.fit)` and the like describe one name.
 

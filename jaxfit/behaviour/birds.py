@@ -219,7 +219,7 @@ class Flock:
         """
         s, rig = self.solution, self._rig
         valid, shape = s.valid[:, frames], s.valid[:, frames].shape
-        pose = jax.tree.map(lambda values: values[:, frames], s.pose)
+        pose = jax.tree.map(lambda values: values[:, frames], s.poses)
         R = self.R_world_body[:, frames]
         if rng is not None:
             pose, R = self._drawn(pose, R, frames, rng)
@@ -269,9 +269,9 @@ class Flock:
             deviation = np.nan_to_num(np.asarray(sd)[:, frames])
             return Rotation.from_rotvec((deviation * rng.standard_normal(deviation.shape)).reshape(-1, 3))
 
-        body = Rotation.from_rotvec(np.nan_to_num(pose.body_pose).reshape(-1, 3)) * error(s.body_pose_sd)
+        body = Rotation.from_rotvec(np.nan_to_num(pose.body_pose).reshape(-1, 3)) * error(s.error_bars.body_pose_sd)
         drawn = body.as_rotvec().reshape(pose.body_pose.shape).astype(np.float32)
-        return replace(pose, body_pose=drawn), R @ error(s.global_orient_sd).as_matrix().reshape(R.shape)
+        return replace(pose, body_pose=drawn), R @ error(s.error_bars.global_orient_sd).as_matrix().reshape(R.shape)
 
 
 def body_length(bird: Bird) -> float:
@@ -327,7 +327,7 @@ def flock_of(
     """
     s, notes = solution, []
     if s.contact is None and not photographs:
-        model = bird if s.has_world and bird.metres_per_unit else replace(bird, metres_per_unit=1.0)
+        model = bird if s.world is not None and bird.metres_per_unit else replace(bird, metres_per_unit=1.0)
         try:
             found = estimate_ledge(s, model, None if camera is None else camera.pinhole(), source=source)
             count, tilt_sd = found.facts["birds"], found.facts["tilt_sd_deg"]
@@ -341,16 +341,16 @@ def flock_of(
                 notes.append(f"the ledge and the vertical are unknown: {problem}")
         except InputError as error:
             notes.append(f"the ledge and the vertical are unknown: {error.problem}")
-    if solution.has_world and bird.metres_per_unit:
+    if solution.world is not None and bird.metres_per_unit:
         unit, per_unit = "m", bird.metres_per_unit
     else:
         unit, per_unit = "bl", 1 / body_length(bird)
     standing = s.contact is not None and not photographs
     contact = np.asarray(s.contact, np.float64) if standing else np.full(s.valid.shape, np.nan)
-    if s.has_world:
-        R = np.where(s.valid[..., None, None], np.asarray(s.R_world_root, np.float64), np.eye(3))
-        place = np.asarray(s.transl_world_m) * (1.0 if unit == "m" else per_unit)
-        size = np.where(s.valid, s.scale, 1.0).astype(np.float64)
+    if s.world is not None:
+        R = np.where(s.valid[..., None, None], np.asarray(s.world.R_world_root, np.float64), np.eye(3))
+        place = s.world.transl_world_m * (1.0 if unit == "m" else per_unit)
+        size = np.where(s.valid, s.poses.scale, 1.0).astype(np.float64)
     else:
         at = in_image(s, bird)
         R = Rotation.from_rotvec(np.nan_to_num(at.orientation).reshape(-1, 3)).as_matrix().reshape(*s.valid.shape, 3, 3)

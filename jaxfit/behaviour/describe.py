@@ -87,7 +87,7 @@ def describe(
     missing = {each.name: reason for each in features if (reason := each.missing(sample)) is not None}
     present = [each for each in features if each.name not in missing]
     values = {each.name: np.full((N, T), np.nan, np.float32) for each in present}
-    bars = deviations and flock.solution.has_error_bars
+    bars = deviations and flock.solution.error_bars is not None
     sd = {each.name: np.full((N, T), np.nan, np.float32) for each in present if bars and _has_sd(each)}
     margin = _margin(flock.step_s)
     with progress("Describing birds", T) as report_progress:
@@ -179,8 +179,8 @@ def _deviations(flock: Flock, features: Sequence[Feature], first: int, last: int
         for each in features:
             drawn[each.name].append(_values(each, birds))
     s = flock.solution
-    known = np.isfinite(np.asarray(s.global_orient_sd)[:, first:last]).all(axis=-1)
-    known &= np.isfinite(np.asarray(s.body_pose_sd)[:, first:last]).all(axis=(-2, -1))
+    known = np.isfinite(s.error_bars.global_orient_sd[:, first:last]).all(axis=-1)
+    known &= np.isfinite(s.error_bars.body_pose_sd[:, first:last]).all(axis=(-2, -1))
     found = {}
     for each in features:
         values = np.stack(drawn[each.name])

@@ -141,7 +141,7 @@ def describe_result(
         exported.times_s,
         config=config,
         features=features,
-        cameras=len(read_cameras(path)) if solution.has_world and path.is_file() else 0,
+        cameras=len(read_cameras(path)) if solution.world is not None and path.is_file() else 0,
         camera=camera,
         photographs=bool(read_summary(folder).get("photographs")),
         source=folder,
@@ -169,7 +169,7 @@ def behaviour_of_result(folder: Path, progress: ProgressTask = silent) -> Behavi
 
 def _notes_of_quality(folder: Path, solution: Solution) -> tuple[str, ...]:
     """Return sentences about why the features may be wrong: low trust, poses that the detections contradict."""
-    notes, flag = [], flags(np.asarray(solution.doubts))[solution.valid]
+    notes, flag = [], flags(solution.flags.doubts)[solution.valid]
     if read_summary(folder).get("trust") == "low":
         notes.append("trust in the tracking is low, so what follows may be wrong: see the report of the result")
     share = float((flag == CONTRADICTED).mean()) if flag.size else 0.0

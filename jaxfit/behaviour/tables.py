@@ -30,7 +30,7 @@ def feature_columns(exported: Exported, description: Description, ethogram: Etho
     """Return a row for each bird and frame: track, frame, time, fitted, flag, behaviour, features."""
     s = exported.solution
     N, T = s.valid.shape
-    flag = flags(np.asarray(s.doubts)).astype(object)
+    flag = flags(s.flags.doubts).astype(object)
     flag[flag == ""] = None
     columns: Columns = {
         "track": np.repeat(s.track_id, T),
@@ -249,7 +249,7 @@ def check_features_path(path: Path) -> None:
 
 
 def _movement_file(exported: Exported, description: Description, ethogram: Ethogram | None) -> bytes:
-    dataset = movement_dataset(exported, "world" if exported.solution.has_world else "2d")
+    dataset = movement_dataset(exported, "world" if exported.solution.world is not None else "2d")
     numbers = np.asarray(dataset["frame"])
     column = np.searchsorted(numbers, exported.solution.frame_index)
     about = about_columns(description)

@@ -155,10 +155,10 @@ def show_world(solution: Solution) -> None:
         if not valid.any():
             table.add_row(str(track), "0", *([""] if on_ledge else []), "", "", "", str(solution.status[n]))
             continue
-        places = np.asarray(solution.transl_world_m)[n, valid]
+        places = solution.world.transl_world_m[n, valid]
         moved_m = np.linalg.norm(places.max(axis=0) - places.min(axis=0))
         where = ", ".join(f"{x:.2f}" for x in np.median(places, axis=0))
-        size = f"{np.median(solution.scale[n, valid]):.3f}"
+        size = f"{np.median(solution.poses.scale[n, valid]):.3f}"
         standing = [] if solution.contact is None else [f"{100 * np.mean(solution.contact[n, valid] > 0.5):.0f} %"]
         status = str(solution.status[n])
         table.add_row(str(track), str(int(valid.sum())), *standing, size, where, f"{moved_m:.2f}", status)
@@ -180,7 +180,7 @@ def ledge(options: argparse.Namespace) -> None:
         raise InputError(options.out, "is the result itself, which stays as it is", "choose another --out")
     solution, bird = load_solution(options.result)
     check_ledge_options(options, bird)
-    if solution.has_world:
+    if solution.world is not None:
         remedy = "fit its observations again with --ledge, and with the same --cameras if there were any"
         raise InputError(options.result, "is in a world already", remedy)
     summary = read_summary(options.result)

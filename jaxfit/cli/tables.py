@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -180,7 +179,7 @@ def fit_cells(solution: Solution) -> dict[int, list[str]]:
     """Return track → number of poses with each flag, and status of the fit."""
     from jaxfit.data.flags import FLAGS, flags
 
-    found = flags(np.asarray(solution.doubts))
+    found = flags(solution.flags.doubts)
     return {
         track: [*(f"{(found[n] == flag).sum()}" for flag in FLAGS), str(solution.status[n])]
         for n, track in enumerate(solution.track_id.tolist())
@@ -191,7 +190,7 @@ def flag_line(solution: Solution) -> str:
     """Return a line with the share of poses of each flag."""
     from jaxfit.data.flags import flag_counts
 
-    counts = flag_counts(np.asarray(solution.doubts))
+    counts = flag_counts(solution.flags.doubts)
     total = sum(counts.values())
     return (
         "poses: " + ", ".join(f"{100 * count / total:.1f} % {flag}" for flag, count in counts.items()) if total else ""

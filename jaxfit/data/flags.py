@@ -1,6 +1,6 @@
 """Flags of single poses: what speaks against the pose of a bird in a frame.
 
-A doubt is one reason; the bits of `Solution.doubts` name the doubts of a pose. The flag follows from them:
+A doubt is one reason; the bits of `Solution.flags.doubts` name the doubts of a pose. The flag follows from them:
 `contradicted` (the detections speak against the pose), else `unsure` (the detections do not determine the pose), else
 `ok`. A flag compares the pose with what was detected. Where detections are wrong and agree with each other, the flag is
 `ok` all the same.
@@ -20,7 +20,6 @@ Source: Iglewicz and Hoaglin 1993, *How to detect and handle outliers* (modified
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -52,7 +51,7 @@ DOUBTS = (
     Doubt(UNSURE, "keypoints with low confidence"),
     Doubt(CONTRADICTED, "keypoints outside the mask"),
 )
-"""The doubts; doubt i has the value 2^i in `Solution.doubts`."""
+"""The doubts; doubt i has the value 2^i in `Solution.flags.doubts`."""
 WRONG_SHARE = 0.1
 """A pose whose keypoints are wrong by more than this share of the length of the bird counts as wrong."""
 MIN_IOU = 0.5
@@ -87,7 +86,7 @@ def keypoint_distances(observations: Observations, solution: Solution) -> Float[
     if not (names and len(tracks[0]) and len(frames[0])):
         return distance
     here, there = np.ix_(tracks[0], frames[0]), np.ix_(tracks[1], frames[1])
-    offset = observations.keypoints_px[here][:, :, own] - solution.keypoints_px[there][:, :, fitted]
+    offset = observations.keypoints_px[here][:, :, own] - solution.keypoints.px[there][:, :, fitted]
     side = observations.box_px[here][..., 2:].max(-1)
     weight = observations.confidence[here][:, :, own]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -143,7 +142,7 @@ def _distances_px(
 def with_doubts(
     solution: Solution, observations: Observations, bird: Bird, progress: ProgressTask = silent
 ) -> Solution:
-    """Return a solution with the doubts about each pose (`Solution.doubts`).
+    """Return a solution with the doubts about each pose (`Solution.flags.doubts`).
 
     Args:
         solution: the poses.
@@ -180,13 +179,13 @@ def with_doubts_of_views(
     doubtful = (
         is_outlier(far) | (far > WRONG_SHARE),
         is_outlier(1 - overlap) | (overlap < MIN_IOU),
-        np.asarray(solution.ambiguity_deg) > 0,
+        solution.flags.ambiguity_deg > 0,
         expected_error(solution, bird) > WRONG_SHARE,
         mean_confidence(confidence) < MIN_CONFIDENCE,
         outside > 0.5,
     )
     doubts = sum(where.astype(np.int8) << i for i, where in enumerate(doubtful))
-    return replace(solution, doubts=doubts)
+    return solution.with_arrays(doubts=doubts)
 
 
 _MEASURES = "far", "overlap", "outside"
@@ -279,11 +278,10 @@ def flag_ranges(doubts: Int8[np.ndarray, "T"]) -> list[tuple[int, int, tuple[str
 
 def flagged_ranges(solution: Solution) -> dict[int, tuple[str, ...]]:
     """Return track → a text for each range of frames whose poses are not `ok`, with the reasons."""
-    assert solution.doubts is not None  # `Solution` replaces None
-    found, texts = flags(solution.doubts), {}
+    found, texts = flags(solution.flags.doubts), {}
     for n, track in enumerate(solution.track_id.tolist()):
         ranges = []
-        for a, b, reasons in flag_ranges(solution.doubts[n]):
+        for a, b, reasons in flag_ranges(solution.flags.doubts[n]):
             if found[n, a] in (UNSURE, CONTRADICTED):
                 numbers = solution.frame_index[[a, b - 1]].tolist()
                 where = f"frame {numbers[0]}" if b - a == 1 else f"frames {numbers[0]} to {numbers[1]}"
@@ -298,8 +296,8 @@ def expected_error(solution: Solution, bird: Bird) -> Float[np.ndarray, "N T"]:
 
     The error is relative to the mean of the keypoints. NaN without error bars.
     """
-    if solution.keypoints_centred_cov is None:
+    if solution.error_bars is None:
         return np.full(solution.valid.shape, np.nan)
-    variance = np.trace(solution.keypoints_centred_cov, axis1=-2, axis2=-1).mean(-1)
+    variance = np.trace(solution.error_bars.keypoints_centred_cov, axis1=-2, axis2=-1).mean(-1)
     with np.errstate(invalid="ignore"):
-        return np.sqrt(variance) / (rest_length(bird) * solution.scale)
+        return np.sqrt(variance) / (rest_length(bird) * solution.poses.scale)

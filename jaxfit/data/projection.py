@@ -52,8 +52,8 @@ class InImage(NamedTuple):
         """Return points of a solution in the camera frame of the image, model units.
 
         Args:
-            points_cam: in the camera frame of the crop, such as `Solution.keypoints_cam`.
-            scale: `Solution.scale`.
+            points_cam: in the camera frame of the crop, such as `Solution.keypoints.cam`.
+            scale: `Solution.poses.scale`.
         """
         from_root = points_cam / (scale / self.size)[..., None, None] - self.root_in_crop[:, :, None]
         return from_root @ self.turn.swapaxes(-1, -2) + self.root[:, :, None]
@@ -65,8 +65,8 @@ def image_focal_px(solution: Solution) -> float:
     The focal length of the footage is unknown. Every crop has its own focal length in image pixels: focal_px · size /
     crop_px. NaN without a pose.
     """
-    sizes = solution.crop[..., 2][solution.valid]
-    return float(np.median(solution.focal_px * sizes / solution.crop_px)) if sizes.size else np.nan
+    sizes = solution.crops.square_px[..., 2][solution.valid]
+    return float(np.median(solution.crops.focal_px * sizes / solution.crops.crop_px)) if sizes.size else np.nan
 
 
 def in_image(
@@ -87,21 +87,21 @@ def in_image(
     """
     s, focal = solution, image_focal_px(solution) if focal_px is None else focal_px
     at = np.nonzero(s.valid)
-    crop = s.crop[at].astype(np.float64)
+    crop = s.crops.square_px[at].astype(np.float64)
     of_camera = in_frame_of_camera(s)  # then the size is the true size
-    size = s.scale[at].astype(np.float64) if of_camera else np.ones(len(at[0]))
-    divisor = (s.scale[at].astype(np.float64) / size)[:, None]
-    root = s.transl[at] / divisor + size[:, None] * np.asarray(bird.joints[0], np.float64)
-    crop_focal = s.focal_px * crop[:, 2:] / s.crop_px
+    size = s.poses.scale[at].astype(np.float64) if of_camera else np.ones(len(at[0]))
+    divisor = (s.poses.scale[at].astype(np.float64) / size)[:, None]
+    root = s.poses.transl[at] / divisor + size[:, None] * np.asarray(bird.joints[0], np.float64)
+    crop_focal = s.crops.focal_px * crop[:, 2:] / s.crops.crop_px
     pixel = root[:, :2] / root[:, 2:] * crop_focal + crop[:, :2] + crop[:, 2:] / 2
     # the pictures of a camera have one size; a photograph may have its own
     middle_of_crop = crop[:, :2] + crop[:, 2:] / 2
     # the crop of the whole picture has the principal point of the camera in its middle
-    known = middle_of_crop if of_camera else s.image_size_px[at] / 2
+    known = middle_of_crop if of_camera else s.crops.image_size_px[at] / 2
     centre = known if centre_px is None else np.asarray(centre_px)
     ray = np.concatenate([(pixel - centre) / focal, np.ones((len(root), 1))], axis=1)
     turn = _between(root, ray)
-    orient = (turn * Rotation.from_rotvec(s.global_orient[at].astype(np.float64))).as_rotvec()
+    orient = (turn * Rotation.from_rotvec(s.poses.global_orient[at].astype(np.float64))).as_rotvec()
 
     def everywhere(values: np.ndarray) -> np.ndarray:
         filled = np.full((*s.valid.shape, *values.shape[1:]), np.nan)
@@ -201,7 +201,7 @@ class PosedBirds:
         Returns:
             One mesh per frame; arbitrary, and possibly NaN, where the solution is not valid.
         """
-        pose = jax.tree.map(lambda values: values[n, frames], self.solution.pose)
+        pose = jax.tree.map(lambda values: values[n, frames], self.solution.poses)
         return np.asarray(_window_cam(self._rig, pose))
 
     def vertices_screen_window(self, n: int, frames: slice = slice(None)) -> Float[np.ndarray, "T V 3"]:
@@ -215,10 +215,10 @@ class PosedBirds:
 
         The divisor is at least 1e-3, also for smaller depths.
         """
-        s, crop = self.solution, self.solution.crop[n, frames][:, None]
+        s, crop = self.solution, self.solution.crops.square_px[n, frames][:, None]
         size, depth = crop[..., 2:], np.maximum(vertices_cam[..., 2:], 1e-3)
         if self._lens is None:
-            xy = vertices_cam[..., :2] * (s.focal_px * size / s.crop_px / depth) + size / 2 + crop[..., :2]
+            xy = vertices_cam[..., :2] * (s.crops.focal_px * size / s.crops.crop_px / depth) + size / 2 + crop[..., :2]
         else:
             xy = self._lens.project(np.concatenate([vertices_cam[..., :2], depth], axis=-1))
         return np.concatenate([xy, vertices_cam[..., 2:]], axis=-1).astype(np.float32)
@@ -235,9 +235,9 @@ def projected_observations(solution: Solution) -> Observations:
     N, T = solution.valid.shape
     K = len(solution.keypoint_names)
     confidence = np.broadcast_to(solution.valid[..., None], (N, T, K)).astype(np.float32)
-    points = np.where(solution.valid[..., None, None], solution.keypoints_px, 0)
+    points = np.where(solution.valid[..., None, None], solution.keypoints.px, 0)
     box = box_of_keypoints(points, confidence > 0)
-    sizes = solution.image_size_px[solution.valid]
+    sizes = solution.crops.image_size_px[solution.valid]
     return Observations(
         track_id=solution.track_id,
         frame_index=solution.frame_index,

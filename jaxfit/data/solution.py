@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int8, Int64
 
 from jaxfit.cameras.camera import MAX_IMAGE_SIDE_PX
 from jaxfit.data.footage import FootageIdentity, footage_of
@@ -24,8 +26,8 @@ from jaxfit.model.files import load_bird, save_bird
 from jaxfit.model.kinematics import Pose
 
 FORMAT_VERSION = 8
-"""Version of ``poses.npz``; increased when its arrays change. Version 7 lacks `LEDGE`, version 6 also `WORLD`,
-version 5 also `doubts`, version 4 also `ERROR_BARS`, version 3 also `ambiguity_deg`, version 2 also `timestamp_s` and
+"""Version of ``poses.npz``; increased when its arrays change. Version 7 lacks `contact`, version 6 also `World`,
+version 5 also `doubts`, version 4 also `ErrorBars`, version 3 also `ambiguity_deg`, version 2 also `timestamp_s` and
 `fps`."""
 _OLDEST_VERSION = 2
 """Older versions are not read."""
@@ -34,58 +36,154 @@ STATUSES = ("ok", "partly diverged", "diverged", "no usable frame")
 """The words of `Solution.status`."""
 
 _WRITTEN_BY = "check the path; `jaxfit fit` and `jaxfit reconstruct` write results"
-
-_CAMERA = {"focal_px": ("", np.float64), "crop_px": ("", np.int64)}
 _TIMES = {"timestamp_s": ("T", np.float64), "fps": ("", np.float64)}
 
-LAYOUT = {
-    "track_id": ("N", np.int64),
-    "frame_index": ("T", np.int64),
-    "valid": ("N T", np.bool_),
-    "global_orient": ("N T 3", np.float32),
-    "body_pose": ("N T J-1 3", np.float32),
-    "transl": ("N T 3", np.float32),
-    "scale": ("N T", np.float32),
-    "bone_length": ("N T J-1", np.float32),
-    "betas": ("N T S", np.float32),
-    "keypoints_cam": ("N T K 3", np.float32),
-    "keypoints_px": ("N T K 2", np.float32),
-    "crop": ("N T 3", np.float32),
-    "image_size_px": ("N T 2", np.int64),
-    "keypoint_names": ("K", np.str_),
-    "joint_names": ("J", np.str_),
-    "status": ("N", np.str_),
-    "ambiguity_deg": ("N T", np.float32),
-    "doubts": ("N T", np.int8),
-}
-ERROR_BARS = {
-    "global_orient_sd": ("N T 3", np.float32),
-    "body_pose_sd": ("N T J-1 3", np.float32),
-    "transl_sd": ("N T 3", np.float32),
-    "scale_sd": ("N T", np.float32),
-    "bone_length_sd": ("N T J-1", np.float32),
-    "betas_sd": ("N T S", np.float32),
-    "keypoints_cam_cov": ("N T K 3 3", np.float32),
-    "keypoints_centred_cov": ("N T K 3 3", np.float32),
-    "keypoints_px_cov": ("N T K 2 2", np.float32),
-    "misfit": ("N T", np.float32),
-}
-"""The arrays of error bars. A solution has all of them or none."""
-WORLD = {
-    "R_world_root": ("N T 3 3", np.float32),
-    "transl_world_m": ("N T 3", np.float64),
-    "keypoints_world_m": ("N T K 3", np.float64),
-}
-"""The arrays of fits in a world. A solution has all of them or none."""
-LEDGE = {"contact": ("N T", np.float32)}
-"""The array of fits in a world whose plane z = 0 is the ledge."""
+
+class _Arrays:
+    """A record of arrays, which become read-only arrays of the types and shapes of its annotations."""
+
+    def __post_init__(self):
+        layout = layout_of(type(self))
+        for name, array in validate_arrays(vars(self), layout).items():
+            object.__setattr__(self, name, array if layout[name][0] else array.item())
 
 
 @dataclass(frozen=True, eq=False)
+class Keypoints(_Arrays):
+    """The keypoints of the poses, in the order of `Solution.keypoint_names`."""
+
+    cam: Float32[np.ndarray, "N T K 3"]
+    """Model units, camera frame of the crop."""
+    px: Float32[np.ndarray, "N T K 2"]
+    """Image pixels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crops(_Arrays):
+    """The square crops in which the poses lie, and their camera; the principal point is the centre of the crop."""
+
+    square_px: Float32[np.ndarray, "N T 3"]
+    """x0, y0 and side of the crop in image pixels."""
+    image_size_px: Int64[np.ndarray, "N T 2"]
+    """Width and height of the image of the bird; 0 where not valid."""
+    focal_px: float
+    """Focal length in pixels of the crop the fit works on."""
+    crop_px: int
+    """Side in pixels of the crop the fit works on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Flags(_Arrays):
+    """Reasons to doubt the poses."""
+
+    ambiguity_deg: Float32[np.ndarray, "N T"]
+    """Angle between the orientation and that of another pose that explains the keypoints almost as well (at most 20
+    times less likely, turned by more than 45°); 0 where the fit found no such pose. Only fits with more than one
+    hypothesis search for other poses."""
+    doubts: Int8[np.ndarray, "N T"]
+    """Sum of 2^i over the doubts i of `jaxfit.data.flags.DOUBTS` about the pose; 0: no doubt; −1: no pose, or not
+    judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorBars(_Arrays):
+    """Error bars of the poses (`fitting/error_bars.py`); NaN where a window has none."""
+
+    global_orient_sd: Float32[np.ndarray, "N T 3"]
+    """Radians, about the axes of the root of the bird."""
+    body_pose_sd: Float32[np.ndarray, "N T bones 3"]
+    """Radians, about the axes of the joint."""
+    transl_sd: Float32[np.ndarray, "N T 3"]
+    """Model units."""
+    scale_sd: Float32[np.ndarray, "N T"]
+    """0 where every bird has the size of the model."""
+    bone_length_sd: Float32[np.ndarray, "N T bones"]
+    """0 where bone lengths are fixed."""
+    betas_sd: Float32[np.ndarray, "N T S"]
+    """0 where the shape is fixed."""
+    keypoints_cam_cov: Float32[np.ndarray, "N T K 3 3"]
+    """Squared model units, camera frame of the crop."""
+    keypoints_centred_cov: Float32[np.ndarray, "N T K 3 3"]
+    """The same, of the keypoints relative to their mean."""
+    keypoints_px_cov: Float32[np.ndarray, "N T K 2 2"]
+    """Squared image pixels."""
+    misfit: Float32[np.ndarray, "N T"]
+    """Factor on all covariances of the window, 1 or more, where the keypoints lie farther from the pose than the
+    objective assumes. The other arrays contain it."""
+
+
+@dataclass(frozen=True, eq=False)
+class World(_Arrays):
+    """The poses in the world of calibrated cameras or of a ledge."""
+
+    R_world_root: Float32[np.ndarray, "N T 3 3"]
+    """Rotation from the root of the bird to the world."""
+    transl_world_m: Float64[np.ndarray, "N T 3"]
+    """Root joint in the world, metres."""
+    keypoints_world_m: Float64[np.ndarray, "N T K 3"]
+    """Keypoints in the world, metres."""
+
+
+def layout_of(record: type) -> dict[str, tuple[str, Any]]:
+    """Return field → (shape, dtype) of a record, from its annotations, as `validate_arrays` expects it."""
+    scalars = {float: ("", np.float64), int: ("", np.int64)}
+    layout: dict[str, tuple[str, Any]] = {}
+    for name, hint in get_type_hints(record).items():
+        if record is Pose:  # its arrays have any leading axes
+            shape = " ".join(["N T", *get_args(hint)[1].dim_str.split()[1:]])
+            layout[name] = (shape, np.float32)
+        else:
+            layout[name] = scalars[hint] if hint in scalars else (hint.dim_str, np.dtype(hint.dtypes[0]).type)
+    return layout
+
+
+_GROUPS: dict[str, Any] = {
+    "poses": Pose,
+    "keypoints": Keypoints,
+    "crops": Crops,
+    "flags": Flags,
+    "error_bars": ErrorBars,
+    "world": World,
+}
+_OPTIONAL = ("error_bars", "world")
+_OTHER_NAMES = {("keypoints", "cam"): "keypoints_cam", ("keypoints", "px"): "keypoints_px"} | {
+    ("crops", "square_px"): "crop"
+}
+PLACES = {
+    _OTHER_NAMES.get((group, name), name): (group, name) for group in _GROUPS for name in layout_of(_GROUPS[group])
+}
+"""Name of an array in ``poses.npz`` → the group and the field of `Solution` that hold it."""
+
+
+def _group_layout(group: str) -> dict[str, tuple[str, Any]]:
+    """Return name in ``poses.npz`` → (shape, dtype) of the arrays of a group."""
+    layout = layout_of(_GROUPS[group])
+    return {name: layout[field] for name, (of_group, field) in PLACES.items() if of_group == group}
+
+
+LAYOUT: dict[str, tuple[str, Any]] = {
+    "track_id": ("N", np.int64),
+    "frame_index": ("T", np.int64),
+    "valid": ("N T", np.bool_),
+    **_group_layout("poses"),
+    **_group_layout("keypoints"),
+    **_group_layout("crops"),
+    **_group_layout("flags"),
+    "keypoint_names": ("K", np.str_),
+    "joint_names": ("J", np.str_),
+    "status": ("N", np.str_),
+}
+"""The arrays of every ``poses.npz``."""
+ERROR_BARS, WORLD, LEDGE = _group_layout("error_bars"), _group_layout("world"), {"contact": ("N T", np.float32)}
+"""The arrays that a ``poses.npz`` may have."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution:
     """Poses of N tracks over T frames; J joints, K keypoints, S shape coefficients.
 
     The arrays are read-only NumPy arrays. Values are arbitrary, and possibly NaN, where ``valid`` is False.
+    `from_arrays` makes a solution from arrays by their names in ``poses.npz``.
 
     Raises:
         ValueError: the shapes do not agree, or a valid frame holds values that no fit gives; the message names the
@@ -98,40 +196,22 @@ class Solution:
     """(T,) int64: numbers of the frames in the video."""
     valid: np.ndarray
     """(N, T) bool: the bird was fitted in this frame."""
-    global_orient: np.ndarray
-    """(N, T, 3) float32: axis-angle in radians, camera frame."""
-    body_pose: np.ndarray
-    """(N, T, J−1, 3) float32: axis-angle in radians, relative to the parent joint."""
-    transl: np.ndarray
-    """(N, T, 3) float32: model units, camera frame of the crop."""
-    scale: np.ndarray
-    """(N, T) float32: size relative to the model."""
-    bone_length: np.ndarray
-    """(N, T, J−1) float32: relative to the rest skeleton."""
-    betas: np.ndarray
-    """(N, T, S) float32: shape coefficients."""
-    keypoints_cam: np.ndarray
-    """(N, T, K, 3) float32: model units, camera frame of the crop."""
-    keypoints_px: np.ndarray
-    """(N, T, K, 2) float32: image pixels."""
-    crop: np.ndarray
-    """(N, T, 3) float32: x0, y0, size of the square crop in image pixels."""
-    image_size_px: np.ndarray
-    """(N, T, 2) int64: width, height of the image of the bird; 0 where not valid."""
-    focal_px: float
-    """Focal length in pixels of the crop the fit works on."""
+    poses: Pose
+    """The fitted poses; every field is float32 and has leading axes (N, T). Camera frame of the crop, model units."""
+    keypoints: Keypoints
+    """The keypoints of the poses."""
+    crops: Crops
+    """The crops in which the poses lie."""
     keypoint_names: tuple[str, ...]
     """K names."""
     joint_names: tuple[str, ...]
     """J names, the root first."""
-    crop_px: int
-    """Side in pixels of the crop the fit works on; the principal point is the centre of the crop."""
-    loss: Mapping[str, np.ndarray]
-    """Term → (N,) float64: its weighted share of the final objective, summed over the track's windows that did not
-    diverge; NaN where there is none."""
     status: np.ndarray
     """(N,) str: summary of the track's windows. ``ok``: all fitted; ``partly diverged``: only the poses of the other
     windows are valid; ``diverged``: no window fitted; ``no usable frame``: no window."""
+    loss: Mapping[str, np.ndarray]
+    """Term → (N,) float64: its weighted share of the final objective, summed over the track's windows that did not
+    diverge; NaN where there is none."""
     failures: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     """Track → its skipped frames, and for each of its windows that diverged: frames, term and step. ``summary.json``
     holds them."""
@@ -142,54 +222,20 @@ class Solution:
     """Mean frame rate of the whole video in frames per second, as its container states; None if unknown."""
     footage: FootageIdentity | None = None
     """Identity of the whole video; None if unknown. ``summary.json`` holds it."""
-
-    ambiguity_deg: np.ndarray | None = None
-    """(N, T) float32: angle between the orientation and that of another pose that explains the keypoints almost as well
-    (at most 20 times less likely, turned by more than 45°); 0 where the fit found no such pose. Only fits with more
-    than one hypothesis search for other poses. None means 0 everywhere."""
-
-    doubts: np.ndarray | None = None
-    """(N, T) int8: sum of 2^i over the doubts i of `jaxfit.data.flags.DOUBTS` about the pose; 0: no doubt; −1: no pose,
-    or not judged. None means −1 everywhere."""
-
-    # error bars (`fitting/error_bars.py`): None without, NaN where a window has none; docs/reference/result_folder.md
-    global_orient_sd: np.ndarray | None = None
-    """(N, T, 3) float32: radians, about the axes of the root of the bird."""
-    body_pose_sd: np.ndarray | None = None
-    """(N, T, J−1, 3) float32: radians, about the axes of the joint."""
-    transl_sd: np.ndarray | None = None
-    """(N, T, 3) float32: model units."""
-    scale_sd: np.ndarray | None = None
-    """(N, T) float32: 0 where every bird has the size of the model."""
-    bone_length_sd: np.ndarray | None = None
-    """(N, T, J−1) float32: 0 where bone lengths are fixed."""
-    betas_sd: np.ndarray | None = None
-    """(N, T, S) float32: 0 where the shape is fixed."""
-    keypoints_cam_cov: np.ndarray | None = None
-    """(N, T, K, 3, 3) float32: squared model units, camera frame of the crop."""
-    keypoints_centred_cov: np.ndarray | None = None
-    """(N, T, K, 3, 3) float32: the same, of the keypoints relative to their mean."""
-    keypoints_px_cov: np.ndarray | None = None
-    """(N, T, K, 2, 2) float32: squared image pixels."""
-    misfit: np.ndarray | None = None
-    """(N, T) float32: factor on all covariances of the window, 1 or more, where the keypoints lie farther from the pose
-    than the objective assumes. The other arrays contain it."""
-
-    # fits with calibrated cameras or on a ledge (`fitting/views.py`, `fitting/ledge.py`): None without
-    R_world_root: np.ndarray | None = None
-    """(N, T, 3, 3) float32: rotation from the root of the bird to the world."""
-    transl_world_m: np.ndarray | None = None
-    """(N, T, 3) float64: root joint in the world, metres."""
-    keypoints_world_m: np.ndarray | None = None
-    """(N, T, K, 3) float64: keypoints in the world, metres."""
+    flags: Flags = None  # type: ignore[assignment]
+    """Reasons to doubt the poses. None means that no pose was judged."""
+    error_bars: ErrorBars | None = None
+    """Error bars; None without."""
+    world: World | None = None
+    """Poses in the world; None for a fit in no world."""
     contact: np.ndarray | None = None
     """(N, T) float32: probability that the bird stands on the ledge z = 0. None: no ledge is known."""
 
     def __post_init__(self):
-        ambiguity_deg = np.zeros(np.shape(self.valid), np.float32) if self.ambiguity_deg is None else self.ambiguity_deg
-        doubts = np.full(np.shape(self.valid), -1, np.int8) if self.doubts is None else self.doubts
+        if self.flags is None:
+            object.__setattr__(self, "flags", _not_judged(np.shape(self.valid)))
         layout = LAYOUT | self.optional_layout
-        arrays = validate_arrays(vars(self) | {"ambiguity_deg": ambiguity_deg, "doubts": doubts}, layout)
+        arrays = validate_arrays(self.arrays(), layout)
         # a frame without a pose has no flag, whatever the array holds there
         arrays["doubts"] = np.where(arrays["valid"], arrays["doubts"], np.int8(-1))
         arrays["doubts"].flags.writeable = False
@@ -200,12 +246,10 @@ class Solution:
         for term, value in self.loss.items():
             layout = {"status": LAYOUT["status"], f"loss[{term}]": ("N", np.float64)}
             loss[str(term)] = validate_arrays({"status": self.status, f"loss[{term}]": value}, layout)[f"loss[{term}]"]
-        camera = validate_arrays({"focal_px": self.focal_px, "crop_px": self.crop_px}, _CAMERA)
-        focal_px, crop_px = float(camera["focal_px"]), int(camera["crop_px"])
-        if not 0 < focal_px < math.inf:
-            raise ValueError(f"focal_px must be above 0 and finite, not {focal_px}")
-        if not 1 <= crop_px <= MAX_IMAGE_SIDE_PX:
-            raise ValueError(f"crop_px must be in 1…{MAX_IMAGE_SIDE_PX}, not {crop_px}")
+        if not 0 < self.crops.focal_px < math.inf:
+            raise ValueError(f"focal_px must be above 0 and finite, not {self.crops.focal_px}")
+        if not 1 <= self.crops.crop_px <= MAX_IMAGE_SIDE_PX:
+            raise ValueError(f"crop_px must be in 1…{MAX_IMAGE_SIDE_PX}, not {self.crops.crop_px}")
         times = np.full(len(arrays["frame_index"]), np.nan) if self.timestamp_s is None else self.timestamp_s
         layout = {"frame_index": LAYOUT["frame_index"], "timestamp_s": _TIMES["timestamp_s"]}
         arrays |= validate_arrays({"frame_index": arrays["frame_index"], "timestamp_s": times}, layout)
@@ -218,63 +262,106 @@ class Solution:
         for name in ("keypoint_names", "joint_names"):
             if len(np.unique(arrays[name])) < len(arrays[name]):
                 raise ValueError(f"{name} must name each part once")
-        for name in ("keypoint_names", "joint_names"):
-            object.__setattr__(self, name, tuple(str(text) for text in arrays.pop(name)))
-        for name, value in (arrays | {"loss": loss, "focal_px": focal_px, "crop_px": crop_px}).items():
+            arrays[name] = tuple(str(text) for text in arrays[name])
+        for name, value in _grouped(arrays | {"loss": loss}).items():
             object.__setattr__(self, name, value)
 
-    @property
-    def has_error_bars(self) -> bool:
-        """Whether the solution has the arrays `ERROR_BARS`.
+    @classmethod
+    def from_arrays(cls, **values: Any) -> Solution:
+        """Return a solution from arrays by their names in ``poses.npz`` (`PLACES`), and from other fields.
 
         Raises:
-            ValueError: the solution has some of the arrays only.
+            ValueError: an array is missing.
         """
-        return self._has("error bars", ERROR_BARS)
+        values = {name: value for name, value in values.items() if value is not None}
+        flags = vars(_not_judged(np.shape(values["valid"])))
+        return cls(**_grouped(flags | values))
 
-    @property
-    def has_world(self) -> bool:
-        """Whether the solution has the arrays `WORLD`.
+    def with_arrays(self, **values: Any) -> Solution:
+        """Return a solution with other arrays, by their names in ``poses.npz`` (`PLACES`), and other fields."""
+        fields_now = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _GROUPS}
+        return Solution.from_arrays(**fields_now | self.arrays() | values)
 
-        Raises:
-            ValueError: the solution has some of the arrays only.
-        """
-        return self._has("poses in the world", WORLD)
-
-    def _has(self, what: str, layout: Mapping[str, Any]) -> bool:
-        absent = [name for name in layout if getattr(self, name) is None]
-        if absent and len(absent) < len(layout):
-            raise ValueError(f"{absent[0]} is missing: {what} need all of {', '.join(layout)}")
-        return not absent
+    def arrays(self) -> dict[str, Any]:
+        """Return the arrays by their names in ``poses.npz``; without the arrays of absent groups."""
+        arrays = {name: getattr(self, name) for name in (*LAYOUT, *self.optional_layout) if name not in PLACES}
+        groups = ((name, getattr(self, group), field) for name, (group, field) in PLACES.items())
+        return arrays | {name: getattr(group, field) for name, group, field in groups if group is not None}
 
     @property
     def optional_layout(self) -> dict[str, tuple[str, Any]]:
         """The entries of `ERROR_BARS`, `WORLD` and `LEDGE` that the solution has."""
-        found = (ERROR_BARS if self.has_error_bars else {}) | (WORLD if self.has_world else {})
-        return found | ({} if self.contact is None else LEDGE)
+        optional = ((self.error_bars, ERROR_BARS), (self.world, WORLD), (self.contact, LEDGE))
+        return {name: entry for value, layout in optional if value is not None for name, entry in layout.items()}
 
     def cells(self, error_bars: bool | None = None) -> dict[str, np.ndarray]:
-        """Return the arrays (N, T, …) by name.
+        """Return the arrays (N, T, …) by their names in ``poses.npz``, without those of a world.
 
         Args:
             error_bars: whether the error bars belong to them; where the solution has none, they are NaN. None: if the
                 solution has error bars.
         """
-        wanted = self.has_error_bars if error_bars is None else error_bars
-        layout = LAYOUT | (ERROR_BARS if wanted else {})
-        found = {}
-        sizes = {"N": self.valid.shape[0], "T": self.valid.shape[1], "K": len(self.keypoint_names)}
-        sizes |= {"J-1": len(self.joint_names) - 1, "S": self.betas.shape[2], "2": 2, "3": 3}
-        for name, (shape, dtype) in layout.items():
-            if shape.startswith("N T"):
-                values = getattr(self, name)
-                found[name] = np.full([sizes[s] for s in shape.split()], np.nan, dtype) if values is None else values
-        return found
+        wanted = self.error_bars is not None if error_bars is None else error_bars
+        arrays = self.arrays()
+        sizes = {"N": self.valid.shape[0], "T": self.valid.shape[1], "K": len(self.keypoint_names), "2": 2, "3": 3}
+        sizes |= {"bones": len(self.joint_names) - 1, "S": self.poses.betas.shape[2]}
+        return {
+            name: arrays[name] if name in arrays else np.full([sizes[s] for s in shape.split()], np.nan, dtype)
+            for name, (shape, dtype) in (LAYOUT | (ERROR_BARS if wanted else {})).items()
+            if shape.startswith("N T")
+        }
 
-    @property
-    def pose(self) -> Pose:
-        """The poses as a `Pose` of the model, every field (N, T, …)."""
-        return Pose(**{each.name: getattr(self, each.name) for each in fields(Pose)})
+    def __repr__(self) -> str:
+        statuses = Counter(self.status.tolist())
+        judged = self.flags.doubts[self.valid & (self.flags.doubts >= 0)]
+        numbers, size = self.frame_index.tolist(), self.poses.scale[self.valid]
+        times = self.timestamp_s[np.isfinite(self.timestamp_s)] if self.timestamp_s is not None else np.zeros(0)
+        lines = {
+            "tracks": f"{len(self.track_id)}: " + ", ".join(f"{count} {status}" for status, count in statuses.items()),
+            "frames": f"{len(numbers)}" + (f": {numbers[0]} to {numbers[-1]}" if numbers else ""),
+            "times": f"{times[0]:.2f} to {times[-1]:.2f} s" if len(times) else "unknown",
+            "poses": f"{int(self.valid.sum())} of {self.valid.size}, {len(self.joint_names)} joints"
+            + (f", size {size.min():.3g} to {size.max():.3g}" if len(size) else ""),
+            "keypoints": f"{len(self.keypoint_names)}: {', '.join(self.keypoint_names[:4])}, …",
+            "crops": f"{self.crops.crop_px} pixels, focal length {self.crops.focal_px:g} pixels",
+            "flags": f"{int((judged > 0).sum())} of {len(judged)} judged poses with doubts",
+            "error_bars": "None" if self.error_bars is None else "standard deviations and covariances",
+            "world": "None" if self.world is None else "places in metres" + (", contact" * (self.contact is not None)),
+            "loss": ", ".join(self.loss) or "none",
+        }
+        return "\n".join(["Solution", *(f"  {name:<11}{text}" for name, text in lines.items())])
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            places = {old: f"{group}.{field}" for old, (group, field) in PLACES.items()} | {"pose": "poses"}
+            places |= {"has_error_bars": "error_bars is not None", "has_world": "world is not None"}
+            if name in places:
+                raise AttributeError(f"Solution has no attribute {name}: use solution.{places[name]}", name=name)
+            raise AttributeError(f"Solution has no attribute {name}", name=name)
+
+
+def _not_judged(shape: tuple[int, ...]) -> Flags:
+    """Return the flags of poses that were not judged."""
+    return Flags(ambiguity_deg=np.zeros(shape, np.float32), doubts=np.full(shape, -1, np.int8))
+
+
+def _grouped(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of `Solution` from arrays by their names in ``poses.npz`` and from other fields.
+
+    Raises:
+        ValueError: some arrays of a group are missing.
+    """
+    result = {name: value for name, value in values.items() if name not in PLACES}
+    for group, record in _GROUPS.items():
+        names = {field: name for name, (of_group, field) in PLACES.items() if of_group == group}
+        missing = [name for name in names.values() if name not in values]
+        if group in _OPTIONAL and len(missing) == len(names):
+            continue
+        if missing:
+            raise ValueError(f"{missing[0]} is missing: {group} needs all of {', '.join(names.values())}")
+        result[group] = record(**{field: values[name] for field, name in names.items()})
+    return result
 
 
 def select_solution(solution: Solution, rows: np.ndarray, columns: np.ndarray) -> Solution:
@@ -282,24 +369,16 @@ def select_solution(solution: Solution, rows: np.ndarray, columns: np.ndarray) -
 
     The loss of a track stays the loss over all its frames.
     """
-    arrays = {}
-    for name, (shape, _) in (LAYOUT | solution.optional_layout).items():
-        if shape.split()[0] not in ("N", "T"):
-            continue
-        array = getattr(solution, name)
+    arrays = solution.arrays() | {"timestamp_s": solution.timestamp_s}
+    for name, (shape, _) in (LAYOUT | solution.optional_layout | _TIMES).items():
         if shape.startswith("N"):
-            array = array[rows]
+            arrays[name] = arrays[name][rows]
         if "T" in shape.split():
-            array = array.take(columns, axis=shape.split().index("T"))
-        arrays[name] = array
+            arrays[name] = arrays[name].take(columns, axis=shape.split().index("T"))
     kept = set(arrays["track_id"].tolist())
-    return replace(
-        solution,
-        **arrays,
-        loss={term: values[rows] for term, values in solution.loss.items()},
-        failures={track: texts for track, texts in solution.failures.items() if track in kept},
-        timestamp_s=None if solution.timestamp_s is None else solution.timestamp_s[columns],
-    )
+    loss = {term: values[rows] for term, values in solution.loss.items()}
+    failures = {track: texts for track, texts in solution.failures.items() if track in kept}
+    return solution.with_arrays(**arrays, loss=loss, failures=failures)
 
 
 def check_poses(arrays: Mapping[str, np.ndarray], fitted: np.ndarray) -> None:
@@ -380,13 +459,11 @@ def write_solution(
 ) -> None:
     """Write the files of `save_solution` into an existing folder, such as a temporary folder of `new_folder`."""
     summary_json = json_text(summary)
-    names = [*LAYOUT, *solution.optional_layout]
-    arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in names}
+    layout = LAYOUT | solution.optional_layout
+    arrays: dict[str, Any] = {name: np.asarray(value, layout[name][1]) for name, value in solution.arrays().items()}
     terms = list(solution.loss)
     arrays["loss"] = np.stack([solution.loss[t] for t in terms], -1) if terms else np.zeros((len(solution.status), 0))
     arrays["loss_terms"] = np.array(terms, dtype=np.str_)
-    arrays["focal_px"] = np.asarray(solution.focal_px, np.float64)
-    arrays["crop_px"] = np.asarray(solution.crop_px, np.int64)
     arrays["timestamp_s"] = solution.timestamp_s
     arrays["fps"] = np.asarray(np.nan if solution.fps is None else solution.fps, np.float64)
     arrays["format_version"] = np.asarray(FORMAT_VERSION, np.int64)
@@ -410,13 +487,10 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
     """
     folder = check_folder(folder, "a folder of results", _WRITTEN_BY)
     path = check_readable(folder / POSES, "an .npz file", _WRITTEN_BY)
-    shapes = {name: shape for name, (shape, _) in (LAYOUT | _CAMERA).items()}
-    shapes |= {"loss": "N L", "loss_terms": "L"}
+    shapes = {name: shape for name, (shape, _) in LAYOUT.items()} | {"loss": "N L", "loss_terms": "L"}
     optional = {name: shape for name, (shape, _) in (_TIMES | ERROR_BARS | WORLD | LEDGE).items()}
     optional |= {name: shapes.pop(name) for name in ("ambiguity_deg", "doubts")}
     arrays: dict[str, Any] = load_npz(path, shapes, FORMAT_VERSION, _OLDEST_VERSION, optional=optional)
-    arrays |= {name: arrays[name].item() for name in _CAMERA}
-    arrays |= {name: tuple(arrays[name].tolist()) for name in ("keypoint_names", "joint_names")}
     terms, loss = arrays.pop("loss_terms"), arrays.pop("loss")
     try:
         if terms.dtype.kind != "U" or len(np.unique(terms)) < len(terms):
@@ -424,14 +498,14 @@ def load_solution(folder: str | Path) -> tuple[Solution, Bird]:
         fps = validate_arrays({"fps": arrays.pop("fps", np.nan)}, {"fps": _TIMES["fps"]})["fps"].item()
         losses = {str(term): loss[:, i] for i, term in enumerate(terms)}
         fps = None if math.isnan(fps) else fps
-        solution = Solution(**arrays, loss=losses, fps=fps, footage=_footage(folder / SUMMARY))
+        solution = Solution.from_arrays(**arrays, loss=losses, fps=fps, footage=_footage(folder / SUMMARY))
     except ValueError as error:
         raise InputError(path, str(error), "run the fit again") from error
     bird = load_bird(folder / MODEL)
     if (bird.joint_names, bird.keypoint_names) != (solution.joint_names, solution.keypoint_names):
         raise InputError(folder / MODEL, f"is not the model of {POSES}", "run the fit again")
-    if bird.num_shapes != solution.betas.shape[2]:
-        problem = f"has {bird.num_shapes} shape coefficients, but {POSES} has {solution.betas.shape[2]}"
+    if bird.num_shapes != solution.poses.betas.shape[2]:
+        problem = f"has {bird.num_shapes} shape coefficients, but {POSES} has {solution.poses.betas.shape[2]}"
         raise InputError(folder / MODEL, problem, "run the fit again")
     return solution, bird
 

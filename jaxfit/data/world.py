@@ -1,6 +1,6 @@
 """A solution in a world, as its cameras see it.
 
-A solution in a world (`data.solution.WORLD`) holds its birds in the frame of its first camera, whose crop is the whole
+A solution in a world (`data.solution.World`) holds its birds in the frame of its first camera, whose crop is the whole
 picture. A fit with one camera and no ledge holds its birds in crops.
 """
 
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.files import read_cameras
 from jaxfit.data.result_folder import CAMERAS
-from jaxfit.data.solution import ERROR_BARS, Solution
+from jaxfit.data.solution import Crops, Keypoints, Solution, World
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
 from jaxfit.model.camera import CROP_PX
@@ -26,8 +25,8 @@ _AGREES_PX = 1.0
 """Largest error of a pixel whose distortion is removed again; a larger error: the lens model does not hold there."""
 
 
-def whole_picture(lens: Camera, valid: Bool[np.ndarray, "N T"], size_px: tuple[int, int]) -> dict[str, Any]:
-    """Return the arrays of a solution that say that the crop of every bird is the whole picture of a camera.
+def whole_picture(lens: Camera, valid: Bool[np.ndarray, "N T"], size_px: tuple[int, int]) -> Crops:
+    """Return the crops of a solution where the crop of every bird is the whole picture of a camera.
 
     Args:
         lens: the camera, with its distortion or without.
@@ -37,28 +36,28 @@ def whole_picture(lens: Camera, valid: Bool[np.ndarray, "N T"], size_px: tuple[i
     width, height = lens.size_px or size_px
     side = max(width, height)
     crop = np.array([*(lens.matrix[:2, 2] - side / 2), side], np.float32)
-    return {
-        "crop": np.broadcast_to(crop, (*valid.shape, 3)),
-        "image_size_px": np.where(valid[..., None], np.array([width, height]), 0),
-        "focal_px": float(lens.matrix[0, 0]) * CROP_PX / side,
-        "crop_px": CROP_PX,
-    }
+    return Crops(
+        square_px=np.broadcast_to(crop, (*valid.shape, 3)),
+        image_size_px=np.where(valid[..., None], np.array([width, height]), 0),
+        focal_px=float(lens.matrix[0, 0]) * CROP_PX / side,
+        crop_px=CROP_PX,
+    )
 
 
 def largest_image_px(solution: Solution) -> tuple[int, int]:
     """Return the width and the height of the largest picture with a pose."""
-    width, height = solution.image_size_px[solution.valid].max(axis=0, initial=1).tolist()
+    width, height = solution.crops.image_size_px[solution.valid].max(axis=0, initial=1).tolist()
     return width, height
 
 
-def world_arrays(
+def in_world(
     camera: Camera,
     unit_m: float,
     orientation: Float[np.ndarray, "N T 3"],
     root: Float[np.ndarray, "N T 3"],
     keypoints: Float[np.ndarray, "N T K 3"],
-) -> dict[str, np.ndarray]:
-    """Return the arrays `WORLD` of poses in the frame of a camera; NaN without a pose.
+) -> World:
+    """Return the places in the world of poses in the frame of a camera; NaN without a pose.
 
     Args:
         camera: the camera in the world.
@@ -68,18 +67,18 @@ def world_arrays(
     """
     orient = Rotation.from_rotvec(np.nan_to_num(orientation).reshape(-1, 3)).as_matrix()
     R = camera.R_cam_world.T @ orient.reshape(*orientation.shape, 3)
-    return {
-        "R_world_root": np.where(np.isnan(orientation)[..., None], np.nan, R).astype(np.float32),
-        "transl_world_m": camera.to_world(root * unit_m),
-        "keypoints_world_m": camera.to_world(keypoints * unit_m),
-    }
+    return World(
+        R_world_root=np.where(np.isnan(orientation)[..., None], np.nan, R).astype(np.float32),
+        transl_world_m=camera.to_world(root * unit_m),
+        keypoints_world_m=camera.to_world(keypoints * unit_m),
+    )
 
 
 def in_frame_of_camera(solution: Solution) -> bool:
     """Whether the birds are in the frame of a camera with a known focal length, not in crops."""
-    side, crops = solution.image_size_px.max(axis=-1), solution.crop[solution.valid]
-    whole = bool((solution.crop[..., 2] >= side)[solution.valid].all())
-    return solution.has_world and whole and bool((crops == crops[:1]).all())
+    side, crops = solution.crops.image_size_px.max(axis=-1), solution.crops.square_px[solution.valid]
+    whole = bool((solution.crops.square_px[..., 2] >= side)[solution.valid].all())
+    return solution.world is not None and whole and bool((crops == crops[:1]).all())
 
 
 def _sees(camera: Camera, points_m: Float[np.ndarray, "N T K 3"]) -> Bool[np.ndarray, "N T"]:
@@ -104,27 +103,29 @@ def in_camera(solution: Solution, bird: Bird, camera: Camera) -> Solution:
         not hold. The solution has no error bars and no footage.
     """
     s, unit_m = solution, bird.metres_per_unit or 1.0
-    places_m, points_m = np.asarray(s.transl_world_m), np.asarray(s.keypoints_world_m)
+    places_m, points_m = s.world.transl_world_m, s.world.keypoints_world_m
     root, points = camera.to_camera(places_m) / unit_m, camera.to_camera(points_m) / unit_m
     joint = np.asarray(bird.joints[0], np.float64)
     # birds in crops have another size than in the world: the keypoints of both have the ratio
     extent = np.linalg.norm(points - root[:, :, None], axis=(-2, -1))
-    before = s.keypoints_cam - (s.transl + s.scale[..., None] * joint)[:, :, None]
+    before = s.keypoints.cam - (s.poses.transl + s.poses.scale[..., None] * joint)[:, :, None]
     with np.errstate(all="ignore"):
-        scale = s.scale * extent / np.linalg.norm(before, axis=(-2, -1))
+        scale = s.poses.scale * extent / np.linalg.norm(before, axis=(-2, -1))
     pixels, valid = camera.project(points_m), s.valid & _sees(camera, points_m)
-    turns = camera.R_cam_world @ np.where(valid[..., None, None], np.asarray(s.R_world_root), np.eye(3))
+    turns = camera.R_cam_world @ np.where(valid[..., None, None], s.world.R_world_root, np.eye(3))
     orient = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec().reshape(*valid.shape, 3)
     return replace(
         s,
-        **dict.fromkeys(ERROR_BARS),
-        **whole_picture(camera, valid, largest_image_px(s)),
         valid=valid,
-        global_orient=orient.astype(np.float32),
-        transl=(root - scale[..., None] * joint).astype(np.float32),
-        scale=scale.astype(np.float32),
-        keypoints_cam=points.astype(np.float32),
-        keypoints_px=np.nan_to_num(pixels).astype(np.float32),
+        poses=replace(
+            s.poses,
+            global_orient=orient.astype(np.float32),
+            transl=(root - scale[..., None] * joint).astype(np.float32),
+            scale=scale.astype(np.float32),
+        ),
+        keypoints=Keypoints(cam=points.astype(np.float32), px=np.nan_to_num(pixels).astype(np.float32)),
+        crops=whole_picture(camera, valid, largest_image_px(s)),
+        error_bars=None,
         footage=None,
     )
 
@@ -145,10 +146,10 @@ def as_filmed(folder: Path, solution: Solution, bird: Bird, name: str | None = N
         InputError: a name is given and the result is in no world, has no such camera, or the camera sees no bird.
     """
     path = folder / CAMERAS
-    if name is not None and not solution.has_world:
+    if name is not None and solution.world is None:
         problem = f"is {name}, but the result is in no world that several cameras could see"
         raise InputError("--camera", problem, "remove --camera, or fit with --cameras or --ledge")
-    if name is None and not (solution.has_world and path.is_file()):
+    if name is None and (solution.world is None or not path.is_file()):
         return solution, None
     cameras = read_cameras(path)
     by_name = {camera.name: camera for camera in cameras}
@@ -157,9 +158,9 @@ def as_filmed(folder: Path, solution: Solution, bird: Bird, name: str | None = N
         raise InputError("--camera", f"is {name}, which {path} does not hold", f"choose one of: {', '.join(by_name)}")
     first = camera is cameras[0]
     side = max(camera.size_px or largest_image_px(solution))
-    own = np.isclose(solution.focal_px, camera.matrix[0, 0] * CROP_PX / side, rtol=1e-4)  # else poses in crops
+    own = np.isclose(solution.crops.focal_px, camera.matrix[0, 0] * CROP_PX / side, rtol=1e-4)  # else poses in crops
     if first and own and in_frame_of_camera(solution):
-        valid = solution.valid & _sees(camera, np.asarray(solution.keypoints_world_m))
+        valid = solution.valid & _sees(camera, solution.world.keypoints_world_m)
         return (solution if (valid == solution.valid).all() else replace(solution, valid=valid)), camera
     seen = in_camera(solution, bird, camera)
     if solution.valid.any() and not seen.valid.any():

@@ -94,7 +94,7 @@ def calibration(solution: Solution, truth: Truth) -> Calibration:
     Raises:
         InputError: the result has no error bars, or shares no bird with the truth.
     """
-    if not solution.has_error_bars:
+    if solution.error_bars is None:
         problem = "the result has no error bars"
         raise InputError("--calibration", problem, "fit with `error_bars: true`, as the config `map` does")
     seen = check_keypoints(truth.observations, solution.keypoint_names, truth.source)
@@ -103,7 +103,7 @@ def calibration(solution: Solution, truth: Truth) -> Calibration:
     both = shared & seen.present[n, t] & solution.valid
     names, K = solution.keypoint_names, len(solution.keypoint_names)
     counted = (both & has_bars)[..., None] & (seen.confidence[n, t] > 0)
-    error_px = solution.keypoints_px.astype(np.float64) - seen.keypoints_px[n, t]
+    error_px = solution.keypoints.px.astype(np.float64) - seen.keypoints_px[n, t]
     labels = np.broadcast_to(np.arange(K), counted.shape)
     image = _Errors(error_px[counted], solution.cells()["keypoints_px_cov"][counted], labels[counted])
     groups = {"keypoints, image": _group(image, names, "px")}
@@ -129,9 +129,9 @@ def _spatial_groups(solution: Solution, truth: Solution, has_bars: np.ndarray, s
     n, t, shared = match(solution, truth.track_id, truth.frame_index)
     counted = shared & solution.valid & has_bars & truth.valid[n, t]
     principal, focal = real_camera(truth, source)
-    R = crop_rotation(solution.crop[..., :2] + solution.crop[..., 2:] / 2, principal, focal)
+    R = crop_rotation(solution.crops.square_px[..., :2] + solution.crops.square_px[..., 2:] / 2, principal, focal)
     order = [truth.keypoint_names.index(name) for name in solution.keypoint_names]
-    p, q = solution.keypoints_cam.astype(np.float64), truth.keypoints_cam[n, t][:, :, order].astype(np.float64)
+    p, q = solution.keypoints.cam.astype(np.float64), truth.keypoints.cam[n, t][:, :, order].astype(np.float64)
     p = (p - p.mean(2, keepdims=True)) @ np.swapaxes(R, -1, -2)
     q = q - q.mean(2, keepdims=True)
     size = best_scale(p, q, counted)[:, None, None, None]
@@ -142,8 +142,8 @@ def _spatial_groups(solution: Solution, truth: Solution, has_bars: np.ndarray, s
     groups = {"keypoints, 3D": _group(points, solution.keypoint_names, "model units")}
     if sorted(solution.joint_names) == sorted(truth.joint_names):
         order = [truth.joint_names.index(name) - 1 for name in solution.joint_names[1:]]
-        own = np.concatenate([solution.global_orient[:, :, None], solution.body_pose], axis=2)[counted]
-        true_pose = np.concatenate([truth.global_orient[:, :, None], truth.body_pose[:, :, order]], axis=2)
+        own = np.concatenate([solution.poses.global_orient[:, :, None], solution.poses.body_pose], axis=2)[counted]
+        true_pose = np.concatenate([truth.poses.global_orient[:, :, None], truth.poses.body_pose[:, :, order]], axis=2)
         R_own, R_true = (
             Rotation.from_rotvec(each.reshape(-1, 3).astype(np.float64)) for each in (own, true_pose[n, t][counted])
         )

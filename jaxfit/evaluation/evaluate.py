@@ -183,7 +183,7 @@ def evaluate(
         unmatched &= ~spatial.measured
 
     annotated = (seen.confidence[n_truth, t_truth] > 0) & measured[..., None]
-    keypoints = (solution.keypoints_px, seen.keypoints_px[n_truth, t_truth], annotated)
+    keypoints = (solution.keypoints.px, seen.keypoints_px[n_truth, t_truth], annotated)
     errors = {
         "pck@0.05": metrics.pck_per_image(*keypoints, masks.true_side_px, 0.05)[..., None],
         "pck@0.10": metrics.pck_per_image(*keypoints, masks.true_side_px, 0.10)[..., None],
@@ -219,7 +219,7 @@ def evaluate(
 
 def _flag_quality(solution: Solution, error: Float[np.ndarray, "N T J"]) -> dict[str, float]:
     """Return `Evaluation.flags`; `error` is a share of the body length, NaN where nothing is measured."""
-    found = flags(np.asarray(solution.doubts))
+    found = flags(solution.flags.doubts)
     measured = np.isfinite(error).any(-1) & (found != "")
     if not measured.any():
         return {}
@@ -311,7 +311,7 @@ def _check_sizes(
 ) -> None:
     """Raise InputError where an image of the truth has another size than the image of the result."""
     for n, t in np.argwhere(measured).tolist():
-        own, true = tuple(solution.image_size_px[n, t].tolist()), seen.image_size(int(at[0][n, 0]), int(at[1][t]))
+        own, true = tuple(solution.crops.image_size_px[n, t].tolist()), seen.image_size(int(at[0][n, 0]), int(at[1][t]))
         if own != true:
             problem = (
                 f"has track {solution.track_id[n]}, frame {solution.frame_index[t]} in an image of "

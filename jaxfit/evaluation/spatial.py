@@ -172,7 +172,7 @@ class SpatialErrors:
         self.measured = shared & solution.valid & truth.valid[n, t]
         self.frame_index = solution.frame_index
         principal, focal = real_camera(truth, source)
-        centre = solution.crop[..., :2] + solution.crop[..., 2:] / 2
+        centre = solution.crops.square_px[..., :2] + solution.crops.square_px[..., 2:] / 2
         R = crop_rotation(centre, principal, focal)  # here and below: arbitrary or NaN where not measured
 
         same = sorted(solution.joint_names) == sorted(truth.joint_names)
@@ -183,14 +183,14 @@ class SpatialErrors:
             root_p, root_q = p[:, :, :1], q[:, :, :1]
         else:
             order = [solution.keypoint_names.index(name) for name in truth.keypoint_names]
-            p, q = solution.keypoints_cam[:, :, order].astype(np.float64), truth.keypoints_cam[n, t].astype(np.float64)
+            p, q = solution.keypoints.cam[:, :, order].astype(np.float64), truth.keypoints.cam[n, t].astype(np.float64)
             root_p, root_q = p.mean(2, keepdims=True), q.mean(2, keepdims=True)
         p, self.truth = (p - root_p) @ np.swapaxes(R, -1, -2), q - root_q
         self.predicted = p * best_scale(p, self.truth, self.measured)[:, None, None, None]
 
-        self.body_length = np.broadcast_to(rest_length(truth_bird) * truth.scale[n, t], self.measured.shape)
-        orient_p = jnp.asarray(R) @ axis_angle_to_matrix(jnp.asarray(solution.global_orient))
-        orient_q = axis_angle_to_matrix(jnp.asarray(truth.global_orient[n, t]))
+        self.body_length = np.broadcast_to(rest_length(truth_bird) * truth.poses.scale[n, t], self.measured.shape)
+        orient_p = jnp.asarray(R) @ axis_angle_to_matrix(jnp.asarray(solution.poses.global_orient))
+        orient_q = axis_angle_to_matrix(jnp.asarray(truth.poses.global_orient[n, t]))
         angle = np.rad2deg(np.asarray(geodesic_distance(orient_p, orient_q), np.float64))
         self.angle_deg = angle if same else np.full(angle.shape, np.nan)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -221,25 +221,29 @@ class SpatialErrors:
 
 def real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:
     """Return the principal point and the focal length of the real camera, image pixels."""
-    crops = truth.crop[truth.valid].astype(np.float64)
+    crops = truth.crops.square_px[truth.valid].astype(np.float64)
     if not len(crops):
         raise InputError(source, "its true poses are all invalid", _REMEDY)
     if not np.isfinite(crops).all() or np.ptp(crops, axis=0).max() > 1e-3 or not crops[0, 2] > 0:
         problem = "its true poses lie in crops that follow the birds, not in one camera"
         raise InputError(source, problem, f"{_REMEDY}; the result of a fit is no truth")
     x0, y0, size = crops[0]
-    return np.array([x0 + size / 2, y0 + size / 2]), truth.focal_px * size / truth.crop_px
+    return np.array([x0 + size / 2, y0 + size / 2]), truth.crops.focal_px * size / truth.crops.crop_px
 
 
 def _apparent_size(solution: Solution, bird: Bird) -> np.ndarray:
     """Return the image pixels per model unit at the root, (N, T); the pose rotates about the root's rest position."""
-    depth = solution.transl[..., 2] + solution.scale * float(np.asarray(bird.joints)[0, 2])
-    return solution.scale * (solution.focal_px * solution.crop[..., 2] / solution.crop_px) / depth
+    depth = solution.poses.transl[..., 2] + solution.poses.scale * float(np.asarray(bird.joints)[0, 2])
+    return (
+        solution.poses.scale
+        * (solution.crops.focal_px * solution.crops.square_px[..., 2] / solution.crops.crop_px)
+        / depth
+    )
 
 
 def _joints(solution: Solution, bird: Bird) -> np.ndarray:
     """Return the joints in the camera frame of the crop, (N, T, J, 3)."""
-    return np.asarray(_pose_joints(fold_bird(bird), solution.pose), np.float64)
+    return np.asarray(_pose_joints(fold_bird(bird), solution.poses), np.float64)
 
 
 @jax.jit

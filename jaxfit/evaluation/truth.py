@@ -218,7 +218,7 @@ def match_by_overlap(solution: Solution, truth: Truth | Observations) -> dict[in
     has_box = annotated.sum(-1) >= MIN_KEYPOINTS
     boxes_px = box_of_keypoints(seen.keypoints_px[:, at_truth], annotated)
     agree = np.zeros((len(solution.track_id), seen.num_tracks), int)
-    for n, keypoints in enumerate(solution.keypoints_px[:, at_own]):
+    for n, keypoints in enumerate(solution.keypoints.px[:, at_own]):
         both = has_box & solution.valid[n, at_own]
         own_boxes_px = box_of_keypoints(np.broadcast_to(keypoints, (*annotated.shape, 2)), annotated)
         overlapping = (both & (box_iou(own_boxes_px, boxes_px) >= MIN_IOU)).sum(1)

@@ -134,11 +134,13 @@ def bird_motion(exported: Exported, n: int) -> Motion:
     """
     s, bird = exported.solution, exported.bird
     at = np.flatnonzero(s.valid[n])
-    angles = np.concatenate([s.global_orient[n, at][:, None], s.body_pose[n, at]], axis=1).astype(np.float64)
+    angles = np.concatenate([s.poses.global_orient[n, at][:, None], s.poses.body_pose[n, at]], axis=1).astype(
+        np.float64
+    )
     rotations = Rotation.from_rotvec(angles.reshape(-1, 3)).as_quat().reshape(*angles.shape[:2], 4)
     joints = np.asarray(bird.joints, np.float64)
     offsets = joints - np.where(np.arange(len(joints))[:, None] > 0, joints[np.maximum(bird.parents, 0)], 0)
-    bones = np.concatenate([np.ones((len(at), 1)), s.bone_length[n, at]], axis=1)
+    bones = np.concatenate([np.ones((len(at), 1)), s.poses.bone_length[n, at]], axis=1)
     turn = Rotation.from_matrix(exported.in_image.turn[n, at])
     size = exported.in_image.size[n, at]
     place = exported.in_image.root[n, at] - turn.apply(size[:, None] * joints[0])  # the turn is about the root joint
@@ -149,7 +151,7 @@ def bird_motion(exported: Exported, n: int) -> Motion:
         place=place * exported.length,
         facing=_continuous(turn.as_quat()),
         size=size * exported.length,
-        betas=s.betas[n, at].astype(np.float64),
+        betas=s.poses.betas[n, at].astype(np.float64),
     )
 
 
@@ -188,7 +190,7 @@ def weight_error(exported: Exported) -> float:
         at = np.flatnonzero(s.valid[n])
         for t in at[np.linspace(0, len(at) - 1, min(len(at), 10)).astype(int)]:
             full, short = (birds.vertices_cam_window(n, slice(t, t + 1))[0] for birds in posed)
-            worst = max(worst, float(np.linalg.norm(full - short, axis=1).max() / s.scale[n, t]))
+            worst = max(worst, float(np.linalg.norm(full - short, axis=1).max() / s.poses.scale[n, t]))
     return worst / _body_length(bird)
 
 
@@ -328,19 +330,23 @@ def ground_of(exported: Exported, motions: dict[int, Motion]) -> Ground:
     """
     s = exported.solution
     named = [k for k, name in enumerate(s.keypoint_names) if "foot" in name] or list(range(len(s.keypoint_names)))
-    points = exported.in_image.points(s.keypoints_cam[:, :, named], s.scale) * exported.length
+    points = exported.in_image.points(s.keypoints.cam[:, :, named], s.poses.scale) * exported.length
     feet = [points[n, motion.at] for n, motion in motions.items()]
     if s.contact is not None:
         n, t = np.argwhere(s.valid)[0].tolist()
         R_cam_root = Rotation.from_rotvec(exported.in_image.orientation[n, t]).as_matrix()
-        R_world_cam = np.asarray(s.R_world_root)[n, t] @ R_cam_root.T
-        position_m = np.asarray(s.transl_world_m)[n, t] - R_world_cam @ exported.in_image.root[n, t] * exported.length
+        R_world_cam = np.asarray(s.world.R_world_root)[n, t] @ R_cam_root.T
+        position_m = (
+            np.asarray(s.world.transl_world_m)[n, t] - R_world_cam @ exported.in_image.root[n, t] * exported.length
+        )
         rotation, translation = _WORLD_TO_GLTF @ R_world_cam, _WORLD_TO_GLTF @ position_m
     else:
         bodies = []
         for n, motion in motions.items():
             turn = Rotation.from_quat(motion.facing)
-            bodies.append((turn * Rotation.from_rotvec(s.global_orient[n, motion.at].astype(np.float64))).as_matrix())
+            bodies.append(
+                (turn * Rotation.from_rotvec(s.poses.global_orient[n, motion.at].astype(np.float64))).as_matrix()
+            )
         up = upward(np.concatenate(bodies))
         forward = np.array([0, 0, 1.0]) if abs(up[2]) < 0.99 else np.array([0, -1.0, 0])
         backward = -(forward - (forward @ up) * up)
@@ -442,7 +448,7 @@ def _content(
         frame["translation"] = level.translation.tolist()
         if ground:
             _add_ground(builder, level)
-    width, height = np.median(s.image_size_px[s.valid], axis=0).tolist()
+    width, height = np.median(s.crops.image_size_px[s.valid], axis=0).tolist()
     view = {"yfov": 2 * float(np.arctan(height / 2 / exported.focal_px)), "aspectRatio": width / height, "znear": 0.01}
     camera = builder.add("cameras", {"type": "perspective", "perspective": view})
     looking = {"name": "footage_camera", "camera": camera, "rotation": _quaternion(_CAMERA_TO_GLTF)}

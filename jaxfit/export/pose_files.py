@@ -223,7 +223,7 @@ def _quality(exported: Exported, individual: str, column: np.ndarray, length: in
     """
     s = exported.solution
     flag = np.full((length, len(s.track_id)), "", "<U12")
-    flag[column] = flags(np.asarray(s.doubts)).T
+    flag[column] = flags(s.flags.doubts).T
     found: dict[str, tuple] = {
         "flag": (("time", individual), flag, {"description": "ok, unsure, contradicted; empty: no pose"}),
         "status": ((individual,), s.status.astype(str), {"description": "how the fit of the track ended"}),
@@ -295,7 +295,7 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str
     s, track = exported.solution, int(exported.solution.track_id[n])
     facts = describe_tracks(exported)[str(track)]
     # the same export has the same identifier
-    digest = hashlib.sha256(f"{video} {track}".encode() + s.keypoints_px[n].tobytes() + s.valid[n].tobytes()).digest()
+    digest = hashlib.sha256(f"{video} {track}".encode() + s.keypoints.px[n].tobytes() + s.valid[n].tobytes()).digest()
     file = pynwb.NWBFile(
         session_description=f"3D pose of bird {track}, fitted by jaxfit to {one_line(exported.require_video().name)}",
         identifier=str(uuid.UUID(bytes=digest[:16])),
@@ -318,7 +318,7 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str
         starting_time=0.0,
         num_samples=int(s.frame_index[-1]) + 1,
         unit="n.a.",
-        dimension=s.image_size_px[s.valid].max(0).tolist(),
+        dimension=s.crops.image_size_px[s.valid].max(0).tolist(),
     )
     file.add_acquisition(footage)
     edges = np.array(skeleton_pairs(s.keypoint_names), np.uint8).reshape(-1, 2)
@@ -350,7 +350,7 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str
 def _flag_intervals(exported: Exported, n: int) -> Any:
     """Return the flags of the poses, one interval for a range of frames with the same flag; None without flags."""
     s, frame_s = exported.solution, 1 / exported.sampling_fps
-    doubts = np.asarray(s.doubts)[n]
+    doubts = s.flags.doubts[n]
     found, times = flags(doubts[None])[0], exported.times_s
     rows = [(a, b, reasons) for a, b, reasons in flag_ranges(doubts) if found[a]]
     if not rows:
@@ -403,7 +403,7 @@ def _further_series(exported: Exported, n: int, first: Any) -> list[Any]:
     rows: list[tuple[str, np.ndarray, str, str]] = []
     if (sd := exported.keypoints_px_sd) is not None:
         rows.append(("keypoints_sd", sd[n], "pixels", f"axes: time, node of the skeleton, (x, y). {SD}"))
-    if exported.solution.has_world:
+    if exported.solution.world is not None:
         description = f"axes: time, node of the skeleton, (x, y, z). Reference frame: {exported.world_frame}"
         rows.append(("keypoints_world", exported.require_world()[n], "metres", description))
     if (contact := exported.contact) is not None:

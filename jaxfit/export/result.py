@@ -137,35 +137,35 @@ class Exported:
         """The confidences as `CONFIDENCE` defines them."""
         valid = self.solution.valid[..., None]
         if self.observations is None:
-            return np.full(self.solution.keypoints_px.shape[:3], np.nan, np.float32)
+            return np.full(self.solution.keypoints.px.shape[:3], np.nan, np.float32)
         return np.where(valid, self.observations.confidence, np.float32(np.nan))
 
     @property
     def keypoints_px(self) -> Float[np.ndarray, "N T K 2"]:
         """Projected keypoints in image pixels; NaN without a pose."""
-        return np.where(self.solution.valid[..., None, None], self.solution.keypoints_px, np.float32(np.nan))
+        return np.where(self.solution.valid[..., None, None], self.solution.keypoints.px, np.float32(np.nan))
 
     @property
     def keypoints_3d(self) -> Float[np.ndarray, "N T K 3"]:
         """Keypoints in the camera frame of the image (`in_image`), in `unit`; NaN without a pose."""
-        points = self.in_image.points(self.solution.keypoints_cam, self.solution.scale)
+        points = self.in_image.points(self.solution.keypoints.cam, self.solution.poses.scale)
         return (points * self.length).astype(np.float32)
 
     @property
     def keypoints_px_sd(self) -> Float[np.ndarray, "N T K 2"] | None:
         """Standard deviations of `keypoints_px`; None without error bars."""
-        covariance = self.solution.keypoints_px_cov
-        return None if covariance is None else self._sd(covariance)
+        bars = self.solution.error_bars
+        return None if bars is None else self._sd(bars.keypoints_px_cov)
 
     @property
     def keypoints_3d_sd(self) -> Float[np.ndarray, "N T K 3"] | None:
         """Standard deviations of `keypoints_3d` relative to their mean, in `unit`; None without error bars."""
-        covariance = self.solution.keypoints_centred_cov
-        if covariance is None:
+        bars = self.solution.error_bars
+        if bars is None:
             return None
         turn = self.in_image.turn[:, :, None]
-        scale = (self.length * self.in_image.size / self.solution.scale)[..., None, None]
-        return self._sd(turn @ covariance @ turn.swapaxes(-1, -2)) * scale
+        scale = (self.length * self.in_image.size / self.solution.poses.scale)[..., None, None]
+        return self._sd(turn @ bars.keypoints_centred_cov @ turn.swapaxes(-1, -2)) * scale
 
     def _sd(self, covariance: np.ndarray) -> np.ndarray:
         variance = np.einsum("...ii->...i", covariance)
@@ -199,11 +199,11 @@ class Exported:
         Raises:
             InputError: the result is in no world.
         """
-        points_m = self.solution.keypoints_world_m
-        if points_m is None:
+        world = self.solution.world
+        if world is None:
             problem = "is in no world: one camera without a ledge does not measure places"
             raise InputError(self.source, problem, "place the birds by `jaxfit ledge`, or fit with --cameras")
-        return np.where(self.solution.valid[..., None, None], points_m, np.nan)
+        return np.where(self.solution.valid[..., None, None], world.keypoints_world_m, np.nan)
 
     def require_fps(self) -> float:
         """Return the frame rate of the footage.
@@ -262,7 +262,7 @@ def open_result(
     if metres_per_unit is not None and not 0 < metres_per_unit < np.inf:
         raise InputError("--metres-per-unit", f"is {metres_per_unit}, not a positive number", "give a number above 0")
     solution, bird = load_solution(folder)
-    if metres_per_unit is not None and solution.has_world:
+    if metres_per_unit is not None and solution.world is not None:
         remedy = f"remove --metres-per-unit: a model unit of this result is {bird.metres_per_unit:.6g} m"
         raise InputError("--metres-per-unit", "is given for a result in a world, which is in metres", remedy)
     rows = track_positions(solution, tracks, folder)
@@ -325,7 +325,7 @@ def _detections(folder: Path, solution: Solution, bird: Bird) -> tuple[Observati
 
 def _rate_of(video: Path, solution: Solution) -> float | None:
     info = probe_video(video)
-    sizes = solution.image_size_px[solution.valid]
+    sizes = solution.crops.image_size_px[solution.valid]
     if len(sizes) and (sizes != info.size_px).any():
         problem = f"is {info.size_px[0]}×{info.size_px[1]}, but the result has images of {sizes[0, 0]}×{sizes[0, 1]}"
         raise InputError(video, problem, "give the video that the result was fitted to")

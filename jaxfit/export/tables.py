@@ -63,7 +63,7 @@ def _write(
 
 def row_columns(exported: Exported) -> Columns:
     """Return the columns that all tables share: track, frame, time, fitted, status, flag and doubts."""
-    s, doubts = exported.solution, np.asarray(exported.solution.doubts)
+    s, doubts = exported.solution, exported.solution.flags.doubts
     N, T = s.valid.shape
     return {
         "track": np.repeat(s.track_id, T),
@@ -87,23 +87,23 @@ def _pose_columns(exported: Exported) -> Columns:
         columns[f"track_{name}"] = np.repeat(np.array(values, np.float64), T)
     columns |= _vectors(exported, {"root": exported.in_image.root * exported.length}, unit)
     columns |= _vectors(exported, {"orientation": exported.in_image.orientation}, "rad")
-    if s.global_orient_sd is not None:
-        columns |= _vectors(exported, {"orientation": s.global_orient_sd}, "sd_rad")
-    columns["size"] = _known(exported, s.scale)
+    if s.error_bars is not None:
+        columns |= _vectors(exported, {"orientation": s.error_bars.global_orient_sd}, "sd_rad")
+    columns["size"] = _known(exported, s.poses.scale)
     if s.contact is not None:
         columns["on_ledge"] = _known(exported, s.contact)
     confidence = exported.confidence
     sd_px, sd = exported.keypoints_px_sd, exported.keypoints_3d_sd
     for k, name in enumerate(s.keypoint_names):
-        columns |= _vectors(exported, {name: s.keypoints_px[:, :, k]}, "px")
+        columns |= _vectors(exported, {name: s.keypoints.px[:, :, k]}, "px")
         columns[f"{name}_confidence"] = _known(exported, confidence[:, :, k])
         columns |= _vectors(exported, {name: points[:, :, k]}, unit)
         if sd_px is not None and sd is not None:
             columns |= _vectors(exported, {name: sd_px[:, :, k]}, "sd_px")
             columns |= _vectors(exported, {name: sd[:, :, k]}, f"sd_{unit}")
-    if s.transl_world_m is not None and s.keypoints_world_m is not None:
-        world = {"root": s.transl_world_m} | {
-            name: s.keypoints_world_m[:, :, k] for k, name in enumerate(s.keypoint_names)
+    if s.world is not None:
+        world = {"root": s.world.transl_world_m} | {
+            name: s.world.keypoints_world_m[:, :, k] for k, name in enumerate(s.keypoint_names)
         }
         for name, values in world.items():
             for i, axis in enumerate("xyz"):  # in float64: a world may have its origin far away
@@ -114,10 +114,10 @@ def _pose_columns(exported: Exported) -> Columns:
 def _angle_columns(exported: Exported) -> Columns:
     """Return the rotation of every joint except the root relative to its parent, as axis-angles."""
     s = exported.solution
-    angles = {name: s.body_pose[:, :, j] for j, name in enumerate(s.joint_names[1:])}
+    angles = {name: s.poses.body_pose[:, :, j] for j, name in enumerate(s.joint_names[1:])}
     columns = row_columns(exported) | _vectors(exported, angles, "rad")
-    if s.body_pose_sd is not None:
-        sd = {name: s.body_pose_sd[:, :, j] for j, name in enumerate(s.joint_names[1:])}
+    if s.error_bars is not None:
+        sd = {name: s.error_bars.body_pose_sd[:, :, j] for j, name in enumerate(s.joint_names[1:])}
         columns |= _vectors(exported, sd, "sd_rad")
     return columns
 
@@ -164,7 +164,7 @@ def _facts_of_space(exported: Exported) -> dict[str, str]:
         "size": f"{size}; positions are those at the size of the {owner}",
         "focal_length_px": f"{exported.focal_px:.6g}, {origin}",
     }
-    if s.has_world:
+    if s.world is not None:
         facts["world"] = f"{exported.world_frame}, metres"
     return facts | ({} if s.contact is None else {"on_ledge": ON_LEDGE})
 

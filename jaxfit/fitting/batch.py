@@ -91,7 +91,7 @@ class FittedWindow(NamedTuple):
     failure: Any
     """Text: reason why the fit diverged, with the terms that were not finite and the step; empty without failure."""
     ambiguity_deg: Float[np.ndarray, "*B T"]
-    """As `Solution.ambiguity_deg`."""
+    """As `Solution.flags.ambiguity_deg`."""
     error_bars: ErrorBars | None = None
     """None if the config has none."""
 

@@ -77,7 +77,7 @@ def collect_windows(
     for n, t in np.argwhere(gathered["valid"]).tolist():
         image_size_px[n, t] = observations.image_size(n, t)
     image_size_px.flags.writeable = False  # so that `Solution` needs no copy
-    return Solution(
+    return Solution.from_arrays(
         **gathered,
         image_size_px=image_size_px,
         focal_px=camera.focal_px,
@@ -369,7 +369,7 @@ def summarise(solution: Solution, bird: Bird, seconds: dict[str, float]) -> dict
         "status": dict(Counter(str(status) for status in solution.status)),
         "track_status": {int(t): str(s) for t, s in zip(solution.track_id, solution.status, strict=True)},
         "failures": solution.failures,
-        "flags": flag_counts(np.asarray(solution.doubts)),
+        "flags": flag_counts(solution.flags.doubts),
         "flagged": flagged_ranges(solution),
         "loss": {name: np.asarray(value).tolist() for name, value in solution.loss.items()},
         "seconds": {name: round(value, 3) for name, value in seconds.items()},

@@ -20,7 +20,7 @@ to its expected median, if this is above 1. A residual is standardised by the sc
 leverage: a keypoint that determines the pose pulls the pose to itself, and its residual is too small.
 
 The error bars are those of the reported pose. Where a second pose explains the keypoints almost as well
-(`Solution.ambiguity_deg`), they do not contain the other pose.
+(`Solution.flags.ambiguity_deg`), they do not contain the other pose.
 """
 
 from __future__ import annotations
@@ -70,15 +70,15 @@ class ErrorBars(NamedTuple):
     body_pose_sd: np.ndarray
     """(T, J−1, 3) radians, about the axes of the joint."""
     transl_sd: np.ndarray
-    """(T, 3) as `Solution.transl`."""
+    """(T, 3) as `Solution.poses.transl`."""
     scale_sd: np.ndarray
-    """(T,) as `Solution.scale`."""
+    """(T,) as `Solution.poses.scale`."""
     bone_length_sd: np.ndarray
     """(T, J−1)."""
     betas_sd: np.ndarray
     """(T, S)."""
     keypoints_cam_cov: np.ndarray
-    """(T, K, 3, 3) as `Solution.keypoints_cam`."""
+    """(T, K, 3, 3) as `Solution.keypoints.cam`."""
     keypoints_centred_cov: np.ndarray
     """(T, K, 3, 3) the same, of the keypoints relative to their mean."""
     keypoints_px_cov: np.ndarray
@@ -89,7 +89,7 @@ class ErrorBars(NamedTuple):
 
 def error_bar_shapes(bones: int, shapes: int, keypoints: int) -> dict[str, tuple[int, ...]]:
     """Return the shape of each array of `ErrorBars` in one frame."""
-    sizes = {"J-1": bones, "S": shapes, "K": keypoints, "2": 2, "3": 3}
+    sizes = {"bones": bones, "S": shapes, "K": keypoints, "2": 2, "3": 3}
     return {name: tuple(sizes[axis] for axis in ERROR_BARS[name][0].split()[2:]) for name in ErrorBars._fields}
 
 

@@ -19,9 +19,9 @@ from jaxtyping import Array, Float
 from jaxfit.cameras.camera import Camera
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.projection import InImage, PosedBirds, in_image
-from jaxfit.data.solution import Solution
+from jaxfit.data.solution import Keypoints, Solution
 from jaxfit.data.tracks import assumed_interval_s, frame_interval_s, frame_step
-from jaxfit.data.world import largest_image_px, whole_picture, world_arrays
+from jaxfit.data.world import in_world, largest_image_px, whole_picture
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
 
@@ -154,9 +154,9 @@ def speed_lengths(solution: Solution, bird: Bird, interval_s: float) -> Float[np
     """
     s, step = solution, max(round(SPEED_S / interval_s), 1)
     length = np.ptp(np.asarray(bird.vertices), axis=0).max()
-    depth = np.where(s.valid, s.transl[..., 2] / s.scale, np.nan)
-    length_px = length / depth * s.focal_px / s.crop_px * s.crop[..., 2]
-    place = np.where(s.valid[..., None], s.keypoints_px.mean(axis=2), np.nan)
+    depth = np.where(s.valid, s.poses.transl[..., 2] / s.poses.scale, np.nan)
+    length_px = length / depth * s.crops.focal_px / s.crops.crop_px * s.crops.square_px[..., 2]
+    place = np.where(s.valid[..., None], s.keypoints.px.mean(axis=2), np.nan)
     T = place.shape[1]
     # about the frame; at the end of the video, before it
     last = np.minimum(np.arange(T) + (step + 1) // 2, T - 1)
@@ -208,7 +208,7 @@ def on_ledge(
         known_sizes: whether several cameras know the places and sizes of the birds, which stay as they are.
 
     Returns:
-        Poses in the frame of the camera, whose crop is the whole picture, with the arrays `data.solution.WORLD` and
+        Poses in the frame of the camera, whose crop is the whole picture, in the world (`World`), with
         `contact`. The size of a bird is its true size.
     """
     s, unit_m, interval_s = solution, metres(bird), interval_of(solution)
@@ -240,27 +240,34 @@ def _in_world(
     """Return the solution in the frame of the whole picture, with all birds moved along their rays by a factor."""
     s, joint = solution, np.asarray(bird.joints[0], np.float64)
     scale, root = factor * placed.size, factor[..., None] * placed.root
-    growth = scale / s.scale
-    points = factor[..., None, None] * placed.points(s.keypoints_cam.astype(np.float64), s.scale.astype(np.float64))
-    world = world_arrays(camera, unit_m, placed.orientation, root, points)
-    turned = {}
-    for name in ("keypoints_cam_cov", "keypoints_centred_cov"):
-        if (covariance := getattr(s, name)) is not None:
-            turn = placed.turn[:, :, None] * growth[..., None, None, None]
-            turned[name] = (turn @ covariance @ turn.swapaxes(-1, -2)).astype(np.float32)
-    for name in ("transl_sd", "scale_sd"):
-        if (deviation := getattr(s, name)) is not None:
-            turned[name] = (deviation * growth.reshape(*growth.shape, *(1,) * (deviation.ndim - 2))).astype(np.float32)
+    growth = scale / s.poses.scale
+    points = factor[..., None, None] * placed.points(
+        s.keypoints.cam.astype(np.float64), s.poses.scale.astype(np.float64)
+    )
+    world = in_world(camera, unit_m, placed.orientation, root, points)
+    bars = s.error_bars
+    if bars is not None:
+        turn = placed.turn[:, :, None] * growth[..., None, None, None]
+        bars = replace(
+            bars,
+            keypoints_cam_cov=(turn @ bars.keypoints_cam_cov @ turn.swapaxes(-1, -2)).astype(np.float32),
+            keypoints_centred_cov=(turn @ bars.keypoints_centred_cov @ turn.swapaxes(-1, -2)).astype(np.float32),
+            transl_sd=(bars.transl_sd * growth[..., None]).astype(np.float32),
+            scale_sd=(bars.scale_sd * growth).astype(np.float32),
+        )
+    pixels = np.nan_to_num(lens.project(world.keypoints_world_m))
     return replace(
         s,
-        **turned,
-        **world,
-        **whole_picture(lens, s.valid, largest_image_px(s)),
-        global_orient=placed.orientation.astype(np.float32),
-        transl=(root - scale[..., None] * joint).astype(np.float32),
-        scale=scale.astype(np.float32),
-        keypoints_cam=points.astype(np.float32),
-        keypoints_px=np.nan_to_num(lens.project(world["keypoints_world_m"])).astype(np.float32),
+        poses=replace(
+            s.poses,
+            global_orient=placed.orientation.astype(np.float32),
+            transl=(root - scale[..., None] * joint).astype(np.float32),
+            scale=scale.astype(np.float32),
+        ),
+        keypoints=Keypoints(cam=points.astype(np.float32), px=pixels.astype(np.float32)),
+        crops=whole_picture(lens, s.valid, largest_image_px(s)),
+        error_bars=bars,
+        world=world,
         contact=contact.astype(np.float32),
     )
 
@@ -268,7 +275,7 @@ def _in_world(
 def _lowest(solution: Solution, bird: Bird, placed: InImage, up: np.ndarray, n: int) -> Float[np.ndarray, "T"]:
     """Return the height of the lower foot of a track relative to the camera, model units, before it is moved."""
     one = InImage(placed.focal_px, *(values[n : n + 1] for values in placed[1:]))
-    return (one.points(feet_cam(solution, bird, n), solution.scale[n : n + 1]) @ up).min(axis=-1)[0]
+    return (one.points(feet_cam(solution, bird, n), solution.poses.scale[n : n + 1]) @ up).min(axis=-1)[0]
 
 
 def metres(bird: Bird) -> float:

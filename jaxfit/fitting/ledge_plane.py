@@ -259,7 +259,7 @@ class _Sample:
         # a short block has a frame more than once
         columns, self._at = np.unique(_blocks(len(solution.frame_index), interval_s), return_inverse=True)
         self._solution = select_solution(solution, np.arange(len(solution.track_id)), columns)
-        contradicted = flags(np.asarray(self._solution.doubts)) == CONTRADICTED
+        contradicted = flags(self._solution.flags.doubts) == CONTRADICTED
         self._usable = self._solution.valid & ~fast[:, columns] & ~contradicted
         if not self._usable.any():
             remedy = "see the report of the result; with a calibrated camera, the plane can be `world`"
@@ -273,7 +273,7 @@ class _Sample:
             placed = in_image(self._solution, self._bird, f, centre)
             orient = Rotation.from_rotvec(np.nan_to_num(placed.orientation).reshape(-1, 3))
             axes = orient.as_matrix().reshape(*self._usable.shape, 3, 3)
-            self._last = (f, *centre), _Placed(placed.points(self._feet, self._solution.scale), axes, placed.root)
+            self._last = (f, *centre), _Placed(placed.points(self._feet, self._solution.poses.scale), axes, placed.root)
         return self._last[1]
 
     def up(self, f: float, centre: tuple[float, float]) -> Float[np.ndarray, "3"]:

@@ -26,7 +26,7 @@ from jaxfit.data.observations import Observations
 from jaxfit.data.projection import in_image
 from jaxfit.data.solution import WORLD, Solution
 from jaxfit.data.views import ViewKeypoints, Views, stacked_keypoints
-from jaxfit.data.world import in_camera, whole_picture, world_arrays
+from jaxfit.data.world import in_camera, in_world, whole_picture
 from jaxfit.fitting.batch import FittedWindow
 from jaxfit.fitting.collect import blend_seams, frame_error_bars, gather_windows, pose_shapes
 from jaxfit.fitting.error_bars import error_bar_shapes
@@ -109,8 +109,8 @@ def fit_views(
         cluster: worker processes that fit the windows.
 
     Returns:
-        Poses in the frame of the first camera without distortion, whose crop is the whole picture, with the arrays
-        `data.solution.WORLD`. With one view: the result of `fit`; in the world, every bird has the size of the model.
+        Poses in the frame of the first camera without distortion, whose crop is the whole picture, in the world
+        (`data.solution.World`). With one view: the result of `fit`; in the world, every bird has the size of the model.
 
     Raises:
         InputError: no bird that two cameras see, a model without a unit, or a size that shows a wrong unit.
@@ -356,9 +356,13 @@ def _solution(
 
     gathered = gather_windows(first, windows, results, arrays, values_of, {})
     width, height = first.image_size_px[0].tolist()
-    return Solution(
+    crops = whole_picture(camera, gathered["valid"], (width, height))
+    return Solution.from_arrays(
         **gathered,
-        **whole_picture(camera, gathered["valid"], (width, height)),
+        crop=crops.square_px,
+        image_size_px=crops.image_size_px,
+        focal_px=crops.focal_px,
+        crop_px=crops.crop_px,
         keypoint_names=bird.keypoint_names,
         joint_names=bird.joint_names,
     )
@@ -416,5 +420,5 @@ def _with_world(solution: Solution, bird: Bird, camera: Camera) -> Solution:
     """Return the solution of one view with the birds in the world: every bird has the size of the model."""
     unit_m = bird.metres_per_unit or 1.0
     placed = in_image(solution, bird, float(camera.matrix[0, 0]), tuple(camera.matrix[:2, 2]))
-    keypoints_cam = placed.points(solution.keypoints_cam.astype(np.float64), solution.scale.astype(np.float64))
-    return replace(solution, **world_arrays(camera, unit_m, placed.orientation, placed.root, keypoints_cam))
+    keypoints_cam = placed.points(solution.keypoints.cam.astype(np.float64), solution.poses.scale.astype(np.float64))
+    return replace(solution, world=in_world(camera, unit_m, placed.orientation, placed.root, keypoints_cam))

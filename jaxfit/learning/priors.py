@@ -100,9 +100,9 @@ def learn_prior(results: Sequence[tuple[object, Solution, Bird]]) -> LearntPrior
             valid = solution.valid[n]
             diverged += status == "diverged"
             if valid.any():
-                pose = solution.body_pose[n].astype(np.float64)
+                pose = solution.poses.body_pose[n].astype(np.float64)
                 tracks.append((pose.reshape(len(valid), -1), valid, next_frame))
-                bones.append(solution.bone_length[n, valid].mean(axis=0, dtype=np.float64))
+                bones.append(solution.poses.bone_length[n, valid].mean(axis=0, dtype=np.float64))
     if not tracks:
         skipped = f"; diverged birds: {diverged}" if diverged else ""
         raise InputError(first_source, f"holds no valid pose{skipped}", "use results with fitted birds")
@@ -336,7 +336,7 @@ def accelerations_rad_s2(
     """
     pairs = solution.valid[n, :-1] & solution.valid[n, 1:] & consecutive(solution.frame_index)
     runs = pairs[:-1] & pairs[1:]
-    orient, body = solution.global_orient[n][:, None], solution.body_pose[n]
+    orient, body = solution.poses.global_orient[n][:, None], solution.poses.body_pose[n]
     rotvec = np.concatenate([orient, body], axis=1).astype(np.float64)
     triples = [rotvec[shift : shift + len(runs)][runs].reshape(-1, 3) for shift in range(3)]
     if not runs.any():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,7 +81,7 @@ def refit(
     result = _empty(solution, after)
     if len(touched):
         result = fit_runs(after, bird, [config], None, progress, source, select=touched)[0]
-    with_bars = result.has_error_bars or solution.has_error_bars
+    with_bars = result.error_bars is not None or solution.error_bars is not None
     copied = solution.cells(with_bars)
     arrays = {name: values.copy() for name, values in result.cells(with_bars).items()}
     counts = np.zeros((after.num_tracks, 2), int)  # windows with poses, windows that diverged
@@ -110,8 +109,7 @@ def refit(
             if own.sum() == (old.track_id == track).sum():  # all windows of one track
                 for term in loss:
                     loss[term][n] = solution.loss[term][_row_of(solution, track)]
-    merged = replace(
-        result,
+    merged = result.with_arrays(
         **arrays,
         loss=loss,
         status=np.array([track_status(*count) for count in counts.tolist()], "<U32"),
@@ -150,7 +148,7 @@ def _empty(solution: Solution, observations: Observations) -> Solution:
         filler = np.nan if values.dtype.kind == "f" else 0
         arrays[name] = np.full((count, *values.shape[1:]), filler, values.dtype)
     status = np.full(count, "no usable frame")
-    return replace(solution, **arrays, track_id=observations.track_id, status=status, loss={}, failures={})
+    return solution.with_arrays(**arrays, track_id=observations.track_id, status=status, loss={}, failures={})
 
 
 def _row_of(solution: Solution, track: int) -> int:
@@ -188,7 +186,7 @@ def read_tracks(result: str | Path, observations: str | Path | None = None) -> T
     """
     folder = Path(result)
     solution, bird = load_solution(folder)
-    if solution.has_world:
+    if solution.world is not None:
         problem = "is in a world, where tracks cannot be corrected or joined"
         remedy = (
             "correct a result without a world and run `jaxfit ledge` after it; or correct the observations of each "

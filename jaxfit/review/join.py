@@ -53,7 +53,7 @@ def concatenate_observations(
     """
     frames = np.cumsum([0, *(part.num_frames for part in parts)])
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _FRAMES}
-    arrays |= {name: _cells(name, parts, rows, len(track_id)) for name in CELLS}
+    arrays |= {name: _in_rows([getattr(part, name) for part in parts], rows, len(track_id), 0) for name in CELLS}
     for name in MAPPINGS:
         arrays[name] = {
             (int(row[n]), int(first) + t): value
@@ -72,10 +72,11 @@ def concatenate_solutions(
     Error bars are NaN in parts without error bars.
     """
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _TIMES}
-    if any(part.has_error_bars for part in parts):
-        parts = [replace(part, **part.cells(error_bars=True)) for part in parts]
-    for name in parts[0].cells():
-        arrays[name] = _cells(name, parts, rows, len(track_id))
+    if any(part.error_bars is not None for part in parts):
+        parts = [part.with_arrays(**part.cells(error_bars=True)) for part in parts]
+    cells = [part.cells() for part in parts]
+    for name in cells[0]:
+        arrays[name] = _in_rows([part[name] for part in cells], rows, len(track_id), np.nan)
     loss = {term: np.full(len(track_id), np.nan) for term in dict.fromkeys(t for part in parts for t in part.loss)}
     statuses: list[list[str]] = [[] for _ in track_id]
     failures: dict[int, tuple[str, ...]] = {}
@@ -89,16 +90,14 @@ def concatenate_solutions(
                 if np.isfinite(values[n]):
                     loss[term][own] = np.nansum([loss[term][own], values[n]])
     status = np.array([_status(each) for each in statuses], "<U32")
-    return replace(parts[0], track_id=track_id, **arrays, loss=loss, status=status, failures=failures)
+    return parts[0].with_arrays(track_id=track_id, **arrays, loss=loss, status=status, failures=failures)
 
 
-def _cells(name: str, parts: Sequence[Any], rows: Sequence[np.ndarray], count: int) -> np.ndarray:
-    """Return an array (N, T, …) of all tracks and frames; NaN, 0 or False where a part lacks a track."""
+def _in_rows(parts: Sequence[np.ndarray], rows: Sequence[np.ndarray], count: int, absent: float) -> np.ndarray:
+    """Return an array (N, T, …) of all tracks and frames; `absent`, 0 or False where a part lacks a track."""
     pieces = []
-    for part, row in zip(parts, rows, strict=True):
-        values = getattr(part, name)
-        absent = np.nan if isinstance(part, Solution) and values.dtype.kind == "f" else 0
-        piece = np.full((count, *values.shape[1:]), absent, values.dtype)
+    for values, row in zip(parts, rows, strict=True):
+        piece = np.full((count, *values.shape[1:]), absent if values.dtype.kind == "f" else 0, values.dtype)
         piece[row] = values
         pieces.append(piece)
     return np.concatenate(pieces, axis=1)

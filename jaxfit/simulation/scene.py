@@ -317,7 +317,7 @@ def _true_poses(
         return np.broadcast_to(values[:, None], (N, T, *values.shape[1:]))
 
     crop_px = CropCamera().size_px
-    return Solution(
+    return Solution.from_arrays(
         track_id=truth.track_id,
         frame_index=truth.frame_index,
         valid=truth.present,

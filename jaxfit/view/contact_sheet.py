@@ -118,7 +118,7 @@ def contact_sheet(
             ground = None if footage is None else footage.get((n, t))
             tiles.append(np.hstack([_observed_tile(posed, detected, n, t, ground), _mesh_tile(posed, n, t, colours)]))
         drawn.append(np.hstack(tiles + [blank] * (columns - len(row))))
-    flagged = bool(np.isin(flags(np.asarray(solution.doubts)), (UNSURE, CONTRADICTED)).any())
+    flagged = bool(np.isin(flags(solution.flags.doubts), (UNSURE, CONTRADICTED)).any())
     legend = _legend(drawn[0].shape[1], footage is not None, observations is not None, flagged)
     write_png(path, np.vstack([legend, *drawn]))
 
@@ -157,8 +157,8 @@ def _legend(width: int, on_footage: bool, has_detections: bool, flagged: bool) -
 
 def _window(posed: PosedBirds, n: int, t: int) -> Float[np.ndarray, "3"]:
     """Return x0, y0, size of the square of a tile: the crop, or a smaller square if the bird is small in the crop."""
-    crop = posed.solution.crop[n, t]
-    points = posed.solution.keypoints_px[n, t]
+    crop = posed.solution.crops.square_px[n, t]
+    points = posed.solution.keypoints.px[n, t]
     low, high = points.min(0), points.max(0)
     size = 1.5 * float((high - low).max())
     return crop if crop[2] < 1.4 * size else np.array([*((low + high - size) / 2), size], np.float32)
@@ -188,7 +188,7 @@ def _observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footag
     covered = hard_mask(screen, posed.faces, TILE_PX, TILE_PX).astype(np.uint8)
     contours, _ = cv2.findContours(covered, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(tile, contours, -1, OUTLINE if footage is None else track_colour(n), 1, cv2.LINE_AA)
-    fitted = _to_tile(solution.keypoints_px[n, t], window)
+    fitted = _to_tile(solution.keypoints.px[n, t], window)
     places, confidence = detected.keypoints(n, t)
     near = _to_tile(places, window)
     rim, fill = (ON_PAPER_DETECTED, ON_PAPER_FITTED) if footage is None else (DETECTED, FITTED)
@@ -201,7 +201,7 @@ def _observed_tile(posed: PosedBirds, detected: Detected, n: int, t: int, footag
     for k in range(len(fitted)) if footage is not None else np.flatnonzero(confidence > 0):
         dot(tile, fitted[k], 2, fill, None if footage is None else INK)
     name, frame = f"track {solution.track_id[n]}", f"frame {solution.frame_index[t]}"
-    frame = with_flag(frame, flags(np.asarray(solution.doubts)[n : n + 1, t : t + 1]).item())
+    frame = with_flag(frame, flags(solution.flags.doubts[n : n + 1, t : t + 1]).item())
     if footage is None:
         text(tile, f"{name}  {frame}", 6, 11, 11, ON_PAPER_DETECTED)
     else:

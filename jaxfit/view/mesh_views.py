@@ -37,7 +37,7 @@ def up_direction(solution: Solution) -> Float[np.ndarray, "3"]:
     feet = np.array([any(word in name for word in FOOT_WORDS) for name in names], bool)
     if not feet.any() or feet.all() or not valid.any():
         return np.array([0.0, -1.0, 0.0])
-    points = solution.keypoints_cam[valid].astype(np.float64)
+    points = solution.keypoints.cam[valid].astype(np.float64)
     directions = points[:, ~feet].mean(1) - points[:, feet].mean(1)
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
     total = directions.mean(0)
@@ -67,16 +67,16 @@ class SideViews:
         self._faces = np.asarray(bird.faces)
         self._colours = [tinted(np.asarray(bird.vertex_colours), n, 0.75) for n in range(N)]
         up = up_direction(solution)
-        turns = Rotation.from_rotvec(np.where(valid[..., None], solution.global_orient, 0).reshape(-1, 3))
+        turns = Rotation.from_rotvec(np.where(valid[..., None], solution.poses.global_orient, 0).reshape(-1, 3))
         left = turns.apply(_left(bird)).reshape(*valid.shape, 3)
         left -= (left @ up)[..., None] * up
         left /= np.maximum(np.linalg.norm(left, axis=-1, keepdims=True), 1e-6)
         down = np.broadcast_to(-up, left.shape)
         self._R_view_cam = np.stack([np.cross(down, -left), down, -left], axis=-2)  # x right, y down, z forward
-        points = np.where(valid[..., None, None], solution.keypoints_cam, 0).astype(np.float64)
+        points = np.where(valid[..., None, None], solution.keypoints.cam, 0).astype(np.float64)
         self._centre_cam = points.mean(2)
         spread = np.einsum("ntij,ntkj->ntki", self._R_view_cam, points - self._centre_cam[:, :, None])
-        reach = np.abs(spread[..., :2]).max((2, 3)) / np.where(valid, solution.scale, 1)
+        reach = np.abs(spread[..., :2]).max((2, 3)) / np.where(valid, solution.poses.scale, 1)
         # a percentile, so that a few failed frames do not make all other birds small
         self._zoom = 0.5 * self.tile_px / max(1.12 * float(np.percentile(reach[valid], 98)), 1e-6) if valid.any() else 1
 
@@ -105,7 +105,7 @@ class SideViews:
 
     def _bird(self, n: int, t: int, vertices_cam: Float[np.ndarray, "V 3"]) -> UInt8[np.ndarray, "S S 3"]:
         blank = np.full((self.tile_px, self.tile_px, 3), PAPER, np.uint8)
-        offset = (vertices_cam - self._centre_cam[n, t]) @ self._R_view_cam[n, t].T / self.solution.scale[n, t]
+        offset = (vertices_cam - self._centre_cam[n, t]) @ self._R_view_cam[n, t].T / self.solution.poses.scale[n, t]
         return draw_parallel(blank, offset * self._zoom, self._faces, self._colours[n])
 
 

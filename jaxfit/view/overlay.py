@@ -80,7 +80,7 @@ def check_belongs(
 def _differences(solution: Solution, video: Path, info: VideoInfo) -> list[str]:
     """Return how a video differs from the video of the result, as far as both are known."""
     known, texts = solution.footage or FootageIdentity(), []
-    sizes = solution.image_size_px[solution.valid]
+    sizes = solution.crops.image_size_px[solution.valid]
     other = sizes[(sizes != info.size_px).any(1)]
     if len(other):
         texts.append(f"images of {info.size_px[0]}×{info.size_px[1]} instead of {other[0, 0]}×{other[0, 1]} pixels")
@@ -340,7 +340,7 @@ class _Drawing:
         # linear interpolation is much faster, and as good while it still reads every pixel
         self._shrink = cv2.INTER_LINEAR if self.zoom > 0.6 else cv2.INTER_AREA
         self.solution, self.posed = solution, PosedBirds(solution, bird, lens)
-        extent = np.ptp(solution.keypoints_px[solution.valid], axis=1).max(-1)
+        extent = np.ptp(solution.keypoints.px[solution.valid], axis=1).max(-1)
         self.style = Style.suited(self.picture_px[0], float(np.median(extent)) * self.zoom)
         self._numbers = Numbers(solution.keypoint_names, self.style)
         self._faces = np.asarray(bird.faces)
@@ -348,13 +348,13 @@ class _Drawing:
         self._pairs = skeleton_pairs(solution.keypoint_names)
         self._detected = Detected(solution, observations)
         text_px = self.style.text_px
-        self._flags = flags(np.asarray(solution.doubts))
+        self._flags = flags(solution.flags.doubts)
         self._legend = Legend(
             self.picture_px[0],
             self.style,
             detected=observations is not None,
             side_views=side_views,
-            regions=solution.has_error_bars,
+            regions=solution.error_bars is not None,
             flagged=bool(np.isin(self._flags, (UNSURE, CONTRADICTED)).any()),
         )
         self._side = SideViews(solution, bird, self.picture_px[0], text_px) if side_views else None
@@ -369,7 +369,7 @@ class _Drawing:
         image = picture.copy() if self.zoom == 1 else cv2.resize(picture, self.picture_px, interpolation=self._shrink)
         shown = np.zeros(len(self.solution.track_id), bool) if t is None else self.solution.valid[:, t]
         birds = [] if t is None else [self._bird(n, t) for n in np.flatnonzero(shown).tolist()]
-        crops = self.solution.crop[shown, t] if t is not None else np.zeros((0, 3))
+        crops = self.solution.crops.square_px[shown, t] if t is not None else np.zeros((0, 3))
         draw_birds(image, birds, self._faces, self.style, one_camera=bool((crops == crops[:1]).all()))
         for bird in birds:
             draw_regions(image, bird, self.style)
@@ -386,10 +386,10 @@ class _Drawing:
         cam, span = self._vertices_cam(n, t), slice(t, t + 1)
         shrink = np.array([self.zoom, self.zoom, 1], np.float32)
         places, confidence = self._detected.keypoints(n, t)
-        points, covariance, regions = self.solution.keypoints_px[n, t] * self.zoom, self.solution.keypoints_px_cov, None
-        if covariance is not None:
-            half = float(self.solution.crop[n, t, 2]) / 2 * self.zoom
-            regions = regions_95(points, covariance[n, t] * self.zoom**2, half)
+        points, bars, regions = self.solution.keypoints.px[n, t] * self.zoom, self.solution.error_bars, None
+        if bars is not None:
+            half = float(self.solution.crops.square_px[n, t, 2]) / 2 * self.zoom
+            regions = regions_95(points, bars.keypoints_px_cov[n, t] * self.zoom**2, half)
         return DrawnBird(
             position=n,
             name=with_flag(str(self.solution.track_id[n]), self._flags[n, t]),

@@ -79,7 +79,7 @@ class Shown:
     @cached_property
     def size_px(self) -> tuple[int, int]:
         """Width and height of the film."""
-        width, height = self.solution.image_size_px[self.solution.valid].max(axis=0).tolist()
+        width, height = self.solution.crops.image_size_px[self.solution.valid].max(axis=0).tolist()
         return width, height
 
     @cached_property
@@ -95,7 +95,7 @@ class Shown:
     def flock(self) -> Flock:
         """The birds in one world. The ledge is estimated where the result has none."""
         path = self.folder / CAMERAS
-        count = len(read_cameras(path)) if self.solution.has_world and path.is_file() else 0
+        count = len(read_cameras(path)) if self.solution.world is not None and path.is_file() else 0
         return flock_of(self.solution, self.bird, self.times_s, count, self._lens, source=self.folder)
 
     def facts(self) -> dict[str, Any]:
@@ -126,7 +126,7 @@ class Shown:
         """Name, title and unit of the values over time that the page offers."""
         own_values = OWN_VALUES if self.observations is not None else {}
         own = [{"name": name, "title": title, "unit": unit} for name, (title, unit) in own_values.items()]
-        unit = "m" if self.solution.has_world and self.bird.metres_per_unit else "bl"
+        unit = "m" if self.solution.world is not None and self.bird.metres_per_unit else "bl"
         return own + [
             {"name": each.name, "title": each.name.replace("_", " ").capitalize(), "unit": each.shown_unit(unit)}
             for each in own_features()
@@ -135,7 +135,7 @@ class Shown:
 
     def flags(self) -> bytes:
         """Return the flag of every pose, uint8 (N, T): a position in `FLAGS` plus 1, 0 without a pose."""
-        found = flags(np.asarray(self.solution.doubts))
+        found = flags(self.solution.flags.doubts)
         numbers = np.select([found == flag for flag in FLAGS], range(1, len(FLAGS) + 1), default=0)
         return pack({"flags": np.where(self.solution.valid, numbers, 0).astype(np.uint8)})
 
@@ -172,7 +172,7 @@ class Shown:
         flock, (n, t) = self.flock, np.argwhere(self.solution.valid)[0]
         one = select_solution(flock.solution, np.array([n]), np.array([t]))
         # the focal length of birds in crops is that of all poses
-        at = in_image(one, self.bird, None if flock.solution.has_world else image_focal_px(flock.solution))
+        at = in_image(one, self.bird, None if flock.solution.world is not None else image_focal_px(flock.solution))
         R_cam_root = Rotation.from_rotvec(at.orientation[0, 0]).as_matrix()
         R_world_cam = flock.R_world_body[n, t] @ R_cam_root.T
         place = flock.place[n, t] - R_world_cam @ at.root[0, 0] * flock.per_unit
@@ -193,24 +193,24 @@ class Shown:
             "place": flock.place[:, span].astype(np.float32),
             "size": (flock.size[:, span] * flock.per_unit).astype(np.float32),
             "turns": in_steps(self._turns(span), TURN_STEP),
-            "keypoints": in_steps(np.where(valid[..., None, None], s.keypoints_px[:, span], np.nan), self._step_px),
+            "keypoints": in_steps(np.where(valid[..., None, None], s.keypoints.px[:, span], np.nan), self._step_px),
         }
-        bones, betas = np.where(valid[..., None], s.bone_length[:, span], 1), s.betas[:, span]
+        bones, betas = np.where(valid[..., None], s.poses.bone_length[:, span], 1), s.poses.betas[:, span]
         if (bones != 1).any():
             arrays["bones"] = bones.astype(np.float32)
         if np.nan_to_num(betas).any():
             arrays["betas"] = np.nan_to_num(betas).astype(np.float32)
         if self.observations is not None:
             arrays["detected"] = in_steps(self._detections(span), self._step_px)
-        if s.keypoints_px_cov is not None:
-            arrays["regions"] = regions(s.keypoints_px_cov[:, span])
+        if s.error_bars is not None:
+            arrays["regions"] = regions(s.error_bars.keypoints_px_cov[:, span])
         return pack(arrays, {"step_px": self._step_px, "turn_step": TURN_STEP})
 
     def _turns(self, span: slice) -> Float[np.ndarray, "N F J 4"]:
         """Return the rotation of the root in the world, and of every other joint relative to its parent."""
         valid = self.solution.valid[:, span]
         root = Rotation.from_matrix(np.where(valid[..., None, None], self.flock.R_world_body[:, span], np.eye(3)))
-        body = np.where(valid[..., None, None], self.solution.body_pose[:, span], 0)
+        body = np.where(valid[..., None, None], self.solution.poses.body_pose[:, span], 0)
         joints = Rotation.from_rotvec(body.reshape(-1, 3)).as_quat().reshape(*body.shape[:3], 4)
         return np.concatenate([root.as_quat().reshape(*valid.shape, 1, 4), joints], axis=2)
 
@@ -231,7 +231,7 @@ class Shown:
         poses, lengths, points, count = [], [], [], span.stop - span.start
         for first in range(span.start, span.stop, POSED_FRAMES):
             for i, birds in enumerate(self._birds_of(first, min(first + POSED_FRAMES, span.stop)), first):
-                crops = self.solution.crop[[bird.position for bird in birds], i]
+                crops = self.solution.crops.square_px[[bird.position for bird in birds], i]
                 one_camera = bool((crops == crops[:1]).all())
                 for n, curves in outlines(birds, faces, self.size_px, one_camera).items():
                     for curve in curves:

@@ -59,7 +59,7 @@ def test_the_table_of_features(folder, tmp_path, capsys):
     assert first["neighbour"] == "2"
     assert first["behaviour"] == "standing"
     solution = load_solution(folder)[0]
-    true = np.linalg.norm(solution.transl_world_m[0, 0] - solution.transl_world_m[1, 0])
+    true = np.linalg.norm(solution.world.transl_world_m[0, 0] - solution.world.transl_world_m[1, 0])
     assert float(first["neighbour_distance_m"]) == pytest.approx(true, rel=1e-5)
     expected = [each.column("m") for each in own_features()]
     assert [name for name in first if name in expected] == expected
@@ -173,7 +173,7 @@ def test_a_part_of_a_result_has_the_rows_of_the_whole(tmp_path, words, tracks, f
     place = np.zeros((2, 60, 3)) + np.array([[[0, 0, 0.2]], [[0.6, 0, 0.2]]])
     place[0, :, 0] += 0.2 * np.sin(np.arange(60) / 7)
     solution = with_error_bars(pair(60), orient_sd=0.1, body_sd=0.05)
-    folder = written(tmp_path / "result", replace(solution, transl_world_m=place))
+    folder = written(tmp_path / "result", solution.with_arrays(transl_world_m=place))
     whole = rows_of(described(folder, tmp_path / "whole.csv"))
     part = rows_of(described(folder, tmp_path / "part.csv", *words))
     assert part == part_of(whole, tracks, frames)
@@ -266,7 +266,7 @@ def test_features_and_rules_of_a_user(folder, tmp_path):
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"base": "behaviour", **rules}), encoding="utf-8")
     out = described(folder, tmp_path / "birds.csv", "--config", str(tmp_path / "mine.yaml"))
     row = rows_of(out)[0]
-    assert float(row["depth_m"]) == pytest.approx(load_solution(folder)[0].transl_world_m[0, 0, 1], abs=1e-5)
+    assert float(row["depth_m"]) == pytest.approx(load_solution(folder)[0].world.transl_world_m[0, 0, 1], abs=1e-5)
     assert row["behaviour"] == "standing"  # the rules of the base come first
     out = described(folder, tmp_path / "other.csv", "--feature", "features_of_a_user:depth")
     assert "depth_m" in rows_of(out)[0]

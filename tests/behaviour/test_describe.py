@@ -104,7 +104,7 @@ def test_which_features_have_a_standard_deviation(uncertain):
 
 def test_a_distance_between_birds_is_not_exact(monkeypatch):
     monkeypatch.setattr(describing, "DRAWS", 4)
-    solution = replace(with_error_bars(pair(), 0.05, 0.05), transl_sd=np.full((2, 4, 3), 1.0))
+    solution = with_error_bars(pair(), 0.05, 0.05).with_arrays(transl_sd=np.full((2, 4, 3), 1.0))
     found = describe(flock(solution)).sd
     assert "neighbour_distance" not in found or (found["neighbour_distance"] > 0.01).all()  # 1 unit is 2 cm
 
@@ -132,7 +132,7 @@ def test_unknown_times():
 def test_no_ledge():
     """Photographs share no world: the vertical is unknown, and all that is measured within a bird remains."""
     no_world = dict.fromkeys(("R_world_root", "transl_world_m", "keypoints_world_m", "contact"))
-    known = flock(replace(pair(), **no_world), photographs=True)
+    known = flock(pair().with_arrays(**no_world), photographs=True)
     assert (known.level, known.unit) == (False, "bl")
     found, on_ledge = describe(known), describe(flock(pair()))
     for name, each in OWN.items():
@@ -168,9 +168,9 @@ def test_poses_that_are_not_valid_have_no_values():
     valid = np.ones((2, 4), bool)
     valid[0, 1] = False
     solution = pair(valid=valid)
-    broken = np.array(solution.body_pose)
+    broken = np.array(solution.poses.body_pose)
     broken[0, 1] = np.nan
-    found = describe(flock(replace(solution, body_pose=broken)))
+    found = describe(flock(solution.with_arrays(body_pose=broken)))
     for name, values in found.values.items():
         assert np.isnan(values[0, 1]), name
     for name in ("body_pitch", "neck_angle", "wing_spread", "height", "airborne"):

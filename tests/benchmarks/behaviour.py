@@ -18,7 +18,6 @@ import argparse
 import sys
 import tempfile
 import unittest.mock
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -61,10 +60,10 @@ def fitted(kind, seed, store):
     scene = stage_scene(BIRD, BIRDS, FRAMES, fps=FPS, seed=seed)
     if kind == "truth":
         s = scene.poses  # as one camera knows them: every bird has the size of the model
-        size = s.scale[..., None]
-        one = {"transl": s.transl / size, "keypoints_cam": s.keypoints_cam / size[..., None]}
+        size = s.poses.scale[..., None]
+        one = {"transl": s.poses.transl / size, "keypoints_cam": s.keypoints.cam / size[..., None]}
         camera = scene.view.camera("cliff", BIRD.metres_per_unit)
-        return scene, on_ledge(replace(s, scale=np.ones_like(s.scale), **one), BIRD, camera)
+        return scene, on_ledge(s.with_arrays(scale=np.ones_like(s.poses.scale), **one), BIRD, camera)
     folder = store / f"{kind}_{seed}"
     if not folder.is_dir():
         config = ledge_config(load_config("fast"))

@@ -56,24 +56,24 @@ def test_true_poses_have_no_error(name, worlds, request):
 
 def test_known_errors_are_measured(window, worlds):
     poses = window.poses
-    moved = poses.keypoints_cam.copy()
+    moved = poses.keypoints.cam.copy()
     bill = poses.keypoint_names.index("bill_tip")
     moved[:, :, bill] += [0, 0, 1.2]
-    wrong = replace(poses, keypoints_cam=moved, scale=1.1 * poses.scale)
+    wrong = poses.with_arrays(keypoints_cam=moved, scale=1.1 * poses.poses.scale)
     values = worlds.measure(wrong, window, False)[0].values()
     # the mean over 12 keypoints of one error of 1.2 is 0.1; alignment distributes the error over all keypoints
-    assert values["aligned"] == pytest.approx(pa_mpjpe(moved, poses.keypoints_cam))
+    assert values["aligned"] == pytest.approx(pa_mpjpe(moved, poses.keypoints.cam))
     assert 0.05 < values["aligned"] < 0.25
     assert values["size_bias"] == pytest.approx(0.1, abs=0.01)
-    length = np.linalg.norm(np.subtract((0, 9, 2.8), (0, -7.9, 0))) * poses.scale.mean()
+    length = np.linalg.norm(np.subtract((0, 9, 2.8), (0, -7.9, 0))) * poses.poses.scale.mean()
     assert values["aligned"] / values["aligned/length"] == pytest.approx(length, rel=0.03)
 
 
 def test_rotation_and_size_are_no_aligned_error(window, worlds):
     turn = Rotation.from_rotvec([0, 0, 0.3]).as_matrix()
-    centre = window.poses.keypoints_cam.mean(2, keepdims=True)
-    turned = 1.2 * (window.poses.keypoints_cam - centre) @ turn.T + centre
-    values = worlds.measure(replace(window.poses, keypoints_cam=turned), window, False)[0].values()
+    centre = window.poses.keypoints.cam.mean(2, keepdims=True)
+    turned = 1.2 * (window.poses.keypoints.cam - centre) @ turn.T + centre
+    values = worlds.measure(window.poses.with_arrays(keypoints_cam=turned), window, False)[0].values()
     assert values["aligned"] == pytest.approx(0, abs=1e-4)
     assert values["mpjpe/length"] > 0.02
 

@@ -175,7 +175,7 @@ def true_solution(bird: Bird, pose: Pose, exact: Observations, camera: CropCamer
     """
     keypoints_cam = np.asarray(keypoints_of(fold_bird(bird), pose), np.float64)
     birds, frames = exact.present.shape
-    return Solution(
+    return Solution.from_arrays(
         track_id=exact.track_id,
         frame_index=exact.frame_index,
         valid=exact.present,

@@ -139,10 +139,12 @@ def errors_3d(solution: Solution, scene: Scene, pictures: bool) -> dict[str, Flo
     truth, bird = scene.poses, scene.bird
     n, t, shared = match(solution, truth.track_id, truth.frame_index)
     measured = shared & solution.valid & truth.valid[n, t]
-    x0, y0, side = truth.crop[truth.valid][0].astype(np.float64)
-    focal = truth.focal_px * side / truth.crop_px
-    R = crop_rotation(solution.crop[..., :2] + solution.crop[..., 2:] / 2, [x0 + side / 2, y0 + side / 2], focal)
-    p, q = solution.keypoints_cam.astype(np.float64), truth.keypoints_cam[n, t].astype(np.float64)
+    x0, y0, side = truth.crops.square_px[truth.valid][0].astype(np.float64)
+    focal = truth.crops.focal_px * side / truth.crops.crop_px
+    R = crop_rotation(
+        solution.crops.square_px[..., :2] + solution.crops.square_px[..., 2:] / 2, [x0 + side / 2, y0 + side / 2], focal
+    )
+    p, q = solution.keypoints.cam.astype(np.float64), truth.keypoints.cam[n, t].astype(np.float64)
     depth_p, depth_q = p[..., 2].mean(-1), q[..., 2].mean(-1)
     p = (p - p.mean(2, keepdims=True)) @ np.swapaxes(R, -1, -2)
     q = q - q.mean(2, keepdims=True)
@@ -150,12 +152,12 @@ def errors_3d(solution: Solution, scene: Scene, pictures: bool) -> dict[str, Flo
         p = p * best_scale(p[:, :, None], q[:, :, None], measured[..., None])[..., None, None]
     else:
         p = p * best_scale(p, q, measured)[:, None, None, None]
-    length = rest_length(bird, truth.pose)[n, t]
+    length = rest_length(bird, truth.poses)[n, t]
     counted = np.broadcast_to(measured[..., None], p.shape[:-1])
     direct, aligned = distances(p, q, counted), distances(procrustes_align(p, q, counted), q, counted)
-    focal_p = solution.focal_px * solution.crop[..., 2] / solution.crop_px
+    focal_p = solution.crops.focal_px * solution.crops.square_px[..., 2] / solution.crops.crop_px
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = (rest_length(bird, solution.pose) * focal_p / depth_p) / (length * focal / depth_q)
+        ratio = (rest_length(bird, solution.poses) * focal_p / depth_p) / (length * focal / depth_q)
     ratio = np.where(measured, ratio, np.nan)[..., None]
     return {
         "mpjpe/length": direct / length[..., None],

@@ -79,7 +79,7 @@ def test_fit_takes_the_file_as_it_is(inputs, tmp_path, csv_file, capsys, caplog)
     assert main(arguments(inputs, tmp_path / "coco")) == 0
     poses, _ = load_solution(tmp_path / "other")
     same, _ = load_solution(tmp_path / "coco")
-    np.testing.assert_allclose(poses.keypoints_px[poses.valid], same.keypoints_px[same.valid], atol=0.05)
+    np.testing.assert_allclose(poses.keypoints.px[poses.valid], same.keypoints.px[same.valid], atol=0.05)
     capsys.readouterr()
     assert main(["evaluate", str(tmp_path / "other"), "--truth", str(csv_file), *size, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] > 0

@@ -40,7 +40,7 @@ def test_a_fit_with_learnt_yaml_gives_the_same_result(inputs, tmp_path):
     assert main(command) == 0
     assert not (tmp_path / "second" / "learnt.yaml").exists()
     a, b = (load_solution(tmp_path / name)[0] for name in ("first", "second"))
-    np.testing.assert_array_equal(a.keypoints_px, b.keypoints_px)
+    np.testing.assert_array_equal(a.keypoints.px, b.keypoints.px)
 
 
 def test_too_few_data_keep_the_config_and_the_file_gives_the_reason(inputs, tmp_path, monkeypatch):

@@ -86,7 +86,7 @@ def test_the_stored_config_reproduces_the_result(fitted, inputs, tmp_path, capsy
     assert "12 poses of 3 tracks (2 ok, 1 no usable frame)" in said
     assert str(tmp_path / "again") in said.replace("\n", "")
     a, b = load_solution(fitted)[0], load_solution(tmp_path / "again")[0]
-    np.testing.assert_array_equal(a.keypoints_px, b.keypoints_px)
+    np.testing.assert_array_equal(a.keypoints.px, b.keypoints.px)
 
 
 def test_evaluate(fitted, inputs, tmp_path, capsys):

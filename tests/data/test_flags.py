@@ -24,8 +24,8 @@ FAR, UNLIKE, SECOND, WIDE, WEAK, OUTSIDE = (1 << i for i in range(len(DOUBTS)))
 
 def test_the_truth_has_no_doubts():
     judged = with_doubts(solution(), truth(), BIRD)
-    assert not judged.doubts.any()
-    assert flag_counts(judged.doubts) == {"ok": N * T, "unsure": 0, "contradicted": 0}
+    assert not judged.flags.doubts.any()
+    assert flag_counts(judged.flags.doubts) == {"ok": N * T, "unsure": 0, "contradicted": 0}
     assert flagged_ranges(judged) == {}
 
 
@@ -41,9 +41,9 @@ def test_every_doubt_has_its_cause():
     valid[1, 3] = False
     seen = dataclasses.replace(seen, keypoints_px=keypoints, confidence=confidence, masks=masks)
     judged = with_doubts(solution(ambiguity_deg=ambiguity_deg, valid=valid), seen, BIRD)
-    np.testing.assert_array_equal(judged.doubts, [[0, FAR + OUTSIDE, WEAK, 0], [UNLIKE + OUTSIDE, SECOND, 0, -1]])
+    np.testing.assert_array_equal(judged.flags.doubts, [[0, FAR + OUTSIDE, WEAK, 0], [UNLIKE + OUTSIDE, SECOND, 0, -1]])
     words = [["ok", "contradicted", "unsure", "ok"], ["contradicted", "unsure", "ok", ""]]
-    np.testing.assert_array_equal(flags(judged.doubts), words)
+    np.testing.assert_array_equal(flags(judged.flags.doubts), words)
     assert flagged_ranges(judged) == {
         5: (
             "frame 11 contradicted: keypoints far from the pose; keypoints outside the mask",
@@ -70,16 +70,16 @@ def test_one_wrong_view_of_three_condemns_no_pose():
         return dataclasses.replace(seen, keypoints_px=keypoints, masks=masks)
 
     views = [wrong([0, 1], [2, 3]), wrong([1], [3]), seen]
-    alone = with_doubts(posed, views[0], BIRD).doubts
+    alone = with_doubts(posed, views[0], BIRD).flags.doubts
     assert (alone[1] > 0).all()
-    doubts = with_doubts_of_views(posed, [(posed, own) for own in views], BIRD).doubts
+    doubts = with_doubts_of_views(posed, [(posed, own) for own in views], BIRD).flags.doubts
     np.testing.assert_array_equal(doubts, [[0, FAR + OUTSIDE, 0, 0], [0, FAR + OUTSIDE, 0, UNLIKE + OUTSIDE]])
     # a view without a bird does not count: one of two views contradicts, so the median is the mean of both
     absent = dataclasses.replace(seen, present=np.zeros((N, T), bool), confidence=seen.confidence * 0, masks={})
-    pair = with_doubts_of_views(posed, [(posed, own) for own in (views[0], absent, seen)], BIRD).doubts
+    pair = with_doubts_of_views(posed, [(posed, own) for own in (views[0], absent, seen)], BIRD).flags.doubts
     np.testing.assert_array_equal(pair[:, :2], [[FAR, FAR]] * 2)
     # keypoints need two views: the second-best confidence counts
-    once = with_doubts_of_views(posed, [(posed, own) for own in (absent, seen, absent)], BIRD).doubts
+    once = with_doubts_of_views(posed, [(posed, own) for own in (absent, seen, absent)], BIRD).flags.doubts
     np.testing.assert_array_equal(once, [[WEAK] * T] * 2)
 
 
@@ -115,7 +115,7 @@ def test_wide_error_bars_are_a_doubt():
         bars["keypoints_centred_cov"][0, :, :, axis, axis] = (0.11 * length) ** 2 / 3
         bars["keypoints_centred_cov"][1, :, :, axis, axis] = (0.09 * length) ** 2 / 3
     judged = with_doubts(solution(**bars, misfit=np.ones((N, T))), truth(), BIRD)
-    np.testing.assert_array_equal(judged.doubts, [[WIDE] * T, [0] * T])
+    np.testing.assert_array_equal(judged.flags.doubts, [[WIDE] * T, [0] * T])
 
 
 def test_outliers_have_a_large_modified_z_score():
@@ -143,7 +143,7 @@ def test_frames_without_a_pose_have_no_flag():
     """Also where arrays of other results are put together, and the rest is filled with 0."""
     valid = np.ones((N, T), bool)
     valid[0, 2:] = False
-    assert flag_counts(solution(valid=valid, doubts=np.zeros((N, T), np.int8)).doubts)["ok"] == N * T - 2
+    assert flag_counts(solution(valid=valid, doubts=np.zeros((N, T), np.int8)).flags.doubts)["ok"] == N * T - 2
 
 
 def test_frames_with_the_same_flag_are_one_range():
@@ -158,4 +158,4 @@ def test_frames_with_the_same_flag_are_one_range():
 
 def test_without_masks_only_keypoints_are_compared():
     seen = dataclasses.replace(truth(), masks={})
-    assert not with_doubts(solution(), seen, BIRD).doubts.any()
+    assert not with_doubts(solution(), seen, BIRD).flags.doubts.any()

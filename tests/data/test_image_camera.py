@@ -22,7 +22,7 @@ def walking_bird(bird, step_px=40.0):
     pose = dataclasses.replace(pose, **{name: np.repeat(value, FRAMES, 0) for name, value in still.items()})
     crop = np.stack([50 + step_px * np.arange(FRAMES), np.full(FRAMES, 300.0), np.full(FRAMES, 220.0)], -1)
     solution = solution_of(bird, [pose], crop[None])
-    return dataclasses.replace(solution, image_size_px=np.broadcast_to(SIZE_PX, (1, FRAMES, 2)))
+    return solution.with_arrays(image_size_px=np.broadcast_to(SIZE_PX, (1, FRAMES, 2)))
 
 
 def test_a_bird_that_walks_across_moves_in_metres_as_in_pixels(tmp_path):
@@ -30,12 +30,12 @@ def test_a_bird_that_walks_across_moves_in_metres_as_in_pixels(tmp_path):
     solution = walking_bird(BIRD)
     image = in_image(solution, BIRD, FOCAL_PX)
     root = image.root[0]
-    assert np.ptp(solution.transl[0], axis=0).max() < 1e-6
+    assert np.ptp(solution.poses.transl[0], axis=0).max() < 1e-6
     assert np.ptp(root[:, 2]) < 1e-4 * root[0, 2]  # constant depth
     walked_px = 40 * (FRAMES - 1)
     assert np.ptp(root[:, 0]) == pytest.approx(walked_px * root[0, 2] / FOCAL_PX, rel=1e-4)
-    crop_focal_px = solution.focal_px * 220 / solution.crop_px
-    depth = (solution.transl[0, 0, 2] / solution.scale[0, 0] + BIRD.joints[0][2]) * FOCAL_PX / crop_focal_px
+    crop_focal_px = solution.crops.focal_px * 220 / solution.crops.crop_px
+    depth = (solution.poses.transl[0, 0, 2] / solution.poses.scale[0, 0] + BIRD.joints[0][2]) * FOCAL_PX / crop_focal_px
     assert root[0, 2] == pytest.approx(float(depth), rel=1e-5)
 
     jaxfit.save_solution(solution, BIRD, "", {}, tmp_path / "walk")
@@ -51,14 +51,14 @@ def test_both_cameras_see_the_bird_at_the_same_pixels():
     solution = walking_bird(bird)
     image = in_image(solution, bird, FOCAL_PX)
     posed = PosedBirds(solution, bird)
-    vertices = image.points(posed.vertices_cam_window(0)[None], solution.scale)[0]
+    vertices = image.points(posed.vertices_cam_window(0)[None], solution.poses.scale)[0]
     pixels = FOCAL_PX * vertices[..., :2] / vertices[..., 2:] + SIZE_PX / 2
     expected = posed.vertices_screen_window(0)[..., :2]
     side = np.ptp(expected, axis=1).max()
     # a rigid bird under another focal length has another perspective; its root joint is exact
     assert np.abs(pixels - expected).max() < 0.02 * side
-    keypoints = image.points(solution.keypoints_cam, solution.scale)
-    at_model_size = solution.keypoints_cam / solution.scale[..., None, None]
+    keypoints = image.points(solution.keypoints.cam, solution.poses.scale)
+    at_model_size = solution.keypoints.cam / solution.poses.scale[..., None, None]
     lengths = (np.linalg.norm(np.diff(points, axis=2), axis=-1) for points in (keypoints, at_model_size))
     np.testing.assert_allclose(*lengths, rtol=1e-4)
 
@@ -74,7 +74,7 @@ def test_gaps_are_unknown_and_orientations_do_not_jump():
     angles = np.linspace(2.5, 4.5, FRAMES)  # through half a turn
     valid = np.ones((1, FRAMES), bool)
     valid[0, [0, 5, 6]] = False
-    turning = dataclasses.replace(turning, global_orient=angles[None, :, None] * [0, 0, 1.0], valid=valid)
+    turning = turning.with_arrays(global_orient=angles[None, :, None] * [0, 0, 1.0], valid=valid)
     image = in_image(turning, BIRD)
     np.testing.assert_array_equal(np.isfinite(image.root).all(-1), valid)
     np.testing.assert_array_equal(np.isfinite(image.orientation).all(-1), valid)

@@ -54,7 +54,7 @@ def test_it_equals_the_comparison_of_whole_images(monkeypatch):
         monkeypatch.setattr(mask_comparison, "_FRAMES", frames)
         rng = np.random.default_rng(seed)
         shift = np.concatenate([rng.integers(-250, 250, (N, T, 2)), np.zeros((N, T, 1), int)], -1)
-        result = solution(crop=(solution().crop + shift).astype(np.float32))
+        result = solution(crop=(solution().crops.square_px + shift).astype(np.float32))
         masks = random_masks(seed)
         whole = {cell: masks.pop(cell) for cell in [(0, 1), (1, 2)]}
         masks[1, 0] = encode_mask(np.zeros((HEIGHT, WIDTH), bool))
@@ -75,7 +75,9 @@ def test_it_equals_the_comparison_of_whole_images(monkeypatch):
 
 @pytest.mark.parametrize("shift_px", [0, 100])
 def test_pixels_of_other_birds_do_not_count(shift_px):
-    result = solution(crop=solution().crop + np.float32([shift_px, 0, 0]))  # the shifted meshes leave the image
+    result = solution(
+        crop=solution().crops.square_px + np.float32([shift_px, 0, 0])
+    )  # the shifted meshes leave the image
     masks = random_masks(7)
     right = np.arange(WIDTH) >= WIDTH // 2  # bird 1 is near the right part of bird 0 only
     masks |= {(1, t): encode_mask(decode_mask(masks[1, t]) & right) for t in range(T)}
@@ -90,10 +92,10 @@ def test_pixels_of_other_birds_do_not_count(shift_px):
 def test_photographs_and_meshes_that_reach_behind_the_camera():
     own = {(1, t): (f"{t}.png", WIDTH, HEIGHT) for t in range(T)}
     seen = dataclasses.replace(truth(), own_images=own, masks=random_masks(5))
-    poses = solution().transl.copy()
+    poses = solution().poses.transl.copy()
     poses[0, 0, 2] = 0.5
     poses[0, 1] = np.nan
-    result = dataclasses.replace(solution(), transl=poses, valid=np.isfinite(poses).all(-1))
+    result = solution().with_arrays(transl=poses, valid=np.isfinite(poses).all(-1))
     measured = np.ones((N, T), bool)
     found, expected = compare_masks(result, BIRD, seen, measured, AT, silent), by_whole_images(result, seen, measured)
     np.testing.assert_allclose(found.iou, expected[0], atol=1e-4)

@@ -48,16 +48,16 @@ def make(**changes):
         "ambiguity_deg": some() ** 2,
         "doubts": rng.integers(-1, 32, (N, T)),
     }
-    return Solution(**values | changes)
+    return Solution.from_arrays(**values | changes)
 
 
 def assert_same(a: Solution, b: Solution):
-    for name, value in vars(a).items():
-        if isinstance(value, np.ndarray):
-            np.testing.assert_array_equal(value, getattr(b, name), err_msg=name)
-            assert value.dtype == getattr(b, name).dtype, name
-    for name in ("focal_px", "crop_px", "keypoint_names", "joint_names", "fps"):
-        assert getattr(a, name) == getattr(b, name), name
+    assert a.arrays().keys() == b.arrays().keys()
+    for name, value in (a.arrays() | {"timestamp_s": a.timestamp_s}).items():
+        again = (b.arrays() | {"timestamp_s": b.timestamp_s})[name]
+        np.testing.assert_array_equal(value, again, err_msg=name)
+        assert np.asarray(value).dtype == np.asarray(again).dtype, name
+    assert (a.keypoint_names, a.joint_names, a.fps) == (b.keypoint_names, b.joint_names, b.fps)
     assert list(a.loss) == list(b.loss)
     for term in a.loss:
         np.testing.assert_array_equal(a.loss[term], b.loss[term])
@@ -76,9 +76,22 @@ def test_what_is_saved_is_loaded(tmp_path, changes):
     np.testing.assert_array_equal(bird.vertices, BIRD.vertices)
 
 
+def test_old_attributes_name_their_place():
+    with pytest.raises(AttributeError, match=r"use solution\.keypoints\.px"):
+        make().keypoints_px  # noqa: B018
+    assert not hasattr(make(), "no_such_thing")
+
+
+def test_a_solution_prints_a_summary():
+    lines = str(make(valid=np.ones((N, T), bool))).splitlines()
+    assert 8 <= len(lines) <= 12
+    assert "2: 1 ok, 1 no usable frame" in lines[1]
+    assert "6 of 6, 8 joints" in lines[4]
+
+
 def test_no_birds_at_all(tmp_path):
-    arrays = {name: value[:0] for name, value in vars(make()).items() if getattr(value, "shape", ())[:1] == (N,)}
-    empty = replace(make(), **arrays, loss={"mask": np.zeros(0)})
+    arrays = {name: value[:0] for name, value in make().arrays().items() if np.shape(value)[:1] == (N,)}
+    empty = make().with_arrays(**arrays, loss={"mask": np.zeros(0)})
     save_solution(empty, BIRD, "", {}, tmp_path / "out")
     assert_same(load_solution(tmp_path / "out")[0], empty)
 
@@ -144,7 +157,7 @@ def test_a_summary_that_is_no_json_writes_nothing(tmp_path):
     [
         ({"valid": np.ones((N, T + 1), bool)}, "valid must have shape .* T is 3 in frame_index"),
         ({"body_pose": np.ones((N, T, J - 1, 4))}, "body_pose must have shape .* axis 3 should be 3"),
-        ({"bone_length": np.ones((N, T, 3))}, "bone_length must have shape .* J-1 is 7 in body_pose"),
+        ({"bone_length": np.ones((N, T, 3))}, "bone_length must have shape .* bones is 7 in body_pose"),
         ({"joint_names": ("root",)}, "joint_names must be 8"),
         ({"keypoint_names": ("a",)}, "keypoint_names must have shape .* K is 12 in keypoints_cam"),
         ({"status": ["ok"]}, "status must have shape .* N is 2"),
@@ -267,7 +280,7 @@ def test_values_that_no_fit_gives(changes, message):
     changes = {"valid": np.ones((N, T), bool)} | changes
     (name, kind) = list(changes.items())[-1]
     if isinstance(kind, str):
-        changes[name] = np.array(getattr(make(), name))
+        changes[name] = np.array(make().arrays()[name])
         changes[name][1, 1] = -1 if kind == "negative" else math.nan
     with pytest.raises(ValueError, match=message):
         make(**changes)

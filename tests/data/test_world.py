@@ -35,7 +35,7 @@ def largest_error_px(solution, lens, rig, v):
     vertices_m = rig.scenes[v].birds[0].vertices_world * UNIT
     errors = [
         drawn[..., :2] - rig.cameras[v].project(vertices_m),
-        solution.keypoints_px[0] - rig.scenes[v].poses.keypoints_px[0],
+        solution.keypoints.px[0] - rig.scenes[v].poses.keypoints_px[0],
     ]
     return max(np.linalg.norm(error, axis=-1).max() for error in errors), drawn
 
@@ -55,7 +55,7 @@ def test_the_mesh_lies_where_each_camera_films_it(rig, placed, folder, v):
 def test_the_first_camera_draws_the_result_itself(placed, folder, tmp_path):
     assert as_filmed(folder, placed, BIRD)[0] is placed
     assert as_filmed(tmp_path, placed, BIRD) == (placed, None)
-    crops = replace(placed, R_world_root=None, transl_world_m=None, keypoints_world_m=None, contact=None)
+    crops = replace(placed, world=None, contact=None)
     assert as_filmed(folder, crops, BIRD) == (crops, None)
 
 
@@ -63,19 +63,18 @@ def test_a_result_in_crops_comes_into_the_frame_of_its_camera(rig, placed, folde
     """A fit of one view without a ledge has crops, and birds of the size of the model."""
     s, factor = placed, 1.25
     crop = np.array([0, 0, 100], np.float32)
-    cropped = replace(
-        s,
-        scale=factor * s.scale,
-        transl=factor * s.transl,
-        keypoints_cam=factor * s.keypoints_cam,
-        crop=0 * s.crop + crop,
+    cropped = s.with_arrays(
+        scale=factor * s.poses.scale,
+        transl=factor * s.poses.transl,
+        keypoints_cam=factor * s.keypoints.cam,
+        crop=0 * s.crops.square_px + crop,
     )
     cropped = replace(cropped, footage=FootageIdentity(frames=7))
     seen, lens = as_filmed(folder, cropped, BIRD)
     assert seen.footage == cropped.footage
     assert lens.name == rig.cameras[0].name
     assert largest_error_px(seen, lens, rig, 0)[0] < 0.05
-    np.testing.assert_allclose(seen.scale, placed.scale, rtol=1e-5)
+    np.testing.assert_allclose(seen.poses.scale, placed.poses.scale, rtol=1e-5)
     assert as_filmed(folder, cropped, BIRD, rig.cameras[1].name)[0].footage is None
 
 
@@ -85,9 +84,9 @@ def test_birds_that_a_camera_cannot_see_have_no_pose(rig, placed):
     assert not in_camera(placed, BIRD, back).valid.any()
     # beyond its turning point, the lens model folds distant points into the picture
     matrix, aside = np.array([[300.0, 0, 160], [0, 300, 100], [0, 0, 1]]), np.array([-8.0, 0.0, 4.0])
-    root = placed.transl_world_m[0, 0]
+    root = placed.world.transl_world_m[0, 0]
     folding = Camera("wide", matrix, np.array([-0.3, 0, 0, 0]), np.eye(3), aside - root, (320, 200))
-    assert (np.abs(folding.project(placed.keypoints_world_m[0]) - [160, 100]) < 300).all()
+    assert (np.abs(folding.project(placed.world.keypoints_world_m[0]) - [160, 100]) < 300).all()
     assert not in_camera(placed, BIRD, folding).valid.any()
 
 
@@ -101,7 +100,7 @@ def test_birds_that_a_camera_cannot_see_have_no_pose(rig, placed):
 def test_wrong_names_of_cameras(placed, folder, name, world, message):
     none = {"R_world_root": None, "transl_world_m": None, "keypoints_world_m": None, "contact": None}
     with pytest.raises(InputError, match=message):
-        as_filmed(folder, placed if world else replace(placed, **none), BIRD, name)
+        as_filmed(folder, placed if world else placed.with_arrays(**none), BIRD, name)
 
 
 def test_missing_cameras(placed, tmp_path):

@@ -22,7 +22,7 @@ ACTS = {5: [(0, "stand"), (12, "preen")], 3: [(0, "walk"), (11, "stand")]}
 
 def moved(n, t, k=slice(None), by=(6, 8)):
     """The truth, but for some keypoints of one bird and frame: 10 px off."""
-    points = solution().keypoints_px.copy()
+    points = solution().keypoints.px.copy()
     points[n, t, k] += by
     return solution(keypoints_px=points)
 
@@ -91,7 +91,7 @@ def test_two_results_of_the_same_birds():
 
 
 def test_all_of_it_can_be_stored():
-    true = solution(crop=np.array(solution().crop))
+    true = solution(crop=np.array(solution().crops.square_px))
     valid = np.array([[True] * T, [True, False, True, False]])
     for result in (
         evaluate(moved(0, 1), BIRD, Truth(truth(), true, behaviours=ACTS)),

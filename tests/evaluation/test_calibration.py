@@ -24,9 +24,9 @@ SD_RAD = 0.05
 
 def with_error_bars(solution: Solution, **values) -> Solution:
     """Return a solution with error bars: 0 or the given values."""
-    sizes = {"N": N, "T": T, "K": K, "J-1": J - 1, "S": BIRD.num_shapes, "2": 2, "3": 3}
+    sizes = {"N": N, "T": T, "K": K, "bones": J - 1, "S": BIRD.num_shapes, "2": 2, "3": 3}
     arrays = {name: np.zeros([sizes[s] for s in shape.split()], np.float32) for name, (shape, _) in ERROR_BARS.items()}
-    return dataclasses.replace(solution, **(arrays | values))
+    return solution.with_arrays(**(arrays | values))
 
 
 def made(scale=1.0, seed=0):
@@ -47,12 +47,11 @@ def made(scale=1.0, seed=0):
 
     error_cam -= error_cam.mean(2, keepdims=True)
     result = with_error_bars(
-        dataclasses.replace(
-            true,
-            keypoints_cam=true.keypoints_cam + error_cam,
-            keypoints_px=true.keypoints_px + error_px,
-            global_orient=turned(true.global_orient),
-            body_pose=turned(true.body_pose),
+        true.with_arrays(
+            keypoints_cam=true.keypoints.cam + error_cam,
+            keypoints_px=true.keypoints.px + error_px,
+            global_orient=turned(true.poses.global_orient),
+            body_pose=turned(true.poses.body_pose),
         ),
         keypoints_centred_cov=covariance_cam,
         keypoints_px_cov=covariance_px,
@@ -90,11 +89,11 @@ def test_poses_without_error_bars_do_not_count():
     result, truth = made()
     misfit = np.ones((N, T), np.float32)
     misfit[0, :10] = np.nan
-    found = calibration(dataclasses.replace(result, misfit=misfit), truth)
+    found = calibration(result.with_arrays(misfit=misfit), truth)
     assert (found.frames, found.without_error_bars) == (N * T - 10, 10)
     assert found.groups["angles"].overall.count == 3 * (N * T - 10) * J
     with pytest.raises(InputError, match="shares no bird"):
-        calibration(dataclasses.replace(result, misfit=np.full((N, T), np.nan)), truth)
+        calibration(result.with_arrays(misfit=np.full((N, T), np.nan)), truth)
 
 
 def test_command(tmp_path, capsys):
@@ -115,7 +114,7 @@ def test_command(tmp_path, capsys):
     capsys.readouterr()
     assert main([*command, "--plot", str(tmp_path / "plot.png")]) != 0
     assert "without --calibration" in capsys.readouterr().err.replace("\n", " ")
-    save_solution(dataclasses.replace(result, **dict.fromkeys(ERROR_BARS)), BIRD, "", {}, tmp_path / "plain")
+    save_solution(dataclasses.replace(result, error_bars=None), BIRD, "", {}, tmp_path / "plain")
     command[1] = str(tmp_path / "plain")
     assert main([*command, "--calibration"]) != 0
     assert "no error bars" in capsys.readouterr().err.replace("\n", " ")

@@ -30,7 +30,7 @@ def test_the_truth_is_perfect():
 
 def test_a_known_error():
     """All keypoints 6, 8 px off: 10 px of each mask's side; steady, so nothing in velocity."""
-    off = solution(keypoints_px=solution().keypoints_px + np.float32([6, 8]))
+    off = solution(keypoints_px=solution().keypoints.px + np.float32([6, 8]))
     result = evaluate(off, BIRD, truth()).overall
     own = np.array([[PosedBirds(off, BIRD).vertices_screen(n, t)[:, :2] for t in range(T)] for n in range(N)])
     extent = np.ptp(own, axis=2).max(-1)
@@ -43,20 +43,20 @@ def test_a_known_error():
 
 def test_velocity_counts_neighbouring_frames_alone():
     """One frame jumps by 10 px: two pairs of 3 see it; frames 12 and 14 are no neighbours."""
-    points = solution().keypoints_px.copy()
+    points = solution().keypoints.px.copy()
     points[0, 1] += [6, 8]
     result = evaluate(solution(keypoints_px=points), BIRD, truth())
     assert result.tracks[5]["me_v"] == pytest.approx(np.sqrt((100 / sides()[0, :2] ** 2).mean()), rel=0.02)
-    points = solution().keypoints_px.copy()
+    points = solution().keypoints.px.copy()
     points[0, 3] += [6, 8]
     assert evaluate(solution(keypoints_px=points), BIRD, truth()).tracks[5]["me_v"] == pytest.approx(0, abs=1e-6)
 
 
 def test_every_second_frame_has_velocity_and_acceleration():
     """Velocity and acceleration are per frame of the file: with twice the frame numbers, all metrics stay the same."""
-    points = solution().keypoints_px.copy()
+    points = solution().keypoints.px.copy()
     points[0, 1] += [6, 8]
-    moved = solution(keypoints_px=points, body_pose=solution().body_pose[:, ::-1])
+    moved = solution(keypoints_px=points, body_pose=solution().poses.body_pose[:, ::-1])
     expected = evaluate(moved, BIRD, Truth(truth(), solution())).overall
     every_second = 2 * truth().frame_index
     result, seen, poses = (dataclasses.replace(each, frame_index=every_second) for each in (moved, truth(), solution()))
@@ -66,7 +66,7 @@ def test_every_second_frame_has_velocity_and_acceleration():
 
 
 def test_overlap_of_a_shifted_mesh():
-    moved = solution(crop=solution().crop + np.float32([7, 0, 0]))
+    moved = solution(crop=solution().crops.square_px + np.float32([7, 0, 0]))
     seen, overlap = truth(), []
     for n in range(N):
         for t in range(T):
@@ -99,7 +99,7 @@ def test_pixels_of_other_birds_do_not_count():
 def test_poses_that_are_missing():
     valid = np.ones((N, T), bool)
     valid[0, 1:3] = valid[1, 0] = False
-    points = solution().keypoints_px.copy()
+    points = solution().keypoints.px.copy()
     points[~valid] = np.nan
     result = evaluate(solution(valid=valid, keypoints_px=points), BIRD, truth())
     assert (result.frames, result.missing) == (5, 3)
@@ -178,7 +178,7 @@ def test_tracks_named_by_a_tracker():
 def test_the_truth_of_another_video_is_reported(caplog):
     evaluate(solution(), BIRD, Truth(truth(), source="t.json"))
     assert not caplog.records
-    elsewhere = solution(crop=solution().crop + np.float32([200, 0, 0]))
+    elsewhere = solution(crop=solution().crops.square_px + np.float32([200, 0, 0]))
     evaluate(elsewhere, BIRD, Truth(truth(), source="t.json"))
     (record,) = caplog.records
     assert record.levelname == "WARNING"
@@ -201,7 +201,7 @@ def test_progress_counts_the_birds():
 
 def test_wrong_poses_are_counted_with_their_flags():
     """Two poses have joints turned far away, and one of them is flagged."""
-    body_pose, doubts = solution().body_pose.copy(), np.zeros((N, T), np.int8)
+    body_pose, doubts = solution().poses.body_pose.copy(), np.zeros((N, T), np.int8)
     body_pose[0, 1:3] += 1.5
     doubts[0, 1] = doubts[1, 3] = 1
     exact = Truth(truth(), solution())

@@ -24,7 +24,7 @@ def result(tracks, frames=FRAMES):
     seen = truth(tracks, frames)
     N, T = seen.present.shape
     K = len(NAMES)
-    return Solution(
+    return Solution.from_arrays(
         track_id=seen.track_id,
         frame_index=seen.frame_index,
         valid=seen.present,
@@ -71,7 +71,7 @@ def test_a_tracker_has_ids_of_its_own(ids):
     renamed, matching = match_tracks(own, truth(TWO))
     assert matching == ("overlap", dict(zip(ids, (1, 2), strict=True)), [], [])
     assert renamed.track_id.tolist() == [1, 2]
-    np.testing.assert_array_equal(renamed.keypoints_px, own.keypoints_px)
+    np.testing.assert_array_equal(renamed.keypoints.px, own.keypoints.px)
     assert match_tracks(own, truth(TWO), "ids")[1].by == "ids"
 
 

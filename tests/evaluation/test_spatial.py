@@ -29,7 +29,7 @@ WHOLE = [*(CENTRE - SCENE / 2), SCENE]
 def build(poses, crop=WHOLE, **changes):
     """A solution of N poses, each of T frames."""
     numbered = {"track_id": np.array([5, 3]), "frame_index": np.array(FRAMES)}
-    return dataclasses.replace(solution_of(BIRD, poses, crop), **numbered | changes)
+    return solution_of(BIRD, poses, crop).with_arrays(**numbered | changes)
 
 
 def random_poses(seed, scale=1.2):
@@ -110,8 +110,10 @@ def test_a_crop_camera_is_undone(factor):
 def test_without_the_correction_the_bird_is_turned():
     """A crop that claims to look along the axis is wrong by the angle of the ray."""
     solution = in_crop_cameras(true_poses())
-    middle = np.concatenate([CENTRE - solution.crop[..., 2:] / 2, solution.crop[..., 2:]], axis=-1)
-    row = row_of(errors(dataclasses.replace(solution, crop=middle)))
+    middle = np.concatenate(
+        [CENTRE - solution.crops.square_px[..., 2:] / 2, solution.crops.square_px[..., 2:]], axis=-1
+    )
+    row = row_of(errors(solution.with_arrays(crop=middle)))
     roots = np.concatenate([root_rest(p) + np.asarray(p.transl) for p in true_poses()])
     angles = np.rad2deg(np.arccos(roots[:, 2] / np.linalg.norm(roots, axis=1)))
     assert angles.mean() > 25
@@ -170,10 +172,10 @@ def test_every_figure_by_hand():
     valid[0, 1] = valid[1, 5] = False
     predicted = random_poses(1, scale=0.8)
     solution = build(predicted, valid=valid)
-    holes = {name: np.array(getattr(solution, name)) for name in ("transl", "scale", "keypoints_cam", "crop")}
+    holes = {name: np.array(solution.arrays()[name]) for name in ("transl", "scale", "keypoints_cam", "crop")}
     for array in holes.values():
         array[~valid] = np.nan
-    found = errors(dataclasses.replace(solution, **holes))
+    found = errors(solution.with_arrays(**holes))
     expected = oracle(predicted, true_poses(), valid)
     assert row_of(found) == pytest.approx(expected, rel=2e-4)
     alone = oracle(predicted[1:], true_poses()[1:], valid[1:])
@@ -185,11 +187,10 @@ def test_tracks_and_frames_are_matched_by_name():
     """The truth has more of both, in another order, and knows nothing of one frame."""
     some = build(true_poses())
     valid = np.array([[True] * T, [True, False, *[True] * (T - 2)]])
-    other = dataclasses.replace(
-        some,
+    other = some.with_arrays(
         valid=valid,
         **{
-            name: np.array(getattr(some, name))[::-1]
+            name: np.array(some.arrays()[name])[::-1]
             for name in ("track_id", "global_orient", "body_pose", "transl", "scale", "bone_length", "betas")
         },
     )
@@ -201,7 +202,7 @@ def test_tracks_and_frames_are_matched_by_name():
     assert row_of(found)["mpjpe"] < 1e-3
     for changes in ({"track_id": np.array([50, 30])}, {"frame_index": np.arange(20, 26)}):
         with pytest.raises(InputError, match="share no track and frame"):
-            errors(dataclasses.replace(solution, **changes), other)
+            errors(solution.with_arrays(**changes), other)
 
 
 def test_nothing_to_measure_is_nan():
@@ -225,14 +226,14 @@ def test_another_model_is_compared_by_keypoints():
     assert found.points == "keypoints"
     row = row_of(found)
     assert math.isnan(row["orientation_deg"])
-    p, q = (np.asarray(s.keypoints_cam, float) for s in (solution, build(true_poses())))
+    p, q = (np.asarray(s.keypoints.cam, float) for s in (solution, build(true_poses())))
     p, q = p - p.mean(2, keepdims=True), q - q.mean(2, keepdims=True)
     scale = (p * q).sum((1, 2, 3)) / (p * p).sum((1, 2, 3))
     expected = np.linalg.norm(scale[:, None, None, None] * p - q, axis=-1).mean()
     assert row["mpjpe"] == pytest.approx(expected, rel=1e-4)
     # a model twice as large at rest, at half the scale: the same apparent size
     twice = dataclasses.replace(bird, vertices=2 * bird.vertices, joints=2 * bird.joints)
-    half = dataclasses.replace(solution, scale=solution.scale / 2)
+    half = solution.with_arrays(scale=solution.poses.scale / 2)
     assert row_of(errors(half, bird=twice))["size_error"] == pytest.approx(row["size_error"], rel=1e-4)
 
 
@@ -243,8 +244,8 @@ def test_joints_are_compared_by_name():
     parents = tuple(-1 if BIRD.parents[j] < 0 else order.index(BIRD.parents[j]) for j in order)
     bird = dataclasses.replace(BIRD, joints=BIRD.joints[np.array(order)], joint_names=names, parents=parents)
     solution, bones = in_crop_cameras(true_poses()), np.array(order[1:]) - 1
-    moved = {name: getattr(solution, name)[:, :, bones] for name in ("body_pose", "bone_length")}
-    found = errors(dataclasses.replace(solution, joint_names=names, **moved), bird=bird)
+    moved = {name: solution.arrays()[name][:, :, bones] for name in ("body_pose", "bone_length")}
+    found = errors(solution.with_arrays(joint_names=names, **moved), bird=bird)
     assert found.points == "joints"
     assert row_of(found)["mpjpe"] < 1e-3
 
@@ -253,7 +254,7 @@ def test_joints_are_compared_by_name():
     ("changes", "message"),
     [
         (
-            {"crop": in_crop_cameras(true_poses()).crop},
+            {"crop": in_crop_cameras(true_poses()).crops.square_px},
             "follow the birds, not in one camera .*a fit is no truth",
         ),
         ({"valid": np.zeros((N, T), bool)}, "are all invalid"),

@@ -24,7 +24,7 @@ def scene(tmp_path):
 
 
 def one_camera():
-    return np.array(solution().crop)
+    return np.array(solution().crops.square_px)
 
 
 def test_a_coco_file(scene):

@@ -50,13 +50,13 @@ def test_tables_hold_a_row_for_every_bird_and_frame(folder, made, tmp_path):
     assert float(rows[3]["time_s"]) == pytest.approx(FRAMES[3] / FPS)
     assert 0 < float(rows[0]["track_mean_confidence"]) < 1
     for k, name in enumerate(made.keypoint_names):
-        expected = np.where(valid, made.keypoints_px[:, :, k, 1], np.nan)
+        expected = np.where(valid, made.keypoints.px[:, :, k, 1], np.nan)
         np.testing.assert_array_equal(column(rows, f"{name}_y_px"), expected)
-        expected = np.where(valid, made.keypoints_cam[:, :, k, 2] / made.scale * 0.02, np.nan)
+        expected = np.where(valid, made.keypoints.cam[:, :, k, 2] / made.poses.scale * 0.02, np.nan)
         np.testing.assert_allclose(column(rows, f"{name}_z_m"), expected, rtol=1e-6)
     for j, name in enumerate(made.joint_names[1:]):
         np.testing.assert_array_equal(
-            column(angles, f"{name}_x_rad"), np.where(valid, made.body_pose[:, :, j, 0], np.nan)
+            column(angles, f"{name}_x_rad"), np.where(valid, made.poses.body_pose[:, :, j, 0], np.nan)
         )
 
 
@@ -108,7 +108,7 @@ def test_netcdf_for_movement(folder, made, tmp_path, dims, names):
         position = data.position.transpose(names[1], "time", names[0], "space").values
         assert np.isnan(position[:, 3]).all()
         expected = np.where(
-            made.valid[..., None, None], made.keypoints_cam / made.scale[..., None, None] * 0.02, np.nan
+            made.valid[..., None, None], made.keypoints.cam / made.poses.scale[..., None, None] * 0.02, np.nan
         )
         np.testing.assert_allclose(np.delete(position, 3, axis=1), expected, rtol=1e-6)
 
@@ -117,7 +117,7 @@ def test_error_bars(tmp_path):
     """Columns and a variable of standard deviations, in the units of their values."""
     xarray = pytest.importorskip("xarray", reason="xarray is not installed")
     pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")
-    sizes = {"N": 3, "T": len(FRAMES), "K": BIRD.num_keypoints, "J-1": BIRD.num_joints - 1, "S": BIRD.num_shapes}
+    sizes = {"N": 3, "T": len(FRAMES), "K": BIRD.num_keypoints, "bones": BIRD.num_joints - 1, "S": BIRD.num_shapes}
     sizes |= {"2": 2, "3": 3}
     arrays = {name: np.full([sizes[s] for s in shape.split()], 4.0) for name, (shape, _) in ERROR_BARS.items()}
     made = write_result(tmp_path / "result", **arrays)
@@ -128,7 +128,7 @@ def test_error_bars(tmp_path):
     np.testing.assert_allclose(column(rows, "orientation_z_sd_rad"), 2 * expected)
     np.testing.assert_allclose(column(angles, "neck_x_sd_rad"), 2 * expected)
     variance = sum(column(rows, f"bill_tip_{axis}_sd_m") ** 2 for axis in "xyz")  # rotations keep the trace
-    np.testing.assert_allclose(variance, 12 * (expected / 2 * 0.02 / made.scale) ** 2, rtol=1e-5)
+    np.testing.assert_allclose(variance, 12 * (expected / 2 * 0.02 / made.poses.scale) ** 2, rtol=1e-5)
     jaxfit.export_result(tmp_path / "result", "movement", tmp_path / "birds.nc")
     with xarray.open_dataset(tmp_path / "birds.nc", engine="h5netcdf") as data:
         assert data.position_sd.dims == data.position.dims
@@ -147,7 +147,7 @@ def test_keypoint_files_come_back_by_import(folder, made, tmp_path, to, name):
     assert read.keypoint_names == made.keypoint_names
     np.testing.assert_array_equal(read.present[:, at], made.valid[poses])
     points = np.where(read.present[..., None, None], read.keypoints_px, 0)[:, at]
-    np.testing.assert_array_equal(points, np.where(made.valid[..., None, None], made.keypoints_px, 0)[poses])
+    np.testing.assert_array_equal(points, np.where(made.valid[..., None, None], made.keypoints.px, 0)[poses])
     if to == "coco":
         assert read.track_id.tolist() == [3, 7]
         info = json.loads((tmp_path / name).read_text())["info"]

@@ -26,7 +26,7 @@ def folder(tmp_path_factory):
 
 def betas():
     """Track 3 has constant shape coefficients, those of track 7 change."""
-    values = solution().betas.copy()
+    values = solution().poses.betas.copy()
     values[0], values[1, 3:] = [0.5, -0.3], [0.2, 1.0]
     return values
 
@@ -50,7 +50,7 @@ def test_a_reader_poses_the_meshes_as_the_model(folder, glb):
     made, bird = jaxfit.load_solution(folder)
     posed = PosedBirds(made, bird)
     for n in (0, 1):
-        ours = posed.vertices_cam_window(n) * 0.02 / made.scale[n][:, None, None]
+        ours = posed.vertices_cam_window(n) * 0.02 / made.poses.scale[n][:, None, None]
         for t in np.flatnonzero(made.valid[n]):
             read = glb.posed(f"bird_{TRACKS[n]}_mesh", TIMES[t])
             assert rigid_difference(read, ours[t]) < 1e-3 * LENGTH
@@ -60,12 +60,12 @@ def test_the_camera_sees_the_birds_where_the_footage_shows_them(folder, glb):
     made, bird = jaxfit.load_solution(folder)
     posed = PosedBirds(made, bird)
     camera = glb.root["cameras"][0]["perspective"]
-    focal = made.image_size_px[0, 0, 1] / 2 / np.tan(camera["yfov"] / 2)
+    focal = made.crops.image_size_px[0, 0, 1] / 2 / np.tan(camera["yfov"] / 2)
     node = next(i for i, each in enumerate(glb.root["nodes"]) if "camera" in each)
     assert np.allclose(glb.matrix(node, {}), np.eye(4), atol=1e-6)
     for t in (0, 2, 4):
         read = glb.posed("bird_3_mesh", TIMES[t])
-        pixels = focal * read[:, :2] * [1, -1] / -read[:, 2:] + made.image_size_px[0, 0] / 2
+        pixels = focal * read[:, :2] * [1, -1] / -read[:, 2:] + made.crops.image_size_px[0, 0] / 2
         expected = posed.vertices_screen(0, t)[:, :2]
         assert np.linalg.norm(pixels - expected, axis=1).max() < 0.02 * np.ptp(expected, axis=0).max()
 
@@ -108,7 +108,7 @@ def test_the_error_of_fewer_weights_is_reported(tmp_path):
     glb = Glb(tmp_path / "birds.glb")
     error = glb.root["asset"]["extras"]["largest_error_of_four_weights"]
     four = np.array([0.3, 0.2, 0.15, 0.15, 0, 0, 0, 0]) / 0.8
-    pose = made.pose
+    pose = made.poses
     difference = []
     for n, t in np.argwhere(made.valid):
         frame = [np.asarray(getattr(pose, name))[n, t] for name in ("global_orient", "body_pose", "transl", "scale")]

@@ -43,7 +43,7 @@ def test_a_file_holds_one_bird_and_its_keypoints(written):
         assert list(pose.skeleton.nodes) == list(made.keypoint_names)
         for k, name in enumerate(made.keypoint_names):
             series = pose[name]
-            expected = np.where(made.valid[1][:, None], made.keypoints_px[1, :, k], np.nan)
+            expected = np.where(made.valid[1][:, None], made.keypoints.px[1, :, k], np.nan)
             np.testing.assert_array_equal(series.data[:], expected)
             np.testing.assert_allclose(series.timestamps[:], np.array(FRAMES) / FPS)
             assert np.isnan(series.confidence[:]).all()

@@ -58,9 +58,9 @@ def test_tables(folder, without_ledge, made, tmp_path):
 
     np.testing.assert_array_equal(column("on_ledge").astype(np.float32), known(made, made.contact))
     for i, axis in enumerate("xyz"):
-        np.testing.assert_array_equal(column(f"root_{axis}_world_m"), known(made, made.transl_world_m[..., i]))
+        np.testing.assert_array_equal(column(f"root_{axis}_world_m"), known(made, made.world.transl_world_m[..., i]))
         # the camera frame has the true size, too
-        expected = known(made, made.keypoints_cam[:, :, 0, i] * UNIT)
+        expected = known(made, made.keypoints.cam[:, :, 0, i] * UNIT)
         np.testing.assert_allclose(column(f"{made.keypoint_names[0]}_{axis}_m"), expected, rtol=1e-5, atol=1e-5)
     jaxfit.export_result(without_ledge, "csv", tmp_path / "views.csv")
     header = (tmp_path / "views.csv").read_text().partition("\n")[0].split(",")
@@ -90,7 +90,7 @@ def test_movement(folder, without_ledge, made, tmp_path):
     jaxfit.export_result(without_ledge, "movement", tmp_path / "views.nc", space="world", dims="plural")
     with xarray.open_dataset(tmp_path / "ledge.nc", engine="h5netcdf") as data:
         position = data.position.transpose("individual", "time", "keypoint", "space")
-        np.testing.assert_array_equal(position.values, known(made, made.keypoints_world_m))
+        np.testing.assert_array_equal(position.values, known(made, made.world.keypoints_world_m))
         assert data.position.attrs["units"] == "metres"
         assert data.attrs["position_frame"] == "world, z up"
         assert data.on_ledge.dims == ("time", "individual")
@@ -112,7 +112,7 @@ def test_nwb(folder, made, tmp_path):
             assert file.intervals is None or "pose_flags" not in file.intervals  # no flags, no error bars
             assert "keypoints_sd" not in behaviour.data_interfaces
             world, on_ledge = behaviour["keypoints_world"], behaviour["on_ledge"]
-            np.testing.assert_array_equal(world.data[:], known(made, made.keypoints_world_m)[n])
+            np.testing.assert_array_equal(world.data[:], known(made, made.world.keypoints_world_m)[n])
             np.testing.assert_array_equal(on_ledge.data[:], known(made, made.contact)[n])
             assert (world.unit, world.rate) == ("metres", made.fps)
             assert world.description.endswith("Reference frame: world, z up")
@@ -142,7 +142,7 @@ def test_a_world_without_a_ledge_keeps_the_camera_frame(without_ledge, tmp_path)
 
 
 def test_wrong_use(folder, made, tmp_path, capsys):
-    crops = replace(made, R_world_root=None, transl_world_m=None, keypoints_world_m=None, contact=None)
+    crops = made.with_arrays(R_world_root=None, transl_world_m=None, keypoints_world_m=None, contact=None)
     jaxfit.save_solution(crops, BIRD, "", {}, tmp_path / "crops")
     out = ["--out", str(tmp_path / "birds.nc")]
     assert main(["export", str(tmp_path / "crops"), "--to", "movement", "--space", "world", *out]) == 2

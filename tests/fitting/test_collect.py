@@ -42,15 +42,15 @@ def collected(windows, common_size):
 
 def test_a_bird_has_the_size_of_the_model_in_all_windows(windows):
     solution = collected(windows, True)
-    np.testing.assert_array_equal(solution.scale[0], 1)
+    np.testing.assert_array_equal(solution.poses.scale[0], 1)
     for w, result in enumerate(results(True)):
         own = slice(6 * w, 6 * w + 6)
-        pose = dataclasses.replace(result.pose, transl=solution.transl[0, own], scale=solution.scale[0, own])
+        pose = dataclasses.replace(result.pose, transl=solution.poses.transl[0, own], scale=solution.poses.scale[0, own])
         points_cam, points_px = _keypoints(MODEL.rig, MODEL.camera, pose)
-        np.testing.assert_allclose(solution.keypoints_cam[0, own], points_cam, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(solution.keypoints.cam[0, own], points_cam, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(points_px, result.keypoints_px, atol=1e-2)  # the picture of the fitted pose
         expected = crop_to_image(result.keypoints_px, windows.crop[w].astype(np.float32), MODEL.camera.size_px)
-        np.testing.assert_array_equal(solution.keypoints_px[0, own], expected)
+        np.testing.assert_array_equal(solution.keypoints.px[0, own], expected)
 
 
 def test_sizes_of_frames_are_not_changed(windows):
@@ -58,6 +58,6 @@ def test_sizes_of_frames_are_not_changed(windows):
     solution = collected(windows, False)
     for w, result in enumerate(results(False)):
         own = slice(6 * w, 6 * w + 6)
-        np.testing.assert_array_equal(solution.scale[0, own], result.pose.scale)
-        np.testing.assert_array_equal(solution.transl[0, own], result.pose.transl)
-        np.testing.assert_array_equal(solution.keypoints_cam[0, own], result.keypoints_cam)
+        np.testing.assert_array_equal(solution.poses.scale[0, own], result.pose.scale)
+        np.testing.assert_array_equal(solution.poses.transl[0, own], result.pose.transl)
+        np.testing.assert_array_equal(solution.keypoints.cam[0, own], result.keypoints_cam)

@@ -86,7 +86,7 @@ def test_a_term_by_its_path(observed):
     for weight in (0, 1e4):
         solution = fit(observed, BIRD, config_of("own_terms:symmetry", steps=30, weight=weight))
         assert set(solution.loss) == {"keypoints", "own_terms:symmetry"}
-        asymmetry.append(np.abs(solution.body_pose[:, :, left] - solution.body_pose[:, :, right]).mean())
+        asymmetry.append(np.abs(solution.poses.body_pose[:, :, left] - solution.poses.body_pose[:, :, right]).mean())
     assert asymmetry[1] < 0.3 * asymmetry[0]
 
 

@@ -49,14 +49,14 @@ def assert_same(a, b, tracks):
 def test_the_fit_recovers_a_known_truth(solution, observed):
     assert solution.status.tolist() == ["ok"] * 3
     assert solution.valid.all()
-    error_px = np.linalg.norm(solution.keypoints_px - keypoints_of(truths()), axis=-1)
+    error_px = np.linalg.norm(solution.keypoints.px - keypoints_of(truths()), axis=-1)
     assert error_px.max() < 1 * SIZE / 256  # one pixel of a 256-pixel crop
     for n, truth in enumerate(truths()):
-        R, R_true = exp_map(solution.global_orient[n]), exp_map(np.asarray(truth.global_orient))
+        R, R_true = exp_map(solution.poses.global_orient[n]), exp_map(np.asarray(truth.global_orient))
         angle = Rotation.from_matrix(R.transpose(0, 2, 1) @ R_true).magnitude()
         assert np.rad2deg(angle).max() < 20  # a coarse bird
         # only the ratio of scale and depth is observable
-        size = solution.scale[n] / solution.transl[n, :, 2]
+        size = solution.poses.scale[n] / solution.poses.transl[n, :, 2]
         np.testing.assert_allclose(size, float(truth.scale[0]) / 200, rtol=0.05)
     result = evaluate(solution, BIRD, observed).overall
     assert result["pck@0.05"] == 1
@@ -66,13 +66,13 @@ def test_the_fit_recovers_a_known_truth(solution, observed):
 
 def test_the_arrays_of_the_solution_are_consistent(solution):
     for n in range(3):
-        pose = jax.tree.map(lambda values, n=n: values[n], solution.pose)
-        pose = dataclasses.replace(pose, bone_length=solution.bone_length[n, 0], betas=solution.betas[n, 0])
+        pose = jax.tree.map(lambda values, n=n: values[n], solution.poses)
+        pose = dataclasses.replace(pose, bone_length=solution.poses.bone_length[n, 0], betas=solution.poses.betas[n, 0])
         keypoints, _ = pose_window(BIRD, pose)
-        np.testing.assert_allclose(solution.keypoints_cam[n], keypoints, atol=1e-3)
-        np.testing.assert_allclose(solution.keypoints_px[n], project(keypoints, CAMERA), atol=0.02)
-        assert np.ptp(solution.transl[n, :, 2]) == 0  # the depth is fixed and constant in the window
-        np.testing.assert_array_equal(solution.bone_length[n], np.ones((T, BIRD.num_joints - 1)))
+        np.testing.assert_allclose(solution.keypoints.cam[n], keypoints, atol=1e-3)
+        np.testing.assert_allclose(solution.keypoints.px[n], project(keypoints, CAMERA), atol=0.02)
+        assert np.ptp(solution.poses.transl[n, :, 2]) == 0  # the depth is fixed and constant in the window
+        np.testing.assert_array_equal(solution.poses.bone_length[n], np.ones((T, BIRD.num_joints - 1)))
     assert set(solution.loss) == {"keypoints", "mask", "pose_prior", "velocity", "acceleration"}
 
 
@@ -85,7 +85,7 @@ def test_a_diverged_bird_does_not_change_the_other_birds(observed, windows_per_b
     assert result.status.tolist() == ["ok", "diverged", "ok"]
     assert result.valid.all(1).tolist() == [True, False, True]
     assert not result.valid[1].any()
-    assert np.isnan(result.global_orient[1]).all()
+    assert np.isnan(result.poses.global_orient[1]).all()
     assert_same(result, fit(observed, BIRD, settings), [0, 2])
 
 
@@ -102,8 +102,8 @@ def test_a_diverged_window_does_not_change_the_other_windows_of_the_track(first_
     assert result.status.tolist() == ["partly diverged", "ok"]
     assert result.valid[0, good].all()
     assert not result.valid[0, bad].any()
-    np.testing.assert_array_equal(result.body_pose[0, good], healthy.body_pose[0])
-    assert np.isnan(result.body_pose[0, bad]).all()
+    np.testing.assert_array_equal(result.poses.body_pose[0, good], healthy.poses.body_pose[0])
+    assert np.isnan(result.poses.body_pose[0, bad]).all()
     for term, loss in healthy.loss.items():
         assert result.loss[term][0] == pytest.approx(loss[0], rel=1e-5)
     (failure,) = result.failures[0]
@@ -153,9 +153,9 @@ def test_missing_frames_have_no_valid_pose(observed):
     np.testing.assert_array_equal(result.timestamp_s, times_s)
     assert result.fps == 12
     assert result.valid[0].tolist() == [False, True, True, False, True, True]
-    error_px = np.linalg.norm(result.keypoints_px - keypoints_of(truths()[:1]), axis=-1)
+    error_px = np.linalg.norm(result.keypoints.px - keypoints_of(truths()[:1]), axis=-1)
     assert error_px[result.valid].max() < SIZE / 256
-    assert np.isnan(result.global_orient[0, [0, 3]]).all()
+    assert np.isnan(result.poses.global_orient[0, [0, 3]]).all()
 
 
 def test_the_batch_size_does_not_change_the_result(observed, caplog):
@@ -194,10 +194,12 @@ def test_boxes_in_a_large_image(observed, tmp_path):
     """The results are in image pixels, the mesh covers the mask, and a second fit can start from the result."""
     large = in_a_large_image(observed)
     result = fit(large, BIRD, config(mode="box"))
-    assert (result.crop[..., 2] != SIZE).all(), "the test needs a scaled crop"
-    np.testing.assert_array_equal(result.image_size_px[result.valid], np.tile([400, 300], (result.valid.sum(), 1)))
-    assert not result.image_size_px[~result.valid].any()
-    error_px = np.linalg.norm(result.keypoints_px - keypoints_of(truths()) - np.array([210, 90]), axis=-1)
+    assert (result.crops.square_px[..., 2] != SIZE).all(), "the test needs a scaled crop"
+    np.testing.assert_array_equal(
+        result.crops.image_size_px[result.valid], np.tile([400, 300], (result.valid.sum(), 1))
+    )
+    assert not result.crops.image_size_px[~result.valid].any()
+    error_px = np.linalg.norm(result.keypoints.px - keypoints_of(truths()) - np.array([210, 90]), axis=-1)
     assert error_px.max() < 0.5
     assert evaluate(result, BIRD, large).overall["iou"] > 0.85
     save_solution(result, BIRD, config_to_yaml(config()), {}, tmp_path / "out")

@@ -97,7 +97,7 @@ def test_equal_first_stages_are_computed_once(observed, monkeypatch):
     assert counts == [BIRDS, 3 * BIRDS]
     for each, solution in zip(sweep, shared, strict=True):
         assert_equal(solution, fit(observed, BIRD, each))
-    assert np.abs(shared[0].keypoints_px - shared[2].keypoints_px).max() > 0.01
+    assert np.abs(shared[0].keypoints.px - shared[2].keypoints.px).max() > 0.01
 
 
 def test_hypotheses_of_different_runs_are_not_mixed(observed, monkeypatch):

@@ -52,7 +52,7 @@ def views_of(rig, which, observations):
 def truth_m(rig):
     """True keypoints in the world, metres."""
     camera = rig.cameras[0]
-    return (rig.scenes[0].poses.keypoints_cam.astype(float) * UNIT - camera.transl_cam) @ camera.R_cam_world
+    return (rig.scenes[0].poses.keypoints.cam.astype(float) * UNIT - camera.transl_cam) @ camera.R_cam_world
 
 
 @pytest.fixture(scope="module")
@@ -61,29 +61,31 @@ def solution(rig):
 
 
 def error_mm(solution, truth_m):
-    error = np.linalg.norm(solution.keypoints_world_m - truth_m, axis=-1)
+    error = np.linalg.norm(solution.world.keypoints_world_m - truth_m, axis=-1)
     return 1000 * error[solution.valid].mean()
 
 
 def test_exact_keypoints_give_the_birds_in_the_world(rig, solution, truth_m):
     assert solution.status.tolist() == ["ok", "ok"]
     assert solution.valid.all()
-    assert not solution.doubts.any()  # keypoints and masks of all views support the poses
+    assert not solution.flags.doubts.any()  # keypoints and masks of all views support the poses
     assert error_mm(solution, truth_m) < 6  # of a bird of 42 cm
-    sizes = solution.scale[:, 0] / rig.scenes[0].poses.scale[:, 0]
+    sizes = solution.poses.poses.scale[:, 0] / rig.scenes[0].poses.poses.scale[:, 0]
     np.testing.assert_allclose(sizes, 1, atol=0.03)
-    true_root = (rig.scenes[0].poses.transl * UNIT - rig.cameras[0].transl_cam) @ rig.cameras[0].R_cam_world
-    assert np.abs(solution.transl_world_m - true_root).max() < 0.015
+    true_root = (rig.scenes[0].poses.poses.transl * UNIT - rig.cameras[0].transl_cam) @ rig.cameras[0].R_cam_world
+    assert np.abs(solution.world.transl_world_m - true_root).max() < 0.015
 
 
 def test_the_pose_in_the_first_camera_is_the_pose_in_the_world(rig, solution):
     camera = rig.cameras[0]
-    np.testing.assert_allclose(camera.to_camera(solution.keypoints_world_m) / UNIT, solution.keypoints_cam, atol=1e-3)
-    np.testing.assert_allclose(camera.project(solution.keypoints_world_m), solution.keypoints_px, atol=1e-2)
-    crop = solution.crop[0, 0]
-    pinhole = camera.pinhole().project(solution.keypoints_world_m[0, 0])
-    focal = solution.focal_px * crop[2] / solution.crop_px
-    points = solution.keypoints_cam[0, 0].astype(float)
+    np.testing.assert_allclose(
+        camera.to_camera(solution.world.keypoints_world_m) / UNIT, solution.keypoints.cam, atol=1e-3
+    )
+    np.testing.assert_allclose(camera.project(solution.world.keypoints_world_m), solution.keypoints.px, atol=1e-2)
+    crop = solution.crops.square_px[0, 0]
+    pinhole = camera.pinhole().project(solution.world.keypoints_world_m[0, 0])
+    focal = solution.crops.focal_px * crop[2] / solution.crops.crop_px
+    points = solution.keypoints.cam[0, 0].astype(float)
     np.testing.assert_allclose(focal * points[:, :2] / points[:, 2:] + crop[:2] + crop[2] / 2, pinhole, atol=1e-2)
 
 
@@ -136,24 +138,24 @@ def test_one_view_is_the_fit_of_one_camera(rig, truth_m):
         np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
     # one view does not know the size of a bird: 10 % of a distance of 5 m
     assert error_mm(found, truth_m) < 500
-    shown = rig.cameras[1].pinhole().project(found.keypoints_world_m)
+    shown = rig.cameras[1].pinhole().project(found.world.keypoints_world_m)
     shift = views.cameras[0].matrix[:2, 2] - rig.cameras[1].matrix[:2, 2]
-    assert np.abs(shown + shift - found.keypoints_px)[found.valid].max() < 4
+    assert np.abs(shown + shift - found.keypoints.px)[found.valid].max() < 4
 
 
 def test_exports_hold_the_world_and_the_true_size(solution, rig, tmp_path):
     facts = {"model": "murre"}
     save_solution(solution, BIRD, config_to_yaml(CONFIG), facts, tmp_path / "result")
     exported = open_result(tmp_path / "result", tracks=[2])
-    np.testing.assert_array_equal(exported.solution.transl_world_m, solution.transl_world_m[1:])
+    np.testing.assert_array_equal(exported.solution.world.transl_world_m, solution.world.transl_world_m[1:])
     # the camera frame of the export is that of the first camera, in metres
-    expected = rig.cameras[0].to_camera(solution.keypoints_world_m[1:])
+    expected = rig.cameras[0].to_camera(solution.world.keypoints_world_m[1:])
     np.testing.assert_allclose(exported.keypoints_3d, expected, atol=1e-3)
     export_result(tmp_path / "result", "csv", tmp_path / "birds.csv")
     with (tmp_path / "birds.csv").open() as file:
         first = next(csv.DictReader(file))
     world = [float(first[f"root_{axis}_world_m"]) for axis in "xyz"]
-    np.testing.assert_allclose(world, solution.transl_world_m[0, 0], atol=1e-9)
+    np.testing.assert_allclose(world, solution.world.transl_world_m[0, 0], atol=1e-9)
     with pytest.raises(InputError, match="is in a world, where tracks cannot be corrected"):
         read_tracks(tmp_path / "result")
 
@@ -178,7 +180,7 @@ def test_initial_poses_align_the_bird_with_triangulated_keypoints(rig, truth_m):
     assert np.abs(found.points_world - truth_m)[both].max() < 0.002
     points = found.points_world / UNIT
     initial = initial_poses(BIRD, points, both.astype(float), "truth")
-    true_scale = rig.scenes[0].poses.scale[:, 0]
+    true_scale = rig.scenes[0].poses.poses.scale[:, 0]
     np.testing.assert_allclose(initial.scale[:, 0] / true_scale, 1, atol=0.1)
     nothing = np.zeros(both.shape)
     with pytest.raises(InputError, match="have no frame with 4 keypoints"):
@@ -211,10 +213,10 @@ def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
     assert "16 poses of 2 birds in 3 views" in printed
     assert re.search(r"poses: [\d.]+ % ok, [\d.]+ % unsure, [\d.]+ % contradicted", printed)
     solution, summary = load_solution(out)[0], json.loads((out / "summary.json").read_text())
-    assert summary["flags"] == flag_counts(solution.doubts)
+    assert summary["flags"] == flag_counts(solution.flags.doubts)
     assert sum(summary["flags"].values()) == 16
-    assert solution.has_world
-    order = np.linalg.norm(solution.transl_world_m[:, None, 0] - truth_m[None, :, 0].mean(-2), axis=-1).argmin(1)
+    assert solution.world is not None
+    order = np.linalg.norm(solution.world.transl_world_m[:, None, 0] - truth_m[None, :, 0].mean(-2), axis=-1).argmin(1)
     assert error_mm(solution, truth_m[order]) < 15
     assert [camera.name for camera in read_cameras(out / "cameras.toml")] == ["cam0", "cam1", "cam2"]
     assert main([*command[:-1], str(tmp_path / "x")]) == 2
@@ -231,10 +233,10 @@ def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
 
 def test_windows_that_share_frames_are_blended_and_have_error_bars(solution, truth_m):
     assert CONFIG.window < FRAMES
-    step_mm = 1000 * np.abs(np.diff(solution.keypoints_world_m - truth_m, axis=1)).max()
+    step_mm = 1000 * np.abs(np.diff(solution.world.keypoints_world_m - truth_m, axis=1)).max()
     assert step_mm < 15  # windows do not jump
-    sd_mm = 1000 * UNIT * np.sqrt(solution.keypoints_cam_cov.trace(axis1=-2, axis2=-1))
+    sd_mm = 1000 * UNIT * np.sqrt(solution.error_bars.keypoints_cam_cov.trace(axis1=-2, axis2=-1))
     assert 0.5 < np.median(sd_mm) < 12
-    assert (solution.scale_sd > 0).all()  # several cameras know the size, up to an error
-    assert solution.keypoints_px_cov.shape == (2, FRAMES, BIRD.num_keypoints, 2, 2)
-    assert np.linalg.eigvalsh(solution.keypoints_cam_cov).min() > 0
+    assert (solution.error_bars.scale_sd > 0).all()  # several cameras know the size, up to an error
+    assert solution.error_bars.keypoints_px_cov.shape == (2, FRAMES, BIRD.num_keypoints, 2, 2)
+    assert np.linalg.eigvalsh(solution.error_bars.keypoints_cam_cov).min() > 0

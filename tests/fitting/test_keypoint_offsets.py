@@ -138,7 +138,7 @@ def test_the_fit_and_its_result_have_the_keypoints_of_the_config():
 
     def error_px(own):
         solution = fit(observations, BIRD, own)
-        return float(np.linalg.norm(solution.keypoints_px - observations.keypoints_px, axis=-1).mean())
+        return float(np.linalg.norm(solution.keypoints.px - observations.keypoints_px, axis=-1).mean())
 
     assert error_px(given) < 0.6 * error_px(PLAIN)
 
@@ -154,7 +154,7 @@ def test_learning_lowers_the_error_and_the_file_repeats_the_fit(tmp_path):
 
     def error_px(own):
         solution = fit(observations, BIRD, own)
-        return float(np.linalg.norm(solution.keypoints_px - observations.keypoints_px, axis=-1).mean())
+        return float(np.linalg.norm(solution.keypoints.px - observations.keypoints_px, axis=-1).mean())
 
     assert error_px(found.config) < 0.7 * error_px(dataclasses.replace(learning, learn_weights=()))
 

@@ -32,11 +32,11 @@ def test_the_width_is_a_factor_on_the_covariance_of_the_model():
     poses = np.random.default_rng(0).multivariate_normal(BIRD.pose_mean, 3.0 * BIRD.pose_covariance, 600)
     result = posed(range(50))
     drawn = poses.reshape(50, T, -1, 3).astype(np.float32)
-    learnt = learn_prior([("a", dataclasses.replace(result, body_pose=drawn), BIRD)])
+    learnt = learn_prior([("a", result.with_arrays(body_pose=drawn), BIRD)])
     assert learnt.width == pytest.approx(3, rel=0.1)
     assert learnt.pose_prior_weight == pytest.approx(1 / 6, rel=0.1)
     still = np.broadcast_to(np.asarray(BIRD.pose_mean, np.float32).reshape(-1, 3), drawn.shape)
-    assert learn_prior([("a", dataclasses.replace(result, body_pose=still), BIRD)]).width == MIN_WIDTH
+    assert learn_prior([("a", result.with_arrays(body_pose=still), BIRD)]).width == MIN_WIDTH
 
 
 def test_oas_by_hand():
@@ -70,9 +70,9 @@ def test_mean_and_covariance():
     solution = posed([1, 2])
     valid = solution.valid.copy()
     valid[0, 3:5] = False
-    body = solution.body_pose.copy()
+    body = solution.poses.body_pose.copy()
     body[0, 3:5] = np.nan
-    solution = dataclasses.replace(solution, valid=valid, body_pose=body)
+    solution = solution.with_arrays(valid=valid, body_pose=body)
     learnt = learn_prior([("a", solution, BIRD)])
     poses = body[valid].reshape(-1, 9).astype(np.float64)
     assert (learnt.poses, learnt.birds, learnt.diverged, learnt.bones_learnt) == (2 * T - 2, 2, 0, False)
@@ -91,8 +91,8 @@ def test_mean_and_covariance():
 
 def test_the_prior_of_one_motionless_bird_is_positive_definite():
     solution = posed([1])
-    still = dataclasses.replace(
-        solution, body_pose=np.broadcast_to(solution.body_pose[:, :1], solution.body_pose.shape)
+    still = solution.with_arrays(
+        body_pose=np.broadcast_to(solution.poses.body_pose[:, :1], solution.poses.body_pose.shape)
     )
     learnt = learn_prior([("a", still, BIRD)])
     assert learnt.effective_poses == 1
@@ -104,7 +104,7 @@ def test_the_prior_of_one_motionless_bird_is_positive_definite():
 def test_bone_lengths_are_learnt_if_they_differ():
     solution = posed([1, 2, 3])
     lengths = np.broadcast_to(np.array([0.9, 1.0, 1.2])[:, None, None], (3, T, 3))
-    learnt = learn_prior([("a", dataclasses.replace(solution, bone_length=lengths), BIRD)])
+    learnt = learn_prior([("a", solution.with_arrays(bone_length=lengths), BIRD)])
     assert learnt.bones_learnt
     np.testing.assert_allclose(learnt.bird.bone_mean, np.full(3, 3.1 / 3), rtol=1e-6)
     np.testing.assert_allclose(np.diag(learnt.bird.bone_covariance), np.var([0.9, 1.0, 1.2]) + 1e-4, rtol=1e-5)

@@ -56,7 +56,7 @@ def moving(birds=3, frames=80, sd_rad_s2=2.0, dof=3.0, fps=25.0, seed=0):
         for own in step:
             R.append(R[-1] * Rotation.from_rotvec(own))
         rotvec[n] = [each.as_rotvec() for each in R]
-    return dataclasses.replace(solution, global_orient=rotvec[:, :, 0], body_pose=rotvec[:, :, 1:], fps=fps)
+    return solution.with_arrays(global_orient=rotvec[:, :, 0], body_pose=rotvec[:, :, 1:], fps=fps)
 
 
 @pytest.mark.parametrize(("sd", "dof"), [(0.5, 0.8), (6.0, 2.0), (300.0, 8.0)])
@@ -90,11 +90,11 @@ def test_accelerations_and_cost_are_those_of_the_term():
     a, runs = accelerations_rad_s2(solution, 0, 0.04)
     assert np.flatnonzero(runs).tolist() == [0, 1, 5, 6, 7, 8, 9]
     expected = np.concatenate(
-        [accelerations(solution.global_orient[0])[:, None], accelerations(solution.body_pose[0])], 1
+        [accelerations(solution.poses.global_orient[0])[:, None], accelerations(solution.poses.body_pose[0])], 1
     )
     np.testing.assert_allclose(a, expected[runs] * 625, atol=1e-6)
     prior = MotionPrior(1.5, 2.0)
-    pose = solution.global_orient[0], solution.body_pose[0], valid[0]
+    pose = solution.poses.global_orient[0], solution.poses.body_pose[0], valid[0]
     term = float(term_value(motion_likelihood, *pose, 0.04, **prior._asdict()))
     at_zero = -multivariate_t(np.zeros(3), 1.5**2 * np.eye(3), 2.0).logpdf(np.zeros(3))
     cost = mean_cost(norm_histogram(np.linalg.norm(a, axis=-1)), prior)
@@ -139,7 +139,7 @@ def test_the_cost_is_that_of_birds_that_were_left_out():
 
 def test_birds_without_motion_give_finite_settings():
     solution = moving(2, 10)
-    still = dataclasses.replace(solution, global_orient=np.zeros((2, 10, 3)), body_pose=np.zeros((2, 10, J - 1, 3)))
+    still = solution.with_arrays(global_orient=np.zeros((2, 10, 3)), body_pose=np.zeros((2, 10, J - 1, 3)))
     learnt = learn_motion([("a", still)])
     assert all(0 < value < 1e3 for value in learnt.prior)
 

@@ -78,7 +78,7 @@ def test_the_learnt_config_is_complete_and_its_fit_learns_nothing(exact, learnt,
         by_fit = fit(observations, BIRD, LEARNING)
     assert "learnt: terms.keypoint_likelihood" in caplog.text
     given = fit(observations, BIRD, learnt.config)
-    np.testing.assert_array_equal(by_fit.body_pose, given.body_pose)
+    np.testing.assert_array_equal(by_fit.poses.body_pose, given.poses.body_pose)
 
 
 @pytest.mark.extended

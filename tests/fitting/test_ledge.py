@@ -35,9 +35,9 @@ def camera(scene):
 def seen(scene):
     """The true poses as one camera knows them: every bird has the size of the model, at the distance that follows."""
     s = scene.poses
-    size = s.scale[..., None]
-    return replace(
-        s, scale=np.ones_like(s.scale), transl=s.transl / size, keypoints_cam=s.keypoints_cam / size[..., None]
+    size = s.poses.scale[..., None]
+    return s.with_arrays(
+        scale=np.ones_like(s.poses.scale), transl=s.poses.transl / size, keypoints_cam=s.keypoints.cam / size[..., None]
     )
 
 
@@ -64,13 +64,13 @@ def true_places_m(scene):
 
 def test_birds_that_stand_are_at_their_places_and_have_their_sizes(scene, placed, flies):
     stands = scene.poses.valid & ~flies
-    error_m = np.linalg.norm(placed.transl_world_m - true_places_m(scene), axis=-1)
+    error_m = np.linalg.norm(placed.world.transl_world_m - true_places_m(scene), axis=-1)
     # the lowest point of a bird is not always a foot, and a foot of a walking bird leaves the ledge
     assert np.median(error_m[stands]) < 0.01
     assert np.percentile(error_m[stands], 95) < 0.06
-    size = np.array([np.median(placed.scale[n][stands[n]]) for n in range(7)])
+    size = np.array([np.median(placed.poses.scale[n][stands[n]]) for n in range(7)])
     np.testing.assert_allclose(size, scene.poses.scale[:, 0], rtol=0.012)
-    np.testing.assert_allclose(placed.keypoints_px[stands], scene.poses.keypoints_px[stands], atol=0.01)
+    np.testing.assert_allclose(placed.keypoints.px[stands], scene.poses.keypoints_px[stands], atol=0.01)
 
 
 def test_contact_shows_which_birds_fly(scene, placed, flies):
@@ -87,20 +87,20 @@ def test_contact_shows_which_birds_fly(scene, placed, flies):
 def test_a_bird_in_the_air_keeps_its_size(scene, placed):
     high = (height_cm(scene) > 5) & scene.poses.valid
     size = np.broadcast_to(scene.poses.scale, high.shape)
-    np.testing.assert_allclose(placed.scale[high], size[high], rtol=0.01)
-    error_m = np.linalg.norm(placed.transl_world_m - true_places_m(scene), axis=-1)
+    np.testing.assert_allclose(placed.poses.scale[high], size[high], rtol=0.01)
+    error_m = np.linalg.norm(placed.world.transl_world_m - true_places_m(scene), axis=-1)
     assert error_m[high].max() < 0.05  # 1 % of 5 m
 
 
 def test_the_pose_in_the_camera_is_the_pose_in_the_world(placed, camera):
     valid = placed.valid
-    world = placed.keypoints_world_m
-    np.testing.assert_allclose(camera.to_camera(world)[valid] / UNIT, placed.keypoints_cam[valid], atol=1e-3)
+    world = placed.world.keypoints_world_m
+    np.testing.assert_allclose(camera.to_camera(world)[valid] / UNIT, placed.keypoints.cam[valid], atol=1e-3)
     moved = replace(camera.pinhole(), distortion=np.array([-0.2, 0.02, 0, 0, 0]))
     bent = on_ledge(
-        replace(placed, R_world_root=None, transl_world_m=None, keypoints_world_m=None), BIRD, camera, moved
+        placed.with_arrays(R_world_root=None, transl_world_m=None, keypoints_world_m=None), BIRD, camera, moved
     )
-    np.testing.assert_allclose(bent.keypoints_px[valid], moved.project(bent.keypoints_world_m)[valid], atol=1e-2)
+    np.testing.assert_allclose(bent.keypoints.px[valid], moved.project(bent.world.keypoints_world_m)[valid], atol=1e-2)
 
 
 def test_the_birds_show_the_plane_and_how_uncertain_it_is(seen, scene, camera):
@@ -115,8 +115,8 @@ def test_the_birds_show_the_plane_and_how_uncertain_it_is(seen, scene, camera):
         assert np.degrees(np.arccos(normal @ expected)) < 2.5 * facts["tilt_sd_deg"] < 12
         own = on_ledge(seen, BIRD, ledge.camera)
         stands = own.contact > 0.9
-        assert np.isfinite(own.transl_world_m[stands]).all()
-        feet = own.keypoints_world_m[stands][:, [BIRD.keypoint_names.index("left_foot")], 2]
+        assert np.isfinite(own.world.transl_world_m[stands]).all()
+        feet = own.world.keypoints_world_m[stands][:, [BIRD.keypoint_names.index("left_foot")], 2]
         assert np.abs(np.median(feet)) < 0.02
     assert facts["focal_sd_px"] > 0.15 * facts["focal_px"]  # one camera from above hardly shows its focal length
 
@@ -138,12 +138,12 @@ def test_measured_distances_give_the_height_and_the_size_of_the_birds(seen, scen
 
 def test_one_calibrated_camera_does_not_know_the_sizes(seen, camera):
     """A fit of one calibrated camera is in a world, but its birds in crops have the size of the model."""
-    side = seen.crop[..., 2:]
-    crop = np.concatenate([seen.crop[..., :2] + (side - 100) / 2, np.full_like(side, 100)], axis=-1)
-    N, T, K, _ = seen.keypoints_cam.shape
+    side = seen.crops.square_px[..., 2:]
+    crop = np.concatenate([seen.crops.square_px[..., :2] + (side - 100) / 2, np.full_like(side, 100)], axis=-1)
+    N, T, K, _ = seen.keypoints.cam.shape
     world = {"R_world_root": (N, T, 3, 3), "transl_world_m": (N, T, 3), "keypoints_world_m": (N, T, K, 3)}
     arrays = {name: np.zeros(shape) for name, shape in world.items()}
-    cropped = replace(seen, crop=crop, focal_px=seen.focal_px * float(side[0, 0, 0]) / 100, **arrays)
+    cropped = seen.with_arrays(crop=crop, focal_px=seen.crops.focal_px * float(side[0, 0, 0]) / 100, **arrays)
     facts, alone = (estimate_ledge(each, BIRD, camera).facts for each in (cropped, seen))
     assert facts["height_sd_m"] == pytest.approx(alone["height_sd_m"], rel=1e-3)
 
@@ -152,8 +152,8 @@ def test_several_cameras_keep_places_and_sizes(placed, camera):
     ledge = estimate_ledge(placed, BIRD, camera)
     assert ledge.facts["height_m"] == pytest.approx(camera.position_world[2], rel=0.02)
     turned = on_ledge(placed, BIRD, ledge.camera, known_sizes=True)
-    np.testing.assert_allclose(turned.keypoints_cam[placed.valid], placed.keypoints_cam[placed.valid], atol=1e-3)
-    np.testing.assert_allclose(turned.scale[placed.valid], placed.scale[placed.valid], rtol=1e-5)
+    np.testing.assert_allclose(turned.keypoints.cam[placed.valid], placed.keypoints.cam[placed.valid], atol=1e-3)
+    np.testing.assert_allclose(turned.poses.scale[placed.valid], placed.poses.scale[placed.valid], rtol=1e-5)
     assert (turned.contact > 0.5)[placed.contact > 0.9].mean() > 0.98
 
 
@@ -213,8 +213,8 @@ def test_no_track_is_no_bird(seen, camera):
 
 def test_a_camera_below_its_birds_has_no_ledge(seen):
     half_turn = Rotation.from_rotvec([np.pi, 0, 0])  # of each bird about its root, so that its feet are nearest
-    orient = (half_turn * Rotation.from_rotvec(seen.global_orient.reshape(-1, 3))).as_rotvec()
-    below = replace(seen, global_orient=orient.reshape(seen.global_orient.shape).astype(np.float32))
+    orient = (half_turn * Rotation.from_rotvec(seen.poses.global_orient.reshape(-1, 3))).as_rotvec()
+    below = seen.with_arrays(global_orient=orient.reshape(seen.poses.global_orient.shape).astype(np.float32))
     with pytest.raises(InputError, match="not below the camera"):
         estimate_ledge(below, BIRD)
 
@@ -252,7 +252,7 @@ def test_the_command_places_a_result(seen, camera, placed, tmp_path, capsys):
     assert "on ledge" in printed
     stored, _ = load_solution(tmp_path / "out")
     np.testing.assert_allclose(stored.contact, placed.contact, atol=1e-5)
-    np.testing.assert_allclose(stored.transl_world_m, placed.transl_world_m, atol=1e-5)
+    np.testing.assert_allclose(stored.world.transl_world_m, placed.world.transl_world_m, atol=1e-5)
     (own,) = read_cameras(tmp_path / "out" / "cameras.toml")
     np.testing.assert_allclose(own.position_world, camera.position_world, atol=1e-9)
     assert main([*command, "--overwrite", "--focal-px", str(camera.matrix[0, 0])]) == 0

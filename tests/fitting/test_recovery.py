@@ -40,12 +40,12 @@ def metrics(reference_dir):
         crop = dataclasses.replace(config.crop, mode="image")
         solution = fit(observed, bird, dataclasses.replace(config, stages=stages, window=window, crop=crop))
         assert (solution.status == "ok").all()
-        keypoints = solution.keypoints_px
+        keypoints = solution.keypoints.px
         measured[name] = {
             "me_p": me_p(keypoints, true_px, visible, sides),
             "me_v": me_v(keypoints, true_px, visible, sides),
-            "3d": mpjpe(centred(solution.keypoints_cam), centred(true_3d)),
-            "aligned 3d": pa_mpjpe(solution.keypoints_cam, true_3d),
+            "3d": mpjpe(centred(solution.keypoints.cam), centred(true_3d)),
+            "aligned 3d": pa_mpjpe(solution.keypoints.cam, true_3d),
         }
     return measured
 

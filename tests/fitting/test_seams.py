@@ -151,7 +151,7 @@ def test_a_window_that_diverged_has_no_part_in_a_seam(failed):
     assert solution.valid[0].tolist() == [failed == 1 or t >= 4 for t in range(6)] + [failed == 0] * 4
     good = results[1 - failed].pose.global_orient
     shared = good[:2] if failed == 0 else good[4:]
-    np.testing.assert_array_equal(solution.global_orient[0, 4:6], shared)
+    np.testing.assert_array_equal(solution.poses.global_orient[0, 4:6], shared)
 
 
 @pytest.mark.extended
@@ -170,4 +170,4 @@ def test_a_fit_with_shared_frames_and_its_corrections(tmp_path):
     assert {track for track, _, _ in again.fitted} == {2, 4}
     expected = fit(corrected, BIRD, SHARED)
     for name in CELLS:
-        np.testing.assert_array_equal(getattr(again.solution, name), getattr(expected, name), err_msg=name)
+        np.testing.assert_array_equal(again.solution.arrays()[name], expected.arrays()[name], err_msg=name)

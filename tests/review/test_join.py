@@ -65,7 +65,7 @@ def scene(ids=((3, 5), (1, 9, 4)), cut=30, frames=60):
 def solution_of(observed, seed):
     """A result with random poses where the bird is present, and a status for each track."""
     rng = np.random.default_rng(seed)
-    sizes = {"N": observed.num_tracks, "T": observed.num_frames, "J-1": BIRD.num_joints - 1, "S": BIRD.num_shapes}
+    sizes = {"N": observed.num_tracks, "T": observed.num_frames, "bones": BIRD.num_joints - 1, "S": BIRD.num_shapes}
     sizes |= {"K": BIRD.num_keypoints, "2": 2, "3": 3}
     cells = {}
     for name, (shape, dtype) in LAYOUT.items():
@@ -73,7 +73,7 @@ def solution_of(observed, seed):
             cells[name] = rng.uniform(0.5, 2, [sizes[axis] for axis in shape.split()]).astype(np.float32)
             cells[name][~observed.present] = np.nan
     image = np.where(observed.present[..., None], SIDE, 0) * np.ones(2, np.int64)
-    return Solution(
+    return Solution.from_arrays(
         track_id=observed.track_id,
         frame_index=observed.frame_index,
         valid=observed.present,
@@ -122,11 +122,11 @@ def test_tracks_continue_and_everything_is_copied(parts, capsys):
     own = solution_of(first, 0), solution_of(second, 1)
     for name in LAYOUT:
         if LAYOUT[name][0].startswith("N T"):
-            joined = getattr(solution, name)
-            np.testing.assert_array_equal(joined[:2, :30], getattr(own[0], name), err_msg=name)
-            np.testing.assert_array_equal(joined[[1, 2, 0], 30:], getattr(own[1], name), err_msg=name)
+            joined = solution.arrays()[name]
+            np.testing.assert_array_equal(joined[:2, :30], own[0].arrays()[name], err_msg=name)
+            np.testing.assert_array_equal(joined[[1, 2, 0], 30:], own[1].arrays()[name], err_msg=name)
     assert not solution.valid[2, :30].any()
-    assert np.isnan(solution.scale[2, :30]).all()
+    assert np.isnan(solution.poses.scale[2, :30]).all()
     np.testing.assert_array_equal(solution.loss["keypoints"], [1 + 3, 2 + 1, 2])
     np.testing.assert_array_equal(observed.keypoints_px[[1, 2, 0], 30:], second.keypoints_px)
     np.testing.assert_array_equal(solution.timestamp_s, np.arange(60) / 25)

@@ -24,7 +24,7 @@ def folder(tmp_path):
 def observed(shift_px):
     """Return the projected keypoints as observations, moved by `shift_px` (T,) to the right."""
     fit = solution()
-    points = fit.keypoints_px + np.asarray(shift_px)[:, None, None] * [1, 0]
+    points = fit.keypoints.px + np.asarray(shift_px)[:, None, None] * [1, 0]
     confidence = np.repeat(fit.valid[..., None], len(fit.keypoint_names), axis=-1)
     return Observations(
         track_id=fit.track_id,
@@ -45,7 +45,7 @@ def test_a_folder_of_fit_gives_its_projected_keypoints(folder, tmp_path):
     seen, fit = result.observations, solution()
     assert seen.frame_index.tolist() == list(range(FIRST, FIRST + T))
     np.testing.assert_array_equal(seen.present, fit.valid)
-    np.testing.assert_array_equal(seen.keypoints_px[fit.valid], fit.keypoints_px[fit.valid])
+    np.testing.assert_array_equal(seen.keypoints_px[fit.valid], fit.keypoints.px[fit.valid])
     assert seen.image_size(0, 0) == (WIDTH, HEIGHT)
 
 

@@ -40,7 +40,7 @@ def test_true_poses_are_in_the_frame_of_each_camera(rig):
         for n, bird in enumerate(scene.birds):
             folded = fold_bird(BIRD)
             points_cam = window_keypoints(folded, window_transforms(folded, bird.pose), bird.pose)
-            np.testing.assert_allclose(points_cam, scene.poses.keypoints_cam[n], atol=2e-3)
+            np.testing.assert_allclose(points_cam, scene.poses.keypoints.cam[n], atol=2e-3)
             world = mesh_keypoints(BIRD, bird.vertices_world[:, None])[:, 0] * UNIT
             np.testing.assert_allclose(camera.to_camera(world) / UNIT, points_cam, atol=2e-3)
 

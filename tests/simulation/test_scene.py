@@ -186,7 +186,7 @@ def test_written_scene_is_read_back(tmp_path):
     np.testing.assert_array_equal(seen.occluded, scene.truth.occluded)
     np.testing.assert_allclose(seen.keypoints_px, scene.truth.keypoints_px, atol=1e-3)
     np.testing.assert_array_equal(seen.whole_mask(0, 2), scene.truth.whole_mask(0, 2))
-    np.testing.assert_array_equal(truth.solution.body_pose, scene.poses.body_pose)
+    np.testing.assert_array_equal(truth.solution.poses.body_pose, scene.poses.poses.body_pose)
     assert truth.bird.keypoint_names == MURRE.keypoint_names
     assert set(truth.behaviours) == {1, 2}
     detections = read_coco(tmp_path / "s" / "detections.json")

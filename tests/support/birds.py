@@ -205,7 +205,7 @@ def solution_of(bird: Bird, poses: Sequence[Pose], crop=(0.0, 0.0, 256.0)) -> So
 
     keypoints = np.stack([pose_window(bird, pose)[0] for pose in poses])
     crop, camera = np.broadcast_to(np.asarray(crop, float), (N, T, 3)), CropCamera()
-    return Solution(
+    return Solution.from_arrays(
         track_id=np.arange(1, N + 1),
         frame_index=np.arange(T),
         valid=np.ones((N, T), bool),

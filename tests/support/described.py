@@ -91,7 +91,7 @@ def result(body_pose=STANDING, turn=None, place_m=(0.0, 0.0, 0.2), shape=None, b
         "keypoints_world_m": np.zeros((N, T, K, 3)),
         "contact": np.ones((N, T)),
     }
-    return Solution(**(fields | changes))
+    return Solution.from_arrays(**(fields | changes))
 
 
 PAIR_M = [[[0, 0, 0.2]], [[0.6, 0, 0.2]]]
@@ -126,14 +126,13 @@ def in_lengths(flock: Flock) -> Flock:
 def with_error_bars(solution: Solution, orient_sd=0.0, body_sd=0.0) -> Solution:
     """Return a result with error bars of angles, radians, broadcast to (N, T, 3) and (N, T, J−1, 3)."""
     N, T, K = *solution.valid.shape, len(solution.keypoint_names)
-    return replace(
-        solution,
+    return solution.with_arrays(
         global_orient_sd=np.array(np.broadcast_to(orient_sd, (N, T, 3))),
-        body_pose_sd=np.array(np.broadcast_to(body_sd, solution.body_pose.shape)),
+        body_pose_sd=np.array(np.broadcast_to(body_sd, solution.poses.body_pose.shape)),
         transl_sd=np.zeros((N, T, 3)),
         scale_sd=np.zeros((N, T)),
-        bone_length_sd=np.zeros_like(solution.bone_length),
-        betas_sd=np.zeros_like(solution.betas),
+        bone_length_sd=np.zeros_like(solution.poses.bone_length),
+        betas_sd=np.zeros_like(solution.poses.betas),
         keypoints_cam_cov=np.zeros((N, T, K, 3, 3)),
         keypoints_centred_cov=np.zeros((N, T, K, 3, 3)),
         keypoints_px_cov=np.zeros((N, T, K, 2, 2)),

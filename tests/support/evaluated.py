@@ -1,6 +1,5 @@
 """Two toy birds with known truth and a result that a test changes, for the tests of evaluation."""
 
-import dataclasses
 import functools
 
 import numpy as np
@@ -52,14 +51,13 @@ def truth():
 
 
 def solution(**changes):
-    return dataclasses.replace(known(), **changes)
+    return known().with_arrays(**changes)
 
 
 @functools.cache
 def known():
     """A result that is the truth."""
-    return dataclasses.replace(
-        solution_of(BIRD, posed(), [*CORNER, 256]),
+    return solution_of(BIRD, posed(), [*CORNER, 256]).with_arrays(
         track_id=np.array([5, 3]),
         frame_index=np.array([10, 11, 12, 14]),
         image_size_px=np.full((N, T, 2), [WIDTH, HEIGHT]),

@@ -22,16 +22,16 @@ def solution(**changes) -> Solution:
     fitted = solution_of(BIRD, [smooth_motion(BIRD, len(FRAMES), seed) for seed in range(3)])
     valid = np.ones((3, len(FRAMES)), bool)
     valid[1, 1:3] = valid[2] = False
-    arrays = {"scale": np.where(valid, fitted.scale, np.nan), "body_pose": fitted.body_pose.copy()}
+    arrays = {"scale": np.where(valid, fitted.poses.scale, np.nan), "body_pose": fitted.poses.body_pose.copy()}
     arrays["body_pose"][~valid] = np.nan
     parts = {"track_id": np.array(TRACKS), "frame_index": np.array(FRAMES), "valid": valid, **arrays}
     parts |= {"status": np.array(["ok", "partly diverged", "diverged"]), "fps": FPS}
-    return dataclasses.replace(fitted, **(parts | {"timestamp_s": np.array(FRAMES) / FPS} | changes))
+    return fitted.with_arrays(**(parts | {"timestamp_s": np.array(FRAMES) / FPS} | changes))
 
 
 def error_bars(shape, bird=BIRD, **values):
     """Arrays of error bars for N tracks, T frames and K keypoints (`shape`): 0 except for the given values."""
-    sizes = dict(zip("NTK", shape, strict=True)) | {"J-1": bird.num_joints - 1, "S": bird.num_shapes, "2": 2, "3": 3}
+    sizes = dict(zip("NTK", shape, strict=True)) | {"bones": bird.num_joints - 1, "S": bird.num_shapes, "2": 2, "3": 3}
     return {
         name: np.zeros([sizes[s] for s in axes.split()], np.float32) for name, (axes, _) in ERROR_BARS.items()
     } | values
@@ -53,4 +53,4 @@ def solution_of_all(made: Solution) -> Solution:
     """The same result with a pose in every frame."""
     full = solution_of(BIRD, [smooth_motion(BIRD, len(FRAMES), seed) for seed in range(3)])
     parts = {"track_id": made.track_id, "frame_index": made.frame_index}
-    return dataclasses.replace(full, **parts)
+    return full.with_arrays(**parts)

@@ -1,6 +1,5 @@
 """Footage and a result of two toy birds, for the tests of overlays."""
 
-import dataclasses
 import functools
 
 import numpy as np
@@ -31,7 +30,7 @@ def solution(**changes) -> Solution:
         "valid": valid,
         "image_size_px": np.where(valid[..., None], [WIDTH, HEIGHT], 0),
     }
-    return dataclasses.replace(solution_of(BIRD, poses, np.array(CROPS)[:, None]), **values | changes)
+    return solution_of(BIRD, poses, np.array(CROPS)[:, None]).with_arrays(**values | changes)
 
 
 def film(path, frames=FIRST + T + 2, size=(WIDTH, HEIGHT)):

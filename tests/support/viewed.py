@@ -1,6 +1,5 @@
 """A small film with its result, and a page of it with its server, for the tests of the viewer."""
 
-import dataclasses
 import http.client
 import json
 import struct
@@ -25,7 +24,7 @@ TYPES = {"f4": np.float32, "i2": np.int16, "u1": np.uint8, "u2": np.uint16, "u4"
 def write_result(folder, **changes):
     """Write a film and the folder of its result; returns the folder and the film."""
     video = overlays.film(folder / "film.mp4")
-    solution = dataclasses.replace(overlays.solution(), **{"fps": overlays.FPS} | changes)
+    solution = overlays.solution().with_arrays(**{"fps": overlays.FPS} | changes)
     result = folder / "result"
     save_solution(solution, overlays.BIRD, "base: fast\n", {"video": {"file": str(video)}}, result)
     write_coco(projected_observations(solution), result / "observations.json")

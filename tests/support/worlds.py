@@ -1,7 +1,5 @@
 """Results in a world: true poses of a simulated scene on its ledge, which need no fit."""
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -18,13 +16,12 @@ UNIT = BIRD.metres_per_unit
 def placed_on(scene, camera):
     """Return the true poses of a scene in the world of a camera, in the frame of this camera; all birds stand."""
     s, R = scene.poses, camera.R_cam_world
-    root = s.transl + s.scale[..., None] * np.asarray(BIRD.joints[0], np.float64)
-    orient = Rotation.from_rotvec(s.global_orient.reshape(-1, 3)).as_matrix().reshape(*s.valid.shape, 3, 3)
-    return replace(
-        s,
+    root = s.poses.transl + s.poses.scale[..., None] * np.asarray(BIRD.joints[0], np.float64)
+    orient = Rotation.from_rotvec(s.poses.global_orient.reshape(-1, 3)).as_matrix().reshape(*s.valid.shape, 3, 3)
+    return s.with_arrays(
         R_world_root=R.T @ orient,
         transl_world_m=(root * UNIT - camera.transl_cam) @ R,
-        keypoints_world_m=(s.keypoints_cam.astype(np.float64) * UNIT - camera.transl_cam) @ R,
+        keypoints_world_m=(s.keypoints.cam.astype(np.float64) * UNIT - camera.transl_cam) @ R,
         contact=np.ones(s.valid.shape),
     )
 

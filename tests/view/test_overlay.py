@@ -29,7 +29,7 @@ from jaxfit.view.overlay import CHUNK, overlay, overlay_frame
 def detections(size=(WIDTH, HEIGHT)) -> Observations:
     """The first bird's bill tip, 20 px left of the fitted one."""
     points = np.zeros((1, T, BIRD.num_keypoints, 2))
-    points[:, :, 0] = solution().keypoints_px[:1, :, 0] - [20, 0]
+    points[:, :, 0] = solution().keypoints.px[:1, :, 0] - [20, 0]
     confidence = np.zeros((1, T, BIRD.num_keypoints))
     confidence[:, :, 0] = 1
     return Observations(
@@ -103,7 +103,7 @@ def test_birds_are_drawn_where_they_are_and_nowhere_else(drawn):
                 continue
             assert differs[mask].mean() > 0.95
             near = cv2.dilate(mask.astype(np.uint8), np.ones((9, 9))) > 0
-            points = solution().keypoints_px[n, t]
+            points = solution().keypoints.px[n, t]
             low, high = (points.min(0) - 70).astype(int), (points.max(0) + 70).astype(int)  # its number, its rings
             far[max(low[1], 0) : high[1], max(low[0], 0) : high[0]] = False
             edge = near & ~(cv2.erode(mask.astype(np.uint8), np.ones((5, 5))) > 0)
@@ -218,13 +218,13 @@ def test_a_frame_shows_regions_and_flags(tmp_path):
     video, shape = film(tmp_path / "f.mp4"), (N, T, BIRD.num_keypoints)
     covariance = np.zeros((*shape, 2, 2), np.float32)
     covariance[0, :, 0] = np.diag([400, 25])
-    plain = dataclasses.replace(solution(), **error_bars(shape, BIRD))
+    plain = solution().with_arrays(**error_bars(shape, BIRD))
     doubts = np.where(np.arange(N)[:, None] == 1, 4, np.zeros((N, T), np.int8)).astype(np.int8)
     changes = {
         "none": solution(),
         "plain": plain,
-        "wide": dataclasses.replace(plain, keypoints_px_cov=covariance),
-        "flag": dataclasses.replace(solution(), doubts=doubts),
+        "wide": plain.with_arrays(keypoints_px_cov=covariance),
+        "flag": solution().with_arrays(doubts=doubts),
     }
     images = {}
     for name, made in changes.items():
@@ -232,7 +232,7 @@ def test_a_frame_shows_regions_and_flags(tmp_path):
         images[name] = cv2.imread(str(tmp_path / f"{name}.png"))[: HEIGHT // 2].astype(int)
     assert (images["none"] == images["plain"]).all()  # dots hide regions without an extent
     rows, columns = np.nonzero(np.abs(images["wide"] - images["plain"]).sum(-1) > 60)
-    x, y = solution().keypoints_px[0, 1, 0] / 2
+    x, y = solution().keypoints.px[0, 1, 0] / 2
     half = np.sqrt(5.991) * 10  # half the size of the footage
     assert columns.min() == pytest.approx(max(x - half, 0), abs=3)
     assert columns.max() == pytest.approx(x + half, abs=3)
@@ -262,7 +262,7 @@ def test_the_contact_sheet_shows_flags(tmp_path, monkeypatch, on_footage):
     doubts = np.array([[0, 1, 0, 0, 0, 4], [0, 0, -1, 0, 0, 0]], np.int8)
     tile = np.zeros((TILE_PX, TILE_PX, 3), np.uint8)
     footage = {(n, t): tile for n in range(N) for t in range(T)} if on_footage else None
-    made = dataclasses.replace(solution(), doubts=doubts)
+    made = solution().with_arrays(doubts=doubts)
     contact_sheet(made, BIRD, None, tmp_path / "sheet.png", columns=T, footage=footage)
     assert f"track 4  frame {FIRST + 1} contradicted" in words
     assert f"track 4  frame {FIRST + 5} unsure" in words
@@ -303,12 +303,12 @@ def test_long_results_are_posed_chunk_by_chunk(tmp_path):
     frames, still = CHUNK + 5, solution()
     names = ("valid", "global_orient", "body_pose", "transl", "scale", "bone_length", "betas", "image_size_px")
     names += ("keypoints_cam", "keypoints_px", "ambiguity_deg", "doubts")
-    many = {name: np.repeat(getattr(still, name)[:1, :1], frames, 1) for name in names}
-    crop = np.repeat(still.crop[:1, :1], frames, 1).copy()
+    many = {name: np.repeat(still.arrays()[name][:1, :1], frames, 1) for name in names}
+    crop = np.repeat(still.crops.square_px[:1, :1], frames, 1).copy()
     crop[:, :, 0] += np.arange(frames)  # it walks to the right, a pixel a frame
-    many["keypoints_px"] = many["keypoints_px"] + (crop - still.crop[:1, :1])[:, :, None, :2]
-    long = dataclasses.replace(
-        still, **many, crop=crop, track_id=[4], frame_index=np.arange(frames), status=["ok"], timestamp_s=None
+    many["keypoints_px"] = many["keypoints_px"] + (crop - still.crops.square_px[:1, :1])[:, :, None, :2]
+    long = still.with_arrays(
+        **many, crop=crop, track_id=[4], frame_index=np.arange(frames), status=["ok"], timestamp_s=None
     )
     made = overlay(long, BIRD, film(tmp_path / "f.mp4", frames), tmp_path / "o.mp4")
     middles = [np.flatnonzero(changed(frame.astype(int)).sum(0) > 3).mean() for _, frame, _ in read_frames(made.video)]
@@ -321,7 +321,7 @@ def test_up_is_where_birds_stand():
     look = Rotation.from_euler("x", 130, degrees=True)
     headings = Rotation.from_rotvec(np.linspace(0, 300, T)[:, None] * [0, 0, 1], degrees=True)
     points = np.stack([look.apply(headings[t].apply(np.asarray(BIRD.keypoints))) for t in range(T)])
-    standing = dataclasses.replace(solution(), keypoints_cam=np.stack([points, points + 5]))
+    standing = solution().with_arrays(keypoints_cam=np.stack([points, points + 5]))
     assert np.degrees(np.arccos(up_direction(standing) @ look.apply([0, 0, 1]))) < 3
 
 

@@ -69,7 +69,7 @@ def folder(tmp_path_factory):
     shape = len(TRACKS), len(FRAMES), BIRD.num_keypoints
     share = np.array([0.02, 0.03, 0.05, 0.1, 0.5])
     covariance = np.zeros((*shape, 3, 3), np.float32)
-    covariance[0] = ((share * rest_length(BIRD) * solution().scale[0]) ** 2 / 3)[:, None, None, None] * np.eye(3)
+    covariance[0] = ((share * rest_length(BIRD) * solution().poses.scale[0]) ** 2 / 3)[:, None, None, None] * np.eye(3)
     doubts = np.zeros(shape[:2], np.int8)
     doubts[0] = [0, 0, 1, 8, 8]
     changes = {"loss": {"a": np.array([10.0, 2.0, np.nan]), "b": np.array([0.5, 2.0, np.nan])}, "doubts": doubts}
@@ -114,7 +114,7 @@ def drawn(tmp_path_factory):
 
 def test_the_table_holds_the_numbers_of_the_result(root, made):
     rows = rows_of(section(root, "Quality of each track"))
-    confidence = np.split(np.linspace(0.1, 1, made.keypoints_px[..., 0].size), 3)[0].mean()
+    confidence = np.split(np.linspace(0.1, 1, made.keypoints.px[..., 0].size), 3)[0].mean()
     assert rows["3"][:4] == ["✓ ok", "10 to 20", "5", "2 / 2 / 1"]
     assert rows["3"][4:7] == ["5", "83", "1"]
     assert rows["3"][7] == f"{confidence:.2f}"
@@ -223,7 +223,7 @@ def test_long_footage_has_several_frames_in_a_column(report):
 
 def test_warnings_name_what_was_skipped(folder, made):
     def titles(doubts=None, **summary):
-        fitted = dataclasses.replace(made, status=np.full(3, "ok"), doubts=doubts)
+        fitted = made.with_arrays(status=np.full(3, "ok"), doubts=doubts)
         return [(each.title, each.text) for each in warnings_of(gather(fitted, None, summary, "", folder))]
 
     assert titles() == []

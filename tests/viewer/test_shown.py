@@ -69,7 +69,7 @@ def test_the_camera_of_the_page_sees_the_birds_where_the_film_does(result):
         x, y, z = R.T @ (seen.flock.place[n, t] - place)
         middle = np.array(seen.size_px) / 2 + focal * np.array([x, y]) / z
         # the root joint is inside the box of the keypoints
-        low, high = (f(seen.solution.keypoints_px[n, t], axis=0) for f in (np.min, np.max))
+        low, high = (f(seen.solution.keypoints.px[n, t], axis=0) for f in (np.min, np.max))
         assert (middle > low - 5).all()
         assert (middle < high + 5).all()
 
@@ -105,7 +105,7 @@ def test_flags_and_facts(result):
     found = unpacked(seen.flags())[1]["flags"]
     names = np.array(["", *seen.facts()["flags"]])
     np.testing.assert_array_equal(
-        names[found], np.where(seen.solution.valid, flags(np.asarray(seen.solution.doubts)), "")
+        names[found], np.where(seen.solution.valid, flags(np.asarray(seen.solution.flags.doubts)), "")
     )
     facts = seen.facts()
     assert [track["id"] for track in facts["tracks"]] == [4, 11]

@@ -110,7 +110,7 @@ def keypoints_error(solution: Solution, bird: Bird, truth: list[Pose]) -> float:
     """Return the mean 3D error of keypoints after Procrustes alignment of every frame, in model units."""
     rig = fold_bird(bird)
     true_cam = np.stack([window_keypoints(rig, window_transforms(rig, pose), pose) for pose in truth])
-    return pa_mpjpe(solution.keypoints_cam, true_cam, np.isfinite(solution.keypoints_cam).all(-1))
+    return pa_mpjpe(solution.keypoints.cam, true_cam, np.isfinite(solution.keypoints.cam).all(-1))
 
 
 def _pose(z: Pose, problem: Problem) -> Pose:

@@ -143,7 +143,7 @@ def _images(observations: Observations, solution: Solution, source: object, file
     images = []
     row = {int(track): n for n, track in enumerate(observations.track_id)}
     for m, t in np.argwhere(solution.valid).tolist():
-        track, crop = int(solution.track_id[m]), solution.crop[m, t]
+        track, crop = int(solution.track_id[m]), solution.crops.square_px[m, t]
         n = row[track]
         mask = observations.mask(n, t)
         images.append(
@@ -154,12 +154,12 @@ def _images(observations: Observations, solution: Solution, source: object, file
                 confidence=np.asarray(observations.confidence[n, t]),
                 mask=np.zeros((MASK_PX, MASK_PX), np.uint8) if mask is None else cut_mask(mask, crop, MASK_PX),
                 pose=Pose(
-                    solution.global_orient[m, t],
-                    solution.body_pose[m, t],
-                    solution.transl[m, t],
-                    solution.scale[m, t],
-                    solution.bone_length[m, t],
-                    solution.betas[m, t],
+                    solution.poses.global_orient[m, t],
+                    solution.poses.body_pose[m, t],
+                    solution.poses.transl[m, t],
+                    solution.poses.scale[m, t],
+                    solution.poses.bone_length[m, t],
+                    solution.poses.betas[m, t],
                 ),
             )
         )

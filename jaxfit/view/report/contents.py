@@ -153,7 +153,7 @@ def gather(
     Raises:
         InputError: an entry of the summary has another type than jaxfit writes.
     """
-    sizes = solution.image_size_px[solution.valid]
+    sizes = solution.crops.image_size_px[solution.valid]
     times_s = np.full(len(solution.frame_index), np.nan) if solution.timestamp_s is None else solution.timestamp_s
     if solution.fps and not np.isfinite(times_s).all():
         times_s = solution.frame_index / solution.fps
@@ -224,7 +224,7 @@ def _tracks(
     rows = {} if observations is None else {track: n for n, track in enumerate(observations.track_id.tolist())}
     size = _image_size(solution)
     total = np.sum(list(solution.loss.values()), axis=0) if solution.loss else np.full(len(solution.track_id), np.nan)
-    found, flagged = flags(np.asarray(solution.doubts)), flagged_ranges(solution)
+    found, flagged = flags(np.asarray(solution.flags.doubts)), flagged_ranges(solution)
     tracks = []
     for n, track_id in enumerate(solution.track_id.tolist()):
         valid, present, confidence = solution.valid[n], solution.valid[n], None
@@ -257,8 +257,13 @@ def _tracks(
 
 def _image_size(solution: Solution) -> Float[np.ndarray, "N T"]:
     """Return the size of every bird in the image, in image pixels per model unit; NaN without a pose."""
-    depth = np.where(solution.valid, solution.transl[..., 2], np.nan)
-    return solution.scale * (solution.focal_px / solution.crop_px) * solution.crop[..., 2] / depth
+    depth = np.where(solution.valid, solution.poses.transl[..., 2], np.nan)
+    return (
+        solution.poses.scale
+        * (solution.crops.focal_px / solution.crops.crop_px)
+        * solution.crops.square_px[..., 2]
+        / depth
+    )
 
 
 MIN_CONFIDENCE = 0.5

@@ -49,7 +49,7 @@ def test_every_run_is_the_fit_of_its_config_in_the_order_of_the_values(observed)
         pair = [jaxfit.with_values(config(), levels[r]) for r in (first, first + 2)]
         alone = fit_runs(observed, BIRD, pair)
         for r, expected in zip((first, first + 2), alone, strict=True):
-            np.testing.assert_array_equal(swept.solutions[r].keypoints_px, expected.keypoints_px)
+            np.testing.assert_array_equal(swept.solutions[r].keypoints.px, expected.keypoints.px)
             assert swept.results[r].evaluation.overall == jaxfit.evaluate(expected, BIRD, observed).overall
             assert swept.results[r].runs_at_once == 2
     me_p = [result.evaluation.overall["me_p"] for result in swept.results]

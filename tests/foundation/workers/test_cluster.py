@@ -100,7 +100,7 @@ def test_a_failed_task_is_a_status_of_its_birds(tmp_path, caplog):
     solution = fit(observed, BIRD, some, cluster=OneFails(None, ""), stored=stored)
     expected = fit(observed, BIRD, some)
     assert solution.status.tolist() == ["partly diverged", "partly diverged", "ok"]
-    np.testing.assert_array_equal(solution.keypoints_px[solution.valid], expected.keypoints_px[solution.valid])
+    np.testing.assert_array_equal(solution.keypoints.px[solution.valid], expected.keypoints.px[solution.valid])
     assert solution.valid.sum() == expected.valid.sum() - 2 * T
     text = f"frames 0 to {T - 1}: not computed: 3 workers ended during the task"
     assert solution.failures == {0: (text,), 1: (text,)}
