@@ -35,7 +35,7 @@ def largest_error_px(solution, lens, rig, v):
     vertices_m = rig.scenes[v].birds[0].vertices_world * UNIT
     errors = [
         drawn[..., :2] - rig.cameras[v].project(vertices_m),
-        solution.keypoints.px[0] - rig.scenes[v].poses.keypoints_px[0],
+        solution.keypoints.px[0] - rig.scenes[v].poses.keypoints.px[0],
     ]
     return max(np.linalg.norm(error, axis=-1).max() for error in errors), drawn
 

@@ -70,7 +70,7 @@ def test_exact_keypoints_give_the_birds_in_the_world(rig, solution, truth_m):
     assert solution.valid.all()
     assert not solution.flags.doubts.any()  # keypoints and masks of all views support the poses
     assert error_mm(solution, truth_m) < 6  # of a bird of 42 cm
-    sizes = solution.poses.poses.scale[:, 0] / rig.scenes[0].poses.poses.scale[:, 0]
+    sizes = solution.poses.scale[:, 0] / rig.scenes[0].poses.poses.scale[:, 0]
     np.testing.assert_allclose(sizes, 1, atol=0.03)
     true_root = (rig.scenes[0].poses.poses.transl * UNIT - rig.cameras[0].transl_cam) @ rig.cameras[0].R_cam_world
     assert np.abs(solution.world.transl_world_m - true_root).max() < 0.015
@@ -135,7 +135,7 @@ def test_one_view_is_the_fit_of_one_camera(rig, truth_m):
     found = fit_views(views, BIRD, keypoints_only)
     alone = fit(views.observations[0], BIRD, keypoints_only)
     for name in ("global_orient", "transl", "scale", "keypoints_px", "crop"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
+        np.testing.assert_array_equal(found.arrays()[name], alone.arrays()[name])
     # one view does not know the size of a bird: 10 % of a distance of 5 m
     assert error_mm(found, truth_m) < 500
     shown = rig.cameras[1].pinhole().project(found.world.keypoints_world_m)

@@ -58,7 +58,7 @@ def height_cm(scene):
 
 
 def true_places_m(scene):
-    root = scene.poses.transl + scene.poses.scale[..., None] * np.asarray(BIRD.joints[0])
+    root = scene.poses.poses.transl + scene.poses.poses.scale[..., None] * np.asarray(BIRD.joints[0])
     return (scene.view.position_world + root.astype(float) @ scene.view.R_cam_world) * UNIT
 
 
@@ -69,8 +69,8 @@ def test_birds_that_stand_are_at_their_places_and_have_their_sizes(scene, placed
     assert np.median(error_m[stands]) < 0.01
     assert np.percentile(error_m[stands], 95) < 0.06
     size = np.array([np.median(placed.poses.scale[n][stands[n]]) for n in range(7)])
-    np.testing.assert_allclose(size, scene.poses.scale[:, 0], rtol=0.012)
-    np.testing.assert_allclose(placed.keypoints.px[stands], scene.poses.keypoints_px[stands], atol=0.01)
+    np.testing.assert_allclose(size, scene.poses.poses.scale[:, 0], rtol=0.012)
+    np.testing.assert_allclose(placed.keypoints.px[stands], scene.poses.keypoints.px[stands], atol=0.01)
 
 
 def test_contact_shows_which_birds_fly(scene, placed, flies):
@@ -86,7 +86,7 @@ def test_contact_shows_which_birds_fly(scene, placed, flies):
 
 def test_a_bird_in_the_air_keeps_its_size(scene, placed):
     high = (height_cm(scene) > 5) & scene.poses.valid
-    size = np.broadcast_to(scene.poses.scale, high.shape)
+    size = np.broadcast_to(scene.poses.poses.scale, high.shape)
     np.testing.assert_allclose(placed.poses.scale[high], size[high], rtol=0.01)
     error_m = np.linalg.norm(placed.world.transl_world_m - true_places_m(scene), axis=-1)
     assert error_m[high].max() < 0.05  # 1 % of 5 m
@@ -133,7 +133,7 @@ def test_measured_distances_give_the_height_and_the_size_of_the_birds(seen, scen
     ledge = estimate_ledge(seen, BIRD, camera, measured(camera, ends_m))
     assert ledge.facts["height_m"] == pytest.approx(camera.position_world[2], rel=0.01)
     assert ledge.facts["height_sd_m"] < 0.1
-    assert ledge.facts["size"] == pytest.approx(np.mean(scene.poses.scale[:, 0]), rel=0.02)
+    assert ledge.facts["size"] == pytest.approx(np.mean(scene.poses.poses.scale[:, 0]), rel=0.02)
 
 
 def test_one_calibrated_camera_does_not_know_the_sizes(seen, camera):

@@ -59,7 +59,7 @@ def test_true_poses_agree_with_masks_and_keypoints(scene):
         # a keypoint is a mean of vertices, so its projection is nearly the mean of their projections
         np.testing.assert_allclose(points[labelled, :2], scene.truth.keypoints_px[n, t][labelled], atol=0.2)
     np.testing.assert_allclose(
-        scene.poses.keypoints_px[scene.truth.confidence > 0], scene.truth.keypoints_px[scene.truth.confidence > 0]
+        scene.poses.keypoints.px[scene.truth.confidence > 0], scene.truth.keypoints_px[scene.truth.confidence > 0]
     )
 
 
