@@ -45,7 +45,9 @@ def test_a_bird_has_the_size_of_the_model_in_all_windows(windows):
     np.testing.assert_array_equal(solution.poses.scale[0], 1)
     for w, result in enumerate(results(True)):
         own = slice(6 * w, 6 * w + 6)
-        pose = dataclasses.replace(result.pose, transl=solution.poses.transl[0, own], scale=solution.poses.scale[0, own])
+        pose = dataclasses.replace(
+            result.pose, transl=solution.poses.transl[0, own], scale=solution.poses.scale[0, own]
+        )
         points_cam, points_px = _keypoints(MODEL.rig, MODEL.camera, pose)
         np.testing.assert_allclose(solution.keypoints.cam[0, own], points_cam, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(points_px, result.keypoints_px, atol=1e-2)  # the picture of the fitted pose
