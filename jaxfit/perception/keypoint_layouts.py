@@ -8,33 +8,12 @@ Metadata of a keypoint network: keys and values of `metadata_props` in the ONNX 
 - `colour`: `rgb` or `bgr`, the colour order of the input; default `rgb`.
 - `input_size`: `width,height`, for an input of variable size; default `256,256`.
 - `activation`: `none`, `sigmoid` or `softmax`, the function that turns the output into confidences; default `none`.
-- `alignment`: position of the cells of a heatmap, see `ALIGNMENTS`; default `centres`, with offsets `deeplabcut`.
+- `alignment`: position of the cells of a heatmap, see below; default `centres`, with offsets `deeplabcut`.
 - `locref_std`: length in pixels of an offset of 1; default 7.2801, DeepLabCut's.
 - `pad_px`, `dilate_px`, `background`: the crops of the training, see `crop_bird`; default 40, 70 (`visible`: 14),
   `black`.
-"""
 
-from __future__ import annotations
-
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from itertools import permutations
-from typing import Any, NamedTuple, TypeVar, get_args
-
-import numpy as np
-import scipy.special
-from jaxtyping import Bool, Float, Int, Num, UInt8
-
-from jaxfit.cameras.camera import MAX_IMAGE_SIDE_PX
-from jaxfit.config.perception import Background
-from jaxfit.foundation.errors import InputError
-from jaxfit.perception.network import IMAGENET_MEAN, IMAGENET_STD, OnnxModel
-
-ACTIVATIONS = ("none", "sigmoid", "softmax")
-
-ALIGNMENTS = ("centres", "deeplabcut", "msra", "udp")
-"""Position of the centre of cell i, in input pixels (pixel centres at i + 0.5), for w cells over W pixels:
+Alignment: position of the centre of cell i, in input pixels (pixel centres at i + 0.5), for w cells over W pixels:
 
 - `centres`: (i + 0.5) · W/w; the cells divide the picture evenly;
 - `deeplabcut`: (i + 0.5) · stride + 0.5; DeepLabCut's pixel centres have integer coordinates;
@@ -42,33 +21,63 @@ ALIGNMENTS = ("centres", "deeplabcut", "msra", "udp")
 - `udp`: i · (W − 1)/(w − 1) + 0.5; MMPose's codec `UDPHeatmap` (ViTPose): the outermost cells lie on the outermost
   pixels.
 
-Source: `HeatmapPredictor` of DeepLabCut 3, `MSRAHeatmap` and `UDPHeatmap` of MMPose 1."""
+Source: `HeatmapPredictor` of DeepLabCut 3, `MSRAHeatmap` and `UDPHeatmap` of MMPose 1.
+"""
 
-BACKGROUNDS: tuple[str, ...] = get_args(Background)
-"""Backgrounds of the crops: `black` outside the bird's dilated mask, or `visible` except other birds (`crop_bird`)."""
+from __future__ import annotations
 
-_MAX_MARGIN_PX = 4096
-"""Largest margin of a crop, and largest side of the square that dilates a mask."""
-_MAX_ASPECT = 8
-"""Largest ratio of the sides of an input. The crop of a bird has the same ratio."""
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Annotated, Any, Literal, NamedTuple
 
-T = TypeVar("T")
+import numpy as np
+import scipy.special
+from annotated_types import Gt
+from jaxtyping import Bool, Float, Int, Num, UInt8
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    FiniteFloat,
+    NonNegativeInt,
+    PositiveInt,
+    StringConstraints,
+    ValidationError,
+)
+
+from jaxfit.config.perception import Background
+from jaxfit.foundation.errors import InputError
+from jaxfit.perception.network import IMAGENET_MEAN, IMAGENET_STD, OnnxModel
 
 
-class KeypointMetadata(NamedTuple):
+def _split(text: Any) -> Any:
+    return text.split(",") if isinstance(text, str) else text
+
+
+def _split_colours(text: Any) -> Any:
+    values = _split(text)
+    return values * 3 if len(values) == 1 else values
+
+
+_Name = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
+_Positive = Annotated[FiniteFloat, Gt(0)]
+_Pixels = Annotated[NonNegativeInt, BeforeValidator(lambda text: round(float(text)))]
+
+
+class KeypointMetadata(BaseModel, frozen=True):
     """The values of the table above; None for a key that is absent and has no default."""
 
-    keypoint_names: tuple[str, ...] | None
-    mean: tuple[float, ...] | None
-    std: tuple[float, ...] | None
-    colour: str
-    input_size: tuple[int, int] | None
-    activation: str
-    alignment: str | None
-    locref_std: float
-    pad_px: int | None
-    dilate_px: int | None
-    background: str | None
+    keypoint_names: Annotated[tuple[_Name, ...], BeforeValidator(_split)] | None = None
+    mean: Annotated[tuple[FiniteFloat, FiniteFloat, FiniteFloat], BeforeValidator(_split_colours)] | None = None
+    std: Annotated[tuple[_Positive, _Positive, _Positive], BeforeValidator(_split_colours)] | None = None
+    colour: Literal["rgb", "bgr"] = "rgb"
+    input_size: Annotated[tuple[PositiveInt, PositiveInt], BeforeValidator(_split)] | None = None
+    activation: Literal["none", "sigmoid", "softmax"] = "none"
+    alignment: Literal["centres", "deeplabcut", "msra", "udp"] | None = None
+    locref_std: _Positive = 7.2801
+    pad_px: _Pixels | None = None
+    dilate_px: _Pixels | None = None
+    background: Background | None = None
 
 
 def read_metadata(model: OnnxModel) -> KeypointMetadata:
@@ -77,81 +86,13 @@ def read_metadata(model: OnnxModel) -> KeypointMetadata:
     Raises:
         InputError: a value that is not valid for its key.
     """
-
-    def value(key: str, read: Callable[[str], T], default: Any = None) -> T:
-        text = model.metadata.get(key)
-        if text is None:
-            return default
-        try:
-            return read(text)
-        except ValueError as error:
-            raise InputError(model.path, f"its metadata `{key}` is {text[:100]!r}", f"expected {error}") from error
-
-    return KeypointMetadata(
-        keypoint_names=value("keypoint_names", _names),
-        mean=value("mean", _colour_values),
-        std=value("std", lambda text: _positive(_colour_values(text))),
-        colour=value("colour", _one_of("rgb", "bgr"), "rgb"),
-        input_size=value("input_size", _size),
-        activation=value("activation", _one_of(*ACTIVATIONS), "none"),
-        alignment=value("alignment", _one_of(*ALIGNMENTS)),
-        locref_std=value("locref_std", lambda text: _positive(_numbers(text, 1))[0], 7.2801),
-        pad_px=value("pad_px", _pixels),
-        dilate_px=value("dilate_px", _pixels),
-        background=value("background", _one_of(*BACKGROUNDS)),
-    )
-
-
-def _names(text: str) -> tuple[str, ...]:
-    names = tuple(name.strip() for name in text.split(","))
-    if not all(names):
-        raise ValueError("names, separated by commas")
-    return names
-
-
-def _one_of(*words: str) -> Callable[[str], str]:
-    def read(text: str) -> str:
-        if text not in words:
-            raise ValueError(", ".join(words[:-1]) + " or " + words[-1])
-        return text
-
-    return read
-
-
-def _numbers(text: str, *counts: int) -> tuple[float, ...]:
-    problem = f"{' or '.join(map(str, counts))} number(s), separated by commas"
     try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError as error:
-        raise ValueError(problem) from error
-    if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
-        raise ValueError(problem)
-    return numbers
-
-
-def _colour_values(text: str) -> tuple[float, ...]:
-    numbers = _numbers(text, 1, 3)
-    return numbers * 3 if len(numbers) == 1 else numbers
-
-
-def _positive(numbers: tuple[float, ...]) -> tuple[float, ...]:
-    if min(numbers) <= 0:
-        raise ValueError("more than 0")
-    return numbers
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, height = _numbers(text, 2)
-    if not (1 <= width <= MAX_IMAGE_SIDE_PX and 1 <= height <= MAX_IMAGE_SIDE_PX):
-        raise ValueError(f"width,height in pixels, at most {MAX_IMAGE_SIDE_PX}")
-    return int(width), int(height)
-
-
-def _pixels(text: str) -> int:
-    (number,) = _numbers(text, 1)
-    if not 0 <= number <= _MAX_MARGIN_PX:
-        raise ValueError(f"0 to {_MAX_MARGIN_PX} pixels")
-    return round(number)
+        return KeypointMetadata.model_validate(model.metadata)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = str(first["loc"][0])
+        problem = f"its metadata `{key}` is {model.metadata[key][:100]!r}"
+        raise InputError(model.path, problem, f"export it with another value: {first['msg']}") from error
 
 
 DEFAULT_SIZE_PX = (256, 256)
@@ -208,10 +149,6 @@ def read_input(model: OnnxModel, metadata: KeypointMetadata) -> KeypointInput:
     height, width = port.shape[1:3] if channels_last else port.shape[2:]
     default = metadata.input_size or DEFAULT_SIZE_PX
     width, height = width or default[0], height or default[1]
-    model.check_input((port.shape[0], height, width, 3))
-    if max(width, height) > _MAX_ASPECT * min(width, height):
-        problem = f"has an input of {width}×{height} pixels"
-        raise InputError(model.path, problem, f"one side may be {_MAX_ASPECT} times as long as the other")
     return KeypointInput(
         size_px=(width, height),
         batch=port.shape[0],
@@ -239,7 +176,7 @@ def apply_activation(
 
     Args:
         values: one map or one vector for each keypoint.
-        activation: one of `ACTIVATIONS`; the softmax runs over a whole map.
+        activation: as in `KeypointMetadata`; the softmax runs over a whole map.
 
     Returns:
         The confidences, and whether all values of a keypoint are finite. If not, its confidences are those of zeros.

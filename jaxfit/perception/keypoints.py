@@ -138,7 +138,7 @@ class CropSettings(NamedTuple):
     pad_px: int = PAD_PX
     dilate_px: int = DILATE_PX["black"]
     background: str = "black"
-    """One of `BACKGROUNDS`."""
+    """`black` outside the dilated mask of the bird, or `visible` except other birds (`crop_bird`)."""
 
     def crop(
         self, frame: UInt8[np.ndarray, "H W 3"], birds: Sequence[Instance], n: int, size_px: tuple[int, int]

@@ -15,29 +15,18 @@ probabilities do not decrease. Without a curve, the confidence is the network's 
 from __future__ import annotations
 
 import base64
-import binascii
-import math
 import mmap
-import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jaxfit.cameras.camera import MAX_IMAGE_SIDE_PX
 from jaxfit.data.masks import box_of_mask, encode_patch
 from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.reading import open_file
-
-MAX_INSTANCES = 1000
-"""Most instances of a frame; more are the output of a network that does not detect birds."""
-_MAX_MASK_AREA = 50
-"""Largest area of all boxes of a frame's instances, as a multiple of the frame."""
-_MAX_INPUT_VALUES = 3 << 26
-"""Most values of an input of a network: 800 MB of floats, a picture of 8192×8192."""
+from jaxfit.foundation.reading import check_readable
 
 
 class Instance(NamedTuple):
@@ -89,33 +78,6 @@ def instance_of(mask: Bool[np.ndarray, "h w"], score: float, label: str, x0: int
     )
 
 
-def collect_instances(
-    source: object, instances: Iterable[Instance | None], frame_px: tuple[int, int]
-) -> list[Instance]:
-    """Return the instances of a frame without None.
-
-    Args:
-        source: the network, for messages.
-        instances: instances, or None for an empty mask.
-        frame_px: width and height of the frame.
-
-    Raises:
-        InputError: the number of instances or the area of their masks shows that the network does not detect birds.
-    """
-    collected, area = [], 0
-    for instance in instances:
-        if instance is None:
-            continue
-        collected.append(instance)
-        area += instance.mask.size
-        if len(collected) > MAX_INSTANCES or area > _MAX_MASK_AREA * frame_px[0] * frame_px[1]:
-            problem = (
-                f"detects more than {MAX_INSTANCES} instances in one frame, or boxes of {_MAX_MASK_AREA} times its area"
-            )
-            raise InputError(source, problem, "raise min_score, or give another network")
-    return collected
-
-
 @runtime_checkable
 class Segmenter(Protocol):
     """Detects the instances of a frame."""
@@ -163,8 +125,7 @@ class OnnxModel:
         threads: number of cores for one run; None uses all cores.
 
     Raises:
-        InputError: the file does not exist, is not ONNX, names external data, contains an unknown operator or text
-            that is not UTF-8, or declares an input without values or with too many values.
+        InputError: the file does not exist, is not ONNX, names external data, or contains an unknown operator.
     """
 
     path: Path
@@ -176,29 +137,27 @@ class OnnxModel:
     def __init__(self, path: str | Path, threads: int | None = None):
         import onnxruntime as ort
 
-        self.path = Path(path)
-        with open_file(self.path, "an ONNX file") as file:
-            size = os.fstat(file.fileno()).st_size
-        if size and _has_external_data(self.path):
-            problem = "stores its weights in another file (external data), which is not read"
-            raise InputError(path, problem, "save the network as one file: onnx.save(onnx.load(path), new_path)")
+        self.path = check_readable(path, "an ONNX file")
         options = ort.SessionOptions()
         options.intra_op_num_threads = threads or 0
         # threads that wait in a loop would slow down the other network, which runs at the same time
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         options.log_severity_level = 4  # the error below reports the problem
         try:
+            if _has_external_data(self.path):
+                problem = "stores its weights in another file (external data), which is not read"
+                raise InputError(path, problem, "save the network as one file: onnx.save(onnx.load(path), new_path)")
             self._session = ort.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
-        except Exception as error:  # the errors of ONNX Runtime have no common base class
-            raise InputError(path, f"cannot be loaded: {_shorten(error)}", _remedy(str(error))) from error
-        try:
             self.inputs = tuple(_read_port(value) for value in self._session.get_inputs())
             self.outputs = tuple(_read_port(value) for value in self._session.get_outputs())
             self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
-        except UnicodeDecodeError as error:
-            raise InputError(path, "has names or metadata that are not UTF-8", "export it again") from error
-        for port in self.inputs:
-            self.check_input(port.shape)
+        except InputError:
+            raise
+        except Exception as error:  # the errors of ONNX Runtime have no common base class
+            remedy = "export it again; use an older opset if an operator is unknown"
+            if "protobuf" in str(error).lower():
+                remedy = "give a complete ONNX file"
+            raise InputError(path, f"cannot be loaded: {_shorten(error)}", remedy) from error
 
     def __call__(self, *inputs: np.ndarray) -> dict[str, np.ndarray]:
         """Run the network once.
@@ -220,14 +179,6 @@ class OnnxModel:
             problem = f"cannot be run: {_shorten(error)}"
             raise InputError(self.path, problem, "check the layout of its inputs") from error
         return dict(zip(names, values, strict=True))
-
-    def check_input(self, shape: Sequence[int | None]) -> None:
-        """Raise InputError if an input of this shape has no values or too many values; None is a variable side."""
-        sides = [side for side in shape if side is not None]
-        if sides and (min(sides) < 1 or max(sides) > MAX_IMAGE_SIDE_PX or math.prod(sides) > _MAX_INPUT_VALUES):
-            problem = f"has an input of {' × '.join(map(str, sides))} values"
-            remedy = f"the limits are {MAX_IMAGE_SIDE_PX} for a side and {_MAX_INPUT_VALUES:,} values"
-            raise InputError(self.path, problem, remedy)
 
     def check_outputs(self, outputs: Mapping[str, Any], expected: Mapping[str, Sequence[int | str | None]]) -> None:
         """Check the outputs of a run.
@@ -271,16 +222,11 @@ def _shorten(error: Exception) -> str:
 
 def _has_external_data(path: Path) -> bool:
     """Return whether a file names external data: a tensor with an entry of the key `location` (`onnx.proto`)."""
+    if not path.stat().st_size:
+        return False
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
         # field 13 of a tensor: tag, length in up to five bytes, then the key; metadata of a model have another tag
         return re.search(rb"\x6a[\x80-\xff]{0,4}[\x00-\x7f]\x0a\x08location\x12", content) is not None
-
-
-def _remedy(text: str) -> str:
-    lowered = text.lower()
-    if "protobuf" in lowered:
-        return "give a complete ONNX file"
-    return "export it again; use an older opset if an operator is unknown"
 
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -349,17 +295,21 @@ def activation_monitor(model: OnnxModel) -> ActivationMonitor | None:
     """Create the monitor of a network; None for a network without statistics of its training.
 
     Raises:
-        InputError: the statistics are incomplete, damaged or too large.
+        InputError: the statistics are incomplete or damaged.
     """
-    texts = [model.metadata.get(key) for key in (MEAN_KEY, WHITENING_KEY)]
-    if texts == [None, None]:
+    keys = (MEAN_KEY, WHITENING_KEY)
+    if not any(key in model.metadata for key in keys):
         return None
-    mean, whitening = (_decode(text or "") for text in texts)
-    if mean is None or whitening is None:
+    try:
+        contents = [base64.b64decode(model.metadata[key], validate=True) for key in keys]
+        mean, whitening = (np.frombuffer(content, "<f4").astype(np.float64) for content in contents)
+        statistics = ActivationStatistics(mean, whitening.reshape(len(mean), len(mean)))
+        is_valid = np.isfinite(mean).all() and np.isfinite(whitening).all() and len(mean) > 0
+    except (KeyError, ValueError) as error:
+        raise _damaged_activations(model) from error
+    if not is_valid or OUTPUT not in {port.name for port in model.outputs}:
         raise _damaged_activations(model)
-    if len(whitening) != len(mean) ** 2 or OUTPUT not in {port.name for port in model.outputs}:
-        raise _damaged_activations(model)
-    return ActivationMonitor(model, ActivationStatistics(mean, whitening.reshape(len(mean), -1)))
+    return ActivationMonitor(model, statistics)
 
 
 def _damaged_activations(model: OnnxModel) -> InputError:
@@ -369,16 +319,6 @@ def _damaged_activations(model: OnnxModel) -> InputError:
 
 def _encode(values: np.ndarray) -> str:
     return base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
-
-
-def _decode(text: str) -> Float[np.ndarray, "n"] | None:
-    """Decode finite numbers; None for any other text."""
-    try:
-        data = base64.b64decode(text, validate=True)
-    except (binascii.Error, ValueError):
-        return None
-    values = np.frombuffer(data, "<f4") if len(data) % 4 == 0 else np.array([np.nan])
-    return values.astype(np.float64) if len(values) and np.isfinite(values).all() else None
 
 
 CONFIDENCE_KEY = "confidence_curve"
@@ -413,16 +353,14 @@ def read_curve(model: OnnxModel, key: str) -> Curve | None:
     if text is None:
         return None
     try:
-        points = np.array([[float(number) for number in point.split(":")] for point in text.split(",")])
-        values, probabilities = points.T
+        values, probabilities = np.array(
+            [[float(number) for number in point.split(":")] for point in text.split(",")]
+        ).T
+        is_rising = (np.diff(values) > 0).all() and (np.diff(probabilities) >= 0).all()
+        if not (np.isfinite(values).all() and is_rising and probabilities[0] >= 0 and probabilities[-1] <= 1):
+            raise ValueError("not a rising curve")
     except ValueError as error:
-        raise _damaged_curve(model, key, text) from error
-    rising = (np.diff(values) > 0).all() and (np.diff(probabilities) >= 0).all()
-    if not (np.isfinite(points).all() and rising and probabilities[0] >= 0 and probabilities[-1] <= 1):
-        raise _damaged_curve(model, key, text)
+        problem = f"its metadata `{key}` is {text[:60]!r}"
+        remedy = "expected points value:probability that rise, as in 0:0,0.5:0.4,1:0.9"
+        raise InputError(model.path, problem, remedy) from error
     return Curve(values, probabilities)
-
-
-def _damaged_curve(model: OnnxModel, key: str, text: str) -> InputError:
-    problem = f"its metadata `{key}` is {text[:60]!r}"
-    return InputError(model.path, problem, "expected points value:probability that rise, as in 0:0,0.5:0.4,1:0.9")

@@ -14,20 +14,12 @@ from jaxfit.config.perception import GENERAL
 from jaxfit.foundation.errors import InputError
 from jaxfit.perception.general_networks import check_general_files, general_files
 from jaxfit.perception.merging import Tiled, length_px, replace_parts
-from jaxfit.perception.network import (
-    MAX_INSTANCES,
-    Instance,
-    OnnxModel,
-    Segmenter,
-    activation_monitor,
-    collect_instances,
-)
+from jaxfit.perception.network import Instance, OnnxModel, Segmenter, activation_monitor
 from jaxfit.perception.segmentation_inputs import Placement, SegmentationNetwork
 from jaxfit.perception.segmentation_layouts import DetectorAndSaliency, MaskRcnn, RfDetrSeg, Saliency, YoloSeg, Yolox
 
 LONGER_SIDE_PX = 864
 """Default of the metadata `longer_side`, the longer side of the input: 6.9 pixels for 2 cm of a ledge 2.5 m wide."""
-LARGEST_SIDE_PX = 8192
 MULTIPLE = 32
 OFFSET_UNIT_PX = 32.0
 MIN_PEAK = 0.2
@@ -46,8 +38,6 @@ LARGE_BIRD_PX = 200.0
 """Birds that are longer in the input are detected in parts, so an input of half the size detects them."""
 SMALLER_INPUTS = 2
 """Number of smaller inputs: half and a quarter of the size."""
-MAX_PEAKS = 10 * MAX_INSTANCES
-"""More peaks are the output of a network that was not trained."""
 MIN_CELLS = 12
 """Instances with fewer cells are dropped."""
 
@@ -63,8 +53,7 @@ class BottomUp(SegmentationNetwork):
     Where the input has a variable size, birds that are long in the input are detected in smaller inputs.
 
     Raises:
-        InputError: an unsupported input, more than one class, or an invalid `longer_side` or `min_track_score` in the
-            metadata.
+        InputError: an unsupported input, more than one class, or invalid metadata.
 
     Source: Cheng et al. 2020, Panoptic-DeepLab.
     """
@@ -74,27 +63,24 @@ class BottomUp(SegmentationNetwork):
 
     def _set_up(self) -> None:
         (self._label,) = self.class_names
-        text = self._model.metadata.get("longer_side", str(LONGER_SIDE_PX))
-        if not (
-            text.isdecimal() and len(text) <= 5 and 1 <= int(text) <= LARGEST_SIDE_PX and int(text) % MULTIPLE == 0
-        ):
-            remedy = f"export it with a multiple of {MULTIPLE} pixels, at most {LARGEST_SIDE_PX}"
-            raise InputError(self._model.path, f"its metadata `longer_side` is {text[:40]!r}", remedy)
-        self._longer_side_px = int(text)
-        self.min_track_score = self._min_track_score()
+        self._longer_side_px = int(self._metadata_number("longer_side", LONGER_SIDE_PX, multiple_of=MULTIPLE))
+        self.min_track_score = self._metadata_number("min_track_score", 0.0, largest=1.0)
         self.activations = activation_monitor(self._model)
 
-    def _min_track_score(self) -> float:
-        """Return the least mean score of a track, 0 if the file does not contain it."""
-        text = self._model.metadata.get("min_track_score", "0")
+    def _metadata_number(
+        self, key: str, default: float, largest: float = np.inf, multiple_of: float | None = None
+    ) -> float:
+        """Return a number of the metadata, 0 or more; more than 0 for a multiple."""
+        text = self._model.metadata.get(key, str(default))
         try:
-            score = float(text)
-        except ValueError:
-            score = float("nan")
-        if not 0 <= score <= 1:
-            problem = f"its metadata `min_track_score` is {text[:40]!r}"
-            raise InputError(self._model.path, problem, "export it with a number within 0 and 1")
-        return score
+            number = float(text)
+            if not 0 <= number <= largest or (multiple_of and (number < 1 or number % multiple_of)):
+                raise ValueError("out of range")
+        except ValueError as error:
+            expected = f"a multiple of {multiple_of}" if multiple_of else f"a number within 0 and {largest:g}"
+            problem = f"its metadata `{key}` is {text[:40]!r}"
+            raise InputError(self._model.path, problem, f"export it with {expected}") from error
+        return number
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
         names_by_index = super()._all_classes(names)
@@ -136,9 +122,6 @@ class BottomUp(SegmentationNetwork):
         foreground, centre = (outputs[name][0, 0].astype(np.float32, copy=False) for name in ("foreground", "centre"))
         cell_px = placement.input_px[0] / foreground.shape[1]
         peaks = _find_peaks(centre)
-        if len(peaks) > MAX_PEAKS:
-            problem = f"gives {len(peaks)} centres of birds in one frame"
-            raise InputError(self._model.path, problem, "give another network")
         assignment = _assign_cells(foreground, outputs["offset"][0] * OFFSET_UNIT_PX, peaks, cell_px)
         places = find_objects(assignment + 1, len(peaks))
         instances = (
@@ -146,7 +129,7 @@ class BottomUp(SegmentationNetwork):
             for n, ((row, column), place) in enumerate(zip(peaks, places, strict=True))
             if place is not None
         )
-        return collect_instances(self._model.path, instances, placement.frame_px)
+        return [instance for instance in instances if instance is not None]
 
     def network_input(
         self, frame: UInt8[np.ndarray, "H W 3"], longer_side_px: float | None = None

@@ -16,8 +16,6 @@ from jaxfit.perception.network import Instance, OnnxModel, instance_of
 
 STRIDES = (8, 16, 32)
 """Cell sizes of the grids of both YOLO families, pixels of the input."""
-_MAX_BOXES = 10_000
-"""Most boxes of a frame that are compared with each other; boxes with lower scores are dropped."""
 _TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 
 
@@ -89,7 +87,7 @@ def literal_metadata(model: OnnxModel, key: str) -> Any:
     text = model.metadata[key]
     try:
         return ast.literal_eval(text)
-    except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
+    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
         raise InputError(model.path, f"metadata `{key}` cannot be read: {text[:80]!r}", "export it again") from error
 
 
@@ -125,7 +123,7 @@ def names_of(model: OnnxModel, names: Sequence[str] | None, count: int | None) -
         count: number of classes; None if the shapes of the network do not contain it.
 
     Raises:
-        InputError: the numbers of names and classes differ, or the metadata cannot be read.
+        InputError: the numbers of names and classes differ, the metadata cannot be read.
     """
     own = literal_metadata(model, "names") if names is None else list(names)
     if own is None:
@@ -305,9 +303,6 @@ def non_maximum_suppression(
     """
     if not len(corners_px):
         return np.zeros(0, int)
-    if len(corners_px) > _MAX_BOXES:  # the time is quadratic
-        best = np.argsort(-scores, kind="stable")[:_MAX_BOXES]
-        return best[non_maximum_suppression(corners_px[best], scores[best], labels[best], max_iou)]
     xywh = np.concatenate([corners_px[:, :2], corners_px[:, 2:] - corners_px[:, :2]], 1)
     kept = cv2.dnn.NMSBoxesBatched(xywh.tolist(), scores.tolist(), labels.tolist(), 0.0, max_iou)
     return np.asarray(kept, int).reshape(-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.foundation.errors import InputError
-from jaxfit.perception.network import Instance, OnnxModel, collect_instances, normalise
+from jaxfit.perception.network import Instance, OnnxModel, normalise
 from jaxfit.perception.segmentation_inputs import (
     STRIDES,
     Placement,
@@ -94,7 +94,7 @@ class YoloSeg(SegmentationNetwork):
             )
             for i in order
         )
-        return collect_instances(self._model.path, instances, placement.frame_px)
+        return [instance for instance in instances if instance is not None]
 
     def _decode(
         self, head: Float[np.ndarray, "R C"], prototypes: int
@@ -121,10 +121,11 @@ def _variable_size_px(model: OnnxModel) -> tuple[int, int]:
     if size is None:
         return _DEFAULT_INPUT_PX
     sides = [size, size] if isinstance(size, int) else size
-    if not (isinstance(sides, (list, tuple)) and len(sides) == 2 and all(type(side) is int for side in sides)):
+    if not (
+        isinstance(sides, (list, tuple)) and len(sides) == 2 and all(type(side) is int and side > 0 for side in sides)
+    ):
         problem = f"its metadata `imgsz` is {size!r:.80}"
         raise InputError(model.path, problem, "export it with height and width")
-    model.check_input((1, 3, *sides))
     return sides[1], sides[0]
 
 
@@ -262,7 +263,7 @@ class RfDetrSeg(SegmentationNetwork):
             for i in np.argsort(-scores)
             if scores[i] >= self._min_score
         )
-        return collect_instances(self._model.path, instances, placement.frame_px)
+        return [instance for instance in instances if instance is not None]
 
     def _all_classes(self, names: Sequence[str] | None) -> dict[int, str]:
         """Return slot → name of every slot that is a class."""
@@ -340,7 +341,7 @@ class MaskRcnn(SegmentationNetwork):
             for i in np.argsort(-scores)
             if scores[i] >= self._min_score and int(labels[i]) in self._classes
         )
-        return collect_instances(self._model.path, instances, frame_px)
+        return [instance for instance in instances if instance is not None]
 
 
 def _reduced(frame_px: tuple[int, int], zoom: float) -> tuple[int, int]:
@@ -403,13 +404,12 @@ class DetectorAndSaliency:
 
     def __call__(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Instance]:
         """Segment a frame, as `Segmenter` describes."""
-        frame_px = (frame.shape[1], frame.shape[0])
-        return collect_instances(self._detector.path, self._instances(frame, frame_px), frame_px)
-
-    def _instances(self, frame: UInt8[np.ndarray, "H W 3"], frame_px: tuple[int, int]) -> Iterator[Instance | None]:
+        instances = []
         for corners_px, score, label in self._detector(frame):
             instance = self.instance_in_box(frame, corners_px)
-            yield instance and instance._replace(score=score, label=label)
+            if instance is not None:
+                instances.append(instance._replace(score=score, label=label))
+        return instances
 
     def boxes(self, frame: UInt8[np.ndarray, "H W 3"]) -> list[Float[np.ndarray, "4"]]:
         """Return the boxes of the detector: x0, y0, x1, y1 in image pixels."""

@@ -295,17 +295,17 @@ def test_unsupported_layouts(tmp_path, shape, outputs, kind, message):
 @pytest.mark.parametrize(
     ("key", "text", "remedy"),
     [
-        ("mean", "1,2", "1 or 3 number"),
-        ("mean", "a,b,c", "1 or 3 number"),
-        ("std", "0", "more than 0"),
-        ("std", "nan", "1 or 3 number"),
-        ("colour", "grey", "rgb or bgr"),
-        ("activation", "relu", "none, sigmoid or softmax"),
-        ("alignment", "left", "centres, deeplabcut, msra or udp"),
-        ("input_size", "0,64", "width,height"),
-        ("locref_std", "-1", "more than 0"),
-        ("pad_px", "-3", "0 to 4096 pixels"),
-        ("keypoint_names", "a,,c", "names, separated by commas"),
+        ("mean", "1,2", "Field required"),
+        ("mean", "a,b,c", "a valid number"),
+        ("std", "0", "greater than 0"),
+        ("std", "nan", "a finite number"),
+        ("colour", "grey", "'rgb' or 'bgr'"),
+        ("activation", "relu", "'sigmoid' or 'softmax'"),
+        ("alignment", "left", "'msra' or 'udp'"),
+        ("input_size", "0,64", "greater than 0"),
+        ("locref_std", "-1", "greater than 0"),
+        ("pad_px", "-3", "greater than or equal to 0"),
+        ("keypoint_names", "a,,c", "at least 1 character"),
     ],
 )
 def test_invalid_metadata(tmp_path, key, text, remedy):
