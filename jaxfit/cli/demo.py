@@ -74,11 +74,21 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     write_whole(folder / METRICS, json_text(metrics).encode())
     compared = [*observation_tables(observed), *evaluation_tables(result, matching.follows)]
     numbers = matching_line(matching)
-    report = done.solution, bird, observations, done.summary, config_to_yaml(config), result_folder
     measured = [_measured(table) for table in compared]
     measured[-1] = measured[-1]._replace(note=f"{measured[-1].note}; {numbers}")
     behaviour = shown_behaviour(done.solution, bird, terminal)
-    write_report(result_folder / REPORT, *report, scene_folder / FOOTAGE, measured=measured, behaviour=behaviour)
+    write_report(
+        result_folder / REPORT,
+        done.solution,
+        bird,
+        observations,
+        done.summary,
+        config_to_yaml(config),
+        result_folder,
+        scene_folder / FOOTAGE,
+        measured=measured,
+        behaviour=behaviour,
+    )
     if verbose:
         for output in (track_table(observations, done.solution), *compared, flag_quality_line(result), numbers):
             show(output)

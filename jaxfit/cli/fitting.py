@@ -6,7 +6,7 @@ import argparse
 import os
 import time
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,22 +35,19 @@ if TYPE_CHECKING:
     from jaxfit.config.fit import FitConfig
     from jaxfit.data.keypoint_names import NameMap
     from jaxfit.data.solution import Solution
+    from jaxfit.data.views import Views
     from jaxfit.evaluation.truth import Truth
     from jaxfit.model.bird import Bird
 
 
 def fit(options: argparse.Namespace) -> None:
     """Fit the poses of birds to observations and write a result."""
-    from jaxfit.cameras.files import write_cameras
     from jaxfit.config.fit import load_config
-    from jaxfit.config.yaml_file import config_to_yaml
-    from jaxfit.data.result_folder import CAMERAS, POSES
-    from jaxfit.data.solution import write_solution
-    from jaxfit.fitting.collect import summarise
+    from jaxfit.data.result_folder import POSES
     from jaxfit.fitting.fit import fit, learn_weights
     from jaxfit.fitting.initial_poses import load_initial_poses
     from jaxfit.fitting.ledge import ledge_config
-    from jaxfit.foundation.files import check_replaceable, new_folder
+    from jaxfit.foundation.files import check_replaceable
     from jaxfit.foundation.workers import open_cluster
 
     start = time.perf_counter()
@@ -69,34 +66,75 @@ def fit(options: argparse.Namespace) -> None:
         raise InputError(options.observations, "holds photographs, which show no common ledge", "leave out --ledge")
     config = _fewer_keypoints(config, names, options)
     initial_poses = load_initial_poses(options.init, observations, bird) if options.init else None
-    read = time.perf_counter()
+    read_s = time.perf_counter() - start
     with open_cluster(options.workers, options.scheduler) as cluster:
         source, learnt = options.observations, None
         if config.learn_weights:
             learnt = learn_weights(observations, bird, config, initial_poses, terminal, source)
             config = learnt.config
         solution = fit(observations, bird, config, initial_poses, terminal, source=source, cluster=cluster)
-    seconds = {"read": read - start, "fit": time.perf_counter() - read}
-    placed, failure = place_if_wanted(options, solution, bird, None, source)
-    solution = placed.solution if placed else solution
-    summary = summarise(solution, bird, seconds)
+    seconds = {"read": read_s, "fit": time.perf_counter() - start - read_s}
+    subject, facts = counted(len(solution.track_id), "track"), {}
+    if observations.photographs:  # every bird has a photograph of its own
+        facts["photographs"] = observations.photographs
+        photographs = counted(observations.photographs, "photograph")
+        subject = f"{counted(len(solution.track_id), 'bird')} in {photographs}"
+    _write_fit(options, config, bird, solution, None, seconds, facts, subject, learnt and learnt.to_yaml())
+
+
+def _write_fit(
+    options: argparse.Namespace,
+    config: FitConfig,
+    bird: Bird,
+    solution: Solution,
+    views: Views | None,
+    seconds: dict[str, float],
+    facts: dict[str, Any],
+    subject: str,
+    learnt: str | None = None,
+) -> None:
+    """Place the birds on the ledge if the options ask for this, write the result and print its tables.
+
+    Args:
+        options: the options of the command.
+        config: the config of the fit.
+        bird: the model.
+        solution: the poses.
+        views: the calibrated cameras; None without.
+        seconds: time of each part of the work.
+        facts: more entries of `summary.json`.
+        subject: the number of birds or tracks, for the last line.
+        learnt: text of `learnt.yaml`.
+
+    Raises:
+        InputError: the birds could not be placed on the ledge; the result was written without.
+    """
+    from jaxfit.cameras.files import write_cameras
+    from jaxfit.config.yaml_file import config_to_yaml
+    from jaxfit.data.result_folder import CAMERAS, POSES
+    from jaxfit.data.solution import write_solution
+    from jaxfit.fitting.collect import summarise
+    from jaxfit.foundation.files import new_folder
+
+    source = options.observations if views is None else ", ".join(map(str, options.observations))
+    placed, failure = place_if_wanted(options, solution, bird, views, source)
+    cameras = () if views is None else views.lenses
     if placed is not None:
-        summary["ledge"] = placed.facts
-    if observations.photographs:
-        summary["photographs"] = observations.photographs
+        solution, cameras = placed.solution, placed.cameras
+        facts = facts | {"ledge": placed.facts}
+    summary = summarise(solution, bird, seconds) | facts
     with new_folder(options.out, options.overwrite, marker=POSES) as part:
-        write_solution(solution, bird, config_to_yaml(config), summary, part, learnt and learnt.to_yaml())
-        if placed is not None:
-            write_cameras(placed.cameras, part / CAMERAS)
+        write_solution(solution, bird, config_to_yaml(config), summary, part, learnt)
+        if cameras:
+            write_cameras(cameras, part / CAMERAS)
     _show_fit(solution)
     if placed is not None:
         show_ledge(placed.facts)
+    if cameras:
         show_world(solution)
-    # every bird has a photograph of its own
-    photographs = f" in {counted(observations.photographs, 'photograph')}" if observations.photographs else ""
-    poses, tracks = counted(summary["poses"], "pose"), counted(summary["tracks"], "bird" if photographs else "track")
     counts = ", ".join(f"{count} {status}" for status, count in summary["status"].items())
-    show(f"{poses} of {tracks}{photographs} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
+    poses = counted(summary["poses"], "pose")
+    show(f"{poses} of {subject} ({counts}) in {seconds['fit']:.1f} s → {options.out}")
     if failure is not None:
         raise failure
 
@@ -126,55 +164,33 @@ def _show_fit(solution: Solution) -> None:
 
 def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start: float) -> None:
     """Fit the birds that calibrated cameras see and write a result."""
-    from jaxfit.cameras.files import write_cameras
     from jaxfit.cli.cameras import read_views, show_matches
-    from jaxfit.config.yaml_file import config_to_yaml
-    from jaxfit.data.result_folder import CAMERAS, POSES
-    from jaxfit.data.solution import write_solution
-    from jaxfit.fitting.collect import summarise
     from jaxfit.fitting.ledge_plane import plane_of
     from jaxfit.fitting.views import fit_views
-    from jaxfit.foundation.files import new_folder
     from jaxfit.foundation.workers import open_cluster
 
     if options.init is not None:
         raise InputError("--init", "is given with --cameras", "leave out --init: the cameras give the initial poses")
     read = read_views(options, bird)
-    views, tracks, matches = read.views, read.tracks, read.matches
     show_matches(read)
     if options.ledge == WORLD:
-        plane_of(views.lenses[0], options.cameras)  # before the long work
-    read_s = time.perf_counter()
+        plane_of(read.views.lenses[0], options.cameras)  # before the long work
+    read_s = time.perf_counter() - start
     with open_cluster(options.workers, options.scheduler) as cluster:
         source = ", ".join(map(str, options.observations))
-        solution = fit_views(views, bird, config, terminal, source, cluster)
-    placed, failure = place_if_wanted(options, solution, bird, views, source)
-    solution, lenses = (solution, views.lenses) if placed is None else placed[:2]
-    seconds = {"read": read_s - start, "fit": time.perf_counter() - read_s}
-    summary = summarise(solution, bird, seconds)
-    summary["cameras"] = [camera.name for camera in lenses]
-    if placed is not None:
-        summary["ledge"] = placed.facts
-    summary["matches"] = {
+        solution = fit_views(read.views, bird, config, terminal, source, cluster)
+    seconds = {"read": read_s, "fit": time.perf_counter() - start - read_s}
+    lenses, matches = read.views.lenses, read.matches
+    matched = {
         f"bird {b + 1}": {
-            camera.name: own.track_id[(of == b).any(axis=1)].tolist()
-            for camera, own, of in zip(views.lenses, tracks, matches.bird, strict=True)
+            camera.name: tracks.track_id[(bird_of_track == b).any(axis=1)].tolist()
+            for camera, tracks, bird_of_track in zip(lenses, read.tracks, matches.bird, strict=True)
         }
         for b in range(matches.birds)
     }
-    with new_folder(options.out, options.overwrite, marker=POSES) as part:
-        write_solution(solution, bird, config_to_yaml(config), summary, part)
-        write_cameras(lenses, part / CAMERAS)
-    _show_fit(solution)
-    if placed is not None:
-        show_ledge(placed.facts)
-    show_world(solution)
-    show(
-        f"{counted(summary['poses'], 'pose')} of {counted(len(solution.track_id), 'bird')} "
-        f"in {counted(len(tracks), 'view')} in {seconds['fit']:.1f} s → {options.out}"
-    )
-    if failure is not None:
-        raise failure
+    facts = {"cameras": [camera.name for camera in lenses], "matches": matched}
+    subject = f"{counted(len(solution.track_id), 'bird')} in {counted(len(read.tracks), 'view')}"
+    _write_fit(options, config, bird, solution, read.views, seconds, facts, subject)
 
 
 def _fewer_keypoints(config: FitConfig, names: NameMap, options: argparse.Namespace) -> FitConfig:
@@ -324,11 +340,16 @@ def overlay(options: argparse.Namespace) -> None:
     observations = None
     if options.observations:
         observations, _ = observations_for(options.observations, solution.keypoint_names, options)
-    drawn = {"observations": observations, "side_views": options.side_views}
-    drawn |= {"overwrite": options.overwrite, "force": options.force, "lens": lens}
+    settings = {
+        "observations": observations,
+        "side_views": options.side_views,
+        "overwrite": options.overwrite,
+        "force": options.force,
+        "lens": lens,
+    }
     if options.frame is not None:
-        overlay_frame(solution, bird, options.video, options.frame, options.out, **drawn)
+        overlay_frame(solution, bird, options.video, options.frame, options.out, **settings)
         show(f"frame {options.frame} → {options.out}")
         return
-    overlay(solution, bird, options.video, options.out, codec=options.codec, progress=terminal, **drawn)
+    overlay(solution, bird, options.video, options.out, codec=options.codec, progress=terminal, **settings)
     show(f"overlay → {options.out}, contact sheet → {options.out.with_suffix('.png')}")

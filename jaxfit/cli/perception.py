@@ -61,10 +61,17 @@ def reconstruct(options: argparse.Namespace) -> None:
     start = time.perf_counter()
     config = reconstruct_config(options)
     bird = find_bird(options.model)
-    settings = {"overwrite": options.overwrite, "progress": terminal}
     with open_cluster(options.workers, options.scheduler) as cluster:
         try:
-            done = reconstruct(options.video, options.out, bird, config, **settings, cluster=cluster)
+            done = reconstruct(
+                options.video,
+                options.out,
+                bird,
+                config,
+                overwrite=options.overwrite,
+                progress=terminal,
+                cluster=cluster,
+            )
         except NoTrackError as error:
             _show_failure(error.tracking, config.track.min_track_frames)
             raise
