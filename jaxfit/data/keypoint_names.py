@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -16,47 +17,30 @@ import numpy as np
 from jaxfit.data.observations import MIN_KEYPOINTS, Observations
 from jaxfit.foundation.errors import InputError
 
-_SYNONYMS = {
-    "beak": "bill",
-    "rostrum": "bill",
-    "chest": "breast",
-    "sternum": "breast",
-    "carpal": "wrist",
-    "carpus": "wrist",
-    "mantle": "back",
-    "spine": "back",
-    "rump": "tailbase",
-    "feet": "foot",
-    "toe": "foot",
-    "toes": "foot",
-    "tarsus": "shin",
-    "ankle": "shin",
-    "chin": "throat",
-    "gular": "throat",
-    "vertex": "crown",
-    "occiput": "nape",
-    "hindneck": "nape",
-    "hind": "back",
-    "frons": "forehead",
-    "end": "tip",
-    "point": "tip",
-    "root": "base",
-    "start": "base",
-    "bend": "wrist",
-    "joint": "",
-    "of": "",
-    "the": "",
-    "middle": "",
-    "centre": "",
-    "center": "",
-    "mid": "",
+_SYNONYMS_OF = {
+    "bill": "beak rostrum",
+    "breast": "chest sternum",
+    "wrist": "carpal carpus bend",
+    "back": "mantle spine hind",
+    "tailbase": "rump",
+    "foot": "feet toe toes",
+    "shin": "tarsus ankle",
+    "throat": "chin gular",
+    "crown": "vertex",
+    "nape": "occiput hindneck",
+    "forehead": "frons",
+    "tip": "end point",
+    "base": "root start",
+    "middle": "mid centre center",
+    "": "joint of the",
 }
-"""Word → the word that replaces it; empty words do not count."""
-_WORDS = {
-    *_SYNONYMS,
-    *("left", "right", "bill", "tip", "base", "tail", "wing", "head", "neck", "eye", "foot", "shin", "wrist", "back"),
-    *("throat", "breast", "crown", "nape", "forehead", "top", "front", "upper", "lower"),
-}
+"""Word → the words that it replaces; the empty word does not count."""
+_SYNONYMS = {synonym: word for word, synonyms in _SYNONYMS_OF.items() for synonym in synonyms.split()}
+_PLAIN_WORDS = """
+left right bill tip base tail wing head neck eye foot shin wrist back throat breast crown nape forehead top front upper
+lower middle
+"""
+_WORDS = {*_SYNONYMS, *_PLAIN_WORDS.split()}
 """Words that a name without separators is split into, such as `tailbase`."""
 _SIDES = {"l": "left", "r": "right", "lt": "left", "rt": "right", "left": "left", "right": "right"}
 _ALIASES: Mapping[str, tuple[str, ...]] = {
@@ -65,7 +49,7 @@ _ALIASES: Mapping[str, tuple[str, ...]] = {
     "forehead": ("front head",),
     "nape": ("neck", "back neck", "back head"),
     "throat": ("front neck", "front throat"),
-    "back": ("back upper",),
+    "back": ("back upper", "back middle"),
     "tail_base": ("tailbase",),
     "tail_tip": ("tail",),
     "wingtip": ("wing",),
@@ -108,12 +92,12 @@ def propose_names(names: Sequence[str], model_names: Sequence[str]) -> NameMap:
         for model, alternatives in ranked.items():
             if model in found.values():
                 continue
-            wanted = alternatives[rank - 1] if 0 < rank <= len(alternatives) else None
-            for name in names:
-                same = name == model if rank == 0 else wanted is not None and words[name] == wanted
-                if same and name not in found:
-                    found[name] = model
-                    break
+            free = [name for name in names if name not in found]
+            same = [
+                name for name in free if (name == model if rank == 0 else words[name] in alternatives[rank - 1 : rank])
+            ]
+            if same:
+                found[same[0]] = model
     return _name_map(found, names, model_names)
 
 
@@ -149,12 +133,10 @@ def checked_map(
             raise InputError(source, f"maps {old}, which the file of keypoints lacks", f"known: {', '.join(names)}")
         if new is not None and new not in model_names:
             raise InputError(source, f"maps {old} to {new}, which the model lacks", f"known: {', '.join(model_names)}")
+        first = next(other for other in given if given[other] == new)
+        if new is not None and first != old:
+            raise InputError(source, f"maps both {first} and {old} to {new}", "map one of the two to null")
     mapped = {old: new for old, new in given.items() if new is not None}
-    first: dict[str, str] = {}
-    for old, new in mapped.items():
-        if new in first:
-            raise InputError(source, f"maps both {first[new]} and {old} to {new}", "map one of the two to null")
-        first[new] = old
     return _name_map(mapped, names, model_names)
 
 
@@ -210,9 +192,9 @@ def _name_map(mapped: dict[str, str], names: Sequence[str], model_names: Sequenc
 
 def _alternatives(model: str) -> list[tuple[str, str]]:
     """Return side and words of a keypoint of a model, and of its other names, in the order of preference."""
-    side, own = _words(model)
+    side, model_words = _words(model)
     part = model.removeprefix("left_").removeprefix("right_")
-    return [(side, own), *((side, words) for words in _ALIASES.get(part, ()))]
+    return [(side, model_words), *((side, words) for words in _ALIASES.get(part, ()))]
 
 
 def _words(name: str) -> tuple[str, str]:
@@ -227,27 +209,21 @@ def _words(name: str) -> tuple[str, str]:
 
 def _split(word: str) -> list[str]:
     """Split a word such as `lefttailbase` into known words; a side may be one letter at an end."""
-    if word in _WORDS or word in _SIDES:
-        return [word]
-    if len(word) > 40:
+    if word in _WORDS or word in _SIDES or len(word) > 40:
         return [word]
     found = _known_words(word)
-    if found is None and word[0] in "lr":
-        found = [word[0], *rest] if (rest := _known_words(word[1:])) else None
-    if found is None and word[-1] in "lr":
-        found = [*rest, word[-1]] if (rest := _known_words(word[:-1])) else None
+    if found is None and word[0] in "lr" and (others := _known_words(word[1:])):
+        found = [word[0], *others]
+    if found is None and word[-1] in "lr" and (others := _known_words(word[:-1])):
+        found = [*others, word[-1]]
     return found or [word]
 
 
+@cache
 def _known_words(text: str) -> list[str] | None:
     """Return a text as known words, with the fewest words; None if it is not made of known words."""
-    best: list[list[str] | None] = [[]] + [None] * len(text)
-    for end in range(1, len(text) + 1):
-        for start in range(end):
-            before = best[start]
-            if before is None or text[start:end] not in _WORDS:
-                continue
-            known = best[end]
-            if known is None or len(before) + 1 < len(known):
-                best[end] = [*before, text[start:end]]
-    return best[-1]
+    if not text:
+        return []
+    ends = (end for end in range(len(text), 0, -1) if text[:end] in _WORDS)
+    splits = ([text[:end], *others] for end in ends if (others := _known_words(text[end:])) is not None)
+    return min(splits, key=len, default=None)

@@ -35,7 +35,20 @@ def test_spellings():
 
 def test_unknown_names_are_not_mapped():
     names = propose_names(
-        ["snout", "leftear", "eye", "wing", "forelegL4", "belly", "left_leg", "ear_r", "x"], MURRE_KEYPOINTS
+        [
+            "snout",
+            "leftear",
+            "eye",
+            "wing",
+            "forelegL4",
+            "belly",
+            "left_leg",
+            "ear_r",
+            "x",
+            "tail_mid",
+            "mid_wing_left",
+        ],
+        MURRE_KEYPOINTS,
     )
     assert not names.mapped
     assert names.missing == MURRE_KEYPOINTS
