@@ -238,7 +238,7 @@ def suggest(
     video, out = Path(video), Path(out)
     if count < 1:
         raise InputError("--count", f"is {count}", "give 1 or more")
-    require_extra("formats", "jaxfit suggest", "h5py")
+    require_extra("formats", "jaxfit suggest", "h5py", "sleap-io")
     info = probe_video(video)
     if is_inside(video, out) or out.absolute() == video.absolute():
         raise InputError(out, "holds the video, which the suggestions would replace", "choose another --out")
@@ -382,7 +382,7 @@ def suggest_marked(
         InputError: the video, the result or the folder cannot be used; the result or the video lacks a frame; or the
             extra `formats` is not installed.
     """
-    require_extra("formats", "frames to label", "h5py")
+    require_extra("formats", "frames to label", "h5py", "sleap-io")
     check_replaceable(out, False, MARKER)
     observations = read_result(result, video).observations
     missing = sorted(set(frames) - set(observations.frame_index.tolist()))

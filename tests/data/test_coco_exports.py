@@ -136,20 +136,6 @@ def test_tracks_of_any_kind_are_kept(tmp_path, caplog):
     assert not caplog.text
 
 
-@pytest.mark.parametrize("untracked", ["video", "labels", "photographs"])
-def test_a_file_in_which_only_some_tracks_are_missing_is_an_error(tmp_path, untracked):
-    without = video()
-    del without["annotations"][3]["track_id"]
-    with pytest.raises(InputError, match=r"annotations\[3\] lacks the key track_id \(give every"):
-        read_observations(saved_video(tmp_path, without), untracked=untracked)
-
-
 def test_only_labels_and_fits_read_a_video_without_tracks(tmp_path):
     with pytest.raises(InputError, match=r"annotations\[0\] lacks the key track_id"):
         read_observations(saved_video(tmp_path, untracked_video()))
-
-
-def test_damaged_exports(tmp_path):
-    for change in ({"images": [1]}, {"annotations": 3}, {"images": [{"file_name": 3}]}):
-        with pytest.raises(InputError):
-            read_observations(saved(tmp_path, cvat(["frame_1.png"], [(1, {})]) | change))

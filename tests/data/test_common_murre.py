@@ -126,13 +126,6 @@ def test_third_numbers(data_set, change, reading, expected):
     np.testing.assert_array_equal(found.occluded, hidden if reading.startswith("COCO") else False & hidden)
 
 
-def test_one_keypoint_has_a_box(data_set):
-    third = np.zeros((T, N, K))
-    third[:, :, 6] = 1
-    found = read_common_murre(data_set(array(third=third))).observations
-    np.testing.assert_array_equal(found.box_px[..., 2:], np.ones((N, T, 2)))
-
-
 def spoilt(**changes):
     content = array()
     for at, value in changes.values():

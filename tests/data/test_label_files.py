@@ -12,7 +12,6 @@ from support.label_files import FRAMES, KINDS, NAMES, SIZE, labelled_birds, writ
 
 from jaxfit.data.formats.cvat import write_cvat_label
 from jaxfit.data.formats.recognise import read_observations
-from jaxfit.data.formats.write_deeplabcut import write_deeplabcut_labels
 from jaxfit.foundation.errors import InputError
 
 WITH_SCORES = ("coco", "label studio", "sleap")
@@ -235,9 +234,3 @@ def test_key_points_without_rectangles_are_one_bird_a_picture(tmp_path):
     path = change_task(lambda tasks: (tasks.pop(), without_rectangles(tasks)))(tmp_path)
     seen = read(path)
     assert seen.present.sum(0).tolist() == [1, 1, 1]
-
-
-def test_the_extra_is_needed(tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxfit.foundation.extras.find_spec", lambda _name: None)
-    with pytest.raises(InputError, match=r"needs h5py.*pip install \"\.\[formats\]\""):
-        write_deeplabcut_labels(labelled_birds(), [""] * 4, tmp_path)

@@ -8,6 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import sleap_io
+from PIL import ExifTags, Image
 from support.films import encode
 from support.tracking_files import T, write_analysis, write_csv, write_project, write_table
 
@@ -15,6 +17,7 @@ from jaxfit.data.formats import recognise
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.formats.keypoint_table import check_table_size
 from jaxfit.data.formats.recognise import read_observations
+from jaxfit.data.observations import reorder_keypoints
 from jaxfit.foundation.errors import InputError
 from jaxfit.video.reader import probe_video
 from jaxfit.video.writer import VideoWriter
@@ -143,3 +146,44 @@ def test_tables_have_a_largest_size():
     check_table_size(Path("hour.h5"), 15, 90_000, 1)
     with pytest.raises(InputError, match=r"1,000 birds × 100,000 frames × 20 keypoints need .* \(split the file\)"):
         check_table_size(Path("large.h5"), 1000, 100_000, 20)
+
+
+def test_other_files_that_sleap_io_reads(tmp_path):
+    """The analysis CSV of SLEAP has the numbers of its project. Key points of AlphaTracker have numbers as names."""
+    project = read_observations(write_project(tmp_path / "birds.slp"))
+    labels = sleap_io.load_slp(str(tmp_path / "birds.slp"), open_videos=False)
+    sleap_io.save_csv(labels, str(tmp_path / "sleap.csv"), format="sleap")
+    table = read_observations(tmp_path / "sleap.csv", size_px=(120, 100))
+    table = reorder_keypoints(table, project.keypoint_names)
+    np.testing.assert_array_equal(table.frame_index, project.frame_index)
+    np.testing.assert_allclose(table.keypoints_px, project.keypoints_px, atol=1e-4)
+    np.testing.assert_allclose(table.confidence, project.confidence, atol=1e-4)
+    points = [{"class": "Face", "x": 1, "y": 1, "width": 9, "height": 9}, {"class": "point", "x": 3.5, "y": 4}]
+    frames = [{"filename": f"img{t}.png", "class": "image", "annotations": points} for t in (7, 12)]
+    (tmp_path / "alpha.json").write_text(json.dumps(frames))
+    alpha = read_observations(tmp_path / "alpha.json", size_px=(120, 100))
+    assert alpha.frame_index.tolist() == [7, 12]
+    np.testing.assert_array_equal(alpha.keypoints_px[0, :, 0], [[3.5, 4]] * 2)
+
+
+def test_one_line_says_what_was_read(tmp_path, caplog):
+    with caplog.at_level("INFO"):
+        read_observations(write_project(tmp_path / "birds.slp"))
+    assert "birds.slp: a SLEAP project of clip.mp4: 2 birds, 4 frames, 3 keypoints, 0 masks" in caplog.text
+
+
+def test_pictures_that_are_turned(tmp_path):
+    """A picture that a camera stored on its side has the size of the upright picture."""
+    path = write_csv(tmp_path / "labels.csv", coords=("x", "y"), rows=["img1.jpg", "img2.jpg", "img3.jpg", "img4.jpg"])
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    for t in range(1, 5):
+        Image.new("CMYK", (100, 120)).save(tmp_path / f"img{t}.jpg", exif=exif)
+    assert read_observations(path).image_size_px.tolist() == [[120, 100]] * 4
+
+
+def test_a_film_that_is_guessed_is_named(tmp_path, caplog):
+    """DeepLabCut names the tables of shortened films by words after the name of the film."""
+    film(tmp_path / "clip.mp4")
+    read_observations(write_csv(tmp_path / "clipshortDLC_net.csv"))
+    assert "clipshortDLC_net.csv: takes clip.mp4, whose name begins its name" in caplog.text

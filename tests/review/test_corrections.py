@@ -26,17 +26,13 @@ def folder(tmp_path_factory):
 
 CASES = {
     "swap the last window": ([Edit("swap", (2, 4), 112)], 4),
-    "swap everywhere": ([Edit("swap", (2, 4))], 0),
-    "cut where a window begins": ([Edit("cut", (2,), 112)], 2),
     "cut inside a window": ([Edit("cut", (4,), 108)], 3),
     "join what was cut": ([Edit("cut", (2,), 109), Edit("join", (2, 6))], 0),
     "delete": ([Edit("delete", (4,))], 0),
     "exclude in the middle of a window": ([Edit("exclude", (4,), 108, 110)], 1),
-    "exclude the last window": ([Edit("exclude", (2,), 112)], 1),
     "exclude a whole window": ([Edit("exclude", (4,), 106, 112)], 2),
-    "exclude all frames": ([Edit("exclude", (4,), 100)], 0),
 }
-FILTERED_BESIDE = ("cut where", "swap the last", "exclude the last", "exclude a whole")
+FILTERED_BESIDE = ("swap the last", "exclude a whole")
 """The median filter also changes frames beside these corrections."""
 
 
@@ -78,8 +74,6 @@ def test_only_changed_windows_are_fitted_again(folder, tmp_path, monkeypatch, ca
         (Edit("cut", (2,), 115), {(2, 108, 113), (2, 112, 114), (6, 115, 116)}),
         # the second part begins where a window began that shared frames with an earlier window
         pytest.param(Edit("cut", (4,), 108), None, marks=pytest.mark.extended),
-        pytest.param(Edit("swap", (2, 4)), set(), marks=pytest.mark.extended),
-        pytest.param(Edit("exclude", (2,), 115), {(2, 108, 113), (2, 112, 114)}, marks=pytest.mark.extended),
     ],
 )
 def test_windows_that_share_frames_are_fitted_with_their_neighbours(tmp_path, edit, fitted):
@@ -125,19 +119,14 @@ def test_edits_move_birds():
 
 WRONG = {
     "unknown track": (["--swap", "2,9@110"], "swap 2,9@110: there is no track 9 (its tracks are 2, 4, 5)"),
-    "same track": (["--swap", "2,2"], "names a track twice"),
     "unknown frame": (["--cut", "2@999"], "cut 2@999: there are no such frames (its frames are 100:117)"),
     "overlap": (["--join", "2,4"], "join 2,4: both tracks have a bird in frame 100"),
     "nothing left": (["--delete", "2,4,5"], "has no track left"),
     "no frame": (["--cut", "2"], "--cut: cannot be '2' (write for example --cut 4@80)"),
-    "no list": (["--delete", "a/b\n"], "--delete: cannot be 'a/b\\n'"),
     "exclusion without frames": (
         ["--exclude", "2"],
         "--exclude: cannot be '2' (write for example --exclude 3@10:20; --delete removes all frames of a track)",
     ),
-    "exclusion of two tracks": (["--exclude", "2,4@100"], "--exclude: cannot be '2,4@100'"),
-    "no frame is left": (["--delete", "4,5", "--exclude", "2@:117"], "has no track left"),
-    "no frames": (["--exclude", "2@110:110"], "exclude 2@110:110: there are no such frames"),
 }
 
 

@@ -91,20 +91,8 @@ def test_the_examples_of_messages_are_edits(kind):
 
 
 WRONG = [
-    *("swap 3", "swap 3,5,7", "swap 3,5@", "swap 3,5@:", "swap 3,5@10:", "swap 3, 5", "swap  3,5", "Swap 3,5"),
-    *(
-        "cut 4",
-        "cut 4@80:90",
-        "cut 4@:80",
-        "cut 4,5@80",
-        "join 2",
-        "join 2,7@10",
-        "delete",
-        "delete 6@10",
-        "delete 6@:9",
-    ),
-    *("exclude 3", "exclude 3@", "exclude 3,4@10:20", "exclude -3@10", "exclude 3@1.5", "exclude 3@10:20:30"),
-    *("", "split 3@10", "--cut 4@80", "cut 4@80 # here", "delete ٣", "delete 6\n", "cut 4@" + 19 * "1"),
+    *("swap 3", "swap 3,5@:", "swap 3, 5", "Swap 3,5", "cut 4", "cut 4@80:90", "cut 4,5@80", "join 2,7@10", "delete"),
+    *("exclude 3", "exclude 3,4@10:20", "exclude 3@1.5", "", "split 3@10", "delete 6\n", "cut 4@" + 19 * "1"),
 ]
 
 
@@ -135,17 +123,11 @@ def edits_file(tmp_path_factory):
     return tmp_path_factory.mktemp("edits") / "edits.txt"
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(edits=st.lists(EDITS, max_size=5))
 def test_a_file_of_edits_comes_back(edits_file, edits):
     edits_file.write_text(edits_text(edits), encoding="utf-8")
     assert read_edits(edits_file) == edits
-
-
-@pytest.mark.parametrize("edit", [Edit("cut", (4,)), Edit("exclude", (3,)), Edit("swap", (3,)), Edit("turn", (3,))])
-def test_incomplete_edits_are_not_written(edit):
-    with pytest.raises(InputError, match="is not a correction"):
-        edits_text([edit])
 
 
 def test_comments_and_empty_lines_are_ignored(tmp_path):
@@ -166,10 +148,6 @@ FILES = {
         "edits.txt: line 2: 'split 4@80' is not a correction (write for example swap 3,5@120:200, cut 4@80, join 2,7, "
         "delete 6, exclude 3@10:20)",
     ),
-    "another kind of text": (b'{"images": []}\n', "edits.txt: line 1: '{\"images\": []}' is not a correction"),
-    "binary": (b"PK\x03\x04\xff\xfe\x00", "line 1 is not UTF-8 text (byte 4) (give a text file of corrections, saved"),
-    "zeros": (bytes(100_000), "edits.txt: line 1: '\\x00"),
-    "UTF-16": ("cut 4@80\n".encode("utf-16"), "is not UTF-8 text"),
     "nothing": (b"# nothing\n", "edits.txt: holds no correction (write one a line, for example swap 3,5@120:200)"),
     "unknown track": (b"exclude 9@110\n", "exclude 9@110: there is no track 9 (its tracks are 2, 4, 5)"),
 }
@@ -193,17 +171,6 @@ def test_wrong_files_are_one_line(folder, tmp_path, capsys, case):
     assert error.count("\n") == 1
     assert len(error) <= 301
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("name", "message"), [(".", "is a folder, not a text file"), ("absent.txt", "does not exist")])
-def test_absent_files(folder, tmp_path, capsys, name, message):
-    assert main(["tracks", str(folder), "--edits", str(tmp_path / name), "--out", str(tmp_path / "out")]) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_a_list_of_tracks_needs_the_observations_that_are_named(folder, tmp_path, capsys):
-    assert main(["tracks", str(folder), "--observations", str(tmp_path / "absent.json")]) == 2
-    assert "absent.json" in capsys.readouterr().err
 
 
 def test_a_file_needs_a_folder_for_the_result(folder, tmp_path, capsys):

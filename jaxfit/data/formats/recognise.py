@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 _WRITTEN_BY = "check the path; `jaxfit track` and `jaxfit import` write observations"
 _FORMATS = (
     "give COCO or Label Studio json, DeepLabCut or Lightning Pose .csv or .h5, SLEAP .slp, .analysis.h5 or .csv, "
-    "or files of NWB, JABS or AlphaTracker"
+    "or AlphaTracker json"
 )
 
 
@@ -121,15 +121,7 @@ def _hdf5_keypoints(path: Path, video: Path | None) -> tuple[str, KeypointTable]
         if table is not None:
             return "an HDF5 file of DeepLabCut", read_deeplabcut_hdf5(table, path)
         names = list(file)
-        is_nwb = "nwb_version" in file.attrs
     if "instances" in names and "frames" in names:
         return "a SLEAP project", read_sleap_project(path, video)
-    if is_nwb:
-        return "an NWB file", read_with_sleap_io(path, "an NWB file", lambda sio, name: sio.load_nwb(name), video)
-    if "poseest" in names:
-        return "a file of JABS", read_with_sleap_io(
-            path, "a file of JABS", lambda sio, name: sio.load_jabs(name), video
-        )
-    raise InputError(
-        path, f"is an HDF5 file of no known format: it holds {', '.join(names[:10]) or 'nothing'}", _FORMATS
-    )
+    held = ", ".join(names[:10]) or "nothing"
+    raise InputError(path, f"is an HDF5 file of no known format: it holds {held}", _FORMATS)

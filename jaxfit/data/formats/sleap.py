@@ -1,7 +1,7 @@
 """Files of SLEAP, and files of other programs that sleap-io reads.
 
-sleap-io reads projects of SLEAP (`.slp`), its analysis CSV, NWB, JABS and AlphaTracker. The birds of the labels become
-a table of keypoints: in a frame, a label of a person replaces the prediction that it was made from, and the prediction
+sleap-io reads projects of SLEAP (`.slp`), its analysis CSV, and AlphaTracker. The birds of the labels become a table of
+keypoints: in a frame, a label of a person replaces the prediction that it was made from, and the prediction
 of the same track. Points that are not visible are missing.
 
 Analysis files of SLEAP (`.analysis.h5`) are read here, because sleap-io 0.9 rejects files without scores, which earlier
