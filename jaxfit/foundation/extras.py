@@ -37,7 +37,9 @@ class OptionalPackage(NamedTuple):
 
 OPTIONAL_PACKAGES = {
     "h5py": OptionalPackage("h5py", "3.14", "formats", "files of DeepLabCut (.h5) and SLEAP"),
-    "sleap-io": OptionalPackage("sleap_io", "0.9", "formats", "projects and CSV of SLEAP, AlphaTracker, `jaxfit suggest`"),
+    "sleap-io": OptionalPackage(
+        "sleap_io", "0.9", "formats", "projects and CSV of SLEAP, AlphaTracker, `jaxfit suggest`"
+    ),
     "xarray": OptionalPackage("xarray", "2025.8", "formats", "`jaxfit export --to movement`"),
     "h5netcdf": OptionalPackage("h5netcdf", "1.4", "formats", "`jaxfit export --to movement`"),
     "pyarrow": OptionalPackage("pyarrow", "18", "formats", "`jaxfit export --to parquet`"),
