@@ -80,17 +80,19 @@ def read_camera_file(path: str | Path, unit: Unit | None = None) -> CameraFile:
     if unit is not None and unit not in get_args(Unit):
         raise ValueError(f"unit must be one of {', '.join(get_args(Unit))} or None, not {unit!r}")
     path = Path(path)
-    found = _read_folder(path) if path.is_dir() else _reader(path)(path)
-    if unit is not None and found.unit is not None and unit != found.unit:
-        raise InputError(path, f"states the unit {found.unit}, not {unit}", f"read the file with the unit {found.unit}")
-    known: Unit | None = unit or found.unit or found.usual_unit
+    content = _read_folder(path) if path.is_dir() else _reader(path)(path)
+    if unit is not None and content.unit is not None and unit != content.unit:
+        raise InputError(
+            path, f"states the unit {content.unit}, not {unit}", f"read the file with the unit {content.unit}"
+        )
+    known: Unit | None = unit or content.unit or content.usual_unit
     if known is None:
-        if any(camera.transl_cam.any() for camera in found.cameras):
-            problem = f"is a file of {found.format}, which does not state its unit of length"
+        if any(camera.transl_cam.any() for camera in content.cameras):
+            problem = f"is a file of {content.format}, which does not state its unit of length"
             raise InputError(path, problem, "give the unit of the file: m, cm or mm")
-        return CameraFile(found.cameras, found.format, None, False)
-    cameras = tuple(in_metres(camera, known) for camera in found.cameras)
-    return CameraFile(cameras, found.format, known, unit is None and found.unit is None)
+        return CameraFile(content.cameras, content.format, None, False)
+    cameras = tuple(in_metres(camera, known) for camera in content.cameras)
+    return CameraFile(cameras, content.format, known, unit is None and content.unit is None)
 
 
 def write_cameras(cameras: Sequence[Camera], path: str | Path) -> None:
@@ -143,33 +145,33 @@ def _reader(path: Path) -> Callable[[Path], Parsed]:
 
 def _read_folder(folder: Path) -> Parsed:
     check_folder(folder)
-    files = sorted((each for each in folder.iterdir() if each.is_file()), key=lambda each: natural(each.name))
-    names = [each.name for each in files]
+    files = sorted((path for path in folder.iterdir() if path.is_file()), key=lambda path: natural(path.name))
+    names = [path.name for path in files]
     if all(name in names for name in _COLMAP_FILES):
         return read_colmap(folder)
     if "cameras.bin" in names and "images.bin" in names:
         raise _binary_colmap(folder)
     kinds = {
-        "TOML files": [each for each in files if each.suffix.lower() == ".toml"],
-        ".mat files": [each for each in files if each.suffix.lower() == ".mat"],
-        "YAML or XML files": [each for each in files if each.suffix.lower() in _STORAGE_SUFFIXES],
+        "TOML files": [path for path in files if path.suffix.lower() == ".toml"],
+        ".mat files": [path for path in files if path.suffix.lower() == ".mat"],
+        "YAML or XML files": [path for path in files if path.suffix.lower() in _STORAGE_SUFFIXES],
     }
-    present = {kind: each for kind, each in kinds.items() if each}
+    present = {kind: paths for kind, paths in kinds.items() if paths}
     if not present:
-        present = {"JSON files": [each for each in files if each.suffix.lower() == ".json"]}
+        present = {"JSON files": [path for path in files if path.suffix.lower() == ".json"]}
     if len(present) > 1:
         raise InputError(folder, f"holds {' and '.join(present)}", "name the file of the cameras, or clear the folder")
-    ((kind, found),) = present.items()
-    if not found:
+    ((kind, chosen),) = present.items()
+    if not chosen:
         raise InputError(folder, "holds no file of cameras", _FORMATS)
-    if len(found) == 1:
-        return _reader(found[0])(found[0])
+    if len(chosen) == 1:
+        return _reader(chosen[0])(chosen[0])
     if kind == "TOML files":
-        raise InputError(folder, f"holds {len(found)} TOML files", "name the file of the cameras")
+        raise InputError(folder, f"holds {len(chosen)} TOML files", "name the file of the cameras")
     if kind == ".mat files":
-        single = [each for each in found if each.stem.lower().endswith("_params")]
-        return read_dannce_folder(folder, single or found)
-    return read_opencv_folder(folder, found)
+        single = [path for path in chosen if path.stem.lower().endswith("_params")]
+        return read_dannce_folder(folder, single or chosen)
+    return read_opencv_folder(folder, chosen)
 
 
 def _binary_colmap(path: Path) -> InputError:

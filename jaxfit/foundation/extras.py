@@ -76,12 +76,12 @@ __version__ = own_version()
 def other_jaxfit() -> str | None:
     """Return the version of the other software that the package index names `jaxfit`; None if it is not installed."""
     try:
-        found = metadata.distribution("jaxfit")
+        distribution = metadata.distribution("jaxfit")
     except metadata.PackageNotFoundError:
         return None
     # earlier versions of this package were distributions of that name too
-    is_own = any(point.value == _COMMAND for point in found.entry_points)
-    return None if is_own else found.version
+    is_this_package = any(point.value == _COMMAND for point in distribution.entry_points)
+    return None if is_this_package else distribution.version
 
 
 def install_command(extra: str, upgrade: bool = False) -> str:

@@ -117,12 +117,12 @@ def read_record(folder: Path) -> Any:
     return read_json_file(check_readable(folder / RECORD, "a record", "remove this folder to begin again"))
 
 
-def differences(held: Any, own: Any, name: str = "") -> Iterator[str]:
+def differences(stored: Any, wanted: Any, name: str = "") -> Iterator[str]:
     """Yield the paths, such as `track.frames.stop`, of the values that differ."""
-    if isinstance(held, dict) and isinstance(own, dict):
-        for key in dict.fromkeys([*own, *held]):
-            yield from differences(held.get(key), own.get(key), f"{name}.{key}" if name else key)
-    elif held != own:
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        for key in dict.fromkeys([*wanted, *stored]):
+            yield from differences(stored.get(key), wanted.get(key), f"{name}.{key}" if name else key)
+    elif stored != wanted:
         yield name or "record"
 
 

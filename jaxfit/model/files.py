@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxfit.foundation.array_files import load_npz
+from jaxfit.foundation.array_files import load_npz, validate_arrays
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
 from jaxfit.model.bird import ARRAY_FIELDS, Bird, check_bird, neutral_colours, unlimited_joints
@@ -78,30 +78,22 @@ def load_bird(path: Path | str) -> Bird:
             has a newer version; or a field is missing or has a wrong shape or wrong content.
     """
     path = Path(path)
-    layout = ARRAY_FIELDS | STATIC_FIELDS
-    optional = {field: layout.pop(field) for field in OPTIONAL_FIELDS} | {_UNIT: ""}
-    content = load_npz(path, layout, FORMAT_VERSION, optional=optional)
-    for field, array in content.items():
-        kinds = "U" if field in TEXT_FIELDS else "f" if field in (*ARRAY_FIELDS, _UNIT) and field != "faces" else "iu"
-        if array.dtype.kind not in kinds:
-            kind = {"U": "text", "f": "real numbers", "iu": "integers"}[kinds]
-            problem = f"{field}: {array.dtype} array of shape {array.shape}, expected {kind}"
-            raise InputError(path, problem, "write the file again with save_bird")
-
-    def pairs(field: str) -> tuple[tuple[int, int], ...]:
-        return tuple((int(left), int(right)) for left, right in content[field])
-
-    def int32(array: np.ndarray) -> np.ndarray:
-        # without this, an index beyond int32 would wrap round to an index that may be valid
-        return np.where((array < 2**31) & (array >= 0), array.astype(np.int32), np.int32(-1))
-
-    # a number too large for float32 becomes infinite, and check_bird reports its field
-    with np.errstate(over="ignore"):
-        arrays: dict[str, Any] = {
-            field: int32(content[field]) if field == "faces" else content[field].astype(np.float32)
-            for field in ARRAY_FIELDS
-            if field in content
-        }
+    shapes = ARRAY_FIELDS | STATIC_FIELDS | {_UNIT: ""}
+    optional = {name: shapes[name] for name in (*OPTIONAL_FIELDS, _UNIT)}
+    required = {name: shape for name, shape in shapes.items() if name not in optional}
+    content = load_npz(path, required, FORMAT_VERSION, optional=optional)
+    whole = ("faces", "parents", "joint_pairs", "keypoint_pairs")
+    types: dict[str, Any] = {
+        name: "U" if name in TEXT_FIELDS else np.int64 if name in whole else np.float32 for name in content
+    }
+    types[_UNIT] = np.float64
+    try:
+        content = validate_arrays(content, {name: (shapes[name], types[name]) for name in content})
+    except ValueError as error:
+        raise InputError(path, str(error), "write the file again with save_bird") from None
+    arrays: dict[str, Any] = {field: content[field] for field in ARRAY_FIELDS if field in content}
+    # an index beyond int32 stays an index that check_bird refuses
+    arrays["faces"] = np.clip(content["faces"], -1, 2**31 - 1).astype(np.int32)
     arrays.setdefault("vertex_colours", neutral_colours(len(content["vertices"])))
     arrays.setdefault("joint_limits", unlimited_joints(max(len(content["parents"]) - 1, 0)))
     bird = Bird(
@@ -109,8 +101,8 @@ def load_bird(path: Path | str) -> Bird:
         parents=tuple(int(parent) for parent in content["parents"]),
         joint_names=tuple(map(str, content["joint_names"])),
         keypoint_names=tuple(map(str, content["keypoint_names"])),
-        joint_pairs=pairs("joint_pairs"),
-        keypoint_pairs=pairs("keypoint_pairs"),
+        joint_pairs=tuple((int(left), int(right)) for left, right in content["joint_pairs"]),
+        keypoint_pairs=tuple((int(left), int(right)) for left, right in content["keypoint_pairs"]),
         name=str(content["name"]),
         metres_per_unit=float(content[_UNIT]) if _UNIT in content else None,
     )

@@ -23,6 +23,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxfit.foundation.array_files import check_shapes
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import check_readable, read_json_file
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, JOINT_NAMES, mirror_pairs
@@ -63,15 +64,18 @@ def read_prior(content: dict[str, Any], keys: tuple[str, ...], source: object) -
     Raises:
         InputError: an array is missing or has a wrong shape.
     """
+    prior = {field: read_numbers(content, key, "f", source) for field, key in zip(PRIOR_FIELDS, keys, strict=True)}
     bones = len(JOINT_NAMES) - 1
-    shapes = ((3 * bones,), (3 * bones, 3 * bones), (bones,), (bones, bones))
-    prior = {}
-    for field, key, shape in zip(PRIOR_FIELDS, keys, shapes, strict=True):
-        prior[field] = array = read_numbers(content, key, "f", source)
-        if array.shape != shape:
-            problem = f"{key}: shape {array.shape}, expected {shape}"
-            raise InputError(source, problem, "use the published prior")
+    shapes = (f"{3 * bones}", f"{3 * bones} {3 * bones}", f"{bones}", f"{bones} {bones}")
+    _check_shapes(prior, dict(zip(PRIOR_FIELDS, shapes, strict=True)), source, "use the published prior")
     return prior
+
+
+def _check_shapes(arrays: dict[str, np.ndarray], layout: dict[str, str], source: object, remedy: str) -> None:
+    try:
+        check_shapes({name: arrays[name].shape for name in layout}, layout)
+    except ValueError as error:
+        raise InputError(source, str(error), remedy) from None
 
 
 def build_bird(
@@ -97,18 +101,15 @@ def build_bird(
     """
     parts = {key: read_numbers(mesh, key, kind, source) for key, kind in MESH_KEYS.items()}
     joints = len(JOINT_NAMES)
-    for key, expected in (
-        ("kintree_table", (2, joints)),
-        ("J", (joints, 3)),
-        ("V", (None, 3)),
-        ("F", (None, 3)),
-        ("weights", (len(parts["V"]), joints)),
-        ("vert2kpt", (len(keypoint_names), len(parts["V"]))),
-    ):
-        actual = parts[key].shape
-        if len(actual) != len(expected) or any(e not in (None, a) for e, a in zip(expected, actual, strict=True)):
-            shown = str(expected).replace("None", "any")
-            raise InputError(source, f"{key}: shape {actual}, expected {shown}", f"is this the {name} model?")
+    layout = {
+        "kintree_table": f"2 {joints}",
+        "J": f"{joints} 3",
+        "V": "V 3",
+        "F": "F 3",
+        "weights": f"V {joints}",
+        "vert2kpt": f"{len(keypoint_names)} V",
+    }
+    _check_shapes(parts, layout, source, f"is this the {name} model?")
     parents, numbers = parts["kintree_table"]
     if not np.array_equal(numbers, np.arange(joints)):
         raise InputError(source, "kintree_table: its second row must be 0, 1, 2, …", "use the published file")

@@ -81,7 +81,7 @@ def read_colmap(folder: Path) -> Parsed:
 
 
 def _intrinsics(path: Path) -> dict[int, _Intrinsics]:
-    found: dict[int, _Intrinsics] = {}
+    intrinsics: dict[int, _Intrinsics] = {}
     for line, text in enumerate(read_text(path, "cameras.txt of COLMAP").splitlines(), 1):
         words = text.split()
         if not words or words[0].startswith("#"):
@@ -97,14 +97,14 @@ def _intrinsics(path: Path) -> dict[int, _Intrinsics]:
         if len(values) != model.focal_lengths + 2 + model.coefficients:
             count = model.focal_lengths + 2 + model.coefficients
             _fail(path, line, f"has {len(values)} parameters; {words[1]} has {count}")
-        if number in found:
+        if number in intrinsics:
             _fail(path, line, f"holds camera {number} a second time")
         fx, fy = values[0], values[model.focal_lengths - 1]
         cx, cy, *coefficients = values[model.focal_lengths :]
         matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
         padded = coefficients + [0.0] * (-len(coefficients) % 4)
-        found[number] = _Intrinsics(matrix, np.array(padded, np.float64), (width, height), model.lens)
-    return found
+        intrinsics[number] = _Intrinsics(matrix, np.array(padded, np.float64), (width, height), model.lens)
+    return intrinsics
 
 
 def _images(path: Path) -> Iterator[tuple[int, str, int, tuple[np.ndarray, np.ndarray]]]:

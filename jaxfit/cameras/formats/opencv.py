@@ -58,7 +58,7 @@ _LENSES: dict[str, Lens] = {
 _REMEDY = "give a file with an intrinsic matrix: camera_matrix, K, cameraMatrix or intrinsicMatrix"
 
 
-class _Found(NamedTuple):
+class _FileCamera(NamedTuple):
     """A camera with its unit, and whether the file states its pose."""
 
     camera: Camera
@@ -73,10 +73,10 @@ def read_opencv(path: Path) -> Parsed:
     Raises:
         InputError: the file is damaged or too large, holds no camera, or a camera has an impossible value.
     """
-    found = list(_cameras(path, read_storage(path), path.stem))
-    if not found:
+    entries = list(_cameras(path, read_storage(path), path.stem))
+    if not entries:
         raise InputError(path, "holds no camera", _REMEDY)
-    return _parsed(path, found)
+    return _parsed(path, entries)
 
 
 def read_opencv_folder(folder: Path, files: Sequence[Path]) -> Parsed:
@@ -90,27 +90,27 @@ def read_opencv_folder(folder: Path, files: Sequence[Path]) -> Parsed:
         merged |= content
     if _stereo_side(_plain(merged)) is not None:
         return _parsed(folder, list(_cameras(folder, merged, folder.name)))
-    found: list[_Found] = []
+    entries: list[_FileCamera] = []
     for path, content in contents.items():
         inside = list(_cameras(path, content, path.stem))
         if not inside:
             raise InputError(path, "holds no camera", f"{_REMEDY}, or remove the file from the folder")
-        found += inside
-    return _parsed(folder, found)
+        entries += inside
+    return _parsed(folder, entries)
 
 
-def _parsed(source: Path, found: list[_Found]) -> Parsed:
-    units = {each.unit for each in found}
+def _parsed(source: Path, entries: list[_FileCamera]) -> Parsed:
+    units = {entry.unit for entry in entries}
     if len(units) > 1:
         raise InputError(source, "holds cameras with different units", "write all cameras in one unit")
-    jarvis = all(each.jarvis for each in found)
-    cameras = [each.camera for each in found]
+    jarvis = all(entry.jarvis for entry in entries)
+    cameras = [entry.camera for entry in entries]
     form, usual = ("JARVIS", "mm") if jarvis else ("OpenCV", None)
-    absent = [each.camera.name for each in found if not each.posed]
+    absent = [entry.camera.name for entry in entries if not entry.posed]
     if len(absent) > 1:
         problem = f"lacks the poses of {len(absent)} cameras, such as {absent[0]}"
         raise InputError(source, problem, "add R and T of each camera, or read the files one by one")
-    return parsed(source, cameras, form, found[0].unit, usual)
+    return parsed(source, cameras, form, entries[0].unit, usual)
 
 
 def _plain(content: dict[str, Any]) -> dict[str, Any]:
@@ -136,7 +136,7 @@ def _stereo_side(values: dict[str, Any]) -> tuple[str, str] | None:
     return None
 
 
-def _cameras(path: Path, content: dict[str, Any], name: str) -> Iterator[_Found]:
+def _cameras(path: Path, content: dict[str, Any], name: str) -> Iterator[_FileCamera]:
     """Yield the cameras of a mapping: the mapping itself, a stereo pair, or the cameras under its keys."""
     values = _plain(content)
     key = _first(values, _MATRIX)
@@ -150,16 +150,16 @@ def _cameras(path: Path, content: dict[str, Any], name: str) -> Iterator[_Found]
     for key, value in content.items():
         parts = [(key, key, value)]
         if _plain({key: 0}).keys() <= {"cameras"} and isinstance(value, dict | list):
-            entries = value.items() if isinstance(value, dict) else enumerate(value)
-            parts = [(f"{key}.{i}", str(i) if isinstance(value, dict) else f"camera{i}", part) for i, part in entries]
-        for address, own, part in parts:
+            numbered = value.items() if isinstance(value, dict) else enumerate(value)
+            parts = [(f"{key}.{i}", str(i) if isinstance(value, dict) else f"camera{i}", part) for i, part in numbered]
+        for address, camera, part in parts:
             inside = _plain(part) if isinstance(part, dict) else {}
             matrix = _first(inside, _MATRIX)
             if matrix is not None and _is_matrix(inside[matrix]):
-                yield _camera(path, str(address), {"unit": unit} | inside, str(own))
+                yield _camera(path, str(address), {"unit": unit} | inside, str(camera))
 
 
-def _camera(path: Path, field: str, values: dict[str, Any], name: str) -> _Found:
+def _camera(path: Path, field: str, values: dict[str, Any], name: str) -> _FileCamera:
     where = f"{field}." if field else ""
     name = camera_name(path, f"{where}name", values.get("cameraname", values.get("name", name)))
     key = _first(values, _MATRIX) or ""
@@ -171,22 +171,22 @@ def _camera(path: Path, field: str, values: dict[str, Any], name: str) -> _Found
     distortion, lens = _distortion(path, where, values)
     size = _size(path, where, values)
     camera = make_camera(path, field, name, matrix, distortion, pose, size, WHOLE_PIXELS, lens)
-    return _Found(camera, stated_unit(path, f"{where}unit", values.get("unit")), pose is not None, jarvis)
+    return _FileCamera(camera, stated_unit(path, f"{where}unit", values.get("unit")), pose is not None, jarvis)
 
 
-def _stereo(path: Path, values: dict[str, Any], pair: tuple[str, str]) -> Iterator[_Found]:
+def _stereo(path: Path, values: dict[str, Any], pair: tuple[str, str]) -> Iterator[_FileCamera]:
     unit = stated_unit(path, "unit", values.get("unit"))
     pose = _pose(path, "", values)
     if pose is None:
         raise InputError(path, "holds two cameras without R and T", "add R and T, from the first camera to the second")
-    for end, own in zip(pair, ((np.eye(3), np.zeros(3)), pose), strict=True):
+    for end, camera_pose in zip(pair, ((np.eye(3), np.zeros(3)), pose), strict=True):
         key = _first(values, _MATRIX, end) or ""
         matrix = numbers(path, key, values[key], (3, 3))
         distortion, lens = _distortion(path, "", values, end)
         name = {"l": "left", "r": "right"}.get(end, end if end in ("left", "right") else f"camera{end}")
         size = _size(path, "", values)
-        camera = make_camera(path, name, name, matrix, distortion, own, size, WHOLE_PIXELS, lens)
-        yield _Found(camera, unit, True)
+        camera = make_camera(path, name, name, matrix, distortion, camera_pose, size, WHOLE_PIXELS, lens)
+        yield _FileCamera(camera, unit, True)
 
 
 def _distortion(path: Path, where: str, values: dict[str, Any], end: str = "") -> tuple[np.ndarray, Lens]:
