@@ -104,6 +104,7 @@ def optimised():
 def distant_birds(monkeypatch):
     """Let a fit accept birds at any distance, whose objective overflows."""
     monkeypatch.setattr("jaxfit.fitting.windows.MAX_DISTANCE_IMAGE_SIDES", 1e35)
+    monkeypatch.setattr("jaxfit.data.observations.LARGEST_POSITION_PX", 1e35)
 
 
 @pytest.fixture(scope="module")

@@ -6,17 +6,16 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from jaxfit.cameras.camera import MAX_IMAGE_SIDE_PX
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.observations import Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.camera import CROP_PX
 from jaxfit.raster.silhouette_reference import UNKNOWN
 
-MAX_CROP_IMAGE_SIDES = 2
-"""Largest side of a crop, as a multiple of the longer side of its image."""
 MIN_SIZE_PX = 16.0
 """Smallest side of a crop, in image pixels."""
+MAX_CROP_IMAGE_SIDES = 2
+"""Largest side of a crop, as a multiple of the longer side of its image."""
 MARGIN_PX = 3.0
 """Pixels this close to another bird's mask are unknown, in pixels of a 256-pixel crop: masks are ragged, and the edge
 of a silhouette is soft."""
@@ -86,16 +85,8 @@ def _around_the_bird(
 
 
 def cut_mask(mask: Bool[np.ndarray, "H W"], crop: Float[np.ndarray, "3"], mask_px: int) -> np.ndarray:
-    """Return the crop of a mask, (mask_px, mask_px): 1 where the mask covers at least half of the pixel, else 0.
-
-    Raises:
-        ValueError: the crop is larger than `crop_squares` allows.
-    """
+    """Return the crop of a mask, (mask_px, mask_px): 1 where the mask covers at least half of the pixel, else 0."""
     x0, y0, size = (int(v) for v in crop)
-    if size > MAX_CROP_IMAGE_SIDES * MAX_IMAGE_SIDE_PX:
-        raise ValueError(
-            f"crop must have a side of at most {MAX_CROP_IMAGE_SIDES * MAX_IMAGE_SIDE_PX} pixels, not {size}"
-        )
     rows, columns = mask.shape
     top, left, bottom, right = max(y0, 0), max(x0, 0), min(y0 + size, rows), min(x0 + size, columns)
     if top >= bottom or left >= right:

@@ -46,24 +46,11 @@ class StoredWindows:
 
     def __init__(self, parts: Parts):
         self._parts, self._count = parts, 0
-        self._contents: set[str] | None = None
 
     @property
     def state(self) -> str:
         """The number of windows that were found or added, for progress."""
         return f"{self._count} {'window' if self._count == 1 else 'windows'} fitted"
-
-    def missing(self, windows: Windows) -> list[int]:
-        """Return the rows of the windows that are not stored.
-
-        Raises:
-            InputError: a file is damaged.
-        """
-        if self._contents is None:
-            parts = (self._parts.load(number, _LAYOUT) for number in self._parts.numbers)
-            self._contents = {content for arrays in parts for content in arrays["content"].tolist()}
-            self._count = len(self._contents)
-        return [w for w in range(len(windows)) if window_hash(windows, w) not in self._contents]
 
     def find(self, windows: Windows) -> dict[int, FittedWindow]:
         """Return row → result of the windows that are stored.
@@ -99,14 +86,11 @@ class StoredWindows:
             InputError: the disk is full, or the folder cannot be written.
         """
         self._count += len(results)
-        contents = [window_hash(windows, w) for w in results]
-        if self._contents is not None:
-            self._contents.update(contents)
         some = list(results.values())
         poses = {name: np.stack([getattr(result.pose, name) for result in some]) for name in _POSE}
         self._parts.add(
             {
-                "content": np.array(contents),
+                "content": np.array([window_hash(windows, w) for w in results]),
                 "failure": np.array([result.failure for result in some]),
                 "loss": np.array([list(result.loss.values()) for result in some], np.float64),
                 "loss_terms": np.array(list(some[0].loss)),

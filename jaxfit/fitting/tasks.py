@@ -6,7 +6,7 @@ The result of a window does not depend on the other windows of its task, so task
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -144,18 +144,10 @@ def _prepare_rows(
     return jax.tree.map(lambda *x: np.concatenate(x), *prepared), np.array([row[pair] for pair in pairs])
 
 
-def in_batches(
-    task: FitTask, model: FitModel, birds: int, stored: StoredWindows | None, cluster: Cluster | None
+def _in_batches(
+    task: FitTask, model: FitModel, birds: int, is_stored: bool, has_workers: bool
 ) -> list[list[tuple[int, int]]]:
-    """Divide the problems of a fit into batches.
-
-    Args:
-        task: all problems.
-        model: the model of the fit.
-        birds: number of tracks.
-        stored: the store of fitted windows, or None.
-        cluster: the workers, or None.
-    """
+    """Divide the problems of a fit into batches."""
     config, views = task.configs[0], task.windows[0].has_mask.shape[2:]
     frames = frames_per_batch(model.bird, config) // (views[0] if views else 1)
     size = max(min(frames // config.window, len(task.problems)), 1)
@@ -166,11 +158,9 @@ def in_batches(
 
     # by time, because masks of a frame lie together in files; problems of one window share their initial poses
     ordered = sorted(task.problems, key=time)
-    if cluster is not None:
-        # a small task costs little if its worker ends
+    if has_workers:  # a small task costs little if its worker ends
         size = min(size, tile_size(config.window) * len(task.configs))
-    if stored is not None:
-        # an interruption costs one batch
+    if is_stored:  # an interruption costs one batch
         size = min(size, windows_per_part(birds, config.window))
     return [ordered[first : first + size] for first in range(0, len(ordered), size)]
 
@@ -187,56 +177,43 @@ def fit_windows(
     """Fit the problems of a fit in batches, with progress, and store the windows of every batch when they are fitted.
 
     Args:
-        task, model, birds, stored, cluster: as for `in_batches`.
+        task: all problems.
+        model: the model of the fit.
+        birds: number of tracks.
         subject: what is fitted, for people.
         progress: shows progress.
+        stored: the store of fitted windows, or None.
+        cluster: worker processes; None: this process.
 
     Returns:
         The result of every problem. A window whose task failed on the workers is not stored.
     """
-    batches, window = in_batches(task, model, birds, stored, cluster), task.configs[0].window
-    _logger.info("%s, %d windows of %d frames, %d batches", subject, len(task.problems), window, len(batches))
-    steps = sum(stage.steps for stage in task.configs[0].stages)
-    with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
-        return fit_batches(batches, task, model, stored, cluster, report_progress)
-
-
-def fit_batches(
-    batches: Sequence[list[tuple[int, int]]],
-    task: FitTask,
-    model: FitModel,
-    stored: StoredWindows | None,
-    cluster: Cluster | None,
-    report_progress: ReportProgress,
-) -> dict[tuple[int, int], FittedWindow]:
-    """Fit the batches of `in_batches`, as `fit_windows`; report the steps of all stages for every batch."""
     config, results = task.configs[0], {}
-    for i, windows in _fit_tasks(batches, task, model, cluster, report_progress):
-        if isinstance(windows, FailedTask):
-            windows = failed_windows(model, config, len(batches[i]), f"not computed: {windows.reason}")
-        elif stored is not None:
-            stored.add(task.windows[0], {w: window for (_, w), window in zip(batches[i], windows, strict=True)})
-            report_progress(0, "")
-        results |= dict(zip(batches[i], windows, strict=True))
+    batches = _in_batches(task, model, birds, stored is not None, cluster is not None)
+    _logger.info("%s, %d windows of %d frames, %d batches", subject, len(task.problems), config.window, len(batches))
+    steps = sum(stage.steps for stage in config.stages)
+    with progress(f"Fitting {subject}", steps * len(batches)) as report_progress:
+        parts = (task.part(batch) for batch in batches)
+        fitted = _fit_here(parts, model, report_progress)
+        if cluster is not None:
+            report_progress(0, "starting workers")
+            fitted = cluster.run(fit_task, model, parts)
+        for i, windows in fitted:  # in the order of arrival
+            if cluster is not None:
+                report_progress(steps, "on workers")
+            if isinstance(windows, FailedTask):
+                windows = failed_windows(model, config, len(batches[i]), f"not computed: {windows.reason}")
+            elif stored is not None:
+                stored.add(task.windows[0], {w: window for (_, w), window in zip(batches[i], windows, strict=True)})
+                report_progress(0, "")
+            results |= dict(zip(batches[i], windows, strict=True))
     return results
 
 
-def _fit_tasks(
-    batches: Sequence[list[tuple[int, int]]],
-    task: FitTask,
-    model: FitModel,
-    cluster: Cluster | None,
-    report_progress: ReportProgress,
-) -> Iterator[tuple[int, list[FittedWindow] | FailedTask]]:
-    """Fit batches in this process or on workers. Yield number and results of every batch, in the order of arrival."""
-    parts = (task.part(batch) for batch in batches)
-    if cluster is None:
-        for i, part in enumerate(parts):
-            report_progress(0, "initial poses")
-            yield i, fit_task(model, part, report_progress)
-        return
-    report_progress(0, "starting workers")
-    steps = sum(stage.steps for stage in task.configs[0].stages)
-    for i, windows in cluster.run(fit_task, model, parts):
-        report_progress(steps, "on workers")
-        yield i, windows
+def _fit_here(
+    parts: Iterable[FitTask], model: FitModel, report_progress: ReportProgress
+) -> Iterator[tuple[int, list[FittedWindow]]]:
+    """Fit tasks in this process. Yield number and results of every task."""
+    for i, part in enumerate(parts):
+        report_progress(0, "initial poses")
+        yield i, fit_task(model, part, report_progress)

@@ -37,7 +37,6 @@ from jaxfit.fitting.solve import crop_camera, without_mask_stages
 from jaxfit.fitting.tasks import FitTask, fit_windows
 from jaxfit.fitting.windows import (
     Windows,
-    first_frames,
     prepare_observations,
     window_frames,
     window_starts,
@@ -264,7 +263,7 @@ def view_windows(
         confidence=confidence.max(axis=0),
         masks={},
     )
-    starts = window_starts(together, config, first_frames(together, config))
+    starts = window_starts(together, config)
     frame = window_frames(together, config, starts)
     posed = has_pose & together.usable(config.min_keypoints)
     starts = starts[((frame >= 0) & posed[starts[:, :1], np.maximum(frame, 0)]).any(axis=1)]

@@ -44,7 +44,7 @@ def test_the_overlap_is_at_most_half_of_the_window():
     half = cut_windows(observations(), dataclasses.replace(CONFIG, overlap=20))
     assert half.frame[:5, 0].tolist() == [0, 3, 6, 9, 12]  # windows of 6 frames
     assert config(window=1, overlap=20).overlap_frames == 0
-    with pytest.raises(ConfigKeyError, match="expected 0 to 10,000"):
+    with pytest.raises(ConfigKeyError, match="expected 0 or more"):
         dataclasses.replace(CONFIG, overlap=-1)
 
 
