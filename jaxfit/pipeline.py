@@ -126,6 +126,41 @@ class Reconstruction(NamedTuple):
     """The keypoints of the network → those of the model, by the words of their names."""
 
 
+class Networks(NamedTuple):
+    """The networks of a reconstruction."""
+
+    segmenter: Segmenter | None
+    """The segmenter of the caller; None for that of the config."""
+    keypoints: KeypointDetector
+    choice: SegmenterChoice | None
+    """The segmenter that `auto` stands for."""
+    hashes: dict[str, dict[str, str]]
+    """Kind → name → SHA-256 hash of the files of the networks of the config."""
+    all_of_config: bool
+    """Whether the caller gave no network, so that frames can be stored and workers can run the networks."""
+    names: NameMap
+    """The keypoints of the network → those of the model."""
+
+
+class Store(NamedTuple):
+    """The unfinished work of a reconstruction."""
+
+    frames: Parts | None
+    """The tracked frames; None with networks of the caller."""
+    window_parts: Parts
+    windows: StoredWindows
+    """The fitted windows, which are stored in `window_parts`."""
+
+    def size(self) -> str:
+        """Return the size of the stored work, for progress."""
+        size_bytes = self.window_parts.size_bytes + (self.frames.size_bytes if self.frames else 0)
+        return f"{size_bytes / 1e6:.1f} MB stored"
+
+    def state(self) -> str:
+        """Return the number of fitted windows and the size of the stored work, for progress."""
+        return f"{self.windows.state}, {self.size()}"
+
+
 def reconstruct(
     video: str | Path,
     folder: str | Path,
@@ -168,82 +203,114 @@ def reconstruct(
             that ends.
     """
     video, folder, clock = Path(video), Path(folder), Clock()
-    replaced = {"segmenter": segmenter is not None, "keypoints": keypoints is not None}
     with clock("load"):
-        config = config or load_reconstruct_config()
         info = probe_video(video)
         _check_folder(folder, video, overwrite)  # before the long work
-        bird = bird or load_murre()
-        keypoints = keypoints or open_keypoint_detector(config.track)
-        config, choice = (config, None) if replaced["segmenter"] else _with_segmenter(config, video, progress)
-        own_networks = {kind: files for kind, files in network_files(config.track).items() if not replaced[kind]}
-        networks = file_hashes(own_networks)
-        names = names_in_model(keypoints.keypoint_names, bird.keypoint_names, config.track.keypoints.file)
+        bird, config = bird or load_murre(), config or load_reconstruct_config()
+        config, networks = _choose(config, video, bird, segmenter, keypoints, progress)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
-            stored, workers = None, None
-            if not any(replaced.values()):
-                stored = Parts(unfinished / "frames", tracking_record(config.track, video, networks, progress))
-                workers = cluster
-            fitted = Parts(unfinished / "windows", fit_record(config.fit, bird))
-            windows = StoredWindows(fitted)
-
-            def disk_used() -> str:
-                return f"{sum(parts.size_bytes for parts in (stored, fitted) if parts) / 1e6:.1f} MB stored"
-
-            fit_progress = annotated(progress, lambda: f"{windows.state}, {disk_used()}")
-            tracking = run_tracking(
-                video,
-                config.track,
-                segmenter,
-                keypoints,
-                progress=annotated(progress, disk_used),
-                parts=stored,
-                cluster=workers,
-            )
-            observations = map_keypoints(tracking.observations, names, bird.keypoint_names)
-            tracking = tracking._replace(choice=choice, observations=observations)
-        _check_tracking(tracking, stored)
+            store = _open_store(unfinished, config, video, bird, networks, progress)
+            tracking = _track(video, config.track, networks, bird, store, progress, cluster)
         with clock("fit"):
-            config, learnt_yaml = _learn_weights(config, observations, bird, video, progress)
-            solution = fit(observations, bird, config.fit, None, fit_progress, video, windows, cluster)
+            config, learnt_yaml = _learn(config, tracking.observations, bird, video, progress)
+            fit_progress = annotated(progress, store.state)
+            solution = fit(tracking.observations, bird, config.fit, None, fit_progress, video, store.windows, cluster)
+        behaviour = shown_behaviour(solution, bird, progress)
         with new_folder(folder, overwrite, marker=POSES) as part:
-            write_coco(observations, part / OBSERVATIONS, tracking.info())
             with clock("overlay"):
-                _draw(solution, bird, video, part / OVERLAY, observations, config.overlay, progress)
-            summary = _summary(tracking, solution, bird, names, networks, video, info, clock)
+                _draw(solution, bird, video, part / OVERLAY, tracking.observations, config.overlay, progress)
+            summary = _summary(tracking, solution, bird, networks, video, info, clock)
             settings = config_to_yaml(config)
+            write_coco(tracking.observations, part / OBSERVATIONS, tracking.info())
             write_solution(solution, bird, settings, summary, part, learnt_yaml)
-            _write_report(part, solution, bird, observations, summary, settings, folder, video, progress)
-    return Reconstruction(tracking, solution, summary, names)
+            write_report(
+                part / REPORT,
+                solution,
+                bird,
+                tracking.observations,
+                summary,
+                settings,
+                folder,
+                video,
+                force=True,
+                behaviour=behaviour,
+            )
+    return Reconstruction(tracking, solution, summary, networks.names)
 
 
-def _write_report(
-    part: Path,
-    solution: Solution,
-    bird: Bird,
-    observations: Observations,
-    summary: dict[str, Any],
-    settings: str,
-    folder: Path,
+def _choose(
+    config: ReconstructConfig,
     video: Path,
+    bird: Bird,
+    segmenter: Segmenter | None,
+    keypoints: KeypointDetector | None,
     progress: ProgressTask,
-) -> None:
-    """Write the report, with what the birds do."""
-    report = solution, bird, observations, summary, settings, folder, video
-    write_report(part / REPORT, *report, force=True, behaviour=shown_behaviour(solution, bird, progress))
+) -> tuple[ReconstructConfig, Networks]:
+    """Return the config with a checked segmenter in place of `auto`, and the networks."""
+    kinds = {"segmenter": segmenter, "keypoints": keypoints}
+    keypoints = keypoints or open_keypoint_detector(config.track)
+    choice = None
+    if segmenter is None:
+        track_config, choice = with_chosen_segmenter(video, config.track, progress)
+        check_segmenter(track_config)
+        config = replace(config, track=track_config)
+    files = {kind: files for kind, files in network_files(config.track).items() if kinds[kind] is None}
+    names = names_in_model(keypoints.keypoint_names, bird.keypoint_names, config.track.keypoints.file)
+    all_of_config = not any(kinds.values())
+    return config, Networks(segmenter, keypoints, choice, file_hashes(files), all_of_config, names)
 
 
-def _with_segmenter(
-    config: ReconstructConfig, video: Path, progress: ProgressTask
-) -> tuple[ReconstructConfig, SegmenterChoice | None]:
-    """Return the config with a checked segmenter in place of `auto`, and the choice."""
-    track_config, choice = with_chosen_segmenter(video, config.track, progress)
-    check_segmenter(track_config)
-    return replace(config, track=track_config), choice
+def _open_store(
+    unfinished: Path,
+    config: ReconstructConfig,
+    video: Path,
+    bird: Bird,
+    networks: Networks,
+    progress: ProgressTask,
+) -> Store:
+    """Return the stored frames and windows in the folder of unfinished work, which an interrupted call has left."""
+    frames = None
+    if networks.all_of_config:
+        frames = Parts(unfinished / "frames", tracking_record(config.track, video, networks.hashes, progress))
+    windows = Parts(unfinished / "windows", fit_record(config.fit, bird))
+    return Store(frames, windows, StoredWindows(windows))
 
 
-def _learn_weights(
+def _track(
+    video: Path,
+    config: TrackConfig,
+    networks: Networks,
+    bird: Bird,
+    store: Store,
+    progress: ProgressTask,
+    cluster: Cluster | None,
+) -> TrackingResult:
+    """Track the birds, with the keypoints of the model; raise the failure of tracking.
+
+    Stored frames that cannot help another call are discarded.
+    """
+    tracking = run_tracking(
+        video,
+        config,
+        networks.segmenter,
+        networks.keypoints,
+        progress=annotated(progress, store.size),
+        parts=store.frames,
+        cluster=cluster if networks.all_of_config else None,
+    )
+    observations = map_keypoints(tracking.observations, networks.names, bird.keypoint_names)
+    tracking = tracking._replace(choice=networks.choice, observations=observations)
+    if tracking.failure is None:
+        return tracking
+    if store.frames is not None and not (tracking.short_tracks or tracking.low_score_tracks):
+        store.frames.keep(0)  # without a bird, only other settings of tracking help
+    failure = NoTrackError(tracking.failure.source, tracking.failure.problem, tracking.failure.remedy)
+    failure.tracking = tracking
+    raise failure
+
+
+def _learn(
     config: ReconstructConfig, observations: Observations, bird: Bird, video: Path, progress: ProgressTask
 ) -> tuple[ReconstructConfig, str | None]:
     """Return the config with learnt weights, and the content of `learnt.yaml`, if the config of the fit says so."""
@@ -259,16 +326,6 @@ def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
     if is_inside(video, folder):
         raise InputError(folder, "holds the video, which the result would replace", "choose another --out")
     check_replaceable(folder, overwrite, POSES)
-
-
-def _check_tracking(tracking: TrackingResult, stored: Parts | None) -> None:
-    """Raise the failure of tracking, and discard stored frames that cannot help another call."""
-    if tracking.failure is not None:
-        if stored is not None and not (tracking.short_tracks or tracking.low_score_tracks):
-            stored.keep(0)  # without a bird, only other settings of tracking help
-        failure = NoTrackError(tracking.failure.source, tracking.failure.problem, tracking.failure.remedy)
-        failure.tracking = tracking
-        raise failure
 
 
 @contextmanager
@@ -323,13 +380,12 @@ def _summary(
     tracking: TrackingResult,
     solution: Solution,
     bird: Bird,
-    names: NameMap,
-    networks: dict[str, dict[str, str]],
+    networks: Networks,
     video: Path,
     info: VideoInfo,
     clock: Clock,
 ) -> dict[str, Any]:
-    """Return the content of `summary.json`; `networks` holds the hashes of `file_hashes`."""
+    """Return the content of `summary.json`."""
     summary = summarise(solution, bird, clock.seconds)
     summary["versions"] |= library_versions(TRACKING_LIBRARIES)
     described = {"file": str(video), **info._asdict(), "damaged": tracking.damaged_frames}
@@ -343,6 +399,6 @@ def _summary(
         "trust_reasons": list(tracking.trust.reasons),
         "trust_signals": tracking.trust.signals._asdict(),
         "seconds_of_tracking": {part: round(value, 3) for part, value in tracking.seconds.items()},
-        "networks": networks,
-        **({"keypoint_names": names.mapped} if names.changes_names else {}),
+        "networks": networks.hashes,
+        **({"keypoint_names": networks.names.mapped} if networks.names.changes_names else {}),
     }
