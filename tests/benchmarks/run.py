@@ -20,12 +20,11 @@ import numpy as np
 from reference_data import reference_bird, reference_folder
 from rich.console import Console
 from rich.table import Table
+from speed import bench_fit, bench_render, bench_silhouette
 
 from jaxfit.cli.main import use_cache
 from jaxfit.config.fit import load_config
 from jaxfit.data.formats.coco import read_coco
-from jaxfit.evaluation.benchmarks.fit import bench_fit
-from jaxfit.evaluation.benchmarks.raster import bench_render, bench_silhouette
 from jaxfit.evaluation.evaluate import evaluate
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.initial_poses import load_initial_poses
@@ -65,8 +64,8 @@ def soft_silhouette() -> Iterator[Metric]:
 def renderer() -> Iterator[Metric]:
     """Measure the z-buffer on crops and the overlay of nine birds on a full frame, with the same generated mesh."""
     result = bench_render()
-    yield Metric("render: crop", 1e3 / result["crops_per_s"], "ms", "less", 2.0)
-    yield Metric("render: anti-aliased crop", 1e3 / result["interpolated_crops_per_s"], "ms", "less", 2.0)
+    yield Metric("render: crop", result["crop_ms"], "ms", "less", 2.0)
+    yield Metric("render: anti-aliased crop", result["interpolated_crop_ms"], "ms", "less", 2.0)
     yield Metric("render: 9 birds on a full frame", result["full_frame_ms"], "ms", "less", 2.0)
     yield Metric("render: one bird's mask in a full frame", result["mask_ms"], "ms", "less", 2.0)
 
@@ -96,7 +95,7 @@ def photographs(bird: Bird, reference: Path) -> Iterator[Metric]:
 def windows(bird: Bird) -> Iterator[Metric]:
     """Measure the paper's setting against single frames and against `fast` on 2 simulated birds × 100 frames."""
     results = {
-        name: bench_fit(bird, birds=2, frames=100, config=load_config(name), seed=7, progress=terminal)
+        name: bench_fit(bird, load_config(name), birds=2, seed=7, progress=terminal)
         for name in ("paper", "baseline", "fast")
     }
     for name in ("me_p", "me_v", "pa_mpjpe"):
@@ -111,7 +110,7 @@ def windows(bird: Bird) -> Iterator[Metric]:
 
 def scene(bird: Bird) -> Iterator[Metric]:
     """Measure a fit of 9 birds × 100 frames with the paper's 600 + 400 steps."""
-    result = bench_fit(bird, progress=terminal)
+    result = bench_fit(bird, load_config("paper"), birds=9, progress=terminal)
     yield Metric("scene of 9 birds: fit", result["minutes"], "min", "less", 1.0)
     yield Metric("scene of 9 birds: first run's compilation", result["compile_s"], "s", "less", 2.0)
     yield Metric("scene of 9 birds: peak memory", result["peak_memory_gb"], "GB", "less", 0.5)

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from reference_data import reference_folder
 from scipy.spatial.transform import Rotation
+from speed import NOISE_PX, OUTLIERS
 
 from jaxfit.config.reconstruct import load_reconstruct_config
 from jaxfit.data.formats import FOOTAGE
@@ -33,7 +34,6 @@ from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.masks import box_of_mask, encode_mask
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
-from jaxfit.evaluation.benchmarks.fit import NOISE_PX, OUTLIERS
 from jaxfit.fitting.initial_poses import InitialPoses, load_initial_poses
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.bird import Bird
