@@ -25,7 +25,6 @@ from jaxfit.learning.priors import (
     norm_histogram,
     shipped_motion,
 )
-from jaxfit.model.anatomy import JOINT_NAMES, joint_group
 from jaxfit.objective.likelihood import motion_likelihood
 
 BIRD = toy_bird()
@@ -137,13 +136,6 @@ def test_the_cost_is_that_of_birds_that_were_left_out():
     assert together.cost == pytest.approx(np.mean(costs), rel=1e-9)
 
 
-def test_birds_without_motion_give_finite_settings():
-    solution = moving(2, 10)
-    still = solution.with_arrays(global_orient=np.zeros((2, 10, 3)), body_pose=np.zeros((2, 10, J - 1, 3)))
-    learnt = learn_motion([("a", still)])
-    assert all(0 < value < 1e3 for value in learnt.prior)
-
-
 def test_results_without_three_frames_are_rejected():
     with pytest.raises(InputError, match="short: holds no bird with three consecutive valid frames"):
         learn_motion([("short", _without_middle(moving(2, 3)))])
@@ -156,13 +148,6 @@ def _without_middle(solution):
     valid = solution.valid.copy()
     valid[:, 1] = False
     return dataclasses.replace(solution, valid=valid)
-
-
-def test_groups_of_joints():
-    groups = [joint_group(joint) for joint in JOINT_NAMES]
-    counts = {name: groups.count(name) for name in groups}
-    assert counts == {"root": 1, "body": 4, "legs": 8, "wings": 8, "head": 4}
-    assert (joint_group("neck_root"), joint_group("left_wing_root"), joint_group("tail")) == ("head", "wings", "body")
 
 
 def test_the_command(tmp_path, capsys):
@@ -182,17 +167,3 @@ def test_the_command(tmp_path, capsys):
     assert settings["sd_rad_s2"] == pytest.approx(learnt.sd_rad_s2, rel=1e-3)
     assert settings["dof"] == pytest.approx(learnt.dof, rel=1e-3)
     assert config.stages == load_config("map").stages
-
-
-def test_bad_input_of_the_command(tmp_path, capsys):
-    save_solution(_without_middle(moving(1, 3)), BIRD, "", {}, tmp_path / "short")
-    save_solution(moving(1, 5), BIRD, "", {}, tmp_path / "good")
-    cases = [
-        ("short", "m.yaml", "three consecutive valid frames"),
-        ("absent", "m.yaml", "absent"),
-        ("good", "m.npz", "ends in .yaml"),
-    ]
-    for folder, out, words in cases:
-        assert main(["prior", "learn", "--motion", str(tmp_path / folder), "--out", str(tmp_path / out)]) == 2
-        assert words in capsys.readouterr().err.replace("\n", " ")
-        assert not (tmp_path / out).exists()

@@ -262,6 +262,18 @@ def test_the_command_places_a_result(seen, camera, placed, tmp_path, capsys):
     assert "5 to 8 % too small" in printed  # the config has the published edge
 
 
+@pytest.fixture(scope="module")
+def files(seen, camera, tmp_path_factory):
+    """A result and files of cameras."""
+    folder = tmp_path_factory.mktemp("ledge")
+    save_solution(seen, BIRD, "base: fast\n", {}, folder / "fit")
+    write_cameras((camera,), folder / "camera.toml")
+    write_cameras((camera, replace(camera, name="other")), folder / "two.toml")
+    write_cameras((replace(camera, distortion=np.array([0.1, 0, 0, 0, 0])),), folder / "bent.toml")
+    write_cameras((replace(camera, size_px=(1280, 760)),), folder / "large.toml")
+    return folder
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -274,14 +286,9 @@ def test_the_command_places_a_result(seen, camera, placed, tmp_path, capsys):
         (["--cameras", "{folder}/large.toml"], "has images of"),
     ],
 )
-def test_wrong_options_of_the_command(seen, camera, tmp_path, capsys, options, message):
-    save_solution(seen, BIRD, "base: fast\n", {}, tmp_path / "fit")
-    write_cameras((camera,), tmp_path / "camera.toml")
-    write_cameras((camera, replace(camera, name="other")), tmp_path / "two.toml")
-    write_cameras((replace(camera, distortion=np.array([0.1, 0, 0, 0, 0])),), tmp_path / "bent.toml")
-    write_cameras((replace(camera, size_px=(1280, 760)),), tmp_path / "large.toml")
-    command = ["ledge", str(tmp_path / "fit"), "--out", str(tmp_path / "out")]
-    assert main([*command, *(option.format(folder=tmp_path) for option in options)]) == 2
+def test_wrong_options_of_the_command(files, tmp_path, capsys, options, message):
+    command = ["ledge", str(files / "fit"), "--out", str(tmp_path / "out")]
+    assert main([*command, *(option.format(folder=files) for option in options)]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert "Traceback" not in error

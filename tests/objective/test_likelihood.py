@@ -1,17 +1,15 @@
 """Terms as likelihoods: the density by scipy, outliers, and motion that does not depend on the frame rate."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 from scipy.stats import multivariate_t
 from support.terms_by_hand import motion_by_hand, posed_window, random_targets, term_value, window_pose
 
-from jaxfit.objective.likelihood import keypoint_likelihood, keypoint_sd_px, motion_likelihood, place_likelihood
+from jaxfit.objective.likelihood import keypoint_sd_px, motion_likelihood, place_likelihood
 from jaxfit.objective.residuals import residual_sum, student_t
 
 
@@ -26,37 +24,6 @@ def test_student_t_is_the_negative_log_density_up_to_a_constant(dof, size):
 def test_scale_of_keypoints_by_confidence():
     scale = keypoint_sd_px(jnp.array([0.0, 0.5, 1.0]), 2.0, 8.0)
     np.testing.assert_allclose(scale, [8, 4, 2], rtol=1e-6)
-
-
-@jax.jit
-def errors_term(error_px, confidence=1.0, **settings):
-    """The keypoint term of one frame whose keypoints have these errors."""
-    error_px = jnp.asarray(error_px, jnp.float32)
-    confidence = jnp.full(error_px.shape[:-1], confidence, jnp.float32)
-    targets = SimpleNamespace(keypoints_px=jnp.zeros_like(error_px), confidence=confidence)
-    return residual_sum(keypoint_likelihood(SimpleNamespace(keypoints_px=error_px, targets=targets), **settings))
-
-
-def test_the_pull_of_an_outlier_falls_with_its_distance():
-    pull = [
-        float(np.asarray(jax.grad(errors_term)(jnp.array([[[x, 0.0]]])))[0, 0, 0]) for x in (0.01, 2.0, 20.0, 200.0)
-    ]
-    # derivative of 3 log(1 + x²/(4 · 1.2²)) by hand
-    np.testing.assert_allclose(pull, [6 * x / (4 * 1.2**2 + x**2) for x in (0.01, 2.0, 20.0, 200.0)], rtol=1e-4)
-    assert pull[1] > pull[2] > pull[3]
-
-
-def test_gradients_of_the_keypoint_term_with_respect_to_its_settings():
-    targets = random_targets()
-    pose = window_pose()
-
-    @jax.jit
-    def total(sd_sure_px, sd_unsure_px, dof):
-        settings = {"sd_sure_px": sd_sure_px, "sd_unsure_px": sd_unsure_px, "dof": dof}
-        return residual_sum(keypoint_likelihood(posed_window(pose, targets), **settings)) / 100
-
-    at = (jnp.float32(1.5), jnp.float32(5.0), jnp.float32(3.0))
-    check_grads(total, at, order=1, modes=["rev"], eps=1e-2, atol=0.01, rtol=0.01)
 
 
 def curve(fps, seconds=2.0):

@@ -5,7 +5,6 @@ import sys
 from importlib import metadata
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import pytest
 from support.terms_by_hand import posed_window, random_targets, window_pose
@@ -182,26 +181,3 @@ def test_a_term_is_one_real_number(returned, said):
     term(name="odd")(lambda window: returned())
     with pytest.raises(InputError, match=rf"term 'odd': returned .*{said}"):
         evaluate_terms(posed_window(window_pose(), random_targets()), find_terms(["odd"]), {"odd": {"weight": 1.0}})
-
-
-def test_a_sweep_over_a_custom_term_compiles_once():
-    traces = []
-
-    @term(name="counted")
-    def own(window, *, power=2.0):
-        traces.append(None)
-        return jnp.sum(jnp.abs(window.pose.body_pose) ** power)
-
-    pose, counted = window_pose(), find_terms(["counted"])
-
-    def objective(weight, power):
-        return weighted_sum(
-            posed_window(pose, random_targets()), counted, {"counted": {"weight": weight, "power": power}}
-        )
-
-    sweep = jax.jit(jax.vmap(objective))
-    found = sweep(jnp.array([1.0, 2.0, 1.0]), jnp.array([1.0, 1.0, 2.0]))
-    sweep(jnp.array([5.0, 2.0, 1.0]), jnp.array([1.0, 3.0, 2.0]))
-    assert len(traces) == 1
-    size = jnp.abs(pose.body_pose)
-    assert found == pytest.approx([float(size.sum()), 2 * float(size.sum()), float((size**2).sum())], rel=1e-5)

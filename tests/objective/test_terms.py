@@ -30,7 +30,7 @@ from support.terms_by_hand import (
 )
 
 from jaxfit.objective.objective import evaluate_terms, weighted_sum
-from jaxfit.objective.posed_window import PosedWindow, Priors, priors_of
+from jaxfit.objective.posed_window import PosedWindow, priors_of
 from jaxfit.objective.registry import find_term, find_terms
 from jaxfit.objective.residuals import geman_mcclure, residual_sum
 from jaxfit.objective.terms import pose_prior
@@ -210,18 +210,6 @@ def test_common_size():
     np.testing.assert_allclose(common_px, spread_px)
     keypoints, _ = pose_window(BIRD, spread)
     np.testing.assert_allclose(common_cam, keypoints, atol=1e-5)
-
-
-def test_whitened_priors():
-    """Wᵀ W is the inverse covariance."""
-    assert isinstance(PRIORS, Priors)
-    for whitener, covariance in (
-        (PRIORS.pose_whitener, BIRD.pose_covariance),
-        (PRIORS.bone_whitener, BIRD.bone_covariance),
-    ):
-        W = np.asarray(whitener, np.float64)
-        np.testing.assert_allclose(W @ np.asarray(covariance, np.float64) @ W.T, np.eye(len(W)), atol=1e-4)
-    np.testing.assert_allclose(PRIORS.shape_sd**2, BIRD.shape_variance, rtol=1e-6)
 
 
 def test_compares_masks_is_set_for_terms_that_draw_silhouettes():
