@@ -151,7 +151,7 @@ def bird_motion(exported: Exported, n: int) -> Motion:
         place=place * exported.length,
         facing=_continuous(turn.as_quat()),
         size=size * exported.length,
-        betas=s.poses.betas[n, at].astype(np.float64),
+        betas=np.asarray(s.poses.betas, np.float64)[n, at],
     )
 
 
@@ -330,15 +330,13 @@ def ground_of(exported: Exported, motions: dict[int, Motion]) -> Ground:
     """
     s = exported.solution
     named = [k for k, name in enumerate(s.keypoint_names) if "foot" in name] or list(range(len(s.keypoint_names)))
-    points = exported.in_image.points(s.keypoints.cam[:, :, named], s.poses.scale) * exported.length
+    points = exported.in_image.points(s.keypoints.cam[:, :, named], np.asarray(s.poses.scale)) * exported.length
     feet = [points[n, motion.at] for n, motion in motions.items()]
-    if s.contact is not None:
+    if s.contact is not None and s.world is not None:
         n, t = np.argwhere(s.valid)[0].tolist()
         R_cam_root = Rotation.from_rotvec(exported.in_image.orientation[n, t]).as_matrix()
-        R_world_cam = np.asarray(s.world.R_world_root)[n, t] @ R_cam_root.T
-        position_m = (
-            np.asarray(s.world.transl_world_m)[n, t] - R_world_cam @ exported.in_image.root[n, t] * exported.length
-        )
+        R_world_cam = s.world.R_world_root[n, t] @ R_cam_root.T
+        position_m = s.world.transl_world_m[n, t] - R_world_cam @ exported.in_image.root[n, t] * exported.length
         rotation, translation = _WORLD_TO_GLTF @ R_world_cam, _WORLD_TO_GLTF @ position_m
     else:
         bodies = []

@@ -148,7 +148,7 @@ class Exported:
     @property
     def keypoints_3d(self) -> Float[np.ndarray, "N T K 3"]:
         """Keypoints in the camera frame of the image (`in_image`), in `unit`; NaN without a pose."""
-        points = self.in_image.points(self.solution.keypoints.cam, self.solution.poses.scale)
+        points = self.in_image.points(self.solution.keypoints.cam, np.asarray(self.solution.poses.scale))
         return (points * self.length).astype(np.float32)
 
     @property

@@ -89,7 +89,7 @@ def _pose_columns(exported: Exported) -> Columns:
     columns |= _vectors(exported, {"orientation": exported.in_image.orientation}, "rad")
     if s.error_bars is not None:
         columns |= _vectors(exported, {"orientation": s.error_bars.global_orient_sd}, "sd_rad")
-    columns["size"] = _known(exported, s.poses.scale)
+    columns["size"] = _known(exported, np.asarray(s.poses.scale))
     if s.contact is not None:
         columns["on_ledge"] = _known(exported, s.contact)
     confidence = exported.confidence
@@ -114,7 +114,7 @@ def _pose_columns(exported: Exported) -> Columns:
 def _angle_columns(exported: Exported) -> Columns:
     """Return the rotation of every joint except the root relative to its parent, as axis-angles."""
     s = exported.solution
-    angles = {name: s.poses.body_pose[:, :, j] for j, name in enumerate(s.joint_names[1:])}
+    angles = {name: np.asarray(s.poses.body_pose)[:, :, j] for j, name in enumerate(s.joint_names[1:])}
     columns = row_columns(exported) | _vectors(exported, angles, "rad")
     if s.error_bars is not None:
         sd = {name: s.error_bars.body_pose_sd[:, :, j] for j, name in enumerate(s.joint_names[1:])}

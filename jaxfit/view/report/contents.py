@@ -257,13 +257,8 @@ def _tracks(
 
 def _image_size(solution: Solution) -> Float[np.ndarray, "N T"]:
     """Return the size of every bird in the image, in image pixels per model unit; NaN without a pose."""
-    depth = np.where(solution.valid, solution.poses.transl[..., 2], np.nan)
-    return (
-        solution.poses.scale
-        * (solution.crops.focal_px / solution.crops.crop_px)
-        * solution.crops.square_px[..., 2]
-        / depth
-    )
+    crops, depth = solution.crops, np.where(solution.valid, solution.poses.transl[..., 2], np.nan)
+    return np.asarray(solution.poses.scale) * (crops.focal_px / crops.crop_px) * crops.square_px[..., 2] / depth
 
 
 MIN_CONFIDENCE = 0.5
