@@ -66,7 +66,7 @@ BAD = [
     (f"{FIT} --unit m", "--unit: is given without --cameras"),
     (f"{FIT} --offsets 0,1", "--offsets: is given without --cameras"),
     (f"{FIT} --focal-px 900", "--focal-px: is given without --ledge"),
-    (FIT.replace("birds", "score"), "keypoint_scores"),
+    (FIT.replace("birds", "score"), "score.json: the content: confidence must lie in [0, 1]"),
     (FIT.replace("birds", "names"), "has no keypoint of the model by name"),
     (FIT.replace("birds", "twice"), "twice"),
     (FIT.replace("birds", "nobody"), "no track has a frame"),
