@@ -266,7 +266,7 @@ class _Names(NamedTuple):
     @classmethod
     def beside(cls, folder: Path, stem: str) -> _Names:
         """Return the names with a stem in the folder of the target, so that a rename stays in one file system."""
-        return cls(*(folder / f"{stem}.{kind}" for kind in ("part", "old", "lock")))
+        return cls(folder / f"{stem}.part", folder / f"{stem}.old", folder / f"{stem}.lock")
 
 
 @contextmanager
