@@ -200,7 +200,9 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         image_id(t, str(observations.file_name[t]), width, height)
     annotations = []
     masks = observations.masks
-    areas = dict(zip(masks, coco_mask.area(cast(Any, [*masks.values()])).tolist() if masks else (), strict=True))
+    areas: dict[tuple[int, int], int] = {}
+    if masks:
+        areas = dict(zip(masks, cast(Any, coco_mask.area(cast(Any, [*masks.values()]))).tolist(), strict=True))
     scores = cast(np.ndarray, observations.score)
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
         confidence = observations.confidence[n, t]

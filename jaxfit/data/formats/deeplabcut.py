@@ -21,7 +21,7 @@ import io
 import pickle
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -29,9 +29,6 @@ from jaxfit.data.formats.hdf5 import hdf5_text
 from jaxfit.data.formats.keypoint_table import KeypointTable, check_table_size
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import open_file
-
-if TYPE_CHECKING:
-    import h5py
 
 COORDS = ("x", "y", "likelihood")
 """The last levels of the columns that are read."""
@@ -166,13 +163,13 @@ def _check_header(path: Path, header: Sequence[list[str]], first: list[str]) -> 
         raise InputError(path, problem, _REMEDY)
 
 
-def find_pandas_table(file: h5py.File) -> h5py.Group | None:
+def find_pandas_table(file: Any) -> Any | None:
     """Return the first folder of an HDF5 file that holds a table of pandas, or None."""
     tables = (entry for entry in file.values() if hdf5_text(entry.attrs.get("pandas_type")) in ("frame", "frame_table"))
     return next(tables, None)
 
 
-def read_deeplabcut_hdf5(table: h5py.Group, path: Path) -> KeypointTable:
+def read_deeplabcut_hdf5(table: Any, path: Path) -> KeypointTable:
     """Read the table of an HDF5 file of DeepLabCut.
 
     Args:
@@ -213,7 +210,7 @@ class _Literals(pickle.Unpickler):
         raise ValueError(f"its pickled names of columns call {module}.{name}, so that they are not read")
 
 
-def _axis(table: h5py.Group, name: str) -> list[tuple[str, ...]]:
+def _axis(table: Any, name: str) -> list[tuple[str, ...]]:
     """Return the names along an axis; an axis with several levels has codes into the texts of every level."""
     if hdf5_text(table.attrs.get(f"{name}_variety")) != "multi":
         return [(hdf5_text(value),) for value in table[name][()].tolist()]

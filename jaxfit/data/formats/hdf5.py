@@ -6,14 +6,11 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.reading import reading
-
-if TYPE_CHECKING:
-    import h5py
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file."""
@@ -24,7 +21,7 @@ _MAX_COMPRESSION = 2000
 
 
 @contextmanager
-def open_hdf5(path: Path, kind: str) -> Iterator[h5py.File]:
+def open_hdf5(path: Path, kind: str) -> Iterator[Any]:
     """Open an HDF5 file for reading, as a context manager.
 
     Args:
@@ -69,7 +66,7 @@ def _check_heaps(path: Path) -> None:
         at = content.find(b"GCOL", at + 1)
 
 
-def _check_entry(path: Path, file: h5py.File, name: str, link: Any) -> None:
+def _check_entry(path: Path, file: Any, name: str, link: Any) -> None:
     """Raise InputError if an entry is stored in another file, or is larger than memory should hold."""
     import h5py
 

@@ -92,10 +92,8 @@ def table_observations(
     sizes = image_sizes(table.size_px, table.pictures, table.video, source, video, size_px)
     order = np.arange(keypoints.shape[1]) if frames is None else np.argsort(frames, kind="stable")
     keypoints, confidence = keypoints[:, order], confidence[:, order]
-    # a score that is not a number counts as 1
-    score = (
-        1.0 if table.score is None else np.clip(np.nan_to_num(table.score[:, order], nan=1, posinf=1, neginf=1), 0, 1)
-    )
+    score = np.ones(1) if table.score is None else table.score[:, order]
+    score = np.clip(np.where(np.isfinite(score), score, 1), 0, 1)  # a score that is not a number counts as 1
     names = _file_names(table, source, sizes.video, frames)[order]
     size = np.broadcast_to(sizes.size_px, (len(order), 2))[order]
     present = np.any(confidence > 0, axis=-1)
@@ -115,7 +113,7 @@ def table_observations(
     common = {"keypoint_names": table.keypoint_names, "skeleton": table.skeleton}
     if frames is None:  # every bird of every picture is a track in frame 0 of a picture of its own
         at = np.argwhere(present)
-        own_images = {(i, 0): (str(names[t]), *map(int, size[t])) for i, (_, t) in enumerate(at.tolist())}
+        own_images = {(i, 0): (str(names[t]), int(size[t][0]), int(size[t][1])) for i, (_, t) in enumerate(at.tolist())}
         return Observations(
             track_id=np.arange(1, len(at) + 1),
             frame_index=np.zeros(1, np.int64),

@@ -27,7 +27,6 @@ from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.reading import reading
 
 if TYPE_CHECKING:
-    import h5py
     from sleap_io import Instance, LabeledFrame, Labels, Video
 
 _log = logging.getLogger(__name__)
@@ -133,7 +132,7 @@ def _chosen_video(labels: Labels, path: Path, video: Path | None) -> Video:
     return films[0]
 
 
-def _pictures_of_frames(pictures: Sequence[str], numbers: np.ndarray, path: Path) -> tuple[str, ...]:
+def _pictures_of_frames(pictures: list[Any], numbers: np.ndarray, path: Path) -> tuple[str, ...]:
     """Return the pictures of frames, whose numbers are positions in the list of pictures.
 
     Pictures of one folder are named without the folder, because SLEAP stores long absolute paths.
@@ -195,7 +194,7 @@ def _rows(labels: Labels, birds: Sequence[tuple[int, Instance]], path: Path) -> 
     return rows, (*names, *(["bird"] if loose and alone else []))
 
 
-def read_sleap_analysis(file: h5py.File, path: Path) -> KeypointTable:
+def read_sleap_analysis(file: Any, path: Path) -> KeypointTable:
     """Read an analysis file of SLEAP.
 
     Args:
@@ -237,7 +236,7 @@ def read_sleap_analysis(file: h5py.File, path: Path) -> KeypointTable:
     )
 
 
-def _ordered(file: h5py.File, name: str, legacy: Sequence[str]) -> np.ndarray:
+def _ordered(file: Any, name: str, legacy: Sequence[str]) -> np.ndarray:
     """Return an array with its axes in the order track, frame, node, xy."""
     stored = file[name].attrs.get("dims")
     axes = list(legacy) if stored is None else json.loads(hdf5_text(stored))

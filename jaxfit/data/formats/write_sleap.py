@@ -9,7 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -31,7 +31,9 @@ def write_sleap_project(observations: Observations, footage: Sequence[str] | str
         InputError: the extra `formats` is not installed, or the file cannot be written.
     """
     require_extra("formats", str(path), "sleap-io")
-    import sleap_io as sio
+    import sleap_io
+
+    sio: Any = sleap_io
 
     on_video = isinstance(footage, str)
     numbers = observations.frame_index.tolist() if on_video else list(range(len(footage)))
