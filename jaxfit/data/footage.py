@@ -41,8 +41,8 @@ class FootageIdentity(NamedTuple):
         """Return whether the first frames of two videos are known and differ."""
         if self.first_frame is None or other.first_frame is None:
             return False
-        own, others = (np.frombuffer(each, np.uint8).astype(int) for each in (self.first_frame, other.first_frame))
-        return int(np.abs(own - others).max()) > TOLERANCE
+        first, second = np.frombuffer(self.first_frame, np.uint8), np.frombuffer(other.first_frame, np.uint8)
+        return int(np.abs(first.astype(int) - second).max()) > TOLERANCE
 
 
 def footage_of(field: Field) -> FootageIdentity:

@@ -86,19 +86,19 @@ def propose_names(names: Sequence[str], model_names: Sequence[str]) -> NameMap:
         model_names: names of the model.
     """
     words = {name: _words(name) for name in names}
-    found: dict[str, str] = {}
+    mapped: dict[str, str] = {}
     ranked = {model: _alternatives(model) for model in model_names}
     for rank in range(2 + max(map(len, _ALIASES.values()))):
         for model, alternatives in ranked.items():
-            if model in found.values():
+            if model in mapped.values():
                 continue
-            free = [name for name in names if name not in found]
+            free = [name for name in names if name not in mapped]
             same = [
                 name for name in free if (name == model if rank == 0 else words[name] in alternatives[rank - 1 : rank])
             ]
             if same:
-                found[same[0]] = model
-    return _name_map(found, names, model_names)
+                mapped[same[0]] = model
+    return _name_map(mapped, names, model_names)
 
 
 def names_in_model(names: Sequence[str], model_names: Sequence[str], source: object) -> NameMap:
@@ -211,12 +211,12 @@ def _split(word: str) -> list[str]:
     """Split a word such as `lefttailbase` into known words; a side may be one letter at an end."""
     if word in _WORDS or word in _SIDES or len(word) > 40:
         return [word]
-    found = _known_words(word)
-    if found is None and word[0] in "lr" and (others := _known_words(word[1:])):
-        found = [word[0], *others]
-    if found is None and word[-1] in "lr" and (others := _known_words(word[:-1])):
-        found = [*others, word[-1]]
-    return found or [word]
+    known = _known_words(word)
+    if known is None and word[0] in "lr" and (others := _known_words(word[1:])):
+        known = [word[0], *others]
+    if known is None and word[-1] in "lr" and (others := _known_words(word[:-1])):
+        known = [*others, word[-1]]
+    return known or [word]
 
 
 @cache

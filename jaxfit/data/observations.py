@@ -192,8 +192,8 @@ class Observations:
     def image_size(self, n: int, t: int) -> tuple[int, int]:
         """Return the width and height in pixels of the image of track ``n`` at frame ``t``."""
         n, t = self._position(n, t)
-        own = self.own_images.get((n, t))
-        return own[1:] if own else (int(self.image_size_px[t, 0]), int(self.image_size_px[t, 1]))
+        image = self.own_images.get((n, t))
+        return image[1:] if image else (int(self.image_size_px[t, 0]), int(self.image_size_px[t, 1]))
 
     def image_sizes_px(self) -> np.ndarray:
         """Return the width and height in pixels of the images of all tracks and frames, (N, T, 2) int64."""
@@ -207,8 +207,8 @@ class Observations:
     def image_file(self, n: int, t: int) -> str:
         """Return the file name of the image of track ``n`` at frame ``t``."""
         n, t = self._position(n, t)
-        own = self.own_images.get((n, t))
-        return own[0] if own else str(self.file_name[t])
+        image = self.own_images.get((n, t))
+        return image[0] if image else str(self.file_name[t])
 
     def usable(self, min_keypoints: int = MIN_KEYPOINTS) -> np.ndarray:
         """Return where a bird has enough keypoints for a fit, (N, T) bool: it is present with ``min_keypoints``."""

@@ -71,7 +71,7 @@ def refit(
     Raises:
         InputError: as `jaxfit.fit`.
     """
-    before, after = (check_observations(each, bird, source) for each in (before, after))
+    before, after = check_observations(before, bird, source), check_observations(after, bird, source)
     old, new = windows_of(before, config, source), windows_of(after, config, source)
     rows = {window_hash(old, w): w for w in range(len(old))}
     source_row = np.array([rows.get(window_hash(new, w), -1) for w in range(len(new))])
@@ -99,14 +99,18 @@ def refit(
                 failures.setdefault(int(after.track_id[n]), []).append(text)
         counts[n, 0 if arrays["valid"][n, at].any() else 1] += 1
     for n in range(after.num_tracks):
-        own = new.track == n
-        origins = {int(old.track_id[row]) for row in source_row[own]} if (source_row[own] >= 0).all() else set()
-        if (source_row[own] < 0).all():
+        windows_of_track = new.track == n
+        origins = (
+            {int(old.track_id[row]) for row in source_row[windows_of_track]}
+            if (source_row[windows_of_track] >= 0).all()
+            else set()
+        )
+        if (source_row[windows_of_track] < 0).all():
             for term in loss:
                 loss[term][n] = result.loss[term][n] if term in result.loss else np.nan
         elif len(origins) == 1:
             track = origins.pop()
-            if own.sum() == (old.track_id == track).sum():  # all windows of one track
+            if windows_of_track.sum() == (old.track_id == track).sum():  # all windows of one track
                 for term in loss:
                     loss[term][n] = solution.loss[term][_row_of(solution, track)]
     merged = result.with_arrays(

@@ -66,7 +66,9 @@ def parse_edit(text: str, source: object) -> Edit:
     wrong |= kind in ("join", "delete") and (start, stop) != (None, None)
     wrong |= kind == "exclude" and (start, stop) == (None, None)
     if wrong:
-        examples = [f"{kind} {EXAMPLES[kind]}"] if kind in EXAMPLES else [" ".join(each) for each in EXAMPLES.items()]
+        examples = (
+            [f"{kind} {EXAMPLES[kind]}"] if kind in EXAMPLES else [" ".join(example) for example in EXAMPLES.items()]
+        )
         remedy = f"write for example {', '.join(examples)}"
         if kind == "exclude":
             remedy += "; delete removes all frames of a track"

@@ -81,15 +81,15 @@ def concatenate_solutions(
     statuses: list[list[str]] = [[] for _ in track_id]
     failures: dict[int, tuple[str, ...]] = {}
     for part, row in zip(parts, rows, strict=True):
-        for n, own in enumerate(row.tolist()):
-            statuses[own].append(str(part.status[n]))
+        for n, joined in enumerate(row.tolist()):
+            statuses[joined].append(str(part.status[n]))
             texts = part.failures.get(int(part.track_id[n]), ())
             if texts:
-                failures[int(track_id[own])] = (*failures.get(int(track_id[own]), ()), *texts)
+                failures[int(track_id[joined])] = (*failures.get(int(track_id[joined]), ()), *texts)
             for term, values in part.loss.items():
                 if np.isfinite(values[n]):
-                    loss[term][own] = np.nansum([loss[term][own], values[n]])
-    status = np.array([_status(each) for each in statuses], "<U32")
+                    loss[term][joined] = np.nansum([loss[term][joined], values[n]])
+    status = np.array([_status(of_parts) for of_parts in statuses], "<U32")
     return parts[0].with_arrays(track_id=track_id, **arrays, loss=loss, status=status, failures=failures)
 
 
@@ -187,10 +187,12 @@ def _boxes(observations: Observations) -> _Boxes:
 def _spread(ranges: Sequence[_Boxes], gap: int, step: int) -> tuple[float, float]:
     """Return σ and τ after `gap` steps. Without enough pairs of frames, the variances grow linearly with the gap."""
     for lag in range(gap, 0, -1):
-        moves, growths = (np.concatenate(each) for each in zip(*(_changes(r, lag * step) for r in ranges), strict=True))
+        changes = [_changes(boxes, lag * step) for boxes in ranges]
+        moves, growths = np.concatenate([c[0] for c in changes]), np.concatenate([c[1] for c in changes])
         if len(growths) >= MIN_PAIRS:
             scale = np.sqrt(gap / lag)
-            sigma, tau = (scale * np.sqrt(np.mean(each**2)) for each in (moves, growths))
+            # RMS of the changes; variances grow linearly with the gap
+            sigma, tau = scale * np.sqrt(np.mean(moves**2)), scale * np.sqrt(np.mean(growths**2))
             return max(sigma, MIN_SPREAD), max(tau, MIN_SPREAD)
     return MIN_SPREAD * np.sqrt(gap), MIN_SPREAD * np.sqrt(gap)
 
@@ -315,7 +317,7 @@ def _read(folder: Path) -> _Part:
         raise InputError(folder, "has no frames", "leave it out")
     failures = summary.get("failures")
     if isinstance(failures, dict):  # the solution that was read has none
-        texts = {int(track): tuple(map(str, own)) for track, own in failures.items()}
+        texts = {int(track): tuple(map(str, reasons)) for track, reasons in failures.items()}
         tracks = tracks._replace(solution=replace(tracks.solution, failures=texts))
     return _Part(folder, tracks, read_config(folder)[0], summary)
 
@@ -390,10 +392,10 @@ def _follow(
     track_id = np.zeros(0, np.int64)
     joined = None  # the observations of the parts so far
     for part in parts:
-        own = replace(part.tracks.observations, masks={}, amodal_masks={})  # boxes are enough
-        links = {} if joined is None else {link.after: link for link in link_tracks(joined, own, max_missing)}
-        row = np.zeros(own.num_tracks, np.int64)
-        for n, track in enumerate(own.track_id.tolist()):
+        later = replace(part.tracks.observations, masks={}, amodal_masks={})  # boxes are enough
+        links = {} if joined is None else {link.after: link for link in link_tracks(joined, later, max_missing)}
+        row = np.zeros(later.num_tracks, np.int64)
+        for n, track in enumerate(later.track_id.tolist()):
             link = links.get(n)
             if link is None:
                 row[n] = len(track_id)
@@ -401,13 +403,21 @@ def _follow(
                 track_id = np.append(track_id, number)
             else:
                 row[n] = link.before
-            at = own.frame_index[own.present[n]]
-            ends = (int(at[0]), int(at[-1])) if len(at) else (-1, -1)
-            more = (link.missing, link.confidence) if link else (None, None)
-            table.append(JoinedTrack(str(part.folder), track, *ends, int(track_id[row[n]]), *more))
-        known, before = [row], [own]
+            at = later.frame_index[later.present[n]]
+            table.append(
+                JoinedTrack(
+                    str(part.folder),
+                    track,
+                    first_frame=int(at[0]) if len(at) else -1,
+                    last_frame=int(at[-1]) if len(at) else -1,
+                    joined=int(track_id[row[n]]),
+                    missing=None if link is None else link.missing,
+                    confidence=None if link is None else link.confidence,
+                )
+            )
+        known, before = [row], [later]
         if joined is not None:
-            known, before = [np.arange(joined.num_tracks), row], [joined, own]
+            known, before = [np.arange(joined.num_tracks), row], [joined, later]
         joined = concatenate_observations(before, known, track_id)
         rows.append(row)
     return table, rows, track_id

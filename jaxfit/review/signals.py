@@ -251,11 +251,11 @@ def segmenter_disagreement(
         teacher: the other segmenter.
     """
     size_px = picture.shape[1], picture.shape[0]
-    own = [_instance(observations, n, t) for n in np.flatnonzero(observations.present[:, t]).tolist()]
+    birds_of_frame = [_instance(observations, n, t) for n in np.flatnonzero(observations.present[:, t]).tolist()]
     nothing = np.zeros(picture.shape[:2], bool)
     first, second = (
         np.asarray(np.any([nothing, *(bird.whole(size_px) for bird in birds if bird is not None)], axis=0))
-        for birds in (own, teacher(picture))
+        for birds in (birds_of_frame, teacher(picture))
     )
     either = np.count_nonzero(first | second)
     return 1 - np.count_nonzero(first & second) / either if either else 0.0

@@ -249,20 +249,20 @@ def suggest(
         _check_count(count, len(_wanted(np.arange(info.frames), config.frames)), video)
     if result is None:
         tracking = run_tracking(video, config, segmenter, keypoints, progress=progress)
-        found = Result(tracking.observations, None)
+        known = Result(tracking.observations, None)
         if tracking.trust.level == "low" and not empty:
             _logger.warning(
                 "%s: the labels may be wrong; --empty writes no labels. %s", video, tracking.trust.sentence()
             )
     else:
-        found = read_result(Path(result), video)
-        wanted = _wanted(found.observations.frame_index, config.frames)
-        found = found._replace(observations=found.observations.select(frames=wanted))
-    observations = found.observations
+        known = read_result(Path(result), video)
+        wanted = _wanted(known.observations.frame_index, config.frames)
+        known = known._replace(observations=known.observations.select(frames=wanted))
+    observations = known.observations
     _check_count(count, observations.num_frames, video if result is None else Path(result))
     with new_folder(out, overwrite, marker=MARKER) as part:
         (part / IMAGES).mkdir()
-        signals = frame_signals(observations, found.solution)
+        signals = frame_signals(observations, known.solution)
         if teacher is None:
             candidates, detector = shortlist(combine(signals)[0], count), _detector(observations, config, keypoints)
         else:  # no other signal counts

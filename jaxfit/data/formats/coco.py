@@ -134,10 +134,10 @@ def coco_observations(root: Field) -> Observations:
         name: {cell: rle for cell, bird in holder.items() if (rle := getattr(bird, name)) is not None}
         for name in ("rle", "amodal_rle")
     }
-    for found in masks.values():
-        invalid = first_invalid([*found.values()])
+    for rles in masks.values():
+        invalid = first_invalid([*rles.values()])
         if invalid is not None:
-            label = holder[[*found][invalid]].label
+            label = holder[[*rles][invalid]].label
             problem = f"{label}: segmentation.counts is corrupt: its runs do not cover the image"
             raise InputError(root.source, problem, "write the mask again with pycocotools, or leave segmentation out")
     info = root.value.get("info")

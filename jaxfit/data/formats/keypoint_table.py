@@ -80,13 +80,11 @@ def table_observations(
     """
     keypoints = np.asarray(table.keypoints_px, np.float32)
     known = np.isfinite(keypoints).all(-1)
-    confidence = known if table.confidence is None else known & ~np.isnan(table.confidence)
-    if table.confidence is not None:
-        if np.abs(table.confidence[confidence]).max(initial=0) > _MAX_CONFIDENCE:
-            largest = np.abs(table.confidence[confidence]).max()
-            raise InputError(source, f"holds a confidence of {largest:g}", "scale the scores to 0 to 1")
-        confidence = np.clip(np.where(confidence, table.confidence, 0), 0, 1)
-    confidence = confidence.astype(np.float32)
+    stored = np.ones(known.shape) if table.confidence is None else table.confidence
+    stored = np.where(known & ~np.isnan(stored), stored, 0)
+    if np.abs(stored).max(initial=0) > _MAX_CONFIDENCE:
+        raise InputError(source, f"holds a confidence of {np.abs(stored).max():g}", "scale the scores to 0 to 1")
+    confidence = np.clip(stored, 0, 1).astype(np.float32)
     numbers = None if table.pictures is None else frame_numbers(table.pictures, video)
     frames = table.frame_index if table.pictures is None else numbers if numbers is None else np.array(numbers)
     sizes = image_sizes(table.size_px, table.pictures, table.video, source, video, size_px)

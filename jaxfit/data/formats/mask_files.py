@@ -168,8 +168,8 @@ def _image_names(observations: Observations, video: Path | None) -> dict[tuple[i
     listed = image_files(video) if video is not None and video.is_dir() and not observations.own_images else []
     known, names = {_stem(file.name) for file in listed}, {}
     for n, t, _ in _images(observations):
-        own, number = Path(observations.image_file(n, t).replace("\\", "/")).name, int(observations.frame_index[t])
-        names[n, t] = own if _stem(own) in known or not 0 <= number < len(listed) else listed[number].name
+        name, number = Path(observations.image_file(n, t).replace("\\", "/")).name, int(observations.frame_index[t])
+        names[n, t] = name if _stem(name) in known or not 0 <= number < len(listed) else listed[number].name
     return names
 
 
