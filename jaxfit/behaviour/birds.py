@@ -263,15 +263,16 @@ class Flock:
 
         Unknown error bars count as 0: `describe` leaves out the standard deviations of these frames.
         """
-        s = self.solution
+        bars = self.solution.error_bars
+        assert bars is not None  # `describe` asks for deviations of results with error bars only
 
-        def error(sd: np.ndarray | None) -> Rotation:
-            deviation = np.nan_to_num(np.asarray(sd)[:, frames])
+        def error(sd: np.ndarray) -> Rotation:
+            deviation = np.nan_to_num(sd[:, frames])
             return Rotation.from_rotvec((deviation * rng.standard_normal(deviation.shape)).reshape(-1, 3))
 
-        body = Rotation.from_rotvec(np.nan_to_num(pose.body_pose).reshape(-1, 3)) * error(s.error_bars.body_pose_sd)
+        body = Rotation.from_rotvec(np.nan_to_num(pose.body_pose).reshape(-1, 3)) * error(bars.body_pose_sd)
         drawn = body.as_rotvec().reshape(pose.body_pose.shape).astype(np.float32)
-        return replace(pose, body_pose=drawn), R @ error(s.error_bars.global_orient_sd).as_matrix().reshape(R.shape)
+        return replace(pose, body_pose=drawn), R @ error(bars.global_orient_sd).as_matrix().reshape(R.shape)
 
 
 def body_length(bird: Bird) -> float:

@@ -178,9 +178,10 @@ def _deviations(flock: Flock, features: Sequence[Feature], first: int, last: int
         birds = flock.birds(slice(first, last), rng)
         for each in features:
             drawn[each.name].append(_values(each, birds))
-    s = flock.solution
-    known = np.isfinite(s.error_bars.global_orient_sd[:, first:last]).all(axis=-1)
-    known &= np.isfinite(s.error_bars.body_pose_sd[:, first:last]).all(axis=(-2, -1))
+    bars = flock.solution.error_bars
+    assert bars is not None
+    known = np.isfinite(bars.global_orient_sd[:, first:last]).all(axis=-1)
+    known &= np.isfinite(bars.body_pose_sd[:, first:last]).all(axis=(-2, -1))
     found = {}
     for each in features:
         values = np.stack(drawn[each.name])

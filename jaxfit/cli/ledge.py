@@ -155,6 +155,7 @@ def show_world(solution: Solution) -> None:
         if not valid.any():
             table.add_row(str(track), "0", *([""] if on_ledge else []), "", "", "", str(solution.status[n]))
             continue
+        assert solution.world is not None
         places = solution.world.transl_world_m[n, valid]
         moved_m = np.linalg.norm(places.max(axis=0) - places.min(axis=0))
         where = ", ".join(f"{x:.2f}" for x in np.median(places, axis=0))

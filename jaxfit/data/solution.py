@@ -369,7 +369,7 @@ def select_solution(solution: Solution, rows: np.ndarray, columns: np.ndarray) -
 
     The loss of a track stays the loss over all its frames.
     """
-    arrays = solution.arrays() | {"timestamp_s": solution.timestamp_s}
+    arrays: dict[str, Any] = solution.arrays() | {"timestamp_s": solution.timestamp_s}
     for name, (shape, _) in (LAYOUT | solution.optional_layout | _TIMES).items():
         if shape.startswith("N"):
             arrays[name] = arrays[name][rows]

@@ -103,6 +103,7 @@ def in_camera(solution: Solution, bird: Bird, camera: Camera) -> Solution:
         not hold. The solution has no error bars and no footage.
     """
     s, unit_m = solution, bird.metres_per_unit or 1.0
+    assert s.world is not None
     places_m, points_m = s.world.transl_world_m, s.world.keypoints_world_m
     root, points = camera.to_camera(places_m) / unit_m, camera.to_camera(points_m) / unit_m
     joint = np.asarray(bird.joints[0], np.float64)
@@ -159,7 +160,7 @@ def as_filmed(folder: Path, solution: Solution, bird: Bird, name: str | None = N
     first = camera is cameras[0]
     side = max(camera.size_px or largest_image_px(solution))
     own = np.isclose(solution.crops.focal_px, camera.matrix[0, 0] * CROP_PX / side, rtol=1e-4)  # else poses in crops
-    if first and own and in_frame_of_camera(solution):
+    if first and own and solution.world is not None and in_frame_of_camera(solution):
         valid = solution.valid & _sees(camera, solution.world.keypoints_world_m)
         return (solution if (valid == solution.valid).all() else replace(solution, valid=valid)), camera
     seen = in_camera(solution, bird, camera)

@@ -290,7 +290,9 @@ def keypoint_accuracy(
         values = []
         for counted in (visible, annotated):
             values.append(int(counted[:, k].sum()))
-            values += [metrics.pck(own[:, k], observed[:, k], counted[:, k], side, p, "pooled") for p in (0.05, 0.10)]
+            for share in (0.05, 0.10):
+                correct = metrics.correct_keypoints(own[:, k], observed[:, k], counted[:, k], side, share)
+                values.append(metrics.mean_error(correct))
         return KeypointRow(*values)
 
     rows = {name: row(slice(k, k + 1)) for k, name in enumerate(names)}

@@ -1,17 +1,19 @@
-"""Definitions of metrics in the image, from the errors of every keypoint in every frame.
+"""Errors of every keypoint in every frame, from which metrics follow.
 
-Errors of every keypoint in every frame, as arrays; NaN where a keypoint does not count. `jaxfit.evaluation.metrics`
-reduces these arrays to one number, `jaxfit.evaluation.bootstrap` reduces them to sums for each bird. Leading axes (…)
-are images or frames, of any number; the last axis is the keypoints.
+The errors are arrays; NaN where a keypoint does not count. Leading axes (…) are images or frames, of any number; the
+last axis is the keypoints. `jaxfit.evaluation.bootstrap` reduces the arrays to sums for each bird, and the sums to
+metrics:
 
-Leading axes (…) are images or frames, of any number. A keypoint counts where ``visible``; where no keypoint counts,
-the metric is NaN, without a warning.
+    PCK = mean of `pck_per_image`;  me_p = √ mean of `squared_errors`;  me_v = √ mean of `squared_velocity_errors`;
+    MPJPE = mean of `distances`;  PA-MPJPE = mean of `distances` after `procrustes_align`
+
+Source: Hägerlind et al. 2024, evaluation (me_p, me_v); Wang et al. 2021, *Birds of a Feather*, evaluation code (PCK:
+mean over images; there the longest side is one pixel shorter, and the comparison is <).
 """
 
 from __future__ import annotations
 
-import math
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -154,7 +156,8 @@ def _counted(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
     return np.where(counted & np.isfinite(values), values, np.nan)
 
 
-def _mean(errors: np.ndarray) -> float:
+def mean_error(errors: np.ndarray) -> float:
+    """Return the mean of the errors that count (not NaN); NaN without one."""
     counted = errors[np.isfinite(errors)]
     return float(counted.mean()) if counted.size else float("nan")
 
@@ -186,43 +189,6 @@ def pck_per_image(
     return np.where(counted > 0, np.nansum(correct, -1) / np.maximum(counted, 1), np.nan)
 
 
-def pck(
-    predicted_px: Any,
-    observed_px: Any,
-    visible: Any,
-    longest_side_px: Any,
-    threshold: float,
-    reduction: Literal["per_image", "pooled"] = "per_image",
-) -> float:
-    """Return the percentage of correct keypoints (PCK) over all images.
-
-    ``per_image``: the mean of PCK_i over the images that show a keypoint. AVES reports this mean; there the longest
-    side is the last minus the first pixel of the annotated mask (``longest_side_of_mask`` − 1), and the comparison
-    is <. ``pooled``: the number of correct over the number of visible keypoints of all images together, so that an
-    image with more keypoints has a greater weight.
-
-    Args:
-        predicted_px: (…, K, 2) pixels.
-        observed_px: (…, K, 2) in the same pixels.
-        visible: (…, K) bool.
-        longest_side_px: (…) longest side of the bird in the same pixels.
-        threshold: fraction of the side, such as 0.05.
-        reduction: how the images are combined.
-
-    Returns:
-        Fraction in [0, 1].
-
-    Raises:
-        ValueError: the shapes do not agree, or the reduction is unknown.
-
-    Source: Wang et al. 2021, *Birds of a Feather*, evaluation code of the fit.
-    """
-    if reduction not in ("per_image", "pooled"):
-        raise ValueError(f'reduction must be "per_image" or "pooled", not {reduction!r}')
-    errors = pck_per_image if reduction == "per_image" else correct_keypoints
-    return _mean(errors(predicted_px, observed_px, visible, longest_side_px, threshold))
-
-
 def iou(mask_a: Any, mask_b: Any) -> float:
     """Return the intersection over union |A ∩ B| / |A ∪ B| of two masks; NaN where both are empty.
 
@@ -242,85 +208,6 @@ def iou(mask_a: Any, mask_b: Any) -> float:
     both = np.count_nonzero(mask_a[box] & mask_b[box])
     union = np.count_nonzero(mask_a[box]) + np.count_nonzero(mask_b) - both
     return both / union if union else float("nan")
-
-
-def longest_side_of_mask(mask: Any) -> float:
-    """Return the longest side of the mask's tight box in pixels, both ends included; NaN for an empty mask.
-
-    Args:
-        mask: (H, W) bool.
-
-    Raises:
-        ValueError: ``mask`` does not have two dimensions.
-    """
-    mask = np.asarray(mask, bool)
-    if mask.ndim != 2:
-        raise ValueError(f"mask must have shape (H, W), not {mask.shape}")
-    box = box_of_mask(mask)
-    return float(max(box[2:])) if box else float("nan")
-
-
-def me_p(predicted: Any, observed: Any, visible: Any, longest_side: Any) -> float:
-    """Return the RMS error of the projected keypoints' position, as a fraction of the bird's size.
-
-    me_p = √( mean over visible keypoints of ‖predicted − observed‖² / side² )
-
-    Keypoints without a finite prediction, or in a frame without a side, do not count.
-
-    Args:
-        predicted: (…, K, 2) pixels.
-        observed: (…, K, 2) in the same pixels.
-        visible: (…, K) bool.
-        longest_side: (…) longest side of the predicted mask's box in the same pixels.
-
-    Raises:
-        ValueError: the shapes do not agree.
-
-    Source: Hägerlind et al. 2024, evaluation.
-    """
-    return math.sqrt(_mean(squared_errors(predicted, observed, visible, longest_side)))
-
-
-def me_v(predicted: Any, observed: Any, visible: Any, longest_side: Any, frame_index: Any = None) -> float:
-    """Return the RMS error of the projected keypoints' velocity, as a fraction of the bird's size per frame.
-
-    v_t = (predicted_t+1 − predicted_t) − (observed_t+1 − observed_t)
-    me_v = √( mean over pairs (t, t+1) of ‖v_t‖² / side_t² )
-
-    Velocity is the displacement from one frame of the file to the next. In a file of every n-th frame of a video, it
-    spans n frames of the video and is not divided by n, so compare me_v only between files of the same step.
-
-    A pair counts where the keypoint is visible in both frames and the frames are consecutive: their numbers differ by
-    the step of the file (`jaxfit.data.tracks.frame_step`). The error of a pair is divided by the side of the
-    earlier frame. Pairs without finite predictions or side do not count.
-
-    Args:
-        predicted: (…, T, K, 2) pixels.
-        observed: (…, T, K, 2) in the same pixels.
-        visible: (…, T, K) bool.
-        longest_side: (…, T) longest side of the predicted mask's box in the same pixels.
-        frame_index: (T,) numbers of the frames in the video; None where all frames are consecutive.
-
-    Raises:
-        ValueError: the shapes do not agree.
-
-    Source: Hägerlind et al. 2024, evaluation.
-    """
-    return math.sqrt(_mean(squared_velocity_errors(predicted, observed, visible, longest_side, frame_index)))
-
-
-def mpjpe(predicted: Any, truth: Any, visible: Any = None) -> float:
-    """Return the mean distance between predicted and true points, in their unit.
-
-    Args:
-        predicted: (…, K, 3).
-        truth: (…, K, 3) in the same frame and unit.
-        visible: (…, K) bool; None for all. Points that are not finite do not count.
-
-    Raises:
-        ValueError: the shapes do not agree.
-    """
-    return _mean(distances(predicted, truth, visible))
 
 
 def procrustes_align(predicted: Any, truth: Any, visible: Any = None) -> np.ndarray:
@@ -356,17 +243,3 @@ def procrustes_align(predicted: Any, truth: Any, visible: Any = None) -> np.ndar
     scale = (D * sign).sum(-1) / np.where(variance > 0, variance, 1)
     aligned = scale[..., None, None] * (predicted - mean_p) @ np.swapaxes(R, -1, -2) + mean_q
     return np.where(used.sum(-1)[..., None, None] >= 3, aligned, np.nan)
-
-
-def pa_mpjpe(predicted: Any, truth: Any, visible: Any = None) -> float:
-    """Return the mean distance after ``procrustes_align`` of each frame, in the truth's unit.
-
-    Args:
-        predicted: (…, K, 3).
-        truth: (…, K, 3).
-        visible: (…, K) bool; None for all. Frames with fewer than three points do not count.
-
-    Raises:
-        ValueError: the shapes do not agree.
-    """
-    return mpjpe(procrustes_align(predicted, truth, visible), truth, visible)

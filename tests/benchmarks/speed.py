@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from jaxfit.config.fit import FitConfig
 from jaxfit.evaluation.evaluate import evaluate
-from jaxfit.evaluation.metrics import pa_mpjpe
+from jaxfit.evaluation.metrics import distances, mean_error, procrustes_align
 from jaxfit.fitting.fit import fit
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.model.bird import Bird
@@ -177,5 +177,5 @@ def bench_fit(
         "peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit,
         "me_p": quality["me_p"],
         "me_v": quality["me_v"],
-        "pa_mpjpe": pa_mpjpe(points_cam, true_cam, np.isfinite(points_cam).all(-1)),
+        "pa_mpjpe": mean_error(distances(procrustes_align(points_cam, true_cam), true_cam)),
     }

@@ -5,13 +5,13 @@ import itertools
 
 import numpy as np
 import pytest
-from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, known, solution, truth
+from support.evaluated import BIRD, HEIGHT, WIDTH, N, T, known, longest_side_of_mask, solution, truth
 
 from jaxfit.data import mask_comparison
 from jaxfit.data.mask_comparison import compare_masks
 from jaxfit.data.masks import decode_mask, encode_mask
 from jaxfit.data.projection import PosedBirds
-from jaxfit.evaluation.metrics import iou, longest_side_of_mask
+from jaxfit.evaluation.metrics import iou
 from jaxfit.foundation.progress import silent
 from jaxfit.raster.zbuffer import hard_mask
 

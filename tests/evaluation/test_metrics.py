@@ -8,16 +8,31 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxfit.evaluation.metrics import (
+    correct_keypoints,
+    distances,
     iou,
-    longest_side_of_mask,
-    me_p,
-    me_v,
-    mpjpe,
-    pa_mpjpe,
-    pck,
+    mean_error,
     pck_per_image,
     procrustes_align,
+    squared_errors,
+    squared_velocity_errors,
 )
+
+
+def me_p(*arguments):
+    return math.sqrt(mean_error(squared_errors(*arguments)))
+
+
+def me_v(*arguments):
+    return math.sqrt(mean_error(squared_velocity_errors(*arguments)))
+
+
+def mpjpe(*arguments):
+    return mean_error(distances(*arguments))
+
+
+def pa_mpjpe(predicted, truth, visible=None):
+    return mpjpe(procrustes_align(predicted, truth, visible), truth, visible)
 
 
 def at_distance(*rows):
@@ -32,8 +47,7 @@ def test_pck_by_hand():
     # sides 100 and 200, threshold 0.05: allowed are 5 and 10 pixels
     args = predicted, observed, visible, [100, 200], 0.05
     np.testing.assert_allclose(pck_per_image(*args), [2 / 3, 1 / 2])
-    assert pck(*args) == pytest.approx((2 / 3 + 1 / 2) / 2)
-    assert pck(*args, reduction="pooled") == pytest.approx(3 / 5)
+    assert mean_error(correct_keypoints(*args)) == pytest.approx(3 / 5)
 
 
 def test_pck_of_failures():
@@ -41,19 +55,15 @@ def test_pck_of_failures():
     visible = np.array([[1, 1], [0, 0], [1, 1]])
     shares = pck_per_image(predicted, observed, visible, [10, 10, 0], 0.1)
     np.testing.assert_array_equal(shares, [0.5, np.nan, 0])  # failed, nothing to see, no side
-    assert pck(predicted, observed, visible, [10, 10, 0], 0.1) == 0.25
-    assert math.isnan(pck(predicted, observed, np.zeros((3, 2)), 10, 0.1))
-    assert math.isnan(pck(predicted, observed, np.zeros((3, 2)), 10, 0.1, reduction="pooled"))
+    assert math.isnan(mean_error(correct_keypoints(predicted, observed, np.zeros((3, 2)), 10, 0.1)))
 
 
-def test_pck_refuses_what_it_cannot_mean():
+def test_points_of_other_shapes_are_refused():
     predicted, observed = at_distance([0, 0])
-    with pytest.raises(ValueError, match="reduction must be"):
-        pck(predicted, observed, [[1, 1]], 10, 0.1, reduction="median")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="visible must have shape"):
-        pck(predicted, observed, [1, 1], 10, 0.1)
+        correct_keypoints(predicted, observed, [1, 1], 10, 0.1)
     with pytest.raises(ValueError, match="must have one shape"):
-        pck(predicted[:, :1], observed, [[1, 1]], 10, 0.1)
+        correct_keypoints(predicted[:, :1], observed, [[1, 1]], 10, 0.1)
 
 
 def test_stored_pck_is_a_mean_over_images(reference_dir):
@@ -82,18 +92,6 @@ def test_iou_by_hand():
     assert iou(a, a) == 1
     with pytest.raises(ValueError, match="one shape"):
         iou(a, b[:2])
-
-
-def test_longest_side_by_hand():
-    mask = np.zeros((20, 30), bool)
-    assert math.isnan(longest_side_of_mask(mask))
-    mask[5, 7] = True
-    assert longest_side_of_mask(mask) == 1
-    mask[9, 20] = True
-    assert longest_side_of_mask(mask) == 14
-    assert longest_side_of_mask(mask.T) == 14
-    with pytest.raises(ValueError, match=r"\(H, W\)"):
-        longest_side_of_mask(mask[0])
 
 
 def test_me_p_by_hand():

@@ -4,9 +4,8 @@ import functools
 
 import numpy as np
 
-from jaxfit.data.masks import encode_mask
+from jaxfit.data.masks import box_of_mask, encode_mask
 from jaxfit.data.observations import Observations
-from jaxfit.evaluation.metrics import longest_side_of_mask
 from jaxfit.model.camera import CropCamera, project
 from jaxfit.simulation.flock import smooth_motion
 from support.birds import filled_mask, pose_window, solution_of, toy_bird
@@ -62,6 +61,12 @@ def known():
         frame_index=np.array([10, 11, 12, 14]),
         image_size_px=np.full((N, T, 2), [WIDTH, HEIGHT]),
     )
+
+
+def longest_side_of_mask(mask):
+    """Return the longest side of the box of a mask in pixels; NaN for an empty mask."""
+    box = box_of_mask(mask)
+    return float(max(box[2:])) if box else np.nan
 
 
 def sides():
