@@ -30,7 +30,6 @@ from jaxfit.viewer.shown import Shown
 HOST = "127.0.0.1"
 LARGEST_BODY = 1 << 20
 """Bytes that the page may send at once."""
-BINARY = "application/octet-stream"
 
 
 @dataclass
@@ -67,14 +66,26 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         port: the port that the server listens on, which belongs to the address of the page.
     """
 
+    async def page(request: Request) -> Response:
+        return Response(index(), media_type="text/html", headers={"Content-Security-Policy": policy()})
+
+    async def page_file(request: Request) -> Response:
+        name = request.path_params["name"]
+        if name not in FILES:
+            raise HTTPException(404)
+        kinds = {".js": "text/javascript", ".css": "text/css"}
+        return Response(FILES[name].read_bytes(), media_type=kinds.get(Path(name).suffix, "text/plain"))
+
     async def facts(request: Request) -> Response:
         return JSONResponse(await run_in_threadpool(viewer.facts))
 
     async def binary(request: Request) -> Response:
-        result = _result(viewer, request)
-        kind, numbered = request.path_params["kind"], request.path_params.get("number")
-        content = await run_in_threadpool(_content, result, kind, numbered)
-        return Response(content, media_type=BINARY)
+        result, kind = request.path_params["result"], request.path_params["kind"]
+        if not result < len(viewer.results):
+            raise HTTPException(404)
+        argument = request.path_params.get("number")
+        content = await run_in_threadpool(_content, viewer.results[result], kind, argument)
+        return Response(content, media_type="application/octet-stream")
 
     async def film(request: Request) -> Response:
         if viewer.video is None or viewer.video.is_dir():
@@ -108,10 +119,13 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         running = None if viewer.session is None else viewer.session.work
         return JSONResponse({"done": True, "kind": ""} if running is None else running.entries())
 
+    async def refused(request: Request, error: Exception) -> Response:
+        return JSONResponse({"problem": str(error)}, 400)
+
     inside = Starlette(
         routes=[
-            Route("/", _page),
-            Route("/page/{name}", _page_file),
+            Route("/", page),
+            Route("/page/{name}", page_file),
             Route("/facts", facts),
             Route("/results/{result:int}/{kind}", binary),
             Route("/results/{result:int}/{kind}/{number}", binary),
@@ -120,7 +134,7 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
             Route("/work", work),
             Route("/change/{action}", change, methods=["POST"]),
         ],
-        exception_handlers={InputError: _refused},
+        exception_handlers={InputError: refused},
     )
     return Guard(inside, viewer.token, port)
 
@@ -180,24 +194,6 @@ _HEADERS = [
 ]
 
 
-async def _page(request: Request) -> Response:
-    return Response(index(), media_type="text/html", headers={"Content-Security-Policy": policy()})
-
-
-async def _page_file(request: Request) -> Response:
-    name = request.path_params["name"]
-    if name not in FILES:
-        raise HTTPException(404)
-    return Response(FILES[name].read_bytes(), media_type=_media_type(name))
-
-
-def _result(viewer: Viewer, request: Request) -> Shown:
-    number = request.path_params["result"]
-    if not number < len(viewer.results):
-        raise HTTPException(404)
-    return viewer.results[number]
-
-
 def _content(result: Shown, kind: str, argument: str | None) -> bytes:
     """Return arrays of a result: `rig`, `flags`, `poses/3`, `outlines/3`, `values/speed`."""
     if kind in ("rig", "flags") and argument is None:
@@ -223,15 +219,6 @@ def _list_of(sent: Any, name: str, kind: type) -> list[Any]:
     if not isinstance(values, list) or not all(type(value) is kind for value in values):
         raise InputError("the page", f"sent no list of {name}", "reload the page")
     return values
-
-
-async def _refused(request: Request, error: Exception) -> Response:
-    return JSONResponse({"problem": str(error)}, 400)
-
-
-def _media_type(name: str) -> str:
-    kinds = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
-    return kinds.get(Path(name).suffix, "text/plain")
 
 
 def listening(port: int | None) -> socket.socket:

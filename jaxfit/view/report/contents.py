@@ -176,7 +176,7 @@ def gather(
         times_s=times_s,
         size_px=(int(sizes[0, 0]), int(sizes[0, 1])) if len(sizes) else None,
         fps=solution.fps,
-        tracks=tuple(sorted(tracks, key=lambda track: (_first(track), track.position))),
+        tracks=tuple(sorted(tracks, key=lambda track: (np.append(track.present, True).argmax(), track.position))),
         config=config,
         **entries,
     )
@@ -206,11 +206,6 @@ def _entries(summary: Mapping[str, Any]) -> dict[str, Any]:
         "facts": facts,
         "corrections": tuple(map(str, summary.get("corrections") or ())),
     }
-
-
-def _first(track: Track) -> int:
-    at = np.flatnonzero(track.present)
-    return int(at[0]) if len(at) else len(track.present)
 
 
 def _tracks(
@@ -335,7 +330,9 @@ def next_steps(report: Report) -> list[Step]:
     """Return the recommended actions in their order."""
     result = shlex.quote(report.folder)
     if report.photographs:
-        return [_draw_photographs(report.folder), *_export(report, result)]
+        text = "Draw the fitted birds beside the annotations, in Python, with the file that was fitted:"
+        drawn = f"*jaxfit.load_solution({report.folder!r}), jaxfit.read_observations('OBS.json'), 'sheet.png'"
+        return [Step(text, f"import jaxfit\njaxfit.contact_sheet({drawn})"), *_export(report, result)]
     video = "VIDEO" if report.video is None else shlex.quote(report.video)
     draw = f"jaxfit overlay {result} --video {video} --out overlay.mp4 --side-views"
     text = (
@@ -355,12 +352,6 @@ def next_steps(report: Report) -> list[Step]:
         )
         steps.append(Step(text, f"jaxfit tracks {result} --swap {a},{b}@{middle} --out corrected"))
     return [*steps, *_export(report, result)]
-
-
-def _draw_photographs(folder: str) -> Step:
-    text = "Draw the fitted birds beside the annotations, in Python, with the file that was fitted:"
-    drawn = f"*jaxfit.load_solution({folder!r}), jaxfit.read_observations('OBS.json'), 'sheet.png'"
-    return Step(text, f"import jaxfit\njaxfit.contact_sheet({drawn})")
 
 
 def _export(report: Report, result: str) -> list[Step]:
