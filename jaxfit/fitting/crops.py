@@ -41,23 +41,15 @@ def crop_squares(
         if not len(image_px):  # a camera that does not see the bird of the window
             crop[w] = 0, 0, MIN_SIZE_PX
         elif config.mode == "image":
-            crop[w] = _whole_image(image_px)
+            sizes = sorted({(width, height) for width, height in image_px.tolist()})
+            if len(sizes) > 1 or sizes[0][0] != sizes[0][1]:
+                problem = f"needs square images of one size, not {sizes} (width, height)"
+                raise InputError("crop.mode: image", problem, "use crop.mode: box")
+            crop[w] = 0, 0, sizes[0][0]
         else:
             largest_px = float(MAX_CROP_IMAGE_SIDES * image_px.max())
             crop[w] = _around_the_bird(observations, n, frame[w], present[w], largest_px, config)
     return crop
-
-
-def _whole_image(image_px: Int[np.ndarray, "P 2"]) -> Float[np.ndarray, "3"]:
-    """Return the whole image as the crop of all frames of one window."""
-    sizes = sorted({(width, height) for width, height in image_px.tolist()})
-    if len(sizes) > 1 or any(width != height for width, height in sizes):
-        raise InputError(
-            "crop.mode: image",
-            f"needs square images of one size, not {sizes} (width, height)",
-            "use crop.mode: box",
-        )
-    return np.array([0.0, 0.0, sizes[0][0]])
 
 
 def _around_the_bird(

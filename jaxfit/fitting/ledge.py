@@ -215,7 +215,10 @@ def on_ledge(
     lens = lens or camera
     placed = in_image(s, bird, float(camera.matrix[0, 0]), tuple(camera.matrix[:2, 2]))
     up, height = camera.R_cam_world[:, 2], float(camera.position_world[2]) / unit_m
-    low = np.array([_lowest(s, bird, placed, up, n) for n in range(len(s.track_id))]).reshape(s.valid.shape)
+    low = np.zeros(s.valid.shape)  # height of the lower foot relative to the camera, model units, before it is moved
+    for n in range(len(low)):
+        one = InImage(placed.focal_px, *(values[n : n + 1] for values in placed[1:]))
+        low[n] = (one.points(feet_cam(s, bird, n), np.asarray(s.poses.scale[n : n + 1])) @ up).min(axis=-1)[0]
     with np.errstate(all="ignore"):
         log_size = np.where(low < 0, np.log(height / -low), np.inf)
     log_size = np.where(s.valid, log_size, np.nan)
@@ -242,7 +245,7 @@ def _in_world(
     scale, root = factor * placed.size, factor[..., None] * placed.root
     growth = scale / s.poses.scale
     points = factor[..., None, None] * placed.points(
-        s.keypoints.cam.astype(np.float64), s.poses.scale.astype(np.float64)
+        s.keypoints.cam.astype(np.float64), np.asarray(s.poses.scale, np.float64)
     )
     world = in_world(camera, unit_m, placed.orientation, root, points)
     bars = s.error_bars
@@ -270,12 +273,6 @@ def _in_world(
         world=world,
         contact=contact.astype(np.float32),
     )
-
-
-def _lowest(solution: Solution, bird: Bird, placed: InImage, up: np.ndarray, n: int) -> Float[np.ndarray, "T"]:
-    """Return the height of the lower foot of a track relative to the camera, model units, before it is moved."""
-    one = InImage(placed.focal_px, *(values[n : n + 1] for values in placed[1:]))
-    return (one.points(feet_cam(solution, bird, n), solution.poses.scale[n : n + 1]) @ up).min(axis=-1)[0]
 
 
 def metres(bird: Bird) -> float:

@@ -273,7 +273,10 @@ class _Sample:
             placed = in_image(self._solution, self._bird, f, centre)
             orient = Rotation.from_rotvec(np.nan_to_num(placed.orientation).reshape(-1, 3))
             axes = orient.as_matrix().reshape(*self._usable.shape, 3, 3)
-            self._last = (f, *centre), _Placed(placed.points(self._feet, self._solution.poses.scale), axes, placed.root)
+            self._last = (
+                (f, *centre),
+                _Placed(placed.points(self._feet, np.asarray(self._solution.poses.scale)), axes, placed.root),
+            )
         return self._last[1]
 
     def up(self, f: float, centre: tuple[float, float]) -> Float[np.ndarray, "3"]:

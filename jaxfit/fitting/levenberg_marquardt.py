@@ -146,8 +146,4 @@ def _evaluate(program: Program, problem: Problem, pose: Pose) -> tuple[Float[Arr
     return value, gradient, blocks
 
 
-def _levenberg_outcome(state: _LevenbergState) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    return state.loss, state.rejected
-
-
-LEVENBERG_MARQUARDT = Solver(_levenberg_init, _levenberg_step, _levenberg_outcome, preparing_steps=1)
+LEVENBERG_MARQUARDT = Solver(_levenberg_init, _levenberg_step, preparing_steps=1)

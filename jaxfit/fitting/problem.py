@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxfit.model.camera import CropCamera
 from jaxfit.model.kinematics import Pose, Rig
@@ -54,9 +54,11 @@ class Problem(NamedTuple):
 
 
 class Solver(NamedTuple):
-    """A method that improves the pose of one problem. All three functions are pure.
+    """A method that improves the pose of one problem. Both functions are pure; a batch maps them over its problems.
 
-    A batch maps the functions over its problems.
+    A state has the fields `loss`, the last loss that the solver computed, and `rejected`, the number of steps of this
+    stage that were rejected because the loss or its gradient was not finite. After the first rejected step, the pose is
+    constant.
     """
 
     init: Callable[[Program, Problem, Any], Any]
@@ -64,9 +66,6 @@ class Solver(NamedTuple):
     previous stage, whose moments the solver continues. None: the solver starts without moments."""
     step: Callable[[Program, Problem, Pose, Any], tuple[Pose, Any]]
     """Take one step. Return the next pose and state."""
-    outcome: Callable[[Any], tuple[Float[Array, ""], Int[Array, ""]]]
-    """Return, from a state, the last loss that the solver computed, and the number of steps of this stage that were
-    rejected because the loss or its gradient was not finite. After the first rejected step, the pose is constant."""
     preparing_steps: int = 0
     """Number of calls of `step` that precede the first step and only evaluate the anchor. `init` could evaluate it, but
     the objective would then be compiled twice, which takes longer than the evaluation."""

@@ -80,11 +80,7 @@ def _loss_of(program: Program):
     return loss
 
 
-def _adam_outcome(state: _AdamState) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    return state.loss, state.rejected
-
-
-ADAM = Solver(_adam_init, _adam_step, _adam_outcome)
+ADAM = Solver(_adam_init, _adam_step)
 
 
 class StageState(NamedTuple):
@@ -128,7 +124,7 @@ def advance(
         state: the current state. Its memory is reused, so the caller must use the returned state instead.
 
     Returns:
-        The new state, and `Solver.outcome` of each problem: loss (B,) and rejected steps (B,).
+        The new state, and loss (B,) and number of rejected steps (B,) of the problems.
     """
     program, problems, steps = fixed
     count = steps + jnp.where(state.started, 0, program.solver.preparing_steps)
@@ -138,7 +134,7 @@ def advance(
 
     # the loop outside: to batch a loop, JAX traces its body a second time
     pose, solver = jax.lax.fori_loop(0, count, step, (state.pose, state.solver))
-    return StageState(pose, solver, jnp.bool_(True)), *jax.vmap(program.solver.outcome)(solver)
+    return StageState(pose, solver, jnp.bool_(True)), solver.loss, solver.rejected
 
 
 class Report(NamedTuple):
@@ -220,7 +216,10 @@ def without_mask_stages(config: FitConfig) -> FitConfig:
     A config that has no other stages keeps its stages, without the terms that compare masks.
     """
     if all(map(needs_mask, config.stages)):
-        stages = [replace(stage, terms=_terms_without_masks(stage)) for stage in config.stages]
+        stages = []
+        for stage in config.stages:
+            others = tuple(name for name, term in find_terms(stage.terms).items() if not term.compares_masks)
+            stages.append(replace(stage, terms=others or stage.terms))
         return replace(config, stages=tuple(stages))
     kept: list[StageConfig] = []
     for stage in config.stages:
@@ -243,11 +242,6 @@ def _continuation(before: StageConfig, stage: StageConfig) -> StageConfig:
         carry_moments=before.solver == "adam",
         keep_best=stage.keep_best,
     )
-
-
-def _terms_without_masks(stage: StageConfig) -> tuple[str, ...]:
-    others = (name for name, term in find_terms(stage.terms).items() if not term.compares_masks)
-    return tuple(others) or stage.terms
 
 
 def stage_program(config: FitConfig, stage: StageConfig, model: FitModel) -> Program:

@@ -419,5 +419,7 @@ def _with_world(solution: Solution, bird: Bird, camera: Camera) -> Solution:
     """Return the solution of one view with the birds in the world: every bird has the size of the model."""
     unit_m = bird.metres_per_unit or 1.0
     placed = in_image(solution, bird, float(camera.matrix[0, 0]), tuple(camera.matrix[:2, 2]))
-    keypoints_cam = placed.points(solution.keypoints.cam.astype(np.float64), solution.poses.scale.astype(np.float64))
+    keypoints_cam = placed.points(
+        solution.keypoints.cam.astype(np.float64), np.asarray(solution.poses.scale, np.float64)
+    )
     return replace(solution, world=in_world(camera, unit_m, placed.orientation, placed.root, keypoints_cam))

@@ -331,11 +331,13 @@ def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray
     crop = crop_squares(prepared, track, frame, present, config.crop)
     confidence = np.zeros((*frame.shape, prepared.num_keypoints), np.float32)
     keypoints_px = np.zeros((*confidence.shape, 2), np.float32)
-    frames, masks = FrameMasks(prepared), np.empty(len(track), object)
+    frames, masks, has_mask = FrameMasks(prepared), np.empty(len(track), object), np.zeros(frame.shape, bool)
     for w, n in enumerate(track.tolist()):
         confidence[w] = prepared.confidence[n, columns[w]] * present[w, :, None]
         points_px = image_to_crop(prepared.keypoints_px[n, columns[w]], crop[w])
         keypoints_px[w] = np.where(confidence[w, ..., None] > 0, points_px, 0)
+        if prepared.masks:
+            has_mask[w] = present[w] & [(n, t) in prepared.masks for t in frame[w].tolist()]
         masks[w] = WindowMasks.of(frames, n, frame[w], present[w], crop[w], config.unknown_pixels)
     numbers = prepared.frame_index
     frame_s = frame_interval_s(numbers, prepared.timestamp_s, prepared.fps)
@@ -347,24 +349,10 @@ def windows_at(prepared: Observations, config: FitConfig, starts: Int[np.ndarray
         crop=crop,
         keypoints_px=keypoints_px,
         confidence=confidence,
-        has_mask=_has_mask(prepared, track, frame, present),
+        has_mask=has_mask,
         masks=masks,
         frame_s=np.full(len(starts), frame_s or assumed_interval_s(numbers), np.float32),
     )
-
-
-def _has_mask(
-    observations: Observations,
-    track: Int[np.ndarray, "W"],
-    frame: Int[np.ndarray, "W T"],
-    present: Bool[np.ndarray, "W T"],
-) -> Bool[np.ndarray, "W T"]:
-    """Return whether a bird has a mask, for the frames of some windows."""
-    has_mask = np.zeros(frame.shape, bool)
-    if observations.masks:
-        for w, t in np.argwhere(present).tolist():
-            has_mask[w, t] = (int(track[w]), int(frame[w, t])) in observations.masks
-    return has_mask
 
 
 def filter_observations(observations: Observations, window: int) -> Observations:
