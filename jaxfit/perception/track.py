@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -129,35 +131,44 @@ def run_tracking(
     keypoints, segmenter = keypoints or open_keypoint_detector(config), segmenter or open_segmenter(config)
     clock = Clock()
     total = expected_frames(reader, frames)
-    stored = load_stored_frames(parts, lambda: tracker or _tracker_of(config))
+    settings = config.tracker
+    own_tracker = partial(
+        load_tracker,
+        settings.name,
+        memory=settings.memory,
+        min_iou=settings.min_iou,
+        min_score=settings.min_score,
+        step=frames.step,
+    )
+    stored = load_stored_frames(parts, lambda: tracker or own_tracker())
     items = list(stored.items)
     records = [item for item in items if isinstance(item, RecordedFrame)]
     start = records[-1].frame_index + frames.step if records else frames.start
 
     end = None if total is None else frames.start + total * frames.step
-    if cluster is not None and (reason := _no_workers(stored.tracker, end)):
+    uses_pictures = getattr(stored.tracker, "uses_pictures", False)
+    if cluster is not None and (uses_pictures or end is None):
+        reason = "the tracker uses the pictures of the video"
+        reason = reason if uses_pictures else "the file does not contain the number of its frames"
         _logger.warning("%s: the networks run in this process, because %s", source, reason)
-        cluster = None
-    if cluster is not None and end is not None:
+    if cluster is not None and end is not None and not uses_pictures:
         detections = detect_on_workers(cluster, reader.path, config, range(start, end, frames.step), clock)
     else:
         remaining = reader if start == frames.start else read_frames(source, start, frames.stop, frames.step)
         detections = detect(remaining, segmenter, keypoints, clock)
     num_keypoints, name = len(keypoints.keypoint_names), reader.path.name
-    with progress("Tracking", total) as report_progress:
+    tracked = tracked_frames(detections, stored.tracker, num_keypoints, name, clock, parts)
+    with progress("Tracking", total) as report_progress, closing(tracked):
         if records:
             report_progress(len(records), "stored frames")
-        if not stored.is_complete:
-            tracked = tracked_frames(detections, stored.tracker, num_keypoints, name, clock, parts)
-            begun_s, num_new = time.perf_counter(), 0
-            for item in tracked:
-                items.append(item)
-                if isinstance(item, RecordedFrame):
-                    num_new += 1
-                    rate, birds = num_new / (time.perf_counter() - begun_s), len(item.masks)
-                    noun = "bird" if birds == 1 else "birds"
-                    note = f"{len(records) + num_new} frames, {rate:.1f} frames/s, {birds} {noun} now"
-                    report_progress(1, note)
+        begun_s, num_new = time.perf_counter(), 0
+        for item in () if stored.is_complete else tracked:
+            items.append(item)
+            if isinstance(item, RecordedFrame):
+                num_new += 1
+                rate, birds = num_new / (time.perf_counter() - begun_s), len(item.masks)
+                noun = "bird" if birds == 1 else "birds"
+                report_progress(1, f"{len(records) + num_new} frames, {rate:.1f} frames/s, {birds} {noun} now")
 
     records = [item for item in items if isinstance(item, RecordedFrame)]
     damaged = [item for item in items if isinstance(item, int)]
@@ -178,75 +189,53 @@ def run_tracking(
         np.concatenate([record.keypoint_distance for record in records]).tolist(),
     ]
     trust = judge(footage_signals(all_tracks, short_tracks, distances, getattr(keypoints, "curve", None) is not None))
-    failure = None
-    if not observations.num_tracks:
-        if low_score_tracks:
-            failure = _only_low_scores(source, trust, low_score_tracks, min_score)
-        elif short_tracks:
-            best_score = max(float(record.score.max(initial=0.0)) for record in records)
-            failure = _only_short_tracks(source, config, trust, short_tracks, best_score)
-        else:
-            failure = _no_bird(source, config, len(records), has_own_segmenter)
-    return TrackingResult(observations, short_tracks, low_score_tracks, damaged, failure, trust, choice, clock.seconds)
+    tracking = TrackingResult(observations, short_tracks, low_score_tracks, damaged, None, trust, choice, clock.seconds)
+    if observations.num_tracks:
+        return tracking
+    return tracking._replace(failure=_failure(source, config, tracking, records, min_score, has_own_segmenter))
 
 
-def _no_workers(tracker: Tracker, end: int | None) -> str | None:
-    """Return why the networks cannot run on workers; None if they can."""
-    if getattr(tracker, "uses_pictures", False):
-        return "the tracker uses the pictures of the video"
-    return "the file does not contain the number of its frames" if end is None else None
-
-
-def _tracker_of(config: TrackConfig) -> Tracker:
-    """Create the tracker of a config."""
-    settings = config.tracker
-    return load_tracker(
-        settings.name,
-        memory=settings.memory,
-        min_iou=settings.min_iou,
-        min_score=settings.min_score,
-        step=config.frames.step,
-    )
-
-
-def _remedy(trust: Trust, setting: str) -> str:
-    """Return what to do about footage without a track; under low trust, lower limits are the last choice."""
-    networks = ["label frames (jaxfit suggest)", "use other networks (--segmenter)"]
-    first, second, last = [*networks, setting] if trust.level == "low" else [setting, *networks]
-    return f"{first}, {second}, or {last}"
-
-
-def _only_low_scores(source: str | Path, trust: Trust, low_score_tracks: dict[int, float], least: float) -> InputError:
-    problem = (
-        f"no tracked bird has a mean score of {least:g}: the highest of {len(low_score_tracks)} tracks is "
-        f"{max(low_score_tracks.values()):.3f}"
-    )
-    return InputError(source, problem, _remedy(trust, "lower --min-track-score"))
-
-
-def _only_short_tracks(
-    source: str | Path, config: TrackConfig, trust: Trust, short_tracks: dict[int, int], best_score: float
+def _failure(
+    source: str | Path,
+    config: TrackConfig,
+    tracking: TrackingResult,
+    records: list[RecordedFrame],
+    min_score: float,
+    has_own_segmenter: bool,
 ) -> InputError:
-    problem = (
-        f"no bird was tracked for {config.min_track_frames} frames: there are {len(short_tracks)} shorter tracks, with "
-        f"scores up to {best_score:.2f} and at most {max(short_tracks.values())} frames"
-    )
-    return InputError(source, problem, _remedy(trust, "lower --min-track-frames"))
+    """Return why a result has no track, and what to do; under low trust, lower limits are the last choice.
 
-
-def _no_bird(source: str | Path, config: TrackConfig, frame_count: int, has_own_segmenter: bool) -> InputError:
-    """Create the error for a video without birds; the segmenter of the config reports its highest score."""
-    classes, min_score = " or ".join(config.segmenter.classes) or "bird", config.segmenter.min_score
-    problem = f"no {classes} was detected in {frame_count} frames"
-    problem += "" if min_score is None else f" with a score of {min_score:g} or more"
-    if not has_own_segmenter:
-        best = _highest_score(source, config)
-        problem += f"; the highest score is {best:.2f}" if best else f"; no score reaches {RETRY_MIN_SCORE}"
-    remedy = (
-        "look whether birds are visible in the film; if so, label frames (jaxfit suggest), use another --segmenter or "
-        "--classes, lower --min-score, or set --tile-px"
-    )
-    return InputError(source, problem, remedy)
+    Without any bird, the segmenter of the config runs again and reports its highest score.
+    """
+    low_scores, short_tracks = tracking.low_score_tracks, tracking.short_tracks
+    if low_scores:
+        problem = (
+            f"no tracked bird has a mean score of {min_score:g}: the highest of {len(low_scores)} tracks is "
+            f"{max(low_scores.values()):.3f}"
+        )
+        remedy = "lower --min-track-score"
+    elif short_tracks:
+        best_score = max(float(record.score.max(initial=0.0)) for record in records)
+        problem = (
+            f"no bird was tracked for {config.min_track_frames} frames: there are {len(short_tracks)} shorter tracks, "
+            f"with scores up to {best_score:.2f} and at most {max(short_tracks.values())} frames"
+        )
+        remedy = "lower --min-track-frames"
+    else:
+        settings = config.segmenter
+        problem = f"no {' or '.join(settings.classes) or 'bird'} was detected in {len(records)} frames"
+        problem += "" if settings.min_score is None else f" with a score of {settings.min_score:g} or more"
+        if not has_own_segmenter:
+            best = _highest_score(source, config)
+            problem += f"; the highest score is {best:.2f}" if best else f"; no score reaches {RETRY_MIN_SCORE}"
+        remedy = (
+            "look whether birds are visible in the film; if so, label frames (jaxfit suggest), use another --segmenter "
+            "or --classes, lower --min-score, or set --tile-px"
+        )
+        return InputError(source, problem, remedy)
+    networks = ["label frames (jaxfit suggest)", "use other networks (--segmenter)"]
+    first, second, last = [*networks, remedy] if tracking.trust.level == "low" else [remedy, *networks]
+    return InputError(source, problem, f"{first}, {second}, or {last}")
 
 
 def _highest_score(source: str | Path, config: TrackConfig) -> float:

@@ -158,7 +158,7 @@ def test_footage_without_birds_leaves_nothing(folder):
 
 
 @pytest.mark.extended
-@pytest.mark.parametrize("point", ["frame 7", "part 1", "part 2", "windows 1", "result"])
+@pytest.mark.parametrize("point", ["frame 7", "windows 1", "result"])
 def test_a_killed_process(folder, expected, point):
     """The process is killed with SIGKILL, so no code of its own cleans up. The process of the tests continues."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
