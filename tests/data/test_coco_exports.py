@@ -139,3 +139,21 @@ def test_tracks_of_any_kind_are_kept(tmp_path, caplog):
 def test_only_labels_and_fits_read_a_video_without_tracks(tmp_path):
     with pytest.raises(InputError, match=r"annotations\[0\] lacks the key track_id"):
         read_observations(saved_video(tmp_path, untracked_video()))
+
+
+def test_scores_in_place_of_visibilities(tmp_path, caplog):
+    scores = {"keypoints": [10, 5, 0.96, 20.5, 6.25, 0.03, 1, 2, 1.0]}
+    observed = read_observations(saved(tmp_path, cvat(["frame_1.png"], [(1, scores)])))
+    np.testing.assert_allclose(observed.confidence[0, 0], [0.96, 0.03, 1])
+    assert not observed.occluded.any()
+    assert "holds scores in place of visibilities" in caplog.text
+
+
+def test_frame_numbers_of_cocovid(tmp_path):
+    content = cvat(["bird/1.png", "bird/2.png"], [(1, {"track_id": 1}), (2, {"track_id": 1})])
+    for i, image in enumerate(content["images"]):
+        image |= {"video_id": 1, "frame_id": 5 * i}
+    assert read_observations(saved(tmp_path, content)).frame_index.tolist() == [0, 5]
+    content["images"][1]["video_id"] = 2
+    with pytest.raises(InputError, match="holds several videos"):
+        read_observations(saved(tmp_path, content))

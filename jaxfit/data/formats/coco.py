@@ -20,6 +20,7 @@ Conventions of the reader:
 - The confidence of a keypoint is its score where ``v > 0``, and 0 where ``v = 0``, since COCO writes a missing keypoint
   at (0, 0) with any score. Without scores, the confidence is 1 where ``v > 0``. Without ``score``, the score of an
   annotation is 1.
+- A file whose visibilities lie between 0 and 1 holds scores in their place, as MMPose and detectron2 write them.
 - The first category with keypoints is the bird. Categories with the same keypoints in the same order, such as several
   species, are birds too. Annotations of other categories are skipped, and one warning reports their number.
 - A file without annotations is a video without birds. A file with annotations of other categories only is rejected.
@@ -124,6 +125,11 @@ def coco_observations(root: Field) -> Observations:
         if bird.scores is not None:
             confidence[i] = np.where(visibility[i] > 0, bird.scores, 0)
 
+    occluded = visibility == 1
+    if (visibility % 1 > 0).any() and visibility.max() <= 1:
+        _log.warning("%s: holds scores in place of visibilities, which are read as confidences", root.source)
+        confidence, occluded = visibility.astype(np.float32), np.zeros(visibility.shape, bool)
+
     def placed(values: Any, *shape: int, dtype: Any = np.float32) -> np.ndarray:
         array = np.zeros((N, T, *shape), dtype)
         with np.errstate(over="ignore"):  # a number that is too large becomes infinite
@@ -156,7 +162,7 @@ def coco_observations(root: Field) -> Observations:
             skeleton=categories.skeleton,
             masks=masks["rle"],
             amodal_masks=masks["amodal_rle"],
-            occluded=placed(visibility == 1, K, dtype=bool),
+            occluded=placed(occluded, K, dtype=bool),
             score=placed([bird.score for bird in birds]),
             timestamp_s=np.array([first_image[f].timestamp_s for f in frames]),
             fps=float(info["fps"].value) if info.has("fps") else None,

@@ -3,7 +3,8 @@
 Annotation programs export files without the keys of video: `frame_index` of images and `track_id` of annotations.
 `complete_export` adds both keys before the file is read:
 
-- The name of a picture gives the number of its frame (`frame_000012.png` → 12), as
+- `frame_id` of CocoVID is the number of the frame; a file of several videos is an error.
+- Otherwise, the name of a picture gives the number of its frame (`frame_000012.png` → 12), as
   `jaxfit.data.tracks.frame_numbers` describes. Other pictures are photographs: `frame_index` is 0, and every bird is a
   track of its own.
 - CVAT stores the track in `attributes.track_id`, or in `attributes.bird` for the label that `cvat` writes. Birds
@@ -245,7 +246,15 @@ def complete_export(root: Field, video: Path | None = None, untracked: Untracked
     photographs = False
     if is_export:
         with errors_of(root, "images"):
-            numbers = frame_numbers([image["file_name"] for image in images], video)
+            in_folder = video is not None and video.is_dir()  # which numbers its pictures by their positions
+            if images and not in_folder and all("frame_id" in image for image in images):  # CocoVID
+                if len({image.get("video_id") for image in images}) > 1:
+                    raise InputError(
+                        root.source, "holds several videos (video_id)", "give every video a file of its own"
+                    )
+                numbers = [_whole(image["frame_id"]) for image in images]
+            else:
+                numbers = frame_numbers([image["file_name"] for image in images], video)
         photographs = numbers is None
         images = [image | {"frame_index": 0 if numbers is None else numbers[i]} for i, image in enumerate(images)]
         with errors_of(root, "annotations"):
