@@ -26,7 +26,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.files import remove_leftovers, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
-from jaxfit.foundation.reading import read_json_file
+from jaxfit.foundation.reading import check_folder, read_json_file
 from jaxfit.foundation.workers import Cluster
 from jaxfit.model.bird import Bird, model_hash
 from jaxfit.model.files import load_murre
@@ -81,16 +81,10 @@ def claim_folder(
 
 def _is_new(folder: Path) -> bool:
     """Return whether a folder is absent or empty; otherwise the folder must have a record."""
-    remove_leftovers(folder)
-    try:
-        files = [file.name for file in folder.iterdir()]
-    except FileNotFoundError:
+    if not os.path.lexists(folder):
         return True
-    except NotADirectoryError:
-        raise InputError(folder, "is a file, not a folder", "choose another --out") from None
-    except (OSError, ValueError) as error:
-        reason = os.strerror(error.errno) if isinstance(error, OSError) and error.errno else "is not a file name"
-        raise InputError(folder, f"cannot be read: {reason}", "choose another --out") from None
+    remove_leftovers(folder)
+    files = [file.name for file in check_folder(folder, "a folder of an ablation").iterdir()]
     if files and _RECORD not in files:
         raise InputError(folder, f"holds files, but no {_RECORD}", "choose another --out")
     return not files

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ from jaxfit.evaluation.truth import Truth, match_tracks
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
-from jaxfit.foundation.reading import json_text, read_json_file
+from jaxfit.foundation.reading import json_text, read_json_file, reading
 
 CLAIMED = ("me_p", "me_v")
 """The metrics of claims and plots; lower is better."""
@@ -95,48 +95,10 @@ def read_metrics(folder: Path) -> tuple[Evaluation, float, int]:
     Raises:
         InputError: a file cannot be read, or does not hold metrics.
     """
-    path, remedy = folder / _EVALUATION, "remove this folder; then the same command fits the run again"
-    content = read_json_file(path)
-    summary = read_json_file(folder / SUMMARY)
-    try:
-        evaluation = Evaluation.from_dict(content)
-        seconds, runs_at_once = summary["seconds"]["fit"], summary["runs_at_once"]
-    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
-        raise InputError(folder, f"holds damaged metrics: {type(error).__name__}: {error}", remedy) from None
-    if not (_is_consistent(evaluation) and _are_numbers([seconds]) and _are_counts([runs_at_once])):
-        raise InputError(path, "does not hold metrics of a run", remedy)
-    return evaluation, seconds, runs_at_once
-
-
-def _is_consistent(evaluation: Evaluation) -> bool:
-    """Return whether all metrics are numbers, and whether the sums have a number for each bird."""
-    rows = [evaluation.overall, *(evaluation.intervals[name]._asdict() for name in evaluation.intervals)]
-    for table in (evaluation.tracks, evaluation.behaviours, evaluation.keypoints):
-        rows += table.values()
-    # NaN marks a metric without a measurement
-    values = [value for row in rows for value in row.values() if value == value]
-    birds, numerators, counts = evaluation.sums.birds, evaluation.sums.numerators, evaluation.sums.counts
-    lengths = {len(each) for each in (birds, *numerators.values(), *counts.values())}
-    return (
-        _are_numbers(values)
-        and all(each.keys() >= set(CLAIMED) for each in (evaluation.overall, evaluation.intervals, counts))
-        and numerators.keys() == counts.keys()
-        and len(lengths) == 1
-        and all(isinstance(bird, str) for bird in birds)
-        and len(set(birds)) == len(birds)
-        and all(map(_are_numbers, numerators.values()))
-        and all(map(_are_counts, counts.values()))
-        and _are_counts([evaluation.frames, evaluation.missing, evaluation.unmatched, evaluation.frames_3d])
-        and evaluation.points_3d in ("", "joints", "keypoints")
-    )
-
-
-def _are_numbers(values: Iterable[Any]) -> bool:
-    return all(type(value) in (int, float) and abs(value) < 1e300 for value in values)
-
-
-def _are_counts(values: Iterable[Any]) -> bool:
-    return all(type(value) is int and 0 <= value < 2**53 for value in values)
+    remedy = "remove this folder; then the same command fits the run again"
+    content, summary = read_json_file(folder / _EVALUATION), read_json_file(folder / SUMMARY)
+    with reading(folder / _EVALUATION, "the metrics of a run", remedy):
+        return Evaluation.from_dict(content), float(summary["seconds"]["fit"]), int(summary["runs_at_once"])
 
 
 @dataclass(frozen=True)
