@@ -20,7 +20,7 @@ SURE, UNSURE, DOF = 1.5, 8.0, 5.0
 
 @pytest.fixture(autouse=True)
 def _few_resamples(monkeypatch):
-    monkeypatch.setattr(detection_noise, "RESAMPLES", 20)
+    monkeypatch.setattr(detection_noise, "RESAMPLES", 2)
 
 
 def draws(frames, dof=DOF, seed=0):
@@ -32,8 +32,9 @@ def draws(frames, dof=DOF, seed=0):
     return scale[..., None] * student_t(rng, shape, dof), confidence
 
 
-def test_known_errors_are_recovered_from_every_tenth_frame():
+def test_known_errors_are_recovered_from_every_tenth_frame(monkeypatch):
     """1,200 labelled keypoints; the errors of the other frames are far larger and do not count."""
+    monkeypatch.setattr(detection_noise, "RESAMPLES", 20)
     error, confidence = draws(100)
     error[:, np.arange(100) % 10 != 0] *= 5
     noise = estimate_noise(detected(range(100), error, confidence), Truth(labelled(range(0, 100, 10))))

@@ -2,19 +2,16 @@
 
 import csv
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
 import sys
-import time
 from importlib import import_module
 
 import pytest
 from support.cli_files import rejected
 
 from jaxfit.cli.main import main
+from jaxfit.evaluation.ablation import runs
 from jaxfit.foundation.errors import InputError
 
 GRID = """
@@ -107,16 +104,18 @@ def test_the_same_again_does_nothing(done, inputs, grid):
 
 
 @pytest.mark.extended
-def test_a_kill_loses_nothing_and_changes_nothing(done, inputs, grid, tmp_path):
-    out = tmp_path / "out"
-    call = [sys.executable, "-c", "from jaxfit.cli.main import run; run()", *command(inputs, grid, out)]
-    process = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (list((out / "runs").glob("*")) if (out / "runs").is_dir() else []):
-        assert process.poll() is None
-        time.sleep(0.01)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+def test_an_interruption_loses_nothing_and_changes_nothing(done, inputs, grid, tmp_path, monkeypatch):
+    out, fit_batches = tmp_path / "out", runs.fit_batches
+
+    def interrupted(*arguments):
+        yield next(fit_batches(*arguments))
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(runs, "fit_batches", interrupted)
+        assert main(command(inputs, grid, out)) == 130
     first = {path: path.stat().st_mtime_ns for path in (out / "runs").rglob("poses.npz")}
+    assert first
     assert main(command(inputs, grid, out)) == 0
     assert (out / "table.csv").read_bytes() == (done / "table.csv").read_bytes()
     assert {path: path.stat().st_mtime_ns for path in first} == first
