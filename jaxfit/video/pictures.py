@@ -6,14 +6,21 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8, UInt16
-from PIL import Image, ImageOps
+from PIL import (  # the plugins register their formats
+    BmpImagePlugin,  # noqa: F401
+    Image,
+    ImageOps,
+    JpegImagePlugin,  # noqa: F401
+    PngImagePlugin,  # noqa: F401
+    TiffImagePlugin,  # noqa: F401
+    WebPImagePlugin,  # noqa: F401
+)
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import check_folder, open_file
-
-Image.init()
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
@@ -87,10 +94,10 @@ def read_pages(file: Path, numbers: range) -> Iterator[tuple[int, UInt8[np.ndarr
 
 def _pixels(image: Image.Image, grey: bool) -> np.ndarray:
     """Return the pixels of a picture as `read_picture`."""
-    upright = ImageOps.exif_transpose(image)
-    if upright.mode.startswith("I"):  # 16 bits, also those that Pillow reads as 32
-        values = np.asarray(upright).clip(0, 2**16 - 1).astype(np.uint16)
+    ImageOps.exif_transpose(image, in_place=True)
+    if image.mode.startswith("I"):  # 16 bits, also those that Pillow reads as 32
+        values = np.asarray(image).clip(0, 2**16 - 1).astype(np.uint16)
         return values if grey else np.repeat((values >> 8).astype(np.uint8)[..., None], 3, axis=2)
-    if grey:
-        return np.array(upright.convert("L"))
-    return np.ascontiguousarray(np.asarray(upright.convert("RGB"))[..., ::-1])
+    mode = "L" if grey else "RGB"
+    values = np.array(image if image.mode == mode else image.convert(mode))
+    return values if grey else cv2.cvtColor(values, cv2.COLOR_RGB2BGR)
