@@ -43,7 +43,7 @@ ARRAYS = [name for name in Pose.__dataclass_fields__] + ["keypoints_cam", "keypo
 
 def assert_same(a, b, tracks):
     for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(a, name)[tracks], getattr(b, name)[tracks], err_msg=name)
+        np.testing.assert_array_equal(a.arrays()[name][tracks], b.arrays()[name][tracks], err_msg=name)
 
 
 def test_the_fit_recovers_a_known_truth(solution, observed):
@@ -206,7 +206,7 @@ def test_boxes_in_a_large_image(observed, tmp_path):
     initial_poses = load_initial_poses(tmp_path / "out" / "poses.npz", large, BIRD)
     again = fit(large, BIRD, config(mode="box", steps=(1, 1)), initial_poses)
     for name in ("global_orient", "body_pose", "transl", "scale"):
-        np.testing.assert_allclose(getattr(again, name), getattr(result, name), atol=0.05, err_msg=name)
+        np.testing.assert_allclose(again.arrays()[name], result.arrays()[name], atol=0.05, err_msg=name)
     shifted = config(mode="box", steps=(1, 1))
     shifted = dataclasses.replace(shifted, crop=dataclasses.replace(shifted.crop, padding=0.5))
     with pytest.raises(InputError, match=r"poses\.npz: `crop` of track 0"):

@@ -41,7 +41,7 @@ def swept(observed):
 
 def assert_equal(a, b):
     for name in ("global_orient", "body_pose", "transl", "scale", "keypoints_px", "valid"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+        np.testing.assert_array_equal(a.arrays()[name], b.arrays()[name], err_msg=name)
     for term in a.loss:
         np.testing.assert_array_equal(a.loss[term], b.loss[term], err_msg=term)
 
@@ -64,8 +64,8 @@ def test_runs_of_a_sweep_equal_separate_fits(observed, swept):
         assert solution.status.tolist() == ["ok"] * BIRDS
         assert_equal(solution, alone)
     # the configs have different results
-    assert np.abs(swept[0].keypoints_px - swept[1].keypoints_px).max() > 0.1
-    assert np.abs(swept[1].keypoints_px - swept[2].keypoints_px).max() > 0.1
+    assert np.abs(swept[0].keypoints.px - swept[1].keypoints.px).max() > 0.1
+    assert np.abs(swept[1].keypoints.px - swept[2].keypoints.px).max() > 0.1
 
 
 def test_a_batch_may_be_shorter_than_the_other_batches(observed):

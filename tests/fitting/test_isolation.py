@@ -21,7 +21,7 @@ def assert_independent(observed, settings, groups):
     for group in groups:
         apart = fit(observed.select(tracks=group), BIRD, settings)
         for name in ARRAYS:
-            expected, actual = getattr(together, name)[group], getattr(apart, name)
+            expected, actual = together.arrays()[name][group], apart.arrays()[name]
             np.testing.assert_array_equal(actual, expected, err_msg=f"{name} of the birds {group}")
         for term, loss in apart.loss.items():
             np.testing.assert_array_equal(loss, together.loss[term][group], err_msg=f"{term} of the birds {group}")
