@@ -235,7 +235,7 @@ class Solution:
         if self.flags is None:
             object.__setattr__(self, "flags", _not_judged(np.shape(self.valid)))
         layout = LAYOUT | self.optional_layout
-        arrays = validate_arrays(self.arrays(), layout)
+        arrays: dict[str, Any] = validate_arrays(self.arrays(), layout)
         # a frame without a pose has no flag, whatever the array holds there
         arrays["doubts"] = np.where(arrays["valid"], arrays["doubts"], np.int8(-1))
         arrays["doubts"].flags.writeable = False

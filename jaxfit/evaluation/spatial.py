@@ -233,12 +233,9 @@ def real_camera(truth: Solution, source: object) -> tuple[np.ndarray, float]:
 
 def _apparent_size(solution: Solution, bird: Bird) -> np.ndarray:
     """Return the image pixels per model unit at the root, (N, T); the pose rotates about the root's rest position."""
-    depth = solution.poses.transl[..., 2] + solution.poses.scale * float(np.asarray(bird.joints)[0, 2])
-    return (
-        solution.poses.scale
-        * (solution.crops.focal_px * solution.crops.square_px[..., 2] / solution.crops.crop_px)
-        / depth
-    )
+    poses, crops = solution.poses, solution.crops
+    depth = poses.transl[..., 2] + poses.scale * float(np.asarray(bird.joints)[0, 2])
+    return np.asarray(poses.scale * (crops.focal_px * crops.square_px[..., 2] / crops.crop_px) / depth)
 
 
 def _joints(solution: Solution, bird: Bird) -> np.ndarray:
