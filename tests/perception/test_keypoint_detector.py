@@ -216,6 +216,33 @@ def test_crop_parameters_come_from_the_metadata(tmp_path):
         np.testing.assert_allclose(points[0], 100 + x0 + 0.5 * scale)
 
 
+def test_visible_background_hides_the_other_birds(tmp_path):
+    """Under a neighbour that covers the whole crop, only the bird's own mask is visible."""
+    shape = ("n", 3, 8, 8)
+    node = helper.make_node("Mul", ["input", "factor"], ["heatmaps"])
+    metadata = PLAIN | {"mean": "0", "std": "255", "background": "visible", "pad_px": "4", "dilate_px": "0"}
+    path = write_graph(
+        tmp_path / "k.onnx",
+        {"input": shape},
+        {"heatmaps": shape},
+        [node],
+        {"factor": np.array(1.0, np.float32)},
+        metadata,
+    )
+    frame = np.full((64, 64, 3), 255, np.uint8)
+    birds = [rectangle_instance(20, 20, 8, 8), rectangle_instance(0, 0, 64, 64)]
+    _, alone = load_keypoint_detector(path)(frame, birds[:1])
+    _, both = load_keypoint_detector(path)(frame, birds)
+    assert alone.max() == 1
+    picture, _ = load_keypoint_detector(path).network_input(frame, birds, [0])
+    assert picture[0, 0].sum() == 16  # the own mask of 4 × 4 pixels, half the crop
+    picture, _ = load_keypoint_detector(path, background="black").network_input(frame, birds, [0])
+    assert picture[0, 0].sum() == 16
+    picture, _ = load_keypoint_detector(path).network_input(frame, birds[:1], [0])
+    assert picture[0, 0].sum() == 64
+    assert both.shape == (2, 3)
+
+
 def test_no_birds(tmp_path):
     path = write_constant(tmp_path / "k.onnx", (1, 3, 64, 32), {"heatmaps": _spots(CELLS)}, PLAIN)
     points, confidence = _detect(path, [])

@@ -68,6 +68,14 @@ def test_odd_sides_are_padded(tmp_path):
     assert np.abs(frame[:47, 63] - sent[:, -1]).mean() < 12
 
 
+def test_what_an_encoder_cannot_do_is_one_clear_error(tmp_path):
+    """MPEG-4 has no time base for 120000/1001 frames/s, the rate of an action camera."""
+    expected = pytest.raises(InputError, match=r"cannot be encoded as mpeg4, .* at 119\.88 frames/s.*another codec")
+    with expected, VideoWriter(tmp_path / "a.mp4", SIZE, 120000 / 1001, "mpeg4") as writer:
+        writer.write(next(frames()))
+    assert not list(tmp_path.iterdir())
+
+
 def test_television_rates_are_exact(tmp_path):
     with VideoWriter(tmp_path / "a.mp4", SIZE, 30000 / 1001) as writer:
         writer.write(next(frames()))
