@@ -89,9 +89,11 @@ def in_image(
     at = np.nonzero(s.valid)
     crop = s.crops.square_px[at].astype(np.float64)
     of_camera = in_frame_of_camera(s)  # then the size is the true size
-    size = s.poses.scale[at].astype(np.float64) if of_camera else np.ones(len(at[0]))
-    divisor = (s.poses.scale[at].astype(np.float64) / size)[:, None]
-    root = s.poses.transl[at] / divisor + size[:, None] * np.asarray(bird.joints[0], np.float64)
+    scale = np.asarray(s.poses.scale[at], np.float64)
+    size = scale if of_camera else np.ones(len(at[0]))
+    root = np.asarray(s.poses.transl[at]) / (scale / size)[:, None] + size[:, None] * np.asarray(
+        bird.joints[0], np.float64
+    )
     crop_focal = s.crops.focal_px * crop[:, 2:] / s.crops.crop_px
     pixel = root[:, :2] / root[:, 2:] * crop_focal + crop[:, :2] + crop[:, 2:] / 2
     # the pictures of a camera have one size; a photograph may have its own
