@@ -307,3 +307,23 @@ def test_a_second_pose_that_is_almost_as_likely_is_reported(observed, after_firs
     weak = dataclasses.replace(settings, terms=dict.fromkeys(settings.terms, 1e-7))
     for order in (1, -1):
         assert fit_two_hypotheses(observed, weak, order).ambiguity_deg.min() > 150
+
+
+@pytest.mark.extended
+def test_the_common_size_is_constant_in_a_window(solution, observed):
+    assert (np.ptp(solution.poses.scale, axis=1) == 0).all()
+    keypoints_only = dataclasses.replace(config(common_size=False), stages=config(steps=(30, 1)).stages[:1])
+    size_per_frame = fit(observed.select(tracks=[0]), BIRD, keypoints_only)
+    assert np.ptp(size_per_frame.poses.scale[0]) > 1e-4
+
+
+def test_the_windows_of_a_long_track_are_independent():
+    observations = detect(BIRD, truths(2 * T - 2, 1), camera=CAMERA)
+    result = fit(observations, BIRD, config(steps=(30, 2)))
+    assert result.valid.all()
+    parts = [fit(observations.select(frames=f), BIRD, config(steps=(30, 2))) for f in (slice(0, T), slice(T, None))]
+    for name in ("global_orient", "keypoints_px", "scale"):
+        joined = np.concatenate([part.arrays()[name] for part in parts], axis=1)
+        np.testing.assert_array_equal(result.arrays()[name], joined, err_msg=name)
+    total = sum(np.asarray(part.loss["keypoints"]) for part in parts)
+    np.testing.assert_allclose(result.loss["keypoints"], total, rtol=1e-6)

@@ -130,3 +130,9 @@ def test_configs_with_different_programs_are_rejected(observed):
     for other in (config(common_size=False), config(window=3), config((12, 3))):
         with pytest.raises(ValueError, match="one compiled program"):
             fit_runs(observed, BIRD, [SWEEP[0], other])
+
+
+def test_the_order_of_the_runs_does_not_change_the_results(observed, swept):
+    reordered = fit_runs(observed, BIRD, SWEEP[::-1])[::-1]
+    for a, b in zip(swept, reordered, strict=True):
+        assert_equal(a, b)

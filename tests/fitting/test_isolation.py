@@ -1,5 +1,7 @@
 """The result of a bird is the same, bit by bit, alone and among any other birds."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from support.fits import BIRD, CAMERA, T, config, replaced, truths
@@ -62,3 +64,10 @@ def test_tiles_hold_every_row_once():
 
 def test_the_size_of_a_tile_depends_only_on_the_length_of_the_windows():
     assert [tile_size(frames) for frames in (1, 4, 6, 16, 100)] == [FRAMES_PER_TILE, 4, 2, 2, 2]
+
+
+@pytest.mark.extended
+def test_birds_with_hypotheses_do_not_depend_on_each_other():
+    settings = config(steps=(60, 5), memory_gb=1.0)
+    initialise = dataclasses.replace(settings.initialise, hypotheses=3)
+    assert_independent(observe(T), dataclasses.replace(settings, initialise=initialise), [[0], [2], [3, DIVERGING, 0]])

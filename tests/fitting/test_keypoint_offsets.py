@@ -176,3 +176,17 @@ def test_wrong_offsets_are_an_error_of_the_config(tmp_path, offsets, words):
 def test_an_offset_of_an_unknown_keypoint_is_an_error():
     with pytest.raises(InputError, match=r"model lacks: antenna"):
         fit(observed(), BIRD, dataclasses.replace(PLAIN, keypoint_offsets={"antenna": (0.0, 0.0, 1.0)}))
+
+
+def test_learnt_offsets_do_not_change_once_they_are_found():
+    exact = keypoints_px(move_keypoints(fold_bird(BIRD), PLACED), POSE)
+    first = learnt(exact)
+    given = dataclasses.replace(PLAIN, keypoint_offsets=first.by_name(BIRD))
+    again = learn_offsets(
+        fit_model(BIRD, given)._replace(camera=CAMERA),
+        first_offsets(BIRD, given.keypoint_offsets),
+        one_window(POSE),
+        targets(exact),
+        SCALE,
+    )
+    np.testing.assert_allclose(again.offsets, first.offsets, atol=0.02)

@@ -240,3 +240,20 @@ def deformed(observations, noise):
         soft = gaussian_filter(mask.astype(float), 1.5) + noise * 0.2 * field / field.std()
         masks[key] = encode_mask(soft > 0.5 if noise else mask)
     return dataclasses.replace(observations, masks=masks)
+
+
+@pytest.mark.extended
+def test_overridden_settings_and_terms_of_others_keep_their_values(exact):
+    stage = dataclasses.replace(STAGE, override={"keypoint_likelihood": {"sd_sure_px": 2.0}})
+    learnt = learn_weights(noisy(exact, 3.0), BIRD, dataclasses.replace(LEARNING, stages=(stage,)))
+    assert learnt.values == {}
+    assert learnt.config.terms == LEARNING.terms
+
+
+@pytest.mark.extended
+def test_a_model_without_prior_learns_from_keypoints_alone(exact):
+    terms = {"keypoint_likelihood": TERMS["keypoint_likelihood"]}
+    own = dataclasses.replace(LEARNING, stages=(dataclasses.replace(STAGE, terms=tuple(terms)),), terms=terms)
+    learnt = learn_weights(noisy(exact, 3.0), BIRD, own)
+    assert learnt.values or len(learnt.remarks) == 1
+    assert all(np.isfinite(value) for value in learnt.values.values())

@@ -299,3 +299,19 @@ def test_a_result_in_a_world_is_not_placed_again(placed, tmp_path, capsys):
     save_solution(placed, BIRD, "base: fast\n", {}, tmp_path / "fit")
     assert main(["ledge", str(tmp_path / "fit"), "--out", str(tmp_path / "out")]) == 2
     assert "is in a world already" in capsys.readouterr().err
+
+
+def test_the_distances_of_birds_agree_with_the_truth_without_a_camera(seen, scene, flies):
+    ledge = estimate_ledge(seen, BIRD)
+    placed, true = on_ledge(seen, BIRD, ledge.camera).world.transl_world_m, true_places_m(scene)
+    t = 10
+    stands = np.flatnonzero(scene.poses.valid[:, t] & ~flies[:, t])
+    pairs = [(i, j) for i in stands for j in stands if i < j]
+    ratio = [np.linalg.norm((placed[i] - placed[j])[t, :2]) / np.linalg.norm((true[i] - true[j])[t, :2]) for i, j in pairs]
+    assert abs(np.median(ratio) - 1) < 0.06
+
+
+def test_unknown_speeds_do_not_exclude_birds(seen, camera):
+    every_second = np.broadcast_to(np.arange(FRAMES) % 2 == 0, seen.valid.shape)
+    gaps = replace(seen, valid=seen.valid & every_second)
+    assert estimate_ledge(gaps, BIRD, camera).facts["birds"] == 7

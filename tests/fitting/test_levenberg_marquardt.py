@@ -240,3 +240,39 @@ def test_both_stages_reach_the_loss_of_adam():
         assert result.status.tolist() == ["ok", "ok"]
         loss[name] = sum(result.loss.values())
     assert (loss["fast"] <= 1.001 * loss["paper"]).all(), loss
+
+
+def test_the_reported_loss_is_the_loss_of_the_poses():
+    start, targets = case()
+    pose, loss, _ = solve([NEWTON], start, targets, (7,))
+    for n in range(B):
+        one, at, seen = jax.tree.map(lambda x, n=n: x[n], (pose, start, targets))
+        np.testing.assert_allclose(loss[n], total(one, at, seen, NEWTON), rtol=1e-5)
+
+
+@pytest.mark.extended
+def test_bones_and_shape_are_optimised_like_by_adam():
+    start, targets = case()
+    stage = dataclasses.replace(
+        NEWTON,
+        optimised=(*NEWTON.optimised, "bone_length", "betas"),
+        terms=(*NEWTON.terms, "bone_prior", "shape_norm"),
+    )
+    adam = dataclasses.replace(stage, solver="adam")
+    _, slow, _ = solve([adam], start, targets, (300,))
+    pose, fast, _ = solve([stage], start, targets, (20,))
+    assert (fast <= 1.001 * slow).all()
+    assert (np.abs(pose.bone_length - start.bone_length).max(axis=1) > 1e-2).all()
+
+
+@pytest.mark.extended
+def test_a_fit_of_single_frames():
+    """With few parameters, conjugate gradients converge before their largest number of steps."""
+    paper, loss = load_config("paper"), {}
+    observed = detect(BIRD, [smooth_motion(BIRD, 3, 3)], 1.0, 0.05)
+    for solver, steps in (("adam", 600), ("levenberg_marquardt", 12)):
+        stages = (dataclasses.replace(paper.stages[0], solver=solver, steps=steps),)
+        result = fit(observed, BIRD, dataclasses.replace(paper, stages=stages, window=1))
+        assert result.status.tolist() == ["ok"]
+        loss[solver] = sum(x.sum() for x in result.loss.values())
+    assert loss["levenberg_marquardt"] < 1.001 * loss["adam"]

@@ -190,3 +190,17 @@ def test_windows_hold_the_time_between_frames():
         assert window_content(windows, 0) != window_content(
             dataclasses.replace(windows, frame_s=2 * windows.frame_s), 0
         )
+
+
+@pytest.mark.parametrize("size", [40, 64, 100])
+def test_masks_have_the_scale_of_the_crop(size):
+    """A disc in the image is a disc at the scale of the crop, for enlarged and for reduced crops."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    crop, centre, radius = np.array([80.0, 60, size]), np.array([80 + 0.55 * size, 60 + 0.4 * size]), 0.25 * size
+    disc = (x - centre[0]) ** 2 + (y - centre[1]) ** 2 < radius**2
+    cut = cut_mask(disc, crop, 256)
+    y, x = np.mgrid[:256, :256] + 0.5
+    expected = (x - 0.55 * 256) ** 2 + (y - 0.4 * 256) ** 2 < (0.25 * 256) ** 2
+    assert (cut & expected).sum() / (cut | expected).sum() > 0.94
+    inside = np.argwhere(cut) + 0.5
+    np.testing.assert_allclose(inside.mean(0), [0.4 * 256, 0.55 * 256], atol=0.25 * 256 / size)

@@ -8,8 +8,10 @@ import pytest
 from support.fits import BIRD, CAMERA, config, truths
 
 from jaxfit.config.fit import StageConfig, load_config, shipped_fit_configs
+from jaxfit.data.formats.coco import read_coco
 from jaxfit.fitting.fit import _without_mask_stages, fit
 from jaxfit.fitting.solve import needs_mask, without_mask_stages
+from jaxfit.model.published import import_model
 from jaxfit.simulation.noise import detect
 
 
@@ -110,3 +112,13 @@ def test_warnings_name_the_stages(caplog):
     _without_mask_stages([dataclasses.replace(config(), stages=stages)], "birds")
     assert "birds: no masks, so these stages compare keypoints only: late" in caplog.text
     assert "birds: no masks, so these stages are skipped: early" in caplog.text
+
+
+@pytest.mark.extended
+def test_photographs_with_keypoints_only_converge(reference_dir):
+    bird = import_model("aves", [reference_dir / "models" / "aves"])
+    for species in ("029.American_Crow", "087.Mallard"):
+        observations = dataclasses.replace(read_coco(reference_dir / "cub" / f"{species}.json"), masks={})
+        photo = dataclasses.replace(load_config("photo"), learn_weights=())
+        converged = total_loss(observations, with_last_steps(without_mask_stages(photo), 300), bird)
+        assert (total_loss(observations, photo, bird) < 1.005 * converged).all()

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 from scipy.stats import multivariate_t
 from support.terms_by_hand import motion_by_hand, posed_window, random_targets, term_value, window_pose
 
-from jaxfit.objective.likelihood import keypoint_sd_px, motion_likelihood, place_likelihood
+from jaxfit.objective.likelihood import keypoint_likelihood, keypoint_sd_px, motion_likelihood, place_likelihood
 from jaxfit.objective.residuals import residual_sum, student_t
 
 
@@ -76,3 +77,16 @@ def test_the_place_is_that_in_the_image_and_not_that_in_the_crop():
 
     assert value(at * [3.0, -2.0]) == pytest.approx(0, abs=1e-6)
     assert value(at**2 * [3.0, -2.0]) > 1
+
+
+def test_gradients_of_the_keypoint_term_with_respect_to_its_settings():
+    targets = random_targets()
+    pose = window_pose()
+
+    @jax.jit
+    def total(sd_sure_px, sd_unsure_px, dof):
+        settings = {"sd_sure_px": sd_sure_px, "sd_unsure_px": sd_unsure_px, "dof": dof}
+        return residual_sum(keypoint_likelihood(posed_window(pose, targets), **settings)) / 100
+
+    at = (jnp.float32(1.5), jnp.float32(5.0), jnp.float32(3.0))
+    check_grads(total, at, order=1, modes=["rev"], eps=1e-2, atol=0.01, rtol=0.01)

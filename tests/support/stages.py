@@ -14,10 +14,10 @@ from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transfor
 from jaxfit.objective.objective import weighted_sum
 from jaxfit.objective.posed_window import PosedWindow, Targets, priors_of
 from jaxfit.simulation.flock import smooth_motion
-from support.birds import tiny_bird
+from support.birds import toy_bird
 
 B, T, STEPS = 2, 4, 25
-BIRD, CAMERA = tiny_bird(), CropCamera()
+BIRD, CAMERA = toy_bird(), CropCamera()
 MODEL = FitModel(BIRD, fold_bird(BIRD), priors_of(BIRD), CAMERA)
 FIRST = StageConfig(
     "first",

@@ -47,7 +47,7 @@ def quick(monkeypatch):
 
 def assert_equal(actual, expected):
     for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(actual, name), getattr(expected, name), err_msg=name)
+        np.testing.assert_array_equal(actual.arrays()[name], expected.arrays()[name], err_msg=name)
     assert set(actual.loss) == set(expected.loss)
     for term, loss in expected.loss.items():
         np.testing.assert_array_equal(actual.loss[term], loss, err_msg=term)
