@@ -307,7 +307,9 @@ def test_the_distances_of_birds_agree_with_the_truth_without_a_camera(seen, scen
     t = 10
     stands = np.flatnonzero(scene.poses.valid[:, t] & ~flies[:, t])
     pairs = [(i, j) for i in stands for j in stands if i < j]
-    ratio = [np.linalg.norm((placed[i] - placed[j])[t, :2]) / np.linalg.norm((true[i] - true[j])[t, :2]) for i, j in pairs]
+    ratio = [
+        np.linalg.norm((placed[i] - placed[j])[t, :2]) / np.linalg.norm((true[i] - true[j])[t, :2]) for i, j in pairs
+    ]
     assert abs(np.median(ratio) - 1) < 0.06
 
 
