@@ -41,12 +41,13 @@ def metrics(reference_dir):
         solution = fit(observed, bird, dataclasses.replace(config, stages=stages, window=window, crop=crop))
         assert (solution.status == "ok").all()
         keypoints = solution.keypoints.px
-        measured[name] = {
+        values = {
             "me_p": np.sqrt(np.nanmean(squared_errors(keypoints, true_px, visible, sides))),
             "me_v": np.sqrt(np.nanmean(squared_velocity_errors(keypoints, true_px, visible, sides))),
             "3d": distances(centred(solution.keypoints.cam), centred(true_3d)).mean(),
             "aligned 3d": distances(procrustes_align(solution.keypoints.cam, true_3d), true_3d).mean(),
         }
+        measured[name] = {metric: float(value) for metric, value in values.items()}
     return measured
 
 
