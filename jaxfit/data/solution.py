@@ -236,6 +236,7 @@ class Solution:
             object.__setattr__(self, "flags", _not_judged(np.shape(self.valid)))
         layout = LAYOUT | self.optional_layout
         arrays: dict[str, Any] = validate_arrays(self.arrays(), layout)
+        arrays |= {"focal_px": float(self.crops.focal_px), "crop_px": int(self.crops.crop_px)}
         # a frame without a pose has no flag, whatever the array holds there
         arrays["doubts"] = np.where(arrays["valid"], arrays["doubts"], np.int8(-1))
         arrays["doubts"].flags.writeable = False
@@ -259,7 +260,7 @@ class Solution:
         if len(unknown):
             track, status = arrays["track_id"][unknown[0]], arrays["status"][unknown[0]]
             raise ValueError(f"status of track {track} is '{status}', expected one of: {', '.join(STATUSES)}")
-        for name in ("keypoint_names", "joint_names"):
+        for name in _NAMES:
             if len(np.unique(arrays[name])) < len(arrays[name]):
                 raise ValueError(f"{name} must name each part once")
             arrays[name] = tuple(str(text) for text in arrays[name])
@@ -271,11 +272,15 @@ class Solution:
         """Return a solution from arrays by their names in ``poses.npz`` (`PLACES`), and from other fields.
 
         Raises:
-            ValueError: an array is missing.
+            ValueError: an array is missing, or has another type or shape.
         """
         values = {name: value for name, value in values.items() if value is not None}
-        flags = vars(_not_judged(np.shape(values["valid"])))
-        return cls(**_grouped(flags | values))
+        values = vars(_not_judged(np.shape(values["valid"]))) | values
+        layout = LAYOUT | ERROR_BARS | WORLD | LEDGE
+        arrays = validate_arrays(values, {name: entry for name, entry in layout.items() if name in values})
+        values |= arrays | {name: tuple(arrays[name].tolist()) for name in _NAMES if name in values}
+        values |= {name: kind(values[name]) for name, kind in (("focal_px", float), ("crop_px", int)) if name in values}
+        return cls(**_grouped(values))
 
     def with_arrays(self, **values: Any) -> Solution:
         """Return a solution with other arrays, by their names in ``poses.npz`` (`PLACES`), and other fields."""
@@ -339,6 +344,9 @@ class Solution:
             if name in places:
                 raise AttributeError(f"Solution has no attribute {name}: use solution.{places[name]}", name=name)
             raise AttributeError(f"Solution has no attribute {name}", name=name)
+
+
+_NAMES = ("keypoint_names", "joint_names")
 
 
 def _not_judged(shape: tuple[int, ...]) -> Flags:

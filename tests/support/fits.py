@@ -25,8 +25,8 @@ def config(window=T, steps=(600, 25), memory_gb=ONE_WINDOW_GB, mode="image", **c
     return dataclasses.replace(plain, filter_window=1, **changes)
 
 
-def truths(frames=T, birds=3):
-    return [smooth_motion(BIRD, frames, seed) for seed in range(birds)]
+def truths(frames=T, birds=3, model=BIRD):
+    return [smooth_motion(model, frames, seed) for seed in range(birds)]
 
 
 def keypoints_of(poses):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -120,6 +120,7 @@ class Measured(NamedTuple):
     """What the columns mean."""
 
 
+@runtime_checkable
 class Behaviour(Protocol):
     """What the birds of a report do over time: `jaxfit.behaviour.page.BehaviourPage`."""
 
