@@ -100,6 +100,27 @@ def test_masks_of_all_kinds(tmp_path):
     assert seen.mask(0, 2) is None
 
 
+def test_hundreds_of_masks_are_written_with_their_areas(tmp_path):
+    """pycocotools fails for lists of more than 255 masks."""
+    frames = 300
+    masks = {(0, i): encode_mask(np.arange(16).reshape(4, 4) < 1 + i % 16) for i in range(frames)}
+    observations = Observations(
+        track_id=np.array([1]),
+        frame_index=np.arange(frames),
+        present=np.ones((1, frames), bool),
+        keypoints_px=np.ones((1, frames, 1, 2), np.float32),
+        confidence=np.ones((1, frames, 1), np.float32),
+        box_px=np.full((1, frames, 4), 2, np.float32),
+        image_size_px=np.full((frames, 2), 4),
+        file_name=np.array([f"{i}.png" for i in range(frames)]),
+        keypoint_names=("bill",),
+        masks=masks,
+    )
+    write_coco(observations, tmp_path / "birds.json")
+    annotations = json.loads((tmp_path / "birds.json").read_text())["annotations"]
+    assert [a["area"] for a in annotations] == [1 + i % 16 for i in range(frames)]
+
+
 def test_several_polygons_are_one_mask(tmp_path):
     data = content()
     data["annotations"][0]["segmentation"] = [[0, 0, 4, 0, 4, 4, 0, 4], [10, 10, 12, 10, 12, 15, 10, 15]]

@@ -206,9 +206,8 @@ def write_coco(observations: Observations, path: str | Path, info: Mapping[str, 
         image_id(t, str(observations.file_name[t]), width, height)
     annotations = []
     masks = observations.masks
-    areas: dict[tuple[int, int], int] = {}
-    if masks:
-        areas = dict(zip(masks, cast(Any, coco_mask.area(cast(Any, [*masks.values()]))).tolist(), strict=True))
+    # one at a time: pycocotools fails for a list of more than 255 masks
+    areas = {place: int(coco_mask.area(cast(Any, mask))) for place, mask in masks.items()}
     scores = cast(np.ndarray, observations.score)
     for n, t in zip(*(axis.tolist() for axis in np.nonzero(observations.present)), strict=True):
         confidence = observations.confidence[n, t]
