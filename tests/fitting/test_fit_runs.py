@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 from support import fits
-from support.fits import BIRD, CAMERA, ONE_WINDOW_GB, T, truths
+from support.fits import BIRD, CAMERA, T, truths
 
 from jaxfit.config.build import with_values
 from jaxfit.fitting import batch, tasks
@@ -70,7 +70,7 @@ def test_runs_of_a_sweep_equal_separate_fits(observed, swept):
 
 def test_a_batch_may_be_shorter_than_the_other_batches(observed):
     """Three runs of two windows in batches of four: the last batch has two windows."""
-    some = [dataclasses.replace(each, memory_gb=4 * ONE_WINDOW_GB) for each in SWEEP]
+    some = [dataclasses.replace(each, memory_gb=0.0066) for each in SWEEP]
     assert batch.frames_per_batch(BIRD, some[0]) // T == 4
     together = fit_runs(observed, BIRD, some)
     for a, b in zip(together, fit_runs(observed, BIRD, some[::-1])[::-1], strict=True):

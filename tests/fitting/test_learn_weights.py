@@ -6,7 +6,6 @@ import logging
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, gaussian_filter1d
-from support.birds import toy_bird
 from support.fits import BIRD, CAMERA, SIZE, config, truths
 
 from jaxfit.config.fit import StageConfig, load_config
@@ -217,7 +216,6 @@ def empty_windows(tracks, frames):
 
 @pytest.mark.extended
 def test_the_weight_of_the_mask_rises_with_exact_outlines_and_never_falls():
-    bird = toy_bird(shapes=0)
     own = dataclasses.replace(
         LEARNING,
         edge="unbiased",
@@ -226,8 +224,8 @@ def test_the_weight_of_the_mask_rises_with_exact_outlines_and_never_falls():
     )
     weights = []
     for noise in (0, 1):
-        exact = detect(bird, truths(T, 1, bird), camera=CAMERA)
-        learnt = learn_weights(deformed(exact, noise), bird, own)
+        exact = detect(BIRD, truths(T, 1), camera=CAMERA)
+        learnt = learn_weights(deformed(exact, noise), BIRD, own)
         weights.append(learnt.values["terms.mask_smooth_l1.weight"])
     assert weights[0] > 2 * weights[1]
     assert weights[1] >= 0.3

@@ -145,7 +145,7 @@ def test_the_report_has_the_weighted_terms_and_the_keypoints_of_the_poses():
     result = report(program(), problems(start, targets), start)
     assert set(result.loss) == set(FIRST.terms)
     np.testing.assert_allclose(sum(result.loss.values()), loss_and_gradient(start, targets)[0], rtol=1e-5)
-    prior = (np.asarray(start.body_pose).reshape(B, -1) ** 2).sum(1) / 0.1  # the variance of the tiny bird's prior
+    prior = (np.asarray(start.body_pose).reshape(B, -1) ** 2).sum(1) / 0.1  # the variance of the toy bird's prior
     np.testing.assert_allclose(result.loss["pose_prior"], 10 * prior, rtol=1e-5, atol=1e-5)
     first = jax.tree.map(lambda x: x[0], start)
     keypoints = window_keypoints(MODEL.rig, window_transforms(MODEL.rig, first), first)

@@ -1,4 +1,4 @@
-"""Fits of tiny birds that move smoothly, with known truth and small silhouettes."""
+"""Fits of toy birds that move smoothly, with known truth and small silhouettes."""
 
 import dataclasses
 
@@ -7,12 +7,12 @@ import numpy as np
 from jaxfit.config.fit import load_config
 from jaxfit.model.camera import CropCamera, project
 from jaxfit.simulation.flock import smooth_motion
-from support.birds import pose_window, tiny_bird
+from support.birds import pose_window, toy_bird
 
-BIRD = tiny_bird(shapes=0)
+BIRD = toy_bird(shapes=0)
 T, SIZE = 6, 64
 CAMERA = CropCamera(2167.0 * SIZE / 256, SIZE / 2, SIZE)
-ONE_WINDOW_GB = 0.0007
+ONE_WINDOW_GB = 0.002
 """Memory in GB for one window of six frames. Most tests use it, so that they share the compiled programs."""
 
 
@@ -25,8 +25,8 @@ def config(window=T, steps=(600, 25), memory_gb=ONE_WINDOW_GB, mode="image", **c
     return dataclasses.replace(plain, filter_window=1, **changes)
 
 
-def truths(frames=T, birds=3, model=BIRD):
-    return [smooth_motion(model, frames, seed) for seed in range(birds)]
+def truths(frames=T, birds=3):
+    return [smooth_motion(BIRD, frames, seed) for seed in range(birds)]
 
 
 def keypoints_of(poses):
