@@ -234,9 +234,7 @@ class Solution:
     def __post_init__(self):
         if self.flags is None:
             object.__setattr__(self, "flags", _not_judged(np.shape(self.valid)))
-        layout = LAYOUT | self.optional_layout
-        arrays: dict[str, Any] = validate_arrays(self.arrays(), layout)
-        arrays |= {"focal_px": float(self.crops.focal_px), "crop_px": int(self.crops.crop_px)}
+        arrays = _typed(self.arrays())
         # a frame without a pose has no flag, whatever the array holds there
         arrays["doubts"] = np.where(arrays["valid"], arrays["doubts"], np.int8(-1))
         arrays["doubts"].flags.writeable = False
@@ -261,9 +259,8 @@ class Solution:
             track, status = arrays["track_id"][unknown[0]], arrays["status"][unknown[0]]
             raise ValueError(f"status of track {track} is '{status}', expected one of: {', '.join(STATUSES)}")
         for name in _NAMES:
-            if len(np.unique(arrays[name])) < len(arrays[name]):
+            if len(set(arrays[name])) < len(arrays[name]):
                 raise ValueError(f"{name} must name each part once")
-            arrays[name] = tuple(str(text) for text in arrays[name])
         for name, value in _grouped(arrays | {"loss": loss}).items():
             object.__setattr__(self, name, value)
 
@@ -276,11 +273,7 @@ class Solution:
         """
         values = {name: value for name, value in values.items() if value is not None}
         values = vars(_not_judged(np.shape(values["valid"]))) | values
-        layout = LAYOUT | ERROR_BARS | WORLD | LEDGE
-        arrays = validate_arrays(values, {name: entry for name, entry in layout.items() if name in values})
-        values |= arrays | {name: tuple(arrays[name].tolist()) for name in _NAMES if name in values}
-        values |= {name: kind(values[name]) for name, kind in (("focal_px", float), ("crop_px", int)) if name in values}
-        return cls(**_grouped(values))
+        return cls(**_grouped(values | _typed(values)))
 
     def with_arrays(self, **values: Any) -> Solution:
         """Return a solution with other arrays, by their names in ``poses.npz`` (`PLACES`), and other fields."""
@@ -347,6 +340,19 @@ class Solution:
 
 
 _NAMES = ("keypoint_names", "joint_names")
+
+
+def _typed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arrays among some values in the types of their layout, names and single numbers as Python's types.
+
+    Raises:
+        ValueError: an array has another type or shape.
+    """
+    layout = LAYOUT | ERROR_BARS | WORLD | LEDGE
+    arrays: dict[str, Any] = validate_arrays(values, {name: layout[name] for name in layout if name in values})
+    arrays |= {name: tuple(arrays[name].tolist()) for name in _NAMES if name in arrays}
+    numbers = {"focal_px": float, "crop_px": int}
+    return arrays | {name: kind(values[name]) for name, kind in numbers.items() if name in values}
 
 
 def _not_judged(shape: tuple[int, ...]) -> Flags:

@@ -71,8 +71,7 @@ def reading(path: str | Path, kind: str, remedy: str = "", absent: str = _CHECK_
         InputError: the path is not a readable file (`check_readable`), or the body raises any exception; an InputError
             of the body stays as it is.
     """
-    with open_file(path, kind, absent):
-        pass
+    check_readable(path, kind, absent)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # libraries warn about damage that the check of the content reports
