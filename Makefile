@@ -59,8 +59,8 @@ portable: install
 	$(BIN)/python tests/support/portable.py
 
 lint: install
-	$(BIN)/ruff check jaxfit tests notebooks .ci
-	$(BIN)/ruff format --check jaxfit tests notebooks .ci
+	$(BIN)/ruff check jaxfit kernels tests notebooks .ci
+	$(BIN)/ruff format --check jaxfit kernels tests notebooks .ci
 	$(BIN)/pyright jaxfit
 
 bench: install

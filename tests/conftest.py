@@ -17,6 +17,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:  # the first process of a run;
 import jax  # JAX reads these variables when it is imported
 import pytest
 from support.cli_files import write_inputs
+from support.unchanged import REASON as UNCHANGED
 
 DEFAULT_REFERENCE = Path(__file__).resolve().parents[1] / ".." / "shared"
 
@@ -28,7 +29,7 @@ ACCEPTED_SKIPS = (
     "no Chromium is installed",  # the report is plain HTML, which the other tests parse
     "npm cannot install TypeScript here",  # needs a registry of packages, which no user needs
     "trackers",  # tests/packaging runs these tests in an environment of their own
-    "unchanged since the last release check",  # `make release` runs all notebooks and the first hour
+    UNCHANGED,  # `make release` runs all notebooks and the first hour
     "mounting a small disk is not allowed here",  # needs the rights of root
 )
 """Reasons of the skips that do not fail a run with JAXFIT_FAIL_ON_SKIP=1, which is how the gate runs the tests."""
