@@ -23,7 +23,7 @@ _ROUND_TRIP_PX = 0.01
 _MAX_PX = 1e7
 """Largest focal length and largest position of the principal point."""
 _MAX_NUMBER = 1e12
-"""Largest coordinate and coefficient; squares of larger numbers lose the small ones beside them."""
+"""Largest coordinate and coefficient; a sum with the square of a larger number loses small numbers."""
 
 
 def _undistort_points(points: np.ndarray, K: np.ndarray, distortion: np.ndarray, *more: Any) -> np.ndarray:

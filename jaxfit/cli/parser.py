@@ -124,7 +124,7 @@ def _describe(command: Parser) -> None:
     """Describe what the birds of a result do: angles, wingbeats, distances, bouts of behaviour, time budgets."""
     command.shared("result")
     text = "features of every bird and frame: .csv, .parquet, or .nc for movement; bouts, time budgets and a project "
-    add_out(command, "PATH", text + "for BORIS stand beside it", overwrite="existing files")
+    add_out(command, "PATH", text + "for BORIS are written to the same folder", overwrite="existing files")
     text = "rules of the behaviours: a file with `base: behaviour` (default: the shipped rules)"
     command.add_argument("--config", default="behaviour", metavar="FILE", help=text)
     text = "also this feature: the name that a package registers, or module:function"

@@ -2,7 +2,7 @@
 
 A writer of `out` first creates `.out.<computer>.<hex>.lock` in the same folder and holds a lock on this file as long as
 `.part` or `.old` of the same name exists. The operating system frees the lock when the process ends, also after
-SIGKILL. A lock file that nobody has locked therefore belongs to no living process, and the next write into the folder
+SIGKILL. A lock file without a lock therefore belongs to no living process, and the next write into the folder
 removes this file with its `.part` and `.old`. An `.old` without its target is the earlier folder of an interrupted
 replacement, and is renamed back to its target. The name of the computer is there because some network file systems
 keep locks to each computer.

@@ -95,7 +95,7 @@ def read_pages(file: Path, numbers: range) -> Iterator[tuple[int, UInt8[np.ndarr
 def _pixels(image: Image.Image, grey: bool) -> np.ndarray:
     """Return the pixels of a picture as `read_picture`."""
     ImageOps.exif_transpose(image, in_place=True)
-    if image.mode.startswith("I"):  # 16 bits, also those that Pillow reads as 32
+    if image.mode.startswith("I"):  # 16 bits per pixel; Pillow reads some of these pictures as 32 bits
         values = np.asarray(image).clip(0, 2**16 - 1).astype(np.uint16)
         return values if grey else np.repeat((values >> 8).astype(np.uint8)[..., None], 3, axis=2)
     mode = "L" if grey else "RGB"
