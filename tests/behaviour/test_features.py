@@ -380,7 +380,7 @@ def test_a_bird_above_its_neighbour_faces_no_direction():
 
 
 def test_the_drawing_shows_features_by_their_names():
-    """`support/feature_drawing.py` draws it; the comments of the file hold its labels."""
+    """The comments of the file hold its labels."""
     labels = re.findall(r"<!-- (\w+_\w+) ", DRAWING.read_text(encoding="utf-8"))
     assert len(labels) == len(set(labels)) >= 13
     assert set(labels) <= {each.name for each in own_features()}
