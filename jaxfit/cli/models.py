@@ -37,7 +37,7 @@ def model_info(options: argparse.Namespace) -> None:
 def model_view(options: argparse.Namespace) -> None:
     """Draw a model from six sides."""
     from jaxfit.foundation.files import check_writable
-    from jaxfit.model.murre.postures import POSTURES
+    from jaxfit.model.murre import POSTURES
     from jaxfit.view.mesh_views import six_views
 
     if options.posture and options.posture not in POSTURES:

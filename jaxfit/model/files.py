@@ -22,7 +22,7 @@ from jaxfit.model.bird import ARRAY_FIELDS, Bird, check_bird, neutral_colours, u
 
 FORMAT_VERSION = 1
 MURRE_PATH = Path(__file__).with_name("murre.npz")
-"""The model file that comes with jaxfit; `jaxfit.model.murre.build` writes this file."""
+"""The model file that comes with jaxfit."""
 OPTIONAL_FIELDS = ("vertex_colours", "joint_limits")
 _UNIT = "metres_per_unit"
 _PROVENANCE = "provenance"

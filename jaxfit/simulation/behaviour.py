@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.interpolate import PchipInterpolator
 
-from jaxfit.model.murre.postures import POSTURES, Posture
+from jaxfit.model.murre import POSTURES, Posture
 
 BEHAVIOURS = ("stand", "incubate", "preen", "walk", "flap", "approach", "jab", "fly_off")
 STEP_S = 0.28

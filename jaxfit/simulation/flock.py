@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose, fold_bird, window_joints, window_transforms, window_vertices
-from jaxfit.model.murre.postures import POSTURES
+from jaxfit.model.murre import POSTURES
 from jaxfit.model.rotation import unwrap_axis_angle
 from jaxfit.simulation.behaviour import JAB_DISTANCE, Key, Keyframes, Motion, interpolate_keyframes
 from jaxfit.simulation.viewpoint import Viewpoint

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose, fold_bird, joint_transforms, posed_vertices
-from jaxfit.model.murre.postures import POSTURES, Posture
-from jaxfit.model.murre.skeleton import CM_PER_UNIT
+from jaxfit.model.murre import POSTURES, Posture
 from jaxfit.raster.zbuffer import draw, shade
 from jaxfit.view.colours import DARK, GREY, PAPER, tinted, track_colour
 from jaxfit.view.drawing import tag, text, text_width, write_png
@@ -173,7 +172,7 @@ def six_views(bird: Bird, path: str | Path, posture: Posture | str | None = None
     published models. In the views from above and below, the head is at the top.
 
     Args:
-        bird: the model. The scale bar of the murre is in centimetres, of other models in model units.
+        bird: the model. The scale bar is in centimetres, or in model units if the length of a unit is unknown.
         path: PNG file to write, 1200 pixels wide.
         posture: a body pose and its pitch, or a name in `jaxfit.model.murre.POSTURES`. None: the murre stands, other
             models have the rest pose.
@@ -253,7 +252,8 @@ def _posed(bird: Bird, posture: Posture | None) -> Float[np.ndarray, "V 3"]:
 
 def _scale(bird: Bird, zoom: float) -> np.ndarray:
     """Return the bottom strip of the sheet: name of the model and a scale bar of a round length."""
-    per_unit, unit = (CM_PER_UNIT, "cm") if bird.name == "murre" else (1.0, "model units")
+    known = bird.metres_per_unit is not None
+    per_unit, unit = (100 * bird.metres_per_unit, "cm") if known else (1.0, "model units")
     longest = 0.6 * TILE_PX / zoom * per_unit
     power = 10.0 ** np.floor(np.log10(longest))
     length = next(step * power for step in (5, 2, 1) if step * power <= longest)

@@ -27,7 +27,7 @@ from support.described import (
 import jaxfit.behaviour.describe as describing
 from jaxfit.behaviour.describe import describe
 from jaxfit.behaviour.registry import NEEDS, UNITS, own_features
-from jaxfit.model.murre.postures import POSTURES
+from jaxfit.model.murre import POSTURES
 
 OWN = {each.name: each for each in own_features()}
 # ---------------------------------------------------------------------------------------------- standard deviations

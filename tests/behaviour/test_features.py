@@ -24,7 +24,7 @@ from support.described import (
 from jaxfit.behaviour.birds import usual_steps, whole_frames
 from jaxfit.behaviour.describe import describe
 from jaxfit.behaviour.registry import own_features
-from jaxfit.model.murre.postures import POSTURES
+from jaxfit.model.murre import POSTURES
 
 DRAWING = Path(__file__).resolve().parents[2] / "docs" / "media" / "behaviour.svg"
 

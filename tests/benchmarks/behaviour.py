@@ -38,7 +38,7 @@ from jaxfit.fitting.fit import fit
 from jaxfit.fitting.ledge import ledge_config, on_ledge
 from jaxfit.fitting.ledge_plane import estimate_ledge
 from jaxfit.foundation.progress import silent
-from jaxfit.model.murre.postures import POSTURES
+from jaxfit.model.murre import POSTURES
 from jaxfit.perception.track import track_video
 from jaxfit.simulation import behaviour, flock
 from jaxfit.simulation.behaviour import BEHAVIOURS

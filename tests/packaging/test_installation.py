@@ -111,7 +111,12 @@ def test_a_wheel_holds_kernels_configs_and_all_files_of_the_package(wheel):
     names = {name for name in names_in(wheel) if ".dist-info/" not in name}
     assert names - set(kernels_in(wheel)) == expected
     assert len(kernels_in(wheel)) == 1
-    for name in ("jaxfit/configs/paper.yaml", "jaxfit/model/murre.npz", "jaxfit/perception/networks/keypoints.onnx"):
+    for name in (
+        "jaxfit/configs/paper.yaml",
+        "jaxfit/model/murre.npz",
+        "jaxfit/model/murre_postures.json",
+        "jaxfit/perception/networks/keypoints.onnx",
+    ):
         assert name in names
 
 

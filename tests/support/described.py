@@ -12,7 +12,7 @@ from jaxfit.data.solution import Solution
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.model.kinematics import Pose
-from jaxfit.model.murre.postures import POSTURES
+from jaxfit.model.murre import POSTURES
 from support.birds import skin_by_hand
 
 BIRD = load_murre()

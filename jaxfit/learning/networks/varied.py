@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose, fold_bird, window_transforms, window_vertices
-from jaxfit.model.murre.postures import POSTURES
+from jaxfit.model.murre import POSTURES
 from jaxfit.simulation.footage import GAMMA, Noise, smoothstep
 
 _Shape = tuple[int, int]
