@@ -30,7 +30,6 @@ def ablate(options: argparse.Namespace) -> None:
             bird,
             options.match,
             terminal,
-            allow_import=options.allow_import,
             cluster=cluster,
         )
     show(results_table(done.results, "simple"))

@@ -517,8 +517,6 @@ def _ablate(command: Parser) -> None:
     command.shared("--model")
     add_cluster(command)
     add_out(command, "DIR", "folder for runs, tables and report; an interrupted ablation continues")
-    text = "accept a record in DIR that names this term (package.module:function), although the grid does not"
-    command.add_argument("--allow-import", action="append", default=[], metavar="NAME", help=text)
 
 
 @_command("research", "dataset murre", "observations.murre")

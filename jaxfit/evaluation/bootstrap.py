@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+import pydantic
 from jaxtyping import Bool, Float
 from scipy.stats import bootstrap
 
@@ -19,11 +20,15 @@ ROOTS = ("me_p", "me_v")
 """Metrics that are the root of a mean square; all other metrics are means."""
 
 
+Number = Annotated[float, pydantic.BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number of a file, in which NaN is null."""
+
+
 class Interval(NamedTuple):
     """Confidence interval of a metric; NaN for fewer than two birds."""
 
-    low: float
-    high: float
+    low: Number
+    high: Number
 
 
 class Ratio(NamedTuple):
@@ -75,23 +80,6 @@ class BirdSums:
             numerators[metric] = tuple(np.nansum(kept, (1, 2)).tolist())
             counts[metric] = tuple(np.isfinite(kept).sum((1, 2)).tolist())
         return cls(tuple(str(bird) for bird in birds), numerators, counts)
-
-    @classmethod
-    def joined(cls, parts: Mapping[str, BirdSums]) -> BirdSums:
-        """Return the birds of several results as one set, named ``result/bird``; more birds give narrower intervals.
-
-        Raises:
-            ValueError: the results have different metrics.
-        """
-        metrics = next(iter(parts.values())).counts.keys()
-        for name, part in parts.items():
-            if part.counts.keys() != metrics:
-                raise ValueError(f"parts must have one set of metrics; {name} has {', '.join(part.counts)}")
-        return cls(
-            tuple(f"{name}/{bird}" for name, part in parts.items() for bird in part.birds),
-            {m: tuple(value for part in parts.values() for value in part.numerators[m]) for m in metrics},
-            {m: tuple(value for part in parts.values() for value in part.counts[m]) for m in metrics},
-        )
 
     def value(self, metric: str) -> float:
         """Return one metric over all birds; NaN where nothing counts."""

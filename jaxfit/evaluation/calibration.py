@@ -15,12 +15,12 @@ Source: Gneiting, Balabdaoui and Raftery 2007, *Probabilistic forecasts, calibra
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -105,24 +105,14 @@ def calibration(solution: Solution, truth: Truth) -> Calibration:
     counted = (both & has_bars)[..., None] & (seen.confidence[n, t] > 0)
     error_px = solution.keypoints.px.astype(np.float64) - seen.keypoints_px[n, t]
     labels = np.broadcast_to(np.arange(K), counted.shape)
-    image = _Errors(error_px[counted], solution.cells()["keypoints_px_cov"][counted], labels[counted])
-    groups = {"keypoints, image": _group(image, names, "px")}
+    covariance = solution.cells()["keypoints_px_cov"][counted]
+    groups = {"keypoints, image": _group(error_px[counted], covariance, labels[counted], names, "px")}
     if truth.solution is not None:
         groups |= _spatial_groups(solution, truth.solution, has_bars, truth.source)
     groups = {name: group for name, group in groups.items() if group.overall.count}
     if not groups:
         raise InputError(truth.source, "shares no bird with error bars with the result", "give the truth of the video")
     return Calibration(groups, int((both & has_bars).sum()), int((both & ~has_bars).sum()))
-
-
-@dataclass(frozen=True)
-class _Errors:
-    """M errors with their covariances."""
-
-    error: Float[np.ndarray, "M d"]
-    covariance: Float[np.ndarray, "M d d"]
-    label: np.ndarray
-    """(M,) index of the keypoint or joint."""
 
 
 def _spatial_groups(solution: Solution, truth: Solution, has_bars: np.ndarray, source: object) -> dict[str, Any]:
@@ -137,9 +127,9 @@ def _spatial_groups(solution: Solution, truth: Solution, has_bars: np.ndarray, s
     size = best_scale(p, q, counted)[:, None, None, None]
     turn = (size[..., None] * R[:, :, None])[counted]
     covariance = turn @ solution.cells()["keypoints_centred_cov"][counted].astype(np.float64) @ turn.swapaxes(-1, -2)
-    K = len(order)
-    points = _Errors((size * p - q)[counted].reshape(-1, 3), covariance.reshape(-1, 3, 3), _labels(covariance, K))
-    groups = {"keypoints, 3D": _group(points, solution.keypoint_names, "model units")}
+    error, label = (size * p - q)[counted].reshape(-1, 3), np.tile(np.arange(len(order)), len(covariance))
+    covariance = covariance.reshape(-1, 3, 3)
+    groups = {"keypoints, 3D": _group(error, covariance, label, solution.keypoint_names, "model units")}
     if sorted(solution.joint_names) == sorted(truth.joint_names):
         order = [truth.joint_names.index(name) - 1 for name in solution.joint_names[1:]]
         own = np.concatenate([solution.poses.global_orient[:, :, None], solution.poses.body_pose], axis=2)[counted]
@@ -154,75 +144,56 @@ def _spatial_groups(solution: Solution, truth: Solution, has_bars: np.ndarray, s
         cells = solution.cells()
         sd = np.concatenate([cells["global_orient_sd"][:, :, None], cells["body_pose_sd"]], axis=2)[counted]
         variance = sd.astype(np.float64).ravel() ** 2
-        label = np.repeat(_labels(own, own.shape[1]), 3)
+        label = np.repeat(np.tile(np.arange(own.shape[1]), len(own)), 3)
         free = variance > 0
-        angles = _Errors(delta.reshape(-1, 1)[free], variance[free, None, None], label[free])
-        groups["angles"] = _group(angles, solution.joint_names, "rad")
+        error, covariance = delta.reshape(-1, 1)[free], variance[free, None, None]
+        groups["angles"] = _group(error, covariance, label[free], solution.joint_names, "rad")
     return groups
 
 
-def _labels(values: np.ndarray, count: int) -> np.ndarray:
-    """Return 0, 1, …, count − 1 for each row of values."""
-    return np.tile(np.arange(count), len(values))
+def _group(
+    error: Float[np.ndarray, "M d"],
+    covariance: Float[np.ndarray, "M d d"],
+    label: Int[np.ndarray, "M"],
+    names: Sequence[str],
+    unit: str,
+) -> CalibrationGroup:
+    """Return the calibration of some errors; `label` is the position of the keypoint or joint in `names`.
 
-
-def _group(errors: _Errors, names: Sequence[str], unit: str) -> CalibrationGroup:
-    """Return the calibration of some errors; errors without a finite covariance do not count."""
-    finite = np.isfinite(errors.covariance).all((1, 2)) & np.isfinite(errors.error).all(1)
-    error, covariance = errors.error[finite].astype(np.float64), errors.covariance[finite].astype(np.float64)
-    label, d = errors.label[finite], error.shape[1]
+    Errors without a finite covariance do not count.
+    """
+    finite = np.isfinite(covariance).all((1, 2)) & np.isfinite(error).all(1)
+    error, covariance = error[finite].astype(np.float64), covariance[finite].astype(np.float64)
+    label, d = label[finite], error.shape[1]
     # rounding of float32 may make a tiny eigenvalue negative
     trace = np.trace(covariance, axis1=1, axis2=2)
     covariance = covariance + (1e-6 * trace / d + 1e-12)[:, None, None] * np.eye(d)
     squared = np.einsum("mi,mi->m", error, np.linalg.solve(covariance, error[..., None])[..., 0])
-    values = _Values(squared, np.linalg.slogdet(covariance)[1], (error**2).sum(1), np.sqrt(trace / d), d)
-    parts = {
-        name: _row(values.of(label == i), values.of(label == i).constant_nll())
-        for i, name in enumerate(names)
-        if (label == i).any()
-    }
-    constant = sum(row.count * row.nll_constant for row in parts.values()) / max(len(label), 1)
-    reliability = {f"{p:g}": _fraction(squared, d, p) for p in PLOTTED}
-    return CalibrationGroup(unit, _row(values, constant), parts, reliability)
+    nll = 0.5 * (squared + np.linalg.slogdet(covariance)[1] + d * np.log(2 * np.pi))
+    error2, sd = (error**2).sum(1), np.sqrt(trace / d)
+
+    def row(chosen: Bool[np.ndarray, "M"]) -> CalibrationRow:
+        if not chosen.any():
+            return CalibrationRow(0, _coverage(squared[chosen], d, LEVELS), *[float("nan")] * 4)
+        variance = float(error2[chosen].mean()) / d
+        return CalibrationRow(
+            count=int(chosen.sum()),
+            coverage=_coverage(squared[chosen], d, LEVELS),
+            sd=float(sd[chosen].mean()),
+            error=float(np.sqrt(variance)),
+            nll=float(nll[chosen].mean()),
+            nll_constant=float(d / 2 * (np.log(2 * np.pi * max(variance, 1e-24)) + 1)),
+        )
+
+    parts = {name: row(label == i) for i, name in enumerate(names) if (label == i).any()}
+    constant = sum(part.count * part.nll_constant for part in parts.values()) / max(len(label), 1)
+    overall = replace(row(np.ones(len(label), bool)), nll_constant=constant)
+    return CalibrationGroup(unit, overall, parts, _coverage(squared, d, PLOTTED))
 
 
-@dataclass(frozen=True)
-class _Values:
-    """z², log |Σ|, ‖e‖² and the standard deviation of M errors in d dimensions."""
-
-    squared: np.ndarray
-    log_volume: np.ndarray
-    error2: np.ndarray
-    sd: np.ndarray
-    d: int
-
-    def of(self, chosen: np.ndarray) -> _Values:
-        squared, log_volume = self.squared[chosen], self.log_volume[chosen]
-        return _Values(squared, log_volume, self.error2[chosen], self.sd[chosen], self.d)
-
-    def constant_nll(self) -> float:
-        variance = max(float(self.error2.mean()) / self.d, 1e-24)
-        return self.d / 2 * (np.log(2 * np.pi * variance) + 1)
-
-
-def _row(values: _Values, constant: float) -> CalibrationRow:
-    if not len(values.squared):
-        nan = float("nan")
-        return CalibrationRow(0, {f"{p:g}": nan for p in LEVELS}, nan, nan, nan, nan)
-    nll = 0.5 * (values.squared + values.log_volume + values.d * np.log(2 * np.pi))
-    return CalibrationRow(
-        count=len(values.squared),
-        coverage={f"{p:g}": _fraction(values.squared, values.d, p) for p in LEVELS},
-        sd=float(values.sd.mean()),
-        error=float(np.sqrt(values.error2.mean() / values.d)),
-        nll=float(nll.mean()),
-        nll_constant=float(constant),
-    )
-
-
-def _fraction(squared: np.ndarray, d: int, p: float) -> float:
-    """Return the fraction of errors inside the region of probability p."""
-    return float((squared <= chi2.ppf(p, d)).mean()) if len(squared) else float("nan")
+def _coverage(squared: np.ndarray, d: int, levels: Sequence[float]) -> dict[str, float]:
+    """Return probability of a region → fraction of errors inside the region."""
+    return {f"{p:g}": float((squared <= chi2.ppf(p, d)).mean()) if len(squared) else float("nan") for p in levels}
 
 
 def plot_calibration(result: Calibration, path: Path) -> None:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+import pydantic
 from jaxtyping import Bool, Float
 
 from jaxfit.data.flags import OK, WRONG_SHARE, flags
@@ -16,7 +17,7 @@ from jaxfit.data.mask_comparison import compare_masks
 from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.evaluation import metrics
-from jaxfit.evaluation.bootstrap import BirdSums, Interval
+from jaxfit.evaluation.bootstrap import BirdSums, Interval, Number
 from jaxfit.evaluation.metrics import correct_keypoints, squared_errors, squared_velocity_errors
 from jaxfit.evaluation.spatial import COLUMNS_3D, SpatialErrors
 from jaxfit.evaluation.truth import Truth, match
@@ -34,10 +35,10 @@ COLUMNS_KEYPOINT = ("pck@0.05", "pck@0.10", "me_p", "me_v")
 class Evaluation:
     """Metrics of a result. NaN where nothing is measured: no mask, no two consecutive frames."""
 
-    overall: dict[str, float]
+    overall: dict[str, Number]
     """COLUMNS over all birds: PCK and IoU are means over images, me_p and me_v are RMS errors over keypoints. With
     true poses also COLUMNS_3D, which `SpatialErrors` defines."""
-    tracks: dict[int, dict[str, float]]
+    tracks: dict[int, dict[str, Number]]
     """Track id → the same metrics of this track, and its number of measured frames as `frames`."""
     frames: int
     """Number of measured pairs of bird and frame."""
@@ -53,18 +54,18 @@ class Evaluation:
     intervals: dict[str, Interval] = field(default_factory=dict)
     """95 % intervals over birds of the metrics in `overall`, as `BirdSums.interval` defines them. The median of the
     orientation error has no interval, since it is not a mean. NaN for fewer than two birds."""
-    behaviours: dict[str, dict[str, float]] = field(default_factory=dict)
+    behaviours: dict[str, dict[str, Number]] = field(default_factory=dict)
     """Behaviour → the metrics of `overall`, the number of `birds` that show the behaviour, and the number of
     `frames`; empty where behaviours are not known. A pair of frames belongs to the behaviour in the earlier frame, a
     triple of frames to the behaviour in the middle frame."""
-    keypoints: dict[str, dict[str, float]] = field(default_factory=dict)
+    keypoints: dict[str, dict[str, Number]] = field(default_factory=dict)
     """Keypoint → COLUMNS_KEYPOINT of this keypoint over all birds, and the number of frames that annotate the
     keypoint as `count`."""
     flags: dict[str, float] = field(default_factory=dict)
     """Number of poses with a 3D error that are `wrong` (a joint wrong by more than `WRONG_SHARE` of the body length),
     `flagged` (`unsure` or `contradicted`), and both (`found`). Empty without true poses, or if the result has no
     flags."""
-    wrong: dict[int, dict[str, float]] = field(default_factory=dict)
+    wrong: dict[int, dict[str, Number]] = field(default_factory=dict)
     """Track id → the number of its wrong poses (see `flags`) as `count`, and the `frame` and the `error` (share of the
     body length) of the worst; the worst track first. Tracks without a wrong pose are left out."""
     sums: BirdSums = field(default_factory=lambda: BirdSums((), {}, {}))
@@ -80,31 +81,10 @@ class Evaluation:
         """Return the evaluation of a `to_dict`, also after JSON, where NaN is null and the track ids are text.
 
         Raises:
-            KeyError: an entry is missing, as in a file of an older version.
+            ValueError: an entry is missing or has another form.
         """
-
-        def rows(name: str) -> dict[str, dict[str, float]]:
-            return {key: _null_to_nan(row) for key, row in content[name].items()}
-
-        sums = content["sums"]
-        return cls(
-            overall=_null_to_nan({name: content[name] for name in (*COLUMNS, *COLUMNS_3D) if name in content}),
-            tracks={int(track): row for track, row in rows("tracks").items()},
-            **{name: content[name] for name in ("frames", "missing", "unmatched", "frames_3d", "points_3d")},
-            intervals={
-                name: Interval(*_null_to_nan(dict(enumerate(bounds))).values())
-                for name, bounds in content["intervals"].items()
-            },
-            behaviours=rows("behaviours"),
-            keypoints=rows("keypoints"),
-            flags=content.get("flags", {}),
-            wrong={int(track): row for track, row in content.get("wrong", {}).items()},
-            sums=BirdSums(
-                tuple(sums["birds"]),
-                {metric: tuple(values) for metric, values in sums["numerators"].items()},
-                {metric: tuple(values) for metric, values in sums["counts"].items()},
-            ),
-        )
+        overall = {name: content[name] for name in (*COLUMNS, *COLUMNS_3D) if name in content}
+        return pydantic.TypeAdapter(cls).validate_python({**content, "overall": overall})
 
 
 def metrics_of(
@@ -126,10 +106,6 @@ def metrics_of(
         angles = angles[np.isfinite(angles)]
         row["orientation_median_deg"] = float(np.median(angles)) if angles.size else math.nan
     return {name: row[name] for name in (*COLUMNS, *COLUMNS_3D) if name in row}
-
-
-def _null_to_nan(row: Mapping[Any, float | None]) -> dict[Any, float]:
-    return {name: math.nan if value is None else value for name, value in row.items()}
 
 
 _logger = logging.getLogger(__name__)
@@ -167,7 +143,10 @@ def evaluate(
     source, seen = truth.source, check_keypoints(truth.observations, bird.keypoint_names, truth.source)
     n_truth, t_truth, shared = match(solution, seen.track_id, seen.frame_index)
     measured = shared & seen.present[n_truth, t_truth] & solution.valid
-    _check_birds(solution, seen, measured, source)
+    if not measured.any():
+        own, true = ((_some(each.track_id), _some(each.frame_index)) for each in (solution, seen))
+        problem = f"shares no bird with the result: tracks {true[0]}, frames {true[1]} against {own[0]}, {own[1]}"
+        raise InputError(source, problem, _REMEDY)
     _check_sizes(solution, seen, measured, (n_truth, t_truth), source)
     spatial = None
     if truth.solution is not None:
@@ -177,7 +156,10 @@ def evaluate(
     if truth.behaviours is not None:
         behaviour = _behaviour_of_frames(truth.behaviours, solution, either, source)
     masks = compare_masks(solution, bird, seen, measured, (n_truth, t_truth), progress)
-    _warn_of_small_overlap(masks.iou, source)
+    overlaps = masks.iou[np.isfinite(masks.iou)]
+    if overlaps.size and np.median(overlaps) < _MIN_MEDIAN_IOU:
+        text = "the birds of the result hardly overlap the birds of %s (median IoU %.2f); check the video of the truth"
+        _logger.warning(text, source, np.median(overlaps))
     unmatched = solution.valid & ~shared
     if spatial is not None:
         unmatched &= ~spatial.measured
@@ -209,7 +191,14 @@ def evaluate(
         frames_3d=int(spatial.measured.sum()) if spatial else 0,
         points_3d=spatial.points if spatial else "",
         intervals=sums.intervals(),
-        behaviours=_metrics_of_behaviours(behaviour, errors, measured, either),
+        behaviours={
+            str(name): {
+                "birds": float((either & (behaviour == name)).any(1).sum()),
+                "frames": float((measured & (behaviour == name)).sum()),
+                **metrics_of(errors, behaviour == name),
+            }
+            for name in np.unique(behaviour[behaviour != ""])
+        },
         keypoints=_metrics_of_keypoints(bird.keypoint_names, errors, keypoints, masks.true_side_px),
         flags={} if spatial is None else _flag_quality(solution, errors["mpjpe/length"]),
         wrong={} if spatial is None else _wrong_poses(solution, errors["mpjpe/length"]),
@@ -238,20 +227,6 @@ def _wrong_poses(solution: Solution, error: Float[np.ndarray, "N T J"]) -> dict[
             values = (largest[n] > WRONG_SHARE).sum(), solution.frame_index[t], largest[n, t]
             rows[int(solution.track_id[n])] = dict(zip(("count", "frame", "error"), map(float, values), strict=True))
     return rows
-
-
-def _metrics_of_behaviours(
-    behaviour: np.ndarray, errors: Mapping[str, np.ndarray], measured: np.ndarray, either: np.ndarray
-) -> dict[str, dict[str, float]]:
-    """Return the metrics of each behaviour; `either` also has the birds and frames with 3D errors only."""
-    return {
-        str(name): {
-            "birds": float((either & (behaviour == name)).any(1).sum()),
-            "frames": float((measured & (behaviour == name)).sum()),
-            **metrics_of(errors, behaviour == name),
-        }
-        for name in np.unique(behaviour[behaviour != ""])
-    }
 
 
 def _metrics_of_keypoints(
@@ -295,17 +270,6 @@ def _behaviour_of_frames(
     return behaviour
 
 
-def _check_birds(solution: Solution, seen: Observations, measured: np.ndarray, source: object) -> None:
-    """Raise InputError if no bird is measured in any frame."""
-    if not measured.any():
-        raise InputError(
-            source,
-            f"shares no bird with the result: tracks {_some(seen.track_id)}, frames {_some(seen.frame_index)} "
-            f"against {_some(solution.track_id)}, {_some(solution.frame_index)}",
-            _REMEDY,
-        )
-
-
 def _check_sizes(
     solution: Solution, seen: Observations, measured: np.ndarray, at: tuple[np.ndarray, np.ndarray], source: object
 ) -> None:
@@ -318,16 +282,6 @@ def _check_sizes(
                 f"{true[0]}×{true[1]} pixels, but the result was fitted to an image of {own[0]}×{own[1]}"
             )
             raise InputError(source, problem, _REMEDY)
-
-
-def _warn_of_small_overlap(iou: np.ndarray, source: object) -> None:
-    overlaps = iou[np.isfinite(iou)]
-    if overlaps.size and np.median(overlaps) < _MIN_MEDIAN_IOU:
-        _logger.warning(
-            "the birds of the result hardly overlap the birds of %s (median IoU %.2f); check the video of the truth",
-            source,
-            np.median(overlaps),
-        )
 
 
 def _some(numbers: np.ndarray) -> str:

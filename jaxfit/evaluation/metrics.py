@@ -169,14 +169,7 @@ def pck_per_image(
 
     PCK_i = |{k visible : ‖predicted_ik − observed_ik‖ ≤ threshold · side_i}| / |{k visible}|
 
-    A visible keypoint without a finite prediction, or in an image without a side, is not correct.
-
-    Args:
-        predicted_px: (…, K, 2) pixels.
-        observed_px: (…, K, 2) in the same pixels.
-        visible: (…, K) bool.
-        longest_side_px: (…) longest side of the bird in the same pixels.
-        threshold: fraction of the side, such as 0.05.
+    Args: as for `correct_keypoints`.
 
     Returns:
         (…) fractions in [0, 1]; NaN where no keypoint is visible.

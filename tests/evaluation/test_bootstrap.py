@@ -52,12 +52,6 @@ def sums_of_many(values):
     return BirdSums(tuple(map(str, range(len(values)))), {"iou": tuple(values)}, {"iou": (1,) * len(values)})
 
 
-def test_equal_birds_leave_no_doubt():
-    equal = sums(me_p=[(2.0, 8), (1.0, 4), (3.0, 12)], iou=[(0.5, 1)] * 3)
-    for metric, value in (("me_p", 0.5), ("iou", 0.5)):
-        assert equal.interval(metric) == pytest.approx((value, value), abs=1e-12)
-
-
 def test_fewer_than_two_birds_have_no_interval():
     one = sums(me_p=[(4.0, 1), (0.0, 0)], me_v=[(0.0, 0), (0.0, 0)])
     assert one.value("me_p") == 2
@@ -71,13 +65,6 @@ def test_a_bird_without_samples_changes_nothing():
     some = sums(me_p=[(4.0, 1), (9.0, 1), (3.0, 2)])
     more = sums(me_p=[(4.0, 1), (0.0, 0), (9.0, 1), (3.0, 2)])
     assert more.interval("me_p") == some.interval("me_p")
-
-
-def test_the_same_seed_draws_the_same():
-    found = sums(iou=[(value, 1) for value in (0.1, 0.5, 0.55, 0.9, 0.3)])
-    assert found.interval("iou") == found.interval("iou")
-    assert found.interval("iou") == sums(iou=list(zip(found.numerators["iou"], [1] * 5, strict=True))).interval("iou")
-    assert sums_of_many(np.arange(40.0)).interval("iou") != sums_of_many(np.arange(40.0)).interval("iou", seed=1)
 
 
 def test_a_paired_ratio_by_hand():
@@ -115,15 +102,6 @@ def test_birds_are_paired_by_name():
     none = paired_ratio([(a, BirdSums(("9",), {"iou": (0.5,)}, {"iou": (1,)}))], "iou")
     assert none.birds == 0
     assert math.isnan(none.value)
-
-
-def test_several_results_make_one_flock():
-    parts = {"s0": sums(iou=[(0.2, 1), (0.6, 2)]), "s1": sums(iou=[(0.9, 1)])}
-    joined = BirdSums.joined(parts)
-    assert joined.birds == ("s0/a", "s0/b", "s1/a")
-    assert joined.value("iou") == pytest.approx(1.7 / 4)
-    with pytest.raises(ValueError, match="one set of metrics; s1 has me_p"):
-        BirdSums.joined(parts | {"s1": sums(me_p=[(1.0, 1)])})
 
 
 def test_a_metric_that_is_none():

@@ -9,7 +9,6 @@ import pytest
 from support.evaluated import BIRD, N, T, sides, solution, truth
 
 from jaxfit.cli.tables import breakdown_tables
-from jaxfit.evaluation.bootstrap import paired_ratio
 from jaxfit.evaluation.evaluate import COLUMNS, COLUMNS_3D, COLUMNS_KEYPOINT, Evaluation, evaluate
 from jaxfit.evaluation.truth import Truth, read_behaviours
 from jaxfit.foundation.errors import InputError
@@ -83,13 +82,6 @@ def test_the_overall_figures_are_those_of_the_sums():
     assert result.intervals["me_p"] == pytest.approx(rows)
 
 
-def test_two_results_of_the_same_birds():
-    """The same error added to both birds' images: known in every bird."""
-    worse, better = (evaluate(moved(slice(None), 1, by=by), BIRD, truth()).sums for by in ((6, 8), (3, 4)))
-    assert paired_ratio([(worse, better)], "me_p")[:3] == pytest.approx((2, 2, 2), rel=1e-3)
-    assert paired_ratio([(worse, better)], "iou") == pytest.approx((1, 1, 1, 2))
-
-
 def test_all_of_it_can_be_stored():
     true = solution(crop=np.array(solution().crops.square_px))
     valid = np.array([[True] * T, [True, False, True, False]])
@@ -107,12 +99,6 @@ def test_all_of_it_can_be_stored():
         assert back.intervals["iou"]._fields == ("low", "high")
     assert "orientation_median_deg" in COLUMNS_3D
     assert "orientation_median_deg" not in result.intervals
-
-
-def test_one_bird_has_no_interval():
-    result = evaluate(solution(), BIRD, truth().select(tracks=[1]))
-    assert all(np.isnan(interval).all() for interval in result.intervals.values())
-    assert result.sums.birds == ("3",)
 
 
 def test_tables_of_behaviours_and_keypoints():

@@ -202,11 +202,6 @@ def test_keypoints_go_by_name():
     assert evaluate_observations(birds({1: {0: SIDE}}, [0], names=("x", "y")), truth).keypoints == {}
 
 
-def test_a_bird_that_is_not_found_has_no_keypoints_to_judge():
-    truth = birds({1: {0: SIDE}, 2: {0: AWAY}}, [0])
-    assert evaluate_observations(birds({1: {0: SIDE}}, [0]), truth).keypoints["all"].visible == 2
-
-
 def test_nothing_found():
     truth = birds({1: steady(HERE, range(2))}, range(2))
     result = evaluate_observations(birds({}, range(2)), truth)
@@ -223,11 +218,6 @@ def test_nothing_to_find():
     assert all(math.isnan(result.detection[name]) for name in ("ap50", "ap50-95", "recall", "mean_iou"))
     assert math.isnan(result.tracking["mota"])
     assert result.tracking["idf1"] == 0
-
-
-def test_nothing_at_all():
-    result = evaluate_observations(birds({}, range(2)), birds({}, range(2)))
-    assert all(math.isnan(figure) for figure in result.detection.values())
 
 
 def test_files_that_do_not_belong_together():

@@ -37,7 +37,7 @@ def test_known_errors_are_recovered_from_every_tenth_frame(monkeypatch):
     monkeypatch.setattr(detection_noise, "RESAMPLES", 20)
     error, confidence = draws(100)
     error[:, np.arange(100) % 10 != 0] *= 5
-    noise = estimate_noise(detected(range(100), error, confidence), Truth(labelled(range(0, 100, 10))))
+    noise = estimate_noise(detected(range(100), error, confidence), Truth(labelled(range(0, 100, 10), masks=False)))
     assert (noise.frames, noise.birds, noise.poses, noise.keypoints) == (10, BIRDS, 60, 60 * K)
     assert noise.keypoint.sd_sure_px == pytest.approx(SURE, rel=0.12)
     assert noise.keypoint.sd_unsure_px == pytest.approx(UNSURE, rel=0.12)
@@ -52,7 +52,7 @@ def test_known_errors_are_recovered_from_every_tenth_frame(monkeypatch):
 
 def test_a_normal_distribution_has_many_degrees_of_freedom():
     error, confidence = draws(40, dof=1e6)
-    noise = estimate_noise(detected(range(40), error, confidence), Truth(labelled(range(40))))
+    noise = estimate_noise(detected(range(40), error, confidence), Truth(labelled(range(40), masks=False)))
     assert noise.keypoint.dof > 15
     assert noise.keypoint.sd_sure_px == pytest.approx(SURE, rel=0.06)
     assert noise.outlier_share < 0.002
@@ -61,7 +61,7 @@ def test_a_normal_distribution_has_many_degrees_of_freedom():
 def test_a_keypoint_that_is_harder_has_a_greater_factor():
     error, confidence = draws(40)
     error[:, :, -1] *= 3
-    factors = estimate_noise(detected(range(40), error, confidence), Truth(labelled(range(40)))).factors
+    factors = estimate_noise(detected(range(40), error, confidence), Truth(labelled(range(40), masks=False))).factors
     assert factors["f"] / factors["a"] == pytest.approx(3, rel=0.2)
 
 
@@ -74,7 +74,9 @@ def test_outliers_and_correlation_in_time():
         error[:, t] = 0.8 * error[:, t - 1] + 0.6 * rng.normal(size=(BIRDS, K, 2))
     far = rng.random((BIRDS, 60, K)) < 0.05
     error[far] += 20
-    noise = estimate_noise(detected(range(60), error, rng.uniform(0.1, 1, far.shape)), Truth(labelled(range(60))))
+    noise = estimate_noise(
+        detected(range(60), error, rng.uniform(0.1, 1, far.shape)), Truth(labelled(range(60), masks=False))
+    )
     assert noise.correlations == {1: pytest.approx(0.8, abs=0.05), 4: pytest.approx(0.8**4, abs=0.05)}
     assert noise.outlier_share == pytest.approx(0.05, abs=0.02)
 
@@ -84,7 +86,7 @@ def test_exchanged_keypoints_are_counted():
     found = detected(range(20), error * 0.1, confidence)
     points = found.keypoints_px.copy()
     points[0, :5, [0, 1]] = points[0, :5, [1, 0]]  # the first left and right keypoint of one bird
-    noise = estimate_noise(found.with_keypoints(points, confidence), Truth(labelled(range(20))))
+    noise = estimate_noise(found.with_keypoints(points, confidence), Truth(labelled(range(20), masks=False)))
     assert noise.exchanged == (5, BIRDS * 20 * SIDES)
 
 

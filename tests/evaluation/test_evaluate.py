@@ -163,11 +163,6 @@ def test_poses_that_the_truth_lacks():
     assert evaluate(solution(), BIRD, away).unmatched == 0  # the truth may annotate a frame in part
 
 
-def test_a_bird_without_a_track_is_missing():
-    result = evaluate(solution(track_id=[5, 99]), BIRD, truth())
-    assert (result.frames, result.missing, result.unmatched) == (T, T, T)
-
-
 def test_tracks_named_by_a_tracker():
     """The same figures as with the truth's ids, once the tracks are matched."""
     own, matching = match_tracks(solution(track_id=[3, 8]), truth())
@@ -183,20 +178,6 @@ def test_the_truth_of_another_video_is_reported(caplog):
     (record,) = caplog.records
     assert record.levelname == "WARNING"
     assert "hardly overlap the birds of t.json (median IoU 0.00)" in record.message
-
-
-def test_progress_counts_the_birds():
-    from contextlib import contextmanager
-
-    reported = []
-
-    @contextmanager
-    def watch(name, total):
-        reported.append(total)
-        yield lambda done, note: reported.append(-done)
-
-    evaluate(solution(), BIRD, truth(), progress=watch)
-    assert reported[0] == N * T == -sum(reported[1:])
 
 
 def test_wrong_poses_are_counted_with_their_flags():

@@ -1,6 +1,5 @@
 """Every metric against cases computed by hand."""
 
-import json
 import math
 
 import numpy as np
@@ -64,22 +63,6 @@ def test_points_of_other_shapes_are_refused():
         correct_keypoints(predicted, observed, [1, 1], 10, 0.1)
     with pytest.raises(ValueError, match="must have one shape"):
         correct_keypoints(predicted[:, :1], observed, [[1, 1]], 10, 0.1)
-
-
-def test_stored_pck_is_a_mean_over_images(reference_dir):
-    """Why per_image is the default: the other fitter's figures cannot be pooled shares of these keypoints."""
-    figures = json.loads((reference_dir / "reference" / "aves_fit.json").read_text())["species"]
-    pooled = per_image = 0
-    for species, figure in figures.items():
-        annotations = json.loads((reference_dir / "cub" / f"{species}.json").read_text())["annotations"]
-        visible = [sum(v > 0 for v in a["keypoints"][2::3]) for a in annotations]
-        share, total, images = figure["pck10"], sum(visible), len(visible)
-        pooled += round(round(share * total) / total, 5) == share
-        # at most two keypoints are wrong anywhere at this threshold
-        misses = {0.0, *(1 / a for a in visible)} | {1 / a + 1 / b for a in visible for b in visible}
-        per_image += any(round(1 - miss / images, 5) == share for miss in misses)
-    assert per_image == 5
-    assert pooled == 1  # of the species without an error
 
 
 def test_iou_by_hand():

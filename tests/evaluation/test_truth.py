@@ -5,7 +5,6 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
-from support.birds import toy_bird
 from support.evaluated import BIRD, solution, truth
 
 from jaxfit.data.formats.coco import write_coco
@@ -70,19 +69,6 @@ def test_poses_count_where_nothing_is_annotated(scene):
     result = evaluate(solution(), BIRD, Truth(truth(), one))
     assert (result.frames, result.frames_3d) == (8, 4)
     assert np.isnan(result.tracks[3]["mpjpe"])
-
-
-def test_without_true_poses(scene):
-    result = evaluate(solution(), BIRD, truth())
-    assert tuple(result.overall) == COLUMNS
-    assert (result.frames_3d, result.points_3d) == (0, "")
-
-
-def test_a_fit_is_no_truth(scene):
-    moving = one_camera()
-    moving[0, 1, 0] += 3
-    with pytest.raises(InputError, match=r"^scene: its true poses lie in crops that follow the birds"):
-        evaluate(solution(), BIRD, Truth(truth(), solution(crop=moving), toy_bird(), source="scene"))
 
 
 def test_folders_without_truth(scene, tmp_path_factory):

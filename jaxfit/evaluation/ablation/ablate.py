@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -35,9 +35,7 @@ FORMAT_VERSION = 2
 _RECORD = "ablation.json"
 
 
-def claim_folder(
-    folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bird: Bird, allow_import: Collection[str] = ()
-) -> None:
+def claim_folder(folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bird: Bird) -> None:
     """Record this ablation in a new folder, or check that an existing folder belongs to this ablation.
 
     The configs in the record are compared as plain values. No term in the record is imported.
@@ -47,7 +45,6 @@ def claim_folder(
         runs: the grid.
         inputs: name in messages → file that the results depend on.
         bird: the model.
-        allow_import: terms `package.module:function` that the record may name, beside the terms of the grid.
 
     Raises:
         InputError: the folder holds something else, or another ablation; the message names the difference.
@@ -58,18 +55,18 @@ def claim_folder(
         "model": model_hash(bird),
         **{name: _digest(path) for name, path in inputs.items()},
     }
-    path = folder / _RECORD
-    if _is_new(folder):
+    path, files = folder / _RECORD, []
+    if os.path.lexists(folder):
+        remove_leftovers(folder)
+        files = [file.name for file in check_folder(folder, "a folder of an ablation").iterdir()]
+    if not files:
         write_whole(path, json.dumps(own, indent=1).encode())
         return
+    if _RECORD not in files:
+        raise InputError(folder, f"holds files, but no {_RECORD}", "choose another --out")
     held = read_json_file(path)
     if not isinstance(held, dict) or not isinstance(held.get("runs"), dict):
         raise InputError(path, "does not describe an ablation", "choose another --out")
-    named = {name for run in own["runs"].values() for name in _import_paths(run)}
-    for name in (name for run in held["runs"].values() for name in _import_paths(run)):
-        if name not in named and name not in allow_import:
-            remedy = f"only --allow-import {name} accepts such a record; or choose another --out"
-            raise InputError(path, f"names the code {name!r}, which the grid does not name", remedy)
     differs = [name for name in own if name != "runs" and held.get(name) != own[name]]
     same = held["runs"].keys() == own["runs"].keys()
     if not same or not all(describes(held["runs"][run.name], run.config) for run in runs):
@@ -77,29 +74,6 @@ def claim_folder(
     if differs:
         remedy = "choose another --out, or remove that folder"
         raise InputError(folder, f"holds an ablation of another {', '.join(differs)}", remedy)
-
-
-def _is_new(folder: Path) -> bool:
-    """Return whether a folder is absent or empty; otherwise the folder must have a record."""
-    if not os.path.lexists(folder):
-        return True
-    remove_leftovers(folder)
-    files = [file.name for file in check_folder(folder, "a folder of an ablation").iterdir()]
-    if files and _RECORD not in files:
-        raise InputError(folder, f"holds files, but no {_RECORD}", "choose another --out")
-    return not files
-
-
-def _import_paths(run: Any) -> Iterator[str]:
-    """Yield the terms of a stored config that are import paths, whatever else the config holds."""
-    parts = [run] if isinstance(run, dict) else []
-    if parts and isinstance(run.get("stages"), list):
-        parts += [stage for stage in run["stages"] if isinstance(stage, dict)]
-    for part in parts:
-        for key in ("terms", "override"):
-            names = part.get(key)
-            if isinstance(names, dict | list):
-                yield from (name for name in names if isinstance(name, str) and ":" in name)
 
 
 def _digest(path: Path) -> str:
@@ -130,7 +104,6 @@ def ablate(
     bird: Bird | None = None,
     matching: Literal["auto", "ids", "overlap"] = "auto",
     progress: ProgressTask = silent,
-    allow_import: Collection[str] = (),
     cluster: Cluster | None = None,
 ) -> Ablation:
     """Fit the same birds under every config of a grid, measure the results, and write tables, a plot and a report.
@@ -147,8 +120,6 @@ def ablate(
         bird: the model; None takes the murre.
         matching: how tracks and birds are matched, see `match_tracks`.
         progress: shows the progress of every part.
-        allow_import: terms `package.module:function` that the record of the folder may name, beside the terms of the
-            grid. The record is only compared with the grid; its terms are never imported.
         cluster: worker processes that fit the windows. None: this process.
 
     Raises:
@@ -159,17 +130,17 @@ def ablate(
     from jaxfit.evaluation.ablation.report import write_report
 
     observations, truth, folder = Path(observations), Path(truth), Path(folder)
-    crossed, bird = load_grid(grid), bird or load_murre()
+    (runs, claims), bird = load_grid(grid), bird or load_murre()
     observed = read_coco(observations, untracked="photographs")  # as `jaxfit fit`
     true = read_truth(truth, untracked="photographs" if observed.own_images else "video")
     if matching != "overlap":
         check_shared(observed, true)
     check_observations(observed, bird, observations)
     inputs = {"observations": observations, "truth": truth}
-    claim_folder(folder, crossed.runs, inputs, bird, allow_import)
-    fitted = fit_grid(observed, bird, crossed.runs, folder, progress, observations, cluster)
-    results = measure_grid(crossed.runs, folder, true, matching, progress)
-    verdicts = judge(crossed.claims, results)
+    claim_folder(folder, runs, inputs, bird)
+    fitted = fit_grid(observed, bird, runs, folder, progress, observations, cluster)
+    results = measure_grid(runs, folder, true, matching, progress)
+    verdicts = judge(claims, results)
     write_report(results, verdicts, folder, inputs, bird.name)
     return Ablation(results, verdicts, fitted)
 
@@ -213,8 +184,8 @@ def sweep(
     observations = check_observations(observations, bird, "observations")
     solutions: dict[int, Solution] = {}
     results: dict[int, Result] = {}
-    for batch in fit_batches(observations, bird, runs, progress):
-        for r, solution in zip(batch.runs, batch.solutions, strict=True):
+    for batch, fitted, seconds in fit_batches(observations, bird, runs, progress):
+        for r, solution in zip(batch, fitted, strict=True):
             evaluation = evaluate(solution, bird, truth, progress)
-            solutions[r], results[r] = solution, Result(runs[r], evaluation, batch.seconds_per_run, len(batch.runs))
+            solutions[r], results[r] = solution, Result(runs[r], evaluation, seconds, len(batch))
     return Sweep([solutions[r] for r in range(len(runs))], [results[r] for r in range(len(runs))])

@@ -6,7 +6,7 @@ import itertools
 import logging
 import math
 import re
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -105,18 +105,8 @@ class Run:
         return get_value(self.config, path)
 
 
-@dataclass(frozen=True)
-class Grid:
-    """The runs and claims of a grid."""
-
-    runs: tuple[Run, ...]
-    claims: tuple[ClaimConfig, ...]
-
-
-def load_grid(source: str | Path) -> Grid:
-    """Read a grid file and return its runs and claims.
-
-    Runs with equal configs are merged.
+def load_grid(source: str | Path) -> tuple[tuple[Run, ...], tuple[ClaimConfig, ...]]:
+    """Read a grid file and return its runs and its claims. Runs with equal configs are merged.
 
     Args:
         source: `ablation`, the name of the shipped grid, or the path of a YAML file.
@@ -138,7 +128,7 @@ def load_grid(source: str | Path) -> Grid:
             if path not in runs[0].levels:
                 problem = f"`claims[{i}]` is about `{path}`, which does not vary"
                 raise InputError(source, problem, known_names(path, runs[0].levels))
-    return Grid(runs, grid.claims)
+    return runs, grid.claims
 
 
 def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) -> tuple[Run, ...]:
@@ -155,14 +145,14 @@ def cross(base: FitConfig, points: Sequence[Mapping[str, Any]], source: object) 
     if base.learn_weights:
         _logger.warning("%s: the runs learn no weights, because an ablation sets the weights itself", source)
         base = replace(base, learn_weights=())
-    kept: dict[Hashable, tuple[FitConfig, Mapping[str, Any]]] = {}
+    kept: dict[Any, tuple[FitConfig, Mapping[str, Any]]] = {}
     repeated = []
     for point in points:
         try:
             config = with_values(base, point)
         except ConfigKeyError as error:
             raise InputError(source, error.problem, error.remedy) from None
-        if kept.setdefault(hashable(plain_config(config)), (config, point))[0] is not config:
+        if kept.setdefault(_hashable(plain_config(config)), (config, point))[0] is not config:
             repeated.append(point)
     if repeated:
         text = shortened(one_line(dict(repeated[0])), 100)
@@ -193,11 +183,11 @@ def _name(values: Mapping[str, Any]) -> str:
     return re.sub(r"[^\w.,=+-]", "-", ",".join(parts), flags=re.ASCII)[:120] or "only"
 
 
-def hashable(plain: Any) -> Hashable:
-    """Return a value that can be a key and is equal for equal plain values, such as those of `plain_config`."""
+def _hashable(plain: Any) -> Any:
+    """Return a value that can be a key and is equal for equal plain values of `plain_config`."""
     if isinstance(plain, dict):
-        return frozenset((key, hashable(value)) for key, value in plain.items())
-    return tuple(map(hashable, plain)) if isinstance(plain, list | tuple) else plain
+        return frozenset((key, _hashable(value)) for key, value in plain.items())
+    return tuple(map(_hashable, plain)) if isinstance(plain, list) else plain
 
 
 def short(value: Any) -> str:

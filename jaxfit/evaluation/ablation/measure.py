@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +10,7 @@ from typing import Any, Literal
 from jaxfit.data.observations import Observations
 from jaxfit.data.result_folder import SUMMARY
 from jaxfit.data.solution import load_solution
-from jaxfit.evaluation.ablation.grid import ClaimConfig, Run, hashable
+from jaxfit.evaluation.ablation.grid import ClaimConfig, Run
 from jaxfit.evaluation.ablation.runs import run_folder
 from jaxfit.evaluation.bootstrap import Ratio, paired_ratio
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
@@ -145,18 +145,14 @@ def judge(claims: Sequence[ClaimConfig], results: Sequence[Result]) -> list[Verd
 def pairs_of(claim: ClaimConfig, runs: Sequence[Run]) -> list[tuple[Run, Run]]:
     """Return the pairs (better, worse) of a claim: runs with equal values of all keys that the claim does not name."""
     named = {*claim.better, *claim.worse}
-    worse_runs: dict[Hashable, list[Run]] = {}
 
-    def rest(run: Run) -> Hashable:
-        return hashable({path: level for path, level in run.levels.items() if path not in named})
+    def chosen(levels: Mapping[str, Any]) -> list[tuple[Run, dict[str, Any]]]:
+        """Return the runs with some levels, and their levels of all other keys."""
+        return [
+            (run, {path: level for path, level in run.levels.items() if path not in named})
+            for run in runs
+            if all(run.levels[path] == level for path, level in levels.items())
+        ]
 
-    for run in runs:
-        if _has(run, claim.worse):
-            worse_runs.setdefault(rest(run), []).append(run)
-    return [
-        (better, worse) for better in runs if _has(better, claim.better) for worse in worse_runs.get(rest(better), ())
-    ]
-
-
-def _has(run: Run, levels: Mapping[str, Any]) -> bool:
-    return all(run.levels[path] == level for path, level in levels.items())
+    worse_runs = chosen(claim.worse)
+    return [(better, worse) for better, rest in chosen(claim.better) for worse, own in worse_runs if own == rest]

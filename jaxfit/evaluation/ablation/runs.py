@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,36 +33,6 @@ def run_folder(folder: Path, run: Run) -> Path:
     return folder / _RUNS / run.name
 
 
-def plan_batches(observations: Observations, bird: Bird, runs: Sequence[Run], source: object) -> list[list[int]]:
-    """Return the positions of the runs of every batch.
-
-    The runs of a batch share one compiled program and keep the order of the grid. The memory and ``FRAMES_AT_ONCE``
-    limit the size of a batch.
-    """
-    groups: dict[Any, list[int]] = {}
-    for r, run in enumerate(runs):
-        groups.setdefault(config_to_yaml(compiled_part(run.config)), []).append(r)
-    batches = []
-    for group in groups.values():
-        config = runs[group[0]].config
-        frames = len(windows_of(observations, config, source)) * config.window
-        at_once = max(min(frames_per_batch(bird, config), FRAMES_AT_ONCE) // frames, 1)
-        parts = np.array_split(group, -(-len(group) // at_once))
-        batches += [part.tolist() for part in parts]
-    return batches
-
-
-class FittedBatch(NamedTuple):
-    """Runs that were fitted together."""
-
-    runs: list[int]
-    """Positions of the runs in the grid."""
-    solutions: list[Solution]
-    """The result of each run."""
-    seconds_per_run: float
-    """Time of the fit, divided by the number of runs."""
-
-
 def fit_batches(
     observations: Observations,
     bird: Bird,
@@ -71,11 +41,12 @@ def fit_batches(
     stored: Collection[int] = (),
     source: object = "observations",
     cluster: Cluster | None = None,
-) -> Iterator[FittedBatch]:
+) -> Iterator[tuple[list[int], list[Solution], float]]:
     """Fit the runs of a grid, batch by batch.
 
-    A batch is fitted as a whole even where some of its runs are stored, so the results of an interrupted ablation do
-    not depend on the interruption. Only batches whose runs are all stored are skipped.
+    The runs of a batch share one compiled program and keep the order of the grid. The memory and ``FRAMES_AT_ONCE``
+    limit the size of a batch. A batch is fitted as a whole even where some of its runs are stored, so the results of
+    an interrupted ablation do not depend on the interruption. Only batches whose runs are all stored are skipped.
 
     Args:
         observations: keypoints and masks.
@@ -86,17 +57,28 @@ def fit_batches(
         source: name of the observations in error messages.
         cluster: worker processes that fit the windows. None: this process.
 
+    Yields:
+        For each batch: the positions of its runs in the grid, the result of each run, and the time of the fit in
+        seconds, divided by the number of runs.
+
     Raises:
         InputError: as `fit_runs`; a config learns its weights.
     """
     if any(run.config.learn_weights for run in runs):
         raise InputError("config", "`learn_weights` would change the weights that an ablation sets", LEARN_REMEDY)
-    for batch in plan_batches(observations, bird, runs, source):
-        if not all(r in stored for r in batch):
-            began = time.perf_counter()
-            configs = [runs[r].config for r in batch]
-            solutions = fit_runs(observations, bird, configs, None, progress, source, cluster=cluster)
-            yield FittedBatch(batch, solutions, (time.perf_counter() - began) / len(batch))
+    groups: dict[Any, list[int]] = {}
+    for r, run in enumerate(runs):
+        groups.setdefault(config_to_yaml(compiled_part(run.config)), []).append(r)
+    for group in groups.values():
+        config = runs[group[0]].config
+        frames = len(windows_of(observations, config, source)) * config.window
+        at_once = max(min(frames_per_batch(bird, config), FRAMES_AT_ONCE) // frames, 1)
+        for batch in (part.tolist() for part in np.array_split(group, -(-len(group) // at_once))):
+            if not all(r in stored for r in batch):
+                began = time.perf_counter()
+                configs = [runs[r].config for r in batch]
+                solutions = fit_runs(observations, bird, configs, None, progress, source, cluster=cluster)
+                yield batch, solutions, (time.perf_counter() - began) / len(batch)
 
 
 def fit_grid(
@@ -119,14 +101,13 @@ def fit_grid(
     for ready in sorted(folder.glob(f"{_READY}*")):  # an interruption between two moves leaves this folder
         _move_in(ready, folder)
     stored = {r for r, run in enumerate(runs) if run_folder(folder, run).is_dir()}
-    for b, batch in enumerate(fit_batches(observations, bird, runs, progress, stored, source, cluster)):
-        ready = folder / f"{_READY}{b}"
+    for b, fitted in enumerate(fit_batches(observations, bird, runs, progress, stored, source, cluster)):
+        ready, (batch, solutions, seconds) = folder / f"{_READY}{b}", fitted
         with new_folder(ready) as part:
-            for r, solution in zip(batch.runs, batch.solutions, strict=True):
+            for r, solution in zip(batch, solutions, strict=True):
                 if r not in stored:
                     (part / runs[r].name).mkdir()
-                    summary = summarise(solution, bird, {"fit": batch.seconds_per_run})
-                    summary |= {"runs_at_once": len(batch.runs)}
+                    summary = summarise(solution, bird, {"fit": seconds}) | {"runs_at_once": len(batch)}
                     write_solution(solution, bird, config_to_yaml(runs[r].config), summary, part / runs[r].name)
         _move_in(ready, folder)
     return len(runs) - len(stored)

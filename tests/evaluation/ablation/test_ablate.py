@@ -165,9 +165,3 @@ def test_a_missing_extra_is_one_input_error(inputs, monkeypatch, tmp_path):
     with pytest.raises(InputError, match=r"^ablate: needs matplotlib and tabulate.*pip install \"\.\[report\]\""):
         ablate(inputs / "birds.json", inputs / "birds.json", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_an_unknown_key_is_refused(inputs, tmp_path, capsys):
-    path = tmp_path / "grid.yaml"
-    path.write_text("crosses: [{cross: {terms.velocty: [1, 2]}}]")
-    rejected(capsys, command(inputs, path, tmp_path / "out"), str(path), "velocty", "velocity")

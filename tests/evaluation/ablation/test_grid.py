@@ -3,7 +3,8 @@
 import pytest
 from support.cli_files import CONFIG
 
-from jaxfit.evaluation.ablation.grid import GRID_RUNS, load_grid, require_runs, short
+from jaxfit.evaluation.ablation.grid import GRID_RUNS, load_grid, require_runs
+from jaxfit.evaluation.ablation.measure import pairs_of
 from jaxfit.fitting.solve import compiled_part
 from jaxfit.foundation.errors import InputError
 
@@ -16,7 +17,7 @@ def grid_file(folder, text):
 
 
 def test_the_shipped_grid_is_the_papers():
-    runs = load_grid("ablation").runs
+    runs = load_grid("ablation")[0]
     assert len(runs) == 34
     single = [run.config for run in runs if run.config.window == 1]
     assert sorted(config.filter_window for config in single) == [1, 5]
@@ -33,16 +34,14 @@ def test_the_shipped_grid_is_the_papers():
 
 
 def test_the_shipped_claims_find_their_pairs():
-    from jaxfit.evaluation.ablation.measure import pairs_of
-
-    grid = load_grid("ablation")
-    counts = [len(pairs_of(claim, grid.runs)) for claim in grid.claims]
+    runs, claims = load_grid("ablation")
+    counts = [len(pairs_of(claim, runs)) for claim in claims]
     assert counts == [2, 17, 1, 16, 1, 16, 1, 8, 8]
 
 
 def test_the_last_key_changes_fastest_and_runs_are_named(tmp_path):
     text = "crosses:\n  - set: {common_size: false}\n    cross: {filter_window: [1, 3], terms.velocity: [1, 1.0e+4]}"
-    runs = load_grid(grid_file(tmp_path, text)).runs
+    runs = load_grid(grid_file(tmp_path, text))[0]
     assert [run.name for run in runs] == [
         "1_filter_window=1,velocity=1",
         "2_filter_window=1,velocity=10000",
@@ -55,7 +54,7 @@ def test_the_last_key_changes_fastest_and_runs_are_named(tmp_path):
 
 def test_a_key_that_a_cross_leaves_alone_has_the_bases_level(tmp_path):
     text = "crosses:\n  - cross: {terms.velocity: [1, 2]}\n  - cross: {window: [3]}"
-    runs = load_grid(grid_file(tmp_path, text)).runs
+    runs = load_grid(grid_file(tmp_path, text))[0]
     assert [dict(run.levels) for run in runs] == [
         {"terms.velocity": 1, "window": 6},
         {"terms.velocity": 2, "window": 6},
@@ -66,7 +65,7 @@ def test_a_key_that_a_cross_leaves_alone_has_the_bases_level(tmp_path):
 def test_equal_runs_are_one(tmp_path, caplog):
     text = "crosses:\n  - cross: {terms.velocity: [0, 2], terms.keypoints: [6.25, =terms.velocity]}\n"
     text += "  - cross: {terms.velocity: [2]}"
-    assert len(load_grid(grid_file(tmp_path, text)).runs) == 4
+    assert len(load_grid(grid_file(tmp_path, text))[0]) == 4
     assert "one run is kept" in caplog.text
 
 
@@ -75,15 +74,8 @@ def test_the_runs_of_a_config_that_learns_weights_learn_none(tmp_path, caplog):
     (tmp_path / "grid.yaml").write_text(
         f"config: {tmp_path / 'fit.yaml'}\ncrosses: [{{cross: {{terms.pose_prior: [1, 2]}}}}]"
     )
-    assert not any(run.config.learn_weights for run in load_grid(tmp_path / "grid.yaml").runs)
+    assert not any(run.config.learn_weights for run in load_grid(tmp_path / "grid.yaml")[0])
     assert "learn no weights" in caplog.text
-
-
-def test_many_equal_runs_are_one_warning(tmp_path, caplog):
-    text = "crosses:\n  - cross: {terms.velocity: [" + "1, 1.0, " * 100 + "2]}"
-    assert len(load_grid(grid_file(tmp_path, text)).runs) == 2
-    assert len(caplog.records) == 1
-    assert "199 times" in caplog.text
 
 
 def test_the_number_of_runs_is_checked_before_the_runs_are_made(tmp_path):
@@ -99,7 +91,7 @@ def test_the_number_of_runs_is_checked_before_the_runs_are_made(tmp_path):
 
 def test_names_of_runs_are_ascii_and_short(tmp_path):
     text = f"crosses:\n  - cross: {{'stages[0].name': ['{'é' * 300}', '../a|b']}}"
-    names = [run.name for run in load_grid(grid_file(tmp_path, text)).runs]
+    names = [run.name for run in load_grid(grid_file(tmp_path, text))[0]]
     assert all(len(name.encode()) < 130 and "/" not in name for name in names)
 
 
@@ -126,10 +118,3 @@ def test_what_is_no_grid(tmp_path, text, words):
         load_grid(path)
     for word in (str(path), *words):
         assert word in str(refusal.value)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"), [(1e4, "10000"), (1e6, "1e6"), (100.0, "100"), (0.25, "0.25"), (1e-7, "1e-7"), (True, "true")]
-)
-def test_short_values(value, text):
-    assert short(value) == text
