@@ -235,7 +235,7 @@ def reconstruct(
                 folder,
                 video,
                 force=True,
-                behaviour=behaviour,
+                describe=lambda: behaviour,
             )
     return Reconstruction(tracking, solution, summary, networks.names)
 

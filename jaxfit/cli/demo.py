@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import time
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from jaxfit.behaviour.result import shown_behaviour
+from jaxfit.behaviour.result import behaviour_of_result
 from jaxfit.cli.observations import matching_line, observation_tables, parsed_size
 from jaxfit.cli.tables import counted, evaluation_tables, flag_quality_line, show, track_table
 from jaxfit.config.build import with_values
 from jaxfit.config.reconstruct import load_reconstruct_config
-from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.formats import FOOTAGE, MARKER
 from jaxfit.data.result_folder import OVERLAY, POSES
 from jaxfit.evaluation.evaluate import Evaluation, evaluate
@@ -30,7 +30,7 @@ from jaxfit.perception.trust import Trust
 from jaxfit.pipeline import reconstruct
 from jaxfit.simulation.scene import simulate
 from jaxfit.view.report.page import Measured
-from jaxfit.view.report.write import REPORT, write_report
+from jaxfit.view.report.write import REPORT, report_of_result
 
 if TYPE_CHECKING:
     from jaxfit.cameras.camera import Camera
@@ -39,22 +39,16 @@ BIRDS, FRAMES, SIZE, SEED = 5, 60, (1296, 760), 1003
 METRICS, ANIMATION = "evaluation.json", "birds.glb"
 
 
-def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
+def demo(options: argparse.Namespace) -> None:
     """Write a simulated scene and its reconstruction to a folder, and print how well the two agree.
 
-    The command prints ten lines. The report of the result holds all tables.
-
-    Args:
-        folder: receives `scene/`, `result/`, `evaluation.json` and `birds.glb`; an earlier demo in the folder is
-            replaced.
-        verbose: print all tables too.
-
-    Returns:
-        The metrics of the reconstruction.
+    The command prints ten lines; with `--verbose`, all tables too. The report of the result holds all tables. An
+    earlier demo in the folder is replaced.
 
     Raises:
         InputError: the folder cannot be written, or holds files other than an earlier demo.
     """
+    folder = options.out
     start = time.perf_counter()
     scene_folder, result_folder = folder / "scene", folder / "result"
     _check_folder(folder)
@@ -76,20 +70,9 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     numbers = matching_line(matching)
     measured = [_measured(table) for table in compared]
     measured[-1] = measured[-1]._replace(note=f"{measured[-1].note}; {numbers}")
-    behaviour = shown_behaviour(done.solution, bird, terminal)
-    write_report(
-        result_folder / REPORT,
-        done.solution,
-        bird,
-        observations,
-        done.summary,
-        config_to_yaml(config),
-        result_folder,
-        scene_folder / FOOTAGE,
-        measured=measured,
-        behaviour=behaviour,
-    )
-    if verbose:
+    describe = partial(behaviour_of_result, progress=terminal)
+    report_of_result(result_folder, scene_folder / FOOTAGE, measured=measured, describe=describe)
+    if options.verbose:
         for output in (track_table(observations, done.solution), *compared, flag_quality_line(result), numbers):
             show(output)
     for line in _answer(done.tracking.trust, observed, result, matching):
@@ -104,7 +87,6 @@ def run_demo(folder: Path, verbose: bool = False) -> Evaluation:
     ):
         show(f"  {path}: {text}")
     show("for your own film: jaxfit reconstruct VIDEO --out result")
-    return result
 
 
 def _answer(trust: Trust, observed: ObservationsEvaluation, result: Evaluation, matching: Matching) -> list[str]:
@@ -184,9 +166,3 @@ def _cameras(options: argparse.Namespace) -> int | tuple[Camera, ...]:
     if options.distortion:
         raise InputError("--distortion", "is given with a file of cameras", "the file holds the distortion")
     return read_cameras(options.cameras)
-
-
-def demo(options: argparse.Namespace) -> None:
-    """Run the demo."""
-
-    run_demo(options.out, options.verbose)

@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 from jaxfit.cameras.camera import Camera
 from jaxfit.view.colours import GREY, INK, PAPER, track_colour
 from jaxfit.view.drawing import dot, line, tag, text
+from jaxfit.view.report.axis import round_step
 
 PANEL_PX, MARGIN_PX, TITLE_PX = 720, 70, 46
 EDGE_POINTS = 12
@@ -84,9 +85,7 @@ def _field_of_view(camera: Camera, depth: float) -> Float[np.ndarray, "P 3"]:
 
 def _grid(panel: UInt8[np.ndarray, "H W 3"], centre: np.ndarray, extent: float, scale: float) -> float:
     """Draw a grid of round coordinates with its labels, and return its step in metres."""
-    power = 10 ** math.floor(math.log10(extent / 4))
-    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= extent / 8)
-    reach = PANEL_PX / 2 / scale
+    step, reach = round_step(extent / 8), PANEL_PX / 2 / scale
     for axis in (0, 1):
         first = math.ceil((centre[axis] - reach) / step)
         for i in range(first, math.floor((centre[axis] + reach) / step) + 1):

@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from jaxfit.view.birds import Style
 from jaxfit.view.colours import DETECTED, FITTED, PAPER, track_colour
 from jaxfit.view.drawing import closed_curve, dot, line, ring, tag, text, text_width
+from jaxfit.view.report.axis import clock
 
 Symbol = Callable[[np.ndarray, float, float, float], None]
 """Draws a symbol, 1.7 times as wide as the text is high: image, left end, middle row, height of the text."""
@@ -83,11 +84,8 @@ class Legend:
     def draw(self, number: int, seconds: float) -> UInt8[np.ndarray, "H W 3"]:
         """Return the legend for the frame with this number and time since the start of the video."""
         image, size = self._ground.copy(), self._style.text_px
-        minutes, rest = divmod(seconds, 60)
-        hours, minutes = divmod(int(minutes), 60)
-        clock = f"{hours}:{minutes:02d}:{rest:05.2f}" if hours else f"{minutes}:{rest:05.2f}"
         text(image, f"frame {number}", 0.8 * size, 1.1 * size, size)
-        text(image, clock, 1.6 * size + text_width("frame 000000", size), 1.1 * size, size, (110, 110, 110))
+        text(image, clock(seconds), 1.6 * size + text_width("frame 000000", size), 1.1 * size, size, (110, 110, 110))
         return image
 
     def _number(self, image, x, y, size):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -21,7 +22,7 @@ from jaxfit.foundation.files import check_new_file, write_whole
 from jaxfit.foundation.reading import reading
 from jaxfit.model.bird import Bird
 from jaxfit.view.report.contents import gather
-from jaxfit.view.report.page import Behaviour, Measured, Picture, page, report_pictures
+from jaxfit.view.report.page import Behaviour, Measured, page, report_pictures
 
 REPORT = "report.html"
 
@@ -39,7 +40,7 @@ def write_report(
     video: Path | None,
     force: bool = False,
     measured: Sequence[Measured] = (),
-    behaviour: Behaviour | None = None,
+    describe: Callable[[], Behaviour | None] = lambda: None,
 ) -> None:
     """Write the report of a result as one HTML page that needs no other file.
 
@@ -53,25 +54,18 @@ def write_report(
         video: the footage; None writes a report without pictures.
         force: draw also on footage that is not the footage of the result.
         measured: metrics against a known truth.
-        behaviour: what the birds do; bouts are links to the footage. None writes no section.
+        describe: returns what the birds do; bouts are links to the footage. None stands for no such section.
 
     Raises:
         InputError: the footage does not belong to the result, or the file cannot be written.
     """
-    report = gather(solution, observations, summary, config, folder, bird)
-    pictures = _pictures(solution, bird, observations, folder, video, force)
+    report, pictures = gather(solution, observations, summary, config, folder, bird), []
+    if video is not None and solution.valid.any():
+        filmed, lens = as_filmed(folder, solution, bird)
+        pictures = report_pictures(filmed, bird, video, observations, force, lens)
+    behaviour = describe()  # last, because the footage may be wrong
     film = None if video is None else film_address(video, path)
     write_whole(path, page(report, pictures, measured, behaviour, film).encode())
-
-
-def _pictures(
-    solution: Solution, bird: Bird, observations: Observations | None, folder: Path, video: Path | None, force: bool
-) -> list[Picture]:
-    """Return frames of the footage with the birds; none without footage or poses."""
-    if video is None or not solution.valid.any():
-        return []
-    filmed, lens = as_filmed(folder, solution, bird)
-    return report_pictures(filmed, bird, video, observations, force, lens)
 
 
 def film_address(film: Path, page: Path) -> str | None:
@@ -97,7 +91,8 @@ def report_of_result(
     out: str | Path | None = None,
     overwrite: bool = False,
     force: bool = False,
-    describe: Callable[[Path], Behaviour | None] | None = None,
+    measured: Sequence[Measured] = (),
+    describe: Callable[[Path], Behaviour | None] = lambda _: None,
 ) -> Path:
     """Write the report of a result folder.
 
@@ -107,7 +102,8 @@ def report_of_result(
         out: file to write; None takes `report.html` in the folder of the result.
         overwrite: replace an existing file. Without `out`, an earlier report of the result is always replaced.
         force: draw also on footage that is not the footage of the result.
-        describe: returns what the birds of a result folder do; None writes no such section.
+        measured: metrics against a known truth.
+        describe: returns what the birds of a result folder do; None stands for no such section.
 
     Returns:
         The written file.
@@ -132,11 +128,8 @@ def report_of_result(
     if video is not None and content.get("photographs"):
         raise InputError(folder, "holds photographs, which are not the frames of one video", "remove --video")
     footage = _footage(content, video)
-    report = gather(solution, observations, content, config, folder, bird)
-    pictures = _pictures(solution, bird, observations, folder, footage, force)
-    behaviour = None if describe is None else describe(folder)  # last, because the footage may be wrong
-    film = None if footage is None else film_address(footage, path)
-    write_whole(path, page(report, pictures, (), behaviour, film).encode())
+    of_folder = partial(describe, folder)
+    write_report(path, solution, bird, observations, content, config, folder, footage, force, measured, of_folder)
     return path
 
 
