@@ -55,6 +55,7 @@ def folder(tmp_path_factory):
     (folder / "unknown.yaml").write_text("paw: crown\n")
     (folder / "notes.txt").write_text("precious")
     (folder / "masks").mkdir()
+    (folder / "loop").symlink_to("loop")
     cv2.imwrite(str(folder / "masks" / "0.png"), np.ones((9, 9), np.uint8))
     return folder
 
@@ -95,6 +96,7 @@ BAD = [
     ("track {}/notes.txt --out {}/out", "notes.txt: is not a readable video"),
     ("track {}/masks --config paper --out {}/out", "paper: is the config of a fit"),
     ("track {}/masks --start 4 --stop 3 --out {}/out", "`track.frames.stop` is 3, and `start` is 4"),
+    ("track {}/masks --out {}/loop", "leads back to itself"),
     ("demo --out {}", "holds files that are not an earlier demo"),
     ("demo --out {}/notes.txt", "is a file"),
     ("export {} --to glb --frames 3 --out {}/out", "--frames: is '3', not a range of frames"),
@@ -159,7 +161,9 @@ def test_config_show(tmp_path, capsys):
 def test_paths_that_are_no_files(inputs, tmp_path, capsys, option):
     os.mkfifo(tmp_path / "pipe")  # a reader that opens the pipe never returns
     (tmp_path / "loop").symlink_to("loop")
-    for path in (tmp_path / "pipe", tmp_path / "loop", tmp_path / ("n" * 300), "/dev/zero"):
+    (tmp_path / "file").write_text("")
+    names = "pipe", "loop", "loop/a.mp4", "file/a.mp4", "n" * 300, "/dev/zero"
+    for path in (tmp_path / name for name in names):
         command = {
             "observations": ["fit", str(path), "--out", "out"],
             "--truth": ["evaluate", str(inputs / "birds.json"), "--truth", str(path)],

@@ -4,6 +4,7 @@ import json
 from types import SimpleNamespace
 from typing import Any
 
+from support.cli_files import rejected
 from support.rectangles import birds, steady
 
 from jaxfit.cli import main as cli
@@ -39,21 +40,15 @@ def test_tables(tmp_path, capsys):
     assert "not counted: 1 hardly visible bird\n" in printed
 
 
-def test_by_keypoint(tmp_path, capsys):
+def test_json_and_the_tables_that_there_are(tmp_path, capsys):
     """The tables of observations have the keypoints, but no behaviours."""
-    assert cli.main([*files(tmp_path), "--by", "keypoint"]) == 0
-    assert "bill" in capsys.readouterr().out
-    assert cli.main([*files(tmp_path), "--by", "behaviour"]) == 2
-    assert "no tables --by behaviour" in " ".join(capsys.readouterr().err.split())
-
-
-def test_json(tmp_path, capsys):
-    assert cli.main([*files(tmp_path), "--json"]) == 0
+    assert cli.main([*files(tmp_path), "--by", "keypoint", "--json"]) == 0
     metrics = json.loads(capsys.readouterr().out)
     assert metrics["counts"]["ignored"] == 1
     assert metrics["keypoints"]["bill"]["visible"] == 6
     assert metrics["tracking"]["switches"] == 0
     assert metrics["detection"]["recall"] == 6 / 7
+    rejected(capsys, [*files(tmp_path), "--by", "behaviour"], "no tables --by behaviour")
 
 
 def test_the_line_of_matched_tracks():

@@ -2,13 +2,11 @@
 
 import json
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from support.cli_files import rejected
-from support.overlays import film
 
 from jaxfit import Observations, load_reconstruct_config, pipeline, read_coco
 from jaxfit.cli import demo
@@ -89,16 +87,6 @@ def test_one_frame_of_the_overlay(scene, tmp_path, capsys):
     rejected(capsys, [*command, "3"], "frame.tiff", ".png")
 
 
-def test_unusable_videos_of_overlay(scene, tmp_path, capsys):
-    def command(video: Path) -> list[str]:
-        return ["overlay", str(scene / "truth"), "--video", str(video), "--out", str(tmp_path / "o.mp4")]
-
-    rejected(capsys, command(tmp_path / "none.mp4"), "none.mp4", alone=False)
-    rejected(capsys, command(scene / "truth.json"), "truth.json", alone=False)
-    rejected(capsys, command(film(tmp_path / "other.mp4")), "other.mp4", "--force", alone=False)
-    assert not (tmp_path / "o.mp4").exists()
-
-
 def test_a_scene_is_overwritten_only_on_request(scene, tmp_path, capsys):
     before = (scene / "truth.json").read_bytes()
     rejected(capsys, ["simulate", *SMALL, "--seed", "8", "--out", str(scene)], "overwrite", alone=False)
@@ -106,13 +94,6 @@ def test_a_scene_is_overwritten_only_on_request(scene, tmp_path, capsys):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "thesis.tex").write_text("precious")
     rejected(capsys, ["simulate", *SMALL, "--out", str(tmp_path / "thesis"), "--overwrite"], "thesis", alone=False)
-
-
-def test_the_murre_has_six_sides(tmp_path, capsys):
-    out = tmp_path / "views.png"
-    assert main(["model", "view", "murre", "--posture", "standing", "--out", str(out)]) == 0
-    assert out.read_bytes().startswith(b"\x89PNG")
-    assert main(["model", "info", "murre"]) == 0
 
 
 class TruthOfTheScene:

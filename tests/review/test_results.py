@@ -61,18 +61,6 @@ def test_the_residual_of_a_folder_of_reconstruct(folder, tmp_path):
     np.testing.assert_allclose(residual, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("film_of", "problem"),
-    [
-        ({"frames": FIRST + 2}, "has keypoints for frame 8"),
-        ({"size": (WIDTH, 240)}, "is 320×240, but result says 320×200"),
-    ],
-)
-def test_the_video_of_another_result(folder, tmp_path, film_of, problem):
-    with pytest.raises(InputError, match=problem):
-        read_result(folder, film(tmp_path / "film.mp4", **film_of))
-
-
 def test_photographs_are_no_video(tmp_path):
     birds = observed(np.zeros(T)).select(tracks=[0], frames=[0])
     own = Observations(

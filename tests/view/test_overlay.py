@@ -337,12 +337,9 @@ def test_a_video_that_is_not_the_results(tmp_path):
         assert not list(tmp_path.glob(".o*"))
 
     last = str(FIRST + T - 1)
-    refused("short.mp4", f"has {T} frames", f"{FIRST} to {last}", video=film(tmp_path / "short.mp4", T))
     refused("short.webm", f"has {T} frames", last, video=film(tmp_path / "short.webm", T))  # learnt only at the end
     small = film(tmp_path / "small.mp4", size=(100, 60))
     refused("small.mp4: is not the video of the result", "100×60 instead of 320×200", "give the video", video=small)
-    large = film(tmp_path / "large.mp4", size=(640, 400))  # all keypoints lie in it
-    refused("large.mp4", "640×400 instead of 320×200", "--force", video=large)
     refused("observations", "640×400", "320×200", observations=detections((640, 400)))
     refused("hold no bird of the result", observations=dataclasses.replace(detections(), track_id=np.array([5])))
     refused("nothing.mp4", "does not exist", video=tmp_path / "nothing.mp4")

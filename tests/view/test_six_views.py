@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from support.birds import toy_bird
 
+from jaxfit.cli.main import main
 from jaxfit.model.files import load_murre
 from jaxfit.view.mesh_views import FOOT_PX, PAPER, TILE_PX, TITLE_PX, six_views
 
@@ -28,7 +29,7 @@ def extent(mask, axis):
 
 
 def test_each_is_seen_from_its_side(tmp_path):
-    six_views(load_murre(), tmp_path / "murre.png")
+    assert main(["model", "view", "murre", "--posture", "standing", "--out", str(tmp_path / "murre.png")]) == 0
     seen, _ = tiles(tmp_path / "murre.png")
     for one, other in (("left", "right"), ("front", "back")):
         np.testing.assert_allclose(seen[one].sum(), seen[other].sum(), rtol=0.01)  # mirror images

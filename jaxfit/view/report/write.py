@@ -91,8 +91,8 @@ def report_of_result(
     out: str | Path | None = None,
     overwrite: bool = False,
     force: bool = False,
-    measured: Sequence[Measured] = (),
     describe: Callable[[Path], Behaviour | None] = lambda _: None,
+    measured: Sequence[Measured] = (),
 ) -> Path:
     """Write the report of a result folder.
 
@@ -102,8 +102,8 @@ def report_of_result(
         out: file to write; None takes `report.html` in the folder of the result.
         overwrite: replace an existing file. Without `out`, an earlier report of the result is always replaced.
         force: draw also on footage that is not the footage of the result.
-        measured: metrics against a known truth.
         describe: returns what the birds of a result folder do; None stands for no such section.
+        measured: metrics against a known truth.
 
     Returns:
         The written file.
