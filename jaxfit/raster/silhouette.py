@@ -292,6 +292,7 @@ def _mask_loss_and_block(vertices, faces, target, weight, skin, camera_px, kind,
 
 
 def _mask_loss_and_block_forward(vertices, faces, target, weight, skin, camera_px, kind, blur, backend):
+    @jax.custom_batching.sequential_vmap  # the derivatives of one image need 100 MB, those of a batch all memory
     def reference(v, f, t, w, s):
         loss, gradient = jax.value_and_grad(silhouette_reference.mask_loss)(v, f, t, w, kind, blur)
         return loss, gradient, silhouette_reference.silhouette_gauss_newton(v, f, t, w, s, camera_px, blur)

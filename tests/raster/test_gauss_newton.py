@@ -206,6 +206,13 @@ def test_a_batch_equals_single_images(native):
         np.testing.assert_allclose(together[n], alone, atol=1e-5 * max(float(np.abs(alone).max()), 1))
 
 
+def test_without_kernels_a_batch_needs_the_memory_of_one_image():
+    rows = jnp.stack([row_of(seed=n) for n in range(100)])
+    program = jax.jit(jax.vmap(lambda row: block(row, "reference"))).lower(rows).compile()
+    derivatives_of_all_images = 100 * rows.shape[1] * SIZE**2 * 4
+    assert program.memory_analysis().temp_size_in_bytes < derivatives_of_all_images / 2
+
+
 def test_wrong_arguments(native):
     row = row_of()
     with pytest.raises(ValueError, match=r"target: expected shape \(size, size\)"):
