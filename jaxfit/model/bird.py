@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
@@ -121,6 +121,8 @@ D = 3B angles."""
 MAX_VERTICES, MAX_FACES = 100_000, 200_000
 """Largest mesh of a bird model."""
 _LIMITS = {"V": MAX_VERTICES, "F": MAX_FACES}
+MAX_NUMBER = 1e9
+"""Largest number of a model; the squares of larger numbers lose the other terms of a sum, or overflow."""
 
 
 def check_bird(bird: Bird, source: object) -> Bird:
@@ -133,116 +135,100 @@ def check_bird(bird: Bird, source: object) -> Bird:
     Raises:
         InputError: a field is wrong; the message names the first wrong field, its value and the expected value.
     """
-    _Checker(bird, source).run()
+    arrays = {name: np.asarray(getattr(bird, name)) for name in ARRAY_FIELDS}
+    for field, problem in _problems(bird, arrays):
+        raise InputError(source, f"{field}: {problem}", "correct the model, or import it again")
     return bird
 
 
-class _Checker:
-    def __init__(self, bird: Bird, source: object):
-        self.bird, self.source = bird, source
-        self.arrays = {name: np.asarray(getattr(bird, name)) for name in ARRAY_FIELDS}
-
-    def run(self) -> None:
-        self.check_tree()
-        self.check_shapes()
-        for field in ("joint_names", "keypoint_names"):
-            self.check_names(field)
-        self.require("name", self.bird.name.isprintable(), "cannot be printed")
-        unit = self.bird.metres_per_unit
-        self.require("metres_per_unit", unit is None or 0 < unit < np.inf, f"{unit} is not positive and finite")
-        self.check_pairs("joint_pairs", len(self.bird.parents))
-        self.check_pairs("keypoint_pairs", len(self.bird.keypoint_names))
-        faces, last = self.arrays["faces"], len(self.arrays["vertices"]) - 1
-        self.require("faces", faces.min() >= 0 and faces.max() <= last, f"an index outside 0…{last}")
-        self.check_weights("skin_weights")
-        most = int((self.arrays["skin_weights"] != 0).sum(axis=1).max())
-        self.require("skin_weights", most <= MAX_INFLUENCES, f"{most} joints move one vertex, the maximum is 8")
-        self.check_weights("keypoint_weights")
-        self.require("shape_variance", bool((self.arrays["shape_variance"] > 0).all()), "must be positive")
-        for field in ("pose_covariance", "bone_covariance"):
-            self.check_covariance(field)
-        self.check_colours()
-        self.check_limits()
-
-    def require(self, field: str, holds: object, problem: str) -> None:
-        if not holds:
-            raise InputError(self.source, f"{field}: {problem}", "correct the model, or import it again")
-
-    def check_shapes(self) -> None:
-        bones = max(len(self.bird.parents) - 1, 0)
-        sizes = {"J": bones + 1, "B": bones, "D": 3 * bones, "K": len(self.bird.keypoint_names), "3": 3, "2": 2}
-        for field, axes in ARRAY_FIELDS.items():
-            array = self.arrays[field]
-            self.require(field, array.ndim == len(axes.split()), f"shape {array.shape}, expected ({axes})")
-            for axis, size in zip(axes.split(), array.shape, strict=True):
-                # the first array with an axis defines the size of this axis
-                expected = sizes.setdefault(axis, size)
-                problem = f"shape {array.shape}, expected ({axes}) with {axis} = {expected}"
-                self.require(field, size == expected, problem)
-                self.require(field, size > 0 or axis == "S", f"shape {array.shape} has no entries")
-                most = _LIMITS.get(axis, size)
-                self.require(field, size <= most, f"shape {array.shape}, the limit is {axis} = {most:,}")
-            kind = "iu" if field == "faces" else "f"
-            self.require(field, array.dtype.kind in kind, f"has values of type {array.dtype}")
-            self.require(field, np.isfinite(array).all(), "holds NaN or infinite numbers")
-
-    def check_tree(self) -> None:
-        parents = self.bird.parents
-        self.require("parents", len(parents) >= 2, "a bird needs a root and at least one more joint")
-        self.require("parents", parents[0] == -1, f"joint 0 must be the root, −1, not {parents[0]}")
-        for joint, parent in enumerate(parents[1:], start=1):
-            problem = f"the parent of joint {joint} must be one of 0…{joint - 1}, not {parent}"
-            self.require("parents", 0 <= parent < joint, problem)
-
-    def check_names(self, field: str) -> None:
-        names: Sequence[str] = getattr(self.bird, field)
-        count = len(self.bird.parents) if field == "joint_names" else len(self.arrays["keypoint_weights"])
-        self.require(field, len(names) == count, f"{len(names)} names for {count}")
-        self.require(field, all(names), "an empty name")
-        self.require(field, all(map(str.isprintable, names)), "a name that cannot be printed")
-        repeated = [name for name, uses in Counter(names).items() if uses > 1]
-        self.require(field, not repeated, f"names used twice: {', '.join(sorted(repeated))}")
-
-    def check_pairs(self, field: str, count: int) -> None:
-        pairs = getattr(self.bird, field)
-        self.require(field, len(pairs) <= count, f"{len(pairs)} pairs of {count}")
+def _problems(bird: Bird, arrays: dict[str, np.ndarray]) -> Iterator[tuple[str, str]]:
+    """Yield the wrong fields of a bird, and what is wrong. The checks after the first wrong field may raise."""
+    parents, joints, keypoints = bird.parents, len(bird.parents), len(bird.keypoint_names)
+    if joints < 2:
+        yield "parents", "a bird needs a root and at least one more joint"
+    if parents[0] != -1:
+        yield "parents", f"joint 0 must be the root, −1, not {parents[0]}"
+    for joint, parent in enumerate(parents[1:], start=1):
+        if not 0 <= parent < joint:
+            yield "parents", f"the parent of joint {joint} must be one of 0…{joint - 1}, not {parent}"
+    yield from _shape_problems(bird, arrays)
+    if len(bird.joint_names) != joints:
+        yield "joint_names", f"{len(bird.joint_names)} names for {joints}"
+    for field, names in (("joint_names", bird.joint_names), ("keypoint_names", bird.keypoint_names)):
+        if not all(name and name.isprintable() for name in names):
+            yield field, "a name that is empty or cannot be printed"
+        if repeated := [name for name, uses in Counter(names).items() if uses > 1]:
+            yield field, f"names used twice: {', '.join(sorted(repeated))}"
+    if not bird.name.isprintable():
+        yield "name", "cannot be printed"
+    if bird.metres_per_unit is not None and not 0 < bird.metres_per_unit < np.inf:
+        yield "metres_per_unit", f"{bird.metres_per_unit} is not positive and finite"
+    for field, pairs, count in (
+        ("joint_pairs", bird.joint_pairs, joints),
+        ("keypoint_pairs", bird.keypoint_pairs, keypoints),
+    ):
         used = [index for pair in pairs for index in pair]
-        self.require(field, all(0 <= index < count for index in used), f"an index outside 0…{count - 1}")
-        self.require(field, len(used) == len(set(used)), "an index is in two pairs, or in one pair twice")
-
-    def check_weights(self, field: str) -> None:
-        weights = self.arrays[field]
-        self.require(field, (weights >= 0).all(), "negative weights")
+        if not all(0 <= index < count for index in used):
+            yield field, f"an index outside 0…{count - 1}"
+        if len(used) > len(set(used)):
+            yield field, "an index is in two pairs, or in one pair twice"
+    faces, last = arrays["faces"], len(arrays["vertices"]) - 1
+    if faces.min() < 0 or faces.max() > last:
+        yield "faces", f"an index outside 0…{last}"
+    for field in ("skin_weights", "keypoint_weights"):
+        weights = arrays[field]
         sums = weights.sum(axis=1)
         row = int(np.abs(sums - 1).argmax())
-        sums_to_one = abs(sums[row] - 1) <= SUM_TOLERANCE
-        self.require(field, sums_to_one, f"row {row} sums to {sums[row]:.4g}, not to 1")
-
-    def check_covariance(self, field: str) -> None:
-        matrix = self.arrays[field].astype(np.float64)
+        if weights.min() < 0:
+            yield field, "negative weights"
+        if abs(sums[row] - 1) > SUM_TOLERANCE:
+            yield field, f"row {row} sums to {sums[row]:.4g}, not to 1"
+    most = int((arrays["skin_weights"] != 0).sum(axis=1).max())
+    if most > MAX_INFLUENCES:
+        yield "skin_weights", f"{most} joints move one vertex, the maximum is {MAX_INFLUENCES}"
+    if not (arrays["shape_variance"] > 0).all():
+        yield "shape_variance", "must be positive"
+    for field in ("pose_covariance", "bone_covariance"):
+        matrix = arrays[field].astype(np.float64)
         size = np.abs(matrix).max()
-        self.require(field, size > 0, "is zero")
-        self.require(field, np.abs(matrix - matrix.T).max() <= 1e-5 * size, "is not symmetric")
         smallest = float(np.linalg.eigvalsh((matrix + matrix.T) / 2)[0])
-        # rounding to float32 may make an eigenvalue of 0 slightly negative
-        problem = f"is not positive semidefinite (eigenvalue {smallest:.3g})"
-        self.require(field, smallest >= -1e-5 * size, problem)
+        if size == 0:
+            yield field, "is zero"
+        if np.abs(matrix - matrix.T).max() > 1e-5 * size:
+            yield field, "is not symmetric"
+        if smallest < -1e-5 * size:  # rounding to float32 may make an eigenvalue of 0 slightly negative
+            yield field, f"is not positive semidefinite (eigenvalue {smallest:.3g})"
+    colours, limits = arrays["vertex_colours"], arrays["joint_limits"]
+    if colours.min() < 0 or colours.max() > 1:
+        yield "vertex_colours", f"values from {colours.min():.4g} to {colours.max():.4g}, sRGB values lie in [0, 1]"
+    for joint in np.argwhere(limits[..., 0] > limits[..., 1])[:, 0]:
+        yield "joint_limits", f"the minimum angle of {bird.joint_names[joint + 1]} exceeds the maximum"
+    largest = float(np.abs(limits).max())
+    if largest > 2 * np.pi + SUM_TOLERANCE:  # an axis-angle component beyond a full turn is never necessary
+        yield "joint_limits", f"{largest:.4g} radians is beyond a full turn"
 
-    def check_colours(self) -> None:
-        colours = self.arrays["vertex_colours"]
-        lowest, highest = float(colours.min()), float(colours.max())
-        problem = f"values from {lowest:.4g} to {highest:.4g}, sRGB values lie in [0, 1]"
-        self.require("vertex_colours", lowest >= 0 and highest <= 1, problem)
 
-    def check_limits(self) -> None:
-        limits = self.arrays["joint_limits"]
-        crossed = np.argwhere(limits[..., 0] > limits[..., 1])
-        joint = self.bird.joint_names[crossed[0, 0] + 1] if len(crossed) else ""
-        self.require("joint_limits", not joint, f"the minimum angle of {joint} exceeds the maximum")
-        largest = float(np.abs(limits).max())
-        # an axis-angle component beyond a full turn is never necessary
-        valid = largest <= 2 * np.pi + SUM_TOLERANCE
-        self.require("joint_limits", valid, f"{largest:.4g} radians is beyond a full turn")
+def _shape_problems(bird: Bird, arrays: dict[str, np.ndarray]) -> Iterator[tuple[str, str]]:
+    bones = len(bird.parents) - 1
+    sizes = {"J": bones + 1, "B": bones, "D": 3 * bones, "K": len(bird.keypoint_names), "3": 3, "2": 2}
+    for field, axes in ARRAY_FIELDS.items():
+        array = arrays[field]
+        if array.ndim != len(axes.split()):
+            yield field, f"shape {array.shape}, expected ({axes})"
+        for axis, size in zip(axes.split(), array.shape, strict=True):
+            expected = sizes.setdefault(axis, size)  # the first array with an axis defines the size of this axis
+            if size != expected:
+                yield field, f"shape {array.shape}, expected ({axes}) with {axis} = {expected}"
+            if size == 0 and axis != "S":
+                yield field, f"shape {array.shape} has no entries"
+            if size > _LIMITS.get(axis, size):
+                yield field, f"shape {array.shape}, the limit is {axis} = {_LIMITS[axis]:,}"
+        if array.dtype.kind not in ("iu" if field == "faces" else "f"):
+            yield field, f"has values of type {array.dtype}"
+        if not np.isfinite(array).all():
+            yield field, "holds NaN or infinite numbers"
+        elif field != "faces" and np.abs(array).max(initial=0) > MAX_NUMBER:
+            yield field, f"holds {np.abs(array).max():.3g}, more than {MAX_NUMBER:g}"
 
 
 def rest_length(bird: Bird) -> float:

@@ -161,23 +161,11 @@ def import_avian_mesh(json_path: Path | str, prior_path: Path | str | None = Non
     if prior_path is None:
         remedy = "give pose_bone_prior.pth too; it is published beside bird_eccv.json"
         raise InputError(json_path, "the prior of pose and bone lengths is missing", remedy)
-    mesh = read_model_json(json_path)
+    mesh = read_json_file(json_path)
+    if not isinstance(mesh, dict):
+        raise InputError(json_path, "not a JSON object", "expected bird_eccv.json")
     prior = read_prior(read_tensors(prior_path), PRIOR_KEYS, prior_path)
     return build_bird("avian-mesh", mesh, prior, AVIAN_MESH_KEYPOINTS, json_path)
-
-
-def read_model_json(path: Path | str) -> dict[str, Any]:
-    """Return the top-level object of a model's JSON file, with its values as parsed.
-
-    Raises:
-        InputError: the file is missing, too large, not JSON (the message names line and column), or does not
-            contain an object.
-    """
-    path = Path(path)
-    content = read_json_file(path)
-    if not isinstance(content, dict):
-        raise InputError(path, "not a JSON object", "expected bird_eccv.json")
-    return content
 
 
 OWN_PRIOR_KEYS = ("pose_mean", "pose_cov", "bone_mean", "bone_cov")
@@ -220,11 +208,13 @@ def import_aves(pt_path: Path | str, prior_path: Path | str | None = None) -> Bi
     return build_bird("aves", tensors, prior, AVES_KEYPOINTS, pt_path, shape)
 
 
-MODEL_KINDS = ("avian-mesh", "aves")
+_FILES = {
+    "avian-mesh": {".json": "bird_eccv.json", ".pth": "pose_bone_prior.pth"},
+    "aves": {".pt": "aves.pt", ".pth": "pose_bone_prior.pth"},
+}
+"""Published model → suffix and published name of each of its files."""
+MODEL_KINDS = tuple(_FILES)
 """Published models that jaxfit imports."""
-SUFFIXES = (".json", ".pt", ".pth")
-FILE_NAMES = {"mesh": "bird_eccv.json", "aves": "aves.pt", "prior": "pose_bone_prior.pth"}
-"""Published name of the file for each role."""
 
 
 def import_model(kind: str, sources: Sequence[Path | str]) -> Bird:
@@ -233,8 +223,8 @@ def import_model(kind: str, sources: Sequence[Path | str]) -> Bird:
     Args:
         kind: "avian-mesh" (`bird_eccv.json` and `pose_bone_prior.pth`) or "aves" (`aves.pt`; a prior is
             optional and replaces the prior of `aves.pt`).
-        sources: files or folders. In a folder, files that the model does not need are ignored. A file that is
-            named explicitly must belong to the model.
+        sources: files, which may have other names with the same suffix; or folders with the published names. The prior
+            of a folder does not replace the prior of `aves.pt`.
 
     Raises:
         ValueError: an unknown kind.
@@ -242,56 +232,25 @@ def import_model(kind: str, sources: Sequence[Path | str]) -> Bird:
     """
     if kind not in MODEL_KINDS:
         raise ValueError(f"kind must be one of {', '.join(MODEL_KINDS)}, not {kind!r}")
-    main = "mesh" if kind == "avian-mesh" else "aves"
-    needed = {FILE_NAMES[main]} | ({FILE_NAMES["prior"]} if kind == "avian-mesh" else set())
+    names = _FILES[kind]
     chosen: dict[str, Path] = {}
-    for path, explicit in _list_files(sources):
-        # a damaged file with the expected name is an error, even where the user named only its folder
-        role = _role(path, strict=explicit or path.name in needed)
-        if role not in (main, "prior"):
-            if explicit:
-                remedy = f"{kind} needs {FILE_NAMES[main]} and {FILE_NAMES['prior']}"
-                raise InputError(path, f"not a file of the {kind} model", remedy)
-            continue
-        # aves.pt contains a prior already: only an explicit file replaces that prior
-        if role == "prior" and kind == "aves" and not explicit:
-            continue
-        if role in chosen and chosen[role].resolve() != path.resolve():
-            problem = f"a second {FILE_NAMES[role]} beside {chosen[role]}"
-            raise InputError(path, problem, "give one of the two, by its file name")
-        chosen[role] = path
-    shown = ", ".join(map(str, sources)) or "nothing"
-    if main not in chosen:
-        raise InputError(shown, f"holds no {FILE_NAMES[main]}", f"give the {kind} model's {FILE_NAMES[main]}")
-    if kind == "aves":
-        return import_aves(chosen["aves"], chosen.get("prior"))
-    return import_avian_mesh(chosen["mesh"], chosen.get("prior"))
-
-
-def _list_files(sources: Sequence[Path | str]) -> list[tuple[Path, bool]]:
-    """Return (file, whether the user named this file explicitly) for all sources."""
-    files: list[tuple[Path, bool]] = []
     for source in map(Path, sources):
         if os.path.isdir(source):  # noqa: PTH112 - False for paths that cannot exist
-            try:
-                inside = [path for path in sorted(source.iterdir()) if path.is_file()]
-            except OSError as error:
-                raise InputError(source, f"cannot be read: {error.strerror}", "check the permissions") from error
-            files += [(path, False) for path in inside if path.suffix.lower() in SUFFIXES]
+            own = names if kind == "avian-mesh" else [".pt"]
+            files = [source / names[suffix] for suffix in own if (source / names[suffix]).is_file()]
         else:
-            files.append((check_readable(source, "a file of a bird model"), True))
-    return files
-
-
-def _role(path: Path, strict: bool) -> str:
-    """Return "mesh", "aves", "prior" or "other", from the content; with `strict`, a damaged file is an error."""
-    try:
-        if path.suffix.lower() == ".json":
-            keys = read_model_json(path).keys()
-            return "mesh" if {"V", "J"} & keys else "other"
-        keys = read_tensors(path).keys()
-        return "aves" if "V" in keys else "prior" if {"p_m", "b_m"} & keys else "other"
-    except InputError:
-        if strict:
-            raise
-        return "other"
+            files = [check_readable(source, "a file of a bird model")]
+        for file in files:
+            suffix = file.suffix.lower()
+            if suffix not in names:
+                remedy = f"{kind} needs {' and '.join(names.values())}"
+                raise InputError(file, f"not a file of the {kind} model", remedy)
+            if chosen.setdefault(suffix, file).resolve() != file.resolve():
+                problem = f"a second {names[suffix]} beside {chosen[suffix]}"
+                raise InputError(file, problem, "give one of the two, by its file name")
+    main, name = next(iter(names.items()))
+    if main not in chosen:
+        shown = ", ".join(map(str, sources)) or "nothing"
+        raise InputError(shown, f"holds no {name}", f"give the {kind} model's {name}")
+    read = import_aves if kind == "aves" else import_avian_mesh
+    return read(chosen[main], chosen.get(".pth"))

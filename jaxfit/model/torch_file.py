@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import io
 import pickle
-import pickletools
 import struct
 import zipfile
 from collections import OrderedDict
@@ -36,7 +35,6 @@ STORAGE_DTYPES = {
     "ByteStorage": "|u1",
 }
 LEGACY_MAGIC, LEGACY_PROTOCOL = 0x1950A86A20F9469CFC6C, 1001
-_MAX_MEMO = 1_000_000
 
 
 class _StorageType(NamedTuple):
@@ -66,13 +64,6 @@ class _Unpickler(pickle.Unpickler):
     def __init__(self, file: io.BytesIO):
         super().__init__(file)
         self.storages: dict[str, _Storage] = {}
-        start = file.tell()
-        for opcode, argument, _ in pickletools.genops(file):  # also checks the lengths of texts
-            if (
-                opcode.name in ("PUT", "LONG_BINPUT") and int(argument or 0) > _MAX_MEMO
-            ):  # memory for all smaller numbers
-                raise pickle.UnpicklingError("it numbers its parts beyond any checkpoint")
-        file.seek(start)
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):

@@ -252,8 +252,8 @@ def _posed(bird: Bird, posture: Posture | None) -> Float[np.ndarray, "V 3"]:
 
 def _scale(bird: Bird, zoom: float) -> np.ndarray:
     """Return the bottom strip of the sheet: name of the model and a scale bar of a round length."""
-    known = bird.metres_per_unit is not None
-    per_unit, unit = (100 * bird.metres_per_unit, "cm") if known else (1.0, "model units")
+    metres = bird.metres_per_unit
+    per_unit, unit = (1.0, "model units") if metres is None else (100 * metres, "cm")
     longest = 0.6 * TILE_PX / zoom * per_unit
     power = 10.0 ** np.floor(np.log10(longest))
     length = next(step * power for step in (5, 2, 1) if step * power <= longest)

