@@ -67,22 +67,6 @@ def path(tmp_path):
     return tmp_path / "net.onnx"
 
 
-@pytest.mark.parametrize(
-    ("layout", "metadata"),
-    [
-        ("yolo", {"names": "["}),
-        ("yolo", {"names": "[" * 10**5}),
-        ("rf_detr", {"rfdetr_inference": "{"}),
-        ("rf_detr", {"rfdetr_inference": '{"class_id_to_name": {}}'}),
-        ("bottom_up", {"names": "['bird']", "longer_side": "100"}),
-    ],
-)
-def test_metadata_that_cannot_be_used(path, layout, metadata):
-    write(path, SEGMENTERS[layout], metadata=metadata)
-    with pytest.raises(InputError, match=r"names|classes|longer_side"):
-        load(path)
-
-
 def test_values_that_are_not_finite(path):
     for value in [np.nan, np.inf, -np.inf, 1e30]:
         for layout in SEGMENTERS:

@@ -5,7 +5,6 @@ import hashlib
 import cv2
 import numpy as np
 import pytest
-from support.cli_files import rejected
 from support.saliency_graphs import BIRD_ROW, write_saliency, write_yolox, yolox_head
 
 from jaxfit.config.perception import SegmenterConfig, TrackConfig
@@ -77,14 +76,6 @@ def test_another_kind_or_class(files):
         load_segmenter("general", kind="yolo")
     with pytest.raises(InputError, match="lacks murre; its classes are person"):
         load_segmenter("general", classes=["murre"])
-
-
-def test_a_command_reports_a_missing_file_in_one_line(folder, tmp_path, capsys):
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    cv2.imwrite(str(frames / "0.png"), np.zeros((64, 64, 3), np.uint8))
-    arguments = ["track", str(frames), "--segmenter", "general", "--out", str(tmp_path / "out")]
-    rejected(capsys, arguments, "yolox_nano.onnx: does not exist", "download https://")
 
 
 def test_the_published_files_detect_a_real_bird(reference_dir, monkeypatch, tmp_path):

@@ -28,7 +28,7 @@ def test_files_are_small_and_state_their_training_data():
 @pytest.fixture(scope="module")
 def tracked(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unseen") / "scene"
-    scene = simulate(load_murre(), folder, birds=4, frames=8, size=(1296, 760), seed=1005)
+    scene = simulate(load_murre(), folder, birds=4, frames=6, size=(1296, 760), seed=1005)
     return run_tracking(folder / FOOTAGE, TrackConfig(min_track_frames=1)), scene.truth
 
 
