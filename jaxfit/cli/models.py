@@ -48,20 +48,17 @@ def model_view(options: argparse.Namespace) -> None:
 
 
 def prior_learn(options: argparse.Namespace) -> None:
-    """Learn a pose prior from results, write a model with this prior and print how the prior changed.
-
-    With `--motion`, learn the term `motion_likelihood`, write a config and print the accelerations of the results.
-    """
+    """Learn a pose prior from results, write a model with this prior and print how the prior changed."""
     import numpy as np
 
     from jaxfit.data.solution import load_solution
     from jaxfit.foundation.files import check_writable
     from jaxfit.learning.priors import learn_prior
 
-    check_writable(options.out)  # before the long work
     if options.motion:
-        _motion_learn(options)
-        return
+        remedy = "set terms.motion_likelihood in a config, as `jaxfit config show map` prints it"
+        raise InputError("--motion", "is no option any more", remedy)
+    check_writable(options.out)  # before the long work
     learnt = learn_prior([(folder, *load_solution(folder)) for folder in options.results])
     counts = {"poses": learnt.poses, "birds": learnt.birds, "effective_poses": learnt.effective_poses}
     notes = {f"prior_{name}": value for name, value in counts.items()} | {"prior_shrinkage": learnt.shrinkage}
@@ -82,43 +79,6 @@ def prior_learn(options: argparse.Namespace) -> None:
     weight = f"weight of `pose_prior` in `map` for this width: {learnt.pose_prior_weight:.2g}"
     show(f"width of the poses: {learnt.width:.2g} times the covariance of the model's prior; {weight}")
     show(f"{learnt.bird.name} with this prior → {options.out}; use the model with `--model {options.out}`")
-
-
-def _motion_learn(options: argparse.Namespace) -> None:
-    """Learn the settings of `motion_likelihood` from results, and write a config with these settings."""
-    import numpy as np
-
-    from jaxfit.data.solution import load_solution
-    from jaxfit.data.tracks import UNKNOWN_FPS
-    from jaxfit.foundation.files import write_whole
-    from jaxfit.learning.priors import learn_motion, motion_config
-
-    if options.out.suffix not in (".yaml", ".yml"):
-        raise InputError(options.out, "is not the name of a config", "choose a name that ends in .yaml")
-    learnt = learn_motion([(folder, load_solution(folder)[0]) for folder in options.results])
-    write_whole(options.out, motion_config(learnt).encode())
-    table = right_aligned("median rad/s²", "95 % quantile rad/s²", title="angular acceleration")
-    table.add_column("joints")
-    for name, norms in sorted(learnt.groups.items(), key=lambda group: -np.median(group[1])):
-        table.add_row(*(f"{value:.3g}" for value in np.quantile(norms, [0.5, 0.95])), name)
-    show(table)
-    table = right_aligned("sd_rad_s2", "dof", "held-out nats", title="cost per joint and frame")
-    table.add_column("settings")
-    costs = {"learnt": (learnt.prior, learnt.cost), "shipped": (learnt.shipped, learnt.shipped_cost)}
-    for name, (prior, cost) in costs.items():
-        table.add_row(*(f"{value:.3g}" for value in prior), "–" if cost is None else f"{cost:.3f}", name)
-    show(table)
-    show("held-out: the cost of each bird, with settings learnt from all other birds; a lower cost is better")
-    if learnt.unknown_rates:
-        results = counted(learnt.unknown_rates, "result")
-        show(f"the frame rate of {results} is not known and is taken as {UNKNOWN_FPS:g} frames/s")
-    skipped = f" ({counted(learnt.diverged, 'diverged track')} skipped)" if learnt.diverged else ""
-    tracks, runs = counted(learnt.birds, "track"), counted(learnt.frames, "run")
-    equivalent = f"{learnt.effective_birds:.1f} tracks of equal length"
-    show(f"{runs} of three frames of {tracks}{skipped}, equivalent to {equivalent}")
-    maximum = ", ".join(f"{name} {value:.3g}" for name, value in learnt.unshrunk._asdict().items())
-    show(f"maximum of likelihood: {maximum}; share of the shipped settings {100 * learnt.shrinkage:.0f} %")
-    show(f"config → {options.out}; use the config with `--config {options.out}`")
 
 
 def list_configs(options: argparse.Namespace) -> None:

@@ -454,13 +454,10 @@ def _adapt_photos(command: Parser) -> None:
 
 @_command("cameras and models", "prior learn", "models.prior_learn")
 def _prior_learn(command: Parser) -> None:
-    """Learn a pose prior from the poses of results and write a model with this prior, or learn a term of motion."""
+    """Learn a pose prior from the poses of results and write a model with this prior."""
     command.add_argument("results", type=Path, nargs="+", metavar="RESULTS", help="result folders of fits of one model")
-    text = "learn the term `motion_likelihood` from the angular accelerations of results, and write a config"
-    command.add_argument("--motion", action="store_true", help=text)
-    add_out(
-        command, "P.npz|M.yaml", "model file to write, for `--model`; with --motion: config to write, for `--config`"
-    )
+    command.add_argument("--motion", action="store_true", help=argparse.SUPPRESS)
+    add_out(command, "P.npz", "model file to write, for `--model`")
 
 
 @_command("research", "simulate", "demo.simulate_scene")

@@ -109,21 +109,6 @@ MURRE_SKELETON = (
 """Pairs of murre keypoints that drawings connect by lines."""
 
 
-_GROUPS = {
-    "wings": ("wing", "shoulder", "elbow", "wrist"),
-    "legs": ("hip", "knee", "ankle", "foot", "leg", "shin", "toe"),
-    "head": ("head", "neck", "jaw", "bill", "beak"),
-}
-"""Group of joints → parts of the names of its joints."""
-
-
-def joint_group(name: str) -> str:
-    """Return the group of a joint: root, wings, legs or head; body for all other joints."""
-    if name == "root":
-        return "root"
-    return next((group for group, parts in _GROUPS.items() if any(part in name for part in parts)), "body")
-
-
 def mirror_pairs(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
     """Return (left, right) indices of the names that differ only in the prefix `left_` or `right_`."""
     index = {name: i for i, name in enumerate(names)}

@@ -141,3 +141,5 @@ def test_the_command(tmp_path, capsys):
     capsys.readouterr()
     assert main(["prior", "learn", str(tmp_path / "absent"), "--out", str(out)]) == 2
     assert "absent" in capsys.readouterr().err
+    assert main(["prior", "learn", "--motion", str(tmp_path / "one"), "--out", str(tmp_path / "motion.yaml")]) == 2
+    assert "terms.motion_likelihood" in capsys.readouterr().err
