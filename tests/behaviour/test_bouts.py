@@ -43,67 +43,39 @@ UP = {"body_pitch": "> 50"}
 
 
 # ---------------------------------------------------------------------------------------------------------- one rule
+HYSTERESIS = {"begins": {"body_pitch": "> 3"}, "lasts": {"body_pitch": "> 1"}}
+INTERRUPTED = [60] * 2 + [0] + [60] * 4 + [0] + [60] * 7
 
 
-def test_a_bout_begins_at_one_limit_and_lasts_to_another():
-    pitch = [0, 2, 4, 2, 0, 2, 2, 0, 4, 0, 2, 2, 4]
-    rule = {"begins": {"body_pitch": "> 3"}, "lasts": {"body_pitch": "> 1"}}
-    assert found({"body_pitch": pitch}, rule) == [(1, 4), (8, 9), (10, 13)]
-    assert found({"body_pitch": pitch}, {"begins": {"body_pitch": "> 3"}}) == [(2, 3), (8, 9), (12, 13)]
+@pytest.mark.parametrize(
+    ("pitch", "rule", "expected"),
+    [
+        ([0, 2, 4, 2, 0, 2, 2, 0, 4, 0, 2, 2, 4], HYSTERESIS, [(1, 4), (8, 9), (10, 13)]),
+        ([0, 2, 4, 2, 0, 2, 2, 0, 4], {"begins": {"body_pitch": "> 3"}}, [(2, 3), (8, 9)]),
+        # a bridge joins runs of which one begins, and there is nothing to bridge at the ends
+        ([2, 2, 0, 2, 4, 0, 0, 0, 2], HYSTERESIS | {"bridge_s": 0.2}, [(0, 5)]),
+        ([0, 0, 4, 0, 0], HYSTERESIS | {"bridge_s": 0.2}, [(2, 3)]),
+        # a limit itself is outside, and a value that is not defined holds no condition
+        ([50, 51, 50, 49], {"begins": UP}, [(1, 2)]),
+        ([-5, -4, 5, 4], {"begins": {"body_pitch": "-5 to 5"}}, [(1, 2), (3, 4)]),
+        ([60, np.nan, 60], {"begins": {"body_pitch": "-500 to 500"}}, [(0, 1), (2, 3)]),
+        ([np.nan] * 4, {"begins": UP}, []),
+        # an interruption of 3 frames lasts 0.3 s
+        ([60] * 5 + [0] * 3 + [60] * 5, {"begins": UP, "bridge_s": 0.3}, [(0, 13)]),
+        ([60] * 5 + [0] * 4 + [60] * 5, {"begins": UP, "bridge_s": 0.3}, [(0, 5), (9, 14)]),
+        # short runs do not count; five frames last 0.5 s; interruptions are bridged first
+        (INTERRUPTED, {"begins": UP, "least_s": 0.5}, [(8, 15)]),
+        ([0] + [60] * 5 + [0], {"begins": UP, "least_s": 0.5}, [(1, 6)]),
+        (INTERRUPTED, {"begins": UP, "least_s": 1.4, "bridge_s": 0.2}, [(0, 15)]),
+    ],
+)
+def test_bouts_of_one_rule(pitch, rule, expected):
+    assert found({"body_pitch": pitch}, rule) == expected
 
 
 def test_all_conditions_of_a_rule_hold_together():
-    pitch, roll = [60, 60, 60, 0, 60], [0, 9, -9, 0, 4]
-    assert found({"body_pitch": pitch, "body_roll": roll}, {"begins": UP | {"body_roll": "-5 to 5"}}) == [
-        (0, 1),
-        (4, 5),
-    ]
-
-
-def test_a_limit_itself_is_outside():
-    assert found({"body_pitch": [50, 51, 50, 49]}, {"begins": UP}) == [(1, 2)]
-    assert found({"body_pitch": [-5, -4, 5, 4]}, {"begins": {"body_pitch": "-5 to 5"}}) == [(1, 2), (3, 4)]
-
-
-def test_a_value_that_is_not_defined_holds_no_condition():
-    for condition in ("> 0", "< 100", "-500 to 500"):
-        assert found({"body_pitch": [60, np.nan, 60]}, {"begins": {"body_pitch": condition}}) == [(0, 1), (2, 3)]
-    nothing = find_bouts(described({"body_pitch": [np.nan] * 4}), rules(up={"begins": UP}))
-    assert nothing.bouts == ()
-    assert (nothing.state == nothing.names.index(OTHER)).all()
-
-
-@pytest.mark.parametrize("frames", [1, 2, 3, 4])
-def test_short_interruptions_belong_to_the_bout(frames):
-    """An interruption of 3 frames lasts 0.3 s."""
-    pitch = [60] * 5 + [0] * frames + [60] * 5
-    expected = [(0, 10 + frames)] if frames <= 3 else [(0, 5), (5 + frames, 10 + frames)]
-    assert found({"body_pitch": pitch}, {"begins": UP, "bridge_s": 0.3}) == expected
-
-
-def test_a_bridge_joins_runs_of_which_one_begins():
-    pitch = [2, 2, 0, 2, 4, 0, 0, 0, 2]
-    rule = {"begins": {"body_pitch": "> 3"}, "lasts": {"body_pitch": "> 1"}, "bridge_s": 0.2}
-    assert found({"body_pitch": pitch}, rule) == [(0, 5)]
-    assert found({"body_pitch": [0, 0, 4, 0, 0]}, rule) == [(2, 3)]  # nothing to bridge at the ends
-
-
-def test_short_runs_do_not_count():
-    pitch = [60] * 2 + [0] + [60] * 4 + [0] + [60] * 7
-    assert found({"body_pitch": pitch}, {"begins": UP, "least_s": 0.5}) == [(8, 15)]
-    bridged = {"begins": UP, "least_s": 1.4, "bridge_s": 0.2}
-    assert found({"body_pitch": pitch}, bridged) == [(0, 15)]  # interruptions are bridged first
-
-
-def test_frame_rates_do_not_matter():
-    """The same second of the same bird at 10, 25 and 50 frames/s."""
-    for fps in (10, 25, 50):
-        time_s = np.arange(4 * fps) / fps
-        up = ((time_s > 0.95) & (time_s < 1.95)) | ((time_s > 2.15) & (time_s < 2.35)) | (time_s > 3.15)
-        rule = {"begins": UP, "bridge_s": 0.3, "least_s": 0.9}
-        (bout,) = find_bouts(described({"body_pitch": 60.0 * up}, fps=fps), rules(up=rule)).bouts
-        assert bout.start_s == pytest.approx(1, abs=0.051)
-        assert bout.stop_s == pytest.approx(2.35, abs=0.051)
+    values = {"body_pitch": [60, 60, 60, 0, 60], "body_roll": [0, 9, -9, 0, 4]}
+    assert found(values, {"begins": UP | {"body_roll": "-5 to 5"}}) == [(0, 1), (4, 5)]
 
 
 def test_start_and_stop():
@@ -115,39 +87,18 @@ def test_start_and_stop():
     assert (late.bouts[0].start_s, late.bouts[0].stop_s) == (7.5, 8.5)
 
 
-def test_a_bird_without_a_pose_does_nothing():
-    valid = np.array([[True, False, False, False, True, True]])
-    ethogram = find_bouts(described({"body_pitch": [60] * 6}, valid=valid), rules(up={"begins": UP}))
-    assert spans(ethogram) == [(0, 0, 1), (0, 4, 6)]
+def test_a_bird_without_a_pose_does_nothing_but_a_short_interruption_belongs_to_its_bout():
+    valid = np.array([[True, False, False, False, True, False, True]])
+    rule = {"begins": UP, "bridge_s": 0.1}
+    ethogram = find_bouts(described({"body_pitch": [60] * 7}, valid=valid), rules(up=rule))
+    assert spans(ethogram) == [(0, 0, 1), (0, 4, 7)]
     np.testing.assert_array_equal(ethogram.state == NO_POSE, ~valid)
-
-
-def test_every_bird_has_its_own_bouts():
-    pitch = [[60, 60, 0, 0], [0, 0, 0, 0], [0, 60, 60, 60]]
-    ethogram = find_bouts(described({"body_pitch": pitch}, track_id=[5, 3, 9]), rules(up={"begins": UP}))
-    assert spans(ethogram) == [(0, 0, 2), (2, 1, 4)]  # a bird is a position, not a track number
-
-
-def test_one_frame_and_no_frame_with_a_value():
-    assert found({"body_pitch": [60]}, {"begins": UP}) == [(0, 1)]
-    assert found({"body_pitch": [60]}, {"begins": UP, "least_s": 0.5}) == []
-
-
-def test_a_short_interruption_without_a_pose_belongs_to_the_bout():
-    valid = np.array([[True] * 5 + [False] + [True] * 5])
-    ethogram = find_bouts(described({"body_pitch": [60] * 11}, valid=valid), rules(up={"begins": UP, "bridge_s": 0.3}))
-    assert spans(ethogram) == [(0, 0, 11)]
 
 
 def test_a_pause_of_the_camera_ends_a_bout():
     time_s = np.concatenate([np.arange(10) / FPS, 3600 + np.arange(10) / FPS])
     bouts = find_bouts(described({"body_pitch": [60] * 20}, time_s=time_s), rules(up={"begins": UP})).bouts
     assert [each.stop_s - each.start_s for each in bouts] == pytest.approx([1.0, 1.0])
-
-
-def test_a_bout_of_the_least_duration_counts():
-    """Five frames last 0.5 s: `stop_s` - `start_s`."""
-    assert found({"body_pitch": [0] + [60] * 5 + [0]}, {"begins": UP, "least_s": 0.5}) == [(1, 6)]
 
 
 # ----------------------------------------------------------------------------------------------------- several rules
@@ -165,12 +116,6 @@ def test_earlier_rules_take_their_frames():
     assert spans(second, "high") == []
 
 
-def test_a_run_that_is_too_short_takes_no_frames():
-    high, low = {"begins": {"body_pitch": "> 70"}, "least_s": 0.5}, {"begins": UP}
-    ethogram = find_bouts(described({"body_pitch": [60, 80, 80, 60]}), rules(high=high, low=low))
-    assert spans(ethogram) == [(0, 0, 4)]
-
-
 def test_what_an_earlier_rule_leaves_may_be_too_short():
     """Of 0.8 s, the earlier rule leaves 0.2 s and 0.4 s; the later rule has the short rest."""
     pitch = [60] * 2 + [80] * 2 + [60] * 4
@@ -185,21 +130,10 @@ def test_what_an_earlier_rule_leaves_has_a_frame_in_which_it_begins():
     frame = np.arange(60)
     speed = np.where((frame >= 20) & (frame < 30), 0.5, 0.2) * LENGTH_M
     pitch = np.where((frame >= 18) & (frame < 32), 60, 0)
-    walking = {"begins": {"speed": "> 0.3"}, "lasts": {"speed": "> 0.15"}}
-    ethogram = find_bouts(
-        described({"speed": speed, "body_pitch": pitch}), rules(attack={"begins": UP}, walking=walking)
-    )
+    config = rules(attack={"begins": UP}, walking={"begins": {"speed": "> 0.3"}, "lasts": {"speed": "> 0.15"}})
+    ethogram = find_bouts(described({"speed": speed, "body_pitch": pitch}), config)
     assert spans(ethogram) == [(0, 18, 32)]
     np.testing.assert_array_equal(ethogram.state[0], np.where(pitch > 50, 0, 2))
-
-
-def test_missing_poses_do_not_make_a_long_bout_too_short():
-    """Of 2 s, every fourth frame has no pose."""
-    valid = (np.arange(20) % 4 != 3)[None]
-    ethogram = find_bouts(
-        described({"body_pitch": [60] * 20}, valid), rules(up={"begins": UP, "least_s": 0.5, "bridge_s": 0.3})
-    )
-    assert (ethogram.state[valid] == 0).all()
 
 
 AIR = {"begins": {"airborne": "> 0.7"}, "lasts": {"airborne": "> 0.3"}}
@@ -212,55 +146,44 @@ def flights(airborne, valid=True, around_s=0.2, **how):
     return find_bouts(described({"airborne": airborne}, valid, **how), config)
 
 
-def test_starts_and_ends_that_are_seen():
-    """The first frame in the air is frame 6, and the first frame on the ledge after it is frame 14."""
-    ethogram = flights([0] * 6 + [1] * 8 + [0] * 6, around_s=0.25)
-    assert spans(ethogram, "off") == [(0, 4, 9)]
-    assert spans(ethogram, "down") == [(0, 12, 17)]
-    assert spans(ethogram, "flight") == [(0, 9, 12)]
+TIME_S = np.arange(20) / FPS
+THERE_AND_BACK = [0] * 6 + [1] * 8 + [0] * 6
 
 
-def test_starts_and_ends_that_are_not_seen():
-    always = flights([1] * 8)
-    assert spans(always) == [(0, 0, 8)]
-    leaves = flights([0] * 6 + [1] * 8)
-    assert [each.behaviour for each in leaves.bouts] == ["off", "flight"]
-    arrives = flights([1] * 8 + [0] * 6)
-    assert [each.behaviour for each in arrives.bouts] == ["flight", "down"]
-    hidden = np.array([[True] * 5 + [False] + [True] * 8])
-    assert [each.behaviour for each in flights([0] * 6 + [1] * 8, hidden).bouts] == ["flight"]
-
-
-def test_a_short_flight_has_a_take_off_and_a_landing():
-    """The take-off does not reach beyond the flight, nor the landing before it."""
-    ethogram = flights([0] * 8 + [1] * 2 + [0] * 8, around_s=0.45)
-    assert spans(ethogram, "off") == [(0, 4, 10)]
-    assert spans(ethogram, "down") == [(0, 10, 15)]
-
-
-def test_nobody_sees_a_start_or_an_end_behind_a_pause_of_the_video():
-    time_s = np.arange(20) / FPS
-    paused = time_s + 60 * (np.arange(20) >= 6)
-    airborne = [0] * 6 + [1] * 8 + [0] * 6
-    assert [each.behaviour for each in flights(airborne, time_s=paused).bouts] == ["flight", "down"]
-    paused = time_s + 60 * (np.arange(20) >= 14)
-    assert [each.behaviour for each in flights(airborne, time_s=paused).bouts] == ["off", "flight"]
+@pytest.mark.parametrize(
+    ("airborne", "how", "expected"),
+    [
+        # the first frame in the air is frame 6, and the first frame on the ledge after it is frame 14
+        (THERE_AND_BACK, {"around_s": 0.25}, {"off": (4, 9), "flight": (9, 12), "down": (12, 17)}),
+        # the take-off does not reach beyond the flight, nor the landing before it
+        ([0] * 8 + [1] * 2 + [0] * 8, {"around_s": 0.45}, {"off": (4, 10), "down": (10, 15)}),
+        # starts and ends that are not seen: at the ends of the video, without a pose, behind a pause of the video
+        ([1] * 8, {}, {"flight": (0, 8)}),
+        ([0] * 6 + [1] * 8, {}, {"off": (4, 9), "flight": (9, 14)}),
+        ([1] * 8 + [0] * 6, {}, {"flight": (0, 6), "down": (6, 11)}),
+        ([0] * 6 + [1] * 8, {"valid": np.arange(14)[None] != 5}, {"flight": (6, 14)}),
+        (THERE_AND_BACK, {"time_s": TIME_S + 60 * (TIME_S > 0.55)}, {"flight": (6, 12), "down": (12, 17)}),
+        (THERE_AND_BACK, {"time_s": TIME_S + 60 * (TIME_S > 1.35)}, {"off": (4, 9), "flight": (9, 14)}),
+    ],
+)
+def test_starts_and_ends(airborne, how, expected):
+    bouts = flights(airborne, **how).bouts
+    assert {each.behaviour: (each.frames.start, each.frames.stop) for each in bouts} == expected
+    assert len(bouts) == len(expected)
 
 
 def test_one_frame_in_the_air_is_no_flight():
     """By the shipped rules, at 25 frames/s."""
-    airborne = np.zeros(60)
-    airborne[20] = 1
-    zeros = {name: np.full(60, np.nan) for name in ("body_pitch", "neck_angle", "speed")}
-    config = load_behaviour_config()
-    missing = {each.name: "not measured" for each in config.features if each.name not in {"airborne", *zeros}}
-    one = find_bouts(described(zeros | {"airborne": airborne}, fps=25, missing=missing), config)
-    assert {each.behaviour for each in one.bouts} == {"standing"}
-    airborne[20:26] = 1
-    six = find_bouts(described(zeros | {"airborne": airborne}, fps=25, missing=missing), config)
-    assert {each.behaviour for each in six.bouts} == {"take_off", "landing", "standing"}
-    airborne[20:38] = 1
-    long = find_bouts(described(zeros | {"airborne": airborne}, fps=25, missing=missing), config)
+    config, unknown = load_behaviour_config(), dict.fromkeys(("body_pitch", "neck_angle", "speed"), [np.nan] * 60)
+    missing = {each.name: "not measured" for each in config.features if each.name not in {"airborne", *unknown}}
+
+    def shown(last):
+        airborne = (np.arange(60) >= 20) & (np.arange(60) < last)
+        return find_bouts(described(unknown | {"airborne": airborne}, fps=25, missing=missing), config)
+
+    assert {each.behaviour for each in shown(21).bouts} == {"standing"}
+    assert {each.behaviour for each in shown(26).bouts} == {"take_off", "landing", "standing"}
+    long = shown(38)
     assert spans(long, "flight") == [(0, 28, 31)]  # what take-off and landing leave, though 0.12 s
     assert not (long.state == long.names.index(OTHER)).any()
 
@@ -295,11 +218,6 @@ def test_the_partner_is_the_usual_neighbour():
     assert find_bouts(described(alone), rules(up={"begins": UP, "partner": True})).bouts[0].partner is None
     one_bird = {"body_pitch": [60, 60]}
     assert find_bouts(described(one_bird), rules(up={"begins": UP, "partner": True})).bouts[0].partner is None
-
-
-def test_any_track_number_can_be_a_partner():
-    values = {"body_pitch": [60, 60], "neighbour": [-3, -3]}
-    assert find_bouts(described(values), rules(up={"begins": UP, "partner": True})).bouts[0].partner == -3
 
 
 def test_means_of_a_bout():
@@ -380,12 +298,12 @@ def test_the_time_of_every_behaviour():
 
 
 def test_a_bird_without_a_pose_has_no_share():
-    valid = np.array([[True] * 4, [False] * 4])
-    rows, _ = budget([[60] * 4, [60] * 4], valid=valid)
+    rows, _ = budget([[60] * 4, [60] * 4], valid=np.array([[True] * 4, [False] * 4]))
     assert np.isnan(rows[2, "up"].share)
     assert rows[2, "up"].seconds == 0
     assert rows[None, "up"].share == 1
     assert np.isnan(rows[None, "up"].low)  # one bird has no interval
+    assert all(np.isnan(row.share) for row in budget(np.zeros((0, 5)))[1])
 
 
 def test_the_interval_of_two_birds():
@@ -406,31 +324,6 @@ def test_the_interval_of_many_birds():
     half = 1.96 * share.std() / np.sqrt(40)
     assert total.share == pytest.approx(share.mean())
     assert (total.low, total.high) == pytest.approx((share.mean() - half, share.mean() + half), abs=0.1 * half)
-
-
-def test_birds_that_are_seen_longer_weigh_more():
-    valid = np.ones((3, 100), bool)
-    valid[1:, 10:] = False
-    rows, _ = budget([[0] * 100, [60] * 100, [60] * 100], valid=valid)
-    assert rows[None, "up"].share == pytest.approx(20 / 120)
-    assert rows[None, "up"].low == 0
-    assert rows[None, "up"].high == 1
-
-
-def test_no_bird_has_no_budget():
-    description = described({"body_pitch": np.zeros((0, 5))})
-    ethogram = find_bouts(description, rules(up={"begins": UP}))
-    assert ethogram.bouts == ()
-    assert all(np.isnan(row.share) for row in time_budget(ethogram, np.zeros(0, int)))
-
-
-def test_the_time_of_a_video_whose_frame_rate_changes():
-    """Upright for 4 s at 25 frames/s, then not for 1 s at 50 frames/s."""
-    time_s = np.concatenate([np.arange(100) / 25, 4 + np.arange(50) / 50])
-    rows, _ = budget([60] * 100 + [0] * 50, time_s=time_s)
-    assert rows[1, "up"].seconds == pytest.approx(4, abs=0.1)
-    assert rows[1, OTHER].seconds == pytest.approx(1, abs=0.1)
-    assert rows[1, "up"].share == pytest.approx(0.8, abs=0.01)
 
 
 def test_budget_and_bouts_of_a_video_whose_frame_rate_changes():
@@ -469,18 +362,3 @@ def test_a_part_of_a_result_has_the_values_of_the_whole():
     np.testing.assert_array_equal(chosen.state, ethogram.state[rows][:, columns])
     total = time_budget(chosen, part.flock.solution.track_id)[0]
     assert (total.seconds, total.share, total.bouts) == pytest.approx((0.4, 4 / 12, 2))
-
-
-# -------------------------------------------------------------------------------------------------- foreign features
-
-
-@pytest.fixture
-def package(tmp_path, monkeypatch):
-    (tmp_path / "own_rules.py").write_text("def tall(birds):\n    return birds.place[..., 2]\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-
-
-def test_a_rule_with_a_feature_of_another_package(package):
-    config = rules(up={"begins": {"own_rules:tall": "> 0.5"}})
-    description = describe(flock(result(place_m=np.array([[[0, 0, 0.2], [0, 0, 0.8]]]))), config.features)
-    assert spans(find_bouts(description, config)) == [(0, 1, 2)]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.described import (
     BIRD,
-    LENGTH_M,
     REST,
     STANDING,
     STRAIGHT,
@@ -158,28 +157,6 @@ def test_features_of_postures_are_those_of_points_by_hand(murres):
             for name, expected in by_hand(joints, keypoints, turn[n, t]).items():
                 tolerance = 1e-4 if name in ("bill_to_body", "height", "wing_spread") else 0.01
                 assert values[name][n, t] == pytest.approx(expected, abs=tolerance, nan_ok=True), (name, n, t)
-
-
-def test_postures_look_as_their_names_say():
-    poses = {name: np.asarray(POSTURES[name].body_pose) for name in POSTURES}
-    pitch = {name: np.degrees(POSTURES[name].pitch_rad) for name in POSTURES}
-    names = list(POSTURES)
-    found = values_of(
-        result(np.stack([poses[n] for n in names])[None], turned(0, np.array([pitch[n] for n in names]))[None])
-    )
-    at = {name: names.index(name) for name in names}
-
-    def value(name, posture):
-        return found[name][0, at[posture]]
-
-    assert value("wing_spread", "wings_up") > 0.7 > value("wing_spread", "wings_half") > 0.3
-    assert value("wing_spread", "standing") < 0.1
-    assert value("wing_elevation", "wings_up") > 25
-    assert value("wing_elevation", "wings_down") < -25
-    assert value("neck_angle", "jab") < 20 < 40 < value("neck_angle", "incubating")
-    assert value("gaze_turn", "preening_left") == pytest.approx(value("gaze_turn", "preening_right"), abs=0.1)
-    assert value("bill_to_body", "preening_left") < 0.25 * LENGTH_M < value("bill_to_body", "standing")
-    assert value("body_pitch", "alert") == pytest.approx(57, abs=1e-3)
 
 
 # ------------------------------------------------------------------------------------------------------------- wings

@@ -60,6 +60,7 @@ def rule(**keys):
         (rule(bridge_s=float("nan")), "bridge_s", "finite"),
         (lambda: BehaviourConfig({}), "behaviours", "has no rules"),
         (lambda: rules(**{"Big bird": {"begins": UP}}), "behaviours.Big bird", "is no name"),
+        (lambda: rules(other={"begins": UP}), "behaviours.other", "is the name of frames"),
         (lambda: rules(off={"start_of": "flight"}), "behaviours.off.start_of", "'flight'"),
         (lambda: rules(a={"start_of": "b"}, b={"end_of": "a"}), "behaviours.a.start_of", "begins"),
     ],
@@ -69,11 +70,6 @@ def test_wrong_rules_are_named(build, key, words):
         build()
     assert caught.value.key == key
     assert words in str(caught.value)
-
-
-def test_the_name_other_is_taken():
-    with pytest.raises(ConfigKeyError):
-        rules(other={"begins": UP})
 
 
 def test_the_shipped_rules():

@@ -68,13 +68,6 @@ def test_small_movements_of_the_wings_are_no_wingbeat():
         assert np.isnan(found[name]).all(), name
 
 
-def test_three_frames_show_no_wingbeat():
-    found, _ = beating([5.0], 25, 0.12)
-    assert found["beat_frequency"].shape == (1, 3)
-    for name in NAMES:
-        assert np.isnan(found[name]).all(), name
-
-
 # ------------------------------------------------------------------------------- the spectrum alone
 
 
@@ -84,15 +77,6 @@ def test_other_frame_rates(fps):
     found = rhythm(signal(time_s, 6.3), time_s)
     np.testing.assert_allclose(found.frequency_hz, 6.3, rtol=0.01)
     np.testing.assert_allclose(found.amplitude, 20, rtol=0.02)
-
-
-def test_a_rhythm_that_begins_and_ends():
-    time_s = np.arange(150) / 25
-    found = rhythm(np.where((time_s > 2) & (time_s < 4), signal(time_s, 7.0), 10.0), time_s)
-    inside, outside = (time_s > 2.5) & (time_s < 3.5), (time_s < 1.5) | (time_s > 4.5)
-    np.testing.assert_allclose(found.frequency_hz[inside], 7, rtol=0.02)
-    for values in found:
-        assert np.isnan(values[outside]).all()
 
 
 def test_a_rhythm_that_becomes_faster():
@@ -106,27 +90,24 @@ def test_a_rhythm_that_becomes_faster():
 
 
 def test_gaps():
-    """Frames without a pose have no rhythm; short gaps do not change that of the others, long gaps leave none."""
-    time_s = np.arange(100) / 25
+    """Frames without a pose have no rhythm; short gaps do not change that of the others, long gaps leave none.
+
+    The camera pauses for 30 s before frame 80, and no window bridges the pause. The second bird has no pose.
+    """
+    time_s = np.arange(130) / 25
+    time_s[80:] += 30
     values = signal(time_s, 6.0)
     values[[10, 11, 12, 30, 33, 34]] = np.nan
-    values[60:75] = np.nan
-    found = rhythm(values, time_s)
-    unknown = np.isnan(found.frequency_hz)
+    values[55:65] = np.nan
+    found = rhythm_of(np.stack([values, np.full(130, np.nan)]), time_s, 5.0)
+    unknown = np.isnan(found.frequency_hz[0])
     assert unknown[np.isnan(values)].all()
-    assert not unknown[:45].any() or set(np.flatnonzero(unknown[:45])) <= {10, 11, 12, 30, 33, 34}
-    np.testing.assert_allclose(found.frequency_hz[~unknown], 6, rtol=0.01)
-    error = (found.phase_deg - np.degrees(2 * np.pi * 6 * time_s + 1) + 180) % 360 - 180
+    assert set(np.flatnonzero(unknown[:45])) <= {10, 11, 12, 30, 33, 34}
+    assert not unknown[105:].any()
+    np.testing.assert_allclose(found.frequency_hz[0, ~unknown], 6, rtol=0.01)
+    error = (found.phase_deg[0] - np.degrees(2 * np.pi * 6 * time_s + 1) + 180) % 360 - 180
     assert np.nanmax(np.abs(error)) < 5
-
-
-def test_a_window_with_few_poses_has_no_rhythm():
-    time_s = np.arange(100) / 25
-    values = np.full(100, np.nan)
-    values[40:55] = signal(time_s, 6.0)[40:55]  # 0.6 s of a window of 1 s
-    assert np.isnan(rhythm(values, time_s).frequency_hz).all()
-    values[35:60] = signal(time_s, 6.0)[35:60]
-    assert np.isfinite(rhythm(values, time_s).frequency_hz[35:60]).all()
+    assert np.isnan(found.frequency_hz[1]).all()
 
 
 def test_uneven_times():
@@ -138,21 +119,13 @@ def test_uneven_times():
     assert np.abs(error).max() < 10
 
 
-def test_a_pause_of_the_camera_is_bridged_by_no_window():
+def test_a_window_with_few_poses_has_no_rhythm():
     time_s = np.arange(100) / 25
-    time_s[50:] += 30
-    found = rhythm(signal(time_s, 5.0), time_s)
-    known = np.isfinite(found.frequency_hz)
-    assert known[:25].all()
-    assert known[75:].all()
-    np.testing.assert_allclose(found.frequency_hz[known], 5, rtol=0.03)
-
-
-@pytest.mark.parametrize("fps", [25, 50])
-def test_noise_of_fitted_poses_is_no_rhythm(fps):
-    noise = 2.5 * np.random.default_rng(0).normal(size=(6, 3 * fps))
-    found = rhythm_of(noise, np.arange(3 * fps) / fps, 5.0)
-    assert np.isnan(found.frequency_hz).all()
+    values = np.full(100, np.nan)
+    values[40:55] = signal(time_s, 6.0)[40:55]  # 0.6 s of a window of 1 s
+    assert np.isnan(rhythm(values, time_s).frequency_hz).all()
+    values[35:60] = signal(time_s, 6.0)[35:60]
+    assert np.isfinite(rhythm(values, time_s).frequency_hz[35:60]).all()
 
 
 def test_a_ramp_and_a_still_bird_have_no_rhythm():
@@ -168,12 +141,6 @@ def test_a_rhythm_in_noise_and_on_a_trend():
     np.testing.assert_allclose(found.amplitude, 20, atol=4)
 
 
-def test_the_strongest_of_two_rhythms():
-    time_s = np.arange(100) / 25
-    found = rhythm(signal(time_s, 4.0) + 8 * np.cos(2 * np.pi * 9 * time_s), time_s)
-    np.testing.assert_allclose(found.frequency_hz, 4, rtol=0.03)
-
-
 def test_too_slow_videos_have_no_rhythm():
     for fps in (1, 3):
         time_s = np.arange(60) / fps
@@ -181,14 +148,6 @@ def test_too_slow_videos_have_no_rhythm():
     for frames in (0, 1, 2, 3):
         time_s = np.arange(frames) / 25
         assert rhythm_of(np.zeros((2, frames)), time_s, 5.0).phase_deg.shape == (2, frames)
-
-
-def test_birds_do_not_change_each_other():
-    time_s = np.arange(60) / 25
-    both = rhythm_of(np.stack([signal(time_s, 5.0), np.full(60, np.nan), signal(time_s, 8.0)]), time_s, 5.0)
-    np.testing.assert_array_equal(both.frequency_hz[0], rhythm(signal(time_s, 5.0), time_s).frequency_hz)
-    np.testing.assert_array_equal(both.phase_deg[2], rhythm(signal(time_s, 8.0), time_s).phase_deg)
-    assert np.isnan(both.amplitude[1]).all()
 
 
 @pytest.mark.parametrize("frequency_hz", [0.8, 1.0, 12.4, 12.5])
@@ -219,7 +178,7 @@ def test_a_bird_that_raises_its_wings_once_does_not_beat_them(seconds, back):
 def test_rounding_does_not_hide_a_pure_sinusoid():
     """The share of the variance that a pure sinusoid explains may exceed 1 by rounding."""
     time_s = np.arange(25) / 25
-    for frequency_hz in np.arange(3, 10, 0.1):
+    for frequency_hz in np.arange(3, 10, 0.4):
         found = rhythm(20 * np.sin(2 * np.pi * frequency_hz * (time_s - 0.48)), time_s)
         np.testing.assert_allclose(found.frequency_hz, frequency_hz, rtol=0.05)
 
