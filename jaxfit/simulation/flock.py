@@ -284,20 +284,16 @@ def _separation(a: _Body, b: _Body) -> Float[np.ndarray, "T 2"]:
     """Compute the shift of bird a along the ledge that separates it from b, per frame; zero without overlap."""
     position_a, position_b = a.position(), b.position()
     worst, direction = np.zeros(len(position_a)), np.zeros((len(position_a), 2))
+    share, frames = np.linspace(0, 1, 5), np.arange(len(position_a))  # five points along each axis are precise enough
+    s, u = np.repeat(share, 5)[:, None, None], np.tile(share, 5)[:, None, None]
     for start_a, end_a, radius_a in a.capsules:
         for start_b, end_b, radius_b in b.capsules:
-            gap = np.full(len(position_a), np.inf)
-            between = np.zeros((len(position_a), 3))
-            for s in np.linspace(0, 1, 5):  # five points along each axis are precise enough
-                for u in np.linspace(0, 1, 5):
-                    point_a = start_a + s * (end_a - start_a) + position_a
-                    offset = point_a - (start_b + u * (end_b - start_b) + position_b)
-                    distance = np.linalg.norm(offset, axis=1)
-                    nearer = distance < gap
-                    gap, between[nearer] = np.where(nearer, distance, gap), offset[nearer]
-            depth = radius_a + radius_b - gap
+            offset = start_a + s * (end_a - start_a) + position_a - (start_b + u * (end_b - start_b) + position_b)
+            distance = np.linalg.norm(offset, axis=-1)
+            nearest = distance.argmin(0)
+            depth = radius_a + radius_b - distance[nearest, frames]
             deeper = depth > worst
-            worst[deeper], direction[deeper] = depth[deeper], between[deeper, :2]
+            worst[deeper], direction[deeper] = depth[deeper], offset[nearest, frames][deeper, :2]
     apart = (position_a - position_b)[:, :2]
     direction = np.where(np.linalg.norm(direction, axis=1, keepdims=True) > 0.3, direction, apart)
     return worst[:, None] * direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-6)

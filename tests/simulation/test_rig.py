@@ -14,12 +14,17 @@ from jaxfit.simulation.scene import mesh_keypoints
 
 BIRD = load_murre()
 UNIT = BIRD.metres_per_unit
-SMALL = {"birds": 2, "frames": 3, "size": (480, 280), "seed": 4}
+SMALL = {"birds": 2, "frames": 8, "size": (480, 280), "seed": 4}
 
 
 @pytest.fixture(scope="module")
-def rig():
-    return stage_rig(BIRD, 3, distorted=True, **SMALL)
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("rig") / "scene"
+
+
+@pytest.fixture(scope="module")
+def rig(folder):
+    return simulate_rig(BIRD, folder, 3, distorted=True, **SMALL)
 
 
 def test_every_camera_sees_the_same_birds(rig):
@@ -48,7 +53,7 @@ def test_true_poses_are_in_the_frame_of_each_camera(rig):
 def test_detections_of_the_cameras_differ_and_have_ids_of_their_own(rig):
     confident = [scene.detections.confidence for scene in rig.scenes]
     assert not np.array_equal(confident[0], confident[1])
-    five = stage_rig(BIRD, 4, birds=5, frames=2, size=(480, 280), seed=4)
+    five = stage_rig(BIRD, 3, **SMALL | {"birds": 5})
     boxes = []
     for scene in five.scenes:
         assert scene.detections.track_id.tolist() == scene.truth.track_id.tolist()
@@ -57,24 +62,17 @@ def test_detections_of_the_cameras_differ_and_have_ids_of_their_own(rig):
     assert any(order != sorted(order) for order in boxes)
 
 
-def test_cameras_of_a_file_film_the_same_pictures(tmp_path):
-    first = simulate_rig(BIRD, tmp_path / "a", 2, distorted=True, **SMALL)
-    cameras = read_cameras(tmp_path / "a" / "cameras.toml")
-    second = stage_rig(BIRD, cameras, **SMALL)
-    for a, b in zip(first.scenes, second.scenes, strict=True):
+def test_cameras_of_a_file_film_the_same_pictures(rig, folder):
+    second = stage_rig(BIRD, read_cameras(folder / "cameras.toml"), **SMALL)
+    for a, b in zip(rig.scenes, second.scenes, strict=True):
         np.testing.assert_allclose(a.truth.keypoints_px, b.truth.keypoints_px, atol=1e-3)
-    assert sorted(path.name for path in (tmp_path / "a" / "cam1").iterdir()) == [
-        "detections.json",
-        "footage.mp4",
-        "scene.json",
-        "truth",
-        "truth.json",
-    ]
-    assert read_coco(tmp_path / "a" / "cam1" / "truth.json").num_tracks == 2
+    names = {path.name for path in (folder / "cam1").iterdir()}
+    assert names == {"detections.json", "footage.mp4", "scene.json", "truth", "truth.json"}
+    assert read_coco(folder / "cam1" / "truth.json").num_tracks == 2
 
 
-def test_cameras_that_cannot_be_simulated_are_refused():
-    camera = stage_rig(BIRD, 1, **SMALL).cameras[0]
+def test_cameras_that_cannot_be_simulated_are_refused(rig):
+    camera = rig.cameras[0]
     fields = {name: getattr(camera, name) for name in ("name", "matrix", "distortion", "R_cam_world", "transl_cam")}
     with pytest.raises(InputError, match="has no image size"):
         stage_rig(BIRD, [Camera(**fields)], **SMALL)
