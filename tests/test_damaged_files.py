@@ -35,7 +35,7 @@ from jaxfit.perception.segmentation import load_segmenter
 from jaxfit.video.pictures import read_picture
 from jaxfit.video.reader import read_frames
 
-VARIANTS, MAT_VARIANTS = 20, 5  # a .mat file is read in a process of its own, which takes a second
+VARIANTS, MAT_VARIANTS = 20, 2  # a .mat file is read in a process of its own, which takes a second
 VALUES = (
     None,
     True,

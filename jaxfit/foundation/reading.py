@@ -18,8 +18,6 @@ import numpy as np
 
 from jaxfit.foundation.errors import InputError
 
-MAX_FILE_BYTES = 2_000_000_000
-"""Largest file that is read into memory at once."""
 _CHECK_PATH = "check the path"
 # Errors of the operating system for a read: the problem, and the action that the user can take.
 _PROBLEMS = {
@@ -111,21 +109,17 @@ def open_file(path: str | Path, kind: str = "a file", absent: str = _CHECK_PATH)
 
 
 def read_file(path: str | Path, kind: str = "a file") -> bytes:
-    """Return the bytes of a regular file of at most `MAX_FILE_BYTES`.
+    """Return the bytes of a regular file.
 
     Raises:
-        InputError: as `check_readable`; or the file is larger.
+        InputError: as `check_readable`.
     """
     with open_file(path, kind) as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > MAX_FILE_BYTES:
-            problem = f"has {size:,} bytes, more than {MAX_FILE_BYTES:,}"
-            raise InputError(path, problem, f"give {kind} of at most this size")
         return file.read()
 
 
 def read_text(path: str | Path, kind: str) -> str:
-    """Return the text of a UTF-8 file of at most `MAX_FILE_BYTES`, without a byte order mark.
+    """Return the text of a UTF-8 file, without a byte order mark.
 
     Raises:
         InputError: as `read_file`; or the content is not UTF-8.

@@ -64,22 +64,16 @@ def test_the_value_of_a_term_is_its_weight():
     ("values", "words"),
     [
         ({"windw": 1}, ("windw", "window")),
-        ({"crop.sze_px": 1}, ("crop.sze_px", "size_px")),
         ({"window.frames": 1}, ("window.frames",)),
-        ({"nothing.here": 1}, ("nothing.here",)),
         ({"stages.msk.steps": 1}, ("msk", "did you mean mask", "keypoints")),
         ({"stages.².steps": 1}, ("'²'",)),
         ({f"stages.{'9' * 5000}.steps": 1}, ("99999",)),
-        ({"": 1}, ("is not a known key",)),
-        ({"window": "="}, ("refers to",)),
         ({"terms.mask": 10**400}, ("expected a number",)),
         ({"crop.mode": []}, ("crop.mode", "is []")),
-        ({"stages[2].steps": 1}, ("'2'", "keypoints", "mask")),
         ({"window": "=no.such"}, ("no.such",)),
         ({"window": "=terms.no_such"}, ("terms.no_such", "not set")),
         ({"window": 0}, ("window", "above 0")),
         ({"terms.no_such": 1}, ("no_such",)),
-        ({"terms.velocity.no_such": 1}, ("no_such",)),
     ],
 )
 def test_unknown_paths_and_values(values, words):

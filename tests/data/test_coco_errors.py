@@ -1,7 +1,6 @@
 """COCO json: one clear error, with file, entry and remedy, for every bad file."""
 
 import copy
-import json
 import math
 
 import numpy as np
@@ -17,16 +16,12 @@ BAD = [
     ([], [1, 2], "must hold an object with images, categories and annotations"),
     (["images"], REMOVED, "lacks the key images"),
     (["images"], [], "images is empty"),
-    (["images", 1], 3, "images must be a list of objects"),
     (["images", 1, "id"], 7, r"images\[1\]: id 7 occurs for the second time"),
     (["images", 0, "width"], 0, r"images\[0\]: a size of 0×20 is outside 1 to 16,384 pixels"),
-    (["images", 0, "height"], math.nan, r"images\[0\]: .*NaN"),
     (["images", 0, "width"], "30", r"images\[0\]: '30' must be a whole number"),
     (["images", 0, "frame_index"], REMOVED, r"images\[0\] lacks the key frame_index \(give every image"),
-    (["images", 0, "frame_index"], 1.5, r"images\[0\]: 1.5 must be a whole number"),
     (["categories"], [], "categories hold none with keypoints"),
     (["categories", 0, "keypoints", 1], "bill", "keypoint_names must be different names, but hold 'bill' twice"),
-    (["categories", 0, "keypoints", 1], 4, r"categories\[0\]: keypoints must be names"),
     (["categories"], lambda old: old * 2, r"categories\[1\]: id 1 occurs for the second time"),
     (["categories", 0, "skeleton", 0], [1, 4], r"categories\[0\]: skeleton \[\(1, 4\), .* are not 1 to 3"),
     (["annotations", 3, "image_id"], 99, r"annotations\[3\]: image_id is 99, which no image has"),
@@ -36,19 +31,13 @@ BAD = [
     (["annotations", 3, "keypoints"], [1] * 8, r"annotations\[3\]: keypoints has 8 numbers, not 9"),
     (["annotations", 3, "keypoints", 1], math.nan, "keypoints_px must be finite where it is not missing"),
     (["annotations", 3, "keypoints", 0], 1e30, "keypoints_px holds 1e.30, which is no position in an image"),
-    (["annotations", 3, "keypoints", 0], "1", r"annotations\[3\]: keypoints must be numbers"),
     (["annotations", 1, "keypoint_scores", 0], 1.01, r"confidence must lie in \[0, 1\]"),
     (["annotations", 1, "keypoint_scores"], [1], r"annotations\[1\]: keypoint_scores has 1 numbers, not 3"),
-    (["annotations", 1, "score"], 1.5, r"score must lie in \[0, 1\]"),
     (["annotations", 3, "bbox", 2], 0, r"annotations\[3\]: bbox has width 0 and height 8"),
-    (["annotations", 3, "bbox", 2], math.nan, r"annotations\[3\]: bbox has width nan"),
     (["annotations", 0, "segmentation", "size"], [30, 20], r"size is \[30, 20\], but its image is \[20, 30\]"),
     (["annotations", 0, "segmentation", "counts"], "", r"annotations\[0\]\): segmentation.counts is corrupt"),
-    (["annotations", 0, "segmentation", "counts"], "é", "segmentation.counts is corrupt"),
     (["annotations", 0, "segmentation", "counts"], lambda s: s[:-1], "segmentation.counts is corrupt"),
-    (["annotations", 0, "segmentation", "counts"], lambda s: s * 50, "segmentation.counts is corrupt"),
     (["annotations", 3, "segmentation", "counts", 0], 1, "segmentation.counts is corrupt: its runs do not cover"),
-    (["annotations", 3, "segmentation", "counts"], [601, -1], "segmentation.counts is corrupt"),
     (["annotations", 4, "segmentation"], [[1, 2, 3, 4, 5]], "segmentation must be a list of polygons"),
     (["annotations", 4, "segmentation", 0, 3], 500000, "segmentation lies far outside its image"),
     (["info"], {"fps": -25}, "fps must be positive"),
@@ -118,8 +107,3 @@ def test_only_other_categories_is_no_bird(tmp_path):
         entry["category_id"] = 2
     with pytest.raises(InputError, match=r"annotations hold no bird \(5 of other categories\)"):
         read_coco(saved(tmp_path, data))
-
-
-def test_a_byte_order_mark_is_no_content(tmp_path):
-    (tmp_path / "marked.json").write_bytes(b"\xef\xbb\xbf" + json.dumps(content()).encode())
-    assert read_coco(tmp_path / "marked.json").num_tracks == 2

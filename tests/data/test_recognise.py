@@ -1,7 +1,6 @@
 """Files and videos that do not belong together, sizes of images, and files of no known format."""
 
 import json
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -125,13 +124,6 @@ def test_other_content(tmp_path, content, message):
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(InputError, match=message):
         read_observations(tmp_path / "file")
-
-
-def test_paths_that_are_no_files(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    for path in (tmp_path, tmp_path / "pipe", tmp_path / "none"):
-        with pytest.raises(InputError, match=r"is a folder|is a device or a pipe|does not exist"):
-            read_observations(path)
 
 
 def test_without_the_extra(tmp_path, monkeypatch):

@@ -2,10 +2,8 @@
 
 import errno
 import os
-import subprocess
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from jaxfit.foundation.errors import InputError
@@ -64,46 +62,6 @@ def test_a_rejected_write_changes_nothing(tmp_path, monkeypatch, number):
         write_whole(tmp_path / "deep" / "down" / "file", b"new")
     assert names(tmp_path) == ["file"]
     assert path.read_bytes() == b"old"
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_a_full_device(tmp_path):
-    def content(file):
-        file.write(b"half")
-        with open("/dev/full", "wb", buffering=0) as full:  # noqa: PTH123
-            full.write(b"the other half")
-
-    with pytest.raises(InputError, match="No space left on device"):
-        write_whole(tmp_path / "file", content)
-    assert names(tmp_path) == []
-
-
-@pytest.fixture
-def tiny_disk(tmp_path):
-    """A file system of 64 KiB."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)]
-    try:
-        mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
-    except OSError:
-        mounted = False
-    if not mounted:
-        pytest.skip("mounting a small disk is not allowed here")
-    yield folder
-    subprocess.run(["umount", str(folder)], check=True)
-
-
-def test_a_disk_that_fills_up(tiny_disk):
-    with new_folder(tiny_disk / "results") as folder:
-        (folder / "poses.npz").write_bytes(b"old")
-    numbers = np.random.default_rng(0).random(100_000)
-    with pytest.raises(InputError, match="results: cannot be written: No space left"):
-        fill(tiny_disk / "results", lambda f: np.savez(f / "poses.npz", a=numbers), overwrite=True)
-    with pytest.raises(InputError, match=r"file: cannot be written: No space left"):
-        write_whole(tiny_disk / "file", bytes(100_000))
-    assert names(tiny_disk) == ["results"]
-    assert (tiny_disk / "results" / "poses.npz").read_bytes() == b"old"
 
 
 def test_other_errors_are_not_converted_and_leave_no_files(tmp_path):

@@ -5,12 +5,12 @@ import logging
 import av
 import numpy as np
 import pytest
-from support.films import COUNT, encode, number_in, numbered, overwrite, packets, reader_threads, write
+from support.films import COUNT, encode, number_in, overwrite, packets, reader_threads, write
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.video import decoding
 from jaxfit.video.decoding import frame_times
-from jaxfit.video.reader import Frame, VideoInfo, probe_video, read_frames
+from jaxfit.video.reader import VideoInfo, probe_video, read_frames
 
 KINDS = {
     "b_frames.mp4": {"options": {"bf": "3", "x264-params": "b-pyramid=normal"}},
@@ -190,8 +190,3 @@ def test_a_file_with_only_sound(tmp_path, name):
         container.mux(stream.encode(None))
     with pytest.raises(InputError, match="has no video stream"):
         read_frames(tmp_path / name)
-
-
-def test_number_in_reads_the_number_of_a_picture():
-    assert [number_in(numbered(i)) for i in range(256)] == list(range(256))
-    assert Frame(1, numbered(1), None).index == 1

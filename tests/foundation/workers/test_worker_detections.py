@@ -17,6 +17,7 @@ from support.toy_footage import (
     TrueSegmenter,
     assert_same_tracking,
 )
+from support.worker_tasks import quick_fit
 
 from jaxfit.cli.main import main
 from jaxfit.config.perception import FramesConfig, SegmenterConfig, TrackConfig, TrackerConfig
@@ -143,6 +144,7 @@ def test_networks_that_run_in_this_process(video, workers, monkeypatch, caplog, 
 
 def test_the_commands(video, scheduler, tmp_path, monkeypatch):
     """The files of tracking and of a reconstruction on workers are those of one process."""
+    monkeypatch.setattr("jaxfit.fitting.tasks.fit_task", quick_fit)
     FOOTAGE.write(tmp_path / "frames")
     save_bird(BIRD, tmp_path / "toy.npz")
     (tmp_path / "quick.yaml").write_text(CONFIG_OF_A_COMMAND + "overlay: {write: false}\n")
