@@ -31,8 +31,9 @@ LINEAR = [
     "stage_anchor",
 ]
 """Terms whose residuals are linear in the pose: their quadratic is a bound everywhere."""
-D = frame_rows(terms_by_hand.window_pose(), SHARED_PARAMETERS).shape[1]
-IS_SHARED = shared_columns(terms_by_hand.window_pose(), SHARED_PARAMETERS)
+POSE, ANCHOR = terms_by_hand.window_pose(), terms_by_hand.window_pose(seed=5)
+IS_SHARED = shared_columns(POSE, SHARED_PARAMETERS)
+D = len(IS_SHARED)
 
 
 def settings(name):
@@ -40,8 +41,7 @@ def settings(name):
 
 
 def window_of(pose, targets):
-    anchor = terms_by_hand.window_pose(seed=5)
-    return terms_by_hand.posed_window(pose, targets, anchor, SHARED_PARAMETERS)
+    return terms_by_hand.posed_window(pose, targets, ANCHOR, SHARED_PARAMETERS)
 
 
 def moved(pose, rows):

@@ -47,6 +47,11 @@ TINY_KEYPOINTS = (
 )
 
 
+def array(values, dtype=np.float32):
+    """Return an array of JAX without an operation of JAX, each of which would be compiled."""
+    return jax.device_put(np.asarray(values, dtype))
+
+
 def _pairs(names):
     return tuple((i, names.index("right" + n[4:])) for i, n in enumerate(names) if n.startswith("left"))
 
@@ -84,21 +89,21 @@ def _bird_of_ellipsoids(name: str, parts: dict, points: dict, shapes: int, subdi
     bones = len(names) - 1
     # shape directions: a thicker and a longer bird
     basis = np.stack([vertices * [0.1, 0, 0.1], vertices * [0, 0.1, 0]])[:shapes]
-    f32 = jnp.float32
+
     return Bird(
-        vertices=jnp.asarray(vertices, f32),
-        faces=jnp.asarray(np.concatenate(faces), jnp.int32),
-        joints=jnp.asarray([part[1] for part in parts.values()], f32),
-        skin_weights=jnp.asarray(np.concatenate(weights), f32),
-        keypoint_weights=jnp.asarray(np.eye(len(vertices))[nearest], f32),
-        shape_basis=jnp.asarray(basis, f32),
-        shape_variance=jnp.ones(shapes),
-        pose_mean=jnp.zeros(3 * bones),
-        pose_covariance=0.1 * jnp.eye(3 * bones),
-        bone_mean=jnp.ones(bones),
-        bone_covariance=0.01 * jnp.eye(bones),
-        vertex_colours=jnp.asarray(neutral_colours(len(vertices))),
-        joint_limits=jnp.asarray(unlimited_joints(bones)),
+        vertices=array(vertices),
+        faces=array(np.concatenate(faces), np.int32),
+        joints=array([part[1] for part in parts.values()]),
+        skin_weights=array(np.concatenate(weights)),
+        keypoint_weights=array(np.eye(len(vertices))[nearest]),
+        shape_basis=array(basis),
+        shape_variance=array(np.ones(shapes)),
+        pose_mean=array(np.zeros(3 * bones)),
+        pose_covariance=array(0.1 * np.eye(3 * bones)),
+        bone_mean=array(np.ones(bones)),
+        bone_covariance=array(0.01 * np.eye(bones)),
+        vertex_colours=array(neutral_colours(len(vertices))),
+        joint_limits=array(unlimited_joints(bones)),
         parents=tuple(-1 if part[0] is None else names.index(part[0]) for part in parts.values()),
         joint_names=names,
         keypoint_names=tuple(points),
@@ -167,15 +172,15 @@ def random_pose(bird: Bird, seed: int, spread: float = 0.5) -> Pose:
     bones = bird.num_joints - 1
 
     def some(*shape):
-        return jnp.asarray(spread * rng.normal(size=shape), jnp.float32)
+        return np.float32(spread * rng.normal(size=shape))
 
     return Pose(
-        global_orient=2 * some(3),
-        body_pose=some(bones, 3),
-        transl=some(3) + jnp.array([0, 0, 150.0]),
-        scale=jnp.asarray(rng.uniform(0.7, 1.4), jnp.float32),
-        bone_length=1 + 0.3 * some(bones),
-        betas=some(bird.num_shapes),
+        global_orient=array(2 * some(3)),
+        body_pose=array(some(bones, 3)),
+        transl=array(some(3) + np.float32([0, 0, 150.0])),
+        scale=array(rng.uniform(0.7, 1.4)),
+        bone_length=array(1 + np.float32(0.3) * some(bones)),
+        betas=array(some(bird.num_shapes)),
     )
 
 

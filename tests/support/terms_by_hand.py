@@ -50,11 +50,12 @@ RIG, PRIORS = fold_bird(BIRD), priors_of(BIRD)
 
 def window_pose(seed=0, spread=0.2):
     """A window of T frames with different poses."""
-    frames = [random_pose(BIRD, seed + t, spread) for t in range(T)]
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *frames)
-    transl = 0.2 * (stacked.transl - jnp.array([0, 0, 150.0])) + jnp.array([0, 0, 160.0])
+    frames = [jax.tree.map(np.asarray, random_pose(BIRD, seed + t, spread)) for t in range(T)]
+    stacked = jax.tree.map(lambda *x: np.stack(x), *frames)
+    transl = np.float32(0.2) * (stacked.transl - np.float32([0, 0, 150])) + np.float32([0, 0, 160])
     first = frames[0]
-    return dataclasses.replace(stacked, transl=transl, bone_length=first.bone_length, betas=first.betas)
+    pose = dataclasses.replace(stacked, transl=transl, bone_length=first.bone_length, betas=first.betas)
+    return jax.device_put(pose)
 
 
 def random_targets(seed=0):
@@ -62,15 +63,16 @@ def random_targets(seed=0):
     rng = np.random.default_rng(seed)
     mask = np.zeros((T, SIZE, SIZE), np.uint8)
     mask[:, 8:22, 6:25] = 1
-    return Targets(
-        keypoints_px=jnp.asarray(rng.uniform(0, SIZE, (T, BIRD.num_keypoints, 2)), jnp.float32),
-        confidence=jnp.asarray(rng.uniform(0.1, 1, (T, BIRD.num_keypoints)), jnp.float32),
-        mask=jnp.asarray(mask),
-        has_mask=jnp.ones(T, bool),
-        present=jnp.ones(T, bool),
-        corner_px=jnp.asarray(rng.uniform(0, 5, (T, 2)), jnp.float32),
-        frame_s=jnp.float32(FRAME_S),
+    targets = Targets(
+        keypoints_px=np.float32(rng.uniform(0, SIZE, (T, BIRD.num_keypoints, 2))),
+        confidence=np.float32(rng.uniform(0.1, 1, (T, BIRD.num_keypoints))),
+        mask=mask,
+        has_mask=np.ones(T, bool),
+        present=np.ones(T, bool),
+        corner_px=np.float32(rng.uniform(0, 5, (T, 2))),
+        frame_s=np.float32(FRAME_S),
     )
+    return jax.device_put(targets)
 
 
 def without_frame(targets, t):
