@@ -1,129 +1,103 @@
 """Several views in the objective: against one view, against NumPy, and the curvature against the gradient."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from support import terms_by_hand
+from support.terms_by_hand import BIRD, T, posed_window, random_targets, window_pose
 
-from jaxfit.model.camera import CropCamera
-from jaxfit.objective.curvature import add_rows, frame_rows
+from jaxfit.objective.curvature import SHARED_PARAMETERS, add_rows, frame_rows
 from jaxfit.objective.objective import evaluate_curvature, evaluate_terms
 from jaxfit.objective.posed_window import ViewMaps
-from jaxfit.objective.registry import find_terms
-from tests.support import terms_by_hand
-from tests.support.terms_by_hand import BIRD, SIZE, T, posed_window, random_targets, window_pose
+from jaxfit.objective.registry import find_term, find_terms
 
 NAMES = ("keypoints", "keypoint_likelihood", "mask", "mask_smooth_l1")
+SETTINGS = {name: {"weight": 1.0, **find_term(name).settings} for name in NAMES}
 RNG = np.random.default_rng(3)
+POSE, TARGETS = window_pose(), random_targets()
 
 
-def identity_maps(views, px_per_unit=5.0):
-    linear = np.broadcast_to(np.eye(3, dtype=np.float32), (T, views, 3, 3))
-    return ViewMaps(jnp.asarray(linear), jnp.zeros((T, views, 3)), jnp.float32(px_per_unit))
-
-
-def repeated(targets, views):
-    """The targets of one view, seen by several equal views."""
-
-    def again(x, axis):
-        return jnp.concatenate([x] * views, axis=axis)
-
+def seen_by(linear, offset):
+    """The targets of one view, seen by several views with the same observations."""
+    views = linear.shape[1]
     return dataclasses.replace(
-        targets,
-        keypoints_px=again(targets.keypoints_px, 1),
-        confidence=again(targets.confidence, 1),
-        mask=jnp.stack([targets.mask] * views, axis=1),
-        has_mask=jnp.stack([targets.has_mask] * views, axis=1),
-        views=identity_maps(views),
+        TARGETS,
+        keypoints_px=np.concatenate([TARGETS.keypoints_px] * views, axis=1),
+        confidence=np.concatenate([TARGETS.confidence] * views, axis=1),
+        mask=np.stack([TARGETS.mask] * views, axis=1),
+        has_mask=np.stack([TARGETS.has_mask] * views, axis=1),
+        views=ViewMaps(np.float32(linear), np.float32(offset), np.float32(5)),
     )
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def values(pose, targets, names=NAMES):
-    settings = {name: {"weight": 1.0, **find_terms([name])[name].settings} for name in names}
-    return evaluate_terms(posed_window(pose, targets), find_terms(names), settings)
+TWO = seen_by(np.broadcast_to(np.eye(3), (T, 2, 3, 3)), np.zeros((T, 2, 3)))
 
 
-def test_equal_views_add_up():
-    pose, targets = window_pose(), random_targets()
-    one, three = values(pose, targets), values(pose, repeated(targets, 3))
+@jax.jit
+def values_and_curvature(pose, targets, direction):
+    """The terms, and H·direction and the diagonal of H for each term."""
+    window, found = posed_window(pose, targets), {}
     for name in NAMES:
-        assert float(three[name]) == pytest.approx(3 * float(one[name]), rel=1e-5), name
+        H = evaluate_curvature(window, find_terms([name]), {name: SETTINGS[name]})
+        found[name] = H.product(direction), H.diagonal
+    return evaluate_terms(window, find_terms(NAMES), SETTINGS), found
 
 
-def test_a_view_that_sees_nothing_costs_nothing():
-    pose, targets = window_pose(), random_targets()
-    two = repeated(targets, 2)
-    K = BIRD.num_keypoints
-    blind = dataclasses.replace(
-        two, confidence=two.confidence.at[:, K:].set(0), has_mask=two.has_mask.at[:, 1].set(False)
-    )
-    one, both = values(pose, targets), values(pose, blind)
+def test_equal_views_add_up_and_a_view_that_sees_nothing_costs_nothing():
+    direction = np.float32(RNG.normal(size=frame_rows(POSE).shape))
+    confidence, has_mask = TWO.confidence.copy(), TWO.has_mask.copy()
+    confidence[:, BIRD.num_keypoints :], has_mask[:, 1] = 0, False
+    blind = dataclasses.replace(TWO, confidence=confidence, has_mask=has_mask)
+    one, both, half = (values_and_curvature(POSE, targets, direction) for targets in (TARGETS, TWO, blind))
     for name in NAMES:
-        assert float(both[name]) == pytest.approx(float(one[name]), rel=1e-5), name
+        np.testing.assert_allclose(both[0][name], 2 * one[0][name], rtol=1e-5, err_msg=name)
+        np.testing.assert_allclose(half[0][name], one[0][name], rtol=1e-5, err_msg=name)
+        for own, expected in zip(both[1][name], one[1][name], strict=True):
+            scale = float(np.abs(expected).max())
+            np.testing.assert_allclose(own, 2 * expected, rtol=1e-4, atol=1e-4 * scale, err_msg=name)
 
 
 def test_view_maps_give_the_pixels_of_their_cameras():
     """The affine map of a camera with another focal length, principal point, skew and pose."""
-    camera: CropCamera = terms_by_hand.CAMERA
-    F, c = camera.focal_px, camera.centre_px
+    F, c = terms_by_hand.CAMERA.focal_px, terms_by_hand.CAMERA.centre_px
     K = np.array([[1.3 * F, 4.0, c + 7], [0, 1.2 * F, c - 5], [0, 0, 1]])
     angle = 0.3
     R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
     t = np.array([1.0, -2.0, 60.0])
     to_crop = np.array([[1 / F, 0, -c / F], [0, 1 / F, -c / F], [0, 0, 1]]) @ K
-    maps = identity_maps(1)
-    maps = dataclasses.replace(
-        maps,
-        linear=jnp.asarray(np.broadcast_to(to_crop @ R, (T, 1, 3, 3)), jnp.float32),
-        offset=jnp.asarray(np.broadcast_to(to_crop @ t, (T, 1, 3)), jnp.float32),
-    )
-    pose = window_pose()
-    window = posed_window(pose, dataclasses.replace(repeated(random_targets(), 1), views=maps))
-    pixels = np.asarray(window.keypoints_cam, np.float64) @ R.T + t
-    pixels = pixels @ K.T
-    np.testing.assert_allclose(window.keypoints_px, pixels[..., :2] / pixels[..., 2:], rtol=2e-5)
-    assert window.place_acceleration_px.shape == (T - 2, 3)
-
-
-@pytest.mark.parametrize("shared", [(), ("bone_length", "betas")])
-def test_curvature_of_views_is_that_of_automatic_differentiation(shared):
-    """H of a squared residual is 2JᵀJ; the Jacobian by formula and by JAX must agree, in two different views."""
-    pose, targets = window_pose(), repeated(random_targets(), 2)
-    linear = np.array(targets.views.linear) + 0.05 * RNG.normal(size=(T, 2, 3, 3))
-    offset = 0.5 * RNG.normal(size=(T, 2, 3))
-    maps = ViewMaps(jnp.asarray(linear, jnp.float32), jnp.asarray(offset, jnp.float32), jnp.float32(5))
-    targets = dataclasses.replace(targets, views=maps)
-
-    def pixels(rows):
-        return posed_window(add_rows(pose, rows, shared), targets).keypoints_px
-
-    zero = jnp.zeros_like(frame_rows(pose, shared))
-    direction = jnp.asarray(RNG.normal(size=zero.shape), jnp.float32)
-    if shared:  # all rows of a shared parameter must agree
-        framewise = frame_rows(pose).shape[1]
-        direction = direction.at[:, framewise:].set(direction[:1, framewise:])
-    _, expected = jax.jvp(pixels, (zero,), (direction,))
-    blocks = posed_window(pose, targets, shared=shared).keypoint_jacobian_px
-    J = np.concatenate([np.asarray(block) for block in blocks], axis=-1)
-    found = np.einsum("tri,ti->tr", J, direction).reshape(expected.shape)
-    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
-
-
-@pytest.mark.parametrize("name", ["mask", "mask_smooth_l1"])
-def test_curvature_of_masks_adds_up_over_views(name):
-    pose, targets = window_pose(), random_targets()
-    settings = {name: {"weight": 1.0}}
-    direction = jnp.asarray(RNG.normal(size=frame_rows(pose).shape), jnp.float32)
+    targets = seen_by(np.broadcast_to(to_crop @ R, (T, 1, 3, 3)), np.broadcast_to(to_crop @ t, (T, 1, 3)))
 
     @jax.jit
-    def product(targets):
-        H = evaluate_curvature(posed_window(pose, targets), find_terms([name]), settings)
-        return H.product(direction), H.diagonal
+    def seen(pose):
+        window = posed_window(pose, targets)
+        return window.keypoints_px, window.keypoints_cam, window.place_acceleration_px
 
-    for one, two in zip(product(targets), product(repeated(targets, 2)), strict=True):
-        np.testing.assert_allclose(two, 2 * one, rtol=1e-4, atol=1e-4 * float(jnp.abs(one).max()))
-    assert targets.mask.shape[-1] == SIZE
+    found, points, acceleration = seen(POSE)
+    pixels = (np.asarray(points, np.float64) @ R.T + t) @ K.T
+    np.testing.assert_allclose(found, pixels[..., :2] / pixels[..., 2:], rtol=2e-5)
+    assert acceleration.shape == (T - 2, 3)
+
+
+def test_curvature_of_views_is_that_of_automatic_differentiation():
+    """H of a squared residual is 2JᵀJ; the Jacobian by formula and by JAX must agree, in two different views."""
+    linear = np.eye(3) + 0.05 * RNG.normal(size=(T, 2, 3, 3))
+    targets = seen_by(linear, 0.5 * RNG.normal(size=(T, 2, 3)))
+    direction = np.float32(RNG.normal(size=frame_rows(POSE, SHARED_PARAMETERS).shape))
+    framewise = frame_rows(POSE).shape[1]
+    direction[:, framewise:] = direction[:1, framewise:]  # all rows of a shared parameter must agree
+
+    @jax.jit
+    def both(pose, direction):
+        def pixels(rows):
+            return posed_window(add_rows(pose, rows, SHARED_PARAMETERS), targets).keypoints_px
+
+        _, change = jax.jvp(pixels, (jnp.zeros_like(direction),), (direction,))
+        J = jnp.concatenate(posed_window(pose, targets, shared=SHARED_PARAMETERS).keypoint_jacobian_px, axis=-1)
+        return change, jnp.einsum("tri,ti->tr", J, direction)
+
+    expected, found = both(POSE, direction)
+    np.testing.assert_allclose(
+        found.reshape(expected.shape), expected, rtol=2e-3, atol=2e-3 * float(np.abs(expected).max())
+    )

@@ -77,12 +77,9 @@ def random_targets(seed=0):
 
 def without_frame(targets, t):
     """The same targets with frame `t` missing, as in the targets of a fit."""
-    return dataclasses.replace(
-        targets,
-        confidence=targets.confidence.at[t].set(0),
-        has_mask=targets.has_mask.at[t].set(False),
-        present=targets.present.at[t].set(False),
-    )
+    targets = jax.tree.map(np.array, targets)
+    targets.confidence[t], targets.has_mask[t], targets.present[t] = 0, False, False
+    return targets
 
 
 def posed_window(pose, targets, anchor=None, shared=()):
@@ -111,8 +108,8 @@ def _term_value(term, orient, body, present, frame_s, settings):
 
 def term_value(term, orient, body, present, frame_s=FRAME_S, **settings):
     """A temporal term of a motion, in a window that has only rotations."""
-    orient, body = jnp.asarray(orient, jnp.float32), jnp.asarray(body, jnp.float32)
-    return _term_value(term, orient, body, jnp.asarray(present), jnp.float32(frame_s), settings)
+    orient, body = (x if isinstance(x, jax.Array) else np.float32(x) for x in (orient, body))
+    return _term_value(term, orient, body, present, np.float32(frame_s), settings)
 
 
 def all_settings():
