@@ -50,7 +50,8 @@ def _randomise_scene(rng: np.random.Generator, picture: np.ndarray, birds: np.nd
     if rng.random() < 0.45:
         image = _replace_ground(rng, image, birds)
     if rng.random() < 0.4:
-        image = _add_clutter(rng, image, birds)
+        alpha = _soft_mask(birds)
+        image = image * alpha + draw_clutter(rng, image) * (1 - alpha)
     if rng.random() < 0.5:  # contrast between plumage and ground: from black on white to grey on grey
         alpha = _soft_mask(birds)
         scaled = image * rng.uniform(0.6, 1.8) + rng.uniform(0, 0.08)
@@ -98,9 +99,9 @@ def _replace_ground(rng: np.random.Generator, image: np.ndarray, birds: np.ndarr
     return image * alpha + ground * (1 - alpha)
 
 
-def _add_clutter(rng: np.random.Generator, image: np.ndarray, birds: np.ndarray) -> np.ndarray:
-    """Draw random ellipses and polygons behind the birds, some as dark as a bird."""
-    drawn = np.ascontiguousarray(image)
+def draw_clutter(rng: np.random.Generator, image: np.ndarray) -> Float[np.ndarray, "H W 3"]:
+    """Draw random ellipses and polygons, some as dark as a bird."""
+    drawn = np.ascontiguousarray(image, np.float32)
     height, width = image.shape[:2]
     for _ in range(int(rng.integers(1, 9))):
         colour = np.clip(rng.choice([0.08, rng.uniform(0, 1)]) + rng.uniform(-0.06, 0.06, 3), 0, 1).tolist()
@@ -114,8 +115,7 @@ def _add_clutter(rng: np.random.Generator, image: np.ndarray, birds: np.ndarray)
             reach = rng.uniform(2, 0.14 * width, spokes)
             corners = centre + reach[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
             cv2.fillPoly(drawn, [corners.astype(np.int32)], colour, cv2.LINE_AA)
-    alpha = _soft_mask(birds)
-    return image * alpha + drawn * (1 - alpha)
+    return drawn
 
 
 def _cast_shadow(rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "H W"]:

@@ -20,7 +20,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
 from jaxfit.learning.networks.labelled_frames import MARKER, LabelledFrames, save_labels
-from jaxfit.learning.networks.varied import Landscape, Species, draw_landscape, draw_species
+from jaxfit.learning.networks.varied import Landscape, Species, draw_landscape, draw_species, draw_strokes
 from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.raster.zbuffer import hard_mask, interpolate, vertex_normals, zbuffer
@@ -229,13 +229,9 @@ def _add_shadow(picture: np.ndarray, bird: _Placed, faces: np.ndarray, light: Li
 def _add_foreground(rng: np.random.Generator, picture: np.ndarray, owner: np.ndarray) -> None:
     """Draw blades of grass or twigs in front of the birds."""
     height, width = owner.shape
-    drawn = np.zeros((height, width), np.float32)
-    around = rng.uniform(0, width)
-    for _ in range(int(rng.integers(5, 60))):
-        root = np.array([around + rng.normal(0, 0.15 * width), height * rng.uniform(0.4, 1.1)])
-        tip = root + np.array([rng.normal(0, 30), -rng.uniform(40, 260)])
-        thickness = int(rng.integers(1, 4))
-        cv2.line(drawn, root.astype(int).tolist(), tip.astype(int).tolist(), 1.0, thickness, cv2.LINE_AA)
+    drawn, count = np.zeros((height, width), np.float32), int(rng.integers(5, 60))
+    columns = rng.uniform(0, width) + rng.normal(0, 0.15 * width, count)
+    draw_strokes(rng, drawn, np.stack([columns, height * rng.uniform(0.4, 1.1, count)], 1), np.ones(1))
     colour = np.array([0.05, 0.2, 0.1]) * rng.uniform(0.3, 2.5) * rng.uniform(0.7, 1.3, 3)
     picture[:] = picture * (1 - drawn[..., None]) + colour * drawn[..., None]
     owner[drawn > 0.5] = 0

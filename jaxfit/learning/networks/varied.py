@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
 
 import cv2
@@ -12,12 +11,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from jaxfit.learning.networks.augment import draw_clutter
 from jaxfit.model.bird import Bird
 from jaxfit.model.kinematics import Pose, fold_bird, window_transforms, window_vertices
 from jaxfit.model.murre import POSTURES
 from jaxfit.simulation.footage import GAMMA, Noise, smoothstep
-
-_Shape = tuple[int, int]
 
 
 class Landscape(NamedTuple):
@@ -29,6 +27,36 @@ class Landscape(NamedTuple):
     """First row of water, where birds swim; the height of the picture if there is no water."""
 
 
+class _Ground(NamedTuple):
+    """A kind of ground: two scales of noise select its colours."""
+
+    colours: tuple[tuple[float, float, float], ...]
+    """From dark to light, linear light."""
+    period: tuple[float, float]
+    """Range of the period of the coarse noise, in widths of the picture."""
+    grain: float
+    """Period of the fine noise, relative to the coarse noise."""
+    highlights: tuple[float, float, float]
+    """Colour of bright patches: foam, snow, guano, clouds."""
+    strokes: tuple[int, int] = (0, 1)
+    """Range of the number of blades or branches."""
+
+
+_GROUNDS = {
+    "water": _Ground(((0.10, 0.08, 0.05), (0.32, 0.26, 0.21), (0.55, 0.45, 0.38)), (0.15, 1.2), 0.3, (0.8, 0.8, 0.8)),
+    "grass": _Ground(
+        ((0.02, 0.07, 0.03), (0.05, 0.2, 0.09), (0.15, 0.38, 0.3)), (0.5, 3), 0.1, (0.2, 0.5, 0.5), (0, 900)
+    ),
+    "sand": _Ground(((0.18, 0.26, 0.33), (0.38, 0.5, 0.58)), (0.7, 3), 0.05, (0.92, 0.9, 0.88)),
+    "rock": _Ground(((0.05, 0.055, 0.06), (0.2, 0.22, 0.25), (0.42, 0.45, 0.48)), (0.5, 2.5), 0.5, (0.75, 0.75, 0.75)),
+    "leaves": _Ground(
+        ((0.01, 0.025, 0.015), (0.04, 0.16, 0.07), (0.15, 0.42, 0.28)), (0.2, 1.5), 0.3, (0.3, 0.5, 0.4), (0, 90)
+    ),
+    "sky": _Ground(((0.75, 0.45, 0.22), (0.85, 0.75, 0.65)), (1, 4), 0.5, (0.9, 0.9, 0.9)),
+}
+"""Kinds of ground; the sky is only above a border."""
+
+
 def draw_landscape(rng: np.random.Generator, width: int, height: int, pitch_deg: float) -> Landscape:
     """Draw a landscape: one kind of ground, or two kinds with an uneven border, and objects.
 
@@ -37,177 +65,53 @@ def draw_landscape(rng: np.random.Generator, width: int, height: int, pitch_deg:
         width, height: size of the picture, pixels.
         pitch_deg: angle of the camera below the horizontal; textures are foreshortened accordingly.
     """
-    shape = height, width
     flatness = max(np.sin(np.radians(pitch_deg)), 0.15)
-    kinds = list(_KINDS)
-    lower = str(rng.choice(kinds[:-1]))
-    picture, water_from = _KINDS[lower](rng, shape, flatness), 0 if lower == "water" else height
+    flat = [kind for kind in _GROUNDS if kind != "sky"]
+    lower = str(rng.choice(flat))
+    picture, water_from = _paint(rng, lower, (height, width), flatness), 0 if lower == "water" else height
     if rng.random() < (0.75 if pitch_deg < 35 else 0.3):
-        upper = str(rng.choice(["sky", "sky", "leaves", "grass", "rock"] if pitch_deg < 35 else kinds[:-1]))
+        upper = str(rng.choice(["sky", "sky", "leaves", "grass", "rock"] if pitch_deg < 35 else flat))
         row = rng.uniform(0.05, 0.6) * height
-        rough = rng.uniform(0, 0.04) * height * _noise(rng)(np.arange(width), np.zeros(width), 2.0 * width)
+        rough = rng.uniform(0, 0.04) * height * Noise(rng, 6)(np.arange(width), np.zeros(width), 2.0 * width)
         above = (np.arange(height)[:, None] < row + rough[None])[..., None]
-        picture = np.where(above, _KINDS[upper](rng, shape, flatness), picture)
+        picture = np.where(above, _paint(rng, upper, (height, width), flatness), picture)
         water_from = max(water_from, int(row + np.abs(rough).max())) if lower == "water" else height
     if rng.random() < 0.5:
-        picture = _add_objects(rng, picture)
+        picture = draw_clutter(rng, picture)
     return Landscape(picture.astype(np.float32), water_from)
 
 
-def _noise(rng: np.random.Generator, octaves: int = 6, gain: float = 0.6) -> Noise:
-    return Noise(rng, octaves=octaves, gain=gain)
-
-
-def _grid(shape: _Shape) -> tuple[np.ndarray, np.ndarray]:
-    y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
-    return x, y
-
-
-def _mixed(values: np.ndarray, *colours: object) -> Float[np.ndarray, "H W 3"]:
-    """Return colours in linear light that change with values from 0 to 1."""
+def _paint(rng: np.random.Generator, kind: str, shape: tuple[int, int], flatness: float) -> Float[np.ndarray, "H W 3"]:
+    """Draw one kind of ground with a random tint; water has finer ripples towards the top of the picture."""
+    ground, (height, width) = _GROUNDS[kind], shape
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    if kind == "water":
+        depth = height * (0.3 + flatness) / (y + 0.3 * height + 1)
+        x, y = (x - width / 2) * depth, 300 * depth
+    if kind not in ("leaves", "sky"):
+        y = y / flatness
+    period = rng.uniform(*ground.period) * width
+    coarse, fine = Noise(rng, 6)(x, y, period), Noise(rng, 6, 0.8)(x, y, max(ground.grain * period, 40))
+    values = np.clip(0.5 + rng.uniform(0.1, 0.3) * coarse + rng.uniform(0, 0.25) * fine, 0, 1)
+    colours = np.clip(np.array(ground.colours) * rng.uniform(0.75, 1.3, 3) * rng.uniform(0.6, 1.5), 0, 1)
     stops = np.linspace(0, 1, len(colours))
-    table = np.array(colours, np.float64)
-    return np.stack([np.interp(values, stops, table[:, i]) for i in range(3)], axis=-1)
-
-
-def _jitter(rng: np.random.Generator, *colours: tuple[float, float, float]) -> list[np.ndarray]:
-    tint = rng.uniform(0.75, 1.3, 3) * rng.uniform(0.6, 1.5)
-    return [np.clip(np.array(colour) * tint, 0, 1) for colour in colours]
-
-
-def _water(rng: np.random.Generator, shape: _Shape, flatness: float) -> np.ndarray:
-    """Draw ripples that are finer towards the top of the picture, with reflections of the sky."""
-    x, y = _grid(shape)
-    depth = shape[0] * (0.3 + flatness) / (y + 0.3 * shape[0] + 1)
-    scale = rng.uniform(0.15, 1.2) * shape[1]
-    ripples = _noise(rng, 7, rng.uniform(0.5, 0.85))((x - shape[1] / 2) * depth, 300 * depth / flatness, scale)
-    swell = _noise(rng, 3)(x, y / flatness, 4.0 * shape[1])
-    values = np.clip(0.45 + rng.uniform(0.08, 0.35) * ripples + 0.15 * swell, 0, 1)
-    deep, light = _jitter(rng, (0.10, 0.08, 0.05), (0.55, 0.45, 0.38))
-    if rng.random() < 0.35:  # green or brown water
-        deep = deep * rng.uniform([0.3, 0.8, 0.6], [0.8, 1.3, 1.6])
-    picture = _mixed(values, deep, (deep + light) / 2, light)
-    glint = smoothstep(1.6, 2.4, ripples)[..., None] * rng.uniform(0, 0.8) * (rng.random() < 0.4)
-    return picture + glint
-
-
-def _grass(rng: np.random.Generator, shape: _Shape, flatness: float) -> np.ndarray:
-    """Draw patches of green or dry grass, with blades where the camera is near."""
-    x, y = _grid(shape)
-    patches = _noise(rng)(x, y / flatness, rng.uniform(0.5, 3) * shape[1])
-    fine = _noise(rng, 5, 0.9)(x * rng.uniform(2, 5), y, 0.25 * shape[1])
-    colours = _jitter(rng, (0.02, 0.07, 0.03), (0.05, 0.20, 0.09), (0.15, 0.38, 0.30))
-    picture = _mixed(np.clip(0.5 + 0.18 * patches + 0.17 * fine, 0, 1), *colours).astype(np.float32)
-    if rng.random() < 0.6:
-        for _ in range(int(rng.integers(200, 900))):
-            root = rng.uniform(0, [shape[1], shape[0]])
-            tip = root + np.array([rng.normal(0, 6), -rng.uniform(4, 40)])
-            shade = (colours[1] * rng.uniform(0.4, 2.2)).tolist()
-            cv2.line(picture, root.astype(int).tolist(), tip.astype(int).tolist(), shade, 1, cv2.LINE_AA)
-    return picture
-
-
-def _sand(rng: np.random.Generator, shape: _Shape, flatness: float) -> np.ndarray:
-    """Draw sand, mud or snow with dunes, grains and pebbles."""
-    x, y = _grid(shape)
-    dunes = _noise(rng, 4)(x, y / flatness, rng.uniform(0.7, 3) * shape[1])
-    grain = _noise(rng, 4, 0.9)(x * 6, y * 6, 0.5 * shape[1])
-    dark, light = _jitter(rng, (0.18, 0.26, 0.33), (0.38, 0.50, 0.58))
-    if rng.random() < 0.25:
-        dark, light = np.array([0.6, 0.55, 0.5]), np.array([0.92, 0.9, 0.88])  # snow
-    picture = _mixed(np.clip(0.5 + 0.15 * dunes + rng.uniform(0, 0.12) * grain, 0, 1), dark, light).astype(np.float32)
-    for _ in range(int(rng.integers(0, 60))):
-        centre, axes = rng.uniform(0, [shape[1], shape[0]]), rng.uniform(1, 9, 2) * [1, max(flatness, 0.4)]
-        shade = (light * rng.uniform(0.2, 1.2)).tolist()
-        cv2.ellipse(picture, centre.astype(int).tolist(), axes.astype(int).tolist(), 0, 0, 360, shade, -1, cv2.LINE_AA)
-    return picture
-
-
-def _rock(rng: np.random.Generator, shape: _Shape, flatness: float) -> np.ndarray:
-    """Draw rock with cracks, and white patches of guano or lichen."""
-    x, y = _grid(shape)
-    period = rng.uniform(0.5, 2.5) * shape[1]
-    coarse, fine = _noise(rng)(x, y / flatness, period), _noise(rng, 7, 0.75)(x, y / flatness, 0.5 * period)
-    colours = _jitter(rng, (0.05, 0.055, 0.06), (0.2, 0.22, 0.25), (0.42, 0.45, 0.48))
-    picture = _mixed(np.clip(0.45 + 0.16 * coarse + 0.16 * fine, 0, 1), *colours)
-    cracks = smoothstep(0.06, 0.0, np.abs(_noise(rng, 5)(x, y / flatness, 1.5 * period)))[..., None]
-    picture = picture * (1 - rng.uniform(0, 0.7) * cracks)
-    white = smoothstep(rng.uniform(0.6, 2), 2.2, coarse + 0.5 * fine)[..., None]
-    return picture * (1 - white) + 0.75 * white
-
-
-def _leaves(rng: np.random.Generator, shape: _Shape, flatness: float) -> np.ndarray:
-    """Draw leaves of trees or bushes, often out of focus, with branches in front."""
-    x, y = _grid(shape)
-    period = rng.uniform(0.2, 1.5) * shape[1]
-    values = 0.45 + 0.2 * _noise(rng, 6, 0.7)(x, y, period) + 0.15 * _noise(rng, 3)(x, y, 3 * period)
-    colours = _jitter(rng, (0.01, 0.025, 0.015), (0.04, 0.16, 0.07), (0.15, 0.42, 0.28))
-    picture = _mixed(np.clip(values, 0, 1), *colours).astype(np.float32)
-    if rng.random() < 0.6:
+    picture = np.stack([np.interp(values, stops, colours[:, i]) for i in range(3)], -1)
+    share = smoothstep(rng.uniform(0.6, 2), 2.4, coarse + 0.5 * fine)[..., None] * rng.uniform(0, 1)
+    picture = (picture * (1 - share) + np.array(ground.highlights) * share).astype(np.float32)
+    if kind == "leaves" and rng.random() < 0.6:  # out of focus
         picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(1, 8))
-    return _add_branches(rng, picture) if rng.random() < 0.6 else picture
+    draw_strokes(rng, picture, rng.uniform(0, [width, height], (int(rng.integers(*ground.strokes)), 2)), colours[-1])
+    return picture
 
 
-def _sky(rng: np.random.Generator, shape: _Shape, flatness: float) -> np.ndarray:
-    """Draw a sky from blue to overcast, with clouds."""
-    x, y = _grid(shape)
-    top, bottom = _jitter(rng, (0.75, 0.45, 0.22), (0.85, 0.75, 0.65))
-    if rng.random() < 0.4:
-        top = bottom = np.full(3, rng.uniform(0.3, 0.9)) * rng.uniform(0.95, 1.05, 3)
-    clouds = _noise(rng)(x, 2 * y, rng.uniform(1, 4) * shape[1])
-    share = smoothstep(rng.uniform(-0.5, 1.5), rng.uniform(1.6, 2.5), clouds)[..., None]
-    return _mixed(y / shape[0], top, bottom) * (1 - share) + rng.uniform(0.6, 0.95) * share
-
-
-_KINDS: dict[str, Callable[[np.random.Generator, _Shape, float], np.ndarray]] = {
-    "water": _water,
-    "grass": _grass,
-    "sand": _sand,
-    "rock": _rock,
-    "leaves": _leaves,
-    "sky": _sky,
-}
-"""Kinds of ground; the last is only above a border."""
-
-
-def _add_branches(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
-    drawn = np.ascontiguousarray(picture, np.float32)
-    height, width = drawn.shape[:2]
-    for _ in range(int(rng.integers(1, 7))):
-        points = [rng.uniform(0, [width, height])]
-        heading = rng.uniform(0, 2 * np.pi)
-        for _ in range(int(rng.integers(3, 12))):
-            heading += rng.normal(0, 0.3)
-            points.append(points[-1] + rng.uniform(20, 90) * np.array([np.cos(heading), np.sin(heading)]))
-        colour = (np.array([0.06, 0.08, 0.11]) * rng.uniform(0.3, 3)).tolist()
-        corners = np.array(points).astype(np.int32)[None]
-        cv2.polylines(drawn, list(corners), False, colour, int(rng.integers(2, 16)), cv2.LINE_AA)
-    return drawn
-
-
-def _add_objects(rng: np.random.Generator, picture: np.ndarray) -> np.ndarray:
-    """Draw objects that are not birds: stones, posts, buoys, branches, with light from above."""
-    drawn = np.ascontiguousarray(picture, np.float32)
-    height, width = drawn.shape[:2]
-    if rng.random() < 0.3:
-        drawn = _add_branches(rng, drawn)
-    for _ in range(int(rng.integers(1, 9))):
-        centre = rng.uniform(0, [width, height])
-        count, radius = int(rng.integers(5, 12)), log_uniform(rng, 6, 110)
-        angles = np.sort(rng.uniform(0, 2 * np.pi, count))
-        reach = radius * rng.uniform(0.6, 1.1, count) * rng.uniform(0.3, 1)
-        corners = centre + np.stack([radius * np.cos(angles), reach * np.sin(angles)], 1)
-        mask = np.zeros((height, width), np.float32)
-        cv2.fillPoly(mask, [corners.astype(np.int32)], 1.0, cv2.LINE_AA)
-        mask = cv2.GaussianBlur(mask, (0, 0), 0.8)[..., None]
-        base = rng.uniform(0.02, 0.7) * rng.uniform(0.8, 1.2, 3)
-        shade = 1.3 - 0.8 * (np.arange(height)[:, None] - corners[:, 1].min()) / max(np.ptp(corners[:, 1]), 1)
-        texture = (
-            _noise(rng, 5, 0.8)(*_grid((height, width)), 300.0) if rng.random() < 0.5 else np.zeros((height, width))
+def draw_strokes(rng: np.random.Generator, picture: np.ndarray, roots_px: np.ndarray, colour: np.ndarray) -> None:
+    """Draw blades of grass or twigs upwards from some points into a picture of 1 or 3 channels, in place."""
+    for root in roots_px:
+        tip = root + np.array([rng.normal(0, 30), -rng.uniform(4, 200)])
+        shade = (colour * rng.uniform(0.2, 1.2)).tolist()
+        cv2.line(
+            picture, root.astype(int).tolist(), tip.astype(int).tolist(), shade, int(rng.integers(1, 4)), cv2.LINE_AA
         )
-        body = np.clip(base * np.clip(shade, 0.3, 1.3)[..., None] * (1 + 0.2 * texture[..., None]), 0, 1)
-        drawn = (drawn * (1 - mask) + body * mask).astype(np.float32)
-    return drawn
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
