@@ -127,17 +127,18 @@ def find_bouts(description: Description, config: BehaviourConfig) -> Ethogram:
     owner = np.full(valid.shape, len(names) - 1)
     for i, name in enumerate(names[:-1]):
         free = found[name] & (owner == len(names) - 1)
-        edges = [k for k, each in enumerate(names[:-1]) if name in _targets(config.behaviours[each])]
+        rules = [config.behaviours[each] for each in names[:-1]]
+        edges = [k for k, each in enumerate(rules) if name in (each.start_of, each.end_of)]
         left = free | (found[name] & np.isin(owner, edges))
         owner[free & _kept(left, begins[name], time_s, frame_s, config.behaviours[name])] = i
-    bouts = _bouts(owner, names, description, config, frame_s)
-    state = np.where(valid, owner, NO_POSE)
-    return Ethogram(names, state, tuple(bouts), time_s, frame_s, missing)
-
-
-def _targets(rule: BehaviourRule) -> tuple[str | None, str | None]:
-    """Return the behaviours whose starts and whose ends a rule describes."""
-    return rule.start_of, rule.end_of
+    bouts = [
+        _bout(n, name, run, description, frame_s, config.behaviours[name].partner)
+        for i, name in enumerate(names[:-1])
+        for n, row in enumerate(owner == i)
+        for run in _runs(row, _pauses(time_s, frame_s, config.behaviours[name]))
+    ]
+    bouts.sort(key=lambda each: (each.bird, each.start_s))
+    return Ethogram(names, np.where(valid, owner, NO_POSE), tuple(bouts), time_s, frame_s, missing)
 
 
 def _frame_times(time_s: Float[np.ndarray, "T"], step_s: Float[np.ndarray, "T"]) -> Float[np.ndarray, "T"]:
@@ -225,35 +226,18 @@ def _edges(
     return found & valid
 
 
-def _bouts(
-    owner: np.ndarray, names: tuple[str, ...], description: Description, config: BehaviourConfig, frame_s: np.ndarray
-) -> list[Bout]:
-    """Return the bouts, with their means; `owner` is the position in `names`, also in bridged frames."""
-    time_s, bouts = description.flock.time_s, []
-    for i, name in enumerate(names[:-1]):
-        pause = _pauses(time_s, frame_s, config.behaviours[name])
-        for n, row in enumerate(owner == i):
-            for run in _runs(row, pause):
-                bouts.append(_bout(n, name, run, description, frame_s, config.behaviours[name].partner))
-    return sorted(bouts, key=lambda each: (each.bird, each.start_s))
-
-
 def _bout(
     bird: int, name: str, run: slice, description: Description, frame_s: Float[np.ndarray, "T"], partner: bool
 ) -> Bout:
     """Return a bout with the means of the features, and with the usual neighbour as its partner if it has one."""
     time_s, values, neighbour = description.flock.time_s, description.values, None
     if partner and "neighbour" in values:
-        neighbour = _most_frequent(values["neighbour"][bird, run], description.track_id)
+        positions = values["neighbour"][bird, run]
+        known, counts = np.unique(positions[np.isfinite(positions)], return_counts=True)
+        neighbour = int(description.track_id[int(known[counts.argmax()])]) if len(known) else None
     means = {e.name: _mean(values[e.name][bird, run], e.circular) for e in description.features if e.unit != "id"}
     stop_s = float(time_s[run.stop - 1] + frame_s[run.stop - 1])
     return Bout(bird, name, run, float(time_s[run.start]), stop_s, neighbour, means)
-
-
-def _most_frequent(positions: Float[np.ndarray, "T"], track_id: Int[np.ndarray, "N"]) -> int | None:
-    """Return the track at the most frequent position; NaN is no position."""
-    known, counts = np.unique(positions[np.isfinite(positions)], return_counts=True)
-    return int(track_id[int(known[counts.argmax()])]) if len(known) else None
 
 
 def _mean(values: np.ndarray, circular: bool) -> float:

@@ -80,16 +80,27 @@ def describe(
         InputError: a feature raises an error, or does not return an array of N birds and T frames.
     """
     features = list(dict.fromkeys([*(own_features() if own is None else own), *further]))
-    _check_names(features)
+    names = [each.name for each in features]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"feature {name!r}", "is defined twice", "give one of the functions another name")
     N, T = flock.solution.valid.shape
+    # some frames, with what all frames show: whether times and the ledge are known
     sample = flock.birds(slice(0, min(T, 2)))
-    sample = _with_times(sample, flock)
+    sample = replace(
+        sample,
+        time_s=np.arange(float(len(sample.time_s))) + (0.0 if times_known(flock.time_s) else np.nan),
+        contact=np.full(sample.contact.shape, 1.0 if np.isfinite(flock.contact).any() else np.nan),
+    )
     missing = {each.name: reason for each in features if (reason := each.missing(sample)) is not None}
     present = [each for each in features if each.name not in missing]
     values = {each.name: np.full((N, T), np.nan, np.float32) for each in present}
     bars = deviations and flock.solution.error_bars is not None
-    sd = {each.name: np.full((N, T), np.nan, np.float32) for each in present if bars and _has_sd(each)}
-    margin = _margin(flock.step_s)
+    # the error bars of places are large along the viewing ray, and say nothing about the ledge
+    single = [each for each in present if bars and each.of_one_frame and not {"ledge", "neighbours"} & {*each.needs}]
+    sd = {each.name: np.full((N, T), np.nan, np.float32) for each in single}
+    # the number of frames in `MARGIN_S` where the frame rate is highest
+    margin = int(np.ceil(MARGIN_S / flock.step_s.min() - 1e-6)) if np.isfinite(flock.step_s).all() and T else 0
     with progress("Describing birds", T) as report_progress:
         for first in range(0, T, CHUNK):
             last = min(first + CHUNK, T)
@@ -99,7 +110,7 @@ def describe(
             for each in present:
                 values[each.name][:, first:last] = _values(each, birds)[:, inside]
             if sd:
-                for name, deviation in _deviations(flock, [e for e in present if e.name in sd], first, last).items():
+                for name, deviation in _deviations(flock, single, first, last).items():
                     sd[name][:, first:last] = deviation
             report_progress(last - first, "")
     return Description(flock, tuple(present), values, sd, missing, flock.solution.track_id)
@@ -116,35 +127,6 @@ def by_reason(missing: Mapping[str, str]) -> dict[str, list[str]]:
     for name, reason in missing.items():
         reasons.setdefault(reason, []).append(name)
     return reasons
-
-
-def _has_sd(feature: Feature) -> bool:
-    # the error bars of places are large along the viewing ray, and say nothing about the ledge
-    return feature.of_one_frame and not {"ledge", "neighbours"} & set(feature.needs)
-
-
-def _check_names(features: Sequence[Feature]) -> None:
-    """Raise InputError if two features have one name."""
-    names = [each.name for each in features]
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"feature {name!r}", "is defined twice", "give one of the functions another name")
-
-
-def _with_times(birds: Birds, flock: Flock) -> Birds:
-    """Return the birds of some frames with what all frames show: whether times and the ledge are known."""
-    known = times_known(flock.time_s)
-    contact = np.where(np.isfinite(flock.contact).any(), 1.0, np.nan)
-    return replace(
-        birds,
-        time_s=np.arange(float(len(birds.time_s))) if known else np.full(len(birds.time_s), np.nan),
-        contact=np.full(birds.contact.shape, contact),
-    )
-
-
-def _margin(step_s: Float[np.ndarray, "T"]) -> int:
-    """Return the number of frames in `MARGIN_S` where the frame rate is highest."""
-    return int(np.ceil(MARGIN_S / step_s.min() - 1e-6)) if len(step_s) and np.isfinite(step_s).all() else 0
 
 
 def _values(feature: Feature, birds: Birds) -> Float[np.ndarray, "N T"]:

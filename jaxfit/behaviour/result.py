@@ -15,7 +15,7 @@ from jaxfit.behaviour.describe import Description, describe
 from jaxfit.behaviour.page import BehaviourPage
 from jaxfit.behaviour.registry import Feature
 from jaxfit.behaviour.rules import BehaviourConfig, load_behaviour_config
-from jaxfit.behaviour.tables import boris_project, bout_columns, budget_columns, check_features_path, features_file
+from jaxfit.behaviour.tables import boris_project, bout_columns, budget_columns, features_file
 from jaxfit.cameras.camera import Camera
 from jaxfit.cameras.files import read_cameras
 from jaxfit.data.flags import CONTRADICTED, flags
@@ -24,6 +24,7 @@ from jaxfit.data.solution import Solution
 from jaxfit.data.world import as_filmed
 from jaxfit.export.result import Exported, frame_times, open_result, stored_times
 from jaxfit.export.tables import csv_table
+from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_package
 from jaxfit.foundation.files import check_new_file, check_writable, write_errors, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
@@ -255,7 +256,8 @@ def output_paths(out: Path) -> dict[str, Path]:
 
 def check_outputs(out: Path, overwrite: bool) -> None:
     """Raise InputError if an output exists, cannot be written or has no known format; before the long work."""
-    check_features_path(out)
+    if out.suffix.lower() not in (".csv", ".parquet", ".nc"):
+        raise InputError(out, "must end with .csv, .parquet or .nc", "choose another --out")
     for path in (out, *output_paths(out).values()):
         check_new_file(path, overwrite)
     check_writable(out)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.signal import lombscargle
 
-from jaxfit.behaviour.birds import usual_steps, whole_frames
+from jaxfit.behaviour.birds import whole_frames
 
 WINDOWS_S = 1.0, 2.0
 """Lengths of the windows, seconds: the long window counts where the short window shows no rhythm."""
@@ -39,9 +39,9 @@ class Rhythm(NamedTuple):
 def rhythm_of(
     signal: Float[np.ndarray, "N T"],
     time_s: Float[np.ndarray, "T"],
+    step_s: Float[np.ndarray, "T"],
+    interval_s: float,
     min_amplitude: float,
-    step_s: Float[np.ndarray, "T"] | None = None,
-    interval_s: float | None = None,
     first: int = 0,
 ) -> Rhythm:
     """Return the rhythm of a signal around each frame, by least squares spectra of windows of `WINDOWS_S`.
@@ -56,17 +56,15 @@ def rhythm_of(
     Args:
         signal: values, NaN where unknown.
         time_s: time of each frame.
+        step_s: usual time between frames around each frame (`usual_steps`).
+        interval_s: usual time between frames of the whole video; NaN for one frame.
         min_amplitude: smallest amplitude, in the unit of the signal.
-        step_s: usual time between frames around each frame; None: as `usual_steps` of `time_s`.
-        interval_s: usual time between frames of the whole video; None takes the median of `time_s`.
         first: number of the first frame, so that the windows of parts of a video are those of the whole video.
 
     Source: Zechmeister and Kürster 2009, *The generalised Lomb-Scargle periodogram*, equations 4, 14 and 24.
     """
     found = Rhythm(*(np.full(signal.shape, np.nan) for _ in Rhythm._fields))
-    interval = interval_s or (float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.inf)
-    hop = int(whole_frames(HOP_S, np.array(interval))) if np.isfinite(interval) else 1
-    step_s = usual_steps(time_s) if step_s is None else step_s
+    hop = int(whole_frames(HOP_S, np.array(interval_s))) if np.isfinite(interval_s) else 1
     for n, values in enumerate(signal):
         for t in range(-(first % hop), len(time_s), hop):
             hops = slice(max(t, 0), t + hop)

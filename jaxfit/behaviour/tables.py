@@ -12,11 +12,9 @@ import numpy as np
 from jaxfit.behaviour.bouts import LEVEL, Budget, Ethogram
 from jaxfit.behaviour.describe import Description
 from jaxfit.behaviour.rules import BehaviourConfig
-from jaxfit.data.flags import flags
 from jaxfit.export.pose_files import movement_dataset, netcdf
 from jaxfit.export.result import Exported
-from jaxfit.export.tables import Columns, csv_table, parquet_table
-from jaxfit.foundation.errors import InputError
+from jaxfit.export.tables import Columns, csv_table, parquet_table, row_columns
 from jaxfit.foundation.reading import json_text
 
 SD_NOTE = (
@@ -28,17 +26,9 @@ SD_NOTE = (
 
 def feature_columns(exported: Exported, description: Description, ethogram: Ethogram | None) -> Columns:
     """Return a row for each bird and frame: track, frame, time, fitted, flag, behaviour, features."""
-    s = exported.solution
-    N, T = s.valid.shape
-    flag = flags(s.flags.doubts).astype(object)
-    flag[flag == ""] = None
-    columns: Columns = {
-        "track": np.repeat(s.track_id, T),
-        "frame": np.tile(s.frame_index, N),
-        "time_s": np.tile(exported.times_s, N),
-        "fitted": s.valid.reshape(-1),
-        "flag": flag.reshape(-1),
-    }
+    columns = row_columns(exported)
+    del columns["status"], columns["doubts"]
+    columns["flag"][columns["flag"] == ""] = None
     if ethogram is not None:
         columns["behaviour"] = np.array([*ethogram.names, None], object)[ethogram.state].reshape(-1)
     for feature in description.features:
@@ -64,14 +54,12 @@ def bout_columns(exported: Exported, description: Description, ethogram: Ethogra
 
     Source: BORIS 10, `export_events.py`: names and order of the columns.
     """
-    s, bouts = exported.solution, ethogram.bouts
-    count, video = len(bouts), exported.video
-    fps = exported.fps
+    s, bouts, video, fps = exported.solution, ethogram.bouts, exported.video, exported.fps
     length_s = None if fps is None or not len(s.frame_index) else (int(s.frame_index[-1]) + 1) / fps
     duration = {n: sum(each.stop_s - each.start_s for each in bouts if each.bird == n) for n in range(len(s.track_id))}
 
     def every(value: Any) -> np.ndarray:
-        return np.full(count, value, object)
+        return np.full(len(bouts), value, object)
 
     def of_bouts(value: Callable[[Any], Any]) -> np.ndarray:
         return np.array([value(each) for each in bouts], object)
@@ -242,12 +230,6 @@ def features_file(path: Path, exported: Exported, description: Description, etho
     return csv_table(columns, {})
 
 
-def check_features_path(path: Path) -> None:
-    """Raise InputError if the name of a file does not say its format."""
-    if path.suffix.lower() not in (".csv", ".parquet", ".nc"):
-        raise InputError(path, "must end with .csv, .parquet or .nc", "choose another --out")
-
-
 def _movement_file(exported: Exported, description: Description, ethogram: Ethogram | None) -> bytes:
     dataset = movement_dataset(exported, "world" if exported.solution.world is not None else "2d")
     numbers = np.asarray(dataset["frame"])
@@ -262,7 +244,10 @@ def _movement_file(exported: Exported, description: Description, ethogram: Ethog
     for feature in description.features:
         name = feature.column(description.flock.unit)
         is_track = feature.unit == "id"
-        arrays = {name: _names(description.tracks(feature.name)) if is_track else description.values[feature.name]}
+        arrays = {name: description.values[feature.name]}
+        if is_track:  # names of individuals, as in `movement_dataset`
+            tracks = description.tracks(feature.name)
+            arrays[name] = np.array([["" if n is None else f"bird_{n}" for n in row] for row in tracks], str)
         if feature.name in description.sd:
             arrays[sd_column(name, feature.name)] = description.sd[feature.name]
         for key, values in arrays.items():
@@ -273,8 +258,3 @@ def _movement_file(exported: Exported, description: Description, ethogram: Ethog
         dataset["behaviour"] = (("time", "individual"), in_time(states, ""), {"description": "empty: no pose"})
     dataset.attrs |= facts_of(exported, description)
     return netcdf(dataset)
-
-
-def _names(tracks: np.ndarray) -> np.ndarray:
-    """Return the names of individuals of some tracks, as in `movement_dataset`; empty for None."""
-    return np.array([["" if track is None else f"bird_{track}" for track in row] for row in tracks], str)

@@ -40,13 +40,11 @@ def wing_elevation(birds: Birds) -> Float[np.ndarray, "N T"]:
     return (sides[0] + sides[1]) / 2
 
 
-def _timing(birds: Birds) -> tuple[Float[np.ndarray, "T"], float, int]:
-    return birds.step_s, birds.interval_s, birds.first
-
-
 def wingbeat(birds: Birds) -> Rhythm:
     """Return the rhythm of the wing elevation."""
-    return rhythm_of(birds.once(wing_elevation), birds.time_s, MIN_BEAT_DEG, *_timing(birds))
+    return rhythm_of(
+        birds.once(wing_elevation), birds.time_s, birds.step_s, birds.interval_s, MIN_BEAT_DEG, birds.first
+    )
 
 
 @feature(unit="Hz", keypoints=TIPS, joints=ARMS, needs=("time",))
@@ -79,7 +77,8 @@ def stride(birds: Birds) -> Rhythm:
     forward = unit_vector(birds.forward * [1, 1, 0]) if birds.level else birds.forward
     ahead = np.sum(apart * forward, axis=-1) / birds.body_length
     on_ledge = ~(birds.contact < 0.5)
-    return rhythm_of(np.where(on_ledge, ahead, np.nan), birds.time_s, MIN_STRIDE, *_timing(birds))
+    ahead = np.where(on_ledge, ahead, np.nan)
+    return rhythm_of(ahead, birds.time_s, birds.step_s, birds.interval_s, MIN_STRIDE, birds.first)
 
 
 @feature(unit="Hz", keypoints=FEET, needs=("time",))

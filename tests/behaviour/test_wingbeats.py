@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.described import STRAIGHT, flock, result, straight_wings
 
+from jaxfit.behaviour.birds import usual_steps
 from jaxfit.behaviour.describe import describe
 from jaxfit.behaviour.rhythm import rhythm_of
 
@@ -23,9 +24,15 @@ def signal(time_s, frequency_hz, amplitude=20.0):
     return 10 + amplitude * np.cos(2 * np.pi * frequency_hz * time_s + 1)
 
 
-def rhythm(values, time_s, least=5.0):
+def rhythms(values, time_s):
+    """Return the rhythms of some birds."""
+    interval_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else np.nan
+    return rhythm_of(values, time_s, usual_steps(time_s), interval_s, 5.0)
+
+
+def rhythm(values, time_s):
     """Return the rhythm of one bird."""
-    found = rhythm_of(np.asarray(values, float)[None], time_s, least)
+    found = rhythms(np.asarray(values, float)[None], time_s)
     return type(found)(*(each[0] for each in found))
 
 
@@ -99,7 +106,7 @@ def test_gaps():
     values = signal(time_s, 6.0)
     values[[10, 11, 12, 30, 33, 34]] = np.nan
     values[55:65] = np.nan
-    found = rhythm_of(np.stack([values, np.full(130, np.nan)]), time_s, 5.0)
+    found = rhythms(np.stack([values, np.full(130, np.nan)]), time_s)
     unknown = np.isnan(found.frequency_hz[0])
     assert unknown[np.isnan(values)].all()
     assert set(np.flatnonzero(unknown[:45])) <= {10, 11, 12, 30, 33, 34}
@@ -147,7 +154,7 @@ def test_too_slow_videos_have_no_rhythm():
         assert np.isnan(rhythm(signal(time_s, 0.3 * fps), time_s).frequency_hz).all()
     for frames in (0, 1, 2, 3):
         time_s = np.arange(frames) / 25
-        assert rhythm_of(np.zeros((2, frames)), time_s, 5.0).phase_deg.shape == (2, frames)
+        assert rhythms(np.zeros((2, frames)), time_s).phase_deg.shape == (2, frames)
 
 
 @pytest.mark.parametrize("frequency_hz", [0.8, 1.0, 12.4, 12.5])
@@ -159,7 +166,7 @@ def test_frequencies_that_cannot_be_measured_are_unknown(frequency_hz):
 
 def test_large_noise_is_no_rhythm():
     noise = 10 * np.random.default_rng(1).normal(size=(20, 75))
-    found = rhythm_of(noise, np.arange(75) / 25, 5.0)
+    found = rhythms(noise, np.arange(75) / 25)
     assert np.isfinite(found.frequency_hz).mean() < 0.01
 
 
