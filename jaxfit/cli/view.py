@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import tempfile
 import webbrowser
 from pathlib import Path
 
@@ -54,18 +55,36 @@ def view(options: argparse.Namespace) -> None:
         session = Session(options.results[0], edits, options.observations, video)
     elif options.edits is not None:
         raise InputError("--edits", "corrects one result, and several are given", "give one result")
-    sock = listening(options.port)
-    serve(Viewer(results, video, session, opened), sock, _started(not options.no_browser))
+    sock, leading = listening(options.port), []
 
-
-def _started(open_browser: bool):
     def started(address: str) -> None:
         show(f"{address}")
         show("open this address in a browser of this computer; Ctrl+C ends the viewer")
-        if open_browser and has_display():
-            webbrowser.open(address)
+        if has_display() and not options.no_browser:
+            leading.append(leading_page(address, options.results[0].resolve().parent))
+            webbrowser.open(leading[0].as_uri())
 
-    return started
+    try:
+        serve(Viewer(results, video, session, opened), sock, started)
+    finally:
+        for page in leading:
+            page.unlink(missing_ok=True)
+
+
+def leading_page(address: str, folder: Path) -> Path:
+    """Write a page that only this user can read, and that leads to an address.
+
+    All users of a computer can read the arguments of a browser, and the address has a secret token. Browsers in a
+    sandbox see no temporary folder, so that the page is beside the result where possible.
+    """
+    text = f'<!DOCTYPE html>\n<meta http-equiv="refresh" content="0; url={address}">\n<a href="{address}">result</a>\n'
+    try:
+        descriptor, name = tempfile.mkstemp(".html", "jaxfit-view-", folder)
+    except OSError:
+        descriptor, name = tempfile.mkstemp(".html", "jaxfit-view-")
+    with os.fdopen(descriptor, "w") as file:  # has the mode 0600
+        file.write(text)
+    return Path(name)
 
 
 def has_display() -> bool:

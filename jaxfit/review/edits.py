@@ -96,13 +96,30 @@ def read_edits(path: str | Path) -> list[Edit]:
     return edits
 
 
-def edits_text(edits: Sequence[Edit]) -> str:
+def edits_text(edits: Sequence[Edit], before: str = "") -> str:
     """Return the content of a file of edits, which `read_edits` reads; one line per edit.
+
+    Args:
+        edits: the edits.
+        before: the present content of the file. Its comments, empty lines and equal first edits stay as they are.
 
     Raises:
         InputError: an edit is not complete, such as a cut without a frame.
     """
-    return "".join(f"{parse_edit(str(edit), 'corrections')}\n" for edit in edits)
+    lines = [str(parse_edit(str(edit), "corrections")) for edit in edits]
+    kept, equal = [], 0
+    for line in before.splitlines():
+        text = line.strip()
+        if not text or text.startswith("#"):
+            kept.append(line)
+        elif lines[equal : equal + 1] == [text]:
+            kept.append(line)
+            equal += 1
+        else:
+            break
+    rest = before.splitlines()[len(kept) :]
+    kept += [line for line in rest if not line.strip() or line.strip().startswith("#")]
+    return "".join(f"{line}\n" for line in [*kept, *lines[equal:]])
 
 
 def apply_edits(observations: Observations, edits: Sequence[Edit], source: object) -> Observations:

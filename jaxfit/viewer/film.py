@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from jaxfit.data.tracks import frame_step
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.video.decoding import frame_times
 from jaxfit.video.reader import probe_video, read_frames
 from jaxfit.video.writer import SLOWEST_FPS, VideoWriter
 from jaxfit.view.overlay import FOLDER_FPS
@@ -23,6 +24,21 @@ JPEG_QUALITY = 85
 def is_played(video: Path) -> bool:
     """Whether browsers may play a film as it is; a folder of images is no film."""
     return not video.is_dir() and video.suffix.lower() in PLAYED
+
+
+def film_times(video: Path, frames: Int[np.ndarray, "T"]) -> list[float | None]:
+    """Return the time at which a film begins to show each frame, seconds; None for a time that is unknown.
+
+    Args:
+        video: a film, which is not decoded.
+        frames: numbers of the frames, ascending.
+
+    Raises:
+        InputError: the film cannot be read.
+    """
+    times_s = frame_times(video, int(frames[-1]) + 1)
+    known = [float(times_s[number]) if number < len(times_s) else np.nan for number in frames.tolist()]
+    return [round(time_s, 6) if np.isfinite(time_s) else None for time_s in known]
 
 
 def frame_picture(video: Path, number: int, max_width: int = 1920) -> bytes:

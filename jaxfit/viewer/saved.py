@@ -11,15 +11,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-from jaxtyping import Int
-
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import check_new_file, check_replaceable, new_folder, write_whole
 from jaxfit.foundation.progress import ProgressTask, silent
-from jaxfit.viewer.film import is_played, write_copy
+from jaxfit.viewer.film import film_times, is_played, write_copy
 from jaxfit.viewer.page import saved_index
-from jaxfit.viewer.shown import Shown
+from jaxfit.viewer.shown import Shown, frames_of
 
 LARGEST_FILE = 30_000_000
 """Bytes of a page in one file."""
@@ -92,7 +89,7 @@ def _film_that_fits(
     with tempfile.TemporaryDirectory() as folder:
         for width in (min(full, WIDTHS[0]), *(each for each in WIDTHS[1:] if each < full)):
             film = Path(folder) / f"{width}.mp4"
-            times = write_copy(video, _frames(results), film, width, progress)
+            times = write_copy(video, frames_of(results), film, width, progress)
             if film.stat().st_size * 4 / 3 < free:
                 text = base64.b64encode(film.read_bytes()).decode()
                 element = f'<script type="text/plain" data-path="film" data-type="video/mp4">{text}</script>'
@@ -112,22 +109,18 @@ def _save_folder(
             write_whole(part / "data" / f"{path.replace('/', '-')}.js", call.encode())
         copy = None
         if video is not None:
-            name, times = "film.mp4", None
-            if is_played(video) and all(np.isfinite(each.times_s).all() for each in results):
-                name = f"film{video.suffix.lower()}"
+            name, frames = f"film{video.suffix.lower()}", frames_of(results)
+            times = film_times(video, frames) if is_played(video) else [None]
+            if None not in times:
                 shutil.copyfile(video, part / name)
             else:
-                times = write_copy(video, _frames(results), part / name, results[0].size_px[0], progress).tolist()
+                name = "film.mp4"
+                times = write_copy(video, frames, part / name, results[0].size_px[0], progress).tolist()
             copy = {"source": name, "times_s": times, "pictures": False}
         facts = _element("facts", json.dumps(_facts(results, curves, copy, left_out)).encode())
         write_whole(part / INDEX, saved_index(facts).encode())
     size = sum(file.stat().st_size for file in out.rglob("*") if file.is_file())
     return Saved(out / INDEX, size, tuple(left_out))
-
-
-def _frames(results: Sequence[Shown]) -> Int[np.ndarray, "T"]:
-    """Return the frames of the page: those of all results."""
-    return np.unique(np.concatenate([each.solution.frame_index for each in results]))
 
 
 def _curves(result: Shown) -> tuple[dict[str, bytes], list[str]]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hmac
+import logging
 import secrets
 import socket
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +17,19 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import parse_json
-from jaxfit.viewer.film import frame_picture, is_played
+from jaxfit.viewer.film import film_times, frame_picture, is_played
 from jaxfit.viewer.page import FILES, index, policy
-from jaxfit.viewer.session import Session
-from jaxfit.viewer.shown import Shown
+from jaxfit.viewer.session import EditsChangedError, Session
+from jaxfit.viewer.shown import Shown, frames_of
+
+_logger = logging.getLogger(__name__)
 
 HOST = "127.0.0.1"
 LARGEST_BODY = 1 << 20
@@ -43,17 +47,47 @@ class Viewer:
     """Opens the new result after corrections."""
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
 
+    def __post_init__(self):
+        self._content = self._film_content()
+
+    def _film_content(self) -> tuple[int, int] | None:
+        """Return size and time of the last change of the film; None without a film. A folder may get more pictures."""
+        if self.video is None or not self.video.exists():
+            return None
+        found = self.video.stat()
+        return (0, 0) if self.video.is_dir() else (found.st_size, found.st_mtime_ns)
+
+    def existing_film(self) -> Path:
+        """Return the film, as it was when the page was opened.
+
+        Raises:
+            HTTPException: there is no film.
+            InputError: the film was removed or replaced.
+        """
+        if self.video is None:
+            raise HTTPException(404)
+        if self._film_content() != self._content:
+            remedy = "start `jaxfit view` again"
+            raise InputError(self.video, "was removed or changed while it is shown", remedy)
+        return self.video
+
+    @cached_property
+    def film(self) -> dict[str, Any] | None:
+        """How the page shows the film; None without a film."""
+        if self.video is None:
+            return None
+        source = "film" if is_played(self.video) else None
+        times_s = film_times(self.video, frames_of(self.results)) if source else None
+        return {"source": source, "times_s": times_s, "pictures": True}
+
     def facts(self) -> dict[str, Any]:
         """Return what the page needs first."""
-        film = None
-        if self.video is not None:
-            film = {"source": "film" if is_played(self.video) else None, "times_s": None, "pictures": True}
         corrections = None
         if self.session is not None:
             corrections = {"edits": [str(edit) for edit in self.session.edits], "file": str(self.session.edits_path)}
         return {
             "results": [each.facts() for each in self.results],
-            "film": film,
+            "film": self.film,
             "corrections": corrections,
         }
 
@@ -80,7 +114,7 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         return JSONResponse(await run_in_threadpool(viewer.facts))
 
     async def binary(request: Request) -> Response:
-        result, kind = request.path_params["result"], request.path_params["kind"]
+        result, kind = _number(request.path_params["result"]), request.path_params["kind"]
         if not result < len(viewer.results):
             raise HTTPException(404)
         argument = request.path_params.get("number")
@@ -88,15 +122,13 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         return Response(content, media_type="application/octet-stream")
 
     async def film(request: Request) -> Response:
-        if viewer.video is None or viewer.video.is_dir():
+        if viewer.existing_film().is_dir():
             raise HTTPException(404)
-        return FileResponse(viewer.video)  # answers byte ranges
+        return FileResponse(viewer.existing_film())  # answers byte ranges
 
     async def picture(request: Request) -> Response:
-        if viewer.video is None:
-            raise HTTPException(404)
-        number = request.path_params["number"]
-        return Response(await run_in_threadpool(frame_picture, viewer.video, number), media_type="image/jpeg")
+        film, number = viewer.existing_film(), _number(request.path_params["number"])
+        return Response(await run_in_threadpool(frame_picture, film, number), media_type="image/jpeg")
 
     async def change(request: Request) -> Response:
         session = viewer.session
@@ -105,10 +137,11 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         sent = parse_json((await _body(request)).decode("utf-8", "replace"), "the page")
         action = request.path_params["action"]
         if action == "edits":
-            await run_in_threadpool(session.set_edits, _list_of(sent, "edits", str))
+            await run_in_threadpool(session.set_edits, _list_of(sent, "edits", str), _list_of(sent, "known", str))
             return JSONResponse({})
         if action == "refit":
-            work = session.refit(lambda out: viewer.results.append(viewer.open_result(out)))
+            known = _list_of(sent, "known", str)
+            work = session.refit(lambda out: viewer.results.append(viewer.open_result(out)), known)
         elif action == "mark":
             work = session.mark(_list_of(sent, "frames", int))
         else:
@@ -120,17 +153,19 @@ def application(viewer: Viewer, port: int) -> ASGIApp:
         return JSONResponse({"done": True, "kind": ""} if running is None else running.entries())
 
     async def refused(request: Request, error: Exception) -> Response:
-        return JSONResponse({"problem": str(error)}, 400)
+        if viewer.session is None or not isinstance(error, EditsChangedError):
+            return JSONResponse({"problem": str(error)}, 400)
+        return JSONResponse({"problem": str(error), "edits": list(map(str, viewer.session.edits))}, 409)
 
     inside = Starlette(
         routes=[
             Route("/", page),
             Route("/page/{name}", page_file),
             Route("/facts", facts),
-            Route("/results/{result:int}/{kind}", binary),
-            Route("/results/{result:int}/{kind}/{number}", binary),
+            Route("/results/{result}/{kind}", binary),
+            Route("/results/{result}/{kind}/{number}", binary),
             Route("/film", film),
-            Route("/frames/{number:int}", picture),
+            Route("/frames/{number}", picture),
             Route("/work", work),
             Route("/change/{action}", change, methods=["POST"]),
         ],
@@ -143,7 +178,8 @@ class Guard:
     """Passes on the requests of this server's own page, and rejects all others.
 
     A request needs the token as the first part of its path. Its `Host` must be this computer, so that a foreign name
-    that leads here (DNS rebinding) fails. An `Origin` or `Sec-Fetch-Site` of another page fails too.
+    that leads here (DNS rebinding) fails. An `Origin` or `Sec-Fetch-Site` of another page fails too; only a link may
+    lead from elsewhere to the page itself.
     """
 
     def __init__(self, inside: ASGIApp, token: str, port: int):
@@ -168,7 +204,14 @@ class Guard:
 
         prefix = f"/{self._token}"
         path = scope["path"].removeprefix(prefix)
-        await self._inside({**scope, "path": path, "raw_path": path.encode(), "root_path": ""}, receive, guarded)
+        inside = {**scope, "path": path, "raw_path": path.encode(), "root_path": ""}
+        try:
+            await self._inside(inside, receive, guarded)
+        except ClientDisconnect:
+            pass
+        except Exception as error:  # such as a film that becomes shorter while it is sent
+            _logger.warning("the viewer could not answer %s: %s: %s", path[:80], type(error).__name__, error)
+            raise  # uvicorn closes the connection
 
     def _problem(self, scope: Scope) -> str | None:
         headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
@@ -176,7 +219,10 @@ class Guard:
             return "jaxfit answers only this computer"
         if "origin" in headers and headers["origin"] not in {f"http://{host}" for host in self._hosts}:
             return "jaxfit answers only its own page"
-        if headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
+        is_link = headers.get("sec-fetch-mode") == "navigate" and scope["path"].count("/") == 2
+        if headers.get("sec-fetch-site", "none") not in ("none", "same-origin") and not (
+            is_link and scope["path"].endswith("/") and scope["method"] == "GET"
+        ):
             return "jaxfit answers only its own page"
         token = scope["path"].split("/")[1] if scope["path"].startswith("/") else ""
         if not hmac.compare_digest(token.encode(), self._token.encode()) or scope["path"].count("/") < 2:
@@ -198,11 +244,18 @@ def _content(result: Shown, kind: str, argument: str | None) -> bytes:
     """Return arrays of a result: `rig`, `flags`, `poses/3`, `outlines/3`, `values/speed`."""
     if kind in ("rig", "flags") and argument is None:
         return result.rig() if kind == "rig" else result.flags()
-    if kind in ("poses", "outlines") and argument is not None and argument.isdecimal() and len(argument) < 9:
-        return result.part(int(argument)) if kind == "poses" else result.outlines(int(argument))
+    if kind in ("poses", "outlines") and argument is not None:
+        return result.part(_number(argument)) if kind == "poses" else result.outlines(_number(argument))
     if kind == "values" and argument in [each["name"] for each in result.kinds_of_values]:
         return result.values(argument)
     raise HTTPException(404)
+
+
+def _number(text: str) -> int:
+    """Return a number of a path."""
+    if not (text.isascii() and text.isdecimal() and len(text) < 10):
+        raise HTTPException(404)
+    return int(text)
 
 
 async def _body(request: Request) -> bytes:
@@ -240,6 +293,11 @@ def listening(port: int | None) -> socket.socket:
     return sock
 
 
+def server_config(viewer: Viewer, port: int) -> uvicorn.Config:
+    """Return the settings of the server, whose tracebacks `jaxfit --verbose` shows."""
+    return uvicorn.Config(application(viewer, port), log_config=None, lifespan="off", server_header=False)
+
+
 def serve(viewer: Viewer, sock: socket.socket, started: Callable[[str], None]) -> None:
     """Serve a page until the process is interrupted.
 
@@ -249,7 +307,7 @@ def serve(viewer: Viewer, sock: socket.socket, started: Callable[[str], None]) -
         started: is called with the address of the page when the server answers.
     """
     port = sock.getsockname()[1]
-    config = uvicorn.Config(application(viewer, port), log_level="warning", lifespan="off", server_header=False)
+    config = server_config(viewer, port)
 
     class Server(uvicorn.Server):
         async def startup(self, sockets: Any = None) -> None:

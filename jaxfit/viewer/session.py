@@ -13,6 +13,7 @@ from typing import Any
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.progress import ReportProgress
+from jaxfit.foundation.reading import read_text
 from jaxfit.review.correct import correct_tracks
 from jaxfit.review.edits import Edit, edits_text, parse_edit, read_edits
 from jaxfit.review.suggest import suggest_marked
@@ -53,6 +54,10 @@ class Work:
         yield report
 
 
+class EditsChangedError(InputError):
+    """The edits are not those that a page shows."""
+
+
 class Session:
     """The corrections of one result.
 
@@ -72,27 +77,44 @@ class Session:
         self.work: Work | None = None
         self._lock = Lock()
 
-    def set_edits(self, texts: list[str]) -> None:
-        """Replace the edits, and write their file.
+    def set_edits(self, texts: list[str], known: list[str]) -> None:
+        """Replace the edits, and write their file, whose comments stay.
+
+        Args:
+            texts: the new edits.
+            known: the edits that the page showed before.
 
         Raises:
-            InputError: a text is no edit, or the file cannot be written.
+            EditsChangedError: another page, another viewer or a person has changed the edits.
+            InputError: a text is no edit, or the file cannot be read or written.
         """
         edits = [parse_edit(text, "edit of the page") for text in texts]
         with self._lock:
-            write_whole(self.edits_path, edits_text(edits).encode())
+            self._check_known(known)
+            before = read_text(self.edits_path, "corrections") if self.edits_path.exists() else ""
+            write_whole(self.edits_path, edits_text(edits, before).encode())
             self.edits = edits
 
-    def refit(self, finish: Callable[[Path], None]) -> Work:
+    def _check_known(self, known: list[str]) -> None:
+        self.edits = read_edits(self.edits_path) if self.edits_path.exists() else []
+        if [str(edit) for edit in self.edits] != known:
+            problem = "were changed by another page, another viewer or by hand: nothing was written"
+            raise EditsChangedError(self.edits_path, problem, "the list is now the one of the file; correct again")
+
+    def refit(self, finish: Callable[[Path], None], known: list[str]) -> Work:
         """Start `jaxfit tracks` with the edits, and write the new result beside the result.
 
         Args:
             finish: is called with the new result, before the work is done.
+            known: the edits that the page shows.
 
         Raises:
+            EditsChangedError: as of `set_edits`.
             InputError: there is no edit, or other work is running.
         """
-        edits = list(self.edits)
+        with self._lock:
+            self._check_known(known)
+            edits = list(self.edits)
         if not edits:
             raise InputError("corrections", "are empty, so nothing changes", "swap, cut, join, delete or exclude first")
 

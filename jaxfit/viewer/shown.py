@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int16
+from jaxtyping import Float, Int, Int16
 from scipy.spatial.transform import Rotation
 
 from jaxfit.behaviour.birds import Flock, flock_of
@@ -282,6 +283,11 @@ class Shown:
             found_here = keypoint_distances(seen, s)
         values[np.ix_(rows[1], columns[1])] = found_here[np.ix_(rows[0], columns[0])]
         return np.where(s.valid, values, np.nan)
+
+
+def frames_of(results: Sequence[Shown]) -> Int[np.ndarray, "T"]:
+    """Return the frames of the page: those of all results."""
+    return np.unique(np.concatenate([each.solution.frame_index for each in results]))
 
 
 def regions(covariance: Float[np.ndarray, "N F K 2 2"]) -> Int16[np.ndarray, "N F K 3"]:

@@ -13,7 +13,7 @@ from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.projection import projected_observations
 from jaxfit.data.solution import save_solution
 from jaxfit.export.result import open_result
-from jaxfit.viewer.server import HOST, Viewer, application, listening
+from jaxfit.viewer.server import HOST, Viewer, listening, server_config
 from jaxfit.viewer.session import Session
 from jaxfit.viewer.shown import Shown
 from support import overlays
@@ -84,7 +84,7 @@ def served(folder, video, edits=None, results=None):
     viewer = Viewer(results or [shown(folder)], video, session, shown)
     sock = listening(None)
     port = sock.getsockname()[1]
-    server = uvicorn.Server(uvicorn.Config(application(viewer, port), log_level="error", lifespan="off"))
+    server = uvicorn.Server(server_config(viewer, port))
     thread = threading.Thread(target=server.run, kwargs={"sockets": [sock]})
     thread.start()
     try:

@@ -11,9 +11,11 @@ import av
 import cv2
 import numpy as np
 import pytest
-from support import overlays
+from support import films, overlays
 from support.viewed import served, shown, unpacked, write_result
 
+from jaxfit.cli.view import leading_page
+from jaxfit.video.reader import read_frames
 from jaxfit.viewer import session
 from jaxfit.viewer.page import ASSETS
 from jaxfit.viewer.saved import save_page
@@ -85,8 +87,12 @@ class Opened:
     def until(self, condition):
         """Wait until a condition holds; the policy of the page forbids `wait_for_function`."""
         for _ in range(400):
-            if self.page.evaluate(condition):
-                return
+            try:
+                if self.page.evaluate(condition):
+                    return
+            except Exception as error:
+                if "navigation" not in str(error):  # while another page is loaded
+                    raise
             time.sleep(0.05)
         raise AssertionError(f"never true: {condition}; {self.errors}")
 
@@ -159,6 +165,86 @@ def test_play_shows_pictures_and_poses_in_step(page):
     assert opened.page.evaluate("jaxfit.state.i") == overlays.T - 1
 
 
+NUMBER = """() => {
+  const canvas = new OffscreenCanvas(128, 80), context = canvas.getContext("2d");
+  context.drawImage(jaxfit.state.film.picture, 0, 0);
+  const cell = (bit) => context.getImageData(16 * bit + 8, 72, 1, 1).data[1] > 127;
+  return [0, 1, 2, 3, 4, 5, 6, 7].reduce((sum, bit) => sum + (cell(bit) ? 1 << bit : 0), 0);
+}"""
+"""The number that is written into the picture of the film (`support.films.numbered`)."""
+UNEVEN = np.cumsum([0, *([2, 2, 9, 2, 17, 3] * 15)]).tolist()
+"""Times of the frames of a film with a variable rate, 1/100 s."""
+CLIPS = {
+    "contiguous": ({}, range(20, 26)),
+    "every fourth frame": ({}, range(3, 27, 4)),
+    "with gaps": ({"b_frames": 3}, (0, 1, 9, 10, 40, 77)),
+    "a range with B-frames": ({"b_frames": 3}, range(50, 56)),
+    "variable rate": ({"ticks": UNEVEN}, range(30, 36)),
+    "variable rate, every fifth frame": ({"ticks": UNEVEN}, range(10, 40, 5)),
+    "a film that begins late": ({"ticks": [80 + 4 * i for i in range(80)]}, range(8, 32, 4)),
+    "VP9": ({"codec": "libvpx-vp9", "suffix": ".webm"}, range(4, 28, 4)),
+    "trimmed": ({"trim": (10, 60)}, range(5, 29, 4)),
+    "a folder": ({"pictures": True}, range(3, 27, 4)),
+}
+"""Films, and frames of results."""
+
+
+def numbered_film(folder, suffix=".mp4", trim=None, pictures=False, **settings):
+    """Write a film whose pictures hold their numbers, or a folder of such pictures."""
+    if pictures:
+        (folder / "pictures").mkdir()
+        for i in range(80):
+            cv2.imwrite(str(folder / "pictures" / f"{i}.png"), films.numbered(i))
+        return folder / "pictures"
+    film = films.encode(folder / f"numbered{suffix}", **{"count": 80, **settings})
+    if trim is not None:
+        films.trim(film, *trim)
+    return film
+
+
+@pytest.mark.parametrize("clip", CLIPS)
+def test_the_picture_is_the_frame_of_the_result(browser, tmp_path, clip):
+    settings, numbers = CLIPS[clip]
+    video = numbered_film(tmp_path, **settings)
+    burnt_in = {number: films.number_in(picture) for number, picture, _ in read_frames(video)}
+    (tmp_path / "of").mkdir()
+    folder, _ = write_result(tmp_path / "of", frame_index=np.array(numbers))
+    expected = [burnt_in[number] for number in numbers]
+    with served(folder, video) as (client, _):
+        opened = Opened(browser, client.address)
+        assert (opened.page.evaluate("jaxfit.state.film.video !== null")) == video.is_file()
+        for i in (3, 0, 5, 1, 4, 2):
+            opened.go(i)
+            assert opened.page.evaluate(NUMBER) == expected[i], i
+        opened.page.keyboard.press("Home")
+        opened.until("!jaxfit.state.busy && jaxfit.state.i === 0")
+        opened.page.select_option("#speed", "0.25")
+        opened.page.keyboard.press(" ")
+        opened.until("!jaxfit.state.playing && !jaxfit.state.busy")
+        assert opened.page.evaluate("jaxfit.state.i") == 5
+        assert opened.page.evaluate(NUMBER) == expected[5]
+        opened.close()
+
+
+def test_a_playing_film_with_gaps_shows_frames_of_the_result_only(browser, tmp_path):
+    numbers = range(3, 51, 8)
+    (tmp_path / "of").mkdir()
+    folder, _ = write_result(tmp_path / "of", frame_index=np.array(numbers))
+    with served(folder, numbered_film(tmp_path)) as (client, _):
+        opened = Opened(browser, client.address)
+        opened.page.evaluate(
+            f"""() => {{ window.seen = []; const number = {NUMBER};
+            window.addEventListener("drawn", () => seen.push([jaxfit.state.i, number()])); }}"""
+        )
+        opened.page.select_option("#speed", "0.25")
+        opened.page.keyboard.press(" ")
+        opened.until("!jaxfit.state.playing && jaxfit.state.i === 5")
+        seen = {tuple(pair) for pair in opened.page.evaluate("seen")}
+        assert seen <= set(enumerate(numbers))
+        assert len(seen) > 2
+        opened.close()
+
+
 def test_a_click_chooses_a_bird_in_all_views(page):
     opened, viewer = page
     opened.go(1)
@@ -175,6 +261,25 @@ def test_a_click_chooses_a_bird_in_all_views(page):
     assert opened.selected() == [11]
     opened.page.keyboard.press("Escape")
     assert opened.selected() == []
+
+
+def test_a_private_page_leads_to_the_result(browser, result, tmp_path):
+    with served(*result) as (client, _):
+        opened = Opened(browser, leading_page(client.address, tmp_path).as_uri())
+        assert opened.page.url.startswith(client.address)
+        opened.close()
+
+
+def test_a_film_that_is_removed_stops_nothing(browser, result, tmp_path):
+    folder, film = result
+    video = Path(shutil.copy(film, tmp_path / "film.mp4"))
+    with served(folder, video) as (client, _):
+        opened = Opened(browser, client.address)
+        video.unlink()
+        for i in (5, 1, 3):
+            opened.page.evaluate("(i) => { jaxfit.state.film.shown.clear(); return jaxfit.go(i); }", i)
+            opened.until(f"!jaxfit.state.busy && jaxfit.state.i === {i}")
+        opened.page.close()
 
 
 def test_keys_and_the_address(page, browser):
@@ -225,11 +330,17 @@ def test_corrections_and_the_fit_after_them(page, monkeypatch, tmp_path):
     ]
     opened.page.click("#undo")
     opened.until("document.querySelectorAll('#edits li').length === 1")
+    viewer.session.edits_path.write_text("# by hand\ncut 4@5\n")
+    opened.page.click("#undo")
+    opened.until("document.getElementById('state').textContent.includes('by hand: nothing was written')")
+    assert opened.page.inner_text("#edits li") == "cut 4@5"
+    assert viewer.session.edits_path.read_text() == "# by hand\ncut 4@5\n"
+    opened.errors.clear()  # the browser reports the answer 409
     opened.page.keyboard.press("m")
     assert f"Frames {first + 1}" in opened.page.inner_text("#marked")
     opened.page.click("#refit")
     opened.until("jaxfit.state.columns.length === 2")
-    assert calls == [[f"swap 4,11@{first}"]]
+    assert calls == [["cut 4@5"]]
 
 
 def test_saved_pages_need_no_server_and_no_network(browser, result, tmp_path):

@@ -1,15 +1,23 @@
 """The server answers its own page only: token, host, origin, paths; it serves the film by ranges and takes edits."""
 
 import json
+import os
+import socket
+import stat
 import time
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import pytest
 from support.cli_files import rejected
 from support.viewed import served, unpacked, write_result
 
 from jaxfit.cli import view
+from jaxfit.cli.main import main
 from jaxfit.foundation.errors import InputError
-from jaxfit.viewer import session
+from jaxfit.review.edits import read_edits
+from jaxfit.viewer import server, session
 from jaxfit.viewer.server import HOST, LARGEST_BODY, listening
 from jaxfit.viewer.session import Session
 
@@ -99,6 +107,10 @@ def test_the_page_itself_is_answered(page):
         "results/-1/rig",
         "results/0/poses/999999999999",
         "results/0/poses/x",
+        "results/0/poses/" + "9" * 5000,
+        "results/" + "9" * 5000 + "/rig",
+        "frames/" + "9" * 5000,
+        "frames/-1",
         "results/0/poses",
         "results/0/rig/1",
         "results/0/values/no_such_value",
@@ -151,9 +163,10 @@ def test_edits_are_stored_and_wrong_ones_refused(page):
         status, _, answer = client.of_page(f"change/{action}", method="POST", body=content)
         return status, json.loads(answer) if answer[:1] == b"{" else answer
 
-    assert send(b'{"edits": ["swap 4,11@5", "exclude 4@3:5"]}')[0] == 200
+    path.write_text("# two birds cross\n")
+    assert send(b'{"edits": ["swap 4,11@5", "exclude 4@3:5"], "known": []}')[0] == 200
     stored = path.read_text()
-    assert stored.split("\n")[:2] == ["swap 4,11@5", "exclude 4@3:5"]
+    assert stored == "# two birds cross\nswap 4,11@5\nexclude 4@3:5\n"
     assert [str(edit) for edit in Session(viewer.session.folder, path, None, None).edits] == [
         "swap 4,11@5",
         "exclude 4@3:5",
@@ -166,7 +179,98 @@ def test_edits_are_stored_and_wrong_ones_refused(page):
     assert send(b'{"frames": []}', "mark")[0] == 400
     assert send(b" " * (LARGEST_BODY + 1))[0] == 413
     assert path.read_text() == stored
-    assert send(b'{"edits": []}')[0] == 200
+    known = json.dumps(["swap 4,11@5", "exclude 4@3:5"]).encode()
+    assert send(b'{"edits": [], "known": %s}' % known)[0] == 200
+
+
+@pytest.mark.parametrize("by", ["another viewer", "another page", "hand", "deletion"])
+def test_edits_of_others_are_not_erased(page, by):
+    """The answer 409 has the list of the file, from which the page goes on; comments stay."""
+    client, viewer, video = page
+    path = viewer.session.edits_path
+    path.write_text("# mine\n\ndelete 4 \n")
+
+    def send(edits, known, action="edits"):
+        body = json.dumps({"edits": edits, "known": known}).encode()
+        status, _, answer = client.of_page(f"change/{action}", method="POST", body=body)
+        return status, json.loads(answer)
+
+    assert send(["delete 4", "cut 11@5"], ["delete 4"])[0] == 200
+    text = "# mine\n\ndelete 4 \ncut 11@5\n"
+    assert path.read_text() == text
+    if by == "another viewer":
+        Session(viewer.session.folder, path, None, video).set_edits(["delete 4", "join 4,11"], ["delete 4", "cut 11@5"])
+        text = "# mine\n\ndelete 4 \njoin 4,11\n"
+    elif by == "another page":
+        assert send(["delete 4"], ["delete 4", "cut 11@5"])[0] == 200
+        text = "# mine\n\ndelete 4 \n"
+    elif by == "hand":
+        text = "delete 11\n# see frame 7\n"
+        path.write_text(text)
+    else:
+        path.unlink()
+    for action in ("edits", "refit"):
+        status, answer = send([], ["delete 4", "cut 11@5"], action)
+        assert status == 409
+        assert "result.edits: were changed" in answer["problem"]
+        assert answer["edits"] == list(map(str, read_edits(path) if path.exists() else []))
+        assert (path.read_text() if path.exists() else text) == text
+    assert send([], answer["edits"])[0] == 200
+    assert path.read_text() == "".join(f"{line}\n" for line in text.splitlines() if line[:1] in "#") * (
+        by != "deletion"
+    )
+
+
+def test_a_film_that_is_removed_or_replaced_is_one_sentence(tmp_path, caplog):
+    folder, video = write_result(tmp_path)
+    with served(folder, video) as (client, _):
+        assert client.of_page("film", Range="bytes=0-9")[0] == 206
+        content = video.read_bytes()
+        video.write_bytes(content + b"0")
+        for path in ("film", "frames/4"):
+            status, _, answer = client.of_page(path)
+            assert status == 400
+            assert "film.mp4: was removed or changed" in json.loads(answer)["problem"]
+        video.unlink()
+        assert client.of_page("film")[0] == 400
+    assert "Traceback" not in caplog.text
+
+
+def test_a_film_that_is_cut_off_while_it_is_sent_ends_the_request(tmp_path, monkeypatch, capfd):
+    folder, _ = write_result(tmp_path)
+    video = tmp_path / "large.mp4"
+    video.write_bytes(bytes(80_000_000))
+    monkeypatch.setattr(server, "film_times", lambda *_: [])
+    with served(folder, video) as (client, _), socket.create_connection((HOST, client.port), timeout=30) as connection:
+        connection.sendall(f"GET /{client.token}/film HTTP/1.1\r\nHost: {HOST}:{client.port}\r\n\r\n".encode())
+        connection.recv(9)
+        os.truncate(video, 1_000_000)
+        while connection.recv(1 << 20):
+            pass
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_a_client_that_leaves_is_no_error(page, caplog, capfd):
+    client, _, _ = page
+    for request in (
+        f"POST /{client.token}/change/edits HTTP/1.1\r\nHost: {HOST}:{client.port}\r\nContent-Length: 99\r\n\r\n[",
+        f"GET /{client.token}/film HTTP/1.1\r\nHost: {HOST}:{client.port}\r\n\r\n",
+    ):
+        with socket.create_connection((HOST, client.port)) as connection:
+            connection.sendall(request.encode())
+    assert client.of_page("facts")[0] == 200
+    assert "Traceback" not in caplog.text + capfd.readouterr().err
+
+
+def test_a_link_may_lead_to_the_page_but_to_nothing_else(page):
+    client, _, _ = page
+    link = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
+    assert client.of_page("", **link)[0] == 200
+    for path in ("facts", "film", "page/main.js", "results/0/rig"):
+        assert client.of_page(path, **link)[0] == 403
+    assert client.of_page("", method="POST", body=b"", **link)[0] == 403
+    assert client.of_page("", Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="cors")[0] == 403
+    assert client.get("/", **link)[0] == 403
 
 
 def wait_for(client):
@@ -190,9 +294,11 @@ def test_work_appends_the_new_result_and_reports_failures(page, monkeypatch, tmp
         called.append(list(map(str, edits)))
 
     monkeypatch.setattr(session, "correct_tracks", corrected)
-    assert client.of_page("change/refit", method="POST", body=b"{}")[0] == 400  # no edits
-    client.of_page("change/edits", method="POST", body=b'{"edits": ["delete 4"]}')
-    assert client.of_page("change/refit", method="POST", body=b"{}")[0] == 200
+    assert client.of_page("change/refit", method="POST", body=b'{"known": []}')[0] == 400  # no edits
+    body = b'{"edits": ["delete 4"], "known": []}'
+    client.of_page("change/edits", method="POST", body=body)
+    known = b'{"known": ["delete 4"], "edits": []}'
+    assert client.of_page("change/refit", method="POST", body=known)[0] == 200
     state = wait_for(client)
     assert (state["problem"], state["out"], called) == ("", str(other), [["delete 4"]])
     assert len(json.loads(client.of_page("facts")[2])["results"]) == 2
@@ -202,9 +308,9 @@ def test_work_appends_the_new_result_and_reports_failures(page, monkeypatch, tmp
         raise InputError("track 4", "cannot be fitted", "choose another")
 
     monkeypatch.setattr(session, "correct_tracks", failing)
-    client.of_page("change/refit", method="POST", body=b"{}")
+    client.of_page("change/refit", method="POST", body=known)
     assert "track 4" in wait_for(client)["problem"]
-    client.of_page("change/edits", method="POST", body=b'{"edits": []}')
+    client.of_page("change/edits", method="POST", body=known)
 
 
 def test_marked_frames_become_a_folder_for_labelling(page):
@@ -243,17 +349,27 @@ def test_wrong_use_is_one_sentence(tmp_path, capsys):
     rejected(capsys, ["view", str(result), "--port", "99999999"], "--port")
 
 
-def test_without_a_display_no_browser_is_opened(monkeypatch, capsys):
+def test_the_browser_gets_a_private_page_and_not_the_address(tmp_path, monkeypatch, capsys):
+    """All users of a computer see the arguments of programs; without a display, no browser is opened."""
+    result, _ = write_result(tmp_path)
     opened = []
-    monkeypatch.setattr(view.webbrowser, "open", opened.append)
+
+    def look(address):
+        leading = Path(url2pathname(urlsplit(address).path))
+        opened.append((address, leading.read_text(), stat.S_IMODE(leading.stat().st_mode)))
+
+    monkeypatch.setattr(view.webbrowser, "open", look)
     monkeypatch.setattr(view.sys, "platform", "linux")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    view._started(True)("http://127.0.0.1:1/x/")
-    assert opened == []
-    assert "http://127.0.0.1:1/x/" in capsys.readouterr().out
-    monkeypatch.setenv("DISPLAY", ":0")
-    view._started(False)("http://127.0.0.1:1/x/")
-    assert opened == []
-    view._started(True)("http://127.0.0.1:1/x/")
-    assert opened == ["http://127.0.0.1:1/x/"]
+    monkeypatch.setattr(
+        "jaxfit.viewer.server.serve", lambda viewer, sock, started: started("http://127.0.0.1:1/secret/")
+    )
+    for display, options in ((":0", []), (":0", ["--no-browser"]), ("", [])):
+        for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+            monkeypatch.setenv(name, display)
+        assert main(["view", str(result), *options]) == 0
+        assert "http://127.0.0.1:1/secret/" in capsys.readouterr().out
+    ((address, text, mode),) = opened
+    assert "secret" not in address
+    assert 'url=http://127.0.0.1:1/secret/"' in text
+    assert mode == 0o600
+    assert not list(tmp_path.glob("*.html"))

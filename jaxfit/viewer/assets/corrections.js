@@ -22,7 +22,7 @@ export class Corrections {
       button.addEventListener("click", () => this.add(button.getAttribute("data-edit") ?? ""));
     }
     find("undo").addEventListener("click", () => this.undo());
-    find("refit").addEventListener("click", () => this.start("refit", {}));
+    find("refit").addEventListener("click", () => this.start("refit", { known: this.edits }));
     find("mark").addEventListener("click", () => this.mark());
     find("write").addEventListener("click", () => this.start("mark", { frames: this.marks }));
     this.show();
@@ -58,9 +58,9 @@ export class Corrections {
   /** @param {string[]} edits */
   async store(edits) {
     try {
-      await change("edits", { edits });
-      this.edits = edits;
-      this.say("");
+      const answer = await change("edits", { edits, known: this.edits });
+      this.edits = answer.edits ?? edits;
+      this.say(answer.problem ?? "", Boolean(answer.problem));
     } catch (error) {
       this.say(String(/** @type {Error} */ (error).message), true);
     }
@@ -77,7 +77,12 @@ export class Corrections {
   /** @param {string} action @param {object} sent */
   async start(action, sent) {
     try {
-      await change(action, sent);
+      const answer = await change(action, sent);
+      if (answer.edits) {
+        this.edits = answer.edits;
+        this.show();
+        throw new Error(answer.problem);
+      }
     } catch (error) {
       this.say(String(/** @type {Error} */ (error).message), true);
       return;

@@ -126,9 +126,10 @@ export async function filmAddress(source) {
   return URL.createObjectURL(new Blob([decoded(await savedText("film"))], { type: kind }));
 }
 
-/** Sends a change to the server. @param {string} action @param {object} sent @returns {Promise<any>} */
+/** Sends a change to the server; an answer with a `problem` has the `edits` that others have written. @param {string} action @param {object} sent @returns {Promise<any>} */
 export async function change(action, sent) {
   const answer = await fetch(`change/${action}`, { method: "POST", body: JSON.stringify(sent) });
+  if (answer.status === 409) return answer.json();
   if (!answer.ok) throw new Error(await problem(answer));
   return answer.json();
 }

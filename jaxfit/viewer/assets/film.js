@@ -7,13 +7,22 @@ import { filmAddress } from "viewer/data";
 
 const MISSING = -32768;
 const CACHE_BYTES = 250e6;
+/** Largest distance from the begin of a frame at which the film is stopped to show the frame, seconds. */
+const MARGIN_S = 1e-3;
+/** Longest wait for the picture of a film at rest, milliseconds. */
+const SHOWN_MS = 200;
 
 /** The pictures of the film: a video element, or single pictures of the server. */
 export class Film {
   /** @param {import("viewer/data").FilmFacts} facts @param {(number | null)[]} times_s @param {number[]} frames */
   constructor(facts, times_s, frames) {
     this.frames = frames;
+    /** Times at which the film begins to show the frames. */
     this.times_s = /** @type {number[]} */ (facts.times_s ?? times_s);
+    const steps = this.times_s.slice(1).map((time, i) => (time - this.times_s[i]) / (frames[i + 1] - frames[i]));
+    this.margin = Math.min(MARGIN_S, ...steps.map((step) => step / 4));
+    /** Whether the film has frames between those of the results. */
+    this.gaps = frames.some((frame, i) => i > 0 && frame > frames[i - 1] + 1);
     this.pictures = facts.pictures;
     /** @type {HTMLVideoElement | null} */
     this.video = null;
@@ -41,32 +50,45 @@ export class Film {
     else if (!this.pictures) this.problem = "The browser cannot play the film.";
   }
 
-  /** Middle of the time in which a frame is shown. @param {number} i position of the frame */
-  middle(i) {
-    const next = this.times_s[i + 1] ?? this.times_s[i] + (i > 0 ? this.times_s[i] - this.times_s[i - 1] : 0.04);
-    return (this.times_s[i] + next) / 2;
+  /** Position of the frame that a playing film shows, −1 for a frame between those of the results. @param {number} time */
+  positionAt(time) {
+    let low = 0, high = this.times_s.length - 1;
+    while (low < high) {
+      const middle = Math.ceil((low + high) / 2);
+      if (this.times_s[middle] <= time + this.margin) low = middle;
+      else high = middle - 1;
+    }
+    return Math.abs(this.times_s[low] - time) <= this.margin || !this.gaps ? low : -1;
   }
 
-  /** Moves the video to a frame. @param {HTMLVideoElement} video @param {number} i position of the frame */
+  /** Moves the video to a frame; whether the video shows this frame. @param {HTMLVideoElement} video @param {number} i position of the frame */
   async move(video, i) {
-    if (video.readyState >= 2 && Math.abs(video.currentTime - this.middle(i)) < 1e-4) return;
+    const time = this.times_s[i] + this.margin;
+    if (video.readyState >= 2 && Math.abs(video.currentTime - time) < 1e-4) return true;
+    const shown = new Promise((done) => video.requestVideoFrameCallback((_, { mediaTime }) => done(mediaTime)));
     await new Promise((done) => {
       video.onseeked = done;
-      video.currentTime = this.middle(i);
+      video.onerror = done;
+      video.currentTime = time;
     });
+    if (video.error) return false; // the film was removed or replaced
+    // the picture may come after the event; at a variable rate, browsers may stop at a neighbour of the frame
+    const mediaTime = await Promise.race([shown, new Promise((done) => setTimeout(done, SHOWN_MS, time))]);
+    return Math.abs(mediaTime - time) <= 2 * this.margin;
   }
 
   /** Shows a frame; resolves when its picture is there. @param {number} i position of the frame */
   async seek(i) {
-    const video = this.video, known = this.shown.get(i);
+    const known = this.shown.get(i);
     if (known) {
       this.shown.delete(i); // the newest is last
       this.shown.set(i, known);
       this.picture = known;
       return;
     }
-    if (video) {
-      await this.move(video, i);
+    const video = this.video, exact = video && (await this.move(video, i));
+    if (video?.error) this.video = null;
+    if (video && (exact || !this.pictures) && !video.error) {
       this.picture = await createImageBitmap(video);
       this.shown.set(i, this.picture);
       const most = Math.max(CACHE_BYTES / (4 * video.videoWidth * video.videoHeight), 2);

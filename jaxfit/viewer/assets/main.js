@@ -103,15 +103,17 @@ async function refresh(seek = true) {
 
 /** @param {boolean} seek whether the film has to be moved */
 async function draw(seek) {
-  const i = state.i, frame = state.frames[i];
+  const i = state.i, frame = state.frames[i], toFrame = seek && !state.playing;
+  let picture = state.film?.picture ?? null;
   try {
     const [found] = await Promise.all([
       Promise.all(state.columns.map((column) => column.load(frame))),
-      seek && !state.playing ? state.film?.seek(i) : null,
+      toFrame ? state.film?.seek(i) : null,
     ]);
+    if (toFrame) picture = state.film?.picture ?? null;
     state.columns.forEach((column, c) => {
       const { t, poses, outlines } = found[c];
-      column.film?.draw(state.film?.picture ?? null, t, poses, outlines, state.selected, find("points").checked, find("camera").value === "follow");
+      column.film?.draw(picture, t, poses, outlines, state.selected, find("points").checked, find("camera").value === "follow");
       if (column.film) column.film.message.textContent = state.film?.problem ?? "";
       if (poses) column.ledge.pose(poses, t, state.selected);
       else column.ledge.pose(/** @type {any} */ ({ shapes: { valid: [0, 0] } }), -1, state.selected);
@@ -170,11 +172,11 @@ async function play() {
     state.film.picture = video;
     video.playbackRate = speed;
     await video.play();
-    const { times_s } = state.film;
+    const film = state.film, { times_s } = film;
     const step = (/** @type {number} */ _, /** @type {VideoFrameCallbackMetadata} */ shown) => {
       if (!state.playing) return;
-      state.i = positionAt(times_s, shown.mediaTime);
-      refresh(false);
+      const i = film.positionAt(shown.mediaTime);
+      if (i >= 0) showPlayed(film, video, i);
       if (video.ended || shown.mediaTime >= times_s[times_s.length - 1] - 1e-3) pause();
       else video.requestVideoFrameCallback(step);
     };
@@ -192,6 +194,13 @@ async function play() {
     await new Promise((done) => requestAnimationFrame(done));
   }
   pause();
+}
+
+/** Shows a frame of the playing film; with frames between those of the results, its picture stays until the next one. @param {Film} film @param {HTMLVideoElement} video @param {number} i */
+async function showPlayed(film, video, i) {
+  if (film.gaps) film.picture = await createImageBitmap(video);
+  state.i = i;
+  refresh(false);
 }
 
 function pause() {
