@@ -8,6 +8,8 @@ at i + 0.5 and metres.
 | OpenCV          | .yaml, .xml or .json of `cv2.FileStorage` | i             | must be given: any unit is usual |
 | anipose         | .toml                                     | i             | `[metadata] unit`, else mm       |
 | Pose2Sim        | .toml with `fisheye = false`              | i             | `[metadata] unit`, else m        |
+| Caliscope       | .toml, with `fisheye = false` or `cameras`| i             | m                                |
+| Kalibr          | camchain.yaml                             | i             | m                                |
 | JARVIS          | Camera_X.yaml with transposed matrices    | i             | mm                               |
 | DANNCE, Label3D | .mat                                      | i + 1         | mm                               |
 | COLMAP          | cameras.txt and images.txt                | i + 0.5       | must be given: arbitrary scale   |
@@ -36,7 +38,8 @@ from jaxfit.foundation.files import write_whole
 from jaxfit.foundation.reading import check_folder, open_file
 
 _FORMATS = (
-    "give OpenCV .yaml, .xml or .json, anipose .toml, DANNCE .mat, JARVIS .yaml, or a folder of COLMAP's text files"
+    "give OpenCV .yaml, .xml or .json, anipose or Caliscope .toml, DANNCE .mat, JARVIS or Kalibr .yaml, or a folder of "
+    "COLMAP's text files"
 )
 _COLMAP_FILES = ("cameras.txt", "images.txt")
 _STORAGE_SUFFIXES = (".yaml", ".yml", ".xml")
@@ -48,7 +51,7 @@ class CameraFile(NamedTuple):
     cameras: tuple[Camera, ...]
     """Cameras with pixel centres at i + 0.5 and lengths in metres."""
     format: str
-    """Program that writes such files: OpenCV, anipose, Pose2Sim, JARVIS, DANNCE or COLMAP."""
+    """Program that writes such files, such as OpenCV."""
     unit: Unit | None
     """Unit of length in the file; None if no camera has a translation, so that no unit is needed."""
     unit_assumed: bool
@@ -61,7 +64,7 @@ def read_cameras(path: str | Path, unit: Unit | None = None) -> tuple[Camera, ..
 
 
 def read_camera_file(path: str | Path, unit: Unit | None = None) -> CameraFile:
-    """Read the calibrated cameras of a file or a folder of OpenCV, anipose, JARVIS, DANNCE or COLMAP.
+    """Read the calibrated cameras of a file or a folder of a program of the table above.
 
     Args:
         path: a file of one or several cameras, or a folder: the text files of a COLMAP model, one file for each camera,

@@ -94,7 +94,10 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"jaxfit: {InputError(command, message, f'see `{self.prog} --help`')}\n")
 
 
-CAMERAS = "calibrated cameras: OpenCV .yaml, .xml or .json, anipose .toml, DANNCE .mat, JARVIS .yaml, COLMAP text"
+CAMERAS = (
+    "calibrated cameras: OpenCV .yaml, .xml or .json, anipose or Caliscope .toml, DANNCE .mat, JARVIS or Kalibr .yaml, "
+    "COLMAP text"
+)
 
 
 def add_view_options(command: Parser) -> None:

@@ -357,7 +357,7 @@ def _cameras_show(command: Parser) -> None:
 def _cameras_check(command: Parser) -> None:
     """Check cameras against the keypoints of birds: errors, wrong order, offset in time, moved camera."""
     command.add_argument("cameras", type=Path, metavar="FILE", help=CAMERAS)
-    text = f"one file for each camera, in the order of the cameras: {OBSERVATIONS}"
+    text = f"one file for each camera, in the order of the cameras or with their names: {OBSERVATIONS}"
     command.add_argument("observations", type=Path, nargs="+", metavar="OBS", help=text)
     add_observation_options(command)
     add_view_options(command)

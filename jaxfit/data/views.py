@@ -74,18 +74,22 @@ def assign_cameras(
 ) -> tuple[Camera, ...]:
     """Return the camera of each file of observations, with the size of its images.
 
-    If every file, or its folder, has the name of a camera, names decide. Else the order decides.
+    If every file, or its folder, has the name of a camera, names decide, and the other cameras are not used. Else the
+    order decides, and there must be one file for each camera.
 
     Raises:
         InputError: the numbers differ, or a camera has another size than its images.
     """
-    if len(cameras) != len(observations):
-        problem = f"{len(cameras)} cameras, but {len(observations)} files of observations"
-        raise InputError("--cameras", problem, "give one file of observations for each camera, in the order of cameras")
     by_name = {camera.name: camera for camera in cameras}
-    named = [_named(source, by_name) for source in sources]
-    if all(named) and len({camera.name for camera in named if camera}) == len(cameras):
-        cameras = [camera for camera in named if camera]
+    named = [camera for source in sources if (camera := _named(source, by_name))]
+    if len(named) == len(sources) == len({camera.name for camera in named}):
+        cameras = named
+    if len(cameras) != len(observations):
+        problem = f"{len(cameras)} cameras ({', '.join(by_name)}), but {len(observations)} files of observations"
+        remedy = (
+            "give each file, or its folder, the name of its camera; or give one file for each camera, in their order"
+        )
+        raise InputError("--cameras", problem, remedy)
     assigned = []
     for camera, own, source in zip(cameras, observations, sources, strict=True):
         sizes = {(int(w), int(h)) for w, h in own.image_size_px}

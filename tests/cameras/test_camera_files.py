@@ -232,9 +232,93 @@ def test_pose2sim_uses_metres_and_names_its_sections_by_camera(tmp_path):
     text += "translation = [ 0.8, 0.4, 5.5]\nfisheye = false\n\n[metadata]\nadjusted = false\nerror = 0.0\n"
     (tmp_path / "Calib.toml").write_text(text)
     file = read_camera_file(tmp_path / "Calib.toml")
-    assert file[1:] == ("Pose2Sim", "m", True)
+    assert file[1:] == ("Pose2Sim or Caliscope", "m", True)
     assert file.cameras[0].size_px == (1088, 1920)
     np.testing.assert_array_equal(file.cameras[0].transl_cam, [0.8, 0.4, 5.5])
+
+
+def in_metres(text):
+    """The cameras of anipose with the translations in metres."""
+    return text.replace("12.5, -30.0, 1500.0", "0.0125, -0.03, 1.5").replace(
+        "-40.0, 20.25, 1800.0", "-0.04, 0.02025, 1.8"
+    )
+
+
+def test_exports_of_caliscope_are_in_metres(tmp_path):
+    """Caliscope writes `fisheye = false`, or no such line if all cameras are fisheye cameras."""
+    mixed = in_metres(ANIPOSE).replace('name = "A"', 'name = "A"\nfisheye = false')
+    millimetres = (ANIPOSE, "anipose")
+    for text, expected in ((mixed, "Pose2Sim or Caliscope"), (in_metres(ANIPOSE), "anipose"), millimetres):
+        (tmp_path / "cameras.toml").write_text(text)
+        file = read_camera_file(tmp_path / "cameras.toml")
+        assert (file.format, file.unit_assumed) == (expected, True)
+        np.testing.assert_allclose(file.cameras[0].transl_cam, [0.0125, -0.03, 1.5])
+
+
+def test_the_cameras_of_caliscope(tmp_path):
+    text = ""
+    for number, ignore in ((0, "false"), (1, "true"), (2, "false")):
+        text += f"[cameras.{number}]\ncam_id = {number}\nrotation_count = 1\nignore = {ignore}\nsize = [1280, 720]\n"
+        text += f"matrix = {MATRIX.tolist()}\ndistortions = {FIVE.tolist()}\n"
+        text += f"rotation = {ROTATION.tolist()}\ntranslation = {TRANSL.tolist()}\n\n"
+    (tmp_path / "camera_array.toml").write_text(text)
+    file = read_camera_file(tmp_path / "camera_array.toml")
+    assert file[1:] == ("Caliscope", "m", True)
+    assert [camera.name for camera in file.cameras] == ["cam_0", "cam_2"]
+    np.testing.assert_allclose(file.cameras[0].project(POINTS), opencv_pixels(POINTS) + 0.5, atol=1e-6)
+
+
+# --- Kalibr
+
+KALIBR = """cam0:
+  cam_overlaps: [1]
+  camera_model: pinhole
+  distortion_coeffs: [-0.28, 0.09, 0.001, -0.0005]
+  distortion_model: radtan
+  intrinsics: [1200.0, 1180.0, 640.25, 355.5]
+  resolution: [1280, 720]
+  rostopic: /cam0/image_raw
+"""
+
+
+def chain(key, *poses):
+    """Return the camchain of cameras with equal lenses, and their poses under a key."""
+    text = ""
+    for number, (R, transl) in enumerate(poses):
+        pose = np.vstack([np.c_[R, transl], [0, 0, 0, 1]])
+        lines = "".join(f"  - {row}\n" for row in pose.tolist())
+        text += KALIBR.replace("cam0", f"cam{number}") + (f"  {key}:\n{lines}" if number or key == "T_cam_imu" else "")
+    return text
+
+
+def test_a_camchain_of_kalibr(tmp_path):
+    path, rest = tmp_path / "camchain.yaml", (np.eye(3), np.zeros(3))
+    first, second = (ROTATION, TRANSL), (OTHER[0] @ ROTATION, OTHER[0] @ TRANSL + OTHER[1])
+    for text, truth in (
+        (chain("T_cam_imu", first, OTHER), (first, OTHER)),
+        (chain("T_cn_cnm1", rest, first, OTHER), (rest, first, second)),
+    ):
+        path.write_text(text)
+        file = read_camera_file(path)
+        assert file[1:] == ("Kalibr", "m", True)
+        assert [camera.name for camera in file.cameras] == [f"cam{number}" for number in range(len(truth))]
+        for camera, (R, transl) in zip(file.cameras, truth, strict=True):
+            points = (POINTS + np.array([0, 0, 3]) - transl) @ R  # ahead of the camera
+            expected = opencv_pixels(points, R, transl, FIVE[:4])
+            np.testing.assert_allclose(camera.project(points), expected + 0.5, atol=1e-6)
+    path.write_text(KALIBR.replace("radtan", "equidistant"))
+    assert read_cameras(path)[0].lens == "fisheye"
+
+
+def test_the_aviary_of_the_authors_of_avian_mesh(reference_dir):
+    """Eight cameras in two planes 5.3 m apart (`utils/extrinsic_calib_v2.yaml` of avian-mesh)."""
+    path = reference_dir / "cases" / "kalibr_camchain_refused" / "extrinsic_calib_v2.yaml"
+    cameras = read_cameras(path)
+    x, y, z = np.array([camera.position_world for camera in cameras]).T
+    assert len(cameras) == 8
+    np.testing.assert_allclose(x, 4 * [0.37] + 4 * [5.64], atol=0.04)
+    for side in (y, z):
+        assert np.ptp(side) == pytest.approx(2.0, abs=0.15)
 
 
 # --- DANNCE

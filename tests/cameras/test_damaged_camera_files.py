@@ -66,6 +66,8 @@ def test_a_file_of_another_kind_is_refused(tmp_path, name, content, message):
         ('"A"', '""', "name must not be empty"),
         ('"A"', "[1]", "cam_0.name must be text"),
         ("-0.4, 0.1,", "nan, 0.1,", "cam_0.rotation holds a value that is not finite"),
+        ("-0.4, 0.1,", "1e11, 0.1,", r"cam_0.rotation is a rotation of 1e\+11 radians, more than 100"),
+        ("641.5", "6e9", r"\[cam_0\]: matrix holds 6e\+09, more than 1e\+07"),
         ("-30.0,", "inf,", "cam_0.translation holds a value that is not finite"),
         ("-30.0,", "1e300,", r"transl_cam holds 1e\+300, more than 1e\+12"),
         ("-30.0,", "", "cam_0.translation must have the shape 3, not 2"),
@@ -127,6 +129,22 @@ def test_cameras_without_poses_or_with_different_units_are_refused(tmp_path):
     refused(tmp_path / "rig.yml", "holds two cameras without R and T")
     write_storage(tmp_path / "rig.yml", {"left": camera_values() | {"unit": "m"}, "right": camera_values()})
     refused(tmp_path / "rig.yml", "cameras with different units")
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ("pinhole", "omni", "cam0.camera_model is 'omni', a model of Kalibr that is not read"),
+        ("radtan", "fov", "cam0.distortion_model is 'fov', a model of Kalibr that is not read"),
+        ("100, 100, 50, 50", "100, 100, 50", "cam0.intrinsics must have the shape 4, not 3"),
+        ("cam2", "cam1", "cam1 lacks its pose, T_cn_cnm1"),
+    ],
+)
+def test_an_impossible_value_of_kalibr_is_refused(tmp_path, before, after, message):
+    section = "{}:\n  camera_model: pinhole\n  distortion_model: radtan\n  intrinsics: [100, 100, 50, 50]\n"
+    text = section.format("cam0") + (section.format("cam2") if before == "cam2" else "")
+    (tmp_path / "camchain.yaml").write_text(text.replace(before, after))
+    refused(tmp_path / "camchain.yaml", message)
 
 
 def test_an_unknown_unit_of_length_is_refused(tmp_path):

@@ -202,8 +202,11 @@ def test_cameras_are_assigned_by_name_or_by_order(rig):
     assert [camera.name for camera in by_order] == ["cam0", "cam1", "cam2"]
     by_name = assign_cameras(rig.cameras, tracks, ["x/cam2/detections.json", "x/cam0/detections.json", "cam1.json"])
     assert [camera.name for camera in by_name] == ["cam2", "cam0", "cam1"]
-    with pytest.raises(InputError, match="3 cameras, but 2 files"):
-        assign_cameras(rig.cameras, tracks[:2], ["a", "b"])
+    some = assign_cameras(rig.cameras, tracks[:2], ["cam2.json", "cam1/detections.json"])
+    assert [camera.name for camera in some] == ["cam2", "cam1"]
+    for names in (["a", "b"], ["cam1.json", "b.json"], ["x/cam1.json", "y/cam1.json"]):
+        with pytest.raises(InputError, match=r"3 cameras \(cam0, cam1, cam2\), but 2 files .*the name of its camera"):
+            assign_cameras(rig.cameras, tracks[:2], names)
     other = replace(rig.cameras[0], size_px=(320, 190))
     with pytest.raises(InputError, match="has images of 640×380, but camera cam0 has 320×190"):
         assign_cameras([other, *rig.cameras[1:]], tracks, ["a", "b", "c"])

@@ -1,10 +1,13 @@
 """Cameras of anipose and aniposelib as TOML, which is also the format that jaxfit writes.
 
 Every section but `metadata` is a camera. Its values are OpenCV's: `matrix`, `distortions`, `rotation` (a rotation
-vector) and `translation` world → camera; `fisheye` selects OpenCV's fisheye model. Pose2Sim writes the same sections,
-in metres and with `fisheye = false`, which aniposelib never writes.
+vector) and `translation` world → camera; `fisheye` selects OpenCV's fisheye model. Pose2Sim and Caliscope write the
+same sections, in metres and with `fisheye = false`, which aniposelib never writes. Where no camera has this value and
+all cameras would lie within `NEAR_MM` millimetres, metres are assumed. Caliscope's own `camera_array.toml` has the
+cameras under `cameras`, with rotation matrices, in metres.
 
-Source: aniposelib 0.8, `CameraGroup.dump` and `CameraGroup.load`; Pose2Sim, `toml_write` of calibration.py.
+Source: aniposelib 0.8, `CameraGroup.dump` and `CameraGroup.load`; Pose2Sim, `toml_write` of calibration.py; Caliscope,
+`CameraArray.to_toml` and `CameraArray.to_aniposelib_toml`.
 """
 
 from __future__ import annotations
@@ -28,10 +31,13 @@ from jaxfit.cameras.formats.values import (
     make_camera,
     numbers,
     parsed,
+    rotation_matrix,
     stated_unit,
 )
 from jaxfit.foundation.reading import read_text, reading
 
+NEAR_MM = 20.0
+"""Two cameras are never this near: their housings are larger."""
 _KEYS = ("matrix", "distortions", "rotation", "translation")
 
 
@@ -47,12 +53,19 @@ def read_anipose(path: Path) -> Parsed:
     if not isinstance(metadata, dict):
         fail(path, "metadata", "must be a table")
     unit = stated_unit(path, "metadata.unit", metadata.get("unit"))
-    cameras = [_camera(path, key, section) for key, section in content.items()]
-    pose2sim = bool(content) and all(section.get("fisheye") is False for section in content.values())
-    return parsed(path, cameras, "Pose2Sim" if pose2sim else "anipose", unit, "m" if pose2sim else "mm")
+    if isinstance(array := content.get("cameras"), dict):
+        used = {key: part for key, part in array.items() if not (isinstance(part, dict) and part.get("ignore"))}
+        cameras = [_camera(path, f"cameras.{key}", part, f"cam_{key}") for key, part in used.items()]
+        return parsed(path, cameras, "Caliscope", unit, "m")
+    cameras = [_camera(path, key, section, key) for key, section in content.items()]
+    positions = np.array([camera.position_world for camera in cameras]).reshape(-1, 3)
+    if any(section.get("fisheye") is False for section in content.values()):
+        return parsed(path, cameras, "Pose2Sim or Caliscope", unit, "m")
+    is_near = len(cameras) > 1 and bool((np.ptp(positions, axis=0) < NEAR_MM).all())
+    return parsed(path, cameras, "anipose", unit, "m" if is_near else "mm")
 
 
-def _camera(path: Path, key: str, section: Any) -> Camera:
+def _camera(path: Path, key: str, section: Any, name: str) -> Camera:
     if not isinstance(section, dict):
         fail(path, key, "is not the table of a camera", "give a file of cameras, with sections [cam_0], [cam_1], …")
     missing = [name for name in _KEYS if name not in section]
@@ -61,12 +74,11 @@ def _camera(path: Path, key: str, section: Any) -> Camera:
     fisheye = section.get("fisheye", False)
     if not isinstance(fisheye, bool):
         fail(path, f"{key}.fisheye", "must be true or false")
-    name = camera_name(path, f"{key}.name", section.get("name", key))
+    name = camera_name(path, f"{key}.name", section.get("name", name))
     matrix = numbers(path, f"{key}.matrix", section["matrix"], (3, 3))
     distortion = numbers(path, f"{key}.distortions", section["distortions"], (-1,))
-    rotation = numbers(path, f"{key}.rotation", section["rotation"], (3,), (3, 3))
+    R = rotation_matrix(path, f"{key}.rotation", section["rotation"])
     transl = numbers(path, f"{key}.translation", section["translation"], (3,))
-    R = rotation if rotation.ndim == 2 else Rotation.from_rotvec(rotation).as_matrix()
     size_px = image_size(path, f"{key}.size", section.get("size", []))
     lens = "fisheye" if fisheye else "perspective"
     return make_camera(path, f"[{key}]", name, matrix, distortion, (R, transl), size_px, WHOLE_PIXELS, lens)

@@ -1,4 +1,4 @@
-"""Cameras in files of `cv2.FileStorage`: OpenCV's names, pairs of stereo cameras, and JARVIS.
+"""Cameras in files of `cv2.FileStorage`: OpenCV's names, pairs of stereo cameras, and JARVIS; YAML of Kalibr.
 
 A camera is a mapping with an intrinsic matrix. Its other values are optional: distortion, image size, a pose as R or
 rvec and T or tvec, a name, a unit. Names of values are compared without case, spaces and underscores. One file holds
@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera, Lens
+from jaxfit.cameras.formats.kalibr import is_kalibr, parse_kalibr
 from jaxfit.cameras.formats.storage import read_storage
 from jaxfit.cameras.formats.values import (
     WHOLE_PIXELS,
@@ -34,6 +34,7 @@ from jaxfit.cameras.formats.values import (
     make_camera,
     numbers,
     parsed,
+    rotation_matrix,
     stated_unit,
 )
 from jaxfit.foundation.errors import InputError
@@ -73,7 +74,10 @@ def read_opencv(path: Path) -> Parsed:
     Raises:
         InputError: the file is damaged or too large, holds no camera, or a camera has an impossible value.
     """
-    entries = list(_cameras(path, read_storage(path), path.stem))
+    content = read_storage(path)
+    if is_kalibr(content):
+        return parse_kalibr(path, content)
+    entries = list(_cameras(path, content, path.stem))
     if not entries:
         raise InputError(path, "holds no camera", _REMEDY)
     return _parsed(path, entries)
@@ -216,6 +220,5 @@ def _pose(path: Path, where: str, values: dict[str, Any]) -> tuple[np.ndarray, n
         return None
     if turn is None or shift is None:
         fail(path, where + (turn or shift or ""), "is only half of a pose", "add R and T, or remove both")
-    rotation = numbers(path, where + turn, values[turn], (3, 3), (3,))
     transl = numbers(path, where + shift, values[shift], (3,))
-    return (rotation if rotation.ndim == 2 else Rotation.from_rotvec(rotation).as_matrix()), transl
+    return rotation_matrix(path, where + turn, values[turn]), transl

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from jaxfit.cameras.camera import Camera, Lens
 from jaxfit.foundation.errors import InputError
@@ -23,6 +24,9 @@ WHOLE_PIXELS = 0.5
 """What to add to a principal point where pixel centres are at 0, 1, 2, …, as in OpenCV."""
 MATLAB_PIXELS = -0.5
 """What to add to a principal point where pixel centres are at 1, 2, 3, …, as in MATLAB."""
+
+MAX_ANGLE_RAD = 100.0
+"""Largest angle of a rotation vector; of larger angles, a file keeps too few digits."""
 
 _REMEDY = "write the file again with the program that made it"
 
@@ -134,6 +138,21 @@ def numbers(source: Path, field: str, value: Any, *shapes: tuple[int, ...]) -> n
     expected = " or ".join("a vector" if shape == (-1,) else "×".join(map(str, shape)) for shape in shapes)
     actual = "×".join(map(str, array.shape)) or "of one number"
     fail(source, field, f"must have the shape {expected}, not {actual}")
+
+
+def rotation_matrix(source: Path, field: str, value: Any) -> np.ndarray:
+    """Return the rotation (3, 3) of a rotation matrix or an axis-angle vector of a file.
+
+    Raises:
+        InputError: as `numbers`; or the angle of a vector is more than `MAX_ANGLE_RAD`.
+    """
+    rotation = numbers(source, field, value, (3, 3), (3,))
+    if rotation.ndim == 2:
+        return rotation
+    angle = float(np.linalg.norm(rotation))
+    if angle > MAX_ANGLE_RAD:
+        fail(source, field, f"is a rotation of {angle:.3g} radians, more than {MAX_ANGLE_RAD:g}")
+    return Rotation.from_rotvec(rotation).as_matrix()
 
 
 def image_size(source: Path, field: str, value: Any) -> tuple[int, int] | None:
