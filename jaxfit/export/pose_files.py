@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxfit.data.flags import flag_ranges, flags
 from jaxfit.data.formats.coco import write_coco
@@ -274,6 +275,7 @@ def write_nwb(
     video = exported.require_video()
     # from the folder of the files; the stored path if the footage was moved
     link = os.path.relpath(video.resolve(), out.resolve()) if video.exists() else str(video)
+    footage_s = exported.footage_times_s()
     tracks = exported.solution.track_id.tolist()
     fitted = np.flatnonzero(exported.solution.valid.any(axis=1)).tolist()
     names = {tracks[n]: f"bird_{tracks[n]}.nwb" for n in fitted}
@@ -282,7 +284,7 @@ def write_nwb(
         progress("Writing NWB", len(fitted)) as report_progress,
     ):
         for n in fitted:
-            _write_bird(exported, n, began, link, folder / names[tracks[n]])
+            _write_bird(exported, n, began, link, footage_s, folder / names[tracks[n]])
             report_progress(1, names[tracks[n]])
     notes = []
     if start is None:
@@ -290,7 +292,14 @@ def write_nwb(
     return [out / name for name in names.values()], notes
 
 
-def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str, path: Path) -> None:
+def _write_bird(
+    exported: Exported,
+    n: int,
+    began: datetime.datetime,
+    video: str,
+    footage_s: Float[np.ndarray, "F"],
+    path: Path,
+) -> None:
     pynwb, ndx_pose = _library("pynwb"), _library("ndx_pose")
     s, track = exported.solution, int(exported.solution.track_id[n])
     facts = describe_tracks(exported)[str(track)]
@@ -314,9 +323,8 @@ def _write_bird(exported: Exported, n: int, began: datetime.datetime, video: str
         external_file=[video],
         format="external",
         starting_frame=[0],
-        rate=exported.require_fps(),
-        starting_time=0.0,
-        num_samples=int(s.frame_index[-1]) + 1,
+        **_even_or_not(footage_s),
+        num_samples=len(footage_s),
         unit="n.a.",
         dimension=s.crops.image_size_px[s.valid].max(0).tolist(),
     )
@@ -366,12 +374,17 @@ def _flag_intervals(exported: Exported, n: int) -> Any:
 
 
 def _timing(exported: Exported, first: Any = None) -> dict[str, Any]:
-    """Return the times of a series: start and rate where frames are even, else times, as a link to `first` if given."""
-    times = exported.times_s
-    steps = np.diff(times)
+    """Return the times of a series of poses; uneven times are a link to the series `first` if it is given."""
+    timing = _even_or_not(exported.times_s)
+    return timing if first is None or "rate" in timing else {"timestamps": first}
+
+
+def _even_or_not(times_s: Float[np.ndarray, "T"]) -> dict[str, Any]:
+    """Return start and rate where times are even, else the times."""
+    steps = np.diff(times_s)
     if len(steps) and np.abs(steps - steps[0]).max() < 1e-6:
-        return {"starting_time": float(times[0]), "rate": float(1 / steps.mean())}
-    return {"timestamps": times if first is None else first}
+        return {"starting_time": float(times_s[0]), "rate": float(1 / steps.mean())}
+    return {"timestamps": times_s}
 
 
 def _series(exported: Exported, n: int) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import new_folder, write_whole
 from jaxfit.foundation.reading import json_text
 from jaxfit.model.bird import Bird
+from jaxfit.video.decoding import frame_times as times_of_frames
 from jaxfit.video.reader import probe_video
 
 
@@ -215,6 +217,22 @@ class Exported:
             raise InputError(self.source, "does not hold the frame rate of the footage", "give --fps, or --video")
         return self.fps
 
+    def footage_times_s(self) -> Float[np.ndarray, "F"]:
+        """Return the time of every frame of the footage, on the clock of `times_s`.
+
+        The times are those of the footage if it can be read and its times are `times_s`. Otherwise they are `times_s`,
+        linear between the frames of the result and by the frame rate before them, up to the last frame of the result.
+
+        Raises:
+            InputError: the frame rate is unknown.
+        """
+        numbers, times_s = self.solution.frame_index, self.times_s
+        own = times_of_footage(self.video)
+        if own is not None and len(own) > numbers[-1] and np.allclose(own[numbers], times_s, rtol=0, atol=1e-3):
+            return own
+        every = np.arange(numbers[-1] + 1)
+        return np.interp(every, numbers, times_s) - np.maximum(numbers[0] - every, 0) / self.require_fps()
+
     def require_video(self) -> Path:
         """Return the footage.
 
@@ -284,7 +302,7 @@ def open_result(
         metres_per_unit=metres_per_unit or bird.metres_per_unit,
         focal_px=image_focal_px(solution),
         fps=rate,
-        times_s=frame_times(solution, fps, rate),
+        times_s=frame_times(solution, fps, rate, video),
         video=video,
     )
     return whole if tracks is None and frames == (None, None) else whole.select(rows, columns)
@@ -297,13 +315,28 @@ def stored_times(solution: Solution) -> Float[np.ndarray, "T"] | None:
     return stored if increasing else None
 
 
-def frame_times(solution: Solution, given: float | None, rate: float | None) -> Float[np.ndarray, "T"]:
-    """Return the time of every frame: by the given rate, by the stored times, else by the rate of the footage."""
-    numbers = solution.frame_index.astype(np.float64)
-    stored = stored_times(solution)
+def frame_times(
+    solution: Solution, given: float | None, rate: float | None, video: Path | None = None
+) -> Float[np.ndarray, "T"]:
+    """Return the time of every frame: by the given rate, else stored, else of the footage, else by its rate."""
+    numbers, stored = solution.frame_index, stored_times(solution)
     if given is None and stored is not None:
         return stored
+    own = None if given is not None else times_of_footage(video)
+    if own is not None and len(numbers) and len(own) > numbers[-1]:
+        return own[numbers]
     return numbers / rate if rate else np.full(len(numbers), np.nan)
+
+
+def times_of_footage(video: Path | None) -> Float[np.ndarray, "F"] | None:
+    """Return the times of all frames of a video, seconds; None if they are unknown, or the video cannot be read."""
+    if video is None or not video.is_file():
+        return None
+    try:
+        times_s = times_of_frames(video, sys.maxsize)
+    except InputError:
+        return None
+    return times_s if len(times_s) and (np.diff(times_s) > 0).all() else None
 
 
 def _detections(folder: Path, solution: Solution, bird: Bird) -> tuple[Observations | None, dict[int, TrackQuality]]:

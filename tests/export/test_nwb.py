@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.exported import BIRD, FPS, FRAMES, TRACKS, error_bars, write_result
+from support.films import encode
 
 import jaxfit
 from jaxfit.cli.main import main
@@ -68,6 +69,24 @@ def test_flags_are_intervals(written):
     step = 2 / FPS  # every second frame was used
     np.testing.assert_allclose(rows.start_time, [10 / FPS, 18 / FPS])
     np.testing.assert_allclose(rows.stop_time, [10 / FPS + step, 20 / FPS + step])
+
+
+@pytest.mark.parametrize("stored", [True, False])
+@pytest.mark.parametrize("first", [0, 132])
+def test_poses_and_footage_have_one_clock(tmp_path, first, stored):
+    """The film has a variable frame rate, and may begin late; the result has its times, or names the film only."""
+    ticks = np.concatenate([first + np.cumsum([0, *[4, 3, 4, 9, 1] * 4]), [999]])
+    film = encode(tmp_path / "film.mkv", count=len(ticks), ticks=ticks.tolist())
+    times_s = ticks[list(FRAMES)] / 100 if stored else None
+    write_result(tmp_path / "result", video=film, timestamp_s=times_s)
+    jaxfit.export_result(tmp_path / "result", "nwb", tmp_path / "nwb")
+    with pynwb.NWBHDF5IO(tmp_path / "nwb" / "bird_7.nwb", "r") as io:
+        file = io.read()
+        footage_s = file.acquisition["footage"].timestamps[:]
+        np.testing.assert_allclose(footage_s, ticks / 100, atol=1e-3)
+        pose = file.processing["behavior"]["PoseEstimation"]
+        pose_s = next(iter(pose.pose_estimation_series.values())).timestamps[:]
+        np.testing.assert_allclose(pose_s, footage_s[list(FRAMES)], atol=1e-3)
 
 
 def test_names_with_slashes():
