@@ -1,15 +1,12 @@
 """Measure features and bouts of behaviour on simulated scenes, whose birds have known poses and behaviours.
 
-    python tests/benchmarks/behaviour.py truth detections pixels beats --seeds 1000 1020 --store DIR
+    python tests/benchmarks/behaviour.py truth detections pixels --seeds 1000 1020 --store DIR
 
 `truth` describes the exact poses, `detections` a fit to simulated detections (config `fast`), `pixels` a fit to what
 the networks detect in the film. Poses are placed on the ledge as by `jaxfit ledge`, without a
 calibrated camera for fits. The store keeps fits, so that a change of the rules repeats none (one scene: 35 s by
 detections, 2 minutes by pixels). The thresholds of `configs/behaviour.yaml` were chosen on seeds 100 to 119; seeds 1000
 to 1019 are for the report. `take_off` and `landing` count as flight, because the simulator knows flights only.
-
-`beats` measures the wingbeat frequency of a bird that flaps on the ledge without a pause, from exact poses and from
-fits to simulated detections by the config of `jaxfit reconstruct`.
 """
 
 from __future__ import annotations
@@ -17,8 +14,6 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-import unittest.mock
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,13 +32,9 @@ from jaxfit.evaluation.truth import match_tracks
 from jaxfit.fitting.fit import fit
 from jaxfit.fitting.ledge import ledge_config, on_ledge
 from jaxfit.fitting.ledge_plane import estimate_ledge
-from jaxfit.foundation.progress import silent
-from jaxfit.model.murre import POSTURES
 from jaxfit.perception.track import track_video
-from jaxfit.simulation import behaviour, flock
 from jaxfit.simulation.behaviour import BEHAVIOURS
-from jaxfit.simulation.scene import LEDGE_DEPTH, simulate, stage_scene, stage_view
-from jaxfit.simulation.viewpoint import random_viewpoint
+from jaxfit.simulation.scene import simulate, stage_scene
 
 BIRD = jaxfit.load_murre()
 NAMES = {"stand": "standing", "incubate": "incubating", "preen": "preening", "walk": "walking", "approach": "walking",
@@ -155,57 +146,10 @@ def measure(kind, seeds, store, config):
             show(f"{each.name:>26} {low:8.3f} {high:8.3f} {'share' if each.unit == 'length' else each.unit}")
 
 
-def beats(store):
-    """Print errors of the wingbeat frequency by frame rate and true frequency."""
-    show("\nwingbeat frequency: median error %, share of frames with a frequency; exact poses, and fits to detections")
-    show("".join(f"{name:>12}" for name in ("frames/s", "true Hz", "exact %", "share", "fit %", "share", "alias Hz")))
-    for fps in (25.0, 50.0, 120.0):
-        for true_hz in (2.0, 4.0, 6.0, 8.0, 10.0, 12.0):
-            scene = flapping_scene(fps, true_hz)
-            folder = store / f"beats_{fps:.0f}_{true_hz:.0f}"
-            if not folder.is_dir():
-                config = load_config("balanced")
-                save_solution(fit(scene.detections, BIRD, config), BIRD, "", {}, folder)
-            cells, alias = [], np.nan
-            for solution in (scene.poses, load_solution(folder)[0]):
-                time_s = np.arange(len(solution.frame_index)) / fps
-                values = describe(flock_of(solution, BIRD, time_s)).values
-                frequency = values["beat_frequency"][solution.valid]
-                known = np.isfinite(frequency)
-                error = 100 * np.median(np.abs(frequency[known] / true_hz - 1)) if known.any() else np.nan
-                cells += [f"{error:12.2f}", f"{known.mean():12.2f}"]
-                alias = np.nanmedian(values["beat_alias"]) if known.any() else np.nan
-            show(f"{fps:12.0f}{true_hz:12.0f}{''.join(cells)}{alias:12.1f}")
-
-
-def flapping_scene(fps, true_hz, seconds=2.0):
-    """Return a scene of a bird that beats its wings at one frequency."""
-
-    def flap(bird, until_s, _target):
-        while bird.last.time_s < until_s:
-            bird.add("flapping_up", 0.5 / true_hz)
-            bird.add("flapping_down", 0.5 / true_hz)
-
-    with unittest.mock.patch.dict(behaviour._BEHAVIOUR_FUNCTIONS, flap=flap):
-        view = random_viewpoint(np.random.default_rng((2, 0)), 2592, 1520, LEDGE_DEPTH)
-        keys = partial(behaviour.Key, -1.0, POSTURES["flapping_down"])
-        with unittest.mock.patch.object(flock, "_draw_keyframes", lambda rng, places, *_: [
-            flapping(behaviour.Keyframes(rng, [keys(place, float(i))]), seconds) for i, place in enumerate(places)
-        ]):  # fmt: skip
-            birds = flock.simulate_flock(BIRD, 1, round(seconds * fps), fps, LEDGE_DEPTH, view, 2)
-    return stage_view(BIRD, birds, view, fps, 2, silent, "Staging")
-
-
-def flapping(keyframes, seconds):
-    """Return keyframes with wingbeats to the end."""
-    keyframes.add_behaviour("flap", seconds)
-    return keyframes
-
-
 def main():
     """Measure the kinds of poses that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kinds", nargs="+", choices=("truth", "detections", "pixels", "beats"))
+    parser.add_argument("kinds", nargs="+", choices=("truth", "detections", "pixels"))
     parser.add_argument("--seeds", type=int, nargs=2, default=(1000, 1020), metavar=("FIRST", "LAST+1"))
     parser.add_argument("--store", type=Path, required=True, help="folder of fits")
     parser.add_argument("--config", default="behaviour")
@@ -213,9 +157,6 @@ def main():
     use_cache()
     options.store.mkdir(parents=True, exist_ok=True)
     for kind in options.kinds:
-        if kind == "beats":
-            beats(options.store)
-            continue
         measure(kind, range(*options.seeds), options.store, load_behaviour_config(options.config))
 
 

@@ -9,7 +9,6 @@ detects the birds of `scenes`, a folder of simulated scenes that the network was
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,12 +17,13 @@ from jaxtyping import Bool, Float
 from scipy.optimize import isotonic_regression
 
 from jaxfit.data.masks import box_of_mask
+from jaxfit.evaluation import metrics
 from jaxfit.evaluation.detection import assign
 from jaxfit.foundation.errors import InputError
 from jaxfit.learning.networks.labelled_frames import LabelledFrames, load_frames
 from jaxfit.learning.networks.network_files import set_metadata
 from jaxfit.perception.keypoints import load_keypoint_detector
-from jaxfit.perception.network import CONFIDENCE_KEY, Curve, Instance, KeypointDetector, Segmenter
+from jaxfit.perception.network import CONFIDENCE_KEY, Curve, KeypointDetector, Segmenter
 from jaxfit.perception.segmentation import load_segmenter
 
 RIGHT = 0.05
@@ -44,24 +44,6 @@ class Outcomes(NamedTuple):
     right: Bool[np.ndarray, "M"]
 
 
-def calibrate_keypoints(path: str | Path, frames: LabelledFrames, segmenter: Segmenter) -> Curve:
-    """Fit the curve of a keypoint network on known birds, and store the curve in the file.
-
-    Args:
-        path: the ONNX file; it is replaced. A curve that the file holds is replaced too.
-        frames: frames that neither network was trained on.
-        segmenter: detects the birds.
-
-    Raises:
-        InputError: the file is no keypoint network, or fewer than 200 keypoints are detected.
-    """
-    detector = load_keypoint_detector(path)
-    detector.curve = None
-    curve = fit_curve(keypoint_outcomes(frames, segmenter, detector), path)
-    set_metadata(path, {CONFIDENCE_KEY: curve.text()})
-    return curve
-
-
 def keypoint_outcomes(frames: LabelledFrames, segmenter: Segmenter, keypoints: KeypointDetector) -> Outcomes:
     """Detect the keypoints of known birds, and compare them with the known positions.
 
@@ -80,7 +62,9 @@ def keypoint_outcomes(frames: LabelledFrames, segmenter: Segmenter, keypoints: K
     ):
         birds = segmenter(picture)
         masks = [owner == n for n in range(1, len(known) + 1)]
-        detected, true = assign(_ious(birds, masks))
+        whole = [bird.whole(owner.shape[::-1]) for bird in birds]
+        iou = np.array([[np.nan_to_num(metrics.iou(own, mask)) for mask in masks] for own in whole])
+        detected, true = assign(iou.reshape(len(birds), len(masks)))
         if not len(detected):
             continue
         points_px, confidence = (array[detected] for array in keypoints(picture, birds))
@@ -123,17 +107,6 @@ def fit_curve(outcomes: Outcomes, source: object = "outcomes") -> Curve:
     return Curve(*np.array(points).T)
 
 
-def _ious(birds: Sequence[Instance], masks: Sequence[Bool[np.ndarray, "H W"]]) -> Float[np.ndarray, "M N"]:
-    """Return the IoU of every detected bird with every known bird."""
-    iou = np.zeros((len(birds), len(masks)))
-    for i, bird in enumerate(birds):
-        height, width = bird.mask.shape
-        for n, mask in enumerate(masks):
-            shared = np.count_nonzero(bird.mask & mask[bird.y0 : bird.y0 + height, bird.x0 : bird.x0 + width])
-            iou[i, n] = shared / (np.count_nonzero(bird.mask) + np.count_nonzero(mask) - shared)
-    return iou
-
-
 def _longer_side(mask: Bool[np.ndarray, "H W"], points_px: Float[np.ndarray, "M 2"]) -> float:
     """Return the longer side of the box around a mask and points, pixels."""
     x0, y0, width, height = box_of_mask(mask) or (0, 0, 0, 0)
@@ -147,4 +120,7 @@ if __name__ == "__main__":
     parser.add_argument("scenes", type=Path, help="folder of simulated scenes of `jaxfit train`")
     options = parser.parse_args()
     known = load_frames(*sorted(options.scenes.glob("scene_*")))
-    calibrate_keypoints(options.network, known, load_segmenter("builtin"))
+    detector = load_keypoint_detector(options.network)
+    detector.curve = None  # a curve that the file holds is replaced
+    curve = fit_curve(keypoint_outcomes(known, load_segmenter("builtin"), detector), options.network)
+    set_metadata(options.network, {CONFIDENCE_KEY: curve.text()})

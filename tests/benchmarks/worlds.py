@@ -8,10 +8,10 @@ in any world. Seeds below 500 are for tuning. Seeds from 500 are for the final r
 
 A config is the name of a shipped config or a YAML file. Further words change its values: `--configs paper map
 "map terms.pose_prior=0.8 grow_masks_px=0"`. With `--out`, runs are stored and not repeated; a change of the code that
-is measured repeats them. `--show` prints the tables of stored runs.
+is measured repeats them.
 
-Every config has three rows: the metrics; their 95 % intervals over birds; the ratios to the first config on the same
-birds, with intervals. `*` marks a ratio whose interval excludes 1. With fewer than 10 birds, intervals are too narrow.
+Every cell has three lines: the metric; its 95 % interval over birds; the ratio to the first config on the same birds,
+with an interval. `*` marks a ratio whose interval excludes 1. With fewer than 10 birds, intervals are too narrow.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import hashlib
 import json
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +30,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 from jaxtyping import Float
+from rich.console import Console
+from rich.table import Table
 from world_scenes import WORLDS, Scene, keypoints_of
 
 import jaxfit
@@ -182,7 +185,18 @@ def measure(solution: Solution, scene: Scene, pictures: bool) -> tuple[BirdSums,
     return sums, evaluation.missing
 
 
-def run(scenes: Sequence[Scene], config: Config, pictures: bool, compiled: set[Any]) -> dict[str, Any]:
+class Line(NamedTuple):
+    """The results of one config in one world, or in a part of a world."""
+
+    name: str
+    sums: BirdSums
+    seconds: float
+    """Duration of the fits, without compilation."""
+    missing: int
+    """Number of true birds and frames without a pose."""
+
+
+def run(scenes: Sequence[Scene], config: Config, pictures: bool, compiled: set[Any]) -> list[dict[str, Any]]:
     """Fit the scenes of one seed and measure the results.
 
     Args:
@@ -193,106 +207,77 @@ def run(scenes: Sequence[Scene], config: Config, pictures: bool, compiled: set[A
             with one step per stage, so that `seconds` is without compilation.
 
     Returns:
-        An entry of the stored results.
+        For each scene its part of the world, `sums`, `seconds` and `missing`.
     """
-    parts: dict[str, dict[str, Any]] = {}
+    results = []
     for scene in scenes:
         init = scene.initial_poses if config.name.split()[0] == "aves" else None
         key = config.key, scene.bird.name, scene.part, scene.observations.present.shape
-        start = time.perf_counter()
         if key not in compiled:
             one_step = tuple(dataclasses.replace(stage, steps=1) for stage in config.config.stages)
             fit(scene.observations, scene.bird, dataclasses.replace(config.config, stages=one_step), init)
             compiled.add(key)
-        ready = time.perf_counter()
+        start = time.perf_counter()
         solution = fit(scene.observations, scene.bird, config.config, init, terminal)
-        seconds, compile_s = time.perf_counter() - ready, ready - start
+        seconds = time.perf_counter() - start
         sums, missing = measure(solution, scene, pictures)
-        part = parts.setdefault(scene.part, {"seconds": 0.0, "compile_s": 0.0, "missing": 0, "scenes": []})
-        part |= {"seconds": part["seconds"] + seconds, "compile_s": part["compile_s"] + compile_s}
-        part["missing"] += missing
-        part["scenes"].append(dataclasses.asdict(sums))
-    return {"parts": parts}
+        sums = dataclasses.asdict(sums)
+        results.append({"part": scene.part, "sums": sums, "seconds": seconds, "missing": missing})
+    return results
 
 
-def pooled(parts: Sequence[tuple[str, BirdSums]]) -> BirdSums:
-    """Return the sums of several results, named ``result/bird``; sums of equal names are added.
-
-    Args:
-        parts: pairs of the name of a result and its sums.
-    """
-    metrics = list(parts[0][1].counts)
-    totals: dict[str, dict[str, list[float]]] = {}
-    for prefix, sums in parts:
-        for b, bird in enumerate(sums.birds):
-            own = totals.setdefault(f"{prefix}/{bird}", {metric: [0.0, 0] for metric in metrics})
-            for metric in metrics:
-                own[metric][0] += sums.numerators[metric][b]
-                own[metric][1] += sums.counts[metric][b]
+def pooled(results: Sequence[tuple[str, BirdSums]]) -> BirdSums:
+    """Return the sums of several results, with birds named ``result/bird``; sums of equal names are added."""
+    metrics = list(results[0][1].counts)
+    numerators: dict[str, Counter[str]] = {metric: Counter() for metric in metrics}
+    counts: dict[str, Counter[str]] = {metric: Counter() for metric in metrics}
+    birds = tuple(dict.fromkeys(f"{name}/{bird}" for name, sums in results for bird in sums.birds))
+    for name, sums in results:
+        for metric in metrics:
+            for bird, numerator, count in zip(sums.birds, sums.numerators[metric], sums.counts[metric], strict=True):
+                numerators[metric][f"{name}/{bird}"] += numerator
+                counts[metric][f"{name}/{bird}"] += count
     return BirdSums(
-        tuple(totals),
-        {metric: tuple(each[metric][0] for each in totals.values()) for metric in metrics},
-        {metric: tuple(int(each[metric][1]) for each in totals.values()) for metric in metrics},
+        birds,
+        {metric: tuple(values[bird] for bird in birds) for metric, values in numerators.items()},
+        {metric: tuple(values[bird] for bird in birds) for metric, values in counts.items()},
     )
 
 
-class Line(NamedTuple):
-    """The results of one config in one world."""
-
-    name: str
-    sums: BirdSums
-    seconds: float
-    """Duration of the fits, without compilation."""
-    missing: int
-    """Number of true birds and frames without a pose."""
-
-
-def line_of(name: str, runs: Sequence[Mapping[str, Any]], part: str | None) -> Line:
-    """Return the results over some stored runs of one world.
+def line_of(name: str, runs: Mapping[str, Sequence[Mapping[str, Any]]], part: str | None) -> Line:
+    """Return the results of a config over some stored runs of one world.
 
     Args:
         name: of the config.
-        runs: stored runs.
+        runs: seed → results of `run`.
         part: part of the world; None for all parts.
     """
-    kept = [(str(run["seed"]), own) for run in runs for key, own in run["parts"].items() if part in (None, key)]
-    sums = [
-        (seed, BirdSums(tuple(scene["birds"]), scene["numerators"], scene["counts"]))
-        for seed, own in kept
-        for scene in own["scenes"]
-    ]
-    seconds, missing = sum(own["seconds"] for _, own in kept), sum(own["missing"] for _, own in kept)
-    return Line(name, pooled(sums), seconds, missing)
+    kept = [(seed, result) for seed, results in runs.items() for result in results if part in (None, result["part"])]
+    sums = pooled(
+        [(seed, BirdSums(**{**result["sums"], "birds": tuple(result["sums"]["birds"])})) for seed, result in kept]
+    )
+    return Line(name, sums, sum(result["seconds"] for _, result in kept), sum(result["missing"] for _, result in kept))
 
 
-def table(lines: Sequence[Line], pictures: bool) -> str:
-    """Return an aligned table of some configs; ratios are to the first config."""
+def table(title: str, lines: Sequence[Line], pictures: bool) -> Table:
+    """Return a table of some configs; ratios are to the first config."""
     shown = [name for name in METRICS if name in lines[0].sums.counts and not (pictures and name == "me_v")]
-    rows = [["", *(METRICS[name][0] for name in shown), "seconds", "missing"]]
+    result = Table("", *(METRICS[name][0] for name in shown), "seconds", "missing", title=title)
     for line in lines:
-        rows.append([line.name])
-        intervals, ratios = [""], ["  × first" if line is not lines[0] else ""]
+        cells = []
         for name in shown:
             _, factor, decimals = METRICS[name]
-            low, high = line.sums.interval(name)
-            rows[-1].append(f"{factor * line.sums.value(name):.{decimals}f}")
-            intervals.append(f"{factor * low:.{decimals}f}…{factor * high:.{decimals}f}")
-            if line is lines[0] or name == "size_bias":
-                ratios.append("")
-                continue
-            ratio = paired_ratio([(line.sums, lines[0].sums)], name)
-            mark = "*" if ratio.low > 1 or ratio.high < 1 else ""
-            ratios.append(f"{ratio.value:.3f} ({ratio.low:.2f}…{ratio.high:.2f}){mark}")
-        rows[-1] += [f"{line.seconds:.1f}", str(line.missing)]
-        rows += [intervals] + ([ratios] if line is not lines[0] else [])
-    filled = [row + [""] * (len(rows[0]) - len(row)) for row in rows]
-    widths = [max(map(len, column)) for column in zip(*filled, strict=True)]
-
-    def aligned(row: Sequence[str]) -> str:
-        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
-        return "  ".join([row[0].ljust(widths[0]), *cells[1:]]).rstrip()
-
-    return "\n".join(map(aligned, filled))
+            value, low, high = (
+                f"{factor * x:.{decimals}f}" for x in (line.sums.value(name), *line.sums.interval(name))
+            )
+            cell = f"{value}\n{low}…{high}"
+            if line is not lines[0] and name != "size_bias":
+                ratio = paired_ratio([(line.sums, lines[0].sums)], name)
+                mark = "*" if ratio.low > 1 or ratio.high < 1 else ""
+                cell += f"\n{ratio.value:.3f} ({ratio.low:.2f}…{ratio.high:.2f}){mark}"
+            cells.append(cell)
+        result.add_row(line.name, *cells, f"{line.seconds:.1f}", str(line.missing))
+    return result
 
 
 def verdict(lines: Sequence[Line], reference: str) -> list[str]:
@@ -312,83 +297,44 @@ def verdict(lines: Sequence[Line], reference: str) -> list[str]:
     return texts or [f"no config is significantly worse than {reference} in me_p, aligned 3D error or IoU"]
 
 
-def world_report(number: int, configs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """Return the tables and verdicts of one world.
+def report(number: int, configs: Mapping[str, Mapping[str, Sequence[Mapping[str, Any]]]]) -> None:
+    """Print the tables and verdicts of one world.
 
     Args:
         number: of the world.
-        configs: name of a config → its stored runs, all with the same seeds.
+        configs: name of a config → seed → results of `run`.
     """
-    world = WORLDS[number]
+    world, console = WORLDS[number], Console(width=200)
     first = next(iter(configs.values()))
-    names = sorted({part for run in first for part in run["parts"]})
-    blocks = []
-    for part in [None, *(names if len(names) > 1 else [])]:
+    parts = sorted({result["part"] for results in first.values() for result in results})
+    for part in [None, *(parts if len(parts) > 1 else [])]:
         lines = [line_of(name, runs, part) for name, runs in configs.items()]
-        seeds = ", ".join(sorted({str(run["seed"]) for run in first}))
         birds, poses = lines[0].sums.birds, sum(lines[0].sums.counts["iou"])
-        title = f"World {number}: {world.name}{f', {part}' if part else ''}; seeds {seeds}; "
-        title += f"{len(birds)} {world.birds}, {poses} poses"
-        blocks.append("\n".join([title, table(lines, world.pictures), *verdict(lines, world.reference)]))
-    return "\n\n".join(blocks)
+        title = f"World {number}: {world.name}{f', {part}' if part else ''}; seeds {', '.join(first)}; "
+        console.print(table(f"{title}{len(birds)} {world.birds}, {poses} poses", lines, world.pictures))
+        for sentence in verdict(lines, world.reference):
+            console.print(sentence)
 
 
-class Store:
-    """Stored runs, in a JSON file that is written after every run."""
-
-    def __init__(self, path: Path | None):
-        self.path = path
-        self.runs: list[dict[str, Any]] = json.loads(path.read_text())["runs"] if path and path.exists() else []
-
-    def find(self, **keys: Any) -> dict[str, Any] | None:
-        """Return the latest run with the given entries."""
-        found = (run for run in reversed(self.runs) if all(run[key] == value for key, value in keys.items()))
-        return next(found, None)
-
-    def add(self, run: dict[str, Any]) -> None:
-        """Append a run and write the file."""
-        self.runs.append(run)
-        if self.path:
-            write_whole(self.path, json.dumps({"runs": self.runs}).encode())
-
-
-def say(text: str) -> None:
-    """Print a text; long lines of tables stay whole."""
-    sys.stdout.write(f"{text}\n")
-    sys.stdout.flush()
-
-
-def compare(configs: Sequence[Config], worlds: Sequence[int], seeds: Sequence[int], quick: bool, store: Store) -> None:
-    """Fit and measure all runs that are not stored, and print the report of every world."""
+def compare(
+    configs: Sequence[Config], worlds: Sequence[int], seeds: Sequence[int], quick: bool, path: Path | None
+) -> None:
+    """Fit and measure all runs that the file does not hold, store them, and print the report of every world."""
+    stored = json.loads(path.read_text()) if path and path.exists() else {}
     code, compiled = code_hash(), set()
     for number in worlds:
-        world, results = WORLDS[number], {config.name: [] for config in configs}
+        world, results = WORLDS[number], {config.name: {} for config in configs}
         for seed in seeds if world.seeds else ["all"]:
             scenes: list[Scene] = []
             for config in configs:
-                keys = {"world": number, "seed": seed, "config_key": config.key, "code": code, "quick": quick}
-                known = store.find(**keys)
-                if known is None:
-                    scenes = scenes or world.draw(seed if world.seeds else 0, quick)
-                    known = keys | {"config": config.name} | run(scenes, config, world.pictures, compiled)
-                    store.add(known)
-                results[config.name].append(known)
-        say(f"\n{world_report(number, results)}")
-
-
-def show(configs: Sequence[str], worlds: Sequence[int], seeds: Sequence[int], quick: bool, store: Store) -> None:
-    """Print the reports of stored runs of any version of the code; the latest run of a seed counts."""
-    for number in worlds:
-        results = {}
-        for name in configs or dict.fromkeys(run["config"] for run in store.runs):
-            keys = {"world": number, "config": name, "quick": quick}
-            wanted = seeds or dict.fromkeys(run["seed"] for run in store.runs if run["world"] == number)
-            wanted = wanted if WORLDS[number].seeds else ["all"]
-            runs = [found for seed in wanted if (found := store.find(seed=seed, **keys))]
-            if runs:
-                results[name] = runs
-        if results:
-            say(f"\n{world_report(number, results)}")
+                key = f"world {number}, seed {seed}, {config.key}, code {code}{', quick' if quick else ''}"
+                if key not in stored:
+                    scenes = scenes or world.draw(int(seed) if world.seeds else 0, quick)
+                    stored[key] = run(scenes, config, world.pictures, compiled)
+                    if path:
+                        write_whole(path, json.dumps(stored).encode())
+                results[config.name][str(seed)] = stored[key]
+        report(number, results)
 
 
 def check_seeds(seeds: Sequence[int]) -> str | None:
@@ -407,26 +353,19 @@ def check_seeds(seeds: Sequence[int]) -> str | None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command. Returns 2 for wrong arguments."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--configs", nargs="+", default=[], help="shipped names or YAML files, the first for ratios")
+    parser.add_argument("--configs", nargs="+", required=True, help="shipped names or YAML files, the first for ratios")
     parser.add_argument("--worlds", nargs="+", type=int, default=list(WORLDS), choices=list(WORLDS))
-    parser.add_argument("--seeds", nargs="+", type=int, default=[])
+    parser.add_argument("--seeds", nargs="+", type=int, required=True)
     parser.add_argument("--out", type=Path, help="JSON file of the runs; runs that it holds are not repeated")
     parser.add_argument("--quick", action="store_true", help="small scenes, to try the command")
-    parser.add_argument("--show", action="store_true", help="only print the tables of the runs in --out")
     options = parser.parse_args(arguments)
     try:
         reminder = check_seeds(options.seeds)
-        store = Store(options.out)
-        if options.show:
-            show(options.configs, options.worlds, options.seeds, options.quick, store)
-            return 0
         configs = [read_named_config(text) for text in options.configs]
-        if not configs or not options.seeds:
-            parser.error("--configs and --seeds are needed")
         if reminder:
-            say(f"NOTE: {reminder}")
+            sys.stdout.write(f"NOTE: {reminder}\n")
         use_cache()
-        compare(configs, options.worlds, options.seeds, options.quick, store)
+        compare(configs, options.worlds, options.seeds, options.quick, options.out)
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2

@@ -211,20 +211,3 @@ def patch_around(
     if factor < 1 and picture.size:
         picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.45 * np.sqrt(1 / factor**2 - 0.75)), np.uint8)
     return picture, owner, low
-
-
-def torn_mask(mask: Bool[np.ndarray, "H W"], angle: float, share: float) -> Bool[np.ndarray, "H W"]:
-    """Return the `share` of the pixels of a mask that lies first in the direction `angle`, in radians."""
-    rows, columns = np.nonzero(mask)
-    along = columns * np.cos(angle) + rows * np.sin(angle)
-    kept = along < np.quantile(along, share)
-    torn = np.zeros_like(mask)
-    torn[rows[kept], columns[kept]] = True
-    return torn
-
-
-def shifted_mask(mask: Bool[np.ndarray, "H W"], angle: float, share: float) -> Bool[np.ndarray, "H W"]:
-    """Shift a mask by a `share` of the longer side of its box in the direction `angle`, in radians."""
-    rows, columns = np.nonzero(mask)
-    shift = share * max(np.ptp(rows), np.ptp(columns)) * np.array([np.cos(angle), np.sin(angle)])
-    return cv2.warpAffine(mask.astype(np.uint8), np.column_stack([np.eye(2), shift]), mask.shape[::-1]) > 0

@@ -21,14 +21,7 @@ from torch.nn import functional
 
 from jaxfit.data.keypoint_names import opposite_keypoints
 from jaxfit.foundation.errors import InputError
-from jaxfit.learning.networks.augment import (
-    SCENE_SHARE,
-    patch_around,
-    random_rotation,
-    randomise_appearance,
-    shifted_mask,
-    torn_mask,
-)
+from jaxfit.learning.networks.augment import SCENE_SHARE, patch_around, random_rotation, randomise_appearance
 from jaxfit.learning.networks.labelled_frames import UNKNOWN, LabelledFrames, draw_bird
 from jaxfit.learning.networks.networks import FeaturePyramid, residual_stages
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
@@ -207,9 +200,15 @@ def _faulty_mask(rng: np.random.Generator, mask: np.ndarray, birds: np.ndarray) 
         kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
     angle = rng.uniform(0, 2 * np.pi)
+    direction = np.array([np.cos(angle), np.sin(angle)])
     if error == "torn":
-        return torn_mask(mask, angle, rng.uniform(0.5, 0.9))
-    return shifted_mask(mask, angle, rng.uniform(0, 0.15))
+        along = columns * direction[0] + rows * direction[1]
+        kept = along < np.quantile(along, rng.uniform(0.5, 0.9))
+        torn = np.zeros_like(mask)
+        torn[rows[kept], columns[kept]] = True
+        return torn
+    shift = rng.uniform(0, 0.15) * max(np.ptp(rows), np.ptp(columns)) * direction
+    return cv2.warpAffine(mask.astype(np.uint8), np.column_stack([np.eye(2), shift]), mask.shape[::-1]) > 0
 
 
 _MASK_ERRORS = {
