@@ -166,8 +166,9 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     """Fit the birds that calibrated cameras see and write a result."""
     from jaxfit.cli.cameras import read_views, show_matches
     from jaxfit.fitting.ledge_plane import plane_of
-    from jaxfit.fitting.views import fit_views
+    from jaxfit.fitting.views import fit_views, with_unit
     from jaxfit.foundation.workers import open_cluster
+    from jaxfit.model.bird import rest_length
 
     if options.init is not None:
         raise InputError("--init", "is given with --cameras", "leave out --init: the cameras give the initial poses")
@@ -175,9 +176,14 @@ def _fit_views(options: argparse.Namespace, config: FitConfig, bird: Bird, start
     show_matches(read)
     if options.ledge == WORLD:
         plane_of(read.views.lenses[0], options.cameras)  # before the long work
+    source = ", ".join(map(str, options.observations))
+    measured = with_unit(read.views, bird, source)
+    if bird.metres_per_unit is None:
+        length_cm = 100 * rest_length(measured) * (measured.metres_per_unit or 1.0)
+        show(f"model {bird.name} has no unit of length: measured by the cameras, bill to tail {length_cm:.1f} cm")
+    bird = measured
     read_s = time.perf_counter() - start
     with open_cluster(options.workers, options.scheduler) as cluster:
-        source = ", ".join(map(str, options.observations))
         solution = fit_views(read.views, bird, config, terminal, source, cluster)
     seconds = {"read": read_s, "fit": time.perf_counter() - start - read_s}
     lenses, matches = read.views.lenses, read.matches

@@ -56,7 +56,8 @@ def check_ledge_options(options: argparse.Namespace, bird: Bird) -> None:
     from jaxfit.fitting.ledge import metres
     from jaxfit.fitting.ledge_plane import read_distances
 
-    metres(bird)
+    if len(getattr(options, "observations", [])) < 2:  # several cameras measure the size of a bird
+        metres(bird)
     if plane not in (WORLD, BIRDS):
         read_distances(Path(plane))
 

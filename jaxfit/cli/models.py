@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from jaxfit.cli.tables import counted, right_aligned, show, show_facts
@@ -13,9 +14,15 @@ from jaxfit.model.files import find_bird, read_provenance, save_bird
 
 def model_import(options: argparse.Namespace) -> None:
     """Import a published model and write a model file."""
+    from jaxfit.model.bird import rest_length
     from jaxfit.model.published import import_model
 
+    length_cm = options.length_cm
+    if length_cm is not None and not 0 < length_cm < float("inf"):
+        raise InputError("--length-cm", f"is {length_cm}", "give the length from bill tip to tail tip, above 0")
     bird = import_model(options.kind, options.sources)
+    if length_cm is not None:
+        bird = replace(bird, metres_per_unit=length_cm / 100 / rest_length(bird))
     save_bird(bird, options.out)
     show(f"{bird.name}: {bird.vertices.shape[0]} vertices, {bird.num_keypoints} keypoints → {options.out}")
 

@@ -369,6 +369,10 @@ def _model_import(command: Parser) -> None:
     """Import a published model."""
     command.add_argument("kind", choices=("avian-mesh", "aves"), help="kind of model")
     command.add_argument("sources", type=Path, nargs="+", help="files of the model, or the folder that holds them")
+    text = (
+        "length of the species from bill tip to tail tip, which sets the unit of the model (several cameras measure it)"
+    )
+    command.add_argument("--length-cm", type=float, metavar="CM", help=text)
     add_out(command, "M.npz", "model file to write")
 
 

@@ -30,6 +30,9 @@ UNMATCHED = 0.5
 """Cost of a bird without a partner in another camera, relative to the side of its box."""
 CLEARLY_BETTER = 0.6
 """A change explains an inconsistency if it lowers the cost below this share."""
+CLEAR_SHIFT, CLEAR_SHARE = 3.0, 0.01
+"""A camera has moved if its other pose shifts the keypoints by more than this multiple of their remaining error, and by
+more than this share of the side of the box. A smaller error of moving keypoints is no sign of an offset in time."""
 MAX_OFFSET = 10
 """Largest offset in time that is tried, frames."""
 MAX_PERMUTED = 5
@@ -152,7 +155,7 @@ def _offsets(views: Views, given: Sequence[float], steps: Sequence[float]) -> li
         scores = {offset: float(np.median(np.concatenate(own))) for offset, own in errors.items() if own}
         if scores:
             best = min(scores, key=scores.__getitem__)
-            if best and scores[best] < CLEARLY_BETTER * scores[0]:
+            if best and scores[0] > CLEAR_SHARE and scores[best] < CLEARLY_BETTER * scores[0]:
                 found.append((scores[best] / scores[0], v, best, scores))
     if not found:
         return []
@@ -217,7 +220,10 @@ def _moved(views: Views) -> list[str]:
         R = cv2.Rodrigues(rvec)[0]
         new = replace(camera, R_cam_world=R, transl_cam=tvec[:, 0] - R @ centre)
         after = float(np.median(reprojection_error_px([new], points, shown[None])))
-        if after < CLEARLY_BETTER * before:
+        # the errors of the keypoints alone move the estimated pose too
+        shift_px = float(np.median(reprojection_error_px([new], points, camera.project(points)[None])))
+        least_px = max(CLEAR_SHIFT * after, CLEAR_SHARE * float(np.median(keypoints.side_px[v][known])))
+        if after < CLEARLY_BETTER * before and shift_px > least_px:
             corrected = [new if w == v else each for w, each in enumerate(views.cameras)]
             found.append((_mean_error(corrected, keypoints), camera, new, before, after))
     if not found:

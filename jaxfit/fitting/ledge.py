@@ -282,6 +282,6 @@ def metres(bird: Bird) -> float:
         InputError: the model has none.
     """
     if bird.metres_per_unit is None:
-        remedy = "import the model again with `metres_per_unit`, or use a model of your species (docs/guide/species.md)"
+        remedy = "import the model with --length-cm, or use a model of your species (docs/guide/species.md)"
         raise InputError(f"model {bird.name}", "has no unit of length, which a world in metres needs", remedy)
     return bird.metres_per_unit

@@ -60,6 +60,8 @@ ROUNDS = 5
 ROBUST = 0.08
 POSSIBLE_SIZES = 0.3, 3.0
 """Sizes relative to the model that a wrong unit or wrong calibration exceeds."""
+POSSIBLE_LENGTHS_M = 0.03, 3.0
+"""Lengths of birds that a wrong unit or wrong calibration exceeds."""
 SIZE_PRIOR = "size_prior"
 
 _logger = logging.getLogger(__name__)
@@ -89,6 +91,27 @@ def views_config(config: FitConfig, has_masks: bool) -> FitConfig:
     )
 
 
+def with_unit(views: Views, bird: Bird, source: object = "observations") -> Bird:
+    """Return the model with its unit of length, which the cameras measure if the model has none.
+
+    The measured unit is that with which the birds have the size of the model, in the median over birds and frames.
+
+    Raises:
+        InputError: there is only one view, no frame has enough keypoints, or the birds are longer or shorter than
+            `POSSIBLE_LENGTHS_M`.
+    """
+    if bird.metres_per_unit is not None or len(views.cameras) < 2:
+        return replace(bird, metres_per_unit=metres(bird))
+    keypoints = stacked_keypoints([check_observations(own, bird, source) for own in views.observations])
+    found = keypoints.triangulated(views.cameras)
+    unit_m = float(np.nanmedian(_alignments(bird, found.points_world, _weights(keypoints, found), source)[1]))
+    extent = np.ptp(np.asarray(bird.vertices, np.float64), axis=0).max()
+    if not POSSIBLE_LENGTHS_M[0] < unit_m * extent < POSSIBLE_LENGTHS_M[1]:
+        problem = f"show birds of {unit_m * extent:.3g} m"
+        raise InputError(source, problem, "check the unit of the cameras (--unit)")
+    return replace(bird, metres_per_unit=unit_m)
+
+
 def fit_views(
     views: Views,
     bird: Bird,
@@ -101,7 +124,7 @@ def fit_views(
 
     Args:
         views: cameras and observations (`data.views`). A view may miss a bird, a frame, a mask or keypoints.
-        bird: the model, with its unit of length.
+        bird: the model, with its unit of length (`with_unit`).
         config: the config of a fit, as for one view.
         progress: shows progress.
         source: name of the observations in error messages.
@@ -171,18 +194,10 @@ def initial_poses(
 
     Source: Umeyama 1991, *Least-squares estimation of transformation parameters between two point patterns*.
     """
-    rig, rest = fold_bird(bird), rest_pose(bird)
-    shape = np.asarray(posed_keypoints(rig, joint_transforms(rig, rest), rest), np.float64)
-    root = np.asarray(rig.joints[0], np.float64)
+    R, scale, shape = _alignments(bird, points, weight, source)
+    rest, root = rest_pose(bird), np.asarray(bird.joints[0], np.float64)
     N, T = weight.shape[:2]
-    R, transl, scale = np.full((N, T, 3, 3), np.nan), np.full((N, T, 3), np.nan), np.full((N, T), np.nan)
-    for n, t in np.argwhere((weight > 0).sum(-1) >= MIN_POINTS).tolist():
-        found = _align(shape, np.nan_to_num(points[n, t]), weight[n, t])
-        if found is not None:
-            R[n, t], scale[n, t] = found
-    if not np.isfinite(scale).any():
-        problem = f"have no frame with {MIN_POINTS} keypoints of a bird in two cameras"
-        raise InputError(source, problem, "see `jaxfit cameras check`")
+    transl = np.full((N, T, 3), np.nan)
     overall = float(np.nanmedian(scale))
     if not POSSIBLE_SIZES[0] < overall < POSSIBLE_SIZES[1]:
         problem = f"show birds of {overall:.3g} × the size of the model"
@@ -215,6 +230,28 @@ def initial_poses(
         bone_length=everywhere(rest.bone_length, bones),
         betas=everywhere(0, shapes),
     )
+
+
+def _alignments(
+    bird: Bird, points: Float[np.ndarray, "N T K 3"], weight: Float[np.ndarray, "N T K"], source: object
+) -> tuple[Float[np.ndarray, "N T 3 3"], Float[np.ndarray, "N T"], Float[np.ndarray, "K 3"]]:
+    """Return rotation and scale of the mean pose in each frame (NaN: not determined), and the keypoints of this pose.
+
+    Raises:
+        InputError: no frame has enough keypoints.
+    """
+    rig, rest = fold_bird(bird), rest_pose(bird)
+    shape = np.asarray(posed_keypoints(rig, joint_transforms(rig, rest), rest), np.float64)
+    N, T = weight.shape[:2]
+    R, scale = np.full((N, T, 3, 3), np.nan), np.full((N, T), np.nan)
+    for n, t in np.argwhere((weight > 0).sum(-1) >= MIN_POINTS).tolist():
+        found = _align(shape, np.nan_to_num(points[n, t]), weight[n, t])
+        if found is not None:
+            R[n, t], scale[n, t] = found
+    if not np.isfinite(scale).any():
+        problem = f"have no frame with {MIN_POINTS} keypoints of a bird in two cameras"
+        raise InputError(source, problem, "see `jaxfit cameras check`")
+    return R, scale, shape
 
 
 def _align(

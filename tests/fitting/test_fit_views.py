@@ -20,7 +20,7 @@ from jaxfit.data.views import Views, birds_in_rows, stacked_keypoints, straighte
 from jaxfit.export.export import export_result
 from jaxfit.export.result import open_result
 from jaxfit.fitting.fit import fit
-from jaxfit.fitting.views import fit_views, initial_poses, views_config
+from jaxfit.fitting.views import fit_views, initial_poses, views_config, with_unit
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import load_murre
 from jaxfit.review.correct import read_tracks
@@ -168,8 +168,20 @@ def test_a_wrong_unit_is_reported(rig):
     )
     with pytest.raises(InputError, match=r"show birds of .* the size of the model .*--unit"):
         fit_views(far, BIRD, CONFIG)
-    with pytest.raises(InputError, match="has no unit of length"):
-        fit_views(views, replace(BIRD, metres_per_unit=None), CONFIG)
+
+
+def test_cameras_measure_the_unit_of_a_model(rig):
+    views = views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes])
+    without = replace(BIRD, metres_per_unit=None)
+    truth_m = UNIT * np.median(rig.scenes[0].poses.poses.scale[:, 0])
+    assert with_unit(views, without).metres_per_unit == pytest.approx(truth_m, rel=0.05)
+    assert with_unit(views, BIRD).metres_per_unit == UNIT
+    with pytest.raises(InputError, match=r"has no unit of length.*--length-cm"):
+        fit_views(views, without, CONFIG)
+    with pytest.raises(InputError, match=r"has no unit of length.*--length-cm"):
+        with_unit(Views(*(part[:1] for part in views)), without)
+    with pytest.raises(InputError, match=r"show birds of .* m .*--unit"):
+        with_unit(views._replace(cameras=tuple(camera.scaled(1000) for camera in views.cameras)), without)
 
 
 def test_initial_poses_align_the_bird_with_triangulated_keypoints(rig, truth_m):

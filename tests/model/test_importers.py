@@ -5,9 +5,13 @@ import json
 import numpy as np
 import pytest
 from support.checkpoints import write_legacy, write_zip
+from support.cli_files import rejected
 
+from jaxfit.cli.main import main
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, mirror_pairs
+from jaxfit.model.bird import rest_length
+from jaxfit.model.files import load_bird
 from jaxfit.model.published import import_aves, import_avian_mesh, import_model
 
 PARENTS = [-1, 0, 1, 0, 3, 3, 5, 6, 7, 3, 9, 10, 11, 3, 13, 14, 15, 3, 17, 18, 19, 3, 21, 22, 23]
@@ -162,6 +166,14 @@ def test_files_that_do_not_belong_to_the_model(tmp_path, avian_mesh_files):
         import_model("aves", [tmp_path])
     with pytest.raises(ValueError, match="kind must be one of avian-mesh, aves, not 'crow'"):
         import_model("crow", [])
+
+
+def test_the_length_of_the_species_sets_the_unit(tmp_path, capsys):
+    command = ["model", "import", "aves", str(write_aves(tmp_path / "aves.pt")), "--out", str(tmp_path / "aves.npz")]
+    assert main([*command, "--length-cm", "28"]) == 0
+    bird = load_bird(tmp_path / "aves.npz")
+    assert bird.metres_per_unit * rest_length(bird) == pytest.approx(0.28)
+    rejected(capsys, [*command, "--length-cm", "-3"], "--length-cm: is -3.0")
 
 
 def test_mirror_pairs():
