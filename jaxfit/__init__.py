@@ -49,7 +49,7 @@ Measure
     read_truth              annotations, masks or a simulated scene: a `Truth`
     match_tracks            give tracks the numbers of the true birds that they follow
     evaluate                compare a result with the truth: an `Evaluation`
-    sweep                   fit and measure under many values, in memory
+    sweep                   fit and measure under many values, in memory: a `Sweep`, with tables and a plot
     ablate                  the same from files, with tables and a report
 
 Pictures

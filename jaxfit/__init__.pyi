@@ -16,6 +16,7 @@ from .data.solution import Solution as Solution
 from .data.solution import load_solution as load_solution
 from .data.solution import save_solution as save_solution
 from .data.tracks import track_quality as track_quality
+from .evaluation.ablation.ablate import Sweep as Sweep
 from .evaluation.ablation.ablate import ablate as ablate
 from .evaluation.ablation.ablate import sweep as sweep
 from .evaluation.evaluate import Evaluation as Evaluation

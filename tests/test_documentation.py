@@ -15,6 +15,7 @@ from jaxfit.cli.main import main
 from jaxfit.cli.parser import COMMANDS
 from jaxfit.objective import registry
 from jaxfit.objective.residuals import residual_sum
+from jaxfit.perception.trust import FootageSignals, Trust, judge
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -95,6 +96,23 @@ def test_the_example_of_residuals_is_a_term(monkeypatch):
     )
     expected = abs(body_pose[0, 1, 0]) + abs(body_pose[2, 1, 0])
     assert residual_sum(names["level_head"](window)) == pytest.approx(expected)
+
+
+def test_the_table_of_a_new_film_has_the_words_that_are_printed():
+    """docs/your_film.md: what to do after each judgement of a film."""
+    text = (ROOT / "docs" / "your_film.md").read_text(encoding="utf-8")
+    rows = re.search(r"^\| the line says .*?\n\n", text, re.DOTALL | re.MULTILINE)[0].splitlines()[2:]
+    bad = FootageSignals(0, 2, 0, 1, 1, 0, 1, 0, 9, 9)
+    judgements = [judge(bad), Trust("high", (), bad), Trust("high", (), bad._replace(frame_distance=None))]
+    printed = " ".join(each.sentence() for each in judgements)
+    words = [word for row in rows if row for word in re.findall("`(.*?)`", row.split("|")[1])]
+    assert len(words) == 8
+    assert not [word for word in words if word not in printed]
+
+
+def test_the_page_of_terms_lists_the_joints():
+    text = (ROOT / "docs" / "developers" / "term.md").read_text(encoding="utf-8")
+    assert not [name for name in jaxfit.load_murre().joint_names if f"`{name}`" not in text]
 
 
 def test_configs_are_valid(tmp_path):

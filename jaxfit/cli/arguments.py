@@ -66,6 +66,16 @@ SHARED: dict[str, dict[str, Any]] = {
 """Arguments of several commands."""
 
 
+Arguments = argparse._ActionsContainer
+"""A parser, or a group of its arguments."""
+
+
+def add_shared(command: Arguments, *names: str) -> None:
+    """Add arguments that several commands have, by their names in `SHARED`."""
+    for name in names:
+        command.add_argument(name, **SHARED[name])
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that reports wrong arguments in one line, and exits with code 2."""
 
@@ -81,8 +91,7 @@ class Parser(argparse.ArgumentParser):
 
     def shared(self, *names: str) -> None:
         """Add arguments that several commands have, by their names in `SHARED`."""
-        for name in names:
-            self.add_argument(name, **SHARED[name])
+        add_shared(self, *names)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse arguments; the parser of all commands calls this function of the parser of one command."""
@@ -100,9 +109,9 @@ CAMERAS = (
 )
 
 
-def add_view_options(command: Parser) -> None:
+def add_view_options(command: Arguments) -> None:
     """Add the options for the observations of several cameras."""
-    command.shared("--unit")
+    add_shared(command, "--unit")
     text = "numbers with commas, one for each camera: its frame at frame 0 of the first camera, such as 0,3,-0.5"
     command.add_argument("--offsets", metavar="N,N,…", help=text)
     text = "which tracks are one bird: a table with the columns camera, track, bird (default: by the keypoints)"
@@ -140,7 +149,7 @@ def add_observation_options(command: Parser, video: bool = True) -> None:
         command.set_defaults(size=None)
 
 
-def add_cluster(command: Parser, work: str = "fit windows") -> None:
+def add_cluster(command: Arguments, work: str = "fit windows") -> None:
     """Add the options that compute a part of the work in worker processes."""
     group = command.add_mutually_exclusive_group()
     text = f"{work} in N worker processes, which share the cores of this machine (extra `cluster`)"

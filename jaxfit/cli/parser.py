@@ -22,6 +22,7 @@ from jaxfit.cli.arguments import (
     add_cluster,
     add_observation_options,
     add_out,
+    add_shared,
     add_tracking_options,
     add_truth,
     add_view_options,
@@ -291,18 +292,22 @@ def _fit(command: Parser) -> None:
     """Fit the poses of birds to keypoints and masks."""
     text = f"{OBSERVATIONS}; with --cameras one file for each camera"
     command.add_argument("observations", type=Path, nargs="+", metavar="OBS", help=text)
-    add_observation_options(command)
-    command.add_argument("--cameras", type=Path, metavar="FILE", help=f"fit all views at once, in the world; {CAMERAS}")
-    add_view_options(command)
-    text = f"place the birds on the ledge that they stand on, in a world in metres; PLANE is {PLANE} (default birds)"
-    command.add_argument("--ledge", nargs="?", const="birds", metavar="PLANE", help=text)
-    command.shared("--focal-px", "--model")
+    add_out(command, "DIR", "folder for the result", overwrite="an earlier result in the folder")
+    command.shared("--model")
     text = "name of a shipped config (paper, baseline, …) or a YAML file (default %(default)s)"
     command.add_argument("--config", default="paper", help=text)
+    add_observation_options(command)
+    group = command.add_argument_group("calibrated cameras")
+    group.add_argument("--cameras", type=Path, metavar="FILE", help=f"fit all views at once, in the world; {CAMERAS}")
+    add_view_options(group)
+    group = command.add_argument_group("the ledge")
+    text = f"place the birds on the ledge that they stand on, in a world in metres; PLANE is {PLANE} (default birds)"
+    group.add_argument("--ledge", nargs="?", const="birds", metavar="PLANE", help=text)
+    add_shared(group, "--focal-px")
+    group = command.add_argument_group("start and speed of the fit")
     text = "initial poses: the output of a pose regressor, or an earlier poses.npz"
-    command.add_argument("--init", type=Path, metavar="POSES.npz", help=text)
-    add_cluster(command)
-    add_out(command, "DIR", "folder for the result", overwrite="an earlier result in the folder")
+    group.add_argument("--init", type=Path, metavar="POSES.npz", help=text)
+    add_cluster(group)
 
 
 @_command("single steps", "ledge", "ledge.ledge")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import time
 from collections import Counter
 from collections.abc import Iterable
@@ -18,8 +17,6 @@ from jaxfit.model.files import find_bird
 if TYPE_CHECKING:
     from jaxfit.config.reconstruct import ReconstructConfig
     from jaxfit.perception.track import TrackingResult
-
-_logger = logging.getLogger(__name__)
 
 
 def track(options: argparse.Namespace) -> None:
@@ -48,7 +45,7 @@ def track(options: argparse.Namespace) -> None:
     seconds = time.perf_counter() - start
     show(f"{counted(tracks, 'track')} over {counted(frames, 'frame')} in {seconds:.1f} s → {options.out}")
     if tracking.failure:
-        _logger.warning("%s", tracking.failure)  # last, because it says what to do next
+        raise tracking.failure  # last, because it says what to do next
 
 
 def reconstruct(options: argparse.Namespace) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -118,6 +119,8 @@ class _Lines:
     def task(self, name: str, total: float | None) -> Iterator[ReportProgress]:
         start = time.monotonic()
         done, note = 0.0, ""
+        reports = 0
+        first = 0.0, math.inf  # time and work of the second report: before it, programs compile
 
         def show() -> None:
             elapsed = time.monotonic() - start
@@ -125,14 +128,17 @@ class _Lines:
             if total is not None:
                 parts.append(f"{100 * done / total if total else 100:.0f} %")
             parts.append(f"{timedelta(seconds=round(elapsed))}")
-            if total is not None and 0 < done < total:
-                parts[-1] += f" + {timedelta(seconds=round(elapsed * (total - done) / done))}"
+            if total is not None and first[1] < done < total:
+                rest_s = (time.monotonic() - first[0]) * (total - done) / (done - first[1])
+                parts[-1] += f" + {timedelta(seconds=round(rest_s))}"
             line = f"{name}: {', '.join([*parts, note] if note else parts)}"
             self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
         def report_progress(more: float, text: str) -> None:
-            nonlocal done, note
-            done, note = done + more, text
+            nonlocal done, note, reports, first
+            done, note, reports = done + more, text, reports + 1
+            if reports == 2:
+                first = time.monotonic(), done
             if time.monotonic() - self._printed >= _LINE_S:
                 self._printed = time.monotonic()
                 for show_task in self._open:

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import re
 
 import cv2
 import numpy as np
@@ -140,12 +141,15 @@ def test_help_lists_the_commands_by_group_and_the_arguments_of_one(capsys):
         (["--help"], ["start:\n  demo ", "  cameras      calibrate, describe and check cameras\n"]),
         (["cameras", "--help"], ["show ", "check ", "calibrate "]),
         (["track", "--help"], ["--min-score SCORE", "VIDEO", "(default 10)"]),
+        (["fit", "--help"], ["calibrated cameras:\n  --cameras", "the ledge:\n  --ledge"]),
     ):
         with pytest.raises(SystemExit) as stopped:
             main(command)
         assert stopped.value.code == 0
         said = capsys.readouterr().out
         assert all(text in said for text in expected)
+    options = re.findall(r"^  (--[\w-]+)", said, re.MULTILINE)
+    assert options[:5] == ["--out", "--overwrite", "--model", "--config", "--names"]
 
 
 def test_config_show(tmp_path, capsys):

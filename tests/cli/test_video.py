@@ -11,7 +11,6 @@ from support.onnx_graphs import write_constant
 from support.toy_footage import BIRD, BIRDS, FRAMES, QUICK, SIDE, Footage, TrueKeypoints, TrueSegmenter
 
 from jaxfit import load_reconstruct_config, load_solution, pipeline, read_coco
-from jaxfit.cli import perception
 from jaxfit.cli.main import main
 from jaxfit.data.footage import read_footage
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
@@ -95,18 +94,18 @@ def test_short_tracks_are_reported(inputs, tmp_path, networks, capsys):
     assert "1 track with fewer than 3 frames skipped: 1 (2)" in capsys.readouterr().out
 
 
-def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
-    """Without a bird, `track` writes a valid file without tracks and explains; `reconstruct` fails."""
+def test_no_bird_at_all(inputs, tmp_path, networks, capsys):
+    """Without a bird, `track` writes a valid file without tracks, says why, and fails as `reconstruct` does."""
     networks += EVERYONE
     out = tmp_path / "obs.json"
-    assert main(command(inputs, "track", out)) == 0
-    (message,) = caplog.messages
+    assert main(command(inputs, "track", out)) == 2
+    said, message = capsys.readouterr()
+    message = message.splitlines()[-1]
     assert "no bird was detected in 12 frames" in message
     assert "look whether birds are visible in the film; if so, label frames (jaxfit suggest)" in message
     assert "--min-score" in message
     content = json.loads(out.read_text())
     assert (len(content["images"]), content["annotations"]) == (FRAMES, [])
-    said = capsys.readouterr().out
     assert "0 tracks over 12 frames" in said.replace("\n", "")
     assert "trust is low: no bird was tracked" in said
     assert {**content["info"], "footage": None} == {
@@ -122,12 +121,11 @@ def test_no_bird_at_all(inputs, tmp_path, networks, capsys, caplog):
 @pytest.mark.parametrize("name", ["track", "reconstruct"])
 def test_only_low_scores_end_with_what_to_do_next(inputs, tmp_path, networks, capsys, caplog, name):
     """`track` and `reconstruct` give the same advice; its options exist, and the stored frames serve them."""
-    code = {"track": 0, "reconstruct": 2}[name]
-    assert main(command(inputs, name, tmp_path / "out", "--min-track-score", "0.95")) == code
+    assert main(command(inputs, name, tmp_path / "out", "--min-track-score", "0.95")) == 2
     said = capsys.readouterr()
     assert "trust is high" in said.out
     assert "3 tracks with a low mean score skipped (--min-track-score)" in said.out
-    *others, last = [*caplog.messages, *said.err.splitlines()[-1:]] if name == "reconstruct" else caplog.messages
+    others, last = caplog.messages, said.err.splitlines()[-1]
     assert "the highest of 3 tracks is 0.900 (lower --min-track-score, label frames (jaxfit suggest), " in last
     stored = [f"{tmp_path}/out.unfinished holds the frames for a lower --min-track-score or --min-track-frames"]
     assert [message.partition(";")[0] for message in others] == (stored if name == "reconstruct" else [])
@@ -139,15 +137,13 @@ def test_only_low_scores_end_with_what_to_do_next(inputs, tmp_path, networks, ca
         assert main(command(inputs, name, tmp_path / "out", "--min-track-score", "0.75", "--overwrite")) == 0
 
 
-def test_low_trust_recommends_other_networks_before_lower_limits(inputs, tmp_path, networks, monkeypatch):
+def test_low_trust_recommends_other_networks_before_lower_limits(inputs, tmp_path, networks, capsys):
     networks += [(t, n) for t, n in EVERYONE if t % 3 == n]
-    said = []
-    monkeypatch.setattr(perception, "show", said.append)
-    monkeypatch.setattr(perception._logger, "warning", lambda text, *values: said.append(text % values))
-    assert main(command(inputs, "track", tmp_path / "obs.json", "--min-track-frames", "13")) == 0
-    assert said[0].startswith("trust is low: 3 of 3 tracks are too short")
-    assert "jaxfit suggest" not in said[0]
-    assert said[-1].endswith(
+    assert main(command(inputs, "track", tmp_path / "obs.json", "--min-track-frames", "13")) == 2
+    said = capsys.readouterr()
+    assert said.out.startswith("trust is low: 3 of 3 tracks are too short")
+    assert "jaxfit suggest" not in said.out.splitlines()[0]
+    assert said.err.rstrip().endswith(
         "(label frames (jaxfit suggest), use other networks (--segmenter), or lower --min-track-frames)"
     )
 

@@ -32,6 +32,16 @@ def test_a_log_receives_a_line_now_and_then(clock, capsys):
     assert capsys.readouterr().err.splitlines() == ["Tracking [1]: 100 %, 0:01:40, 5 birds"]
 
 
+def test_a_slow_start_is_not_the_speed_of_the_work(clock, capsys):
+    """Programs compile before the first step: 60 seconds here, and one second for each step after it."""
+    with progress.terminal("Training", 200) as report_progress:
+        for seconds in (60, *[1] * 30):
+            clock.now += seconds
+            report_progress(1, "")
+        lines = capsys.readouterr().err.splitlines()
+        assert lines == ["Training: 0 %, 0:01:00", "Training: 16 %, 0:01:30 + 0:02:49"]
+
+
 def test_work_of_unknown_length_shows_the_elapsed_time_only(clock, capsys):
     with progress.terminal("Tracking", None) as report_progress:
         clock.now += 30
@@ -76,7 +86,7 @@ def test_open_tasks_share_their_lines(clock, capsys):
         clock.now += 20
         report_frames(25, "25 frames, 3 birds now")
         assert capsys.readouterr().err.splitlines() == [
-            "Tracking: 25 %, 0:00:30 + 0:01:30, 25 frames, 3 birds now",
+            "Tracking: 25 %, 0:00:30, 25 frames, 3 birds now",
             "Fitting: 0:00:20, 2 windows fitted",
         ]
         clock.now += 29

@@ -10,13 +10,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
 from jaxfit.config.build import describes, plain_config
 from jaxfit.config.fit import FitConfig
 from jaxfit.data.formats import TRUE_POSES, TRUTH
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.data.observations import Observations
 from jaxfit.data.solution import Solution
-from jaxfit.evaluation.ablation.grid import Run, cross, load_grid, require_runs
+from jaxfit.evaluation.ablation.grid import ClaimConfig, Run, cross, load_grid, require_runs, short
 from jaxfit.evaluation.ablation.measure import Result, Verdict, check_shared, judge, measure_grid
 from jaxfit.evaluation.ablation.runs import fit_batches, fit_grid
 from jaxfit.evaluation.evaluate import evaluate
@@ -33,6 +35,8 @@ from jaxfit.model.files import load_murre
 
 FORMAT_VERSION = 2
 _RECORD = "ablation.json"
+_SHOWN_RUNS = 7
+"""Most runs that `print` shows."""
 
 
 def claim_folder(folder: Path, runs: Sequence[Run], inputs: dict[str, Path], bird: Bird) -> None:
@@ -146,11 +150,54 @@ def ablate(
 
 
 class Sweep(NamedTuple):
-    """The outcome of a sweep, run by run."""
+    """The outcome of a sweep, run by run. `print` shows the best runs."""
 
     solutions: list[Solution]
     results: list[Result]
-    """The runs and their metrics, for the tables and plots of `jaxfit.evaluation.ablation`."""
+    """The runs and their metrics."""
+
+    def __repr__(self) -> str:
+        """Return the varied keys and the metrics of the best runs, in ten lines at most."""
+        best = sorted(self.results, key=lambda result: np.nan_to_num(result.evaluation.overall["me_p"], nan=np.inf))
+        lines = [f"Sweep of {len(best)} runs, the lowest me_p first"]
+        for result in best[:_SHOWN_RUNS]:
+            levels = ", ".join(f"{path} {short(level)}" for path, level in result.run.levels.items())
+            metrics = (f"{name} {result.evaluation.overall[name]:.4f}" for name in ("me_p", "me_v"))
+            lines.append("  " + "  ".join([levels, *metrics]))
+        more = [f"  … and {len(best) - _SHOWN_RUNS} more runs"] if len(best) > _SHOWN_RUNS else []
+        return "\n".join([*lines, *more, "table() has all metrics, plot() draws them, compare() tests a claim"])
+
+    def table(self, form: str = "simple") -> str:
+        """Return the metrics of all runs, the best first (extra `report`).
+
+        Args:
+            form: a format of tabulate: `simple`, `github`, `latex_booktabs`, `html`, …
+        """
+        require_extra("report", "sweep")
+        from jaxfit.evaluation.ablation.table import results_table
+
+        return results_table(self.results, form)
+
+    def plot(self) -> bytes:
+        """Return a PNG of me_p and me_v over the varied key with the most numbers (extra `report`)."""
+        require_extra("report", "sweep")
+        from jaxfit.evaluation.ablation.report import plot
+
+        return plot(self.results)
+
+    def compare(self, claim: str, better: Mapping[str, Any], worse: Mapping[str, Any], form: str = "simple") -> str:
+        """Return the verdict on a claim as a table: whether some values give lower errors than others.
+
+        Args:
+            claim: the claim in words.
+            better: path of a config key → the value that is claimed to be better.
+            worse: the other value of the same keys.
+            form: as for `table`.
+        """
+        require_extra("report", "sweep")
+        from jaxfit.evaluation.ablation.table import claims_table
+
+        return claims_table(judge([ClaimConfig(claim, dict(better), dict(worse))], self.results), form)
 
 
 def sweep(

@@ -9,8 +9,10 @@ from matplotlib.figure import Figure
 from support.birds import toy_bird
 
 import jaxfit
+from jaxfit.evaluation.ablation import ablate as ablation
 from jaxfit.evaluation.ablation import report as plotting
-from jaxfit.evaluation.ablation.grid import Run
+from jaxfit.evaluation.ablation import table
+from jaxfit.evaluation.ablation.grid import ClaimConfig, Run
 from jaxfit.evaluation.ablation.measure import Result
 from jaxfit.evaluation.ablation.table import results_table
 from jaxfit.evaluation.bootstrap import Interval
@@ -55,6 +57,20 @@ def test_every_run_is_the_fit_of_its_config_in_the_order_of_the_values(observed)
     me_p = [result.evaluation.overall["me_p"] for result in swept.results]
     assert len(set(me_p)) == 4
     assert results_table(swept.results, "simple").count("\n") == 5
+
+
+def test_print_shows_the_best_runs_in_ten_lines(monkeypatch):
+    results = [result_of({"terms.velocity": v}, me) for v, me in ((0, 0.3), (1, float("nan")), (2, 0.1), (3, 0.2))]
+    lines = repr(jaxfit.Sweep([], results)).splitlines()
+    assert lines[1:3] == [f"  terms.velocity {v}  me_p {me:.4f}  me_v {me:.4f}" for v, me in ((2, 0.1), (3, 0.2))]
+    assert "terms.velocity 1" in lines[4]
+    assert len(repr(jaxfit.Sweep([], results * 30)).splitlines()) == 10
+    assert jaxfit.Sweep([], results).table("github") == results_table(results, "github")
+    assert jaxfit.Sweep([], results).plot()[1:4] == b"PNG"
+    monkeypatch.setattr(ablation, "judge", lambda claims, _: claims)
+    monkeypatch.setattr(table, "claims_table", lambda claims, form: (*claims, form))
+    claim = ClaimConfig("2 helps", {"terms.velocity": 2}, {"terms.velocity": 0})
+    assert jaxfit.Sweep([], results).compare("2 helps", claim.better, claim.worse) == (claim, "simple")
 
 
 def test_an_unknown_key_is_refused(observed):
