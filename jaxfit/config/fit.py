@@ -82,7 +82,7 @@ class CropConfig:
 
     mode: Literal["box", "image"] = "box"
     """`box`: a square around the bird; its size is constant in a window and its centre follows the bird.
-    `image`: the whole image, which must be square."""
+    `image`: the whole image, where all images of a window are square and of one size; else as `box`."""
     padding: NonNegativeFloat = 0.15
     """Margin on each side of the window's largest box, as a fraction of the box's longer side."""
     size_px: Annotated[int, Ge(16)] = 256

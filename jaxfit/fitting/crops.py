@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from jaxfit.config.fit import CropConfig
 from jaxfit.data.observations import Observations
-from jaxfit.foundation.errors import InputError
 from jaxfit.model.camera import CROP_PX
 from jaxfit.raster.silhouette_reference import UNKNOWN
 
@@ -31,25 +30,23 @@ def crop_squares(
     """Return (x0, y0, size) in image pixels for every frame of some windows: whole numbers, one size for each window.
 
     The size is at most `MAX_CROP_IMAGE_SIDES` times the longer side of the window's largest image.
-
-    Raises:
-        InputError: `mode: image` with images that are not square or not of one size.
     """
     crop, sizes_px = np.zeros((*frame.shape, 3)), observations.image_sizes_px()
     for w, n in enumerate(track.tolist()):
         image_px = sizes_px[n, frame[w, present[w]]]
         if not len(image_px):  # a camera that does not see the bird of the window
             crop[w] = 0, 0, MIN_SIZE_PX
-        elif config.mode == "image":
-            sizes = sorted({(width, height) for width, height in image_px.tolist()})
-            if len(sizes) > 1 or sizes[0][0] != sizes[0][1]:
-                problem = f"needs square images of one size, not {sizes} (width, height)"
-                raise InputError("crop.mode: image", problem, "use crop.mode: box")
-            crop[w] = 0, 0, sizes[0][0]
+        elif config.mode == "image" and square_images(image_px):
+            crop[w] = 0, 0, image_px[0, 0]
         else:
             largest_px = float(MAX_CROP_IMAGE_SIDES * image_px.max())
             crop[w] = _around_the_bird(observations, n, frame[w], present[w], largest_px, config)
     return crop
+
+
+def square_images(size_px: Int[np.ndarray, "T 2"]) -> bool:
+    """Return whether images, of a width and a height, are square and of one size."""
+    return bool((size_px == size_px[0, 0]).all())
 
 
 def _around_the_bird(

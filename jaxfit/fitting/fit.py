@@ -20,6 +20,7 @@ from jaxfit.data.observations import Observations, check_keypoints
 from jaxfit.data.solution import Solution
 from jaxfit.fitting.batch import bytes_per_frame
 from jaxfit.fitting.collect import blend_seams, collect_windows
+from jaxfit.fitting.crops import square_images
 from jaxfit.fitting.diagnose import check_terms
 from jaxfit.fitting.initial_poses import InitialPoses
 from jaxfit.fitting.learn import Learnt, learn
@@ -180,6 +181,8 @@ def fit_runs(
     skipped = report_distant_birds(observations, source)
     if not observations.masks:
         configs = _without_mask_stages(configs, source)
+    if configs[0].crop.mode == "image" and not square_images(observations.image_sizes_px()[observations.present]):
+        _logger.warning("%s: the images are not square and of one size, so the crops follow the birds", source)
     if any(compiled_part(config) != compiled_part(configs[0]) for config in configs):
         allowed = "weights, settings, step sizes and the preparation of the data"
         raise ValueError(f"configs: expected configs that share one compiled program and differ only in {allowed}")

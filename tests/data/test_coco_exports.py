@@ -96,6 +96,27 @@ def test_birds_without_tracks(tmp_path, files, frames, tracks):
         assert observed.image_file(2, 0) == files[1]
 
 
+def test_images_of_several_sizes_are_photographs(tmp_path, caplog):
+    """The frames of a video have one size."""
+    content = cvat(["img_1.png", "img_2.png"], [(1, {}), (2, {})])
+    content["images"][0]["width"] += 8
+    assert read_observations(saved(tmp_path, content)).track_id.tolist() == [1, 2]
+    assert "2 sizes" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("content", "program"),
+    [
+        ({"version": "5.2.1", "shapes": [], "imagePath": "a.jpg", "imageHeight": 9, "imageWidth": 9}, "LabelMe.*COCO"),
+        ({"_via_settings": {}, "_via_img_metadata": {"a.jpg123": {"filename": "a.jpg", "regions": []}}}, "VIA.*COCO"),
+        ({"a.jpg123": {"filename": "a.jpg", "size": 123, "regions": []}}, "VIA.*COCO"),
+    ],
+)
+def test_a_file_of_a_program_that_is_not_read_is_named(tmp_path, content, program):
+    with pytest.raises(InputError, match=program):
+        read_observations(saved(tmp_path, content))
+
+
 def test_a_video_file_that_lacks_a_track_is_still_an_error(tmp_path):
     content = cvat(["frame_1.png", "frame_2.png"], [(1, {"track_id": 4}), (2, {})])
     with pytest.raises(InputError, match=r"annotations\[1\] lacks the key track_id"):

@@ -148,11 +148,11 @@ def test_masks_shrink_by_area():
 
 
 def test_whole_images():
-    observations = dataclasses.replace(walk(range(4)), image_size_px=np.full((4, 2), 400), masks={})
-    crop = cut_windows(observations, config(crop=CropConfig(mode="image"))).crop
-    np.testing.assert_array_equal(crop, np.broadcast_to([0, 0, 400], (2, 4, 3)))
-    with pytest.raises(InputError, match=r"crop.mode: image.*square.*400, 300.*box"):
-        cut_windows(walk(range(4)), config(crop=CropConfig(mode="image")))
+    whole, around = config(crop=CropConfig(mode="image")), config(crop=CropConfig(mode="box"))
+    square = dataclasses.replace(walk(range(4)), image_size_px=np.full((4, 2), 400), masks={})
+    np.testing.assert_array_equal(cut_windows(square, whole).crop, np.broadcast_to([0, 0, 400], (2, 4, 3)))
+    others = walk(range(4))  # 400×300 pixels
+    np.testing.assert_array_equal(cut_windows(others, whole).crop, cut_windows(others, around).crop)
 
 
 @pytest.mark.parametrize("numbers", [range(9), [0, 1, 2, 5, 6, 11, 12, 13, 14], [0, 2, 4, 6, 10, 12]])

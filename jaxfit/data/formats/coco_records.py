@@ -241,6 +241,7 @@ def complete_export(root: Field, video: Path | None = None, untracked: Untracked
     """
     if not isinstance(root.value, dict):
         raise InputError(root.source, "must hold an object with images, categories and annotations", "give a COCO json")
+    _refuse_other_programs(root)
     images, birds = _table(root, "images"), _table(root, "annotations")
     is_export = not any("frame_index" in image for image in images)
     photographs = False
@@ -255,6 +256,11 @@ def complete_export(root: Field, video: Path | None = None, untracked: Untracked
                 numbers = [_whole(image["frame_id"]) for image in images]
             else:
                 numbers = frame_numbers([image["file_name"] for image in images], video)
+                sizes = {(image.get("width"), image.get("height")) for image in images}
+                if numbers is not None and video is None and len(sizes) > 1:
+                    numbers = None
+                    text = "%s: the images have %d sizes, so they are read as photographs, not as frames of one video"
+                    _log.warning(text, root.source, len(sizes))
         photographs = numbers is None
         images = [image | {"frame_index": 0 if numbers is None else numbers[i]} for i, image in enumerate(images)]
         with errors_of(root, "annotations"):
@@ -274,6 +280,16 @@ def complete_export(root: Field, video: Path | None = None, untracked: Untracked
         elif is_export:
             birds = _with_tracks(birds, photographs, root.source)
     return Field(root.source, root.path, root.value | {"images": images, "annotations": birds})
+
+
+def _refuse_other_programs(root: Field) -> None:
+    """Raise InputError for the JSON files of two programs for labels whose own format is not read."""
+    if "shapes" in root.value and "imagePath" in root.value:
+        raise InputError(root.source, "is a file of LabelMe", "convert the folder to COCO, as labelme2coco does")
+    images = root.value.get("_via_img_metadata", root.value)
+    if isinstance(images, dict) and any(isinstance(image, dict) and "regions" in image for image in images.values()):
+        remedy = "in VIA, choose Annotation > Export Annotations (COCO format)"
+        raise InputError(root.source, "is a file of the VGG Image Annotator (VIA)", remedy)
 
 
 def _numbered(annotations: list[dict[str, Any]], images: list[dict[str, Any]]) -> list[dict[str, Any]]:
