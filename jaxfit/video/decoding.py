@@ -37,6 +37,7 @@ _RAW = ("h264", "hevc", "m4v", "mpegvideo", "mjpeg")
 """Formats that are only the stream of a codec. Without time stamps, the rate in the codec's header counts."""
 _REORDER = 64  # packets; the time stamps of packets that are further apart in a file are in order
 _FIRST_PACKETS = 500  # packets; a later first picture would make probing slow
+_RESTART_S = 0.5  # seconds; a decoding time that falls by more is a clock that starts again
 _FPS_RANGE = 1e-5, 1e5  # other rates come from damaged headers
 _HDR = {ColorTrc.SMPTE2084: "PQ", ColorTrc.ARIB_STD_B67: "HLG"}
 _LARGEST_TILT = math.tan(math.radians(1))  # players ignore smaller deviations from multiples of 90°, as FFmpeg does
@@ -102,8 +103,8 @@ def frame_count(stream: Any) -> int | None:
 def frame_rate(stream: Any) -> float | None:
     """Return the mean frame rate in frames per second; None if the rate is unknown, or absurd because of damage."""
     rate = stream.average_rate or stream.guessed_rate
-    if stream.container.format.name in _RAW:  # the mean rate is a default of FFmpeg
-        rate = stream.guessed_rate or rate
+    if stream.container.format.name in _RAW:  # the mean rate is a default of FFmpeg, and so is a rate without a header
+        rate = stream.guessed_rate if stream.codec_context.framerate else None
     return float(rate) if rate and _FPS_RANGE[0] <= rate <= _FPS_RANGE[1] else None
 
 
@@ -182,7 +183,7 @@ def _packets(path: Path, stop: int) -> _Packets:
     frames: list[tuple[int | None, bool]] = []
     with opened(path) as (container, stream):
         try:
-            for packet in filter(_is_shown, container.demux(stream)):
+            for packet in filter(_is_shown, _rising(container, stream)):
                 if first is None or None in (first.pts, packet.pts) or packet.pts >= first.pts:
                     frames.append((packet.pts, packet.is_keyframe))
                 if len(frames) > stop + _REORDER:
@@ -196,9 +197,28 @@ def _packets(path: Path, stop: int) -> _Packets:
     return _Packets(len(frames), sorted(stamps), [i for i, (_, is_key) in enumerate(frames) if is_key])
 
 
+def _rising(container: Any, stream: Any) -> Iterator[Any]:
+    """Yield the packets. Where the clock of a file starts again, the later time stamps continue the earlier ones.
+
+    Recorders join transport streams whose clocks begin at 0 each.
+    """
+    shift, last, tick_s = 0, None, float(stream.time_base)
+    for packet in container.demux(stream):
+        if packet.dts is not None:
+            if last is not None and (last - packet.dts - shift) * tick_s > _RESTART_S:
+                shift = last + (packet.duration or 1) - packet.dts
+            packet.dts += shift
+            if packet.pts is not None:
+                packet.pts += shift
+            last = packet.dts
+        yield packet
+
+
 def _has_stamps(container: Any, stream: Any) -> bool:
-    # AVI has no time stamps, and FFmpeg cannot derive correct time stamps for these codecs
-    return not (container.format.name == "avi" and stream.codec_context.name in ("h264", "hevc"))
+    # AVI has no time stamps, and FFmpeg cannot derive correct time stamps for these codecs; the time stamps of a stream
+    # without a rate are a default of FFmpeg
+    is_avi = container.format.name == "avi" and stream.codec_context.name in ("h264", "hevc")
+    return not (is_avi or (container.format.name in _RAW and frame_rate(stream) is None))
 
 
 def _is_shown(packet: Any) -> bool:
@@ -254,7 +274,7 @@ def _numbered(
         number += 1
         return NumberedPicture(number - 1, time_s, picture)
 
-    packets = container.demux(stream)
+    packets = _rising(container, stream)
     packet: Any = True
     while packet is not None and not stopped():
         try:
@@ -413,7 +433,9 @@ def _pixels(path: Path, number: int, picture: Any, size_px: tuple[int, int]) -> 
 
 
 def warn_of_difference(path: Path, stream: Any, picture: Any) -> None:
-    """Warn if players show a video in another way: tilted, with stretched pixels, or with tone mapping."""
+    """Warn of unknown times, and if players show a video tilted, with stretched pixels, or with tone mapping."""
+    if frame_rate(stream) is None and not _has_stamps(stream.container, stream):
+        _logger.warning("%s: states no frame rate, so the times of its frames are unknown", path)
     if display_turn(picture) is None:
         _logger.warning("%s: players tilt this video by an angle between multiples of 90°, jaxfit does not", path)
     aspect = stream.sample_aspect_ratio

@@ -48,15 +48,25 @@ def number_in(picture):
 
 
 def encode(
-    path, codec="libx264", count=100, gop=20, ticks=None, options=None, b_frames=None, turn=None, picture_of=numbered
+    path,
+    codec="libx264",
+    count=100,
+    gop=20,
+    ticks=None,
+    options=None,
+    b_frames=None,
+    turn=None,
+    picture_of=numbered,
+    rate=25,
 ):
-    """Write a video of `numbered` pictures at 25 frames per second, or at times `ticks` in units of 1/100 s.
+    """Write a video of `numbered` pictures at `rate` frames per second, or at times `ticks` in units of 1/100 s.
 
     `turn` is the rotation of the display matrix in degrees counterclockwise, and whether to mirror x and y after it.
     """
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=25 if ticks is None else 100, options=options or {})
-        stream.width, stream.height, stream.pix_fmt = BITS * CELL_PX, 64 + CELL_PX, "yuv420p"
+        stream = container.add_stream(codec, rate=rate if ticks is None else 100, options=options or {})
+        stream.width, stream.height = BITS * CELL_PX, 64 + CELL_PX
+        stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
         stream.codec_context.gop_size = gop
         if turn is not None:
             stream.set_display_rotation(*turn)
@@ -65,7 +75,7 @@ def encode(
             stream.codec_context.max_b_frames = b_frames
         for i in range(count):
             picture = av.VideoFrame.from_ndarray(picture_of(i), format="bgr24")
-            picture.pts, picture.time_base = (i, Fraction(1, 25)) if ticks is None else (ticks[i], Fraction(1, 100))
+            picture.pts, picture.time_base = (i, Fraction(1, rate)) if ticks is None else (ticks[i], Fraction(1, 100))
             container.mux(stream.encode(picture))
         container.mux(stream.encode(None))
     return path

@@ -125,6 +125,31 @@ def test_a_stream_that_begins_between_keyframes(tmp_path, films):
     assert number_in(next(iter(read_frames(tmp_path / "a.ts", 30))).picture) == 50
 
 
+@pytest.mark.parametrize("name", ["h264.ts", "b_frames.mpg"])
+def test_joined_recordings_have_one_clock(tmp_path, films, name):
+    """The clock of each recording begins at 0; the numbers and the times of the frames rise over both."""
+    if name not in films:
+        films[name] = encode(tmp_path / "one.mpg", "mpeg2video", b_frames=2)
+    (tmp_path / name).write_bytes(films[name].read_bytes() * 2)
+    reader = read_frames(tmp_path / name)
+    read = list(reader)
+    assert [number_in(frame.picture) for frame in read] == [*range(100), *range(100)]
+    assert reader.damaged == []
+    np.testing.assert_allclose(np.diff([frame.time_s for frame in read]), 1 / 25, atol=0.05)
+    assert (np.diff([frame.time_s for frame in read]) > 0).all()
+    assert frame_times(tmp_path / name, 1000).tolist() == [frame.time_s for frame in read]
+
+
+def test_a_stream_without_a_rate(tmp_path, films, caplog):
+    """FFmpeg assumes 25 frames per second for a raw stream; the header of H.264 has the rate, that of MJPEG has not."""
+    assert probe_video(encode(tmp_path / "a.h264", rate=50, count=10)).fps == 50
+    encode(tmp_path / "a.mjpeg", "mjpeg", count=10)
+    assert probe_video(tmp_path / "a.mjpeg").fps is None
+    assert [frame.time_s for frame in read_frames(tmp_path / "a.mjpeg")] == [None] * 10
+    assert np.isnan(frame_times(tmp_path / "a.mjpeg", 99)).all()
+    assert "states no frame rate, so the times of its frames are unknown" in caplog.text
+
+
 @pytest.mark.parametrize("name", ["front.mp4", "plain.avi", "vp9.webm"])
 def test_a_truncated_file(tmp_path, films, caplog, name):
     path = films.get(name, tmp_path / name)
