@@ -273,7 +273,10 @@ def _open_store(
     """Return the stored frames and windows in the folder of unfinished work, which an interrupted call has left."""
     frames = None
     if networks.all_of_config:
-        frames = Parts(unfinished / "frames", tracking_record(config.track, video, networks.hashes, progress))
+        record = tracking_record(config.track, video, networks.hashes, progress)
+        # the same command may use other files of the networks
+        renewed = ("networks",) if networks.choice is None else ("networks", "track.segmenter.file")
+        frames = Parts(unfinished / "frames", record, renewed)
     windows = Parts(unfinished / "windows", fit_record(config.fit, bird))
     return Store(frames, windows, StoredWindows(windows))
 

@@ -2,7 +2,7 @@
 
 Parts of a long computation: numbered `.npz` files in one folder, with a record of what they depend on. Every file
 appears whole or not at all. The record `record.json` is written with the first file. A computation that depends on
-something else is refused as long as the folder holds files.
+something else is refused as long as the folder holds files, or begins again if the user cannot undo the difference.
 
 The folder of the result `out` is `out.unfinished`. The process that works in the folder holds a lock on the file
 `lock`. The operating system frees the lock when the process ends, also after SIGKILL.
@@ -11,6 +11,7 @@ The folder of the result `out` is `out.unfinished`. The process that works in th
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -25,6 +26,8 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import created_parents, remove_leftovers, resolved, write_errors, write_whole
 from jaxfit.foundation.reading import check_readable, read_json_file
 
+_logger = logging.getLogger(__name__)
+
 RECORD = "record.json"
 """Name of the file that holds the record."""
 _SHOWN = 3
@@ -37,6 +40,8 @@ class Parts:
     Args:
         folder: the folder, which may be absent.
         record: name → JSON value that the content of the parts depends on; values may be mappings.
+        renewed: beginnings of the paths of values, such as `networks`. If only these values differ, the parts are
+            removed, with a warning.
 
     Raises:
         InputError: the folder holds parts with another record; the message names the differences.
@@ -47,13 +52,13 @@ class Parts:
     size_bytes: int
     """Size of the stored parts."""
 
-    def __init__(self, folder: Path, record: Mapping[str, Any]):
+    def __init__(self, folder: Path, record: Mapping[str, Any], renewed: tuple[str, ...] = ()):
         self._folder, self._record = folder, json.loads(json.dumps(record))
         remove_leftovers(folder)
         self.numbers = sorted(int(file.stem) for file in folder.glob("*.npz") if file.stem.isdigit())
         self.size_bytes = sum(self._path(number).stat().st_size for number in self.numbers)
         if self.numbers:
-            self._check_record()
+            self._check_record(renewed)
 
     def add(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Store the next part.
@@ -98,14 +103,18 @@ class Parts:
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:06d}.npz"
 
-    def _check_record(self) -> None:
-        held = read_record(self._folder)
-        changed = list(differences(held, self._record))
-        if changed:
-            more = f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else ""
-            problem = f"was begun with another {', '.join(changed[:_SHOWN])}{more}"
-            remedy = "repeat the earlier command to continue, or remove this folder to begin again"
-            raise InputError(self._folder, problem, remedy)
+    def _check_record(self, renewed: tuple[str, ...]) -> None:
+        changed = list(differences(read_record(self._folder), self._record))
+        if not changed:
+            return
+        more = f" and {len(changed) - _SHOWN} more" if len(changed) > _SHOWN else ""
+        problem = f"was begun with another {', '.join(changed[:_SHOWN])}{more}"
+        if all(name.startswith(renewed) for name in changed):
+            _logger.warning("%s: %s, so the work begins again", self._folder, problem)
+            self.keep(0)
+            return
+        remedy = "repeat the earlier command to continue, or remove this folder to begin again"
+        raise InputError(self._folder, problem, remedy)
 
 
 def read_record(folder: Path) -> Any:

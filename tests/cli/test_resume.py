@@ -133,6 +133,15 @@ def test_other_inputs_are_refused(folder, capsys):
         assert main(command(folder)) == 0
 
 
+def test_the_same_command_with_other_networks_begins_again(folder, caplog):
+    """The segmenter that `auto` stands for depends on the files that are there."""
+    assert run(folder, "frame 7")[0] == 130
+    with mock.patch.object(pipeline, "file_hashes", return_value={"segmenter": {"new.onnx": "0"}}):
+        assert stopped(run(folder, "frame 9"), 0, 9)
+    assert "result.unfinished/frames: was begun with another networks.segmenter" in caplog.text
+    assert ", so the work begins again" in caplog.text
+
+
 @pytest.mark.extended
 def test_a_full_disk_costs_nothing_that_was_stored(folder, expected, capsys):
     sync = files._sync

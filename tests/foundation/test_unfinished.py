@@ -91,6 +91,8 @@ def test_parts_of_another_computation_are_refused(tmp_path):
     Parts(tmp_path / "p", {"a": {"b": 1, "c": 2}, "v": 1}).add({"x": np.zeros(1)})
     with pytest.raises(InputError, match=r"p: was begun with another a\.b, v \(repeat the earlier command"):
         Parts(tmp_path / "p", {"a": {"b": 7, "c": 2}})
+    with pytest.raises(InputError, match="was begun with another"):
+        Parts(tmp_path / "p", {"a": {"b": 7, "c": 2}, "v": 2}, ("a",))
     many = {"a": {str(i): 0 for i in range(9)}, "v": 1}
     with pytest.raises(InputError, match=r"another a\.0, a\.1, a\.2 and 8 more"):
         Parts(tmp_path / "p", many)
@@ -103,6 +105,13 @@ def test_parts_of_another_computation_are_refused(tmp_path):
     (tmp_path / "p" / "record.json").unlink()
     with pytest.raises(InputError, match=r"record\.json: does not exist \(remove this folder"):
         Parts(tmp_path / "p", {"new": 1})
+
+
+def test_parts_begin_again_if_only_renewed_values_differ(tmp_path, caplog):
+    Parts(tmp_path / "p", {"a": {"b": 1}, "v": 1}).add({"x": np.zeros(1)})
+    assert Parts(tmp_path / "p", {"a": {"b": 2}, "v": 1}, ("a.b",)).numbers == []
+    assert caplog.messages == [f"{tmp_path / 'p'}: was begun with another a.b, so the work begins again"]
+    assert list((tmp_path / "p").glob("*.npz")) == []
 
 
 def test_every_flipped_bit_is_harmless_or_reported(tmp_path):
