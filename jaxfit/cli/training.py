@@ -18,7 +18,6 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import require_extra
 from jaxfit.foundation.files import check_new_file
 from jaxfit.foundation.progress import terminal
-from jaxfit.learning.networks.ranges import check_numbers
 
 if TYPE_CHECKING:
     from jaxfit.learning.networks.fine_tune import FineTuned
@@ -71,8 +70,6 @@ def train(options: argparse.Namespace) -> None:
 
 def _train_on_simulation(options: argparse.Namespace) -> None:
     scenes = BUILTIN_SCENES if options.scenes is None else options.scenes
-    # before the imports, which take seconds
-    check_numbers(False, options.steps, scenes, options.seed, varied=options.varied, wings=options.wings)
     from jaxfit.learning.networks.training import Simulation, default_schedule, train_network
 
     start = time.perf_counter()
@@ -88,9 +85,6 @@ def _train_on_simulation(options: argparse.Namespace) -> None:
 
 def _train_on_labels(options: argparse.Namespace) -> None:
     scenes = LABEL_SCENES if options.scenes is None else options.scenes
-    check_numbers(
-        True, options.steps, scenes, options.seed, holdout=options.holdout
-    )  # before the imports, which take seconds
     from jaxfit.learning.networks.fine_tune import LABELLED_SHARE, Settings, default_schedule, fine_tune
     from jaxfit.learning.networks.label_data import LabelFiles
     from jaxfit.learning.networks.scenes import missing_scenes
@@ -107,7 +101,7 @@ def _train_on_labels(options: argparse.Namespace) -> None:
     schedule = None if steps is None else default_schedule(options.network, 0)._replace(steps=steps)
     settings = Settings(options.base or "builtin", options.holdout, scenes, schedule, options.seed, teacher)
     frames = options.frames or Path("simulated_frames")
-    missing = missing_scenes(frames, scenes) if scenes else 0
+    missing = missing_scenes(frames, scenes)
     if missing:
         simulated = f"{100 * (1 - LABELLED_SHARE):.0f} %"
         show(

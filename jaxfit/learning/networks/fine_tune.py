@@ -66,10 +66,9 @@ from jaxfit.learning.networks.network_files import (
     write_segmenter,
 )
 from jaxfit.learning.networks.networks import FeaturePyramid
-from jaxfit.learning.networks.ranges import check_numbers
 from jaxfit.learning.networks.scenes import film_scenes
 from jaxfit.learning.networks.teacher import Taught, open_teacher, teach
-from jaxfit.learning.networks.training import Schedule, Source, Trained, train, weights_of
+from jaxfit.learning.networks.training import Schedule, Source, Trained, check_numbers, train, weights_of
 from jaxfit.perception.keypoint_layouts import HeatmapLayout, KeypointInput, read_metadata
 from jaxfit.perception.keypoints import OnnxKeypoints, crop_settings, load_keypoint_detector
 from jaxfit.perception.network import Instance, KeypointDetector, OnnxModel, Port, Segmenter, instance_of

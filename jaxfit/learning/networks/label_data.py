@@ -399,22 +399,13 @@ def read_label_files(network: str, files: LabelFiles, progress: ProgressTask = s
 
 def fingerprint(data: FineTuningData, scenes: Sequence[Path], base: Path, settings: Sequence[object]) -> str:
     """Return a hash of everything that determines a training, so that only the same training is resumed."""
-    content = hashlib.blake2b(digest_size=16)
+    content = hashlib.blake2b(base.read_bytes(), digest_size=16)
     content.update(repr((tuple(settings), data.keypoint_names, data.scale, data.split)).encode())
-    content.update(base.read_bytes())
     for folder in scenes:
         content.update((folder / MARKER).read_bytes())
-    for array in (data.frames.keypoints_px, data.frames.visibility, data.frames.pixels_per_unit):
+    frames = data.frames
+    for array in (frames.keypoints_px, frames.visibility, frames.pixels_per_unit, *frames.pictures, *frames.owner):
         content.update(np.ascontiguousarray(array).tobytes())
-    for pictures, owner in zip(data.frames.pictures, data.frames.owner, strict=True):
-        content.update(np.ascontiguousarray(pictures).tobytes())
-        content.update(np.ascontiguousarray(owner).tobytes())
     for picture in (*data.pictures, *data.tracked):  # the measurements and the second training use all labels
-        labels = picture.labels
-        unknown = labels.unknown and dict(labels.unknown)
-        content.update(repr((labels.name, labels.frame, labels.size_px, unknown)).encode())
-        for bird in labels.birds:
-            for array in (bird.box_px, bird.keypoints_px, bird.visibility):
-                content.update(np.ascontiguousarray(array).tobytes())
-            content.update(repr(bird.mask and dict(bird.mask)).encode())
+        content.update(repr(picture.labels).encode())
     return content.hexdigest()

@@ -126,10 +126,7 @@ def save_labels(
 
 
 def load_frames(*folders: str | Path) -> LabelledFrames:
-    """Load the frames of a folder, or the frames of several folders as one.
-
-    The pictures of one folder are memory-mapped. Of several folders, only the file of the frame in use is open: index
-    one frame at a time.
+    """Load the frames of folders as one. A picture is read when it is indexed: index one frame at a time.
 
     Args:
         folders: folders of frames of the same size with the same keypoints.
@@ -137,25 +134,44 @@ def load_frames(*folders: str | Path) -> LabelledFrames:
     Raises:
         InputError: the frames cannot be read, an earlier version wrote them, or the labels hold impossible values.
     """
-    parts = [_load_folder(Path(folder), is_open=len(folders) == 1) for folder in folders]
-    if len(parts) == 1:
-        return parts[0]
+    parts = [_load_folder(Path(folder)) for folder in folders]
     birds = max(part.visibility.shape[1] for part in parts)
 
-    def with_birds(array: np.ndarray) -> np.ndarray:
-        return np.concatenate([array, np.zeros((len(array), birds - array.shape[1], *array.shape[2:]), array.dtype)], 1)
+    def joined(name: str) -> np.ndarray:
+        arrays = [getattr(part, name) for part in parts]
+        missing = [(0, birds - array.shape[1]) for array in arrays]
+        return np.concatenate(
+            [np.pad(a, [(0, 0), more, *[(0, 0)] * (a.ndim - 2)]) for a, more in zip(arrays, missing, strict=True)]
+        )
 
-    return LabelledFrames(
-        cast(Any, _Joined([part.pictures for part in parts])),
-        cast(Any, _Joined([part.owner for part in parts])),
-        np.concatenate([with_birds(part.keypoints_px) for part in parts]),
-        np.concatenate([with_birds(part.visibility) for part in parts]),
-        np.concatenate([part.pixels_per_unit for part in parts]),
-        parts[0].keypoint_names,
+    return parts[0]._replace(
+        pictures=cast(Any, _Frames([frame for part in parts for frame in cast(Any, part.pictures).files])),
+        owner=cast(Any, _Frames([frame for part in parts for frame in cast(Any, part.owner).files])),
+        keypoints_px=joined("keypoints_px"),
+        visibility=joined("visibility"),
+        pixels_per_unit=np.concatenate([part.pixels_per_unit for part in parts]),
     )
 
 
-def _load_folder(folder: Path, is_open: bool) -> LabelledFrames:
+class _Frames(Sequence[np.ndarray]):
+    """Frames of files in their order, each the path of a file and the position in the file."""
+
+    def __init__(self, files: list[tuple[Path, int]]):
+        self.files = files
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return (len(self), *self[0].shape)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, s: Any) -> Any:
+        path, place = self.files[s]
+        return np.load(path, mmap_mode="r")[place]
+
+
+def _load_folder(folder: Path) -> LabelledFrames:
     labels = load_npz(folder / MARKER, _LABELS, optional={"keypoint_names": "K"})
     points, visibility, scale = (labels[name] for name in _LABELS)
     pictures = load_npy(folder / "pictures.npy", f"{len(scale)} H W 3", mapped=True)
@@ -163,34 +179,10 @@ def _load_folder(folder: Path, is_open: bool) -> LabelledFrames:
     names = tuple(str(name) for name in labels.get("keypoint_names", MURRE_KEYPOINTS))
     frames = LabelledFrames(pictures, owner, points, visibility, scale, names)
     _check_labels(frames, folder)
-    if is_open:
-        return frames
-    return frames._replace(
-        pictures=cast(Any, _FrameFile(folder / "pictures.npy", pictures.shape)),
-        owner=cast(Any, _FrameFile(folder / "owner.npy", owner.shape)),
+    pictures, owner = (
+        cast(Any, _Frames([(folder / name, s) for s in range(len(scale))])) for name in ("pictures.npy", "owner.npy")
     )
-
-
-class _FrameFile(NamedTuple):
-    """A file of frames that is not open."""
-
-    path: Path
-    shape: tuple[int, ...]
-
-
-class _Joined(Sequence[np.ndarray]):
-    """Frames of several files in their order; a frame is read when it is indexed."""
-
-    def __init__(self, files: Sequence[Any]):
-        self._frames = [(file.path, s) for file in files for s in range(file.shape[0])]
-        self.shape = (len(self._frames), *files[0].shape[1:])
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, s: Any) -> Any:
-        path, place = self._frames[s]
-        return np.load(path, mmap_mode="r")[place]
+    return frames._replace(pictures=pictures, owner=owner)
 
 
 def _check_labels(frames: LabelledFrames, folder: Path) -> None:

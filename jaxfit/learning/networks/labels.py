@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, UInt8
 from jaxfit.data.formats.coco import coco_observations
 from jaxfit.data.formats.coco_records import complete_export
 from jaxfit.data.formats.fields import Field, read_json
-from jaxfit.data.formats.mask_files import add_masks, masks_of_picture
+from jaxfit.data.formats.mask_files import add_masks, mask_observations
 from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.keypoint_names import opposite_keypoints
 from jaxfit.data.masks import box_of_mask, decode_mask, encode_mask
@@ -106,7 +106,7 @@ def read_labels(
         if file.is_dir():
             if needs_keypoints:
                 raise InputError(file, "is a folder of masks, without keypoints", "give a file of labelled keypoints")
-            read, file_names = list(_mask_pictures(file, progress)), (CENTRE,)
+            read, file_names = list(_pictures(mask_observations(file, progress), file)), (CENTRE,)
         else:
             observations = _observations(file, images[i] if images else None, needs_keypoints)
             if masks is not None:
@@ -187,21 +187,6 @@ def _pictures(observations: Observations, file: Path) -> Iterator[LabelledPictur
         yield LabelledPicture(
             file, name, i if observations.own_images else int(observations.frame_index[t]), size, labelled
         )
-
-
-def _mask_pictures(folder: Path, progress: ProgressTask) -> Iterator[LabelledPicture]:
-    """Yield the pictures of a folder of masks; one grey value for several birds is one bird here."""
-    files = image_files(folder)
-    numbers = frame_numbers([file.name for file in files]) or range(len(files))
-    with progress("Reading masks", len(files)) as report_progress:
-        for file, frame in zip(files, numbers, strict=True):
-            report_progress(1, "")
-            picture = read_picture(file, grey=True)
-            if picture is None:
-                raise InputError(file, "is no readable picture", "write the picture again, or remove it")
-            masks = [mask for mask in masks_of_picture(picture, file, several_birds=False) if mask.any()]
-            birds = tuple(mask_bird(i, mask) for i, mask in enumerate(masks, 1))
-            yield LabelledPicture(folder, file.name, frame, (picture.shape[1], picture.shape[0]), birds)
 
 
 def mask_bird(number: int, mask: np.ndarray) -> LabelledBird:

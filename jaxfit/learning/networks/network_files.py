@@ -16,7 +16,6 @@ import logging
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -66,7 +65,9 @@ def export_onnx(
         metadata: metadata of the file, which describes input and output.
         path: an `.onnx` file; an existing file is replaced.
     """
-    with _quiet_exporter():
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns that torchvision is not installed
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         program = torch.onnx.export(
             network,
             (example,),
@@ -93,20 +94,6 @@ def export_onnx(
         del node.metadata_props[:]  # the exporter writes local paths into it
     onnx.checker.check_model(model)
     write_whole(path, model.SerializeToString())
-
-
-@contextmanager
-def _quiet_exporter() -> Iterator[None]:
-    """Hide the warnings of the exporter itself, for example that torchvision is not installed."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
 
 
 def _convert_weights(model: onnx.ModelProto) -> None:

@@ -268,8 +268,7 @@ def film_scenes(
     """Film the scenes that a folder lacks, each into a folder of its own; the same seeds give the same frames.
 
     Args:
-        folder: folder of the scenes, with about 32 MB per scene. A folder in which an earlier version stored the frames
-            of all scenes is used as it is.
+        folder: folder of the scenes, with about 32 MB per scene.
         count: number of scenes, with seeds from 0.
         varied: share of the scenes with other birds in other landscapes (`varied.py`).
         wings: share of the scenes in which the birds flap or fly. None: the shares of the scenes in the folder.
@@ -318,8 +317,6 @@ def _missing(folders: Sequence[Path]) -> list[int]:
 
 
 def _scene_folders(folder: Path, count: int) -> tuple[Path, ...]:
-    if (folder / MARKER).exists():
-        return (folder,)
     names = [path.name for path in folder.iterdir()] if folder.is_dir() else []
     others = sorted(name for name in names if not name.startswith((".", "scene_")) and name != SHARES)
     if others:

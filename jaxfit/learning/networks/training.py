@@ -33,8 +33,7 @@ from jaxfit.learning.networks.network_files import (
     write_segmenter,
 )
 from jaxfit.learning.networks.networks import FeaturePyramid
-from jaxfit.learning.networks.ranges import CHECKS, check_numbers
-from jaxfit.learning.networks.scenes import FRAMES_PER_SCENE, film_scenes
+from jaxfit.learning.networks.scenes import film_scenes
 from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception.segmentation import load_segmenter
 
@@ -42,6 +41,8 @@ SCENES = 160
 """Number of training scenes, with seeds from 0; seeds of 1000 and more are for tests."""
 CONTINUED_RATE = 1e-3
 """Learning rate of a training that starts from another network."""
+CHECKS = 10
+"""Number of measurements on the held-out pictures during a training on labels."""
 PATIENCE = 4
 """Number of measurements without a better score after which the training stops."""
 
@@ -298,6 +299,29 @@ def _load_state(
         return Trained(content["step"], [tuple(entry) for entry in content["history"]], best, {})
 
 
+def check_numbers(has_labels: bool, steps: int | None, scenes: int, seed: int, **shares: float) -> None:
+    """Check the numbers of a training, and raise InputError for a number outside its range.
+
+    Args:
+        has_labels: whether a person or a teacher made labels.
+        steps: number of steps; None for the default.
+        scenes: number of simulated scenes.
+        seed: seed of the samples.
+        shares: `holdout`, `varied` or `wings`.
+    """
+    fewest_steps, fewest_scenes = (CHECKS, 0) if has_labels else (20, 1)
+    if steps is not None and steps < fewest_steps:
+        raise InputError("train: steps", f"is {steps}", f"give {fewest_steps} or more")
+    if not fewest_scenes <= scenes <= 900:  # seeds of 1000 and more are for tests
+        raise InputError("train: scenes", f"is {scenes}", f"give {fewest_scenes} to 900")
+    if seed < 0:
+        raise InputError("train: seed", f"is {seed}", "give a whole number from 0")
+    for name, share in shares.items():
+        largest = 0.5 if name == "holdout" else 1
+        if not 0 <= share <= largest:
+            raise InputError(f"train: {name}", f"is {share}", f"give a share of 0 to {largest}")
+
+
 class Simulation(NamedTuple):
     """The simulated frames of a training."""
 
@@ -357,9 +381,6 @@ def train_network(
     scenes = simulation.scenes
     folders = film_scenes(simulation.folder, scenes, simulation.varied, simulation.wings, progress)
     frames = load_frames(*folders)
-    if len(frames.pictures) != scenes * FRAMES_PER_SCENE:  # a folder of an earlier version, with all frames in one file
-        problem = f"holds {len(frames.pictures) // FRAMES_PER_SCENE} scenes, not {scenes}"
-        raise InputError(simulation.folder, problem, "give another folder or the same number of scenes")
     module = segmenter if which == "segmenter" else keypoints
     sources = [Source(folders, module.draw_sample)]
     losses = train(

@@ -181,9 +181,7 @@ def test_wrong_use_of_the_command(tmp_path, capsys):
         (["--seed", "-1"], "seed: is -1 (give a whole number from 0)"),
     ],
 )
-def test_wrong_numbers_are_rejected_before_the_imports(tmp_path, capsys, monkeypatch, options, message):
-    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.fine_tune", None)
-    monkeypatch.setitem(sys.modules, "jaxfit.learning.networks.training", None)
+def test_wrong_numbers_are_rejected(tmp_path, capsys, options, message):
     assert main(["train", "keypoints", *options, "--out", str(tmp_path / "mine.onnx")]) == 2
     assert capsys.readouterr().err == f"jaxfit: train: {message}\n"
 

@@ -73,14 +73,11 @@ def test_only_missing_scenes_are_filmed_with_the_shares_of_the_folder(filmed, tm
         film_scenes(tmp_path / "wings", 2, 0.25, 0.0)
 
 
-def test_folders_of_an_earlier_version_and_other_folders(filmed, tmp_path):
-    write_scene(tmp_path / "all", 3)
-    assert scenes.missing_scenes(tmp_path / "all", 20) == 0
-    assert film_scenes(tmp_path / "all", 20) == (tmp_path / "all",)
-    assert not filmed
+def test_folders_of_other_files_are_rejected(filmed, tmp_path):
     (tmp_path / "holiday.png").touch()
-    with pytest.raises(InputError, match=r"holds other files than simulated scenes: all .*--frames"):
+    with pytest.raises(InputError, match=r"holds other files than simulated scenes: holiday.* .*--frames"):
         film_scenes(tmp_path, 20)
+    assert not filmed
 
 
 def test_the_end_of_a_process_is_one_error(monkeypatch, tmp_path):

@@ -183,15 +183,13 @@ def test_a_keypoint_network_from_a_base_network_begins_with_its_weights(scenes, 
     ("arguments", "message"),
     [
         ({"scenes": 0}, "scenes"),
-        ({"scenes": 3}, "holds 0 scenes, not 3"),
         ({"schedule": QUICK._replace(steps=3)}, "steps"),
         ({"wings": 2}, "wings"),
-        ({"wings": 0.5}, "not of"),
+        ({}, "holds other files"),
         ({"path": "n.pt"}, ".onnx"),
     ],
 )
 def test_invalid_arguments_are_rejected(folder, tmp_path, arguments, message):
-    """The folder holds all frames in one file, as earlier versions wrote simulated scenes."""
     path = tmp_path / arguments.pop("path", "n.onnx")
     given = {key: arguments.pop(key) for key in ("scenes", "wings") if key in arguments}
     with pytest.raises(InputError, match=message):
