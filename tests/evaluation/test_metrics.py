@@ -99,6 +99,9 @@ def test_me_v_by_hand():
     # velocity differences (0, 0), (3, 4), (0, 0), divided by the sides of frames 0, 1, 2
     sides, visible = [10, 20, 40, 1], np.ones((4, 1))
     assert me_v(predicted, observed, visible, sides) == pytest.approx(math.sqrt((5 / 20) ** 2 / 3))
+    # the error of a pair belongs to its earlier frame
+    errors = squared_velocity_errors(predicted, observed, visible, sides)
+    np.testing.assert_allclose(errors, [[0], [(5 / 20) ** 2], [0], [np.nan]])
     # a gap between frames 2 and 4 takes that pair out
     assert me_v(predicted, observed, visible, sides, [1, 2, 4, 5]) == 0
     # every second frame: consecutive frames differ by the file's step, which is 2
