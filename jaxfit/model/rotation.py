@@ -159,20 +159,24 @@ def unwrap_axis_angle(axis_angle: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
     Many axis-angles describe one rotation. Without unwrapping, the axis-angle of a bird that turns through θ = π jumps
     by 2π between two frames, and the velocity term penalises a motion that does not exist.
     """
-
-    def step(previous, current):
-        theta = jnp.linalg.norm(current)
-        axis = current / jnp.maximum(theta, 1e-9)
-        # choose k so that (θ + 2πk)·axis is closest to the previous axis-angle
-        k = jnp.round((jnp.dot(previous, axis) - theta) / (2 * jnp.pi))
-        # a zero rotation has no axis: use a whole number of turns about the previous axis
-        length = jnp.linalg.norm(previous)
-        turns = 2 * jnp.pi * jnp.round(length / (2 * jnp.pi)) * previous / jnp.maximum(length, 1e-9)
-        nearest = jnp.where(theta < 1e-6, turns, current + 2 * jnp.pi * k * axis)
-        return nearest, nearest
-
-    _, unwrapped = jax.lax.scan(step, axis_angle[0], axis_angle)
+    _, unwrapped = jax.lax.scan(_nearest_turn, axis_angle[0], axis_angle)
     return unwrapped
+
+
+def _nearest_turn(previous, current):
+    """Return, twice, the axis-angle of the rotation `current` that is nearest to `previous`.
+
+    A function of the module: outside of `jit`, JAX would compile a local function again in every call.
+    """
+    theta = jnp.linalg.norm(current)
+    axis = current / jnp.maximum(theta, 1e-9)
+    # choose k so that (θ + 2πk)·axis is closest to the previous axis-angle
+    k = jnp.round((jnp.dot(previous, axis) - theta) / (2 * jnp.pi))
+    # a zero rotation has no axis: use a whole number of turns about the previous axis
+    length = jnp.linalg.norm(previous)
+    turns = 2 * jnp.pi * jnp.round(length / (2 * jnp.pi)) * previous / jnp.maximum(length, 1e-9)
+    nearest = jnp.where(theta < 1e-6, turns, current + 2 * jnp.pi * k * axis)
+    return nearest, nearest
 
 
 def viewing_axis_rotations(count: int) -> Float[np.ndarray, "C 3 3"]:

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.birds import pose_window
 from support.fits import BIRD, CAMERA, config, truths
-from support.stages import CONFIG, MODEL, POSTERIOR, B, T, case, problems
+from support.stages import CONFIG, MODEL, POSTERIOR, B, T, case, problems, row
 
 from jaxfit.config.yaml_file import config_to_yaml
 from jaxfit.data.solution import ERROR_BARS, load_solution, save_solution
@@ -33,16 +34,12 @@ def scene(noise_px=0.0, weight=1.0, prior=None, **changes):
     """Return problems at some poses, whose keypoints have noise, with a weight of the keypoints and of other terms."""
     truth, targets = case()
     noise = np.random.default_rng(1).normal(size=targets.keypoints_px.shape) * noise_px
-    points = jnp.stack([keypoints_px(jax.tree.map(lambda x, b=b: x[b], truth)) for b in range(B)])
-    targets = dataclasses.replace(targets, keypoints_px=points + noise, **changes)
+    points = np.stack([project(pose_window(MODEL.bird, row(truth, b))[0], MODEL.camera) for b in range(B)])
+    targets = dataclasses.replace(targets, keypoints_px=np.float32(points + noise), **changes)
     prior = weight if prior is None else prior
     terms = {name: {"weight": weight if name == "keypoint_likelihood" else prior} for name in POSTERIOR.terms}
     own = dataclasses.replace(CONFIG, terms=terms)
     return problems(truth, targets, POSTERIOR, own), truth
-
-
-def keypoints_px(pose):
-    return project(window_keypoints(MODEL.rig, window_transforms(MODEL.rig, pose), pose), MODEL.camera)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +62,7 @@ def narrow(laplace_only):
 
 def test_error_bars_are_those_of_samples_from_the_posterior(narrow):
     poses, posterior, bars = narrow
-    pose = jax.tree.map(lambda x: x[0], poses)
+    pose = row(poses)
     columns, frame = np.concatenate([posterior.columns.own, posterior.columns.shared]), 2
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(
@@ -84,7 +81,7 @@ def test_error_bars_are_those_of_samples_from_the_posterior(narrow):
         points = window_keypoints(MODEL.rig, window_transforms(MODEL.rig, new), new)
         return new, points[frame], project(points, MODEL.camera)[frame]
 
-    new, cam, px = jax.tree.map(np.asarray, moved(jnp.asarray(draws, jnp.float32)))
+    new, cam, px = jax.tree.map(np.asarray, moved(np.float32(draws)))
     scale = new.scale[:, :1]
     expected = {
         "keypoints_px_cov": covariances(px),
@@ -130,7 +127,7 @@ def test_missing_frames_and_birds_without_keypoints():
     present[0, 1] = False
     confidence = np.ones((B, T, MODEL.bird.num_keypoints), np.float32)
     confidence[1] = 0
-    several, pose = scene(present=jnp.asarray(present), confidence=jnp.asarray(confidence * present[..., None]))
+    several, pose = scene(present=present, confidence=confidence * present[..., None])
     (first, second), reasons = window_error_bars(PROGRAM, several, pose, common_size=False)
     assert reasons == ["", ""]
     for name, values in first._asdict().items():
@@ -145,7 +142,9 @@ def test_missing_frames_and_birds_without_keypoints():
 
 def test_a_pose_that_is_not_finite_has_no_error_bars():
     several, pose = scene()
-    pose = dataclasses.replace(pose, transl=pose.transl.at[0].set(jnp.nan))
+    transl = np.array(pose.transl)
+    transl[0] = np.nan
+    pose = jax.device_put(dataclasses.replace(pose, transl=transl))
     bars, reasons = window_error_bars(PROGRAM, several, pose, common_size=True)
     assert reasons[0]
     assert not reasons[1]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from support.precisions import blocks, dense, random_precision
-from support.stages import CONFIG, MODEL, POSTERIOR, SHARED, B, T, case, problems
+from support.stages import CONFIG, MODEL, POSTERIOR, SHARED, B, T, case, problems, row
 
 from jaxfit.fitting.posterior import (
     Blocks,
@@ -77,7 +77,7 @@ def products():
 
 def test_blocks_are_those_of_the_dense_curvature(products):
     program, several, poses = fitted()
-    is_shared = shared_columns(jax.tree.map(lambda x: x[0], poses), SHARED)
+    is_shared = shared_columns(row(poses), SHARED)
     D = len(is_shared)
 
     @jax.jit
@@ -91,9 +91,9 @@ def test_blocks_are_those_of_the_dense_curvature(products):
         return jnp.einsum("itd,jtd->ij", basis, jax.vmap(H.product)(basis))
 
     for b in range(B):
-        one = jax.tree.map(lambda x, b=b: x[b], (several, poses))
+        one = row((several, poses), b)
         expected = np.asarray(whole(*one))
-        own = blocks_of(jax.tree.map(lambda x, b=b: x[b], products), is_shared)
+        own = blocks_of(row(products, b), is_shared)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         np.testing.assert_allclose(dense(own) / scale, expected / scale, atol=2e-5)
 
@@ -103,7 +103,7 @@ def test_posterior_of_a_window():
     program, several, poses = fitted()
     for each in window_posteriors(program, several, poses):
         assert not isinstance(each, str)
-        J, D = len(MODEL.rig.parents), frame_rows(jax.tree.map(lambda x: x[0], poses), SHARED).shape[1]
+        J, D = len(MODEL.rig.parents), frame_rows(row(poses), SHARED).shape[1]
         assert 3 * J + 2 not in each.columns.own  # depth
         assert len(each.columns.own) == 3 * J + 2
         assert len(each.columns.shared) == D - 3 * J - 3
@@ -146,7 +146,7 @@ def test_a_term_that_links_distant_frames_is_reported():
     terms = {**find_terms(("keypoints", "pose_prior")), "ends": Term("ends", ends, {}, frozenset(), False)}
     program = fitted()[0]._replace(terms=terms)
     several = fitted(stage=dataclasses.replace(POSTERIOR, terms=("keypoints", "pose_prior")))[1]
-    settings = several.hyperparameters.settings | {"ends": {"weight": jnp.full(B, 100.0)}}
+    settings = several.hyperparameters.settings | {"ends": {"weight": np.full(B, 100.0, np.float32)}}
     several = several._replace(hyperparameters=several.hyperparameters._replace(settings=settings))
     own = window_posteriors(program, several, fitted()[2])
     assert all(isinstance(each, str) and "frames apart" in each for each in own)
@@ -162,7 +162,7 @@ def test_second_order_curvature_of_student_t_is_its_fisher_information():
     class Line:
         """A window with one parameter per residual: the residuals are r + rows."""
 
-        pose = dataclasses.replace(fitted()[2], global_orient=jnp.zeros((count, 3)))
+        pose = dataclasses.replace(fitted()[2], global_orient=np.zeros((count, 3), np.float32))
         shared = ()
 
     kernel = student_t(dof, size)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from support.stages import CONFIG, FIRST, case, problems, program
+from support.stages import CONFIG, FIRST, case, problems, program, row
 
 import jaxfit
 from jaxfit.fitting import stored_programs
@@ -39,7 +39,7 @@ CASE = case()
 
 def arguments(stage=FIRST, birds=2, config=CONFIG, started=True):
     """Return the arguments of `advance`; with poses in place of the state if not `started`, for keys."""
-    start, targets = jax.tree.map(lambda x: x[:birds], CASE)
+    start, targets = jax.device_put(row(CASE, slice(birds)))
     own = program(stage, config), problems(start, targets, stage, config)
     return (*own, jnp.int32(3)), begin(*own, None) if started else start
 
