@@ -19,7 +19,6 @@ from jaxfit.data.solution import load_solution, save_solution
 from jaxfit.data.views import Views, birds_in_rows, stacked_keypoints, straightened
 from jaxfit.export.export import export_result
 from jaxfit.export.result import open_result
-from jaxfit.fitting.fit import fit
 from jaxfit.fitting.views import fit_views, initial_poses, views_config, with_unit
 from jaxfit.foundation.errors import InputError
 from jaxfit.model.files import load_murre
@@ -56,8 +55,13 @@ def truth_m(rig):
 
 
 @pytest.fixture(scope="module")
-def solution(rig):
-    return fit_views(views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes]), BIRD, CONFIG)
+def views(rig):
+    return views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes])
+
+
+@pytest.fixture(scope="module")
+def solution(views):
+    return fit_views(views, BIRD, CONFIG)
 
 
 def error_mm(solution, truth_m):
@@ -89,53 +93,55 @@ def test_the_pose_in_the_first_camera_is_the_pose_in_the_world(rig, solution):
     np.testing.assert_allclose(focal * points[:, :2] / points[:, 2:] + crop[:2] + crop[2] / 2, pinhole, atol=1e-2)
 
 
+def seen_only(observations, present, **changes):
+    """Return the observations without the absent birds."""
+    return replace(
+        observations,
+        present=present,
+        confidence=np.where(present[..., None], observations.confidence, 0),
+        masks={cell: rle for cell, rle in observations.masks.items() if present[cell]},
+        occluded=None,
+        score=None,
+        **changes,
+    )
+
+
 def test_views_that_miss_things_cost_nothing(rig, truth_m):
     """One view without masks and half the keypoints, one without one bird, and frames without views."""
     first, second, third = (scene.truth for scene in rig.scenes)
-    second = replace(second, masks={}, amodal_masks={})
     confidence = second.confidence.copy()
     confidence[:, :, ::2] = 0
-    second = second.with_keypoints(second.keypoints_px, confidence)
+    second = replace(second, masks={}, amodal_masks={}).with_keypoints(second.keypoints_px, confidence)
     present = third.present.copy()
-    present[1] = False
-    present[0, :3] = False
-    third = replace(
-        third,
-        present=present,
-        confidence=np.where(present[..., None], third.confidence, 0),
-        masks={cell: rle for cell, rle in third.masks.items() if present[cell]},
-        occluded=None,
-        score=None,
-    )
-    found = fit_views(views_of(rig, (0, 1, 2), [first, second, third]), BIRD, CONFIG)
+    present[1] = present[0, :3] = False
+    found = fit_views(views_of(rig, (0, 1, 2), [first, second, seen_only(third, present)]), BIRD, CONFIG)
     assert found.valid.all()
     assert error_mm(found, truth_m) < 12
 
 
 def test_a_bird_that_one_camera_sees_has_no_pose(rig):
-    first, second = (scene.truth for scene in rig.scenes[:2])
-    present = second.present.copy()
-    present[1] = False
-    confidence = np.where(present[..., None], second.confidence, 0)
-    second = replace(
-        second, present=present, confidence=confidence, masks={}, amodal_masks={}, occluded=None, score=None
-    )
+    first, second, third = (scene.truth for scene in rig.scenes)
+    one, none = np.array([[True], [False]]) & second.present, np.zeros_like(third.present)
+    views = views_of(rig, (0, 1, 2), [first, seen_only(second, one, amodal_masks={}), seen_only(third, none)])
     quick = replace(CONFIG, stages=(replace(CONFIG.stages[0], steps=2),), error_bars=False)
-    found = fit_views(views_of(rig, (0, 1), [first, second]), BIRD, quick)
+    found = fit_views(views, BIRD, quick)
     assert found.valid[0].all()
     assert not found.valid[1].any()
     assert found.status.tolist() == ["ok", "no usable frame"]
     with pytest.raises(InputError, match="have no bird with 21 keypoints in two cameras"):
-        fit_views(views_of(rig, (0, 1), [first, second]), BIRD, replace(quick, min_keypoints=21))
+        fit_views(views, BIRD, replace(quick, min_keypoints=21))
 
 
-def test_one_view_is_the_fit_of_one_camera(rig, truth_m):
-    views = views_of(rig, (1,), [rig.scenes[1].truth])
-    keypoints_only = replace(CONFIG, stages=CONFIG.stages[:1])
-    found = fit_views(views, BIRD, keypoints_only)
-    alone = fit(views.observations[0], BIRD, keypoints_only)
+def test_one_view_is_the_fit_of_one_camera(rig, truth_m, monkeypatch):
+    """The poses are those of `fit`, here the true poses; in the world, every bird has the size of the model."""
+    views, true = views_of(rig, (1,), [rig.scenes[1].truth]), rig.scenes[1].poses
+    monkeypatch.setattr(
+        "jaxfit.fitting.views.fit", lambda observed, *_, **__: observed is views.observations[0] and true
+    )
+    monkeypatch.setattr("jaxfit.fitting.views.check_observations", lambda observed, *_: observed)
+    found = fit_views(views, BIRD, CONFIG)
     for name in ("global_orient", "transl", "scale", "keypoints_px", "crop"):
-        np.testing.assert_array_equal(found.arrays()[name], alone.arrays()[name])
+        np.testing.assert_array_equal(found.arrays()[name], true.arrays()[name])
     # one view does not know the size of a bird: 10 % of a distance of 5 m
     assert error_mm(found, truth_m) < 500
     shown = rig.cameras[1].pinhole().project(found.world.keypoints_world_m)
@@ -160,8 +166,7 @@ def test_exports_hold_the_world_and_the_true_size(solution, rig, tmp_path):
         read_tracks(tmp_path / "result")
 
 
-def test_a_wrong_unit_is_reported(rig):
-    views = views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes])
+def test_a_wrong_unit_is_reported(views):
     far = views._replace(
         cameras=tuple(camera.scaled(1000) for camera in views.cameras),
         lenses=tuple(camera.scaled(1000) for camera in views.lenses),
@@ -184,8 +189,7 @@ def test_cameras_measure_the_unit_of_a_model(rig):
         with_unit(views._replace(cameras=tuple(camera.scaled(1000) for camera in views.cameras)), without)
 
 
-def test_initial_poses_align_the_bird_with_triangulated_keypoints(rig, truth_m):
-    views = views_of(rig, (0, 1, 2), [scene.truth for scene in rig.scenes])
+def test_initial_poses_align_the_bird_with_triangulated_keypoints(rig, views, truth_m):
     found = stacked_keypoints(views.observations).triangulated(views.cameras)
     both = np.isfinite(found.points_world).all(-1)
     assert both.mean() > 0.7
@@ -217,7 +221,7 @@ def test_the_command_fits_all_views(rig, tmp_path, capsys, truth_m):
         files.append(str(tmp_path / f"{camera.name}.json"))
         write_coco(scene.detections, files[-1])
     config = tmp_path / "quick.yaml"
-    config.write_text(f"base: fast\nwindow: {FRAMES}\nfilter_window: 1\ncrop: {{size_px: 64}}\n")
+    config.write_text("base: fast\nwindow: 6\noverlap: 4\nfilter_window: 1\ncrop: {size_px: 64}\n")
     out = tmp_path / "result"
     command = ["fit", *files, "--config", str(config), "--out", str(out)]
     assert main([*command, "--cameras", str(tmp_path / "rig.toml")]) == 0
