@@ -1,7 +1,9 @@
 """Fits of toy birds that move smoothly, with known truth and small silhouettes."""
 
 import dataclasses
+import functools
 
+import jax
 import numpy as np
 
 from jaxfit.config.fit import load_config
@@ -25,8 +27,13 @@ def config(window=T, steps=(600, 25), memory_gb=ONE_WINDOW_GB, mode="image", **c
     return dataclasses.replace(plain, filter_window=1, **changes)
 
 
+@functools.cache
+def truth(frames, seed):
+    return jax.tree.map(np.asarray, smooth_motion(BIRD, frames, seed))
+
+
 def truths(frames=T, birds=3):
-    return [smooth_motion(BIRD, frames, seed) for seed in range(birds)]
+    return [truth(frames, seed) for seed in range(birds)]
 
 
 def keypoints_of(poses):
