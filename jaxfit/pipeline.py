@@ -42,6 +42,8 @@ from jaxfit.video.reader import VideoInfo, probe_video
 from jaxfit.view.overlay import check_outputs, is_inside, overlay
 from jaxfit.view.report.write import REPORT, write_report
 
+_logger = logging.getLogger(__name__)
+
 _AFTER_TRACKING = ("min_track_frames", "min_track_score")
 """Settings of tracking that are applied to the stored frames."""
 _FORMAT_VERSION = 2
@@ -103,9 +105,6 @@ def _content_hash(files: Sequence[Path], report_bytes: Callable[[int], object] =
     return digest.hexdigest()
 
 
-_logger = logging.getLogger(__name__)
-
-
 class NoTrackError(InputError):
     """A video without a track that counts, so that there is nothing to fit."""
 
@@ -142,18 +141,31 @@ class Networks(NamedTuple):
     """The keypoints of the network → those of the model."""
 
 
-class Store(NamedTuple):
-    """The unfinished work of a reconstruction."""
+class Store:
+    """The unfinished work of a reconstruction in a folder, which an interrupted call has left."""
 
-    frames: Parts | None
-    """The tracked frames; None with networks of the caller."""
-    window_parts: Parts
-    windows: StoredWindows
-    """The fitted windows, which are stored in `window_parts`."""
+    def __init__(
+        self,
+        folder: Path,
+        config: ReconstructConfig,
+        video: Path,
+        bird: Bird,
+        networks: Networks,
+        progress: ProgressTask,
+    ):
+        self.frames: Parts | None = None
+        """The tracked frames; None with networks of the caller."""
+        if networks.all_of_config:
+            record = tracking_record(config.track, video, networks.hashes, progress)
+            # the same command may use other files of the networks
+            renewed = ("networks",) if networks.choice is None else ("networks", "track.segmenter.file")
+            self.frames = Parts(folder / "frames", record, renewed)
+        self._window_parts = Parts(folder / "windows", fit_record(config.fit, bird))
+        self.windows = StoredWindows(self._window_parts)
 
     def size(self) -> str:
         """Return the size of the stored work, for progress."""
-        size_bytes = self.window_parts.size_bytes + (self.frames.size_bytes if self.frames else 0)
+        size_bytes = self._window_parts.size_bytes + (self.frames.size_bytes if self.frames else 0)
         return f"{size_bytes / 1e6:.1f} MB stored"
 
     def state(self) -> str:
@@ -205,16 +217,22 @@ def reconstruct(
     video, folder, clock = Path(video), Path(folder), Clock()
     with clock("load"):
         info = probe_video(video)
-        _check_folder(folder, video, overwrite)  # before the long work
+        check_outputs([folder / OVERLAY], video, overwrite=True)  # before the long work
+        if is_inside(video, folder):
+            raise InputError(folder, "holds the video, which the result would replace", "choose another --out")
+        check_replaceable(folder, overwrite, POSES)
         bird, config = bird or load_murre(), config or load_reconstruct_config()
         model_of_fit(bird, config.fit)  # reports a setting that cannot be used before the tracking
         config, networks = _choose(config, video, bird, segmenter, keypoints, progress)
     with _announced(folder), unfinished_work(folder) as unfinished:
         with clock("track"):
-            store = _open_store(unfinished, config, video, bird, networks, progress)
+            store = Store(unfinished, config, video, bird, networks, progress)
             tracking = _track(video, config.track, networks, bird, store, progress, cluster)
         with clock("fit"):
-            config, learnt_yaml = _learn(config, tracking.observations, bird, video, progress)
+            learnt_yaml = None
+            if config.fit.learn_weights:
+                learnt = learn_weights(tracking.observations, bird, config.fit, progress=progress, source=video)
+                config, learnt_yaml = replace(config, fit=learnt.config), learnt.to_yaml()
             fit_progress = annotated(progress, store.state)
             solution = fit(tracking.observations, bird, config.fit, None, fit_progress, video, store.windows, cluster)
         behaviour = shown_behaviour(solution, bird, progress)
@@ -262,25 +280,6 @@ def _choose(
     return config, Networks(segmenter, keypoints, choice, file_hashes(files), all_of_config, names)
 
 
-def _open_store(
-    unfinished: Path,
-    config: ReconstructConfig,
-    video: Path,
-    bird: Bird,
-    networks: Networks,
-    progress: ProgressTask,
-) -> Store:
-    """Return the stored frames and windows in the folder of unfinished work, which an interrupted call has left."""
-    frames = None
-    if networks.all_of_config:
-        record = tracking_record(config.track, video, networks.hashes, progress)
-        # the same command may use other files of the networks
-        renewed = ("networks",) if networks.choice is None else ("networks", "track.segmenter.file")
-        frames = Parts(unfinished / "frames", record, renewed)
-    windows = Parts(unfinished / "windows", fit_record(config.fit, bird))
-    return Store(frames, windows, StoredWindows(windows))
-
-
 def _track(
     video: Path,
     config: TrackConfig,
@@ -312,24 +311,6 @@ def _track(
     failure = NoTrackError(tracking.failure.source, tracking.failure.problem, tracking.failure.remedy)
     failure.tracking = tracking
     raise failure
-
-
-def _learn(
-    config: ReconstructConfig, observations: Observations, bird: Bird, video: Path, progress: ProgressTask
-) -> tuple[ReconstructConfig, str | None]:
-    """Return the config with learnt weights, and the content of `learnt.yaml`, if the config of the fit says so."""
-    if not config.fit.learn_weights:
-        return config, None
-    learnt = learn_weights(observations, bird, config.fit, progress=progress, source=video)
-    return replace(config, fit=learnt.config), learnt.to_yaml()
-
-
-def _check_folder(folder: Path, video: Path, overwrite: bool) -> None:
-    """Raise InputError if the result cannot be written to the folder."""
-    check_outputs([folder / OVERLAY], video, overwrite=True)
-    if is_inside(video, folder):
-        raise InputError(folder, "holds the video, which the result would replace", "choose another --out")
-    check_replaceable(folder, overwrite, POSES)
 
 
 @contextmanager

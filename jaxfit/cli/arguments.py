@@ -41,6 +41,20 @@ SHARED: dict[str, dict[str, Any]] = {
     "--model": {"default": "murre", "help": f"{MODEL} (default %(default)s)"},
     "--frames": {"metavar": "A:B", "help": "only the frames from A to B; B is left out"},
     "--fps": {"type": float, "help": "frame rate of the footage (default: that of the result)"},
+    "--video": {
+        "type": Path,
+        "help": "the footage, if the result does not name the footage, or the footage was moved",
+    },
+    "--observations": {
+        "type": Path,
+        "metavar": "OBS.json",
+        "help": "the file that was fitted, for a result of `jaxfit fit`",
+    },
+    "--camera": {
+        "metavar": "NAME",
+        "help": "for a result in a world: the camera of the video, by its name in cameras.toml (default: the first "
+        "camera)",
+    },
     "--tracks": {"metavar": "ID,ID", "help": "only these tracks"},
     "--json": {"action": "store_true", "help": "print JSON instead of a table"},
     "--unit": {

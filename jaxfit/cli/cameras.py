@@ -77,7 +77,7 @@ def read_views(options: argparse.Namespace, bird: Bird) -> ReadViews:
 
     file = read_camera_file(options.cameras, options.unit)
     own = [
-        observations_for(path, bird.keypoint_names, options, quiet=i > 0).observations
+        observations_for(path, bird.keypoint_names, options, quiet=i > 0)[0]
         for i, path in enumerate(options.observations)
     ]
     lenses = assign_cameras(file.cameras, own, options.observations)

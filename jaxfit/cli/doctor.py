@@ -113,14 +113,12 @@ def _ffmpeg() -> Iterator[Finding]:
     codecs = ".".join(map(str, av.library_versions["libavcodec"]))
     yield Finding("FFmpeg", f"PyAV {av.__version__} with libavcodec {codecs}")
     remedy = 'run pip install --upgrade --force-reinstall "av>=18,<19"'
-    decoders = [name for name in _DECODERS if _has_codec(name, "r")]
-    lacking = [name for name in _DECODERS if name not in decoders]
-    state = f"{', '.join(decoders)}" + (f"; without {', '.join(lacking)}" if lacking else "")
-    yield Finding("codecs that are read", state, remedy if lacking else "")
-    encoders = [name for name, (encoder, _) in CODECS.items() if _has_codec(encoder, "w")]
-    lacking = [name for name in CODECS if name not in encoders]
-    state = f"{', '.join(encoders) or 'none'}" + (f"; without {', '.join(lacking)}" if lacking else "")
-    yield Finding("codecs that are written", state, remedy if lacking else "")
+    encoders = {name: encoder for name, (encoder, _) in CODECS.items()}
+    for what, mode, codecs in (("read", "r", {name: name for name in _DECODERS}), ("written", "w", encoders)):
+        found = [name for name, codec in codecs.items() if _has_codec(codec, mode)]
+        lacking = [name for name in codecs if name not in found]
+        state = f"{', '.join(found) or 'none'}" + (f"; without {', '.join(lacking)}" if lacking else "")
+        yield Finding(f"codecs that are {what}", state, remedy if lacking else "")
 
 
 def _has_codec(name: str, mode: str) -> bool:

@@ -6,7 +6,7 @@ import argparse
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
@@ -23,21 +23,14 @@ if TYPE_CHECKING:
     from jaxfit.evaluation.truth import Matching
 
 
-class MappedObservations(NamedTuple):
-    """Observations with the keypoints of a model, and the map of the names."""
-
-    observations: Observations
-    names: NameMap
-
-
 def observations_for(
     path: Path,
     model_names: Sequence[str],
     options: argparse.Namespace,
     quiet: bool = False,
     untracked: Untracked = "video",
-) -> MappedObservations:
-    """Read a file of observations and map its keypoints to those of a model, by `--names` or by a proposal.
+) -> tuple[Observations, NameMap]:
+    """Return the observations of a file with the keypoints of a model, by `--names` or by a proposal, and this map.
 
     Args:
         path: the file.
@@ -53,7 +46,7 @@ def observations_for(
 
     observations = read_observations(path, options.video, image_size(options), untracked)
     names = keypoint_map(observations.keypoint_names, path, model_names, options.names, quiet)
-    return MappedObservations(map_keypoints(observations, names, model_names), names)
+    return map_keypoints(observations, names, model_names), names
 
 
 def keypoint_map(

@@ -90,8 +90,7 @@ def _reconstruct(command: Parser) -> None:
 def _report(command: Parser) -> None:
     """Write a report of a result as one HTML page: quality, warnings, pictures, timeline."""
     command.shared("result")
-    text = "the footage, if the result does not name the footage, or the footage was moved"
-    command.add_argument("--video", type=Path, help=text)
+    command.shared("--video")
     text = "file to write (default: report.html in the folder of the result, which replaces an earlier report)"
     command.add_argument("--out", type=Path, metavar="HTML", help=text)
     command.add_argument("--overwrite", action="store_true", help="replace an existing file of --out")
@@ -105,11 +104,7 @@ def _view(command: Parser) -> None:
     command.add_argument("results", type=Path, nargs="+", metavar="RESULT", help=text)
     text = "film of the result (default: the film that the result names, if it is still there)"
     command.add_argument("--video", type=Path, metavar="VIDEO|DIR", help=text)
-    text = "for a result in a world: the camera of the film, by its name in cameras.toml (default: the first camera)"
-    command.add_argument("--camera", metavar="NAME", help=text)
-    text = "the file that was fitted, for a result of `jaxfit fit`"
-    command.add_argument("--observations", type=Path, metavar="OBS.json", help=text)
-    command.shared("--frames", "--fps")
+    command.shared("--camera", "--observations", "--frames", "--fps")
     text = "file of the corrections, which `jaxfit tracks --edits` takes too (default: RESULT.edits beside the result)"
     command.add_argument("--edits", type=Path, metavar="FILE", help=text)
     command.add_argument("--port", type=int, metavar="PORT", help="port to listen on (default: a free port)")
@@ -205,8 +200,7 @@ def _tracks(command: Parser) -> None:
     text = "text file of corrections, one a line, such as `swap 3,5@120:200` or `exclude 3@10:20`; lines that begin "
     text += "with # are ignored; these corrections come before those of the options"
     command.add_argument("--edits", dest="edits_file", type=Path, metavar="FILE", help=text)
-    text = "the file that was fitted, for a result of `jaxfit fit`"
-    command.add_argument("--observations", type=Path, metavar="OBS.json", help=text)
+    command.shared("--observations")
     command.add_argument("--out", type=Path, metavar="DIR", help="folder for the corrected result")
     text = "replace an earlier result in the folder of --out"
     command.add_argument("--overwrite", action="store_true", help=text)
@@ -237,8 +231,7 @@ def _export(command: Parser) -> None:
     command.add_argument("--fps", type=float, help=text)
     text = "length of a model unit in metres, for models that do not state the length"
     command.add_argument("--metres-per-unit", type=float, metavar="M", help=text)
-    text = "the footage, if the result does not name the footage, or the footage was moved"
-    command.add_argument("--video", type=Path, help=text)
+    command.shared("--video")
     text = (
         "movement: keypoints in image pixels (2d, the default), in the camera frame (3d) or in the world of the result"
     )
@@ -256,8 +249,7 @@ def _overlay(command: Parser) -> None:
     """Draw a result on its video."""
     command.add_argument("result", type=Path, metavar="DIR", help="folder of a result")
     command.add_argument("--video", type=Path, required=True, help="the video (or folder of frames) of the result")
-    text = "for a result in a world: the camera of the video, by its name in cameras.toml (default: the first camera)"
-    command.add_argument("--camera", metavar="NAME", help=text)
+    command.shared("--camera")
     add_out(
         command, "FILE", "video to write; the same folder receives a contact sheet (.png)", overwrite="existing files"
     )

@@ -137,15 +137,6 @@ def write_labels(observations: Observations, video: Path, folder: Path, final: P
     write_whole(folder / "README.txt", text.encode())
 
 
-def write_list(rows: list[tuple], path: Path) -> None:
-    """Write the table of suggested frames: frame, time in seconds, picture, birds, reason, score."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("frame", "time_s", "picture", "birds", "reason", "score"))
-    writer.writerows(rows)
-    write_whole(path, text.getvalue().encode())
-
-
 def _link(source: Path, target: Path) -> None:
     """Give a file a second name, or copy the file where the file system has no hard links."""
     try:
@@ -275,7 +266,7 @@ def suggest(
             (part / IMAGES / picture_name(video, int(observations.frame_index[t]))).unlink()
         chosen = observations.select(tracks=[] if empty else None, frames=positions)
         write_labels(chosen, video, part, out.resolve())
-        _write_rows(frames, video, part)
+        _write_list(frames, video, part)
     return Suggestions(frames, chosen)
 
 
@@ -399,13 +390,16 @@ def suggest_marked(
             SuggestedFrame(number, examined.times_s[t], int(birds[t]), MARKED, 1.0)
             for number, t in zip(frames, candidates.tolist(), strict=True)
         ]
-        _write_rows(marked, video, part)
+        _write_list(marked, video, part)
     return Suggestions(marked, chosen)
 
 
-def _write_rows(frames: Sequence[SuggestedFrame], video: Path, part: Path) -> None:
-    rows = []
+def _write_list(frames: Sequence[SuggestedFrame], video: Path, part: Path) -> None:
+    """Write the table of suggested frames: frame, time in seconds, picture, birds, reason, score."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(("frame", "time_s", "picture", "birds", "reason", "score"))
     for number, time_s, birds, reason, score in frames:
         time = "" if time_s is None else f"{time_s:.3f}"
-        rows.append((number, time, picture_name(video, number), birds, reason, f"{score:.3f}"))
-    write_list(rows, part / MARKER)
+        writer.writerow((number, time, picture_name(video, number), birds, reason, f"{score:.3f}"))
+    write_whole(part / MARKER, text.getvalue().encode())

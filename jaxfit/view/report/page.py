@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -120,33 +120,8 @@ class Measured(NamedTuple):
     """What the columns mean."""
 
 
-@runtime_checkable
-class Behaviour(Protocol):
-    """What the birds of a report do over time: `jaxfit.behaviour.page.BehaviourPage`."""
-
-    @property
-    def track_id(self) -> np.ndarray:
-        """(N,) numbers of the tracks."""
-        ...
-
-    @property
-    def frames(self) -> np.ndarray:
-        """(T,) numbers of the frames."""
-        ...
-
-    @property
-    def kinds(self) -> Sequence[Any]:
-        """The behaviours; `colour` of each is its position in `BEHAVIOUR_COLOURS`, or None."""
-        ...
-
-    @property
-    def meanings(self) -> Sequence[tuple[str, str]]:
-        """Words of the section and their definitions."""
-        ...
-
-    def section(self, order: Sequence[int], film: str | None) -> str:
-        """Return the section, HTML."""
-        ...
+Behaviour = Any
+"""What the birds of a report do over time: a `jaxfit.behaviour.page.BehaviourPage`, of a higher floor."""
 
 
 class Cell(NamedTuple):
