@@ -395,6 +395,10 @@ def select_solution(solution: Solution, rows: np.ndarray, columns: np.ndarray) -
     return solution.with_arrays(**arrays, loss=loss, failures=failures)
 
 
+MAX_ANGLE_RAD, MAX_NUMBER = 1e4, 1e12
+"""Largest angle, and largest other number of a pose: beyond them, 32 bits keep no angle and no position."""
+
+
 def check_poses(arrays: Mapping[str, np.ndarray], fitted: np.ndarray) -> None:
     """Check the numbers of tracks and frames, and the poses of fitted frames.
 
@@ -404,7 +408,8 @@ def check_poses(arrays: Mapping[str, np.ndarray], fitted: np.ndarray) -> None:
 
     Raises:
         ValueError: a track or a frame is there twice, frames are not in order, or a fitted frame holds NaN, an
-            infinite number, or a size that is not positive; the message names the array, the track and the frame.
+            infinite or impossible number, or a size that is not positive; the message names the array, the track and
+            the frame.
     """
     tracks, frames = arrays["track_id"], arrays["frame_index"]
     unique, count = np.unique(tracks, return_counts=True)
@@ -426,6 +431,8 @@ def check_poses(arrays: Mapping[str, np.ndarray], fitted: np.ndarray) -> None:
     for name, (shape, dtype) in LAYOUT.items():
         if shape.startswith("N T") and dtype is np.float32 and name in arrays:
             require(name, np.isfinite(arrays[name]), "holds NaN or infinite numbers")
+            limit = MAX_ANGLE_RAD if name in ("global_orient", "body_pose") else MAX_NUMBER
+            require(name, np.abs(arrays[name]) <= limit, f"holds numbers beyond {limit:g}")
     if "scale" in arrays:
         require("scale", arrays["scale"] > 0, "is not above 0")
     if "crop" in arrays:

@@ -232,6 +232,8 @@ def test_what_is_no_folder_of_results(tmp_path):
         ({"frame_index": np.array([5, 6, 2**63], np.uint64)}, "frame_index must be of type int64, but holds"),
         ({"scale": "negative"}, "scale is not above 0 for track 8, frame 6"),
         ({"transl": "nan"}, "transl holds NaN or infinite numbers for track 8, frame 6"),
+        ({"body_pose": "1e11"}, r"body_pose holds numbers beyond 10000 for track 8, frame 6"),
+        ({"transl": "1e33"}, r"transl holds numbers beyond 1e\+12 for track 8, frame 6"),
         ({"crop": "negative"}, "crop has a size that is not above 0 for track 8, frame 6"),
         ({"image_size_px": "negative"}, "image_size_px is not in 1…16384 for track 8, frame 6"),
         ({"status": ["ok", "lost"]}, "status of track 8 is 'lost', expected one of: ok, partly diverged"),
@@ -245,7 +247,7 @@ def test_values_that_no_fit_gives(changes, message):
     (name, kind) = list(changes.items())[-1]
     if isinstance(kind, str):
         changes[name] = np.array(make().arrays()[name])
-        changes[name][1, 1] = -1 if kind == "negative" else math.nan
+        changes[name][1, 1] = -1 if kind == "negative" else float(kind)
     with pytest.raises(ValueError, match=message):
         make(**changes)
     if isinstance(kind, str):  # values are arbitrary where the solution is not valid

@@ -21,6 +21,8 @@ from jaxfit.foundation.reading import read_json_file, reading
 SCAN_FORMATS = (".ply", ".obj", ".stl", ".glb")
 MAX_FACES = 150_000
 """Scans with more faces are decimated to about this number."""
+MAX_COORDINATE = 1e9
+"""Largest coordinate, in any unit: the areas of larger scans are not exact."""
 MIN_PART = 0.01
 """Parts with a smaller share of the surface are skipped."""
 
@@ -48,7 +50,8 @@ def read_scan(path: str | Path) -> Scan:
         path: a .ply, .obj, .stl or .glb file.
 
     Raises:
-        InputError: the file cannot be read, has another format or no faces, or has coordinates that are not finite.
+        InputError: the file cannot be read, has another format or no faces, a face names an absent vertex, or
+            coordinates are not finite or beyond `MAX_COORDINATE`.
     """
     path = Path(path)
     kind = path.suffix.lower()
@@ -62,11 +65,17 @@ def read_scan(path: str | Path) -> Scan:
         meshes = [part for part in parts if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if not meshes:
         raise InputError(path, "has no faces", "give a mesh, not a point cloud: reconstruct a surface first")
+    for mesh in meshes:
+        last, named = len(mesh.vertices) - 1, np.asarray(mesh.faces)
+        if named.min() < 0 or named.max() > last:
+            wrong = named.min() if named.min() < 0 else named.max()
+            raise InputError(path, f"has a face that names vertex {wrong}, not 0…{last}", "write the scan again")
+        if not (np.abs(mesh.vertices) <= MAX_COORDINATE).all():  # NaN too
+            problem = f"has vertices that are not finite, or beyond {MAX_COORDINATE:g}"
+            raise InputError(path, problem, "write the scan again")
     numbered = np.array(meshes[0].vertices, np.float64) if len(meshes) == 1 and kind != ".stl" else None
     bare = [trimesh.Trimesh(m.vertices, m.faces, process=False) for m in meshes]
     mesh = cast(trimesh.Trimesh, trimesh.util.concatenate(bare))
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError(path, "has vertices that are not finite", "write the scan again")
     if not mesh.area > 0:
         raise InputError(path, "has no area: all its faces are points or lines", "write the scan again")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)

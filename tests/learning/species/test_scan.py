@@ -132,6 +132,22 @@ def test_files_that_are_no_scans_are_one_line_errors(tmp_path):
             read_scan(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("coordinate", "face", "says"),
+    [
+        ("1", "0 1 -1", "has a face that names vertex -1, not 0…2"),
+        ("1", "0 1 9", "has a face that names vertex 9, not 0…2"),
+        ("1e33", "0 1 2", "has vertices that are not finite, or beyond"),
+    ],
+)
+def test_impossible_meshes_are_one_line_errors(tmp_path, coordinate, face, says):
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    head += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "scan.ply").write_text(f"{head}0 0 0\n{coordinate} 0 0\n0 1 0\n3 0 1 2\n3 {face}\n")
+    with pytest.raises(InputError, match=rf"scan\.ply: {says}"):
+        read_scan(tmp_path / "scan.ply")
+
+
 def test_a_mirrored_scan_and_distant_keypoints_are_rejected(tmp_path, capsys):
     bird, _, scan = small_scan()
     names = list(scan.keypoints)
