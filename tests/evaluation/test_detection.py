@@ -125,30 +125,35 @@ def test_who_finds_an_ignored_bird_is_excused():
         assert result.tracking["idf1"] == (1 if excused else 2 / 3)
 
 
-def test_a_bird_that_is_hidden_altogether_excuses_nobody():
-    truth = birds({1: {0: WHOLE, 1: WHOLE}}, [0, 1], visible={(1, 1): None})
-    result = evaluate_observations(birds({1: steady(WHOLE, [0, 1])}, [0, 1]), truth)
-    assert (result.counts["ignored"], result.counts["excused"]) == (1, 0)
-    assert result.detection["precision"] == 1 / 2
+CROWD = (50, 0, 60, 40)
 
 
-def test_an_annotation_without_a_mask_is_a_region_to_ignore():
-    """As COCO's crowds, which have no mask here; everybody inside is excused, however many."""
-    truth = birds({1: {0: HERE}, 2: {0: (50, 0, 60, 40)}}, [0])
-    truth = dataclasses.replace(truth, masks={(0, 0): truth.masks[0, 0]})
-    found = birds({1: {0: HERE}, 2: {0: (55, 5, 20, 10)}, 3: {0: (80, 5, 20, 10)}, 4: {0: AWAY}}, [0])
-    result = evaluate_observations(found, truth)
-    assert (result.counts["true"], result.counts["ignored"], result.counts["excused"]) == (1, 1, 2)
-    assert result.detection["precision"] == 1 / 2
+def without_mask(truth):
+    """The second bird is annotated without a mask, as are crowds of COCO."""
+    return dataclasses.replace(truth, masks={(0, 0): truth.masks[0, 0]})
 
 
-def test_a_counted_bird_goes_before_an_ignored_one():
-    """What is found lies on a bird that counts and on a crowd: it is a match."""
-    truth = birds({1: {0: HERE}, 2: {0: (0, 0, 60, 40)}}, [0])
-    truth = dataclasses.replace(truth, masks={(0, 0): truth.masks[0, 0]})
-    result = evaluate_observations(birds({1: {0: HERE}}, [0]), truth)
-    assert result.counts["excused"] == 0
-    assert result.detection == PERFECT
+@pytest.mark.parametrize(
+    ("truth", "found", "counts", "precision"),
+    [
+        # a bird that is hidden altogether excuses nobody
+        (birds({1: steady(WHOLE, [0, 1])}, [0, 1], visible={(1, 1): None}), {1: steady(WHOLE, [0, 1])}, (1, 1, 0), 0.5),
+        # everybody inside a crowd is excused, however many
+        (
+            without_mask(birds({1: {0: HERE}, 2: {0: CROWD}}, [0])),
+            {1: {0: HERE}, 2: {0: (55, 5, 20, 10)}, 3: {0: (80, 5, 20, 10)}, 4: {0: AWAY}},
+            (1, 1, 2),
+            0.5,
+        ),
+        # a counted bird goes before an ignored one
+        (without_mask(birds({1: {0: HERE}, 2: {0: (0, 0, 60, 40)}}, [0])), {1: {0: HERE}}, (1, 1, 0), 1),
+    ],
+    ids=["hidden", "crowd", "both"],
+)
+def test_regions_to_ignore(truth, found, counts, precision):
+    result = evaluate_observations(birds(found, truth.frame_index.tolist()), truth)
+    assert tuple(result.counts[name] for name in ("true", "ignored", "excused")) == counts
+    assert result.detection["precision"] == precision
 
 
 def test_only_shared_frames_are_compared():
@@ -157,11 +162,7 @@ def test_only_shared_frames_are_compared():
     found = birds({1: steady(HERE, [4, 5, 6])}, [4, 5, 6, 7])
     result = evaluate_observations(found, truth)
     assert result.detection == PERFECT
-    assert {name: result.counts[name] for name in ("frames", "true_elsewhere", "detected_elsewhere")} == {
-        "frames": 2,
-        "true_elsewhere": 1,
-        "detected_elsewhere": 1,
-    }
+    assert [result.counts[name] for name in ("frames", "true_elsewhere", "detected_elsewhere")] == [2, 1, 1]
 
 
 SIDE = (20, 20, 40, 20)

@@ -83,32 +83,37 @@ def test_strays_and_birds_that_nobody_follows():
     assert renamed.track_id.tolist() == [1, 3, 4]
 
 
-def test_one_to_one_with_most_frames_in_all():
-    """Track 8 is near both birds, and nearer to 1; but track 9 can only have 1."""
-    near_both = (0, 0, 33, 20)
-    there = truth({1: steady(LEFT, FRAMES), 2: steady((3, 0, 33, 20), FRAMES)})
-    own = result({8: steady(near_both, FRAMES), 9: steady((0, 0, 20, 20), FRAMES)})
-    assert match_by_overlap(own, there) == {8: 2, 9: 1}
-
-
-@pytest.mark.parametrize(("away", "followed"), [(2, {5: 1}), (3, {})])
-def test_half_of_the_frames_must_agree(away, followed):
-    boxes = steady(LEFT, FRAMES) | steady(BELOW, range(away))
-    assert match_by_overlap(result({5: boxes}), truth(TWO)) == followed
-
-
-@pytest.mark.parametrize(("shift", "followed"), [(10, {5: 1}), (11, {})])
-def test_how_near_is_near(shift, followed):
-    """Boxes of 30 px, 10 px apart: 20 shared of 40."""
+def beside(shift):
     x, y, w, h = LEFT
-    assert match_by_overlap(result({5: steady((x + shift, y, w, h), FRAMES)}), truth(TWO)) == followed
+    return x + shift, y, w, h
 
 
-def test_frames_go_by_number_and_poses_that_are_missing_do_not_count():
-    there = truth({1: {3: LEFT, 5: LEFT, 6: LEFT}}, [3, 4, 5, 6])
-    own = result({5: {4: LEFT, 5: LEFT}, 6: {3: RIGHT, 9: LEFT}}, [3, 4, 5, 9])
-    assert match_by_overlap(own, there) == {5: 1}
-    assert match_by_overlap(result({5: {9: LEFT}}, [9]), there) == {}
+@pytest.mark.parametrize(
+    ("own", "true", "followed"),
+    [
+        # one-to-one: track 8 is near both birds and nearer to 1, but track 9 can only have 1
+        (
+            {8: steady((0, 0, 33, 20), FRAMES), 9: steady((0, 0, 20, 20), FRAMES)},
+            {1: steady(LEFT, FRAMES), 2: steady((3, 0, 33, 20), FRAMES)},
+            {8: 2, 9: 1},
+        ),
+        # half of the frames must agree
+        ({5: steady(LEFT, FRAMES) | steady(BELOW, range(2))}, TWO, {5: 1}),
+        ({5: steady(LEFT, FRAMES) | steady(BELOW, range(3))}, TWO, {}),
+        # boxes of 30 px, 10 px apart: 20 shared of 40
+        ({5: steady(beside(10), FRAMES)}, TWO, {5: 1}),
+        ({5: steady(beside(11), FRAMES)}, TWO, {}),
+        # frames go by number, and poses that are missing do not count
+        ({5: {4: LEFT, 5: LEFT}, 6: {3: RIGHT, 9: LEFT}}, {1: {3: LEFT, 5: LEFT, 6: LEFT}}, {5: 1}),
+        ({5: {9: LEFT}}, {1: {3: LEFT, 5: LEFT, 6: LEFT}}, {}),
+    ],
+)
+def test_which_track_follows_which_bird(own, true, followed):
+    own, true = (
+        make(tracks, sorted({frame for boxes in tracks.values() for frame in boxes}))
+        for make, tracks in ((result, own), (truth, true))
+    )
+    assert match_by_overlap(own, true) == followed
 
 
 def test_boxes_are_of_what_is_annotated():

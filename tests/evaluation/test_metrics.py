@@ -85,12 +85,9 @@ def test_me_p_by_hand():
     assert me_p(predicted, observed, visible, [10, 50]) == pytest.approx(expected)
     assert me_p(2 * predicted, 2 * observed, visible, [20, 100]) == pytest.approx(expected)
     assert math.isnan(me_p(predicted, observed, np.zeros((2, 2)), 10))
-
-
-def test_me_p_leaves_out_what_failed():
-    predicted, observed = at_distance([3, np.nan], [10, 7])
-    assert me_p(predicted, observed, np.ones((2, 2)), [10, 0]) == pytest.approx(0.3)
-    assert me_p(predicted, observed, np.ones((2, 2)), [10, np.nan]) == pytest.approx(0.3)
+    predicted[0, 1] = np.nan
+    for side in (0, np.nan):  # neither a keypoint that failed nor an image without a side counts
+        assert me_p(predicted, observed, np.ones((2, 2)), [10, side]) == pytest.approx(0.3)
 
 
 def test_me_v_by_hand():
