@@ -37,11 +37,8 @@ def correct_keypoints(
 
     Returns:
         (…, K).
-
-    Raises:
-        ValueError: the shapes do not agree.
     """
-    predicted, observed, visible = validate_points(predicted_px, observed_px, visible)
+    predicted, observed, visible = _points(predicted_px, observed_px, visible)
     allowed = threshold * _sides(longest_side_px, visible.shape[:-1])
     with np.errstate(invalid="ignore"):
         correct = np.linalg.norm(predicted - observed, axis=-1) <= allowed
@@ -61,11 +58,8 @@ def squared_errors(predicted: Any, observed: Any, visible: Any, longest_side: An
 
     Returns:
         (…, K).
-
-    Raises:
-        ValueError: the shapes do not agree.
     """
-    predicted, observed, visible = validate_points(predicted, observed, visible)
+    predicted, observed, visible = _points(predicted, observed, visible)
     with np.errstate(invalid="ignore"):
         squared = ((predicted - observed) ** 2).sum(-1) / _sides(longest_side, visible.shape[:-1]) ** 2
     return _counted(squared, visible)
@@ -92,17 +86,9 @@ def squared_velocity_errors(
 
     Returns:
         (…, T, K).
-
-    Raises:
-        ValueError: the shapes do not agree.
     """
-    predicted, observed, visible = validate_points(predicted, observed, visible)
-    if predicted.ndim < 3:
-        raise ValueError(f"predicted must have shape (…, T, K, 2), not {predicted.shape}")
-    T = predicted.shape[-3]
-    frames = np.arange(T) if frame_index is None else np.asarray(frame_index)
-    if frames.shape != (T,):
-        raise ValueError(f"frame_index must have shape ({T},), not {frames.shape}")
+    predicted, observed, visible = _points(predicted, observed, visible)
+    frames = np.arange(predicted.shape[-3]) if frame_index is None else np.asarray(frame_index)
     both = visible[..., 1:, :] & visible[..., :-1, :] & consecutive(frames)[:, None]
     side = _sides(longest_side, visible.shape[:-1])[..., :-1, :]
     with np.errstate(invalid="ignore"):
@@ -122,27 +108,16 @@ def distances(predicted: Any, truth: Any, visible: Any = None) -> np.ndarray:
 
     Returns:
         (…, K) in the same unit.
-
-    Raises:
-        ValueError: the shapes do not agree.
     """
-    predicted, truth, visible = validate_points(predicted, truth, visible)
+    predicted, truth, visible = _points(predicted, truth, visible)
     with np.errstate(invalid="ignore"):
         return _counted(np.linalg.norm(predicted - truth, axis=-1), visible)
 
 
-def validate_points(predicted: Any, observed: Any, visible: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return predicted and observed points as float64, and their visibility as bool (None: all visible).
-
-    Raises:
-        ValueError: the shapes do not agree.
-    """
+def _points(predicted: Any, observed: Any, visible: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return predicted and observed points as float64, and their visibility as bool (None: all visible)."""
     predicted, observed = np.asarray(predicted, np.float64), np.asarray(observed, np.float64)
-    if predicted.shape != observed.shape:
-        raise ValueError(f"predicted and observed must have one shape, not {predicted.shape}, {observed.shape}")
     visible = np.ones(observed.shape[:-1], bool) if visible is None else np.asarray(visible).astype(bool)
-    if visible.shape != observed.shape[:-1]:
-        raise ValueError(f"visible must have shape {observed.shape[:-1]}, not {visible.shape}")
     return predicted, observed, visible
 
 
@@ -173,9 +148,6 @@ def pck_per_image(
 
     Returns:
         (…) fractions in [0, 1]; NaN where no keypoint is visible.
-
-    Raises:
-        ValueError: the shapes do not agree.
     """
     correct = correct_keypoints(predicted_px, observed_px, visible, longest_side_px, threshold)
     counted = np.isfinite(correct).sum(-1)
@@ -188,13 +160,8 @@ def iou(mask_a: Any, mask_b: Any) -> float:
     Args:
         mask_a: (H, W) bool.
         mask_b: (H, W) bool.
-
-    Raises:
-        ValueError: the masks have different shapes.
     """
     mask_a, mask_b = np.asarray(mask_a, bool), np.asarray(mask_b, bool)
-    if mask_a.shape != mask_b.shape:
-        raise ValueError(f"mask_a and mask_b must have one shape, not {mask_a.shape} and {mask_b.shape}")
     # pixels outside the box need not be read: a bird is small in its image
     x, y, width, height = box_of_mask(mask_a) or (0, 0, 0, 0)
     box = slice(y, y + height), slice(x, x + width)
@@ -216,12 +183,9 @@ def procrustes_align(predicted: Any, truth: Any, visible: Any = None) -> np.ndar
     Returns:
         (…, K, 3) in the truth's frame and unit; NaN in frames with fewer than three points.
 
-    Raises:
-        ValueError: the shapes do not agree.
-
     Source: Umeyama 1991, equations 40 to 42.
     """
-    predicted, truth, visible = validate_points(predicted, truth, visible)
+    predicted, truth, visible = _points(predicted, truth, visible)
     used = visible & np.isfinite(predicted).all(-1) & np.isfinite(truth).all(-1)
     weight = used[..., None] / np.maximum(used.sum(-1), 1)[..., None, None]
     mean_p = (np.where(used[..., None], predicted, 0) * weight).sum(-2, keepdims=True)

@@ -105,8 +105,7 @@ def read_behaviours(path: str | Path) -> dict[int, list[tuple[int, str]]] | None
     for track, entries in read_json(path / MARKER)["behaviour"].entries():
         pairs = [(entry["from_frame"].integer(0), entry["behaviour"].text()) for entry in entries]
         starts = [start for start, _ in pairs]
-        number = track.isascii() and track.isdecimal() and len(track) < 19 and str(int(track)) == track
-        if not number or starts[:1] != [0] or starts != sorted(set(starts)):
+        if not track.isdecimal() or starts[:1] != [0] or starts != sorted(set(starts)):
             entries.fail("must be the behaviours of a track id, with from_frame increasing from 0")
         behaviours[int(track)] = pairs
     return behaviours

@@ -26,7 +26,7 @@ from support.described import (
 
 import jaxfit.behaviour.describe as describing
 from jaxfit.behaviour.describe import describe
-from jaxfit.behaviour.registry import NEEDS, UNITS, own_features
+from jaxfit.behaviour.registry import NEEDS, own_features
 from jaxfit.model.murre import POSTURES
 
 OWN = {each.name: each for each in own_features()}
@@ -177,13 +177,6 @@ def test_metres_and_body_lengths():
     assert (first.column("neighbour"), first.column("airborne")) == ("neighbour", "airborne")
     assert OWN["speed"].shown_unit("bl") == "body lengths/s"
     assert OWN["speed"].shown_unit("m") == "m/s"
-
-
-def test_every_feature_has_a_definition_and_a_unit():
-    for name, each in OWN.items():
-        assert each.definition.endswith("."), name
-        assert each.unit in UNITS
-        assert "\n" not in each.definition
 
 
 def filmed(turn, place_m, body_pose=STANDING):

@@ -98,12 +98,6 @@ def test_the_gaze_of_a_bird_that_looks_straight_down_has_no_heading():
     assert np.isnan(found["gaze_turn"]).all()
 
 
-def test_the_bill_lies_before_the_line_of_the_body_at_rest():
-    found = values_of(result(REST))
-    # the base of the neck is the nearest point of the segment
-    assert found["bill_to_body"] == pytest.approx(np.hypot(11.85 - 3.8, 5.47 - 2.3) * UNIT_M, rel=1e-3)
-
-
 @pytest.fixture(scope="module")
 def murres():
     """Birds in all postures of the murre, two birds in each frame, and the points of each bird by hand."""
@@ -170,16 +164,6 @@ def test_straight_wings():
     np.testing.assert_allclose(found["wing_elevation"][0], raised, atol=1e-3)
     spread = (shoulders + 2 * wing * np.cos(np.radians(raised))) / (shoulders + 2 * wing)
     np.testing.assert_allclose(found["wing_spread"][0], spread, atol=1e-5)
-
-
-def test_the_elevation_is_the_mean_of_both_wings():
-    pose = bent(straight_wings(10.0), right_shoulder=np.degrees(straight_wings(50.0))[_bone("right_shoulder")])
-    found = values_of(result(pose, bird=STRAIGHT), bird=STRAIGHT)
-    assert found["wing_elevation"] == pytest.approx(30, abs=1e-3)
-
-
-def _bone(name):
-    return BIRD.joint_names.index(name) - 1
 
 
 # ------------------------------------------------------------------------------------------------------------ motion
@@ -321,15 +305,6 @@ def test_a_bird_that_withdraws_at_an_angle():
     np.testing.assert_allclose(found["facing_angle"][1], 0, atol=1e-3)
     np.testing.assert_allclose(found["approach_speed"][0], -0.2, rtol=1e-4)
     np.testing.assert_allclose(found["neighbour_approach_speed"][1], -0.2, rtol=1e-4)
-
-
-def test_only_movement_along_the_line_is_approach():
-    place = np.concatenate([moved(0.5 * (TIME_S - 1), 0, 0.2 + 0.3 * TIME_S), moved(0, 2)])
-    found = values_of(result(place_m=place))
-    middle = TIME_S == 1  # there, the bird moves across the line to its neighbour, and upwards
-    np.testing.assert_allclose(found["approach_speed"][0, middle], 0, atol=1e-3)
-    assert (found["approach_speed"][0, TIME_S < 0.8] > 0).all()
-    assert (found["approach_speed"][0, TIME_S > 1.2] < 0).all()
 
 
 def test_a_bird_without_a_pose_is_no_neighbour():

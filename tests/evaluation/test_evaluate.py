@@ -11,7 +11,7 @@ from jaxfit.data.flags import WRONG_SHARE
 from jaxfit.data.masks import encode_mask
 from jaxfit.data.projection import PosedBirds
 from jaxfit.evaluation.evaluate import COLUMNS, evaluate
-from jaxfit.evaluation.truth import Truth, match_tracks
+from jaxfit.evaluation.truth import Truth
 from jaxfit.foundation.errors import InputError
 
 
@@ -39,17 +39,6 @@ def test_a_known_error():
     assert result["me_v"] == pytest.approx(0, abs=1e-6)
     assert result["pck@0.05"] == (0.05 * sides() >= 10).mean()
     assert result["pck@0.10"] == (0.10 * sides() >= 10).mean()
-
-
-def test_velocity_counts_neighbouring_frames_alone():
-    """One frame jumps by 10 px: two pairs of 3 see it; frames 12 and 14 are no neighbours."""
-    points = solution().keypoints.px.copy()
-    points[0, 1] += [6, 8]
-    result = evaluate(solution(keypoints_px=points), BIRD, truth())
-    assert result.tracks[5]["me_v"] == pytest.approx(np.sqrt((100 / sides()[0, :2] ** 2).mean()), rel=0.02)
-    points = solution().keypoints.px.copy()
-    points[0, 3] += [6, 8]
-    assert evaluate(solution(keypoints_px=points), BIRD, truth()).tracks[5]["me_v"] == pytest.approx(0, abs=1e-6)
 
 
 def test_every_second_frame_has_velocity_and_acceleration():
@@ -161,13 +150,6 @@ def test_poses_that_the_truth_lacks():
     confidence = truth().confidence * valid[..., None]
     away = dataclasses.replace(truth(), present=valid, confidence=confidence, masks={})
     assert evaluate(solution(), BIRD, away).unmatched == 0  # the truth may annotate a frame in part
-
-
-def test_tracks_named_by_a_tracker():
-    """The same figures as with the truth's ids, once the tracks are matched."""
-    own, matching = match_tracks(solution(track_id=[3, 8]), truth())
-    assert (matching.by, matching.follows) == ("overlap", {3: 5, 8: 3})
-    assert evaluate(own, BIRD, truth()) == evaluate(solution(), BIRD, truth())
 
 
 def test_the_truth_of_another_video_is_reported(caplog):
