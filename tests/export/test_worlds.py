@@ -16,7 +16,7 @@ from jaxfit.simulation.scene import stage_scene
 
 @pytest.fixture(scope="module")
 def scene():
-    return stage_scene(BIRD, birds=2, frames=3, size=(320, 200), seed=3)
+    return stage_scene(BIRD, birds=2, frames=8, size=(320, 200), seed=3)
 
 
 @pytest.fixture(scope="module")

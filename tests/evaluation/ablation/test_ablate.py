@@ -17,12 +17,20 @@ from jaxfit.foundation.errors import InputError
 GRID = """
 config: {folder}/quick.yaml
 crosses:
-  - set: {{window: 1, terms.velocity: 0}}
+  - set: {{terms.velocity: 1}}
     cross: {{filter_window: [3]}}
   - cross: {{filter_window: [3, 1], terms.velocity: [0.1, 5]}}
 claims:
   - {{claim: the filter helps, better: {{filter_window: 3}}, worse: {{filter_window: 1}}}}
 """
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_batches():
+    """Fit two runs at once, with one program."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "FRAMES_AT_ONCE", 40)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +63,8 @@ def test_the_table_is_that_of_its_runs(done):
     assert len(table) == 5
     errors = [float(row["me_p"]) for row in table]
     assert errors == sorted(errors)
-    assert {(row["window"], row["terms.velocity"], row["filter_window"]) for row in table} == {
-        ("1", "0", "3"),
-        ("6", "0.1", "3"),
-        ("6", "5", "3"),
-        ("6", "0.1", "1"),
-        ("6", "5", "1"),
-    }
+    levels = {(row["terms.velocity"], row["filter_window"]) for row in table}
+    assert levels == {("1", "3"), ("0.1", "3"), ("5", "3"), ("0.1", "1"), ("5", "1")}
 
 
 def test_metrics_are_those_of_evaluate(done, inputs, capsys):
