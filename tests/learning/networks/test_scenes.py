@@ -9,7 +9,7 @@ from jaxfit.learning.networks import scenes
 from jaxfit.learning.networks.labelled_frames import load_frames, save_labels
 from jaxfit.learning.networks.labels import load_reference_birds
 from jaxfit.learning.networks.scenes import FRAMES_PER_SCENE, MAX_VARIED_BIRDS, draw_frames, draw_scene, film_scenes
-from jaxfit.learning.networks.varied import draw_landscape, draw_species
+from jaxfit.learning.networks.varied import draw_species
 from jaxfit.model.files import load_murre
 
 K = 20
@@ -106,12 +106,6 @@ def test_impossible_labels(tmp_path, changed, message):
         load_frames(tmp_path / "scene")
 
 
-def test_frames_of_an_earlier_version_are_rejected(tmp_path):
-    np.savez(tmp_path / "frames.npz", keypoints_px=np.zeros((1, 1, K, 2)), seen=np.zeros((1, 1, K)))
-    with pytest.raises(InputError, match=r"frames\.npz: lacks the array visibility"):
-        load_frames(tmp_path)
-
-
 def test_keypoints_far_outside_the_picture_are_clipped(tmp_path):
     write_scene(tmp_path / "scene", 1)
     frames = load_frames(tmp_path / "scene")
@@ -146,14 +140,6 @@ def test_varied_birds_agree_with_their_labels(varied):
     again = draw_frames(np.random.default_rng(2), load_murre(), 1, WIDTH, HEIGHT)
     for one, other in zip(again[:5], varied[2][:5], strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("pitch_deg", [0, 90])
-def test_landscapes(pitch_deg):
-    landscape = draw_landscape(np.random.default_rng((0, pitch_deg)), WIDTH, HEIGHT, pitch_deg)
-    assert landscape.picture.shape == (HEIGHT, WIDTH, 3)
-    assert np.isfinite(landscape.picture).all()
-    assert 0 <= landscape.water_from <= HEIGHT
 
 
 def test_species_differ_and_keep_the_joint_tree():

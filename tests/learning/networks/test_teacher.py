@@ -15,7 +15,7 @@ from jaxfit.learning.networks.label_data import LabelFiles, Scale, prepare_data,
 from jaxfit.learning.networks.labelled_frames import UNKNOWN_OWNER
 from jaxfit.learning.networks.labels import LabelledPicture, StoredPicture, mask_bird
 from jaxfit.learning.networks.segmenter import _targets
-from jaxfit.learning.networks.teacher import open_teacher, read_film, teach, track_labels
+from jaxfit.learning.networks.teacher import read_film, teach, track_labels
 from jaxfit.perception.keypoints import CropSettings
 from jaxfit.perception.network import instance_of
 
@@ -171,14 +171,6 @@ def test_training_data_with_tracked_frames(film, tmp_path):
     assert len(tracked_holdout) == 4
     assert len(data.frames.pictures) == len(data.split.training) + len(frames - {17} - tracked_holdout)
     assert "confirms: 10; other frames with tracked masks: 20" in data.teacher
-
-
-def test_open_teacher(monkeypatch, tmp_path):
-    monkeypatch.setenv("JAXFIT_NETWORKS", str(tmp_path))
-    assert open_teacher("auto") is None
-    assert open_teacher("none") is None
-    with pytest.raises(InputError, match="download"):
-        open_teacher("general")
 
 
 @pytest.mark.parametrize(
