@@ -87,6 +87,10 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
+READERS = "jaxfit.data.formats.recognise"
+"""Logger of the readers of observations: one line for each file, also without `--verbose`."""
+
+
 class OneLine(logging.Formatter):
     """Formats a record as one line of at most `MAX_MESSAGE_CHARACTERS`, since names may come from damaged files."""
 
@@ -97,12 +101,13 @@ class OneLine(logging.Formatter):
 
 
 def _prepare_logging(verbose: bool) -> None:
-    """Log messages of jaxfit on stderr, and messages of libraries only if `verbose`."""
+    """Log warnings of jaxfit on stderr, and what its readers read; further messages only if `verbose`."""
     handler = logging.StreamHandler()
     handler.setFormatter(OneLine())
     if not verbose:
         handler.addFilter(logging.Filter("jaxfit"))
-    logging.basicConfig(handlers=[handler], level=logging.INFO if verbose else logging.WARNING)
+        handler.addFilter(lambda record: record.levelno >= logging.WARNING or record.name == READERS)
+    logging.basicConfig(handlers=[handler], level=logging.INFO)
 
 
 def _prepare_streams(verbose: bool) -> None:

@@ -187,6 +187,13 @@ def with_values(config: Config, values: Mapping[str, Any]) -> Config:
     """
     plain = plain_config(config)
     references = {path: value[1:] for path, value in values.items() if isinstance(value, str) and value[:1] == "="}
+    for path in references:
+        target = references[path]
+        for _ in references:
+            target = references.get(target, target)
+        if target in references:
+            raise ConfigKeyError(path, "refers to itself", "give one of the values")
+        references[path] = target
     for path in sorted(values, key=lambda path: path in references):  # references last
         value = _get(plain, references[path], path) if path in references else values[path]
         parent, key, is_term = _locate(plain, path, path)

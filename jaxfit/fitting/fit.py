@@ -244,9 +244,15 @@ def model_of_fit(bird: Bird, config: FitConfig, initial_poses: InitialPoses | No
 def _without_mask_stages(configs: Sequence[FitConfig], source: object) -> list[FitConfig]:
     """Return the configs with stages that compare no masks, and report the changed stages once."""
     left = [without_mask_stages(config) for config in configs]
+    if any(any(map(needs_mask, config.stages)) for config in left):
+        problem = "holds no masks, but every term of the config compares masks"
+        raise InputError(source, problem, "give masks, or choose a config with terms that compare keypoints")
     kept = {stage.name for stage in left[0].stages}
     changed = [stage.name for stage in configs[0].stages if needs_mask(stage)]
-    for stages, what in ((kept.intersection(changed), "compare keypoints only"), (set(changed) - kept, "are skipped")):
+    for stages, what in (
+        (kept.intersection(changed), "run without the terms that compare masks"),
+        (set(changed) - kept, "are skipped"),
+    ):
         if stages:
             names = ", ".join(name for name in changed if name in stages)
             _logger.warning("%s: no masks, so these stages %s: %s", source, what, names)

@@ -213,14 +213,16 @@ def without_mask_stages(config: FitConfig) -> FitConfig:
     minimum, and its `override` may be for the beginning of a fit only. A stage that compares masks is left out if no
     stage stands before it.
 
-    A config that has no other stages keeps its stages, without the terms that compare masks.
+    A config that has no other stages keeps its stages, without the terms that compare masks. If no term is left, the
+    config is returned unchanged.
     """
     if all(map(needs_mask, config.stages)):
         stages = []
         for stage in config.stages:
             others = tuple(name for name, term in find_terms(stage.terms).items() if not term.compares_masks)
-            stages.append(replace(stage, terms=others or stage.terms))
-        return replace(config, stages=tuple(stages))
+            if others:
+                stages.append(replace(stage, terms=others))
+        return replace(config, stages=tuple(stages) or config.stages)
     kept: list[StageConfig] = []
     for stage in config.stages:
         if kept and needs_mask(stage):

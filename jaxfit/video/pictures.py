@@ -29,7 +29,7 @@ _NUMBERS = re.compile(r"(\d*)(\D+|$)")
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Return the images of a folder in the order of their names, with numbers sorted by value.
+    """Return the images of a folder in the order of their names, with numbers sorted by value (equal numbers as text).
 
     Raises:
         InputError: the folder cannot be read, or has no images.
@@ -44,7 +44,9 @@ def image_files(folder: Path) -> list[Path]:
         raise InputError(folder, f"cannot be read: {error.strerror}", "change its permissions") from error
     if not files:
         raise InputError(folder, "has no images", f"names of images end in {', '.join(IMAGE_SUFFIXES)}")
-    return sorted(files, key=lambda file: [(int(n or 0), text) for n, text in _NUMBERS.findall(file.name)])
+    return sorted(
+        files, key=lambda file: [(int(n or 0), text) for n, text in _NUMBERS.findall(file.name)] + [(0, file.name)]
+    )
 
 
 def read_picture(

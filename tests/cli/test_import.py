@@ -1,15 +1,18 @@
 """`jaxfit import`, and commands that read files of other tracking programs as they are."""
 
 import json
+import logging
 
 import cv2
 import h5py
 import numpy as np
 import pytest
 from support.cli_files import BIRD, SIZE, arguments, rejected
+from support.tracking_files import write_csv
 
-from jaxfit.cli.main import main
+from jaxfit.cli.main import _prepare_logging, main
 from jaxfit.data.formats.coco import read_coco
+from jaxfit.data.formats.recognise import read_observations
 from jaxfit.data.solution import load_solution
 
 OTHER = {
@@ -75,7 +78,7 @@ def test_fit_takes_the_file_as_it_is(inputs, tmp_path, csv_file, capsys, caplog)
     mask = "  - {name: outline, steps: 5, terms: [keypoints, mask]}\n"
     (tmp_path / "masks.yaml").write_text((inputs / "quick.yaml").read_text() + mask)
     assert main([*arguments(inputs, tmp_path / "other", obs=csv_file, config=tmp_path / "masks.yaml"), *size]) == 0
-    assert "no masks, so these stages compare keypoints only: outline" in caplog.text
+    assert "no masks, so these stages run without the terms that compare masks: outline" in caplog.text
     assert main(arguments(inputs, tmp_path / "coco")) == 0
     poses, _ = load_solution(tmp_path / "other")
     same, _ = load_solution(tmp_path / "coco")
@@ -123,3 +126,16 @@ def test_a_malicious_file_on_the_command_line(tmp_path, capsys):
         table.attrs["values_block_0_kind"] = np.bytes_(b"cos\nsystem\n(S'touch /tmp/never'\ntR.")
     command = ["import", str(tmp_path / "a.h5"), "--out", str(tmp_path / "o.json"), "--size", "64x64"]
     rejected(capsys, command, "its pickled names of columns call os.system, so that they are not read")
+
+
+def test_one_line_says_what_was_read(tmp_path, monkeypatch, capsys):
+    """Also without `--verbose`; other messages of this level are not shown."""
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.WARNING)
+    _prepare_logging(verbose=False)
+    read_observations(write_csv(tmp_path / "birds.csv"), size_px=(120, 100))
+    logging.getLogger("jaxfit.other").info("something else")
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition("birds.csv: ")[2].partition(":")[0] for line in lines] == [
+        "a CSV of DeepLabCut of an unknown film, 120×100"
+    ]

@@ -54,6 +54,15 @@ def test_a_reference_to_another_value_does_not_depend_on_the_order():
         assert (changed.terms["velocity"], changed.terms["acceleration"]) == (5, 5)
 
 
+def test_a_reference_to_a_reference_has_the_new_value():
+    chain = {"terms.acceleration": "=terms.velocity", "terms.velocity": "=terms.pose_prior", "terms.pose_prior": 5}
+    for order in (1, -1):
+        terms = with_values(PAPER, dict(list(chain.items())[::order])).terms
+        assert (terms["acceleration"], terms["velocity"], terms["pose_prior"]) == (5, 5, 5)
+    with pytest.raises(ConfigKeyError, match="refers to itself"):
+        with_values(PAPER, chain | {"terms.pose_prior": "=terms.acceleration"})
+
+
 def test_the_value_of_a_term_is_its_weight():
     assert get_value(PAPER, "terms.keypoints") == 1
     assert get_value(PAPER, "terms.keypoints.sigma_px") == 50

@@ -162,19 +162,41 @@ def test_only_labels_and_fits_read_a_video_without_tracks(tmp_path):
         read_observations(saved_video(tmp_path, untracked_video()))
 
 
-def test_scores_in_place_of_visibilities(tmp_path, caplog):
-    scores = {"keypoints": [10, 5, 0.96, 20.5, 6.25, 0.03, 1, 2, 1.0]}
-    observed = read_observations(saved(tmp_path, cvat(["frame_1.png"], [(1, scores)])))
-    np.testing.assert_allclose(observed.confidence[0, 0], [0.96, 0.03, 1])
+@pytest.mark.parametrize(
+    ("third", "confidence"),
+    [
+        ((0.96, 0.03, 1.0), (0.96, 0.03, 1)),
+        ((2, 0.4, 0), (1, 0.4, 0)),  # 2 is a score, too
+        ((3.2, 0.5, 1), (1, 0.5, 1)),  # the peak of a heat map
+    ],
+)
+def test_scores_in_place_of_visibilities(tmp_path, caplog, third, confidence):
+    """Only 0, 1 and 2 are visibilities; one other number makes all of them scores."""
+    points = [value for x, score in zip((10, 20.5, 1), third, strict=True) for value in (x, 5, score)]
+    observed = read_observations(saved(tmp_path, cvat(["frame_1.png"], [(1, {"keypoints": points})])))
+    np.testing.assert_allclose(observed.confidence[0, 0], confidence)
     assert not observed.occluded.any()
     assert "holds scores in place of visibilities" in caplog.text
 
 
-def test_frame_numbers_of_cocovid(tmp_path):
-    content = cvat(["bird/1.png", "bird/2.png"], [(1, {"track_id": 1}), (2, {"track_id": 1})])
+@pytest.mark.parametrize("third", [96, -1, 11.5])
+def test_third_numbers_of_keypoints_that_are_no_scores(tmp_path, third):
+    path = saved(tmp_path, cvat(["frame_1.png"], [(1, {"keypoints": [10, 5, 2, 20.5, 6.25, third, 1, 2, 0]})]))
+    with pytest.raises(InputError, match=f"keypoint 1 is {third}, which is no visibility"):
+        read_observations(path)
+
+
+def test_cocovid(tmp_path):
+    """Frames are numbered by `frame_id`, tracks by `instance_id`; the message about several videos names them."""
+    birds = [(1, {"instance_id": 7}), (2, {"instance_id": 4}), (2, {"instance_id": 7})]
+    content = cvat(["bird/1.png", "bird/2.png"], birds)
     for i, image in enumerate(content["images"]):
         image |= {"video_id": 1, "frame_id": 5 * i}
-    assert read_observations(saved(tmp_path, content)).frame_index.tolist() == [0, 5]
+    observed = read_observations(saved(tmp_path, content))
+    assert observed.frame_index.tolist() == [0, 5]
+    assert observed.track_id.tolist() == [4, 7]
+    assert observed.present.tolist() == [[False, True], [True, True]]
     content["images"][1]["video_id"] = 2
-    with pytest.raises(InputError, match="holds several videos"):
+    content["videos"] = [{"id": 1, "name": "north"}, {"id": 2, "name": "south"}]
+    with pytest.raises(InputError, match=r"holds 2 videos \(video_id\): north, south"):
         read_observations(saved(tmp_path, content))

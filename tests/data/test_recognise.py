@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import sleap_io
 from PIL import ExifTags, Image
+from support.coco_files import content, saved
 from support.films import encode
 from support.tracking_files import T, write_analysis, write_csv, write_project, write_table
 
@@ -161,7 +162,10 @@ def test_other_files_that_sleap_io_reads(tmp_path):
 def test_one_line_says_what_was_read(tmp_path, caplog):
     with caplog.at_level("INFO"):
         read_observations(write_project(tmp_path / "birds.slp"))
-    assert "birds.slp: a SLEAP project of clip.mp4: 2 birds, 4 frames, 3 keypoints, 0 masks" in caplog.text
+    assert (
+        "birds.slp: a SLEAP project of clip.mp4, 120×100: 2 birds, 4 frames (0 to 30), 3 keypoints (24 of 24 known), 0"
+        in caplog.text
+    )
 
 
 def test_pictures_that_are_turned(tmp_path):
@@ -174,8 +178,66 @@ def test_pictures_that_are_turned(tmp_path):
     assert read_observations(path).image_size_px.tolist() == [[120, 100]] * 4
 
 
-def test_a_film_that_is_guessed_is_named(tmp_path, caplog):
+@pytest.mark.parametrize("name", ["clipshortDLC_net.csv", "clip_left_croppedDLC_net.csv", "clip-1DLC_net.csv"])
+def test_a_film_that_is_guessed_is_named(tmp_path, caplog, name):
     """DeepLabCut names the tables of shortened films by words after the name of the film."""
     film(tmp_path / "clip.mp4")
-    read_observations(write_csv(tmp_path / "clipshortDLC_net.csv"))
-    assert "clipshortDLC_net.csv: takes clip.mp4, whose name begins its name" in caplog.text
+    read_observations(write_csv(tmp_path / name))
+    assert f"{name}: takes clip.mp4, whose name begins its name" in caplog.text
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv", "ts"])
+@pytest.mark.parametrize("frames", [T - 1, T, T + 2])
+def test_rows_are_compared_with_the_frames(tmp_path, caplog, suffix, frames):
+    """Also where the container does not store the number of frames."""
+    encode(tmp_path / f"clip.{suffix}", count=frames)
+    path = write_csv(tmp_path / "clipDLC_net.csv")
+    if frames < T:
+        with pytest.raises(InputError, match=r"keypoints for frame 3, but .* has 3 frames"):
+            read_observations(path)
+        return
+    read_observations(path)
+    text = "holds 4 rows for the 6 frames of its video; its first row is taken for frame 0"
+    assert (text in caplog.text) == (frames > T)
+
+
+def rewritten(path, change):
+    """Change the cells of a CSV file by a function of the row, its number and the cells."""
+    rows = [change(i, line.split(",")) for i, line in enumerate(path.read_text().splitlines())]
+    path.write_text("\n".join(",".join(row) for row in rows))
+    return path
+
+
+def test_positions_in_space_with_likelihoods(tmp_path):
+    def with_depth(i, row):
+        keypoints = [row[k : k + 3] for k in range(1, len(row), 3)]
+        depth = {0: "net", 2: "z"}
+        return [row[0], *(cell for x, y, c in keypoints for cell in (x, y, depth.get(i, x if i == 1 else "5"), c))]
+
+    with pytest.raises(InputError, match="holds positions in space"):
+        read_observations(rewritten(write_csv(tmp_path / "a.csv"), with_depth), size_px=(120, 100))
+
+
+def test_fractions_of_the_image(tmp_path):
+    def divided(i, row):
+        return row if i < 3 else [row[0], *(str(float(v) / 120) if k % 3 < 2 else v for k, v in enumerate(row[1:]))]
+
+    with pytest.raises(InputError, match="the positions are fractions of the image, not pixels"):
+        read_observations(rewritten(write_csv(tmp_path / "a.csv"), divided), size_px=(120, 100))
+
+
+@pytest.mark.parametrize(
+    ("factor", "message"), [(1 / 30, "fractions of the image"), (10, "7 of 7 keypoints outside images of 30×20")]
+)
+def test_coco_files_with_positions_that_are_no_pixels(tmp_path, factor, message):
+    data = content()
+    for bird in data["annotations"]:
+        bird["keypoints"] = [v if k % 3 == 2 else factor * v for k, v in enumerate(bird["keypoints"])]
+    with pytest.raises(InputError, match=message):
+        read_observations(saved(tmp_path, data))
+
+
+def test_rows_with_numbers_of_pandas(tmp_path):
+    """A table that pandas has written again may number its rows 30.0, 31.0, …"""
+    path = write_csv(tmp_path / "a.csv", rows=["30.0", "31.0", "33.0", "34.0"])
+    assert read_observations(path, size_px=(120, 100)).frame_index.tolist() == [30, 31, 33, 34]

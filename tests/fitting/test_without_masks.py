@@ -11,6 +11,7 @@ from jaxfit.config.fit import StageConfig, load_config, shipped_fit_configs
 from jaxfit.data.formats.coco import read_coco
 from jaxfit.fitting.fit import _without_mask_stages, fit
 from jaxfit.fitting.solve import needs_mask, without_mask_stages
+from jaxfit.foundation.errors import InputError
 from jaxfit.model.published import import_model
 from jaxfit.simulation.noise import detect
 
@@ -100,7 +101,13 @@ def test_the_steps_of_another_solver_do_not_count():
 def test_a_config_with_mask_stages_only_loses_the_mask_terms():
     stage = StageConfig("only", 3, ("keypoints", "mask", "pose_prior"))
     mask = StageConfig("mask", 3, ("mask",))
-    assert [stage.terms for stage in staged(stage, mask)] == [("keypoints", "pose_prior"), ("mask",)]
+    assert [stage.terms for stage in staged(stage, mask)] == [("keypoints", "pose_prior")]
+
+
+def test_a_config_that_compares_masks_only_is_refused():
+    some = dataclasses.replace(config(), stages=(StageConfig("outline", 1, ("mask",)),))
+    with pytest.raises(InputError, match="birds: holds no masks, but every term of the config compares masks"):
+        _without_mask_stages([some], "birds")
 
 
 def test_warnings_name_the_stages(caplog):
@@ -110,7 +117,7 @@ def test_warnings_name_the_stages(caplog):
         StageConfig("late", 1, ("keypoints", "mask")),
     )
     _without_mask_stages([dataclasses.replace(config(), stages=stages)], "birds")
-    assert "birds: no masks, so these stages compare keypoints only: late" in caplog.text
+    assert "birds: no masks, so these stages run without the terms that compare masks: late" in caplog.text
     assert "birds: no masks, so these stages are skipped: early" in caplog.text
 
 

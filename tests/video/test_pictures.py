@@ -58,6 +58,13 @@ def test_a_folder_of_images(tmp_path, caplog):
     assert caplog.records == []
 
 
+def test_equal_numbers_are_ordered_by_their_text(tmp_path):
+    for name in ("1.png", "01.png", "2.png", "001.png", "b1.png", "a01.png", "a1.png"):
+        (tmp_path / name).touch()
+    names = [file.name for file in image_files(tmp_path)]
+    assert names == ["a01.png", "a1.png", "b1.png", "001.png", "01.png", "1.png", "2.png"]
+
+
 def test_pages_of_a_tiff_file_are_frames(tmp_path):
     first, *others = [Image.fromarray(picture[..., ::-1].copy()) for picture in PICTURES]
     first.save(tmp_path / "stack.tif", save_all=True, append_images=others)

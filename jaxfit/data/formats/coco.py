@@ -20,7 +20,8 @@ Conventions of the reader:
 - The confidence of a keypoint is its score where ``v > 0``, and 0 where ``v = 0``, since COCO writes a missing keypoint
   at (0, 0) with any score. Without scores, the confidence is 1 where ``v > 0``. Without ``score``, the score of an
   annotation is 1.
-- A file whose visibilities lie between 0 and 1 holds scores in their place, as MMPose and detectron2 write them.
+- Only 0, 1 and 2 are visibilities. A file with other numbers holds scores in their place, as MMPose and detectron2
+  write them.
 - The first category with keypoints is the bird. Categories with the same keypoints in the same order, such as several
   species, are birds too. Annotations of other categories are skipped, and one warning reports their number.
 - A file without annotations is a video without birds. A file with annotations of other categories only is rejected.
@@ -36,7 +37,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -44,6 +45,8 @@ import numpy as np
 
 from jaxfit.data.footage import footage_of
 from jaxfit.data.formats.coco_records import (
+    MAX_SCORE,
+    Annotation,
     Image,
     Untracked,
     complete_export,
@@ -126,9 +129,8 @@ def coco_observations(root: Field) -> Observations:
             confidence[i] = np.where(visibility[i] > 0, bird.scores, 0)
 
     occluded = visibility == 1
-    if (visibility % 1 > 0).any() and visibility.max() <= 1:
-        _log.warning("%s: holds scores in place of visibilities, which are read as confidences", root.source)
-        confidence, occluded = visibility.astype(np.float32), np.zeros(visibility.shape, bool)
+    if not np.isin(visibility, (0, 1, 2)).all():
+        confidence, occluded = _scores(root, visibility, birds), np.zeros(visibility.shape, bool)
 
     def placed(values: Any, *shape: int, dtype: Any = np.float32) -> np.ndarray:
         array = np.zeros((N, T, *shape), dtype)
@@ -173,6 +175,22 @@ def coco_observations(root: Field) -> Observations:
                 if bird.image[:4] != first_image[bird.image.frame_index][:4]
             },
         )
+
+
+def _scores(root: Field, third: np.ndarray, birds: Sequence[Annotation]) -> np.ndarray:
+    """Return confidences from the third numbers of keypoints, which are scores; `keypoint_scores` replace them.
+
+    Raises:
+        InputError: a number is neither a visibility nor a score.
+    """
+    wrong = np.argwhere(~((third >= 0) & (third <= MAX_SCORE)))
+    if len(wrong):
+        i, k = wrong[0].tolist()
+        problem = f"{birds[i].label}: the third number of keypoint {k} is {third[i, k]:g}, which is no visibility (0, 1"
+        raise InputError(root.source, f"{problem}, 2) and no score", "write visibilities, or scores from 0 to 1")
+    _log.warning("%s: holds scores in place of visibilities, which are read as confidences", root.source)
+    given = [third[i] if bird.scores is None else bird.scores * (third[i] > 0) for i, bird in enumerate(birds)]
+    return np.minimum(given, 1).astype(np.float32)
 
 
 def write_coco(observations: Observations, path: str | Path, info: Mapping[str, str] | None = None) -> None:

@@ -3,7 +3,8 @@
 Annotation programs export files without the keys of video: `frame_index` of images and `track_id` of annotations.
 `complete_export` adds both keys before the file is read:
 
-- `frame_id` of CocoVID is the number of the frame; a file of several videos is an error.
+- `frame_id` of CocoVID is the number of the frame, and `instance_id` is the track; a file of several videos is an
+  error.
 - Otherwise, the name of a picture gives the number of its frame (`frame_000012.png` → 12), as
   `jaxfit.data.tracks.frame_numbers` describes. Other pictures are photographs: `frame_index` is 0, and every bird is a
   track of its own.
@@ -41,6 +42,8 @@ _REMEDIES = {
     "track_id": "give every annotation the track_id of its bird; for photographs, a unique number",
     "frame_index": "give every image the number of its frame in the video; for photographs, 0",
 }
+MAX_SCORE = 10
+"""Scores between 1 and this limit count as 1: peaks of a network may lie above 1."""
 Untracked = Literal["video", "labels", "photographs"]
 """How a file without any track is read. `video`: by the rule of exports; a file with `frame_index` is not completed.
 `labels`: every annotation is a bird of its own. `photographs`: the same, and all images have `frame_index` 0."""
@@ -249,10 +252,12 @@ def complete_export(root: Field, video: Path | None = None, untracked: Untracked
         with errors_of(root, "images"):
             in_folder = video is not None and video.is_dir()  # which numbers its pictures by their positions
             if images and not in_folder and all("frame_id" in image for image in images):  # CocoVID
-                if len({image.get("video_id") for image in images}) > 1:
-                    raise InputError(
-                        root.source, "holds several videos (video_id)", "give every video a file of its own"
-                    )
+                videos = {image.get("video_id") for image in images}
+                if len(videos) > 1:
+                    named = {video.get("id"): video.get("name") for video in root.value.get("videos") or ()}
+                    names = ", ".join(sorted(str(named.get(video) or video) for video in videos))
+                    problem = f"holds {len(videos)} videos (video_id): {names}"
+                    raise InputError(root.source, problem, "give every video a file of its own")
                 numbers = [_whole(image["frame_id"]) for image in images]
             else:
                 numbers = frame_numbers([image["file_name"] for image in images], video)
@@ -346,7 +351,8 @@ def _with_tracks(annotations: list[dict[str, Any]], photographs: bool, source: P
 def _track(annotation: dict[str, Any]) -> int | None:
     attributes = annotation.get("attributes")
     if not isinstance(attributes, dict):
-        return None
+        instance = annotation.get("instance_id")
+        return instance if type(instance) is int else None
     track, text = attributes.get("track_id"), attributes.get("bird")
     if track is None and isinstance(text, str) and re.fullmatch(r"[0-9]{1,15}", text):
         return int(text)

@@ -19,6 +19,7 @@ from __future__ import annotations
 import csv
 import io
 import pickle
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,8 @@ def keypoint_table(
         InputError: rows of both kinds, no column of positions, a column twice, a keypoint without x or y, or
             positions in space.
     """
-    coords = dict.fromkeys(levels[-1] for levels in columns)
-    if "z" in coords and "likelihood" not in coords:
+    coords, known = dict.fromkeys(levels[-1] for levels in columns), set(columns)
+    if any(known >= {(*levels[:-1], coord) for coord in "xyz"} for levels in columns):
         problem = "holds positions in space (x, y, z), not positions in an image"
         raise InputError(source, problem, "give the file of keypoints of one camera")
     place: dict[tuple[str, str, str], int] = {}
@@ -87,7 +88,8 @@ def keypoint_table(
                 confidence[n, :, k] = values[:, i]
             else:
                 keypoints[n, :, k, COORDS.index(coord)] = values[:, i]
-    numbered = [name.isascii() and name.isdecimal() for name in row_names] or [True]
+    whole = [re.fullmatch(r"(\d+)(\.0+)?", name, re.ASCII) for name in row_names]
+    numbered = [match is not None for match in whole] or [True]
     if any(numbered) and not all(numbered):
         problem = f"names its row {numbered.index(True) + 1} by a number, and row {numbered.index(False) + 1} otherwise"
         raise InputError(source, problem, "name all rows by frame numbers or by pictures")
@@ -96,8 +98,9 @@ def keypoint_table(
         tuple(bird or "bird" for bird in birds),
         keypoints,
         None if certain else confidence,
-        frame_index=np.array(row_names, np.int64) if numbered[0] else None,
+        frame_index=np.array([match[1] for match in whole if match], np.int64) if numbered[0] else None,
         pictures=None if numbered[0] else tuple(row_names),
+        rows_of_frames=numbered[0],
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,15 +16,33 @@ from PIL import ExifTags, Image
 
 from jaxfit.data.footage import read_footage
 from jaxfit.data.masks import MAX_IMAGE_SIDE_PX
-from jaxfit.data.observations import Observations
+from jaxfit.data.observations import MIN_KEYPOINTS, Observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.reading import reading
 from jaxfit.video.decoding import frame_times
-from jaxfit.video.reader import probe_video
+from jaxfit.video.reader import VideoInfo, probe_video
 
 _log = logging.getLogger(__name__)
 
-_VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".mts", ".wmv")
+CERTAIN = 0.6
+"""Confidence of a keypoint that is certain; DeepLabCut draws keypoints from 0.6 on."""
+_OUTSIDE = 0.2
+"""Largest accepted fraction of certain keypoints outside their image."""
+_VIDEO_SUFFIXES = (
+    ".mp4",
+    ".avi",
+    ".mov",
+    ".mkv",
+    ".webm",
+    ".m4v",
+    ".mpg",
+    ".mpeg",
+    ".mts",
+    ".m2ts",
+    ".ts",
+    ".h264",
+    ".wmv",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +53,7 @@ class ImageSizes:
     """(2,) width and height of all images, or (T, 2) of each image."""
     video: Path | None = None
     frames: int | None = None
-    """Number of frames of the video, if it is known."""
+    """Number of frames of the video; None without a video."""
 
     def check_frames(self, last: int, source: Path) -> None:
         """Raise InputError if the video lacks the last frame."""
@@ -71,7 +90,7 @@ def image_sizes(
         if stored is not None and info.size_px != stored:
             problem = f"is {info.size_px[0]}×{info.size_px[1]}, but {source.name} was made from {stored[0]}×{stored[1]}"
             raise InputError(video, problem, "give the video of these keypoints")
-        return ImageSizes(np.array(info.size_px), video, info.frames)
+        return ImageSizes(np.array(info.size_px), video, _counted(video, info))
     if pictures is not None:
         sizes = _picture_sizes(pictures, source)
         if sizes is not None:
@@ -86,12 +105,37 @@ def image_sizes(
     found = _video_beside(source, stored_video) if pictures is None else None
     if found is not None:
         info = probe_video(found)
-        return ImageSizes(np.array(info.size_px), found, info.frames)
+        return ImageSizes(np.array(info.size_px), found, _counted(found, info))
     if stored_video:
         problem = f"stores no image size, and its video {Path(stored_video).name} is not in the same folder"
     else:
         problem = "stores no image size" + (", and its pictures are not in the same folder" if pictures else "")
     raise InputError(source, problem, "give --video VIDEO, or --size WIDTHxHEIGHT")
+
+
+def _counted(video: Path, info: VideoInfo) -> int:
+    """Return the number of frames; the packets are counted if the container does not store the number."""
+    return len(frame_times(video, sys.maxsize)) if info.frames is None else info.frames
+
+
+def check_positions(observations: Observations, source: Path) -> None:
+    """Raise InputError if the certain keypoints cannot be pixels of their images.
+
+    Raises:
+        InputError: many keypoints lie outside their image, as in images of another size, or all keypoints lie within
+            the first pixel, as fractions of the image do.
+    """
+    points, size = observations.keypoints_px, observations.image_sizes_px()[:, :, None]
+    certain = observations.confidence >= CERTAIN
+    outside = certain & ((points < -1) | (points > size + 1)).any(-1)
+    if outside.sum() > _OUTSIDE * certain.sum():
+        n, t, k = np.argwhere(outside)[0].tolist()
+        problem = f"has {outside.sum():,} of {certain.sum():,} keypoints outside images of {size[n, t, 0, 0]}×"
+        problem += f"{size[n, t, 0, 1]}, such as x {points[n, t, k, 0]:.0f}, y {points[n, t, k, 1]:.0f}"
+        raise InputError(source, problem, "give the video or pictures in the size that was labelled, by --video")
+    if certain.sum() >= MIN_KEYPOINTS and np.abs(points[certain]).max() <= 1 < size.max():
+        problem = "has no keypoint beyond 1 pixel: the positions are fractions of the image, not pixels"
+        raise InputError(source, problem, "multiply x by the width and y by the height of the image")
 
 
 def check_video(observations: Observations, source: Path, video: Path) -> None:
@@ -103,7 +147,7 @@ def check_video(observations: Observations, source: Path, video: Path) -> None:
         problem = f"is {info.size_px[0]}×{info.size_px[1]}, but {source.name} says {other[0][0]}×{other[0][1]}"
         raise InputError(video, problem, "give the video or pictures in the size that was labelled")
     if observations.num_frames and not observations.own_images:
-        sizes_of = ImageSizes(np.array(info.size_px), video, info.frames)
+        sizes_of = ImageSizes(np.array(info.size_px), video, _counted(video, info))
         sizes_of.check_frames(int(observations.frame_index[-1]), source)
 
 
@@ -154,7 +198,7 @@ def _video_beside(source: Path, stored: str | None) -> Path | None:
         and _is_file(file)
     ]
     found = max(videos, key=lambda file: len(file.stem), default=None)
-    if found is not None and not re.match(r"DLC|[._]|$", source.name[len(found.stem) :]):
+    if found is not None and not re.match(r"DLC|[.]|$", source.name[len(found.stem) :]):
         # DeepLabCut names tables of shortened or cropped films by words after the name of the film
         _log.warning("%s: takes %s, whose name begins its name (give another film by --video)", source, found.name)
     return found

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxfit.data.formats.image_sizes import add_times, image_sizes
+from jaxfit.data.formats.coco_records import MAX_SCORE
+from jaxfit.data.formats.image_sizes import CERTAIN, add_times, image_sizes
 from jaxfit.data.masks import box_of_keypoints
 from jaxfit.data.observations import Observations
 from jaxfit.data.tracks import frame_numbers
@@ -16,13 +17,6 @@ from jaxfit.foundation.array_files import check_memory, observations_bytes
 from jaxfit.foundation.errors import InputError, one_line, shortened
 
 _log = logging.getLogger(__name__)
-
-CERTAIN = 0.6
-"""Confidence of a keypoint that is certain; DeepLabCut draws keypoints from 0.6 on."""
-_MAX_CONFIDENCE = 10
-"""Scores between 1 and this limit count as 1: peaks of a network may lie above 1."""
-_OUTSIDE = 0.2
-"""Largest accepted fraction of certain keypoints outside their image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +43,10 @@ class KeypointTable:
     """Path of the video, if the file stores it."""
     certain: float = CERTAIN
     """Keypoints from this confidence on determine the box of a bird."""
+    rows_of_frames: bool = False
+    """Whether the rows count the frames of the video, so that their number tells whether they do."""
+    video_frames: int | None = None
+    """Number of frames of the video, if the file stores it."""
 
 
 def check_table_size(source: Path, birds: int, frames: int, keypoints: int) -> None:
@@ -82,7 +80,7 @@ def table_observations(
     known = np.isfinite(keypoints).all(-1)
     stored = np.ones(known.shape) if table.confidence is None else table.confidence
     stored = np.where(known & ~np.isnan(stored), stored, 0)
-    if np.abs(stored).max(initial=0) > _MAX_CONFIDENCE:
+    if np.abs(stored).max(initial=0) > MAX_SCORE:
         raise InputError(source, f"holds a confidence of {np.abs(stored).max():g}", "scale the scores to 0 to 1")
     confidence = np.clip(stored, 0, 1).astype(np.float32)
     numbers = None if table.pictures is None else frame_numbers(table.pictures, video)
@@ -95,7 +93,6 @@ def table_observations(
     names = _file_names(table, source, sizes.video, frames)[order]
     size = np.broadcast_to(sizes.size_px, (len(order), 2))[order]
     present = np.any(confidence > 0, axis=-1)
-    _check_inside(keypoints, confidence, size, source)
     certain = confidence >= table.certain
     certain = np.where(certain.any(-1, keepdims=True), certain, confidence > 0)
     box = box_of_keypoints(keypoints, certain)
@@ -128,6 +125,10 @@ def table_observations(
     if len(numbers) and numbers[0] < 0:
         raise InputError(source, f"holds frame {numbers[0]}", "number the frames from 0 on")
     sizes.check_frames(int(numbers[-1]) if len(numbers) else 0, source)
+    in_video = table.video_frames or sizes.frames
+    if table.rows_of_frames and in_video is not None and len(numbers) not in (0, in_video):
+        text = "%s: holds %d rows for the %d frames of its video; its first row is taken for frame %d"
+        _log.warning(text, source, len(numbers), in_video, numbers[0])
     track_id = np.arange(1, len(table.bird_names) + 1)
     if len(table.bird_names) > 1:
         tracks = ", ".join(f"{name} = {i}" for i, name in enumerate(table.bird_names, 1))
@@ -150,15 +151,3 @@ def _file_names(table: KeypointTable, source: Path, video: Path | None, frames: 
     stored = (table.video or source.stem).replace("\\", "/").rpartition("/")[2]
     name = video.name if video is not None else stored
     return np.array([f"{name}#{frame}" for frame in (frames if frames is not None else ())], str).reshape(-1)
-
-
-def _check_inside(keypoints: np.ndarray, confidence: np.ndarray, size: np.ndarray, source: Path) -> None:
-    """Raise InputError if many certain keypoints lie outside their image, as with pictures of another size."""
-    certain = confidence >= CERTAIN
-    outside = certain & ((keypoints < -1) | (keypoints > size[None, :, None] + 1)).any(-1)
-    if outside.sum() > _OUTSIDE * certain.sum():
-        t = int(np.flatnonzero(outside.any((0, 2)))[0])
-        far = np.where(outside[:, t, :, None], keypoints[:, t], -np.inf).max((0, 1))
-        problem = f"has {outside.sum():,} of {certain.sum():,} keypoints outside images of {size[t][0]}×{size[t][1]}, "
-        problem += f"such as x {far[0]:.0f}, y {far[1]:.0f}"
-        raise InputError(source, problem, "give the video or pictures in the size that was labelled, by --video")

@@ -10,7 +10,7 @@ from jaxfit.data.formats.coco_records import Untracked
 from jaxfit.data.formats.deeplabcut import find_pandas_table, read_deeplabcut_csv, read_deeplabcut_hdf5
 from jaxfit.data.formats.fields import read_json
 from jaxfit.data.formats.hdf5 import HDF5_SIGNATURE, open_hdf5
-from jaxfit.data.formats.image_sizes import add_times, check_video
+from jaxfit.data.formats.image_sizes import add_times, check_positions, check_video
 from jaxfit.data.formats.keypoint_table import KeypointTable, table_observations
 from jaxfit.data.formats.label_studio import read_label_studio
 from jaxfit.data.formats.sleap import read_sleap_analysis, read_sleap_project, read_with_sleap_io
@@ -63,24 +63,31 @@ def read_observations(
                 observations = add_times(observations, video)
         else:
             observations = table_observations(table, path, video, size_px)
-    _log.info("%s: %s", path, statement(observations, kind))
+        check_positions(observations, path)
+    _log.info("%s: %s", path, statement(observations, kind, path))
     return observations
 
 
-def statement(observations: Observations, kind: str) -> str:
+def statement(observations: Observations, kind: str, path: Path) -> str:
     """Return what a file of observations holds, in one line.
 
     Args:
         observations: the observations.
         kind: the kind of file with its article, such as `a SLEAP project`.
+        path: the file.
     """
     N, T = observations.present.shape
     films = sorted({str(name).partition("#")[0] for name in observations.file_name})
-    of = films[0] if len(films) == 1 else f"{len(films)} pictures" if films else "no film"
-    count = f"{observations.photographs} photographs" if observations.photographs else f"{T} frames"
-    return (
-        f"{kind} of {of}: {N} birds, {count}, {observations.num_keypoints} keypoints, {len(observations.masks)} masks"
-    )
+    of = films[0] if len(films) == 1 else f"{len(films)} pictures" if films else path.stem
+    of = "an unknown film" if of == path.stem else of
+    width, height = observations.image_size_px[0].tolist() if T else (0, 0)
+    numbers = observations.frame_index[[0, -1]].tolist() if T else []
+    frames = f"{T} frames ({numbers[0]} to {numbers[1]})" if T else "no frame"
+    count = f"{observations.photographs} photographs" if observations.photographs else frames
+    known, most = int((observations.confidence > 0).sum()), int(observations.present.sum()) * observations.num_keypoints
+    keypoints = f"{observations.num_keypoints} keypoints ({known:,} of {most:,} known)"
+    rate = "" if observations.fps is None else f" at {observations.fps:.5g} frames/s"
+    return f"{kind} of {of}, {width}×{height}{rate}: {N} birds, {count}, {keypoints}, {len(observations.masks)} masks"
 
 
 def _keypoints(path: Path, start: bytes, video: Path | None) -> tuple[str, KeypointTable | None]:

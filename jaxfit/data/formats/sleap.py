@@ -217,10 +217,6 @@ def read_sleap_analysis(file: Any, path: Path) -> KeypointTable:
     if "instance_scores" in file:
         score = _ordered(file, "instance_scores", ("track", "frame"))
     stored = json.loads(hdf5_text(file.attrs.get("video_backend_metadata", "{}"))).get("shape")
-    if stored and stored[0] and stored[0] > frames:
-        # SLEAP leaves out the frames before the first bird and after the last one where it does not export all frames
-        text = "%s: holds %d frames of a video of %d; the number of the first frame is not stored, and 0 is assumed"
-        _log.warning(text, path, frames, stored[0])
     edges = np.asarray(file["edge_inds"][()] if "edge_inds" in file else [], np.int64).reshape(-1, 2)
     return KeypointTable(
         tuple(names),
@@ -233,6 +229,8 @@ def read_sleap_analysis(file: Any, path: Path) -> KeypointTable:
         size_px=(stored[2], stored[1]) if stored else None,
         video=hdf5_text(file["video_path"][()]) or None if "video_path" in file else None,
         certain=_CERTAIN,
+        rows_of_frames=True,  # SLEAP may leave out the frames before the first bird and after the last one
+        video_frames=int(stored[0]) if stored and stored[0] else None,
     )
 
 
