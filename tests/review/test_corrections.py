@@ -17,13 +17,6 @@ from jaxfit.review.edits import Edit, apply_edits
 CELLS = [name for name, (shape, _) in LAYOUT.items() if shape.startswith("N T")]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("tracks") / "result"
-    write(folder)
-    return folder
-
-
 CASES = {
     "swap the last window": ([Edit("swap", (2, 4), 112)], 4),
     "cut inside a window": ([Edit("cut", (4,), 108)], 3),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.corrected import observations, write
+from support.corrected import observations
 
 from jaxfit.cli.main import main
 from jaxfit.data.masks import encode_mask
@@ -147,13 +147,6 @@ FILES = {
     "nothing": (b"# nothing\n", "edits.txt: holds no correction (write one a line, for example swap 3,5@120:200)"),
     "unknown track": (b"exclude 9@110\n", "exclude 9@110: there is no track 9 (its tracks are 2, 4, 5)"),
 }
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("tracks") / "result"
-    write(folder)
-    return folder
 
 
 @pytest.mark.parametrize("case", FILES)

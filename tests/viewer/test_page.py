@@ -54,15 +54,10 @@ def browser(playwright):
     started.close()
 
 
-@pytest.fixture(scope="module")
-def result(tmp_path_factory):
-    return write_result(tmp_path_factory.mktemp("page"))
-
-
 @pytest.fixture
 def page(browser, result, tmp_path):
-    folder, video = result
-    with served(folder, video, tmp_path / "result.edits") as (client, viewer):
+    seen, video = result
+    with served(seen.folder, video, tmp_path / "result.edits") as (client, viewer):
         opened = Opened(browser, client.address)
         yield opened, viewer
         opened.close()
@@ -264,21 +259,25 @@ def test_a_click_chooses_a_bird_in_all_views(page):
 
 
 def test_a_private_page_leads_to_the_result(browser, result, tmp_path):
-    with served(*result) as (client, _):
+    with served(result[0].folder, result[1]) as (client, _):
         opened = Opened(browser, leading_page(client.address, tmp_path).as_uri())
         assert opened.page.url.startswith(client.address)
         opened.close()
 
 
 def test_a_film_that_is_removed_stops_nothing(browser, result, tmp_path):
-    folder, film = result
+    seen, film = result
     video = Path(shutil.copy(film, tmp_path / "film.mp4"))
-    with served(folder, video) as (client, _):
+    with served(seen.folder, video) as (client, _):
         opened = Opened(browser, client.address)
         video.unlink()
         for i in (5, 1, 3):
             opened.page.evaluate("(i) => { jaxfit.state.film.shown.clear(); return jaxfit.go(i); }", i)
             opened.until(f"!jaxfit.state.busy && jaxfit.state.i === {i}")
+        opened.page.evaluate("jaxfit.state.film.video = null; jaxfit.state.film.shown.clear(); jaxfit.go(2)")
+        opened.until(
+            "document.querySelector('.film .message').textContent.includes('film.mp4: was removed or changed')"
+        )
         opened.page.close()
 
 
@@ -344,8 +343,7 @@ def test_corrections_and_the_fit_after_them(page, monkeypatch, tmp_path):
 
 
 def test_saved_pages_need_no_server_and_no_network(browser, result, tmp_path):
-    folder, video = result
-    seen = shown(folder)
+    seen, video = result
     for out in (tmp_path / "page.html", tmp_path / "page"):
         path = save_page([seen], video, out).path
         opened = Opened(browser, path.as_uri(), f"#frame={overlays.FIRST + 4}", only_local=True)
@@ -356,11 +354,11 @@ def test_saved_pages_need_no_server_and_no_network(browser, result, tmp_path):
 
 
 def test_without_webgl_the_film_works_and_the_page_says_why(playwright, result):
-    folder, video = result
+    seen, video = result
     started = playwright.chromium.launch(
         executable_path=BROWSER, args=["--no-sandbox", "--disable-gpu", "--disable-3d-apis"]
     )
-    with served(folder, video) as (client, viewer):
+    with served(seen.folder, video) as (client, viewer):
         opened = Opened(started, client.address)
         opened.until("document.querySelector('.ledge .message').textContent.includes('no WebGL')")
         opened.go(4)
@@ -370,7 +368,7 @@ def test_without_webgl_the_film_works_and_the_page_says_why(playwright, result):
 
 
 def test_a_film_that_browsers_cannot_play_is_shown_as_pictures(browser, result, tmp_path):
-    folder, _ = result
+    seen, _ = result
     old = tmp_path / "film.mp4"
     with av.open(str(old), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
@@ -379,7 +377,7 @@ def test_a_film_that_browsers_cannot_play_is_shown_as_pictures(browser, result, 
             picture = np.full((overlays.HEIGHT, overlays.WIDTH, 3), overlays.GREY, np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
         container.mux(stream.encode(None))
-    with served(folder, old) as (client, viewer):
+    with served(seen.folder, old) as (client, viewer):
         opened = Opened(browser, client.address)
         assert opened.page.evaluate("jaxfit.state.film.video") is None
         opened.go(4)
@@ -388,8 +386,8 @@ def test_a_film_that_browsers_cannot_play_is_shown_as_pictures(browser, result, 
 
 
 def test_two_results_and_no_film(browser, result):
-    folder, _ = result
-    with served(folder, None, results=[shown(folder), shown(folder)]) as (client, _):
+    seen, _ = result
+    with served(seen.folder, None, results=[seen, shown(seen.folder)]) as (client, _):
         opened = Opened(browser, client.address)
         assert opened.page.locator(".result").count() == 2
         assert opened.page.locator(".film").count() == 0

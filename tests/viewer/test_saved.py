@@ -7,7 +7,6 @@ import re
 
 import pytest
 from support.cli_files import rejected
-from support.viewed import shown, write_result
 
 from jaxfit.cli.main import main
 from jaxfit.export.result import open_result
@@ -15,12 +14,6 @@ from jaxfit.foundation.errors import InputError
 from jaxfit.viewer import saved
 from jaxfit.viewer.saved import save_page
 from jaxfit.viewer.shown import Shown
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory):
-    folder, video = write_result(tmp_path_factory.mktemp("saved"))
-    return shown(folder), video
 
 
 def opened(text):

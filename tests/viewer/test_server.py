@@ -179,8 +179,10 @@ def test_edits_are_stored_and_wrong_ones_refused(page):
     assert send(b'{"frames": []}', "mark")[0] == 400
     assert send(b" " * (LARGEST_BODY + 1))[0] == 413
     assert path.read_text() == stored
-    known = json.dumps(["swap 4,11@5", "exclude 4@3:5"]).encode()
-    assert send(b'{"edits": [], "known": %s}' % known)[0] == 200
+    known, many = json.dumps(["swap 4,11@5", "exclude 4@3:5"]).encode(), ["swap 4,11@5"] * 20_000
+    assert send(b'{"edits": %s, "known": %s}' % (json.dumps(many).encode(), known))[0] == 200
+    assert len(Session(viewer.session.folder, path, None, None).edits) == len(many)
+    assert send(b'{"edits": [], "known": %s}' % json.dumps(many).encode())[0] == 200
 
 
 @pytest.mark.parametrize("by", ["another viewer", "another page", "hand", "deletion"])

@@ -19,12 +19,6 @@ from jaxfit.viewer.film import frame_picture, write_copy
 from jaxfit.viewer.shown import regions
 
 
-@pytest.fixture(scope="module")
-def result(tmp_path_factory):
-    folder, video = write_result(tmp_path_factory.mktemp("shown"))
-    return shown(folder), video
-
-
 def test_arrays_come_back():
     arrays = {
         "a": np.arange(6, dtype=np.int16).reshape(2, 3),

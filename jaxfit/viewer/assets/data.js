@@ -82,6 +82,12 @@ async function problem(answer) {
   }
 }
 
+/** Why the server does not send a picture. @param {string} path */
+export async function problemOf(path) {
+  const answer = await fetch(path);
+  return answer.ok ? "The browser cannot show the picture." : problem(answer);
+}
+
 /** @param {ArrayBuffer} buffer @returns {Packed} */
 export function unpacked(buffer) {
   const size = new DataView(buffer).getUint32(0, true);

@@ -1,13 +1,13 @@
 // The film with outlines, keypoints and error ellipses of all birds.
 // @ts-check
-import { filmAddress } from "viewer/data";
+import { filmAddress, problemOf } from "viewer/data";
 
 /** @typedef {import("viewer/data").Packed} Packed */
 /** @typedef {import("viewer/data").ResultFacts} ResultFacts */
 
 const MISSING = -32768;
 const CACHE_BYTES = 250e6;
-/** Largest distance from the begin of a frame at which the film is stopped to show the frame, seconds. */
+/** Largest distance from the beginning of a frame at which the film is stopped to show the frame, seconds. */
 const MARGIN_S = 1e-3;
 /** Longest wait for the picture of a film at rest, milliseconds. */
 const SHOWN_MS = 200;
@@ -90,6 +90,7 @@ export class Film {
     if (video?.error) this.video = null;
     if (video && (exact || !this.pictures) && !video.error) {
       this.picture = await createImageBitmap(video);
+      this.problem = exact ? "" : "The browser shows a frame of the film beside this one.";
       this.shown.set(i, this.picture);
       const most = Math.max(CACHE_BYTES / (4 * video.videoWidth * video.videoHeight), 2);
       for (const [old, picture] of this.shown) {
@@ -107,7 +108,8 @@ export class Film {
       this.picture = image;
       this.problem = "";
     } catch {
-      this.problem = `The film has no picture of frame ${this.frames[i]}.`;
+      this.picture = null;
+      this.problem = await problemOf(image.src);
     }
   }
 }
