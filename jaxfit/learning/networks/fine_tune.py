@@ -36,7 +36,6 @@ from jaxfit.learning.networks import keypoints, segmenter
 from jaxfit.learning.networks.label_data import (
     ALL_FRAMES,
     FRAMES,
-    PICTURES,
     TRACKED,
     FineTuningData,
     LabelFiles,
@@ -47,7 +46,7 @@ from jaxfit.learning.networks.label_data import (
     prepare_frames,
     read_label_files,
 )
-from jaxfit.learning.networks.labelled_frames import LabelledFrames, load_frames
+from jaxfit.learning.networks.labelled_frames import load_frames
 from jaxfit.learning.networks.labels import (
     CENTRE,
     LabelledPicture,
@@ -183,57 +182,46 @@ def fine_tune(
     base = base_file(network, settings.base)
     teacher = open_teacher(settings.teacher) if network == "segmenter" else None
     taught: Taught | None = None
-    if files.labels:
-        labels = read_label_files(network, files, progress)
-    else:
-        if teacher is None or len(files.images) != 1:
-            raise InputError("train: labels", "are missing", "give --labels, or --video with --teacher")
-        (folder / TRACKED).mkdir(parents=True, exist_ok=True)
-        taught = teach(files.images[0], teacher, folder / TRACKED, progress)
-        labels = LabelSet((CENTRE,), tuple(picture.labels for picture in taught.pictures))
-        files, teacher = LabelFiles(files.images, files.images), None
-    torch.manual_seed(settings.seed)
-    starts: tuple[str, ...] = labels.keypoint_names
-    if network == "segmenter":
-        model = load_segmenter_base(base)
-    else:
-        model, starts = load_keypoint_base(base, labels.keypoint_names)
     try:
+        if files.labels:
+            labels = read_label_files(network, files, progress)
+        else:
+            if teacher is None or len(files.images) != 1:
+                raise InputError("train: labels", "are missing", "give --labels, or --video with --teacher")
+            (folder / TRACKED).mkdir(parents=True, exist_ok=True)
+            taught = teach(files.images[0], teacher, folder / TRACKED, progress)
+            labels = LabelSet((CENTRE,), tuple(picture.labels for picture in taught.pictures))
+            files, teacher = LabelFiles(files.images, files.images), None
+        names = labels.keypoint_names
+        torch.manual_seed(settings.seed)
+        starts: tuple[str, ...] = names
+        if network == "segmenter":
+            model = load_segmenter_base(base)
+        else:
+            model, starts = load_keypoint_base(base, names)
         references = load_reference_birds() if settings.scenes else None
         data = prepare_data(network, files, settings.holdout, references, folder, labels, progress, teacher)
         if network == "keypoints" and not keypoints.has_usable_bird(data.frames):
-            least = min(keypoints.MIN_VISIBLE, len(data.keypoint_names))
-            problem = f"no bird of the training part has {least} visible keypoints"
+            problem = f"no bird of the training part has {min(keypoints.MIN_VISIBLE, len(names))} visible keypoints"
             raise InputError(files.labels[0], problem, "label more keypoints")
         base_scale = _base_scale(network, base, data.scale)
-    except BaseException:
-        if not (folder / CHECKPOINT).exists():
-            _remove(folder)
-        raise
-    names = dict(zip(data.keypoint_names, starts, strict=True))
-    schedule = settings.schedule or default_schedule(network, len(data.split.training))
-    try:
-        scenes = ()
-        if settings.scenes:
-            scenes = film_scenes(frames_folder, settings.scenes, progress=progress)
-            scenes = scenes if _has_samples(load_frames(*scenes), network, data.keypoint_names) else ()
+        scenes = film_scenes(frames_folder, settings.scenes, progress=progress) if settings.scenes else ()
+        if scenes and network == "keypoints":
+            visible = load_frames(*scenes).with_keypoints(names).visibility == 2
+            scenes = scenes if (visible.sum(-1) >= min(MIN_COMMON_KEYPOINTS, len(names))).any() else ()
+        schedule = settings.schedule or default_schedule(network, len(data.split.training))
+        own_names = dict(zip(names, starts, strict=True))
         work = _FineTuning(
-            network, model, base, base_scale, names, data, scenes, schedule, settings.seed, folder, progress
+            network, model, base, base_scale, own_names, data, scenes, schedule, settings.seed, folder, progress
         )
         result = work.run(path, teacher)
     except BaseException as error:
-        if (folder / CHECKPOINT).exists() and not isinstance(error, InputError):
+        if not (folder / CHECKPOINT).exists():
+            shutil.rmtree(folder, ignore_errors=True)
+        elif not isinstance(error, InputError):
             _logger.warning("%s holds the work so far; the same command continues there", folder)
         raise
     return result._replace(doubt=_doubt(taught, result)) if taught else result
-
-
-def _has_samples(frames: LabelledFrames, network: str, names: Sequence[str]) -> bool:
-    """Return whether a network of keypoints of these names can be trained on simulated frames."""
-    if network == "segmenter":
-        return True
-    least = min(MIN_COMMON_KEYPOINTS, len(names))
-    return bool(((frames.with_keypoints(names).visibility == 2).sum(-1) >= least).any())
 
 
 @dataclass
@@ -294,7 +282,7 @@ class _FineTuning:
         }
         self._write(self.base_scale if chosen == "base" else data.scale, facts, path)
         store_training_activations(self.network, path, [frames, *simulated], progress=self.progress)
-        _remove(self.folder)
+        shutil.rmtree(self.folder)
         return FineTuned(
             accuracy=accuracy,
             chosen=chosen,
@@ -404,16 +392,6 @@ def _base_scale(network: str, base: Path, scale: Scale) -> Scale:
         load_segmenter(base, kind="bottom_up")  # checks the scale
         return scale._replace(longer_side_px=int(model.metadata.get("longer_side", LONGER_SIDE_PX)))
     return scale._replace(crops=crop_settings(read_metadata(model)))
-
-
-def _remove(folder: Path) -> None:
-    """Remove the files of a finished training; files of other programs stay."""
-    for name in (PICTURES, FRAMES, ALL_FRAMES, TRACKED):
-        shutil.rmtree(folder / name, ignore_errors=True)
-    for file in (folder / CHECKED, *folder.glob("checkpoint*")):
-        file.unlink(missing_ok=True)
-    if folder.exists() and not any(folder.iterdir()):
-        folder.rmdir()
 
 
 CROPS = 16

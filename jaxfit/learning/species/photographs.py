@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -69,41 +68,31 @@ def read_photographs(
     if frames_per_track < 1:
         raise ValueError(f"frames_per_track: expected 1 or more, not {frames_per_track}")
     config = _keypoint_config()
-    images: list[_Image] = []
+    parts: list[Photographs] = []
     remarks: list[str] = []
-    for file, (source, given) in enumerate(sources):
+    for source, given in sources:
         checked = check_keypoints(given, bird.keypoint_names, source)
         observations = _few_frames(checked, config.min_keypoints, frames_per_track)
         solution = fit(observations, bird, config, progress=progress, source=source)
-        images += _images(observations, solution, source, file)
         usable, chosen = (int(part.usable(config.min_keypoints).sum()) for part in (checked, observations))
         all_images, fitted = int(checked.present.sum()), int(solution.valid.sum())
         remarks += _remarks(source, all_images, usable, chosen, fitted, frames_per_track)
-    if not images:
+        if fitted:
+            parts.append(_images(observations, solution, source))
+    if not parts:
         raise InputError(sources[0][0], "has no usable image", "annotate at least four keypoints per bird")
-    number = {key: n for n, key in enumerate(dict.fromkeys(image.individual for image in images))}
+    first = np.cumsum([0, *(part.individual.max() + 1 for part in parts[:-1])])
+    joined = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("keypoints_px", "confidence", "mask", "has_mask")
+    }
     return Photographs(
-        names=tuple(image.name for image in images),
-        individual=np.array([number[image.individual] for image in images]),
-        keypoints_px=np.stack([image.keypoints_px for image in images]),
-        confidence=np.stack([image.confidence for image in images]),
-        mask=np.stack([image.mask for image in images]),
-        has_mask=np.array([bool(image.mask.any()) for image in images]),
-        pose=jax.tree.map(lambda *x: np.stack(x), *(image.pose for image in images)),
+        names=tuple(name for part in parts for name in part.names),
+        individual=np.concatenate([part.individual + n for part, n in zip(parts, first, strict=True)]),
+        **joined,
+        pose=jax.tree.map(lambda *x: np.concatenate(x), *(part.pose for part in parts)),
         remarks=tuple(remarks),
     )
-
-
-class _Image(NamedTuple):
-    """One image; the fields are those of `Photographs`."""
-
-    name: str
-    individual: tuple[int, int]
-    """Position of the file, whose name others may have too, and number of the track."""
-    keypoints_px: np.ndarray
-    confidence: np.ndarray
-    mask: np.ndarray
-    pose: Pose
 
 
 def _remarks(source: object, images: int, usable: int, chosen: int, fitted: int, frames_per_track: int) -> list[str]:
@@ -138,29 +127,25 @@ def _few_frames(observations: Observations, min_keypoints: int, most: int) -> Ob
     return observations.with_keypoints(observations.keypoints_px, confidence)
 
 
-def _images(observations: Observations, solution: Solution, source: object, file: int) -> list[_Image]:
-    """Return the images with a valid pose."""
-    images = []
+def _images(observations: Observations, solution: Solution, source: object) -> Photographs:
+    """Return the images of a file with a valid pose."""
+    at = np.argwhere(solution.valid)
     row = {int(track): n for n, track in enumerate(observations.track_id)}
-    for m, t in np.argwhere(solution.valid).tolist():
+    names, points, confidence, masks = [], [], [], []
+    for m, t in at.tolist():
         track, crop = int(solution.track_id[m]), solution.crops.square_px[m, t]
         n = row[track]
         mask = observations.mask(n, t)
-        images.append(
-            _Image(
-                name=f"{source}: {observations.image_file(n, t) or solution.frame_index[t]}, track {track}",
-                individual=(file, track),
-                keypoints_px=np.asarray(image_to_crop(observations.keypoints_px[n, t], crop), np.float32),
-                confidence=np.asarray(observations.confidence[n, t]),
-                mask=np.zeros((MASK_PX, MASK_PX), np.uint8) if mask is None else cut_mask(mask, crop, MASK_PX),
-                pose=Pose(
-                    solution.poses.global_orient[m, t],
-                    solution.poses.body_pose[m, t],
-                    solution.poses.transl[m, t],
-                    solution.poses.scale[m, t],
-                    solution.poses.bone_length[m, t],
-                    solution.poses.betas[m, t],
-                ),
-            )
-        )
-    return images
+        names.append(f"{source}: {observations.image_file(n, t) or solution.frame_index[t]}, track {track}")
+        points.append(np.asarray(image_to_crop(observations.keypoints_px[n, t], crop), np.float32))
+        confidence.append(observations.confidence[n, t])
+        masks.append(np.zeros((MASK_PX, MASK_PX), np.uint8) if mask is None else cut_mask(mask, crop, MASK_PX))
+    return Photographs(
+        names=tuple(names),
+        individual=np.unique(at[:, 0], return_inverse=True)[1],
+        keypoints_px=np.stack(points),
+        confidence=np.stack(confidence),
+        mask=np.stack(masks),
+        has_mask=np.any(masks, axis=(1, 2)),
+        pose=jax.tree.map(lambda x: np.asarray(x)[solution.valid], solution.poses),
+    )
