@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.lib.format import open_memmap
 
 from jaxfit.data.masks import decode_mask
 from jaxfit.foundation.errors import InputError
@@ -33,7 +34,6 @@ from jaxfit.learning.networks.labelled_frames import (
     UNKNOWN,
     UNKNOWN_OWNER,
     LabelledFrames,
-    create_pictures,
     load_frames,
     save_labels,
 )
@@ -218,7 +218,8 @@ def prepare_frames(
     given = [bird.visibility for picture in pictures for bird in picture.labels.birds] or [np.zeros(K)]
     without_label = np.where((np.max(given, 0) > 0) & ~(np.array(given) == 1).any(), 0, UNKNOWN)
     with new_folder(folder, overwrite=True, marker=MARKER) as part:
-        stored, owner = create_pictures(part, S, height, width)
+        stored = open_memmap(part / "pictures.npy", "w+", np.uint8, (S, height, width, 3))
+        owner = open_memmap(part / "owner.npy", "w+", np.uint8, (S, height, width))
         for s, (picture, _) in enumerate(pictures):
             w, h = sizes[s].tolist()
             resample = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR

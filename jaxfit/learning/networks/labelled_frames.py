@@ -8,7 +8,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from numpy.lib.format import open_memmap
 
 from jaxfit.data.keypoint_names import propose_names
 from jaxfit.data.observations import LARGEST_POSITION_PX
@@ -88,18 +87,6 @@ def draw_bird(rng: np.random.Generator, frames: LabelledFrames, spread_share: fl
         s, n = rng.choice(spread).tolist()
         return s, n
     return int(rng.integers(len(frames.pictures))), None
-
-
-def create_pictures(folder: Path, count: int, height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Create the memory-mapped files of `count` pictures and of the bird of each pixel, both 0; the caller fills them.
-
-    Args:
-        folder: an existing folder.
-        count, height, width: number and size of the pictures.
-    """
-    pictures = open_memmap(folder / "pictures.npy", "w+", np.uint8, (count, height, width, 3))
-    owner = open_memmap(folder / "owner.npy", "w+", np.uint8, (count, height, width))
-    return pictures, owner
 
 
 def save_labels(

@@ -109,8 +109,7 @@ def _place(
     placed = []
     for n, (centre, kind) in enumerate(zip(centres, kinds, strict=True)):
         bird_scale = scale * float(np.exp(rng.normal(0, 0.12)))
-        birds = posed["fly" if flies else "swim" if swims[n] else "stand"][kind]
-        vertices, keypoints = birds.vertices_world[n], birds.keypoints_world[n]
+        vertices, keypoints = (points[n] for points in posed["fly" if flies else "swim" if swims[n] else "stand"][kind])
         screen, points = (
             _on_screen(world, R_cam_world, bird_scale, centre, N - n + 1) for world in (vertices, keypoints)
         )

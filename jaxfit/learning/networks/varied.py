@@ -141,13 +141,6 @@ _NATURAL = np.array(
 """Colours of plumage in linear light (blue, green, red): black, white, greys; browns; dark green, blue, orange."""
 
 
-class PosedBirds(NamedTuple):
-    """P birds of one species in the world frame (z up), with the root at the origin."""
-
-    vertices_world: Float[np.ndarray, "P V 3"]
-    keypoints_world: Float[np.ndarray, "P K 3"]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Species:
     """A body and a plumage."""
@@ -156,13 +149,16 @@ class Species:
     colours: Float[np.ndarray, "V 3"]
     """Linear light: blue, green, red."""
 
-    def pose(self, rng: np.random.Generator, count: int, manner: str) -> PosedBirds:
+    def pose(self, rng: np.random.Generator, count: int, manner: str) -> tuple[np.ndarray, np.ndarray]:
         """Draw postures and headings of some birds.
 
         Args:
             rng: source of randomness.
             count: number of birds.
             manner: `stand`, `swim` or `fly`.
+
+        Returns:
+            Vertices (count, V, 3) and keypoints (count, K, 3) in the world frame (z up), with the root at the origin.
         """
         flies = manner == "fly"
         names = _POSTURES[manner]
@@ -188,17 +184,11 @@ class Species:
         )
         rig = fold_bird(self.body)
         vertices = np.asarray(window_vertices(rig, window_transforms(rig, pose), pose), np.float64)
-        keypoints = np.einsum("kv,pvc->pkc", np.asarray(self.body.keypoint_weights, np.float64), vertices)
-        return PosedBirds(vertices, keypoints)
+        return vertices, np.einsum("kv,pvc->pkc", np.asarray(self.body.keypoint_weights, np.float64), vertices)
 
 
 def draw_species(rng: np.random.Generator, bird: Bird) -> Species:
     """Draw a species from the murre: other proportions of neck, legs, wings, head, bill and body, other colours."""
-    body = _draw_body(rng, bird)
-    return Species(body, _draw_plumage(rng, bird))
-
-
-def _draw_body(rng: np.random.Generator, bird: Bird) -> Bird:
     names = bird.joint_names
     vertices, joints = np.asarray(bird.vertices, np.float64), np.asarray(bird.joints, np.float64)
     weights = np.asarray(bird.skin_weights, np.float64)
@@ -218,7 +208,7 @@ def _draw_body(rng: np.random.Generator, bird: Bird) -> Bird:
         factor = log_uniform(rng, low, high)
         for name in group:
             bone[names.index(name) - 1] *= factor
-    return dataclasses.replace(
+    body = dataclasses.replace(
         bird,
         vertices=jnp.asarray(vertices * stretch, jnp.float32),
         joints=jnp.asarray(joints * stretch, jnp.float32),
@@ -226,6 +216,7 @@ def _draw_body(rng: np.random.Generator, bird: Bird) -> Bird:
         shape_variance=bird.shape_variance[:0],
         bone_mean=jnp.asarray(bone, jnp.float32),
     )
+    return Species(body, _draw_plumage(rng, bird))
 
 
 def _draw_plumage(rng: np.random.Generator, bird: Bird) -> Float[np.ndarray, "V 3"]:

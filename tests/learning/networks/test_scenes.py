@@ -80,16 +80,6 @@ def test_folders_of_other_files_are_rejected(filmed, tmp_path):
     assert not filmed
 
 
-def test_the_end_of_a_process_is_one_error(monkeypatch, tmp_path):
-    def film(*_arguments, **_shares):
-        raise scenes.BrokenProcessPool
-
-    monkeypatch.setattr(scenes, "film_scene", film)
-    monkeypatch.setattr(scenes, "ProcessPoolExecutor", Pool)
-    with pytest.raises(InputError, match="the system ended a process that films scenes"):
-        film_scenes(tmp_path / "scenes", 3)
-
-
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

@@ -85,11 +85,11 @@ def test_wrong_options_are_one_line_errors(tmp_path, capsys, option, says):
     assert says in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("most", "used"), [(FRAMES_PER_TRACK, 10), (2, 2), (25, 25), (104, 25)])
-def test_a_track_gives_few_frames(most, used):
-    chosen = np.flatnonzero(_few_frames(labelled_track(25), 1, most).usable(1)[0])
-    assert len(chosen) == used
-    assert chosen[[0, -1]].tolist() == [0, 24]
+def test_a_track_gives_few_frames():
+    for most, used in ((FRAMES_PER_TRACK, 10), (2, 2), (25, 25), (104, 25)):
+        chosen = np.flatnonzero(_few_frames(labelled_track(25), 1, most).usable(1)[0])
+        assert len(chosen) == used
+        assert chosen[[0, -1]].tolist() == [0, 24]
 
 
 def labelled_track(frames):
