@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from jaxfit.foundation.errors import InputError
 from jaxfit.video import CODECS
 
-MODEL = "`murre`, or a model file (.npz) that `jaxfit model import` writes"
+MODEL = "`murre`, `aves` (after `jaxfit model get aves`), or a model file (.npz) that `jaxfit model import` writes"
 OBSERVATIONS = (
     "keypoints and masks: COCO, Label Studio (.json), DeepLabCut (.h5, .csv), Lightning Pose (.csv) or SLEAP (.slp, "
     ".analysis.h5)"
@@ -56,6 +56,12 @@ SHARED: dict[str, dict[str, Any]] = {
         "camera)",
     },
     "--tracks": {"metavar": "ID,ID", "help": "only these tracks"},
+    "--from": {
+        "type": Path,
+        "dest": "source",
+        "metavar": "DIR",
+        "help": "folder with copies of the files, for a machine without a network",
+    },
     "--json": {"action": "store_true", "help": "print JSON instead of a table"},
     "--unit": {
         "choices": ("m", "cm", "mm"),

@@ -157,7 +157,7 @@ def _general_segmenter() -> Finding:
 
     name = "general segmenter"
     if not any(path.exists() for path in general_files()):
-        return Finding(name, "not installed (optional): docs/guide/networks.md#general-birds")
+        return Finding(name, "not installed", "for birds of any species: jaxfit networks get general", optional=True)
     try:
         load_segmenter("general")
     except InputError as error:

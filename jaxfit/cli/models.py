@@ -1,4 +1,4 @@
-"""`model`, `prior`, `config`."""
+"""`model`, `networks`, `prior`, `config`."""
 
 from __future__ import annotations
 
@@ -25,6 +25,25 @@ def model_import(options: argparse.Namespace) -> None:
         bird = replace(bird, metres_per_unit=length_cm / 100 / rest_length(bird))
     save_bird(bird, options.out)
     show(f"{bird.name}: {bird.vertices.shape[0]} vertices, {bird.num_keypoints} keypoints → {options.out}")
+
+
+def model_get(options: argparse.Namespace) -> None:
+    """Download a published model."""
+    from jaxfit.foundation.progress import terminal
+    from jaxfit.foundation.published import get_published
+    from jaxfit.model.published import AVES, models_folder
+
+    (path,) = get_published((AVES,), models_folder(), options.source, terminal)
+    show(f"{options.name}: {path}; use the model with `--model {options.name}`")
+
+
+def networks_get(options: argparse.Namespace) -> None:
+    """Download published networks."""
+    from jaxfit.foundation.progress import terminal
+    from jaxfit.perception.general_networks import get_general_files
+
+    files = get_general_files(options.source, terminal)
+    show(f"{options.name}: {', '.join(map(str, files))}; `--segmenter auto` compares this segmenter from now on")
 
 
 def model_info(options: argparse.Namespace) -> None:

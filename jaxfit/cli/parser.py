@@ -50,7 +50,8 @@ _FAMILIES = {
     "cameras": "calibrate, describe and check cameras",
     "config": "list the configs and print their settings",
     "dataset": "convert published data sets",
-    "model": "import, describe and draw bird models",
+    "model": "download, import, describe and draw bird models",
+    "networks": "download published networks",
     "prior": "learn a prior of poses or of motion from results",
 }
 """First word of the commands of two words → its description."""
@@ -371,6 +372,21 @@ def _model_import(command: Parser) -> None:
     )
     command.add_argument("--length-cm", type=float, metavar="CM", help=text)
     add_out(command, "M.npz", "model file to write")
+
+
+@_command("cameras and models", "model get", "models.model_get")
+def _model_get(command: Parser) -> None:
+    """Download a published model; `--model` takes its name then."""
+    command.add_argument("name", choices=("aves",), help="AVES: birds of many species (MIT licence, 1.8 MB)")
+    command.shared("--from")
+
+
+@_command("cameras and models", "networks get", "models.networks_get")
+def _networks_get(command: Parser) -> None:
+    """Download published networks."""
+    text = "the segmenter of birds of any species: YOLOX-nano and U²-Net-p (Apache-2.0 licence, 8.2 MB)"
+    command.add_argument("name", choices=("general",), help=text)
+    command.shared("--from")
 
 
 @_command("cameras and models", "model info", "models.model_info")

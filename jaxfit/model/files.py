@@ -18,7 +18,9 @@ import numpy as np
 from jaxfit.foundation.array_files import load_npz, validate_arrays
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.files import write_whole
+from jaxfit.foundation.published import check_published
 from jaxfit.model.bird import ARRAY_FIELDS, Bird, check_bird, neutral_colours, unlimited_joints
+from jaxfit.model.published import AVES, import_aves, models_folder
 
 FORMAT_VERSION = 1
 MURRE_PATH = Path(__file__).with_name("murre.npz")
@@ -115,7 +117,7 @@ def read_provenance(name_or_path: Path | str) -> dict[str, str]:
     Raises:
         InputError: the file cannot be read, or the note is not a list of texts.
     """
-    if str(name_or_path) == "murre":
+    if str(name_or_path) in ("murre", "aves"):
         return {}
     content = load_npz(name_or_path, {}, optional={_PROVENANCE: "lines"})
     lines = content.get(_PROVENANCE, np.zeros(0, np.str_))
@@ -133,9 +135,16 @@ def find_bird(name_or_path: Path | str) -> Bird:
     """Load a bird by its name or from its file.
 
     Args:
-        name_or_path: "murre" for the bird that comes with jaxfit; any other value is the path of an `.npz` file.
+        name_or_path: "murre" for the bird that comes with jaxfit; "aves" for the published model that
+            `jaxfit model get aves` downloads; any other value is the path of an `.npz` file.
 
     Raises:
-        InputError: as `load_bird`.
+        InputError: as `load_bird`; or the file of "aves" is missing, or has another content than the published file.
     """
-    return load_murre() if str(name_or_path) == "murre" else load_bird(name_or_path)
+    if str(name_or_path) == "murre":
+        return load_murre()
+    if str(name_or_path) == "aves":
+        path = models_folder() / AVES.file_name
+        check_published(path, AVES)
+        return import_aves(path)
+    return load_bird(name_or_path)

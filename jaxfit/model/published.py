@@ -25,6 +25,7 @@ import numpy as np
 
 from jaxfit.foundation.array_files import check_shapes
 from jaxfit.foundation.errors import InputError
+from jaxfit.foundation.published import PublishedFile, user_folder
 from jaxfit.foundation.reading import check_readable, read_json_file
 from jaxfit.model.anatomy import AVES_KEYPOINTS, AVIAN_MESH_KEYPOINTS, JOINT_NAMES, mirror_pairs
 from jaxfit.model.bird import Bird, check_bird, neutral_colours, unlimited_joints
@@ -145,6 +146,19 @@ def build_bird(
 
 PRIOR_KEYS = ("p_m", "p_cov", "b_m", "b_cov")
 """Tensors of `pose_bone_prior.pth`: mean and covariance of the pose, then of the bone lengths."""
+
+AVES = PublishedFile(
+    "aves.pt",
+    "https://raw.githubusercontent.com/yufu-wang/aves/f8e8ae86cfd6ebfefa9cf68ed89d104537765258/models/aves.pt",
+    ("720b08798a6123f050c81dee3fdbe28fc29afb53f825a27da08ed54a0036122c",),
+    "jaxfit model get aves",
+)
+"""The model AVES (Wang et al. 2021, MIT): mean, shapes and priors of birds of many species."""
+
+
+def models_folder() -> Path:
+    """Return the folder of downloaded models: `JAXFIT_MODELS`, or the folder `jaxfit/models` of the user's data."""
+    return user_folder("models", "JAXFIT_MODELS")
 
 
 def import_avian_mesh(json_path: Path | str, prior_path: Path | str | None = None) -> Bird:

@@ -1,30 +1,17 @@
-"""The general segmenter: two published networks that the user downloads once, and the check of the two files."""
+"""The general segmenter: two published networks that the user downloads once."""
 
 from __future__ import annotations
 
-import hashlib
-import os
 from pathlib import Path
-from typing import Any, NamedTuple, cast
 
-from jaxfit.foundation.errors import InputError
-from jaxfit.foundation.reading import open_file
+from jaxfit.foundation.progress import ProgressTask, silent
+from jaxfit.foundation.published import PublishedFile, check_published, get_published, user_folder
 
 FOLDER_VARIABLE = "JAXFIT_NETWORKS"
 """Environment variable that names the folder of the files."""
-
-
-class PublishedNetwork(NamedTuple):
-    """A network that its publisher distributes as one file."""
-
-    file_name: str
-    url: str
-    """Address of the file at its publisher."""
-    sha256: tuple[str, ...]
-    """The accepted hashes; the first is that of the file of the publisher."""
-
-
-DETECTOR = PublishedNetwork(
+COMMAND = "jaxfit networks get general"
+"""The command that downloads the files."""
+DETECTOR = PublishedFile(
     "yolox_nano.onnx",
     "https://github.com/Megvii-BaseDetection/YOLOX/releases/download/0.1.1rc0/yolox_nano.onnx",
     (
@@ -32,22 +19,21 @@ DETECTOR = PublishedNetwork(
         # another export of this network, with PyTorch 2.1.1 (3,713,911 bytes); the docs' figures are from this file
         "d39bee73564e338080378b0ad567fbb40e818b55bbfaf971de82a0267ed16b8a",
     ),
+    COMMAND,
 )
 """YOLOX-nano, trained on COCO (Apache-2.0): boxes of the class bird."""
-SALIENCY = PublishedNetwork(
+SALIENCY = PublishedFile(
     "u2netp.onnx",
     "https://github.com/danielgatis/rembg/releases/download/v0.0.0/u2netp.onnx",
     ("309c8469258dda742793dce0ebea8e6dd393174f89934733ecc8b14c76f4ddd8",),
+    COMMAND,
 )
 """U²-Net-p (Apache-2.0), in the export of the project rembg: the salient object in each box."""
 
 
 def networks_folder() -> Path:
     """Return the folder of the files: `JAXFIT_NETWORKS`, or the folder `jaxfit/networks` of the user's data."""
-    named = os.environ.get(FOLDER_VARIABLE)
-    if named:
-        return Path(named)
-    return Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "jaxfit" / "networks"
+    return user_folder("networks", FOLDER_VARIABLE)
 
 
 def general_files() -> list[Path]:
@@ -63,11 +49,10 @@ def check_general_files() -> list[Path]:
     """
     files = general_files()
     for path, network in zip(files, (DETECTOR, SALIENCY), strict=True):
-        if not path.exists():
-            raise InputError(path, "does not exist; `general` needs the file", f"download {network.url} to this path")
-        with open_file(path, "an ONNX file") as file:
-            digest = hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
-        if digest not in network.sha256:
-            problem = "is not the published file: its SHA-256 differs"
-            raise InputError(path, problem, f"remove the file and download {network.url} to this path")
+        check_published(path, network)
     return files
+
+
+def get_general_files(source: Path | None = None, progress: ProgressTask = silent) -> list[Path]:
+    """Download both files, and return their paths. Arguments and errors are those of `get_published`."""
+    return get_published((DETECTOR, SALIENCY), networks_folder(), source, progress)

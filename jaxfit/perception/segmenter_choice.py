@@ -93,7 +93,7 @@ def choose_segmenter(source: str | Path, config: TrackConfig, progress: Progress
     if (settings.kind, settings.names) != (SegmenterConfig.kind, SegmenterConfig.names):
         return SegmenterChoice(BUILTIN, "`kind` or `names` describes one network", is_compared=False)
     if not any(path.exists() for path in general_files()):
-        reason = "for birds of other species, download the two files of `general`: docs/guide/networks.md#general-birds"
+        reason = "for birds of other species, run `jaxfit networks get general` first"
         return SegmenterChoice(BUILTIN, reason, is_compared=False)
     try:
         check_general_files()

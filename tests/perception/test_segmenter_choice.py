@@ -142,7 +142,7 @@ def test_without_the_files_no_network_runs(video, monkeypatch, tmp_path):
     assert config == TrackConfig(segmenter=SegmenterConfig("builtin"), min_track_frames=2)
     assert not choice.is_compared
     assert choice.info() == {}
-    assert "docs/guide/networks.md#general-birds" in choice.sentence()
+    assert "jaxfit networks get general" in choice.sentence()
 
 
 def test_a_wrong_file_is_reported(video, monkeypatch, tmp_path, caplog):
