@@ -49,24 +49,11 @@ def image_input(model: OnnxModel, unbatched: bool = False) -> ImageInput:
         raise InputError(model.path, problem, "give a network with one input")
     port = model.inputs[0]
     axes = port.shape
-    if len(axes) not in ((3, 4) if unbatched else (4,)):
-        raise InputError(
-            model.path, f"its input {port} is not a batch of pictures", "export it as (1, 3, height, width)"
-        )
-    if axes[-3] not in (3, None):
-        problem = f"its input {port} has {axes[-3]} channels, not 3"
-        raise InputError(
-            model.path, problem, "give a network for colour pictures, with the channels before height and width"
-        )
-    if len(axes) == 4 and axes[0] not in (1, None):
-        raise InputError(model.path, f"its input {port} is a batch of {axes[0]}", "export it for a batch of 1")
-    if port.kind not in _TYPES:
-        raise InputError(model.path, f"its input {port} is {port.kind}", "export it with an input of floats")
+    has_axes = (len(axes) == 4 and axes[0] in (1, None)) or (unbatched and len(axes) == 3)
+    if not (has_axes and axes[-3] in (3, None) and (axes[-2] is None) == (axes[-1] is None) and port.kind in _TYPES):
+        remedy = "export it as (1, 3, height, width) of floats, with both sides fixed or both variable"
+        raise InputError(model.path, f"its input {port} of {port.kind} is not supported", remedy)
     height, width = axes[-2:]
-    if (height is None) != (width is None):
-        raise InputError(
-            model.path, f"its input {port} has one variable side", "export it with both sides fixed or both variable"
-        )
     size = None if height is None or width is None else (width, height)
     return ImageInput(size, _TYPES[port.kind], len(axes) == 4)
 

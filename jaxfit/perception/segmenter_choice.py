@@ -162,11 +162,7 @@ def first_trust(
     return judge(
         FootageSignals(
             birds_per_frame=len(scores) / len(pictures),
-            short_tracks=0,
             tracks=len(scores),
-            short_share=None,
-            count_change=None,
-            contradicted_share=None,
             score=float(np.median(scores)) if scores and frame_distance is not None else None,
             confidence=float(np.median(np.concatenate(confidences))) if is_calibrated else None,
             frame_distance=frame_distance,

@@ -32,10 +32,7 @@ from jaxfit.perception.segmenter_choice import SegmenterChoice, with_chosen_segm
 from jaxfit.perception.tracking import (
     RecordedFrame,
     Tracker,
-    drop_low_scores,
-    drop_short_tracks,
     load_tracker,
-    mean_scores,
     observations_of,
 )
 from jaxfit.perception.trust import Trust, footage_signals, judge
@@ -178,12 +175,14 @@ def run_tracking(
     with clock("clean up"):
         names, footage = keypoints.keypoint_names, read_footage(source, reader.info.frames)
         all_tracks = observations_of(records, names, skeleton_pairs(names), reader.info.fps, footage)
-        long_tracks = drop_short_tracks(all_tracks, config.min_track_frames)
-        observations = drop_low_scores(long_tracks, min_score)
-    lengths = dict(zip(all_tracks.track_id.tolist(), all_tracks.present.sum(1).tolist(), strict=True))
-    short_tracks = {track: length for track, length in lengths.items() if track not in long_tracks.track_id}
-    scores = dict(zip(long_tracks.track_id.tolist(), mean_scores(long_tracks).tolist(), strict=True))
-    low_score_tracks = {track: score for track, score in scores.items() if track not in observations.track_id}
+        length = all_tracks.present.sum(1)  # frames with a detection of the bird, not the frames in between
+        score = np.where(all_tracks.present, np.asarray(all_tracks.score), 0).sum(1) / np.maximum(length, 1)
+        is_short = length < config.min_track_frames
+        is_low = ~is_short & (score < min_score)
+        observations = all_tracks.select(tracks=~is_short & ~is_low)
+    ids = all_tracks.track_id
+    short_tracks = dict(zip(ids[is_short].tolist(), length[is_short].tolist(), strict=True))
+    low_score_tracks = dict(zip(ids[is_low].tolist(), score[is_low].tolist(), strict=True))
     distances = [
         np.concatenate([record.segmenter_distance for record in records]).tolist(),
         np.concatenate([record.keypoint_distance for record in records]).tolist(),

@@ -48,23 +48,23 @@ class FootageSignals(NamedTuple):
 
     birds_per_frame: float
     """Mean number of tracked birds in a frame, short tracks included."""
-    short_tracks: int
+    short_tracks: int = 0
     """Number of tracks that are too short."""
-    tracks: int
+    tracks: int = 0
     """Number of all tracks."""
-    short_share: float | None
+    short_share: float | None = None
     """Share of the detections that belong to tracks that are too short."""
-    count_change: float | None
+    count_change: float | None = None
     """Mean change of the number of birds between consecutive frames, divided by `birds_per_frame`."""
-    score: float | None
+    score: float | None = None
     """Median score of the birds; None for a segmenter without statistics, because scores of networks differ."""
-    contradicted_share: float | None
+    contradicted_share: float | None = None
     """Share of the birds whose keypoints contradict their masks (`jaxfit.data.flags`)."""
-    confidence: float | None
+    confidence: float | None = None
     """Median over the birds of the mean confidence of a bird's keypoints; None for confidences without a curve."""
-    frame_distance: float | None
+    frame_distance: float | None = None
     """Median over the frames of the distance of the segmenter's activations."""
-    bird_distance: float | None
+    bird_distance: float | None = None
     """Median over the birds of the distance of the activations of the keypoint network."""
 
 
@@ -141,65 +141,59 @@ def judge(signals: FootageSignals) -> Trust:
     Args:
         signals: the signals; a signal that is None is not judged.
     """
-    reasons = tuple(rule.reason(signals) for rule in _RULES if rule.is_broken(signals))
+    reasons = []
+    for signal, limit, bound, text, unit in _RULES:
+        value = getattr(signals, signal)
+        if value is not None and (value > limit if bound == "at most" else value < limit):
+            reasons.append(f"{text.format(**signals._asdict())} ({bound} {limit:{unit}} on simulated footage)")
     if not signals.tracks:
-        reasons = ("no bird was tracked", *reasons)
-    return Trust("low" if reasons else "high", reasons, signals)
-
-
-class _Rule(NamedTuple):
-    """The limit of a signal, and the reason that the user reads if the signal lies beyond it."""
-
-    signal: str
-    limit: float
-    is_upper: bool
-    text: str
-    limit_format: str = ".2g"
-
-    def is_broken(self, signals: FootageSignals) -> bool:
-        value = getattr(signals, self.signal)
-        return value is not None and (value > self.limit if self.is_upper else value < self.limit)
-
-    def reason(self, signals: FootageSignals) -> str:
-        bound = "at most" if self.is_upper else "at least"
-        limit = f"{bound} {self.limit:{self.limit_format}} on simulated footage"
-        return f"{self.text.format(**signals._asdict())} ({limit})"
+        reasons.insert(0, "no bird was tracked")
+    return Trust("low" if reasons else "high", tuple(reasons), signals)
 
 
 _RULES = (
-    _Rule(
+    (
         "frame_distance",
         MAX_FRAME_DISTANCE,
-        True,
+        "at most",
         "the frames differ from the training of the segmenter: distance {frame_distance:.2f}",
+        ".2g",
     ),
-    _Rule(
+    (
         "bird_distance",
         MAX_BIRD_DISTANCE,
-        True,
+        "at most",
         "the birds differ from the training of the keypoint network: distance {bird_distance:.2f}",
+        ".2g",
     ),
-    _Rule("score", MIN_SCORE, False, "the scores of the birds are low: median {score:.2f}"),
-    _Rule(
+    ("score", MIN_SCORE, "at least", "the scores of the birds are low: median {score:.2f}", ".2g"),
+    (
         "contradicted_share",
         MAX_CONTRADICTED_SHARE,
-        True,
+        "at most",
         "{contradicted_share:.0%} of the birds have keypoints outside their masks",
         ".0%",
     ),
-    _Rule("confidence", MIN_CONFIDENCE, False, "the confidences of the keypoints are low: median {confidence:.2f}"),
-    _Rule(
+    (
+        "confidence",
+        MIN_CONFIDENCE,
+        "at least",
+        "the confidences of the keypoints are low: median {confidence:.2f}",
+        ".2g",
+    ),
+    (
         "short_share",
         MAX_SHORT_SHARE,
-        True,
+        "at most",
         "{short_tracks} of {tracks} tracks are too short, and hold {short_share:.0%} of the detections",
         ".0%",
     ),
-    _Rule(
+    (
         "count_change",
         MAX_COUNT_CHANGE,
-        True,
+        "at most",
         "the number of birds changes by {count_change:.0%} from frame to frame",
         ".0%",
     ),
 )
+"""Signal, limit, kind of limit, the reason that the user reads beyond the limit, and the format of the limit."""

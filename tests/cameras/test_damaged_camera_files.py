@@ -2,20 +2,19 @@
 
 import numpy as np
 import pytest
-import scipy.io
 from support.camera_files import (
     ANIPOSE,
     MATRIX,
     ROTATION,
     STEREO,
     camera_values,
-    cell,
     matlab_values,
     write_colmap,
     write_storage,
 )
 
 from jaxfit.cameras.files import read_camera_file, read_cameras
+from jaxfit.cameras.formats import dannce
 from jaxfit.foundation.errors import InputError
 
 
@@ -170,22 +169,26 @@ def test_an_unknown_unit_of_length_is_refused(tmp_path):
         ({"K": None}, "lacks K"),
     ],
 )
-def test_an_impossible_value_of_dannce_is_refused(tmp_path, changes, message):
+def test_an_impossible_value_of_dannce_is_refused(tmp_path, monkeypatch, changes, message):
     values = {key: value for key, value in (matlab_values() | changes).items() if value is not None}
-    scipy.io.savemat(tmp_path / "rig.mat", {"params": cell([matlab_values(), values])})
+    monkeypatch.setattr(dannce, "read_variables", lambda *_: {"params": [matlab_values(), values]})
+    (tmp_path / "rig.mat").write_bytes(b"MATLAB")
     refused(tmp_path / "rig.mat", rf"params\{{2\}}.*{message}")
 
 
-def test_another_structure_of_a_mat_file_is_refused(tmp_path):
-    path = tmp_path / "a.mat"
-    scipy.io.savemat(path, {"x": np.eye(3)})
-    refused(path, "the file lacks K, R, t")
-    scipy.io.savemat(path, {"params": cell([np.eye(3)])})
-    refused(path, r"params\{1\} is not a struct")
-    scipy.io.savemat(path, {"params": cell([matlab_values()] * 2), "camnames": cell(["a", "b", "c"])})
-    refused(path, "holds 2 cameras and 3 camnames")
-    scipy.io.savemat(path, {"params": cell([matlab_values()] * 2), "camnames": cell(["a", "a"])})
-    refused(path, 'two cameras with the name "a"')
+@pytest.mark.parametrize(
+    ("variables", "message"),
+    [
+        ({"x": 1.0}, "the file lacks K, R, t"),
+        ({"params": [1.0]}, r"params\{1\} is not a struct"),
+        ({"params": [matlab_values()] * 2, "camnames": ["a", "b", "c"]}, "holds 2 cameras and 3 camnames"),
+        ({"params": [matlab_values()] * 2, "camnames": ["a", "a"]}, 'two cameras with the name "a"'),
+    ],
+)
+def test_another_structure_of_a_mat_file_is_refused(tmp_path, monkeypatch, variables, message):
+    monkeypatch.setattr(dannce, "read_variables", lambda *_: variables)
+    (tmp_path / "a.mat").write_bytes(b"MATLAB")
+    refused(tmp_path / "a.mat", message)
 
 
 @pytest.mark.parametrize(

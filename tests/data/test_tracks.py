@@ -16,7 +16,7 @@ from jaxfit.fitting.fit import fit
 from jaxfit.fitting.windows import filter_observations
 from jaxfit.foundation.errors import InputError
 from jaxfit.perception.network import instance_of
-from jaxfit.perception.tracking import drop_low_scores, drop_short_tracks, observations_of, record_frame
+from jaxfit.perception.tracking import observations_of, record_frame
 
 NAMES, SIZE = ("bill", "left_eye", "right_eye"), (60, 40)
 
@@ -91,25 +91,6 @@ def test_a_frame_that_contradicts_itself_is_refused():
         record_frame(5, "a", SIZE, one * 2, [1, 1], np.zeros((2, 3, 2)), np.zeros((2, 3)))
     with pytest.raises(ValueError, match=r"must have 2 instances, not \(1, 1\)"):
         record_frame(5, "a", SIZE, one * 2, [1, 2], points, points[..., 0])
-
-
-def test_short_tracks_are_dropped_by_their_detections():
-    """Track 1 lasts eight frames and was detected in three, track 2 lasts four, in all of which it was detected."""
-    seen = record({t: [(2, 20)] * (t < 4) + [(1, 0)] * (t in (0, 3, 7)) for t in range(8)})
-    assert [drop_short_tracks(seen, least).track_id.tolist() for least in (1, 3, 4, 5)] == [[1, 2], [1, 2], [2], []]
-    kept = drop_short_tracks(seen, 4)
-    assert kept.num_frames == 8
-    assert kept.mask(0, 2).sum() == 59
-
-
-def test_tracks_with_low_mean_scores_are_dropped():
-    """Only frames with a detection count for the mean; observations without scores do not change."""
-    seen = record({t: [(2, 20)] * (t < 4) + [(1, 0)] * (t in (0, 3, 7)) for t in range(8)})
-    score = np.where(seen.present, np.array([[0.8], [0.5]], np.float32), 0)
-    score[0, 0] = 0.5  # the mean of track 1 is 0.7
-    scored = dataclasses.replace(seen, score=score)
-    assert [drop_low_scores(scored, least).track_id.tolist() for least in (0.5, 0.6, 0.71)] == [[1, 2], [1], []]
-    assert drop_low_scores(dataclasses.replace(seen, score=None), 0.9).num_tracks == 2
 
 
 def moving(points, numbers, confidence=None, side=10.0):

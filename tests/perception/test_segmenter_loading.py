@@ -1,5 +1,6 @@
 """Loading of segmenters, and errors for unsupported files."""
 
+import re
 from functools import partial
 
 import numpy as np
@@ -59,19 +60,20 @@ def test_unknown_layouts_are_reported_with_the_supported_layouts(path, outputs):
 
 
 @pytest.mark.parametrize(
-    ("shape", "kind", "problem"),
+    ("shape", "kind"),
     [
-        ((1, 1, 64, 64), TensorProto.FLOAT, "1 channels, not 3"),
-        ((1, 64, 64, 3), TensorProto.FLOAT, "64 channels, not 3"),
-        ((2, 3, 64, 64), TensorProto.FLOAT, "a batch of 2"),
-        ((1, 3, 64, "width"), TensorProto.FLOAT, "one variable side"),
-        ((1, 3, 64, 64), TensorProto.UINT8, "tensor.uint8"),
-        ((3, 64, 64), TensorProto.FLOAT, "not a batch of pictures"),
+        ((1, 1, 64, 64), TensorProto.FLOAT),
+        ((1, 64, 64, 3), TensorProto.FLOAT),
+        ((2, 3, 64, 64), TensorProto.FLOAT),
+        ((1, 3, 64, "width"), TensorProto.FLOAT),
+        ((1, 3, 64, 64), TensorProto.UINT8),
+        ((3, 64, 64), TensorProto.FLOAT),
     ],
 )
-def test_unsupported_inputs(path, shape, kind, problem):
+def test_unsupported_inputs(path, shape, kind):
     write(path, shape, kind, output0=np.zeros((1, 116, 9000)), output1=PROTOS)
-    with pytest.raises(InputError, match=problem):
+    sides = ", ".join("?" if side == "width" else str(side) for side in shape)
+    with pytest.raises(InputError, match=rf"images \({re.escape(sides)}\) of tensor.*export it as \(1, 3,"):
         load(path)
 
 
