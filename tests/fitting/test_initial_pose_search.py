@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.birds import exp_map, tiny_bird
+from support.birds import exp_map, pose_window, tiny_bird
 
 from jaxfit.config.fit import InitialiseConfig
 from jaxfit.fitting.initial_poses import (
@@ -22,11 +22,10 @@ from jaxfit.fitting.initial_poses import (
     search_initial_poses,
 )
 from jaxfit.model.camera import CropCamera, project
-from jaxfit.model.kinematics import fold_bird, window_keypoints, window_transforms
+from jaxfit.model.kinematics import fold_bird
 from jaxfit.model.rotation import viewing_axis_rotations
 
 BIRD, CAMERA = tiny_bird(), CropCamera()
-RIG = fold_bird(BIRD)
 FROM_ABOVE = np.diag([1.0, -1.0, -1.0])
 ABOVE, AROUND = InitialiseConfig(), InitialiseConfig(method="so3", turns=16, directions=60, candidates=48)
 
@@ -41,12 +40,12 @@ def projected(R, scale=1.0, depth=200.0, shift=(1.0, -2.0)):
     return np.array(project(scale * keypoints @ np.swapaxes(R, -1, -2) + [*shift, depth], CAMERA))
 
 
-def search(keypoints_px, config, confidence=None, common_size=True):
+def search(keypoints_px, config, confidence=None, common_size=True, bird=BIRD):
     """Return the initial poses of one window, with leading axes H, T."""
-    keypoints_px = np.asarray(keypoints_px, np.float32)
     confidence = np.ones(keypoints_px.shape[:2]) if confidence is None else confidence
-    one = (jnp.asarray(keypoints_px)[None], jnp.asarray(confidence, jnp.float32)[None])
-    return jax.tree.map(lambda x: np.asarray(x)[0], search_initial_poses(BIRD, RIG, *one, config, CAMERA, common_size))
+    one = np.float32(keypoints_px)[None], np.float32(confidence)[None]
+    found = search_initial_poses(bird, fold_bird(bird), *one, config, CAMERA, common_size)
+    return jax.tree.map(lambda x: np.asarray(x)[0], found)
 
 
 def turns(rng, frames):
@@ -74,20 +73,20 @@ def test_the_papers_candidates():
 
 def test_the_match_recovers_scale_and_shift():
     """The true candidate has cost 0 and the true scale. With an outlier, it still has the lowest cost and the scale."""
-    candidates = candidate_orientations(ABOVE)
+    candidates, matched = candidate_orientations(ABOVE), jax.jit(match_candidates)
     flat = np.asarray(BIRD.keypoints, np.float64) @ candidates[7, :2].T
     points = 9.5 * flat + [100, 140]
     confidence = np.linspace(0.5, 1, len(points))
     with_outlier = points.copy()
     with_outlier[3] += [90, -70]
     for detected in (points, with_outlier):
-        match = match_candidates(*map(jnp.asarray, (candidates, BIRD.keypoints, detected, confidence)))
+        match = matched(*map(np.float32, (candidates, BIRD.keypoints, detected, confidence)))
         assert int(np.argmin(match.cost)) == 7
         assert float(match.scale_px[7]) == pytest.approx(9.5, rel=0.01)
         assert (np.asarray(match.scale_px) > 0).all()
-    clean = match_candidates(*map(jnp.asarray, (candidates, BIRD.keypoints, points, confidence)))
+    clean = matched(*map(np.float32, (candidates, BIRD.keypoints, points, confidence)))
     assert float(clean.cost[7]) == pytest.approx(0, abs=1e-3)
-    missing = match_candidates(*map(jnp.asarray, (candidates, BIRD.keypoints, points, 0 * confidence)))
+    missing = matched(*map(np.float32, (candidates, BIRD.keypoints, points, 0 * confidence)))
     np.testing.assert_array_equal(missing.cost, 0)
 
 
@@ -118,8 +117,7 @@ def test_the_initial_pose_matches_the_keypoints(common_size):
     assert pose.scale.shape == ((1, 1) if common_size else (1, 6))
     assert pose.body_pose.shape == (1, 6, 3, 3)
     np.testing.assert_array_equal(pose.body_pose[0, 0], np.asarray(BIRD.pose_mean).reshape(3, 3))
-    window = jax.tree.map(lambda x: jnp.asarray(x)[0], pose)
-    posed = project(window_keypoints(RIG, window_transforms(RIG, window), window), CAMERA)
+    posed = project(pose_window(BIRD, jax.tree.map(lambda x: x[0], pose))[0], CAMERA)
     apart = np.linalg.norm(np.asarray(posed) - points, axis=-1)
     # the means agree; perspective and the common size leave errors of a few pixels on a bird of 200 pixels
     np.testing.assert_allclose(np.asarray(posed).mean(1), points.mean(1), atol=3)
@@ -131,15 +129,13 @@ def test_the_initial_pose_matches_the_keypoints(common_size):
 
 def test_the_bird_rotates_about_its_root():
     """The initial pose also matches the keypoints if the root of the model is far from the origin."""
-    shift = jnp.array([4.0, -7.0, 3.0])
-    far = dataclasses.replace(BIRD, vertices=BIRD.vertices + shift, joints=BIRD.joints + shift)
-    points = projected(np.broadcast_to(FROM_ABOVE, (6, 3, 3)), depth=150.0).astype(np.float32)
-    one = (jnp.asarray(points)[None], jnp.ones((1, 6, BIRD.num_keypoints)))
+    shift = np.float32([4.0, -7.0, 3.0])
+    moved = {name: np.asarray(getattr(BIRD, name)) + shift for name in ("vertices", "joints")}
+    points = projected(np.broadcast_to(FROM_ABOVE, (6, 3, 3)), depth=150.0)
     posed = []
-    for bird in (BIRD, far):
-        rig = fold_bird(bird)
-        window = jax.tree.map(lambda x: x[0, 0], search_initial_poses(bird, rig, *one, ABOVE, CAMERA, True))
-        posed.append(project(window_keypoints(rig, window_transforms(rig, window), window), CAMERA))
+    for bird in (BIRD, dataclasses.replace(BIRD, **jax.device_put(moved))):
+        window = jax.tree.map(lambda x: x[0], search(points, ABOVE, bird=bird))
+        posed.append(project(pose_window(bird, window)[0], CAMERA))
     np.testing.assert_allclose(posed[1], posed[0], atol=0.01)
 
 
@@ -219,8 +215,9 @@ def test_hypotheses_differ(method):
 def test_windows_are_independent():
     rng = np.random.default_rng(5)
     points = np.stack([projected(turns(rng, 6)) for _ in range(3)]).astype(np.float32)
-    ones = jnp.ones(points.shape[:3])
-    together = search_initial_poses(BIRD, RIG, jnp.asarray(points), ones, ABOVE, CAMERA, True)
+    ones = np.ones(points.shape[:3], np.float32)
+    together = search_initial_poses(BIRD, fold_bird(BIRD), points, ones, ABOVE, CAMERA, True)
     for w in range(3):
-        np.testing.assert_allclose(together.global_orient[w], search(points[w], ABOVE).global_orient, atol=1e-5)
-        np.testing.assert_allclose(together.transl[w], search(points[w], ABOVE).transl, rtol=1e-4, atol=1e-4)
+        alone = search(points[w], ABOVE)
+        np.testing.assert_allclose(np.asarray(together.global_orient)[w], alone.global_orient, atol=1e-5)
+        np.testing.assert_allclose(np.asarray(together.transl)[w], alone.transl, rtol=1e-4, atol=1e-4)

@@ -11,10 +11,10 @@ import pytest
 from support.kernel_cases import STORED, cases, read_cases
 
 KERNELS = Path(__file__).resolve().parents[2] / "kernels"
+pytestmark = pytest.mark.extended
 COMPILER = shlex.split(os.environ.get("CXX", "c++"))
 
 
-@pytest.mark.extended
 def test_stored_cases_are_those_of_the_reference():
     stored, expected = read_cases(STORED.read_text(encoding="utf-8")), cases()
     assert len(stored) == len(expected)
