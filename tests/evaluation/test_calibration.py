@@ -6,12 +6,12 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.birds import solution_of, toy_bird
+from support.birds import error_bars, solution_of, toy_bird
 
 from jaxfit.cli.main import main
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.projection import projected_observations
-from jaxfit.data.solution import ERROR_BARS, Solution, save_solution
+from jaxfit.data.solution import save_solution
 from jaxfit.evaluation.calibration import calibration
 from jaxfit.evaluation.truth import Truth
 from jaxfit.foundation.errors import InputError
@@ -20,13 +20,6 @@ from jaxfit.simulation.flock import smooth_motion
 BIRD = toy_bird()
 N, T, K, J = 2, 60, BIRD.num_keypoints, BIRD.num_joints
 SD_RAD = 0.05
-
-
-def with_error_bars(solution: Solution, **values) -> Solution:
-    """Return a solution with error bars: 0 or the given values."""
-    sizes = {"N": N, "T": T, "K": K, "bones": J - 1, "S": BIRD.num_shapes, "2": 2, "3": 3}
-    arrays = {name: np.zeros([sizes[s] for s in shape.split()], np.float32) for name, (shape, _) in ERROR_BARS.items()}
-    return solution.with_arrays(**(arrays | values))
 
 
 def made(scale=1.0, seed=0):
@@ -46,18 +39,13 @@ def made(scale=1.0, seed=0):
         return (Rotation.from_rotvec(axis_angles.reshape(-1, 3)) * delta).as_rotvec().reshape(axis_angles.shape)
 
     error_cam -= error_cam.mean(2, keepdims=True)
-    result = with_error_bars(
-        true.with_arrays(
-            keypoints_cam=true.keypoints.cam + error_cam,
-            keypoints_px=true.keypoints.px + error_px,
-            global_orient=turned(true.poses.global_orient),
-            body_pose=turned(true.poses.body_pose),
-        ),
-        keypoints_centred_cov=covariance_cam,
-        keypoints_px_cov=covariance_px,
-        global_orient_sd=np.full((N, T, 3), SD_RAD),
-        body_pose_sd=np.full((N, T, J - 1, 3), SD_RAD),
-        misfit=np.ones((N, T)),
+    covariances = {"keypoints_centred_cov": covariance_cam, "keypoints_px_cov": covariance_px}
+    result = true.with_arrays(
+        keypoints_cam=true.keypoints.cam + error_cam,
+        keypoints_px=true.keypoints.px + error_px,
+        global_orient=turned(true.poses.global_orient),
+        body_pose=turned(true.poses.body_pose),
+        **error_bars(true, **covariances, global_orient_sd=SD_RAD, body_pose_sd=SD_RAD, misfit=1.0),
     )
     return result, Truth(projected_observations(true), true, BIRD)
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.exported import BIRD, FPS, FRAMES, TRACKS, write_result
+from support.birds import error_bars
+from support.exported import BIRD, FPS, FRAMES, TRACKS, solution, write_result
 
 import jaxfit
 from jaxfit.cli.main import main
-from jaxfit.data.solution import ERROR_BARS
 from jaxfit.foundation.errors import InputError
 from jaxfit.foundation.extras import OPTIONAL_PACKAGES
 
@@ -117,10 +117,7 @@ def test_error_bars(tmp_path):
     """Columns and a variable of standard deviations, in the units of their values."""
     xarray = pytest.importorskip("xarray", reason="xarray is not installed")
     pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")
-    sizes = {"N": 3, "T": len(FRAMES), "K": BIRD.num_keypoints, "bones": BIRD.num_joints - 1, "S": BIRD.num_shapes}
-    sizes |= {"2": 2, "3": 3}
-    arrays = {name: np.full([sizes[s] for s in shape.split()], 4.0) for name, (shape, _) in ERROR_BARS.items()}
-    made = write_result(tmp_path / "result", **arrays)
+    made = write_result(tmp_path / "result", **error_bars(solution(), 4.0))
     jaxfit.export_result(tmp_path / "result", "csv", tmp_path / "birds.csv")
     rows, angles = rows_of(tmp_path / "birds.csv"), rows_of(tmp_path / "birds_angles.csv")
     expected = np.where(made.valid, 2.0, np.nan)

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from support.exported import BIRD, FPS, FRAMES, TRACKS, error_bars, write_result
+from support.birds import error_bars
+from support.exported import BIRD, FPS, FRAMES, TRACKS, solution, write_result
 from support.films import encode
 
 import jaxfit
@@ -23,7 +24,7 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("nwb")
     doubts = np.zeros(SHAPE[:2], np.int8)
     doubts[1] = [1, -1, -1, 4, 12]
-    bars = error_bars(SHAPE, keypoints_px_cov=VARIANCE[..., None, None] * np.diag([1, 4]).astype(np.float32))
+    bars = error_bars(solution(), keypoints_px_cov=VARIANCE[..., None, None] * np.diag([1, 4]))
     made = write_result(folder / "result", video="/films/a/clip.mp4", **bars, doubts=doubts)
     jaxfit.export_result(folder / "result", "nwb", folder / "nwb", start="2024-06-01T12:00:00+02:00")
     return made, folder / "nwb"

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from jaxfit.data.solution import Solution
+from jaxfit.data.solution import ERROR_BARS, Solution
 from jaxfit.model.bird import Bird, neutral_colours, unlimited_joints
 from jaxfit.model.camera import CropCamera, crop_to_image, project
 from jaxfit.model.kinematics import Pose, fold_bird, window_keypoints, window_transforms, window_vertices
@@ -244,3 +244,9 @@ def filled_mask(vertices_px, faces, size: int) -> np.ndarray:
         inside = np.all([s >= 0 for s in sides], axis=0) | np.all([s <= 0 for s in sides], axis=0)
         canvas[low[1] : high[1], low[0] : high[0]] |= inside
     return canvas
+
+
+def error_bars(solution, default=0.0, **values):
+    """Return the arrays of error bars of a solution; values are broadcast to their shapes."""
+    cells = solution.cells(error_bars=True)
+    return {name: np.full(cells[name].shape, values.get(name, default), np.float32) for name in ERROR_BARS}

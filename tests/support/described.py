@@ -13,7 +13,7 @@ from jaxfit.model.bird import Bird
 from jaxfit.model.files import load_murre
 from jaxfit.model.kinematics import Pose
 from jaxfit.model.murre import POSTURES
-from support.birds import skin_by_hand
+from support.birds import error_bars, skin_by_hand
 
 BIRD = load_murre()
 UNIT_M = BIRD.metres_per_unit
@@ -125,39 +125,22 @@ def in_lengths(flock: Flock) -> Flock:
 
 def with_error_bars(solution: Solution, orient_sd=0.0, body_sd=0.0) -> Solution:
     """Return a result with error bars of angles, radians, broadcast to (N, T, 3) and (N, T, J−1, 3)."""
-    N, T, K = *solution.valid.shape, len(solution.keypoint_names)
     return solution.with_arrays(
-        global_orient_sd=np.array(np.broadcast_to(orient_sd, (N, T, 3))),
-        body_pose_sd=np.array(np.broadcast_to(body_sd, solution.poses.body_pose.shape)),
-        transl_sd=np.zeros((N, T, 3)),
-        scale_sd=np.zeros((N, T)),
-        bone_length_sd=np.zeros_like(solution.poses.bone_length),
-        betas_sd=np.zeros_like(solution.poses.betas),
-        keypoints_cam_cov=np.zeros((N, T, K, 3, 3)),
-        keypoints_centred_cov=np.zeros((N, T, K, 3, 3)),
-        keypoints_px_cov=np.zeros((N, T, K, 2, 2)),
-        misfit=np.ones((N, T)),
+        **error_bars(solution, global_orient_sd=orient_sd, body_pose_sd=body_sd, misfit=1.0),
     )
 
 
-def mesh_by_hand(body_pose, turn, place_m, scale=1.0, bird=BIRD):
-    """Return vertices and joints of one bird in the world, metres; no code of the package poses the bird."""
-    root = scale * np.asarray(bird.joints[0], float)
+def points_by_hand(body_pose, turn, place_m, scale=1.0, bird=BIRD):
+    """Return joints and keypoints of one bird in the world by name, metres; no code of the package poses the bird."""
     pose = Pose(
         global_orient=Rotation.from_matrix(turn).as_rotvec(),
         body_pose=body_pose,
-        transl=np.asarray(place_m) / bird.metres_per_unit - root,
+        transl=np.asarray(place_m) / bird.metres_per_unit - scale * np.asarray(bird.joints[0], float),
         scale=np.asarray(scale),
         bone_length=np.ones(bird.num_joints - 1),
         betas=np.zeros(bird.num_shapes),
     )
-    vertices, joints = skin_by_hand(bird, pose)
-    return vertices * bird.metres_per_unit, joints * bird.metres_per_unit
-
-
-def points_by_hand(body_pose, turn, place_m, scale=1.0, bird=BIRD):
-    """Return joints and keypoints of one bird in the world by name, metres, from `mesh_by_hand`."""
-    vertices, joints = mesh_by_hand(body_pose, turn, place_m, scale, bird)
+    vertices, joints = (points * bird.metres_per_unit for points in skin_by_hand(bird, pose))
     keypoints = np.asarray(bird.keypoint_weights, float) @ vertices
     return dict(zip(bird.joint_names, joints, strict=True)), dict(zip(bird.keypoint_names, keypoints, strict=True))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxfit.data.formats.coco import write_coco
 from jaxfit.data.projection import projected_observations
-from jaxfit.data.solution import ERROR_BARS, Solution, save_solution
+from jaxfit.data.solution import Solution, save_solution
 from jaxfit.simulation.flock import smooth_motion
 from support.birds import solution_of, toy_bird
 
@@ -27,14 +27,6 @@ def solution(**changes) -> Solution:
     parts = {"track_id": np.array(TRACKS), "frame_index": np.array(FRAMES), "valid": valid, **arrays}
     parts |= {"status": np.array(["ok", "partly diverged", "diverged"]), "fps": FPS}
     return fitted.with_arrays(**(parts | {"timestamp_s": np.array(FRAMES) / FPS} | changes))
-
-
-def error_bars(shape, bird=BIRD, **values):
-    """Arrays of error bars for N tracks, T frames and K keypoints (`shape`): 0 except for the given values."""
-    sizes = dict(zip("NTK", shape, strict=True)) | {"bones": bird.num_joints - 1, "S": bird.num_shapes, "2": 2, "3": 3}
-    return {
-        name: np.zeros([sizes[s] for s in axes.split()], np.float32) for name, (axes, _) in ERROR_BARS.items()
-    } | values
 
 
 def write_result(folder, with_detections=False, video=None, bird=BIRD, **changes):
