@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.birds import filled_mask, pose_window
-from support.exported import error_bars
+from support.birds import error_bars, filled_mask, pose_window
 from support.overlays import BIRD, CAMERA, CROPS, FIRST, FPS, GREY, HEIGHT, WIDTH, N, T, film, solution
 
 from jaxfit.data.observations import Observations
@@ -218,7 +217,7 @@ def test_a_frame_shows_regions_and_flags(tmp_path):
     video, shape = film(tmp_path / "f.mp4"), (N, T, BIRD.num_keypoints)
     covariance = np.zeros((*shape, 2, 2), np.float32)
     covariance[0, :, 0] = np.diag([400, 25])
-    plain = solution().with_arrays(**error_bars(shape, BIRD))
+    plain = solution().with_arrays(**error_bars(solution()))
     doubts = np.where(np.arange(N)[:, None] == 1, 4, np.zeros((N, T), np.int8)).astype(np.int8)
     changes = {
         "none": solution(),

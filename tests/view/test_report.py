@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 import pytest
 from support import overlays
+from support.birds import error_bars
 from support.cli_files import rejected
-from support.exported import BIRD, FRAMES, TRACKS, error_bars, solution, write_result
+from support.exported import BIRD, FRAMES, TRACKS, solution, write_result
 
 from jaxfit.behaviour.bouts import OTHER, Bout, Budget, Ethogram, time_budget
 from jaxfit.behaviour.page import BehaviourPage, Kind
@@ -73,7 +74,7 @@ def folder(tmp_path_factory):
     doubts = np.zeros(shape[:2], np.int8)
     doubts[0] = [0, 0, 1, 8, 8]
     changes = {"loss": {"a": np.array([10.0, 2.0, np.nan]), "b": np.array([0.5, 2.0, np.nan])}, "doubts": doubts}
-    bars = error_bars(shape, keypoints_centred_cov=covariance)
+    bars = error_bars(solution(), keypoints_centred_cov=covariance)
     write_result(folder, with_detections=True, video=f"/films/{FILM}", **bars, **changes)
     summary = json.loads((folder / "summary.json").read_text())
     summary |= {

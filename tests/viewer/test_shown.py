@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import overlays
-from support.exported import error_bars
+from support.birds import error_bars
 from support.viewed import shown, unpacked, write_result
 
 from jaxfit.data.flags import flags
@@ -133,8 +133,7 @@ def test_regions_are_the_axes_of_the_covariance(tmp_path):
     assert found[1].tolist() == [-32768] * 3
     assert found[0][:2] / 64 == pytest.approx([long, short], abs=0.01)
     assert found[0][2] / 100 % 180 == pytest.approx(30, abs=0.01)
-    shape = (overlays.N, overlays.T, len(overlays.solution().keypoint_names))
-    folder, _ = write_result(tmp_path, **error_bars(shape, overlays.BIRD))
+    folder, _ = write_result(tmp_path, **error_bars(overlays.solution()))
     assert "regions" in unpacked(shown(folder).part(0))[1]
 
 
