@@ -61,8 +61,7 @@ from jaxfit.learning.networks.network_files import (
     load_keypoint_base,
     load_segmenter_base,
     store_training_activations,
-    write_keypoints,
-    write_segmenter,
+    write_network,
 )
 from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.scenes import film_scenes
@@ -362,10 +361,8 @@ class _FineTuning:
         return self._accuracy(self.folder / CHECKED, {name: name for name in self.data.keypoint_names})
 
     def _write(self, scale: Scale, facts: Mapping[str, str], path: Path) -> None:
-        if self.network == "segmenter":
-            write_segmenter(self.model, facts, path, scale.longer_side_px)
-        else:
-            write_keypoints(self.model, self.data.keypoint_names, facts, path, scale.crops)
+        names = self.data.keypoint_names
+        write_network(self.network, self.model, facts, path, names, scale.longer_side_px, scale.crops)
 
 
 def _doubt(taught: Taught, result: FineTuned) -> str:

@@ -37,6 +37,7 @@ from jaxfit.learning.networks.labelled_frames import LabelledFrames
 from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.segmenter import segmenter_network
 from jaxfit.learning.priors import oas_shrinkage
+from jaxfit.model.anatomy import MURRE_KEYPOINTS
 from jaxfit.perception.keypoints import BUILTIN_PATH, CropSettings, load_keypoint_detector
 from jaxfit.perception.network import OUTPUT, ActivationStatistics, OnnxModel, Segmenter, instance_of
 from jaxfit.perception.segmentation import BUILTIN, LONGER_SIDE_PX, BottomUp, load_segmenter
@@ -124,39 +125,32 @@ class Probabilities(nn.Module):
         return torch.sigmoid(maps["foreground"]), maps["centre"], maps["offset"]
 
 
-def write_segmenter(
-    network: nn.Module, facts: Mapping[str, str], path: str | Path, longer_side_px: int = LONGER_SIDE_PX
-) -> None:
-    """Write a segmenter to an ONNX file.
-
-    Args:
-        network: the trained network.
-        facts: metadata about the training.
-        path: the `.onnx` file; an existing file is replaced.
-        longer_side_px: longer side of the pictures that the network expects.
-    """
-    metadata = {"names": repr({0: "bird"}), "longer_side": str(longer_side_px), **facts}
-    outputs = ("foreground", "centre", "offset")
-    example, axes = torch.rand(1, 3, 256, 320), {2: "height", 3: "width"}
-    export_onnx(Probabilities(network).eval(), example, axes, outputs, metadata, path)
-
-
-def write_keypoints(
+def write_network(
+    which: str,
     network: nn.Module,
-    names: Sequence[str],
     facts: Mapping[str, str],
     path: str | Path,
+    names: Sequence[str] = MURRE_KEYPOINTS,
+    longer_side_px: int = LONGER_SIDE_PX,
     crops: CropSettings = CROPS,
 ) -> None:
-    """Write a keypoint network to an ONNX file.
+    """Write a trained network to an ONNX file.
 
     Args:
+        which: `segmenter` or `keypoints`.
         network: the trained network.
-        names: names of the keypoints, without commas.
         facts: metadata about the training.
         path: the `.onnx` file; an existing file is replaced.
-        crops: the crops of the training.
+        names: names of the keypoints of a keypoint network, without commas.
+        longer_side_px: longer side of the pictures that a segmenter expects.
+        crops: the crops of the training of a keypoint network.
     """
+    if which == "segmenter":
+        metadata = {"names": repr({0: "bird"}), "longer_side": str(longer_side_px), **facts}
+        outputs = ("foreground", "centre", "offset")
+        example, axes = torch.rand(1, 3, 256, 320), {2: "height", 3: "width"}
+        export_onnx(Probabilities(network).eval(), example, axes, outputs, metadata, path)
+        return
     side = keypoints.SIDE_PX
     metadata = {
         "keypoint_names": ",".join(names),

@@ -29,8 +29,7 @@ from jaxfit.learning.networks.network_files import (
     load_keypoint_base,
     load_segmenter_base,
     store_training_activations,
-    write_keypoints,
-    write_segmenter,
+    write_network,
 )
 from jaxfit.learning.networks.networks import FeaturePyramid
 from jaxfit.learning.networks.scenes import film_scenes
@@ -393,25 +392,21 @@ def train_network(
         "schedule": json.dumps(schedule._asdict()),
         "loss": json.dumps({name: round(value, 5) for name, value in losses.items()}),
     }
-    if which == "segmenter":
-        write_segmenter(network, facts, path)
-        store_training_activations(which, path, [frames], progress=progress)
-    else:
-        write_keypoints(network, MURRE_KEYPOINTS, facts, path)
-        # a keypoint network sees the birds that a segmenter detects
-        store_training_activations(which, path, [frames], load_segmenter("builtin"), progress)
+    write_network(which, network, facts, path)
+    # a keypoint network sees the birds that a segmenter detects
+    birds_of = load_segmenter("builtin") if which == "keypoints" else None
+    store_training_activations(which, path, [frames], birds_of, progress)
     return losses
 
 
 def _initial_network(which: str, base: str | Path | None) -> FeaturePyramid:
     """Return the network before the training."""
-    if base is not None and which == "segmenter":
-        return load_segmenter_base(base_file(which, base))
+    path = base_file(which, base or "builtin")
     if base is not None:
-        return load_keypoint_base(base_file(which, base), MURRE_KEYPOINTS)[0]
+        return load_segmenter_base(path) if which == "segmenter" else load_keypoint_base(path, MURRE_KEYPOINTS)[0]
     if which == "keypoints":
         return keypoints.keypoint_network()
     network = segmenter.segmenter_network()
     # the encoder was trained on photographs, and its first stages are fixed; all other layers have random weights
-    network.down.load_state_dict(load_segmenter_base(base_file(which, "builtin")).down.state_dict())
+    network.down.load_state_dict(load_segmenter_base(path).down.state_dict())
     return network

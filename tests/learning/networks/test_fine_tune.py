@@ -46,7 +46,7 @@ def compared(tmp_path, monkeypatch):
         trained = {name: value + 1 for name, value in weights_of(model).items()}
         return Trained(10, [(0, 0.5), (5, 0.6), (10, 0.4)], trained, {})
 
-    def write(model, facts, path, longer_side_px):
+    def write(which, model, facts, path, names, longer_side_px, crops):
         is_trained = not torch.equal(model.state_dict()["heads.centre.bias"], initial)
         written.append((path.name, longer_side_px, is_trained))
 
@@ -64,7 +64,7 @@ def compared(tmp_path, monkeypatch):
     initial = fine_tune.load_segmenter_base(base).state_dict()["heads.centre.bias"]
     for name, function in (
         ("train", training),
-        ("write_segmenter", write),
+        ("write_network", write),
         ("load_segmenter", lambda path, kind: path),
         ("store_training_activations", lambda *_sources, **_options: None),
     ):
