@@ -58,7 +58,7 @@ class _Tensor(NamedTuple):
     strides: tuple[int, ...]
 
 
-class _Unpickler(pickle.Unpickler):
+class _Unpickler(pickle._Unpickler):  # in Python: for one wrong number, that in C reserves the memory of the machine
     """Builds dicts, lists, numbers, text and `_Tensor`; notes the storages by key."""
 
     def __init__(self, file: io.BytesIO):
