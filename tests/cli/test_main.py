@@ -279,6 +279,18 @@ def test_no_code_loses_an_interrupt(code):
     assert (done.returncode, done.stderr) == (130, "jaxfit: stopped; no incomplete files are left\n")
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["ablate", "o.json", "--truth", "t", "--out", "a", "--allow-import", "a:b"],
+        ["prior", "learn", "r", "--motion", "--out", "p.npz"],
+    ],
+)
+def test_an_option_of_earlier_versions_names_what_replaces_it(arguments, capsys):
+    assert main(arguments) == 2
+    assert "is no option any more (" in capsys.readouterr().err
+
+
 def test_unusable_truths_of_evaluate(fitted, inputs, tmp_path, capsys):
     (tmp_path / "masks").mkdir()
     cv2.imwrite(str(tmp_path / "masks" / "0.png"), np.ones((9, 9), np.uint8))
