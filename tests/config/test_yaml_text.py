@@ -1,8 +1,18 @@
 """YAML 1.2: values and lines of a text, and one line with file and line for a text that is not accepted."""
 
+import time
+
 import pytest
 
 from jaxfit.config.yaml_file import read_yaml, rounded
+
+NINE = ", ".join(f"k{i}: 1" for i in range(9))
+ANCHORS = f"a0: &a0 {{{NINE}}}\n" + "".join(
+    f"a{j}: &a{j} {{{', '.join(f'k{i}: *a{j - 1}' for i in range(9))}}}\n" for j in range(1, 10)
+)
+MERGES = f"a0: &a0 {{{NINE}}}\n" + "".join(
+    f"a{j}: &a{j} {{<<: [{', '.join([f'*a{j - 1}'] * 9)}]}}\n" for j in range(1, 10)
+)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +62,8 @@ def test_lines():
         ("a: !own {}", "line 1 holds the tag `!own`"),
         ("a: " + "9" * 5000, "which is no number"),
         ("a: 0x_", "which is no number"),
-        ("{a: " * 500, "is nested too deeply"),
+        ("a: " + "[" * 2000 + "]" * 2000, "is nested too deeply"),
+        ("{a: " * 20_000, "is nested too deeply"),
         ("1: 1", "line 1 holds the key '1', which is not text"),
         ("x: 1\n? [a]\n: 1", "line 2 holds the key .*, which is not text"),
         ("a: 1\nb: 2\na: 3", "line 3 holds the key `a`, which line 1 holds too"),
@@ -62,6 +73,8 @@ def test_lines():
         ("a: {<<: 3}", "`<<` a value that is not a mapping"),
         ("a: 1\n---\nb: 2", "line 2 is not valid YAML: but found another document"),
         ("a: [1,\n", "is not valid YAML"),
+        (ANCHORS, "line 1 is value number 100,001"),
+        (MERGES, "line 1 is value number 100,001"),
         ("- a", "no mapping"),
         ("", "no mapping"),
         ("3", "no mapping"),
@@ -69,9 +82,11 @@ def test_lines():
     ids=lambda value: value[:20],
 )
 def test_what_is_not_accepted(text, words):
+    began = time.process_time()
     with pytest.raises(ValueError, match=words) as caught:
         read_yaml(text, "mine.yaml")
     assert str(caught.value).startswith("mine.yaml: ")
+    assert time.process_time() - began < 5
 
 
 @pytest.mark.parametrize(

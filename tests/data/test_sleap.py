@@ -183,10 +183,16 @@ def virtual(file):
     file.create_virtual_dataset("tracks", layout)
 
 
+def huge(file):
+    del file["tracks"]
+    file.create_dataset("tracks", (10**5, 2, 10**5, 10**3), "f8", chunks=(1, 2, 3, 4))
+
+
 HOSTILE = {
     "external link": (external_link, "tracks is stored outside the file"),
     "external storage": (external_storage, "tracks is stored outside the file"),
     "virtual": (virtual, "tracks is stored outside the file"),
+    "huge": (huge, "tracks needs 160,000,000,000,000 bytes, too many for its file"),
 }
 
 

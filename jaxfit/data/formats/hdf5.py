@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,10 @@ from jaxfit.foundation.reading import reading
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """First bytes of an HDF5 file."""
+_MAX_BYTES = 4e9
+"""Largest array of a file that is read."""
+_MAX_COMPRESSION = 2000
+"""Largest ratio of an array and its file; gzip compresses zeros to a thousandth."""
 
 
 @contextmanager
@@ -24,8 +29,8 @@ def open_hdf5(path: Path, kind: str) -> Iterator[Any]:
         kind: the expected kind of file with its article, for messages.
 
     Raises:
-        InputError: the extra `formats` is missing; the file cannot be read or refers to data outside the file; or the
-            body raises any exception.
+        InputError: the extra `formats` is missing; the file cannot be read, refers to data outside the file, or holds
+            an array that is too large; or the body raises any exception.
     """
     require_extra("formats", str(path), "h5py")
     import h5py
@@ -62,7 +67,7 @@ def _check_heaps(path: Path) -> None:
 
 
 def _check_entry(path: Path, file: Any, name: str, link: Any) -> None:
-    """Raise InputError if an entry is stored in another file."""
+    """Raise InputError if an entry is stored in another file, or is larger than memory should hold."""
     import h5py
 
     external = isinstance(link, h5py.ExternalLink)
@@ -70,6 +75,11 @@ def _check_entry(path: Path, file: Any, name: str, link: Any) -> None:
     array = entry if isinstance(entry, h5py.Dataset) else None
     if external or (array is not None and (array.is_virtual or array.external)):
         raise InputError(path, f"{name} is stored outside the file", "write a file that holds its own data")
+    needed = 0 if array is None or array.shape is None else math.prod(array.shape) * array.dtype.itemsize
+    if needed > min(_MAX_BYTES, path.stat().st_size * _MAX_COMPRESSION):
+        raise InputError(
+            path, f"{name} needs {needed:,} bytes, too many for its file", "split the file, or copy it again"
+        )
 
 
 def hdf5_text(value: Any) -> str:
